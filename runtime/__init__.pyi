@@ -33,6 +33,9 @@ from .api import (
     critical as critical,
 )
 from .api import (
+    export as export,
+)
+from .api import (
     feel as feel,
 )
 from .api import (

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from apc.hands.passivity import PassiveHands
     from apc.moments.network import NetworkVerdict
     from apc.regions.region import Region
+    from apc.result import Result
     from apc.simulation.buzz import Buzz
     from apc.simulation.trajectory import Trajectory
     from apc.sweeps.sweep import Sweep
@@ -540,10 +541,7 @@ def sweep(
 
     path = None if out is None else Path(out)
     system = _model(model, set)
-    if path is not None and not isinstance(model, CompiledSystem):
-        from apc.inputs import check_outputs
-
-        check_outputs(Path(model), (name for name, _ in system.origin.texts), {"out=": path})
+    _check_out(model, system, path)
     return points.sweep(system, over, of=of, criterion=criterion, out=path, jobs=jobs, cluster=cluster)
 
 
@@ -554,6 +552,14 @@ def _model(model: CompiledSystem | str | Path, set: Mapping[str, str] | None) ->
 
         model = load_or_compile(Path(model))
     return set_parameters(model, set) if set else model
+
+
+def _check_out(model: CompiledSystem | str | Path, system: CompiledSystem, path: Path | None) -> None:
+    """Refuse to write over what the model was read from."""
+    if path is not None and not isinstance(model, CompiledSystem):
+        from apc.inputs import check_outputs
+
+        check_outputs(Path(model), (name for name, _ in system.origin.texts), {"out=": path})
 
 
 def simulate(
@@ -643,6 +649,47 @@ def bench(
     from apc.benchmark import bench as measuring
 
     return measuring.bench(_model(model, set), rounds=measuring.ROUNDS if rounds is None else rounds)
+
+
+def export(
+    model: CompiledSystem | str | Path,
+    to: str | None = None,
+    out: str | Path | None = None,
+    *,
+    set: Mapping[str, str] | None = None,
+    cut: str = "",
+) -> Result:
+    """Hand a scene over to other tools.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    to
+        "control", "mat" or "npz": a state space; the suffix of `out` says it if not given.
+    out
+        The file to write; nothing is written if not given.
+    cut
+        The link or coupler to cut the loop open at.
+
+    Returns
+    -------
+    Result
+        What was made, and written if asked: of a state space its matrices with the names and units of states,
+        inputs and outputs, and `.to_control()`.
+
+    Raises
+    ------
+    ApcError
+        The input is at fault, or the scene can't be handed over so.
+    """
+    from apc.exports import export as handing
+
+    path = None if out is None else Path(out)
+    chosen = handing.format_of(to, path, option="=")
+    system = _model(model, set)
+    _check_out(model, system, path)
+    return handing.export(system, chosen, handing.Asked(cut=cut), path)
 
 
 def show(path: str | Path, *, format: Format = "text") -> str:

@@ -114,11 +114,12 @@ HOUSE = (
         panels
         """,
     ),
+    ("apc.exports", "lifted files export"),
     ("apc.benchmark", "timing truth bench hard scale"),
     (
         "apc.present",
         """
-        forms pictures network hands analysis vary comparison_picture comparison region_picture region
+        forms pictures exports network hands analysis vary comparison_picture comparison region_picture region
         planar simulation still recording bench
         """,
     ),
@@ -127,7 +128,7 @@ HOUSE = (
         "apc",
         "inputs api",
     ),
-    ("apc.cli", "options progress region simulate sweep compare critical feel bench analyze commands"),
+    ("apc.cli", "options progress region simulate sweep compare critical feel export bench analyze commands"),
     ("apc", "__main__"),
 )
 ORDER = tuple(f"{package}.{name}" for package, names in HOUSE for name in names.split())

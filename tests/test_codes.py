@@ -113,7 +113,7 @@ E802 runtime/frame: the weights of a mean add up to nothing
 E803 runtime/eigen: an operator over equal peers has no linearization
 E804 runtime/analysis runtime/eigen runtime/large runtime/vary: too large a matrix, or equals not linear
 E805 runtime/frame: a frame is too long to be taken apart
-E806 runtime/analysis runtime/frame: numbers leave the range of floats
+E806 runtime/analysis runtime/exports runtime/frame: numbers leave the range of floats
 E807 runtime/frame: an operator over the others has no linearization inside a loop
 E808 runtime runtime/frame: the equations have no finite value at the start
 E809 runtime/frame: a time that follows from others is below zero
@@ -186,6 +186,10 @@ E935 runtime/hands: a frequency is none that a response is told of, or nothing t
 E936 runtime/hands: a device is named that is not there
 E940 runtime/comparison: what is to be compared is no stiffness, delay or loss
 E941 runtime/comparison: a scene has several stiffnesses, delays or losses to compare
+E950 runtime/exports: a loop is to be cut where there is no link or coupler
+E951 runtime/exports: a state space is too large for the memory or a file
+E952 runtime/exports: a format to export to is not known
+E953 runtime/exports: an option means nothing to the format
 """
 
 

@@ -17,6 +17,7 @@ from apc.cli.analyze import analyze_command
 from apc.cli.bench import bench_command
 from apc.cli.compare import compare_command
 from apc.cli.critical import critical_command
+from apc.cli.export import export_command
 from apc.cli.feel import feel_command
 from apc.cli.options import Group, beside, file_argument, file_option, tell
 from apc.cli.progress import at_work
@@ -70,6 +71,7 @@ def apc() -> None:
         apc simulate       what happens over time, as rows and a picture
         apc region         where it is stable over two parameters: curves, areas
         apc sweep          any of it at many values of some parameters
+        apc export         files that other tools read
         apc show           what the scene is made of, as text or a picture
 
     Without FILE a command takes the only topology of the folder.
@@ -80,6 +82,7 @@ apc.add_command(analyze_command)
 apc.add_command(bench_command)
 apc.add_command(compare_command)
 apc.add_command(critical_command)
+apc.add_command(export_command)
 apc.add_command(feel_command)
 apc.add_command(simulate_command)
 apc.add_command(region_command)

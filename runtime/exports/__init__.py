@@ -1,1 +1,1 @@
-"""What goes out of the house: files that other programs read."""
+"""What other tools read: a judged scene as files of theirs."""

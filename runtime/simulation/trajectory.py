@@ -108,6 +108,21 @@ class Trajectory(Played):
 def provenance_of(simulation: Simulation) -> Provenance:
     """Return what makes a simulation's results."""
     system = simulation.system
+    return Provenance(
+        topology=system.name,
+        texts=texts_of(system),
+        duration_s=str(simulation.settings.duration),
+        method=simulation.how,
+        tolerances=simulation.tolerances,
+        seed=simulation.seed,
+        parameters=parameters_of(system),
+        timings=tuple((one.name, str(one.value)) for one in system.timings),
+        versions=versions("casadi", "numpy"),
+    )
+
+
+def parameters_of(system: CompiledSystem) -> tuple[tuple[str, float, str], ...]:
+    """Return the parameters of a scene, its groups and peers: name, value in SI, unit."""
     parameters = [(one.name, one.value, one.unit) for one in system.parameters]
     for group in system.groups:
         parameters += [(f"{group.name}.{one.name}", one.value, one.unit) for one in group.values]
@@ -118,18 +133,13 @@ def provenance_of(simulation: Simulation) -> Provenance:
                 (f"{group.name}[{i + 1}].{column.name}", float(one), units.get(column.name, "1"))
                 for i, one in enumerate(column.values[:MOST_LISTED])
             ]
+    return tuple(parameters)
+
+
+def texts_of(system: CompiledSystem) -> str:
+    """Return the SHA-256 of all texts of a scene."""
     texts = "\n".join(f"{name} {digest}" for name, digest in system.origin.texts)
-    return Provenance(
-        topology=system.name,
-        texts=hashlib.sha256(texts.encode("utf-8", "surrogateescape")).hexdigest(),
-        duration_s=str(simulation.settings.duration),
-        method=simulation.how,
-        tolerances=simulation.tolerances,
-        seed=simulation.seed,
-        parameters=tuple(parameters),
-        timings=tuple((one.name, str(one.value)) for one in system.timings),
-        versions=versions("casadi", "numpy"),
-    )
+    return hashlib.sha256(texts.encode("utf-8", "surrogateescape")).hexdigest()
 
 
 class Sink(Protocol):

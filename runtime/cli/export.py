@@ -1,0 +1,74 @@
+"""The command `apc export`.
+
+Takes: words of a command line. Gives: a file, and what is in it on stdout.
+Guarantees: with --json, stdout holds one JSON document and nothing else; a file that can't be written is
+refused before anything is computed.
+Does not: compute, or know a format.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from apc.cli.options import (
+    Command,
+    beside,
+    file_argument,
+    file_option,
+    json_option,
+    note_aside,
+    print_result,
+    set_option,
+    tell,
+)
+from apc.threads import start_single_threaded
+
+
+@click.command("export", cls=Command)
+@file_argument
+@click.option(
+    "--to",
+    metavar="FORMAT",
+    help="control: a script that makes a python-control StateSpace (.py); mat, npz: the same matrices for "
+    "MATLAB, SciPy, NumPy. Taken from --out if not given.",
+)
+@set_option
+@click.option(
+    "--cut",
+    default="",
+    metavar="NAME",
+    help="Cut the loop open at a link or a coupler, for margins and designs of your own: closed again by "
+    "u = -y it is the closed loop.",
+)
+@file_option("--out", "The file to write.", required=True)
+@json_option
+def export_command(
+    file: str | None,
+    to: str | None,
+    settings: tuple[str, ...],
+    cut: str,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Hand a scene over to other tools.
+
+    FILE is a topology or a compiled model. As a state space it is the whole
+    loop over one frame, all peers in it: from a force on every mass and noise
+    on every measurement to every position, velocity and force.
+
+    \b
+        apc export --out loop.mat
+        apc export --to control --cut lan --out open_loop.py
+    """
+    start_single_threaded()
+    from apc.exports.export import Asked, export, format_of
+    from apc.inputs import open_scene
+
+    chosen = format_of(to, out)
+    system = open_scene(file, settings, {"--out": out}, told=note_aside)
+    found = export(system, chosen, Asked(cut=cut), out)
+    print_result(found, as_json=as_json, err=beside(out))
+    if not as_json:
+        tell(f"\n{out} is written", err=beside(out))

@@ -1,0 +1,140 @@
+"""What a scene can be handed over as: the table of formats, and who makes each.
+
+Takes: a `CompiledSystem`, where it goes and what is asked of it.
+Gives: `Format`, `FORMATS`; `Asked`; `format_of`, `export`.
+Guarantees: a format is chosen by its name or by the suffix, which agree; an option that means nothing to a
+format is refused; a maker is imported when it is asked for.
+Does not: make anything itself.
+
+A new format is a line of the table: its name, its suffix, what it is, the options it takes, and a function
+that makes a result of a compiled scene and what is asked, and one that writes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.frozen import dataclass
+from apc.result import Result
+from apc.suffixes import check_suffix
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What is asked of an export, each "" or () where it is not: where to `cut` the loop, `free` numbers."""
+
+    cut: str = ""
+    free: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A format: its name, its suffix, what it is, and which fields of `Asked` mean something to it."""
+
+    name: str
+    suffix: str
+    about: str
+    takes: tuple[str, ...]
+    make: Callable[[CompiledSystem, Asked], Result]
+    write: Callable[[Path, Any], None]
+
+
+def _state_space(system: CompiledSystem, asked: Asked) -> Result:
+    from apc.exports.lifted import state_space
+
+    return state_space(system, cut=asked.cut)
+
+
+def _script(path: Path, found: Any) -> None:
+    from apc.exports.files import write_script
+
+    write_script(path, found)
+
+
+def _mat(path: Path, found: Any) -> None:
+    from apc.exports.files import write_mat
+
+    write_mat(path, found)
+
+
+def _npz(path: Path, found: Any) -> None:
+    from apc.exports.files import write_npz
+
+    write_npz(path, found)
+
+
+FORMATS = (
+    Format("control", ".py", "a script that makes a control.StateSpace", ("cut",), _state_space, _script),
+    Format("mat", ".mat", "a state space for MATLAB and SciPy", ("cut",), _state_space, _mat),
+    Format("npz", ".npz", "a state space for NumPy", ("cut",), _state_space, _npz),
+)
+
+
+def format_of(to: str | None, out: Path | None, *, option: str = "--") -> Format:
+    """Return the format that a name or a suffix says.
+
+    Parameters
+    ----------
+    to
+        The name, None if the suffix says it.
+    out
+        The file, None if nothing is written.
+    option
+        How options are written: "--" before or "=" behind.
+
+    Raises
+    ------
+    ApcError
+        E952 no such format; E878 a suffix that is none, or another one's.
+    """
+    names = [one.name for one in FORMATS]
+    written = "--out" if option == "--" else "out="
+    if to is None:
+        if out is None:
+            raise ApcError(
+                Mistake("E952", Place("export"), "no format is named", f"one of {', '.join(names)}")
+            )
+        suffix = check_suffix(out, [one.suffix for one in FORMATS], written)
+        return next(one for one in FORMATS if one.suffix == suffix)
+    found = next((one for one in FORMATS if one.name == to), None)
+    if found is None:
+        near = nearest(to, names) or names[0]
+        place = Place("--to" if option == "--" else "to")
+        raise ApcError(
+            Mistake("E952", place, "a format", f"one of {', '.join(names)}", to[:40], f"{place} {near}")
+        )
+    if out is not None:
+        check_suffix(out, [found.suffix], written)
+    return found
+
+
+def export(system: CompiledSystem, chosen: Format, asked: Asked, out: Path | None = None) -> Result:
+    """Make what a format says of a scene, and write it.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    chosen, asked
+        The format, from `format_of`, and what is asked of it.
+    out
+        The file; None writes nothing.
+
+    Raises
+    ------
+    ApcError
+        E953 an option that means nothing to the format; E601 the file can't be written; and the maker's.
+    """
+    for name in Asked.__slots__:
+        if getattr(asked, name) and name not in chosen.takes:
+            able = ", ".join(one.name for one in FORMATS if name in one.takes)
+            what = f"--{name} means nothing to the format {chosen.name}"
+            raise ApcError(Mistake("E953", Place(f"--{name}"), what, hint=f"--to {able}" if able else ""))
+    found = chosen.make(system, asked)
+    if out is not None:
+        chosen.write(out, found)
+    return found

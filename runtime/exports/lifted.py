@@ -1,0 +1,559 @@
+"""A scene over one frame as a state space, all peers in it: from forces and noise to what is simulated.
+
+Takes: a `CompiledSystem`; a link or coupler to cut it at.
+Gives: `Port`, `StateSpace`, `state_space`.
+Guarantees: every event within a frame is in it, exactly but for rounding; its eigenvalues are those that
+`analyze` finds, and 0 for each force that nothing else remembers until the frame ends. Cut open and closed
+again by u = −y it is the closed loop.
+Does not: write files (see `files`), or keep equal peers apart from different ones.
+
+    x⁺ = A x + B u      y = C x + D u      once a frame
+
+A force that comes in is held from one frame's beginning to the next; noise is added to every sample that is
+taken of a measured value in that time, by ticks and by packets alike. What comes out is what a row of
+`apc simulate` has at the frame's beginning: values just before the tick. Of a scene that is not linear, or
+that forces of its own push, these are the small motions about its start.
+
+Cut at a link, u is what each peer hears over it and −y what it would hear; cut at a coupler, u is what each
+of its forces is at each tick of a frame and −y what the tick computed. D then holds what is sent or computed
+upon it within the frame.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import lifted_groups, prepare
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.frozen import dataclass
+from apc.distribution import versions
+from apc.eigen.closing import Feedback, Loop, close, feedback_of, lay_out_loop
+from apc.eigen.modes import dense_loop
+from apc.eigen.peer_group import PeerGroup, states_of
+from apc.finite_equations import finite_equations
+from apc.frame.devices import Device, find_device
+from apc.frame.discretize import TOO_LARGE, discretize
+from apc.frame.lift import FrameMap, check_packets, compose, named, step_durations
+from apc.frame.ports import with_holds, with_ports
+from apc.frame.radius import FLOATS, Arithmetic
+from apc.frame.schedule import Heard, Propagate, Schedule, Sent, Tick, Value, Way
+from apc.frame.site import LinearSite
+from apc.memory import refuse_beyond
+from apc.network.nominal import left_out
+from apc.result import Result
+from apc.simulation.signals import local_signals, ticking_partitions
+from apc.simulation.trajectory import parameters_of, texts_of
+from apc.threads import single_threaded
+
+if TYPE_CHECKING:
+    import control
+
+Floats = NDArray[np.float64]
+Places = NDArray[np.intp]
+Matrix = NDArray[Any]
+Blocks = tuple[Matrix, Matrix, Matrix, Matrix]
+
+# Bytes of an entry of the closed matrix while it is made: the matrix, its parts, and what is sent.
+ENTRY = 40
+
+# What comes from outside stands where packets do, and is of no link.
+_OUTSIDE = Heard(Way("", "", ""), Sent("", "", 0), 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Port:
+    """An input, an output or a state: its name, such as `left[2].cube.x`, and its SI unit."""
+
+    name: str
+    unit: str
+
+
+Labels = tuple[Port, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StateSpace(Result):
+    """A scene as a discrete state space with the sample time `frame_s`; `cut` is where it is cut, "" closed.
+
+    `notes` say what it leaves out.
+    """
+
+    shown_by = "exports:state_space"
+
+    topology: str
+    cut: str
+    frame_s: float
+    a: Floats  # (n, n)
+    b: Floats  # (n, inputs)
+    c: Floats  # (outputs, n)
+    d: Floats  # (outputs, inputs)
+    states: tuple[Port, ...]
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    notes: tuple[str, ...]
+    made_by: str
+
+    @property
+    def matrices(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """A, B, C and D."""
+        return self.a, self.b, self.c, self.d
+
+    @property
+    def what(self) -> str:
+        """The closed loop, or where it is cut."""
+        return f"the loop cut at {self.cut}" if self.cut else "the closed loop"
+
+    @property
+    def meaning(self) -> str:
+        """How inputs are held, and when outputs are read."""
+        step = f"x[k+1] = A x[k] + B u[k], y[k] = C x[k] + D u[k], one step a frame of {self.frame_s!r} s"
+        if self.cut:
+            closing = "as by control.feedback(system, the identity), it is the closed loop"
+            return f"{step}, cut at {self.cut}: closed again by u = -y, {closing}."
+        held = "Forces are held for a frame; noise is added to each sample taken in it"
+        return f"{step}. {held}; y are the values just before it."
+
+    def to_control(self) -> control.StateSpace:
+        """Return it as python-control's, names in letters, digits and `_`. Raises ApcError (E875)."""
+        return self._shown("control")
+
+
+@dataclass(frozen=True, slots=True)
+class Numbers:
+    """What a frame is made of in a kind of number.
+
+    `site` gives the matrices of some peers, `inverse` the 1/m of what is pushed, `steps` [F G] of each of
+    some durations in seconds, with so many inputs behind the holds, forces first.
+    """
+
+    site: Callable[[PeerGroup], LinearSite]
+    inverse: Callable[[PeerGroup, Device], Any]
+    steps: Callable[[PeerGroup, Sequence[Device], int, Sequence[Fraction]], list[Matrix]]
+    arithmetic: Arithmetic
+
+
+def _steps(
+    group: PeerGroup, forces: Sequence[Device], count: int, durations: Sequence[Fraction]
+) -> list[Matrix]:
+    """Return the exponentials of exact matrices, in floats."""
+    columns = np.zeros((len(group.exact.a), count), dtype=object)
+    for place, device in enumerate(forces):
+        columns[device.velocity, place] = device.inverse
+    found = discretize(group.exact.a, np.concatenate([group.exact.b, columns], axis=1), durations)
+    return [step.matrix for step in found]
+
+
+IN_FLOATS = Numbers(lambda group: group.site, lambda group, one: float(one.inverse), _steps, FLOATS)
+
+
+def state_space(system: CompiledSystem, *, cut: str = "") -> StateSpace:
+    """Lift a scene, all its peers in one system.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    cut
+        The link or coupler to cut it at; "" leaves it closed.
+
+    Raises
+    ------
+    ApcError
+        E950 nothing to cut at; E951 too many states; and those of `analysis.lifted_groups`.
+    """
+    (a, b, c, d), (states, inputs, outputs) = lifted(system, cut, IN_FLOATS)
+    if not all(np.isfinite(block).all() for block in (a, b, c, d)):
+        raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
+    frame_s, notes = about(system)
+    return StateSpace(system.name, cut, frame_s, a, b, c, d, states, inputs, outputs, notes, made_by(system))
+
+
+def about(system: CompiledSystem) -> tuple[float, tuple[str, ...]]:
+    """Return how long a frame of a scene is, in seconds, and what its linear map leaves out."""
+    prepared = prepare(system)
+    affine = all(prepared.jacobians[group.kind].affine for group in system.groups)
+    return float(prepared.schedules[0].frame_s), left_out(system, linear=affine)
+
+
+def made_by(system: CompiledSystem) -> str:
+    """Return what a scene's export is made of, as one line of JSON."""
+    told = {
+        "topology": system.name,
+        "texts": texts_of(system),
+        "parameters": parameters_of(system),
+        "timings": [(one.name, str(one.value)) for one in system.timings],
+        "versions": versions("casadi", "numpy"),
+    }
+    return json.dumps(told, ensure_ascii=False)
+
+
+def lifted(
+    system: CompiledSystem, cut: str, numbers: Numbers
+) -> tuple[Blocks, tuple[Labels, Labels, Labels]]:
+    """Return A, B, C and D of a scene in a kind of number, and the names of its states, inputs and outputs.
+
+    Parameters
+    ----------
+    system, cut
+        As for `state_space`.
+    numbers
+        What the matrices are of.
+    """
+    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+        groups, exchange = lifted_groups(system)
+        link = _link_of(system, cut)
+        opened = [_open(system, group, "" if link else cut, numbers) for group in groups]
+        _check_size(system, opened)
+        loop = dense_loop([one.group for one in opened], exchange)
+        of_schedule = {id(one.group.schedule): one for one in opened}
+        sites = [of_schedule[id(site.schedule)] for site in loop.sites]
+        return _closed(loop, sites, _sent_units(system), link=link, cut=cut, arithmetic=numbers.arithmetic)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Opened:
+    """Peers that are moved from outside: `group` has the ways in, of which `inputs` says what they are.
+
+    `states` and `signals` name entries of z and what is simulated, which are those at `places`; `drawn` are
+    the entries of z that come in. `cuts` are the forces cut open, `computed` the entries of z that hold what
+    the ticks made of them, and the last of what is heard stands in their place.
+    """
+
+    group: PeerGroup
+    map: FrameMap
+    states: tuple[Port, ...]
+    signals: tuple[Port, ...]
+    places: tuple[int, ...]
+    inputs: tuple[Port, ...]
+    drawn: Places
+    cuts: tuple[Port, ...]
+    computed: tuple[int, ...]
+
+
+def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) -> _Opened:
+    """Let forces and noise into some peers, and cut the forces of a coupler open."""
+    schedule = _remembering(group)
+    forces, noises = _masses(system, group), _measured(group.site)
+    plain = numbers.site(group)
+    wide = with_inputs(plain, forces, [numbers.inverse(group, one) for one in forces], noises)
+    count = len(forces) + len(noises)
+    nothing = np.zeros((0, sum(wide.b.shape)), dtype=wide.b.dtype)
+    (site,), full, ports = with_ports([wide], schedule, count, [0], [nothing], [])
+    kind = group.jacobians.kind
+    unit_of = [*(state.unit for state in kind.states)]
+    unit_of += [kind.clocks[one.partition].units[one.output] for one in schedule.carried]
+    listed = _cut_forces(group, cut) if cut else []
+    site, full, cuts, computed = _cut_open(site, full, listed)
+    check_packets(full)
+    durations = step_durations(full)
+    steps = numbers.steps(group, forces, count, [one * full.quantum for one in durations])
+    frame = compose(site, full, dict(zip(durations, steps, strict=True)), numbers=numbers.arithmetic)
+    lifted = named(site.kind, full, frame, frame)
+    names = [*(state.name for state in kind.states), *schedule.value_names]
+    place_of = {one: len(kind.states) + k for k, one in enumerate(schedule.carried)}
+    signals = [
+        (
+            Port(one.name, one.unit),
+            one.place[0] if one.role == "state" else place_of[Value(one.place[0], one.place[1], -1)],
+        )
+        for one in local_signals(kind, group.schedule)
+        if one.role != "hold"
+    ]
+    inputs = [Port(f"force on {device.part}", "N") for device in forces]
+    inputs += [Port(f"noise on {kind.states[place].name}", kind.states[place].unit) for place in noises]
+    return _Opened(
+        group=group.with_site(site, group.exact, full, lifted),
+        map=frame,
+        states=tuple(map(Port, names, unit_of)),
+        signals=tuple(port for port, _ in signals),
+        places=tuple(place for _, place in signals),
+        inputs=tuple(inputs),
+        drawn=ports.drawn.ravel(),
+        cuts=cuts,
+        computed=computed,
+    )
+
+
+def _remembering(group: PeerGroup) -> Schedule:
+    """Return a peer's frame with all that its clocks computed last among what it remembers."""
+    schedule, kind = group.schedule, group.jacobians.kind
+    at = _instants(schedule)
+    kept = [Value(p, o, -1) for p in ticking_partitions(schedule) for o in range(len(kind.clocks[p].outputs))]
+    kept = [one for one in kept if one not in schedule.carried]
+    names = [
+        f"{kind.clocks[one.partition].outputs[one.output]}"
+        f"({float((at[one.partition][-1] - schedule.frame) * schedule.quantum * 1000):.6g} ms)"
+        for one in kept
+    ]
+    return replace(
+        schedule,
+        carried=(*schedule.carried, *kept),
+        value_names=(*schedule.value_names, *names),
+        repeats=None,
+    )
+
+
+def _instants(schedule: Schedule) -> dict[int, list[int]]:
+    """Return when in a frame each clock partition ticks, in quanta."""
+    found: dict[int, list[int]] = {}
+    now = 0
+    for event in schedule.events:
+        if isinstance(event, Propagate):
+            now += event.duration
+        elif isinstance(event, Tick):
+            found.setdefault(event.partition, []).append(now)
+    return found
+
+
+def _masses(system: CompiledSystem, group: PeerGroup) -> list[Device]:
+    """Return what of a peer has a mass, and so can be pushed, each axis of it by itself."""
+    unit_of = {one.name: one.unit for one in system.parameters}
+    found: dict[int, Device] = {}
+    for state in group.jacobians.kind.states:
+        if state.unit != "m":
+            continue
+        for part in (state.name.rpartition(".")[0], state.name):
+            one = find_device(group.jacobians, group.parameters, unit_of, group.listening, part=part)
+            if isinstance(one, Device):
+                found.setdefault(one.velocity, one)
+                break
+    return list(found.values())
+
+
+def _measured(site: LinearSite) -> list[int]:
+    """Return the states that something samples."""
+    looking = [*(tick.x for tick in site.ticks), *(send.x for send in site.sends)]
+    if not looking:
+        return []
+    return [int(place) for place in np.flatnonzero(np.concatenate(looking).any(axis=0))]
+
+
+def with_inputs(
+    site: LinearSite, forces: Sequence[Device], inverses: Sequence[Any], noises: Sequence[int]
+) -> LinearSite:
+    """Return a site with a hold for each force and for each noise, which is added to what is sampled.
+
+    Parameters
+    ----------
+    site
+        In any kind of number.
+    forces, inverses
+        What is pushed, and the 1/m of each.
+    noises
+        The states whose samples are noisy.
+    """
+    columns = np.zeros((len(site.a), len(forces) + len(noises)), dtype=site.b.dtype)
+    for place, (device, inverse) in enumerate(zip(forces, inverses, strict=True)):
+        columns[device.velocity, place] = inverse
+    wide = with_holds(site, columns)
+    if noises:
+        matrices = [*((tick.u, tick.x) for tick in wide.ticks), *((send.u, send.x) for send in wide.sends)]
+        for u, x in matrices:
+            u[:, -len(noises) :] = x[:, noises]
+    return wide
+
+
+def _link_of(system: CompiledSystem, cut: str) -> str:
+    """Return the link that a cut names, "" for a coupler. Raises ApcError (E950) if it names neither."""
+    links = [link.name for link in system.links]
+    parts = {hold.name.rpartition(".")[0] for kind in system.kinds for hold in kind.holds}
+    if cut in links:
+        return cut
+    if cut and cut not in parts:
+        known = [*links, *sorted(parts)]
+        what = f"{cut[:80]} is no link or coupler of {system.name} ({', '.join(known) or 'it has none'})"
+        near = nearest(cut, known) or (known[0] if known else "")
+        raise ApcError(Mistake("E950", Place("--cut"), what, hint=f"--cut {near}" if near else ""))
+    return ""
+
+
+def _cut_forces(group: PeerGroup, cut: str) -> list[tuple[int, int]]:
+    """Return the clock partition and output of each force of a coupler."""
+    kind = group.jacobians.kind
+    numbers = {partition.clock: p for p, partition in enumerate(kind.clocks)}
+    found = [(numbers[hold.clock], hold.output) for hold in kind.holds if hold.name.rpartition(".")[0] == cut]
+    return list(dict.fromkeys(found))
+
+
+def _cut_open(
+    site: LinearSite, schedule: Schedule, listed: Sequence[tuple[int, int]]
+) -> tuple[LinearSite, Schedule, tuple[Port, ...], tuple[int, ...]]:
+    """Let forces come from outside at each tick, what the tick computes of them being remembered beside."""
+    ticks, carried = list(site.ticks), list(schedule.carried)
+    heard, n_x = len(schedule.heard), len(site.kind.states)
+    rows: dict[int, list[int]] = {}
+    ports: list[Port] = []
+    computed: list[int] = []
+    at = _instants(schedule)
+    for partition, output in listed:
+        tick, count = ticks[partition], schedule.ticks[partition]
+        if not count:
+            continue
+        outputs = len(tick.x)
+        blocks = [np.vstack([block, block[output]]) for block in (tick.x, tick.u, tick.m, tick.r)]
+        for block in blocks:
+            block[output] = 0
+        force = np.zeros((outputs + 1, 1), dtype=tick.r.dtype)
+        force[output] = 1
+        x, u, m, r = blocks
+        ticks[partition] = replace(tick, x=x, u=u, m=m, r=np.hstack([r, force]))
+        clock = site.kind.clocks[partition]
+        for index in range(count):
+            when = float(at[partition][index] * schedule.quantum * 1000)
+            ports.append(Port(f"{clock.outputs[output]} at {when:.6g} ms", clock.units[output]))
+            computed.append(n_x + len(carried))
+            carried.append(Value(partition, outputs, index - count))
+        rows.setdefault(partition, []).append(heard)
+        heard += count
+    events = tuple(
+        replace(one, heard=(*one.heard, *((row + one.index,) for row in rows.get(one.partition, ()))))
+        if isinstance(one, Tick)
+        else one
+        for one in schedule.events
+    )
+    whole = replace(
+        schedule,
+        events=events,
+        carried=tuple(carried),
+        heard=(*schedule.heard, *(_OUTSIDE,) * len(ports)),
+        value_names=(*schedule.value_names, *(f"{port.name} computed" for port in ports)),
+    )
+    return replace(site, ticks=tuple(ticks)), whole, tuple(ports), tuple(computed)
+
+
+def _check_size(system: CompiledSystem, opened: Sequence[_Opened]) -> None:
+    """Refuse a scene whose matrix does not fit the memory: ApcError E951."""
+    columns = sum(one.group.count * states_of(one.group.schedule, one.group.jacobians) for one in opened)
+    peers = sum(one.group.count for one in opened)
+    what = f"{columns:,} × {columns:,} numbers, the states and inputs of all {peers:,} peers together,"
+    first = max(opened, key=lambda one: one.group.count).group
+    hint = f"fewer peers: --set {system.groups[0].name if len(opened) == 1 else first.name}.count=10"
+    refuse_beyond(ENTRY * columns**2, "E951", Place(system.origin.topology), what, hint)
+
+
+def _closed(
+    loop: Loop,
+    sites: Sequence[_Opened],
+    units: Mapping[tuple[str, str], str],
+    *,
+    link: str,
+    cut: str,
+    arithmetic: Arithmetic,
+) -> tuple[Blocks, tuple[Labels, Labels, Labels]]:
+    """Close a loop, but where it is cut; return A, B, C and D, and the names of states, inputs, outputs."""
+    layout = lay_out_loop(loop)
+    n, peers = len(layout.names), [site.name for site in loop.sites]
+    plain = [one.plain for one in feedback_of(loop, layout)]
+    open_rows = [_open_rows(one, link) for one in sites]
+    outside = sum(map(len, open_rows))
+    taken, feedback = 0, []
+    for wires, rows in zip(plain, open_rows, strict=True):
+        now, before = wires.now.copy(), np.pad(wires.before, ((0, 0), (0, outside)))
+        now[rows], before[rows] = 0.0, 0.0
+        before[rows, n + taken + np.arange(len(rows))] = 1.0
+        feedback.append(Feedback(now, before))
+        taken += len(rows)
+    whole = close([one.map for one in sites], feedback, layout, numbers=arithmetic)
+    drawn = _places(one.drawn + offset for one, offset in zip(sites, layout.offsets, strict=True))
+    computed = _places(
+        np.array(one.computed, np.intp) + offset for one, offset in zip(sites, layout.offsets, strict=True)
+    )
+    own = np.delete(np.arange(n), np.concatenate([drawn, computed]))
+    names = layout.names if len(sites) > 1 else tuple(f"{peers[0]}.{name}" for name in layout.names)
+    of_states = [unit for one in sites for unit in _units(one, units)]
+    states = tuple(Port(names[place], of_states[place]) for place in own)
+    matrix = whole.matrix
+    if not cut:
+        seen = _places(
+            np.array(one.places, np.intp) + offset for one, offset in zip(sites, layout.offsets, strict=True)
+        )
+        c = (own[None, :] == seen[:, None]).astype(np.float64)
+        inputs = tuple(
+            _named(port, peer) for one, peer in zip(sites, peers, strict=True) for port in one.inputs
+        )
+        outputs = tuple(
+            _named(port, peer) for one, peer in zip(sites, peers, strict=True) for port in one.signals
+        )
+        blocks = matrix[np.ix_(own, own)], matrix[np.ix_(own, drawn)], c, np.zeros((len(c), len(drawn)))
+        return blocks, (states, inputs, outputs)
+    given = n + np.arange(outside)
+    if link:
+        back = [
+            arithmetic.add(
+                arithmetic.multiply(wires.now[rows], whole.sent),
+                np.pad(wires.before[rows], ((0, 0), (0, outside))),
+            )
+            for wires, rows in zip(plain, open_rows, strict=True)
+        ]
+        answer = -np.concatenate(back)
+    else:
+        answer = -matrix[computed]
+    ways = [
+        (port, peer)
+        for one, peer in zip(sites, peers, strict=True)
+        for port in (_heard_ports(one, link, units) if link else one.cuts)
+    ]
+    inputs = tuple(_named(port, peer) for port, peer in ways)
+    outputs = tuple(_named(replace(port, name=f"{port.name} back"), peer) for port, peer in ways)
+    blocks = matrix[np.ix_(own, own)], matrix[np.ix_(own, given)], answer[:, own], answer[:, given]
+    return blocks, (states, inputs, outputs)
+
+
+def _places(listed: Iterable[Places]) -> Places:
+    """Return places one after the other."""
+    return np.concatenate([np.zeros(0, np.intp), *listed])
+
+
+def _named(port: Port, peer: str) -> Port:
+    """Return a peer's port, its name with the peer's: `force on left[2].cube`."""
+    word, _, rest = port.name.rpartition(" on ")
+    return replace(port, name=f"{word} on {peer}.{rest}" if word else f"{peer}.{rest}")
+
+
+def _open_rows(one: _Opened, link: str) -> list[int]:
+    """Return which rows of what a peer hears come from outside."""
+    heard = one.group.schedule.heard
+    return [row for row, what in enumerate(heard) if what is _OUTSIDE or (link and what.way.link == link)]
+
+
+def _heard_ports(one: _Opened, link: str, units: Mapping[tuple[str, str], str]) -> list[Port]:
+    """Return what a peer hears over a link: of which packet of a frame, and how many frames ago."""
+    heard = [what for what in one.group.schedule.heard if what.way.link == link]
+    several = any(what.sent.slot for what in heard)
+    found = []
+    for what in heard:
+        which = f" #{what.sent.slot + 1}" if several else ""
+        name = f"{what.way.operator} {what.sent.channel}{which}({-what.lag})"
+        found.append(Port(name, units[what.sent.link, what.sent.channel]))
+    return found
+
+
+def _sent_units(system: CompiledSystem) -> dict[tuple[str, str], str]:
+    """Return the unit of each channel of each link."""
+    return {
+        (send.link, channel): unit
+        for kind in system.kinds
+        for send in kind.sends
+        for channel, unit in zip(send.channels, send.units, strict=True)
+    }
+
+
+def _units(one: _Opened, units: Mapping[tuple[str, str], str]) -> list[str]:
+    """Return the units of a peer's part of the state: of z, then of the packets on their way."""
+    group = one.group
+    own = [port.unit for port in one.states]
+    added = ["1"] * (len(group.lifted.z_names) - len(own))
+    packets = [
+        units[sent.link, sent.channel]
+        for sent, depth in zip(group.schedule.sent, group.schedule.depths, strict=True)
+        for _ in range(depth)
+    ]
+    return [*own, *added, *packets]

@@ -1,0 +1,44 @@
+"""What an export is, in words and as plain data.
+
+Takes: what `exports` makes. Gives: `state_space_text`, `state_space_document`.
+Guarantees: at most 80 columns.
+Does not: write files.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from apc.compiler.words import counted, wrapped
+from apc.exports.files import as_control
+from apc.exports.lifted import Port, StateSpace
+from apc.present.forms import document, note
+
+MOST_NAMED = 6
+
+
+def state_space_text(found: StateSpace) -> str:
+    """Return what a state space has."""
+    lines = [f"{found.topology}: {found.what} over one frame of {found.frame_s * 1e3:.6g} ms", ""]
+    for word, ports in (("state", found.states), ("input", found.inputs), ("output", found.outputs)):
+        lines += wrapped(f"{counted(len(ports), word)}: {_named(ports)}", "  ", "    ")
+    lines += ["", *note(found.meaning), *(line for one in found.notes for line in note(one))]
+    return "\n".join(lines)
+
+
+def _named(ports: Sequence[Port]) -> str:
+    names = [port.name for port in ports[:MOST_NAMED]]
+    return ", ".join([*names, "…"] if len(ports) > MOST_NAMED else names) or "none"
+
+
+def state_space_control(found: StateSpace) -> Any:
+    """Return a state space as python-control's."""
+    return as_control(found)
+
+
+def state_space_document(found: StateSpace) -> dict[str, Any]:
+    """Return a state space as plain data."""
+    plain: dict[str, Any] = document(found, {"made_by": json.loads(found.made_by)})
+    return {**plain, "meaning": found.meaning}

@@ -1,0 +1,250 @@
+"""`exports`: a scene handed over, opened again by the tools it is handed to."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import apc
+from apc.__main__ import run
+from apc.compiler.errors import ApcError
+from apc.exports.lifted import StateSpace, state_space
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
+
+Floats = NDArray[np.float64]
+
+# Groups of unlike clocks and delays, contacts, a server, packets heard in the frame they are sent in.
+NAMES = ("mixed-clocks", "experiment-average", "client-server", "star-lecture", "two-users-waves", "finger")
+LATE = AVERAGE.replace("lan: {clock: network, delay: 8 ms}", "lan: {clock: network, delay: 3.5 ms}")
+PUSHED = AVERAGE + "hands:\n  hand: {type: ConstantForce, flange: device, force: 0 N}\n"
+
+
+def scenes() -> dict[str, apc.CompiledSystem]:
+    """Return the scenes every export has to carry."""
+    texts = {"average": AVERAGE, "mesh": MESH, "late": LATE}
+    return {name: compiled(text) for name, text in texts.items()} | {
+        name: apc.compile(SCENES / f"{name}.yaml") for name in NAMES
+    }
+
+
+ALL = scenes()
+
+
+def magnitudes(matrix: Floats) -> Floats:
+    """Return the magnitudes of a matrix's eigenvalues, largest first."""
+    return np.sort(np.abs(np.linalg.eigvals(matrix)))[::-1]
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_its_eigenvalues_are_those_of_the_analysis(name: str) -> None:
+    analysis = apc.analyze(ALL[name])
+    modes = [mode.magnitude for mode in analysis.modes for _ in range(mode.multiplicity)]
+    wanted = np.sort([*modes, *[1.0] * analysis.rigid_modes])[::-1]
+    found = magnitudes(state_space(ALL[name]).a)
+    large = wanted[wanted > 1e-2]  # defective ones near 0 are known to no digit
+    assert found[: len(large)] == pytest.approx(large, abs=1e-7)  # a pair may be a double root
+    assert (found[len(large) :] < 1.5e-2).all()
+
+
+def cuts(system: apc.CompiledSystem) -> list[str]:
+    """Return all that a scene can be cut at."""
+    forces = {hold.name.rpartition(".")[0] for kind in system.kinds for hold in kind.holds}
+    return [*(link.name for link in system.links), *sorted(forces)]
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_cut_open_and_closed_again_it_is_the_loop(name: str) -> None:
+    whole = state_space(ALL[name])
+    for cut in cuts(ALL[name]):
+        found = state_space(ALL[name], cut=cut)
+        assert found.states == whole.states
+        again = np.linalg.solve(np.eye(len(found.d)) + found.d, found.c)
+        # The forces of a stiff contact are thousands of newtons a metre: roundings of the solution.
+        scale = np.abs(found.b) @ np.abs(again) + np.abs(whole.a)
+        assert (np.abs(found.a - found.b @ again - whole.a) <= 1e-13 * (1 + scale)).all(), cut
+
+
+@pytest.mark.parametrize("cut", ["", "lan", "coordination"])
+def test_python_control_finds_the_same_poles(cut: str) -> None:
+    control = pytest.importorskip("control")
+    found = state_space(ALL["average"], cut=cut)
+    system = found.to_control()
+    assert system.dt == found.frame_s == 0.008
+    assert (system.ninputs, system.noutputs, system.nstates) == (*found.d.shape[::-1], len(found.a))
+    if cut:
+        system = control.feedback(system, np.eye(len(found.d)))
+    poles = np.sort(np.abs(system.poles()))[::-1]
+    assert poles[:2] == pytest.approx([1.0, apc.analyze(ALL["average"]).spectral_radius], abs=1e-11)
+
+
+def grows(found: StateSpace, gain: float) -> bool:
+    """Say whether a loop cut open and closed with a gain is unstable, its translation left out."""
+    closed = found.a - gain * found.b @ np.linalg.solve(np.eye(len(found.d)) + gain * found.d, found.c)
+    return bool(magnitudes(closed)[1] > 1)
+
+
+@pytest.mark.parametrize("cut", ["contact", "coordination"])
+def test_the_gain_margin_of_a_coupler_cut_open_is_that_of_its_stiffness(cut: str) -> None:
+    """Its force is its stiffness times a length: all else is as it was."""
+    margin = next(one for one in apc.margins(ALL["average"]).rows if one.parameter == f"{cut}.stiffness")
+    found = state_space(ALL["average"], cut=cut)
+    assert margin.factor is not None
+    assert not grows(found, margin.factor * (1 - 1e-8))
+    assert grows(found, margin.factor * (1 + 1e-8))
+
+
+def pushed(text: str, peer: int, group: str = "user") -> tuple[apc.CompiledSystem, apc.CompiledSystem]:
+    """Return a scene at rest, and the same with 1 N at a peer's device."""
+    count = compiled(text).peers
+    push = ", ".join("1 N" if one == peer else "0 N" for one in range(count))
+    own = f"{group}: {{count: {count}}}"
+    moved = replaced(text, (own, f"{group}: {{count: {count}, set: {{hand.force: [{push}]}}}}"))
+    return compiled(text), compiled(moved)
+
+
+@pytest.mark.parametrize(
+    "text", [PUSHED, PUSHED.replace("delay: 8 ms}", "delay: 3.5 ms}")], ids=["8 ms", "3.5 ms"]
+)
+def test_its_step_response_is_what_simulate_plays(text: str) -> None:
+    control = pytest.importorskip("control")
+    system, moved = pushed(text, 1)
+    found = state_space(system)
+    frames = 60
+    inputs = np.zeros((len(found.inputs), frames + 1))
+    inputs[[port.name for port in found.inputs].index("force on user[2].device")] = 1.0
+    response = control.forced_response(found.to_control(), inputs=inputs)
+    played = apc.simulate(moved, duration=f"{8 * frames} ms", jit=False)
+    for place, port in enumerate(found.outputs):
+        rows = played[port.name][::8]
+        assert np.abs(response.outputs[place] - rows[: frames + 1]).max() <= 1e-9 * max(
+            1.0, np.abs(rows).max()
+        )
+        assert np.abs(rows).max() > 1e-6  # something is compared
+
+
+HELD = """\
+topology: held
+clocks: {haptic: 1 ms}
+peers: {user: {count: 1}}
+masses: {device: {mass: 0.1 kg, damping: 5 N*s/m}}
+couplers: {wall: {type: SampledSpringDamper, a: device, b: ground, stiffness: 400 N/m, clock: haptic}}
+"""
+
+
+def test_what_a_force_and_noise_move_in_the_end_is_known() -> None:
+    """A spring gives way by F/k; one that is told of a place too far by n pulls back by n."""
+    found = state_space(compiled(HELD))
+    assert [port.name for port in found.inputs] == ["force on user[1].device", "noise on user[1].device.x"]
+    steady = found.c @ np.linalg.solve(np.eye(len(found.a)) - found.a, found.b) + found.d
+    gains = dict(zip((port.name for port in found.outputs), steady.tolist(), strict=True))
+    assert gains["user[1].device.x"] == pytest.approx([1 / 400, -1.0], rel=1e-12)
+    assert gains["user[1].wall.f"] == pytest.approx([1.0, 0.0], abs=1e-9)
+
+
+def matrices(found: StateSpace) -> list[list[list[float]]]:
+    return [one.tolist() for one in found.matrices]
+
+
+@pytest.mark.parametrize("suffix", [".py", ".mat", ".npz"])
+def test_every_file_holds_the_same(
+    suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    path = tmp_path / f"loop{suffix}"
+    assert run(["export", "--out", path.name, "--cut", "lan", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    found = state_space(compiled(AVERAGE), cut="lan")
+    assert [told[name] for name in "abcd"] == matrices(found)
+    names = [port.name for port in found.states]
+    read: dict[str, Any]
+    if suffix == ".py":
+        pytest.importorskip("control")
+        read = runpy.run_path(str(path))
+        assert read["states"] == [(port.name, port.unit) for port in found.states]
+        assert read["system"].state_labels == found.to_control().state_labels
+        assert read["system"].A.tolist() == read["A"]
+        assert [read[name] for name in "ABCD"] == matrices(found)
+    elif suffix == ".mat":
+        read = pytest.importorskip("scipy.io").loadmat(path, squeeze_me=True)
+        assert read["states"].tolist() == names
+        assert read["state_units"].tolist() == [port.unit for port in found.states]
+        assert [read[name].tolist() for name in "ABCD"] == matrices(found)
+        assert json.loads(str(read["provenance"]))["topology"] == "three-users-average"
+    else:
+        with np.load(path, allow_pickle=False) as archive:
+            read = dict(archive)
+        assert read["states"].tolist() == names
+        assert [read[name].tolist() for name in "ABCD"] == matrices(found)
+    assert float(read["dt"]) == 0.008
+
+
+def test_a_scenes_words_are_never_read_as_python(tmp_path: Path) -> None:
+    """Python quotes, ends of lines and braces in what a scene says of itself."""
+    found = state_space(compiled(AVERAGE))
+    evil = StateSpace(
+        'x"""\\\nimport os; os.abort()\n"""{0}', found.cut, found.frame_s, *found.matrices,
+        *(found.states, found.inputs, found.outputs), ('"""\nraise SystemExit',), '"""\nraise SystemExit',
+    )  # fmt: skip
+    from apc.exports.files import write_script
+
+    write_script(path := tmp_path / "loop.py", evil)
+    pytest.importorskip("control")
+    assert runpy.run_path(str(path))["made_by"] == evil.made_by
+
+
+def test_names_for_python_control_are_never_alike() -> None:
+    from apc.exports.files import control_names
+    from apc.exports.lifted import Port
+
+    assert control_names([Port("a.b", ""), Port("a_b", ""), Port("a_b_2", ""), Port("a[b]", "")]) == [
+        "a_b", "a_b_2", "a_b_2_2", "a_b_3",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--out", "x.foo"], "x.foo: E878 the suffix of --out wants one of .py"),
+        (["--out", "x.npz", "--to", "mat"], "x.npz: E878 the suffix of --out wants .mat, got .npz"),
+        (["--out", "x.mat", "--to", "matlab"], "--to: E952 a format wants one of control"),
+        (
+            ["--out", "x.mat", "--cut", "lann"],
+            "--cut: E950 lann is no link or coupler of three-users-average",
+        ),
+        (["--out", "no/x.mat"], "no/x.mat: E601 can't be written"),
+        (["--out", "scene.yaml", "--to", "npz"], "scene.yaml: E878"),
+    ],
+)
+def test_what_cannot_be_is_told_and_nothing_is_written(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    assert run(["export", *words]) == 1
+    assert capsys.readouterr().err.startswith(message)
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.yaml"]
+
+
+def test_more_peers_than_the_memory_holds_are_refused_before_anything_is_built() -> None:
+    many = compiled(replaced(AVERAGE, ("count: 3", "count: 1000000")))
+    with pytest.raises(ApcError, match=r"E951 .* all 1,000,000 peers .* take about .* of memory"):
+        state_space(many)
+
+
+def test_from_python_the_suffix_says_the_format(tmp_path: Path) -> None:
+    found = apc.export(SCENES / "three-users-average.yaml", out=tmp_path / "loop.npz")
+    assert isinstance(found, StateSpace)
+    assert matrices(found) == matrices(state_space(compiled(AVERAGE)))
+    with pytest.raises(ApcError, match="E952"):
+        apc.export(ALL["average"])
