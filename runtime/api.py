@@ -658,6 +658,9 @@ def export(
     *,
     set: Mapping[str, str] | None = None,
     cut: str = "",
+    peer: str = "",
+    device: str = "",
+    method: str = "",
 ) -> Result:
     """Hand a scene over to other tools.
 
@@ -666,11 +669,20 @@ def export(
     model, set
         As for `analyze`.
     to
-        "control", "mat" or "npz": a state space; the suffix of `out` says it if not given.
+        "control", "mat" or "npz": a state space; "c": one peer in C99; "fmu": a scene or a peer for
+        co-simulation. The suffix of `out` says it if not given.
     out
         The file to write; nothing is written if not given.
     cut
         The link or coupler to cut the loop open at.
+    peer
+        Of "c" and "fmu": the peer, such as "left[1]". An FMU is of all peers if not given.
+    device
+        Of "c": the masses that move outside the peer's computer, "none" if none does; those that a hand holds
+        or that others are not told of if not given.
+    method
+        Of "c" and "fmu": how states move between ticks, as for `simulate`; such as "rk4:0.1 ms" where they are
+        not linear.
 
     Returns
     -------
@@ -689,7 +701,7 @@ def export(
     chosen = handing.format_of(to, path, option="=")
     system = _model(model, set)
     _check_out(model, system, path)
-    return handing.export(system, chosen, handing.Asked(cut=cut), path)
+    return handing.export(system, chosen, handing.Asked(cut=cut, peer=peer, device=device, method=method), path)
 
 
 def show(path: str | Path, *, format: Format = "text") -> str:

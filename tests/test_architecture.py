@@ -114,12 +114,12 @@ HOUSE = (
         panels
         """,
     ),
-    ("apc.exports", "lifted files export"),
+    ("apc.exports", "lifted files peer c_text scene_text fmu code export"),
     ("apc.benchmark", "timing truth bench hard scale"),
     (
         "apc.present",
         """
-        forms pictures exports network hands analysis vary comparison_picture comparison region_picture region
+        forms pictures exports code network hands analysis vary comparison_picture comparison region_picture region
         planar simulation still recording bench
         """,
     ),

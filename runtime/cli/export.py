@@ -32,7 +32,8 @@ from apc.threads import start_single_threaded
     "--to",
     metavar="FORMAT",
     help="control: a script that makes a python-control StateSpace (.py); mat, npz: the same matrices for "
-    "MATLAB, SciPy, NumPy. Taken from --out if not given.",
+    "MATLAB, SciPy, NumPy; c: one tick of a peer in C99, with a header and a driver; fmu: the scene or a peer "
+    "for co-simulation (FMI 2.0). Taken from --out if not given.",
 )
 @set_option
 @click.option(
@@ -42,6 +43,22 @@ from apc.threads import start_single_threaded
     help="Cut the loop open at a link or a coupler, for margins and designs of your own: closed again by "
     "u = -y it is the closed loop.",
 )
+@click.option(
+    "--peer", default="", metavar="NAME", help="For c and fmu: one peer, such as 'left[1]'. An FMU is of all."
+)
+@click.option(
+    "--device",
+    default="",
+    metavar="MASS",
+    help="For c: what the peer's computer doesn't move, several with commas between, or none. What a hand "
+    "holds, or others are not told of, if not given.",
+)
+@click.option(
+    "--method",
+    default="",
+    metavar="METHOD",
+    help="For c and fmu: how states move between ticks, as for simulate; rk4:STEP where they are not linear.",
+)
 @file_option("--out", "The file to write.", required=True)
 @json_option
 def export_command(
@@ -49,6 +66,9 @@ def export_command(
     to: str | None,
     settings: tuple[str, ...],
     cut: str,
+    peer: str,
+    device: str,
+    method: str,
     out: Path,
     as_json: bool,
 ) -> None:
@@ -56,11 +76,14 @@ def export_command(
 
     FILE is a topology or a compiled model. As a state space it is the whole
     loop over one frame, all peers in it: from a force on every mass and noise
-    on every measurement to every position, velocity and force.
+    on every measurement to every position, velocity and force. As C or an FMU
+    it is a peer as it computes, or all of them with the packets between.
 
     \b
         apc export --out loop.mat
         apc export --to control --cut lan --out open_loop.py
+        apc export --peer "left[1]" --out left.c
+        apc export --out scene.fmu
     """
     start_single_threaded()
     from apc.exports.export import Asked, export, format_of
@@ -68,7 +91,7 @@ def export_command(
 
     chosen = format_of(to, out)
     system = open_scene(file, settings, {"--out": out}, told=note_aside)
-    found = export(system, chosen, Asked(cut=cut), out)
+    found = export(system, chosen, Asked(cut=cut, peer=peer, device=device, method=method), out)
     print_result(found, as_json=as_json, err=beside(out))
     if not as_json:
         tell(f"\n{out} is written", err=beside(out))

@@ -694,6 +694,7 @@ int main(int count, char **words) {OPEN}
     printf("%.17g", {name}_time(&peer));
     {name}_tick(&peer, &in, &out);
 {_block(prints, "    ")}    printf("\\n");
+    fflush(stdout);
   {CLOSE}
   return 0;
 {CLOSE}

@@ -168,8 +168,8 @@ def _description(unit: Unit) -> str:
     return xml.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
 
 
-def compile_texts(texts: Mapping[str, str], target: Path, options: Sequence[str]) -> None:
-    """Compile texts of C, by their file names, to a file.
+def compile_texts(texts: Mapping[str, str], options: Sequence[str], place: Place) -> bytes:
+    """Return what a compiler makes of texts of C, by their file names; `place` is what is told of.
 
     Raises
     ------
@@ -179,7 +179,7 @@ def compile_texts(texts: Mapping[str, str], target: Path, options: Sequence[str]
     found = compiler()
     if found is None:
         what = "no C compiler answers to cc, gcc or clang, or to what the variable CC says"
-        raise ApcError(Mistake("E962", Place(str(target)), what, hint="--to c, which needs none"))
+        raise ApcError(Mistake("E962", place, what, hint="gcc or clang installed, or --to c, which needs none"))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for one, text in texts.items():
@@ -191,23 +191,21 @@ def compile_texts(texts: Mapping[str, str], target: Path, options: Sequence[str]
                 command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE, check=False
             )
         except (OSError, subprocess.SubprocessError) as error:
-            raise ApcError(Mistake("E962", Place(str(target)), f"{found[0]} can't be run: {error}")) from None
+            raise ApcError(Mistake("E962", place, f"{found[0]} can't be run: {error}")) from None
         if done.returncode:
             said = (done.stderr.strip().splitlines() or ["nothing"])[0][:200]
             what = f"{found[0]} doesn't compile it, and says: {said}"
-            raise ApcError(Mistake("E962", Place(str(target)), what))
-        target.write_bytes((folder / "built").read_bytes())
+            raise ApcError(Mistake("E962", place, what))
+        return (folder / "built").read_bytes()
 
 
 def write_fmu(path: Path, unit: Unit) -> None:
     """Write an FMU, whole or not at all. Raises ApcError (E601, E962)."""
     system, suffix = PLATFORMS.get(platform.system(), PLATFORMS["Linux"])
-    with tempfile.TemporaryDirectory() as name:
-        library = Path(name) / "library"
-        compile_texts(unit.texts, library, OPTIONS)
-        members = {"modelDescription.xml": unit.description.encode()}
-        members |= {f"sources/{one}": text.encode() for one, text in unit.texts.items()}
-        members[f"binaries/{system}64/{_identifier(unit.scene)}{suffix}"] = library.read_bytes()
+    library = compile_texts(unit.texts, OPTIONS, Place(str(path)))
+    members = {"modelDescription.xml": unit.description.encode()}
+    members |= {f"sources/{one}": text.encode() for one, text in unit.texts.items()}
+    members[f"binaries/{system}64/{_identifier(unit.scene)}{suffix}"] = library
 
     def write(temporary: Path) -> None:
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:

@@ -276,7 +276,7 @@ def _outside(
         chosen = {one.strip() for one in device.split(",")}
         for one in sorted(chosen - masses):
             what = f"--device: no mass of {name} is called {one[:40] or 'so'}"
-            raise ApcError(Mistake("E961", place, what, hint=f"--device {nearest(one, masses) or NO_DEVICE}"))
+            raise ApcError(Mistake("E961", place, what, hint=f"--device {nearest(one, masses) or min(masses, default=NO_DEVICE)}"))
     elif held:
         hands = tuple(f"{hand}." for hand in kind.hands)
         chosen = {parts[row] for own in tied if own & held for row in own} & masses
