@@ -1,8 +1,8 @@
 """What is read from disk and written to it, whoever named the file.
 
 Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `same_file`;
-`write_file`, `write_text`, `write_texts`, `check_target`, `unwritable`, `is_special`, `is_stdout`, and for what is written
-piece by piece `begin_file`, `finish_file`, `drop_file`, `partial_name`.
+`write_file`, `write_text`, `write_texts`, `check_target`, `unwritable`, `is_special`, `is_stdout`, and for
+what is written piece by piece `begin_file`, `finish_file`, `drop_file`, `partial_name`.
 Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
 waited for. What is written is there whole or not at all: a file is replaced by one of its mode and owner, a
 link stays and its file is written; a device or pipe, or what standard output writes to, is written to, never

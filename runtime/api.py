@@ -681,8 +681,8 @@ def export(
         Of "c": the masses that move outside the peer's computer, "none" if none does; those that a hand holds
         or that others are not told of if not given.
     method
-        Of "c" and "fmu": how states move between ticks, as for `simulate`; such as "rk4:0.1 ms" where they are
-        not linear.
+        Of "c" and "fmu": how states move between ticks, as for `simulate`; such as "rk4:0.1 ms" where they
+        are not linear.
 
     Returns
     -------
@@ -701,7 +701,9 @@ def export(
     chosen = handing.format_of(to, path, option="=")
     system = _model(model, set)
     _check_out(model, system, path)
-    return handing.export(system, chosen, handing.Asked(cut=cut, peer=peer, device=device, method=method), path)
+    return handing.export(
+        system, chosen, handing.Asked(cut=cut, peer=peer, device=device, method=method), path
+    )
 
 
 def show(path: str | Path, *, format: Format = "text") -> str:

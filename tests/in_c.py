@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import apc
 from apc.exports.c_text import CPeer, c_peer, driver, header, source
@@ -190,6 +189,3 @@ def worst(off: Mapping[str, tuple[float, float]]) -> float:
     """Return the largest difference, as a part of the largest value of its signal."""
     assert off and any(size for _, size in off.values()), "something is compared"
     return max(gap / size if size else gap for gap, size in off.values())
-
-
-Floats = NDArray[np.float64]

@@ -119,8 +119,8 @@ HOUSE = (
     (
         "apc.present",
         """
-        forms pictures exports code network hands analysis vary comparison_picture comparison region_picture region
-        planar simulation still recording bench
+        forms pictures exports code network hands analysis vary comparison_picture comparison region_picture
+        region planar simulation still recording bench
         """,
     ),
     # what a person calls

@@ -32,8 +32,8 @@ from apc.threads import start_single_threaded
     "--to",
     metavar="FORMAT",
     help="control: a script that makes a python-control StateSpace (.py); mat, npz: the same matrices for "
-    "MATLAB, SciPy, NumPy; c: one tick of a peer in C99, with a header and a driver; fmu: the scene or a peer "
-    "for co-simulation (FMI 2.0). Taken from --out if not given.",
+    "MATLAB, SciPy, NumPy; c: one tick of a peer in C99, with a header and a driver; fmu: the scene or a "
+    "peer for co-simulation (FMI 2.0). Taken from --out if not given.",
 )
 @set_option
 @click.option(

@@ -20,17 +20,60 @@ import numpy as np
 
 from apc.compiler.frozen import dataclass
 from apc.compiler.plain import straight
+from apc.compiler.weights import sum_weights
 from apc.distribution import program_version
 from apc.exports.peer import Instant, Line, Move, Peer, has_edge
 from apc.simulation.machine import straight_lines
 from apc.simulation.pairs import pair_function
 
 WORDS = frozenset(
-    """
-    auto break case char const continue default do double else enum extern float for goto if inline int long
-    register restrict return short signed sizeof static struct switch typedef union unsigned void volatile
-    while main quanta instant missing y0 y1 yn j0 j1 jn gamma
-    """.split()
+    [
+        "auto",
+        "break",
+        "case",
+        "char",
+        "const",
+        "continue",
+        "default",
+        "do",
+        "double",
+        "else",
+        "enum",
+        "extern",
+        "float",
+        "for",
+        "goto",
+        "if",
+        "inline",
+        "int",
+        "long",
+        "register",
+        "restrict",
+        "return",
+        "short",
+        "signed",
+        "sizeof",
+        "static",
+        "struct",
+        "switch",
+        "typedef",
+        "union",
+        "unsigned",
+        "void",
+        "volatile",
+        "while",
+        "main",
+        "quanta",
+        "instant",
+        "missing",
+        "y0",
+        "y1",
+        "yn",
+        "j0",
+        "j1",
+        "jn",
+        "gamma",
+    ]
 )
 OPEN, CLOSE = "{", "}"
 
@@ -99,9 +142,7 @@ def c_peer(peer: Peer, name: str = "") -> CPeer:
         *(f"{kind.holds[h].name} acting" for h in sorted(acted)),
     ]
     # A value remembered from the start must not act before it is computed, and so has a place of its own.
-    kept = sorted(
-        key for key, lag in lags.items() if lag or key[1] in kind.clocks[key[0]].memories
-    )
+    kept = sorted(key for key, lag in lags.items() if lag or key[1] in kind.clocks[key[0]].memories)
     members += [f"{kind.clocks[p].outputs[o]} late" for p, o in kept]
     named = iter(in_order(members))
     states = ["" if place in peer.outside else next(named) for place in range(len(kind.states))]
@@ -113,9 +154,7 @@ def c_peer(peer: Peer, name: str = "") -> CPeer:
     late = {key: (next(named), lags[key] + 1) for key in kept}
     lines = in_order(line.link for line in peer.lines)
     measured = in_order((kind.states[place].name for place in peer.measured), lines)
-    forces = in_order(
-        (one.name for one in peer.forces), [*lines, *(f"{line}_sent" for line in lines)]
-    )
+    forces = in_order((one.name for one in peer.forces), [*lines, *(f"{line}_sent" for line in lines)])
     return CPeer(
         peer=peer,
         name=name or identifier(peer.name),
@@ -191,7 +230,9 @@ void {name}_tick({name} *peer, const {name}_in *in, {name}_out *out);
 
 def _title(peer: Peer) -> str:
     """Return the comment that a text begins with."""
-    texts = "\n".join(f"     {_comment(digest)}  {_comment(path)}" for path, digest in peer.system.origin.texts)
+    texts = "\n".join(
+        f"     {_comment(digest)}  {_comment(path)}" for path, digest in peer.system.origin.texts
+    )
     clocks = {partition.clock for partition in peer.kind.clocks}
     timings = {one.name: one.value for one in peer.system.timings}
     periods = ", ".join(
@@ -429,43 +470,37 @@ def _receive(c: CPeer, p: int, place: int, channels: Sequence[int]) -> list[str]
         return [f"const double r{place} = 0.0;", f"(void)r{place};"]
     line, total = peer.line(receive.link), f"r{place}"
     own, count = c.lines[line.link], len(line.senders)
-    weights = np.array([one.weight for one in line.senders])
-    mean = receive.operator == "mean"
+    joined, mean = receive.operator in ("max", "min"), receive.operator == "mean"
     edge = has_edge(peer.kind, p, place)
-    plain = line.complete and not edge  # then nothing but a sum, and what it is divided by
-    lines = [f"double {total} = {'0.0' if receive.operator in ('sum', 'mean') else 'NAN'};"]
-    weight = ""
-    if receive.operator in ("sum", "mean") and not plain and not (weights == 1).all() | mean:
-        weight = "weights[k]"
-    if mean and not plain:
-        weight, weights = "weights[k]", weights / weights.sum()
-    if weight:
+    weights = np.array([one.weight for one in line.senders])
+    divided = mean and line.complete and not edge
+    if mean and not divided:
+        weights = weights / sum_weights(np.zeros(count, np.int64), weights, 1).floats[0]
+    lines, weight = [f"double {total} = {'NAN' if joined else '0.0'};"], ""
+    if not joined and (weights != 1).any():
         listed = ", ".join(map(number, weights.tolist()))
         lines = [f"static const double weights_{place}[{count}] = {OPEN}{listed}{CLOSE};", *lines]
         weight = f"weights_{place}[k] * "
     packet = f"in->{own}[k]"
     names = [c.channels[line.link][channel] for channel in channels]
     lines.append(f"for (int k = 0; k < {count}; k++) {OPEN}")
+    value = f"{packet}.{names[0]}"
     if edge:
         lines += [f"  {one}" for one in _look(c, p, place, packet, names, line)]
         value = "value"
-    else:
-        value = f"{packet}.{names[0]}"
-        if line.missing:
-            value = f"({packet}.missing ? own_{own}.{names[0]} : {value})"
-    if receive.operator in ("max", "min"):
+    elif line.missing:
+        value = f"({packet}.missing ? own_{own}.{names[0]} : {value})"
+    if joined:
         lines.append(f"  {total} = f{receive.operator}({total}, {value});")
     else:
         lines.append(f"  {total} += {weight}{value};")
     lines.append(CLOSE)
-    if plain and mean:
+    if divided:
         lines.append(f"{total} /= {float(count)!r};")
     return lines
 
 
-def _look(
-    c: CPeer, p: int, place: int, packet: str, names: Sequence[str], line: Line
-) -> list[str]:
+def _look(c: CPeer, p: int, place: int, packet: str, names: Sequence[str], line: Line) -> list[str]:
     """Return the lines that make `value` of one sender's packet."""
     pair, own = pair_function(c.peer.kind, p, place)
     function, inputs = straight(pair), _inputs(c)
@@ -523,9 +558,7 @@ def _begin(c: CPeer) -> str:
     values |= dict.fromkeys((own for own in c.acting if own), 0.0)
     lines = ["peer->quanta = 0;", "peer->instant = 0;"]
     lines += [f"peer->{own} = {number(value)};" for own, value in values.items()]
-    lines += [
-        f"for (int k = 0; k < {kept}; k++) peer->{own}[k] = 0.0;" for own, kept in c.late.values()
-    ]
+    lines += [f"for (int k = 0; k < {kept}; k++) peer->{own}[k] = 0.0;" for own, kept in c.late.values()]
     silent = ["(void)in;"]
     for line in peer.lines:
         for k, sender in enumerate(line.senders):
@@ -566,7 +599,11 @@ def _switch(c: CPeer, cases: Sequence[Sequence[str]]) -> list[str]:
     lines = [f"switch ({c.name}_kind(peer)) {OPEN}"]
     for body, places in alike.items():
         if body:
-            lines += [*(f"  case {place}:" for place in places), *(f"    {one}" for one in body), "    break;"]
+            lines += [
+                *(f"  case {place}:" for place in places),
+                *(f"    {one}" for one in body),
+                "    break;",
+            ]
     return [*lines, "  default:", "    break;", CLOSE]
 
 
@@ -651,10 +688,8 @@ def driver(c: CPeer, include: str) -> str:
                 counts.append(f"&in.{own}[{k}].missing")
                 headings.append(f"{line.link} {sender.name} missing")
                 read.append("")
-    tests = [
-        f'scanf("%d", {counts.pop(0)}) == 1' if not one else f'scanf("%lf", {one}) == 1' for one in read
-    ]
-    condition = " &&\n      ".join(tests) or "!feof(stdin) && scanf(\"%*[^\\n]\") != EOF && getchar() != EOF"
+    tests = [f'scanf("%d", {counts.pop(0)}) == 1' if not one else f'scanf("%lf", {one}) == 1' for one in read]
+    condition = " &&\n      ".join(tests) or '!feof(stdin) && scanf("%*[^\\n]") != EOF && getchar() != EOF'
     shown = [("%.17g", f"out.{own}", force.name) for own, force in zip(c.forces, peer.forces, strict=True)]
     for line in (line for line in peer.lines if line.sending >= 0):
         own = c.lines[line.link]
@@ -670,8 +705,8 @@ def driver(c: CPeer, include: str) -> str:
     prints = [f'printf(" {form}", {value});' for form, value, _ in shown]
     return f"""\
 {_title(peer)}
-/* Reads, a row an instant: {_comment(', '.join(headings)) or 'a line of any text'}.
-   Prints: time, {_comment(', '.join(told for _, _, told in shown))}. */
+/* Reads, a row an instant: {_comment(", ".join(headings)) or "a line of any text"}.
+   Prints: time, {_comment(", ".join(told for _, _, told in shown))}. */
 #include "{include}"
 #include <stdio.h>
 #include <stdlib.h>

@@ -83,7 +83,7 @@ def _plan(system: CompiledSystem, method: str) -> tuple[Method, Plan]:
 
 
 def peer_named(plan: Plan, name: str) -> int:
-    """Return the number of a peer, counted from 0 over all groups. Raises ApcError (E963) if there is none."""
+    """Return the number of a peer, counted from 0 over all groups. Raises ApcError (E963)."""
     system, starts = plan.system, plan.exchange.starts
     groups = [group.name for group in system.groups]
     matched = _NAME.match(name.strip())

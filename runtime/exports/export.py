@@ -101,7 +101,14 @@ FORMATS = (
     Format("control", ".py", "a script that makes a control.StateSpace", ("cut",), _state_space, _script),
     Format("mat", ".mat", "a state space for MATLAB and SciPy", ("cut",), _state_space, _mat),
     Format("npz", ".npz", "a state space for NumPy", ("cut",), _state_space, _npz),
-    Format("c", ".c", "one tick of a peer in C99, a header and a driver", ("peer", "device", "method"), _code, _texts),
+    Format(
+        "c",
+        ".c",
+        "one tick of a peer in C99, a header and a driver",
+        ("peer", "device", "method"),
+        _code,
+        _texts,
+    ),
     Format("fmu", ".fmu", "a scene or a peer for co-simulation", ("peer", "method"), _unit, _fmu),
 )
 

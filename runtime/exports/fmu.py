@@ -179,7 +179,9 @@ def compile_texts(texts: Mapping[str, str], options: Sequence[str], place: Place
     found = compiler()
     if found is None:
         what = "no C compiler answers to cc, gcc or clang, or to what the variable CC says"
-        raise ApcError(Mistake("E962", place, what, hint="gcc or clang installed, or --to c, which needs none"))
+        raise ApcError(
+            Mistake("E962", place, what, hint="gcc or clang installed, or --to c, which needs none")
+        )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for one, text in texts.items():

@@ -1,14 +1,15 @@
 """One peer apart from the others: what it measures and hears, computes, sends, and moves by itself.
 
 Takes: a `CompiledSystem`, which of its peers, how its states move between events.
-Gives: `Peer`, `peer_of`, `sites_of`, `group_of`, `lines_of`, `first_packet`, `has_edge`, `refused`; its parts `Instant`, `Act`, `Line`, `Sender`, `Force`, `Move`.
+Gives: `Peer`, `peer_of`, `sites_of`, `group_of`, `lines_of`, `first_packet`, `has_edge`, `refused`;
+its parts `Instant`, `Act`, `Line`, `Sender`, `Force`, `Move`.
 Guarantees: the functions, transitions and instants are those that `simulate` plays; what stands in no finite
 list of arithmetic is refused, by the name of what moves or is computed so.
 Does not: write anything (see `c_text`), or carry packets from peer to peer (see `scene_text`).
 
 A peer's states fall into sets that equations tie to each other. The set that a hand holds is a device; where
-no hand says so, the one with a mass that others are not told of, since what they are told of is a copy of what
-all hold. A device moves by itself, and what is computed from it is measured; a copy moves in the peer's
+no hand says so, the one with a mass that others are not told of, since what they are told of is a copy of
+what all hold. A device moves by itself, and what is computed from it is measured; a copy moves in the peer's
 computer. A device that is tied to a copy by more than forces computed at ticks can't be told apart from it.
 """
 
@@ -37,8 +38,8 @@ from apc.frame.start import start_arguments, start_values
 from apc.simulation.flow import flow_of, rows_to_move, state_scales
 from apc.simulation.propagate import rates, transition_rows
 from apc.simulation.settings import Method
-from apc.simulation.simulation import Plan
 from apc.simulation.signals import LocalSignal, local_signals
+from apc.simulation.simulation import Plan
 
 NO_DEVICE = "none"  # the word for a peer that moves nothing outside its computer
 STEPS = "--method rk4:0.1ms"  # a method that is arithmetic, whatever moves
@@ -244,22 +245,26 @@ def _refuse_what_iterates(system: CompiledSystem, name: str, kind: Kind) -> None
     for partition in kind.clocks:
         if not partition.tick.is_a("SXFunction"):
             outputs = ", ".join(partition.outputs)
-            what = f"{name}: at a tick of {partition.clock} {outputs} are solved for by iteration, which is not"
+            what = (
+                f"{name}: at a tick of {partition.clock} {outputs} are solved for by iteration, which is not"
+            )
             raise refused(system, f"{what} written as C", "equations that can be solved for these")
     for one in kind.sends:
         if not one.send.is_a("SXFunction"):
-            what = f"{name}: {', '.join(one.channels)} of {one.link} are solved for by iteration, which is not"
+            what = (
+                f"{name}: {', '.join(one.channels)} of {one.link} are solved for by iteration, which is not"
+            )
             raise refused(system, f"{what} written as C", "equations that can be solved for these")
     if not kind.clocks:
-        raise refused(system, f"{name} computes nothing at any tick of a clock: there is nothing to write as C")
+        raise refused(
+            system, f"{name} computes nothing at any tick of a clock: there is nothing to write as C"
+        )
 
 
 # ---- what moves outside
 
 
-def _outside(
-    system: CompiledSystem, name: str, site: SiteJacobians, device: str | None
-) -> frozenset[int]:
+def _outside(system: CompiledSystem, name: str, site: SiteJacobians, device: str | None) -> frozenset[int]:
     """Return the states that the peer's computer does not move."""
     kind, place = site.kind, Place(system.origin.topology)
     if device == NO_DEVICE:
@@ -276,7 +281,14 @@ def _outside(
         chosen = {one.strip() for one in device.split(",")}
         for one in sorted(chosen - masses):
             what = f"--device: no mass of {name} is called {one[:40] or 'so'}"
-            raise ApcError(Mistake("E961", place, what, hint=f"--device {nearest(one, masses) or min(masses, default=NO_DEVICE)}"))
+            raise ApcError(
+                Mistake(
+                    "E961",
+                    place,
+                    what,
+                    hint=f"--device {nearest(one, masses) or min(masses, default=NO_DEVICE)}",
+                )
+            )
     elif held:
         hands = tuple(f"{hand}." for hand in kind.hands)
         chosen = {parts[row] for own in tied if own & held for row in own} & masses
@@ -292,7 +304,9 @@ def _outside(
     if device is None and not held and len(chosen) > 1:
         listed = sorted(chosen)
         what = f"{name}: {' and '.join(listed)} may be devices, or copies that its computer moves"
-        raise ApcError(Mistake("E961", place, what, hint=f"--device {','.join(listed)} or --device {listed[0]}"))
+        raise ApcError(
+            Mistake("E961", place, what, hint=f"--device {','.join(listed)} or --device {listed[0]}")
+        )
     found: set[int] = set()
     for own in tied:
         inside = {parts[row] for row in own}
@@ -362,8 +376,9 @@ def _forces(
         state = kind.states[row].name
         axis = slopes[velocity, :]
         if casadi.depends_on(axis, varying):
-            what = f"{name}: what pushes {state} is no sum of what is computed at ticks, but bends with the motion"
-            raise ApcError(Mistake("E961", Place(system.origin.topology), what))
+            what = f"{name}: what pushes {state} is no sum of what is computed at ticks: it bends with the motion"
+            hint = "a motor without a limit, which the real one has"
+            raise ApcError(Mistake("E961", Place(system.origin.topology), what, hint=hint))
         device = find_device(site, vector, unit_of, part=state)
         if not isinstance(device, Device):
             why = device or f"{state} is no mass"
@@ -405,7 +420,9 @@ def _moves(
     if linear.timed:
         g = linear.rate(*linear.rate.sx_in())
         pushed = ", ".join(
-            kind.states[row].name for row in range(g.numel()) if casadi.depends_on(g[row], linear.rate.sx_in()[1])
+            kind.states[row].name
+            for row in range(g.numel())
+            if casadi.depends_on(g[row], linear.rate.sx_in()[1])
         )
         what = f"{name}: {pushed} is pushed by a force that changes with time between ticks"
         raise refused(system, f"{what}; its exact integral is not written as C", STEPS)
@@ -415,7 +432,9 @@ def _moves(
     for length, duration, matrix in zip(lengths, seconds, found.matrices, strict=True):
         function = flow.over(duration) if flow is not None else None
         if function is not None and not function.is_a("SXFunction"):
-            what = f"{name}: {names} take too many steps of {method} from one instant to the next to be written"
+            what = (
+                f"{name}: {names} take too many steps of {method} from one instant to the next to be written"
+            )
             raise refused(system, what, STEPS)
         moves.append(Move(length, matrix[0], tuple(flowing), function))
     return tuple(moves)

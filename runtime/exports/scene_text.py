@@ -1,9 +1,9 @@
 """Several peers in one C text, and the packets between them; or one peer that hears from outside.
 
-Takes: `Peer`s, when they send, how late each hears each. Gives: `CScene`, `c_scene`, `one_peer`; `scene_source`;
-`Variable`.
-Guarantees: time counts in whole quanta; of what happens at once all sends come first, then what is heard, then
-ticks, as everywhere; a value is looked at as it is just before an instant's ticks, as in a row of `simulate`.
+Takes: `Peer`s, when they send, how late each hears each. Gives: `CScene`, `c_scene`, `one_peer`;
+`scene_source`; `Variable`.
+Guarantees: time counts in whole quanta; of what happens at once all sends come first, then what is heard,
+then ticks, as everywhere; a value is looked at as it is just before an instant's ticks, as in a row of `simulate`.
 Does not: know how a simulator calls it (see `fmu`).
 
 What a scene remembers is one struct, `model`, that can be copied: no pointer is in it.
@@ -92,9 +92,7 @@ def one_peer(plan: Plan, peer: int, method: Method) -> CScene:
         if line.sending >= 0:
             own = _channels(code, line, f"out0[0].{code.lines[line.link]}")
             variables += [Variable(f"{line.link}.{name}", unit, member) for name, unit, member in own]
-    variables += [
-        Variable(one.name, one.unit, f"peer0[0].{_member(code, one)}") for one in found.signals
-    ]
+    variables += [Variable(one.name, one.unit, f"peer0[0].{_member(code, one)}") for one in found.signals]
     quantum = found.schedule.quantum
     return CScene(code.name, quantum, (code,), ((0, 0),), (), {}, {}, tuple(variables))
 
@@ -112,7 +110,9 @@ def c_scene(plan: Plan, method: Method) -> CScene:
     if plan.routes:
         link = plan.routes[0].link
         what = f"{link} loses or delays packets by chance, which is not written as C"
-        raise refused(system, what, f'--peer "{exchange.peer_name(0)}": what it hears then comes from outside')
+        raise refused(
+            system, what, f'--peer "{exchange.peer_name(0)}": what it hears then comes from outside'
+        )
     first = sites_of(plan)
     sites = tuple(dict.fromkeys(first))
     total = exchange.peers * (exchange.peers - 1) if any(map(exchange.is_complete, exchange.links)) else 0
@@ -120,9 +120,7 @@ def c_scene(plan: Plan, method: Method) -> CScene:
         what = f"{exchange.peers:,} peers hear each other on {total:,} ways; {MOST_WAYS:,} fit a text of C"
         raise refused(system, what, f'--peer "{exchange.peer_name(0)}"')
     names = in_order(exchange.peer_name(one) for one in sites)
-    codes = tuple(
-        c_peer(peer_of(plan, one, method), name) for one, name in zip(sites, names, strict=True)
-    )
+    codes = tuple(c_peer(peer_of(plan, one, method), name) for one, name in zip(sites, names, strict=True))
     places = [0] * len(sites)
     peers = []
     for one in first:
@@ -209,7 +207,7 @@ def scene_source(scene: CScene) -> str:
             f"{name} peer{s}[{count}];",
             f"{name}_in in{s}[{count}];",
             f"{name}_out out{s}[{count}];",
-            f"int stage{s}[{count}]; /* 0: come to its next instant, 1: what it sends has gone out, 2: done */",
+            f"int stage{s}[{count}]; /* at an instant: 0 come, 1 what it sends has gone out, 2 done */",
         ]
         every = f"for (int i = 0; i < {count}; i++)"
         begin += [

@@ -56,7 +56,9 @@ def code_document(found: Code) -> dict[str, Any]:
         ],
         "forces": [one.name for one in peer.forces],
         "sent": [{"link": line.link, "channels": list(line.channels)} for line in _sending(peer)],
-        "instants_s": [float(sum(_lengths(peer)[:k]) * peer.schedule.quantum) for k in range(len(peer.instants))],
+        "instants_s": [
+            float(sum(_lengths(peer)[:k]) * peer.schedule.quantum) for k in range(len(peer.instants))
+        ],
         "source": source(found.code, f"{found.code.name}.h"),
     }
 
@@ -83,7 +85,8 @@ def unit_document(found: Unit) -> dict[str, Any]:
         "step_s": found.step,
         "duration_s": found.duration,
         "variables": [
-            document({"name": one.name, "unit": one.unit, "input": one.given}) for one in found.scene.variables
+            document({"name": one.name, "unit": one.unit, "input": one.given})
+            for one in found.scene.variables
         ],
     }
 
