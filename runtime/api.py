@@ -658,6 +658,7 @@ def export(
     *,
     set: Mapping[str, str] | None = None,
     cut: str = "",
+    free: Sequence[str] = (),
     peer: str = "",
     device: str = "",
     method: str = "",
@@ -675,6 +676,8 @@ def export(
         The file to write; nothing is written if not given.
     cut
         The link or coupler to cut the loop open at.
+    free
+        Parameters that stay free: `.function` is a `casadi.Function` of them that gives A, B, C and D.
     peer
         Of "c" and "fmu": the peer, such as "left[1]". An FMU is of all peers if not given.
     device
@@ -701,9 +704,8 @@ def export(
     chosen = handing.format_of(to, path, option="=")
     system = _model(model, set)
     _check_out(model, system, path)
-    return handing.export(
-        system, chosen, handing.Asked(cut=cut, peer=peer, device=device, method=method), path
-    )
+    asked = handing.Asked(cut, tuple(free), peer, device, method)
+    return handing.export(system, chosen, asked, path)
 
 
 def show(path: str | Path, *, format: Format = "text") -> str:

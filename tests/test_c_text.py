@@ -128,11 +128,11 @@ def test_names_of_a_scene_are_names_in_c() -> None:
     [
         (BENT, "", None, "E961 user[1]: device and stop may be devices, or copies that its computer moves. "
                          "Write: --device device,stop or --device device"),
-        (BENT, "", "device", "E960 user[1]: between ticks cube.x, cube.v move by CVODES, which is not written "
-                             "as C. Write: --method rk4:0.1ms"),
+        (BENT, "", "device", "E960 user[1]: between ticks cube.x, cube.v move by CVODES, which is not "
+                             "written as C. Write: --method rk4:0.1ms"),
         (MOVED, "", "box", "E961 --device: no mass of user[1] is called box. Write: --device cube"),
-        (TIED, "", None, "E961 user[1]: device and cube are tied to each other between ticks: no computer can move "
-                         "cube where device moves by itself."),
+        (TIED, "", None, "E961 user[1]: device and cube are tied to each other between ticks: no computer can "
+                         "move cube where device moves by itself."),
     ],
 )  # fmt: skip
 def test_what_it_cannot_hold_is_named(text: str, method: str, device: str | None, message: str) -> None:

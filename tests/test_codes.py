@@ -190,6 +190,7 @@ E950 runtime/exports: a loop is to be cut where there is no link or coupler
 E951 runtime/exports: a state space is too large for the memory or a file
 E952 runtime/exports: a format to export to is not known
 E953 runtime/exports: an option means nothing to the format
+E954 runtime/exports: a number can't be left free
 E960 runtime/exports: what a peer or a scene does is not written as C
 E961 runtime/exports: what of a peer is its device can't be said, or can't be told apart from a copy
 E962 runtime/exports: there is no C compiler, or it doesn't take a text

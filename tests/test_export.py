@@ -199,11 +199,10 @@ def test_a_scenes_words_are_never_read_as_python(tmp_path: Path) -> None:
     assert runpy.run_path(str(path))["made_by"] == evil.made_by
 
 
-def test_names_for_python_control_are_never_alike() -> None:
-    from apc.exports.files import control_names
-    from apc.exports.lifted import Port
+def test_words_for_names_are_never_alike() -> None:
+    from apc.exports.words import Port, words
 
-    assert control_names([Port("a.b", ""), Port("a_b", ""), Port("a_b_2", ""), Port("a[b]", "")]) == [
+    assert words([Port("a.b", ""), Port("a_b", ""), Port("a_b_2", ""), Port("a[b]", "")]) == [
         "a_b", "a_b_2", "a_b_2_2", "a_b_3",
     ]  # fmt: skip
 
@@ -217,6 +216,13 @@ def test_names_for_python_control_are_never_alike() -> None:
         (
             ["--out", "x.mat", "--cut", "lann"],
             "--cut: E950 lann is no link or coupler of three-users-average",
+        ),
+        (["--out", "x.npz", "--free", "lan.delay"], "--free: E954 lan.delay is a time"),
+        (["--out", "x.npz", "--free", "device.mas"], "--free: E622 device.mas is no parameter"),
+        (["--out", "x.npz", "--free", "device.mass", "--free", "device.mass"], "--free: E954 device.mass is"),
+        (
+            ["--out", "x.py", "--free", "device.mass"],
+            "--free: E953 --free means nothing to the format",
         ),
         (["--out", "no/x.mat"], "no/x.mat: E601 can't be written"),
         (["--out", "scene.yaml", "--to", "npz"], "scene.yaml: E878"),
@@ -248,3 +254,49 @@ def test_from_python_the_suffix_says_the_format(tmp_path: Path) -> None:
     assert matrices(found) == matrices(state_space(compiled(AVERAGE)))
     with pytest.raises(ApcError, match="E952"):
         apc.export(ALL["average"])
+
+
+FREE = {
+    "average": ("coordination.stiffness", "device.mass"),
+    "mixed-clocks": ("near.coordination.stiffness",),
+    "experiment-average": ("contact.stiffness", "contact.damping"),
+    "client-server": ("device.damping", "contact.stiffness"),
+    "late": ("coordination.damping",),
+    "mesh": ("cube.mass",),
+}
+
+
+@pytest.mark.parametrize("cut", ["", "link", "coupler"])
+@pytest.mark.parametrize("name", FREE)
+def test_with_a_number_free_it_is_at_each_value_what_it_is_with_that_set(name: str, cut: str) -> None:
+    system = ALL[name]
+    at = {"": "", "link": cuts(system)[0], "coupler": cuts(system)[-1]}[cut]
+    found = apc.export(system, "npz", free=FREE[name], cut=at)
+    assert isinstance(found, StateSpace)
+    now = {one.name: one.value for one in system.parameters}
+    for factor in (1.0, 1.7, 30.0):
+        values = [(now[label.removeprefix("near.")] or 1.0) * factor for label in FREE[name]]
+        texts = [f"{value!r} {port.unit}" for value, port in zip(values, found.free, strict=True)]
+        changed = apc.set_parameters(system, dict(zip(FREE[name], texts, strict=True)))
+        there = state_space(changed, cut=found.cut)
+        for one, other in zip(found.function(*values), there.matrices, strict=True):
+            assert np.abs(np.array(one) - other).max() <= 1e-12 * max(1.0, np.abs(other).max())
+
+
+def test_a_free_named_number_moves_all_that_follows_from_it() -> None:
+    named = ("peers:", "parameters: {kt: 500 N/m}\npeers:"), ("stiffness: 500 N/m", "stiffness: 2*kt")
+    found = apc.export(compiled(replaced(AVERAGE, *named)), "npz", free=["kt"])
+    assert isinstance(found, StateSpace)
+    there = state_space(compiled(replaced(AVERAGE, ("stiffness: 500 N/m", "stiffness: 1400 N/m"))))
+    assert np.abs(np.array(found.function(700.0)[0]) - there.a).max() < 1e-12 * np.abs(there.a).max()
+
+
+def test_the_function_is_in_the_file(tmp_path: Path) -> None:
+    casadi = pytest.importorskip("casadi")
+    path = tmp_path / "family.npz"
+    apc.export(ALL["average"], out=path, free=["coordination.stiffness"])
+    with np.load(path, allow_pickle=False) as archive:
+        function = casadi.Function.deserialize(str(archive["function"]))
+        assert archive["free"].tolist() == ["coordination.stiffness"]
+    there = state_space(apc.set_parameters(ALL["average"], {"coordination.stiffness": "800 N/m"}))
+    assert np.abs(np.array(function(800.0)[0]) - there.a).max() < 1e-12 * np.abs(there.a).max()

@@ -44,6 +44,13 @@ from apc.threads import start_single_threaded
     "u = -y it is the closed loop.",
 )
 @click.option(
+    "--free",
+    multiple=True,
+    metavar="PATH",
+    help="Leave a number free: A, B, C and D are a casadi.Function of it too, `function` in the file. May "
+    "be repeated.",
+)
+@click.option(
     "--peer", default="", metavar="NAME", help="For c and fmu: one peer, such as 'left[1]'. An FMU is of all."
 )
 @click.option(
@@ -66,6 +73,7 @@ def export_command(
     to: str | None,
     settings: tuple[str, ...],
     cut: str,
+    free: tuple[str, ...],
     peer: str,
     device: str,
     method: str,
@@ -82,6 +90,7 @@ def export_command(
     \b
         apc export --out loop.mat
         apc export --to control --cut lan --out open_loop.py
+        apc export --free coordination.stiffness --out family.npz
         apc export --peer "left[1]" --out left.c
         apc export --out scene.fmu
     """
@@ -91,7 +100,7 @@ def export_command(
 
     chosen = format_of(to, out)
     system = open_scene(file, settings, {"--out": out}, told=note_aside)
-    found = export(system, chosen, Asked(cut=cut, peer=peer, device=device, method=method), out)
+    found = export(system, chosen, Asked(cut, free, peer, device, method), out)
     print_result(found, as_json=as_json, err=beside(out))
     if not as_json:
         tell(f"\n{out} is written", err=beside(out))

@@ -310,7 +310,7 @@ def _sent_in_turn(within: Matrix, alone: Matrix, numbers: Arithmetic) -> Matrix:
     sent = term = alone
     for _ in range(within.shape[-1]):
         term = numbers.multiply(within, term)
-        if not term.any():
+        if numbers.vanishes(term):
             return sent
         sent = numbers.add(sent, term)
     assert not (np.isfinite(term) & (term != 0)).any(), "a packet is heard before it is sent"

@@ -466,7 +466,7 @@ static void {c.name}_tick_{p}({c.name} *peer, const {c.name}_in *in, double t) {
 def _receive(c: CPeer, p: int, place: int, channels: Sequence[int]) -> list[str]:
     """Return the lines that make up what a receive hears."""
     peer, receive = c.peer, c.peer.kind.clocks[p].receives[place]
-    if not channels:
+    if not channels or not peer.line(receive.link).senders:
         return [f"const double r{place} = 0.0;", f"(void)r{place};"]
     line, total = peer.line(receive.link), f"r{place}"
     own, count = c.lines[line.link], len(line.senders)

@@ -50,6 +50,10 @@ class Format:
 
 
 def _state_space(system: CompiledSystem, asked: Asked) -> Result:
+    if asked.free:
+        from apc.exports.free import with_free
+
+        return with_free(system, asked.free, cut=asked.cut)
     from apc.exports.lifted import state_space
 
     return state_space(system, cut=asked.cut)
@@ -99,8 +103,8 @@ def _fmu(path: Path, found: Any) -> None:
 
 FORMATS = (
     Format("control", ".py", "a script that makes a control.StateSpace", ("cut",), _state_space, _script),
-    Format("mat", ".mat", "a state space for MATLAB and SciPy", ("cut",), _state_space, _mat),
-    Format("npz", ".npz", "a state space for NumPy", ("cut",), _state_space, _npz),
+    Format("mat", ".mat", "a state space for MATLAB and SciPy", ("cut", "free"), _state_space, _mat),
+    Format("npz", ".npz", "a state space for NumPy", ("cut", "free"), _state_space, _npz),
     Format(
         "c",
         ".c",

@@ -1,6 +1,6 @@
 """A state space as python-control's, and as files that Python, SciPy and MATLAB read.
 
-Takes: a `StateSpace`. Gives: `as_control`, `control_names`; `write_script`, `write_mat`, `write_npz`.
+Takes: a `StateSpace`. Gives: `as_control`; `write_script`, `write_mat`, `write_npz`.
 Guarantees: a file is there whole or not at all; no name out of a scene is read as Python's text; nothing is
 pickled. All hold the same: A, B, C, D, dt in seconds, names and SI units, and what made them.
 Does not: compute.
@@ -9,7 +9,6 @@ Does not: compute.
 from __future__ import annotations
 
 import json
-import re
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,10 +18,12 @@ import numpy as np
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import write_file, write_text
+from apc.exports.words import word, words
 from apc.optional import need
 
 if TYPE_CHECKING:
-    from apc.exports.lifted import Port, StateSpace
+    from apc.exports.lifted import StateSpace
+    from apc.exports.words import Port
 
 LARGEST_MAT = 2**31 - 2**20  # bytes: a variable of a MAT-file of version 5 is less than 2 GiB
 
@@ -67,36 +68,17 @@ def as_control(found: StateSpace) -> Any:
     control = need("control", "control")
     return control.StateSpace(
         *(found.a, found.b, found.c, found.d, found.frame_s),
-        name=_word(found.topology),
-        states=control_names(found.states),
-        inputs=control_names(found.inputs),
-        outputs=control_names(found.outputs),
+        name=word(found.topology),
+        states=words(found.states),
+        inputs=words(found.inputs),
+        outputs=words(found.outputs),
     )
-
-
-def control_names(ports: Sequence[Port]) -> list[str]:
-    """Return names of letters, digits and `_`, as python-control wants them, no two alike."""
-    found: list[str] = []
-    taken: set[str] = set()
-    for port in ports:
-        word = own = _word(port.name)
-        number = 1
-        while word in taken:
-            number += 1
-            word = f"{own}_{number}"
-        taken.add(word)
-        found.append(word)
-    return found
-
-
-def _word(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
 
 
 def write_script(path: Path, found: StateSpace) -> None:
     """Write a Python script that makes a `control.StateSpace`. Raises ApcError (E601)."""
-    control_words = (control_names(ports) for ports in (found.states, found.inputs, found.outputs))
-    state_words, input_words, output_words = map(_listed, control_words)
+    listed = (words(ports) for ports in (found.states, found.inputs, found.outputs))
+    state_words, input_words, output_words = map(_listed, listed)
     text = _SCRIPT.format(
         title=_quotable(f"{found.topology}, {found.what}, as a state space."),
         told=_quotable("\n".join(textwrap.fill(one, 100) for one in (found.meaning, *found.notes))),
@@ -107,7 +89,7 @@ def write_script(path: Path, found: StateSpace) -> None:
         outputs=_pairs(found.outputs),
         **{name: _rows(matrix) for name, matrix in zip("abcd", found.matrices, strict=True)},
         made_by=json.dumps(found.made_by),
-        name=json.dumps(_word(found.topology)),
+        name=json.dumps(word(found.topology)),
         state_words=state_words,
         input_words=input_words,
         output_words=output_words,
@@ -157,6 +139,10 @@ def _variables(found: StateSpace) -> dict[str, Any]:
         variables[f"{name.removesuffix('s')}_units"] = [port.unit for port in ports]
     variables["cut"], variables["notes"] = found.cut, [found.meaning, *found.notes]
     variables["provenance"] = found.made_by
+    if found.free:
+        variables["free"] = [port.name for port in found.free]
+        variables["free_units"] = [port.unit for port in found.free]
+        variables["function"] = found.function.serialize()
     return variables
 
 

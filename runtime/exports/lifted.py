@@ -1,7 +1,7 @@
 """A scene over one frame as a state space, all peers in it: from forces and noise to what is simulated.
 
 Takes: a `CompiledSystem`; a link or coupler to cut it at.
-Gives: `Port`, `StateSpace`, `state_space`.
+Gives: `StateSpace`, `state_space`; `Numbers`, `lifted`, `steps_in_floats`: the same in any kind of number.
 Guarantees: every event within a frame is in it, exactly but for rounding; its eigenvalues are those that
 `analyze` finds, and 0 for each force that nothing else remembers until the frame ends. Cut open and closed
 again by u = −y it is the closed loop.
@@ -38,9 +38,11 @@ from apc.distribution import versions
 from apc.eigen.closing import Feedback, Loop, close, feedback_of, lay_out_loop
 from apc.eigen.modes import dense_loop
 from apc.eigen.peer_group import PeerGroup, states_of
+from apc.exports.words import Port
 from apc.finite_equations import finite_equations
 from apc.frame.devices import Device, find_device
 from apc.frame.discretize import TOO_LARGE, discretize
+from apc.frame.exchange import Exchange
 from apc.frame.lift import FrameMap, check_packets, compose, named, step_durations
 from apc.frame.ports import with_holds, with_ports
 from apc.frame.radius import FLOATS, Arithmetic
@@ -68,14 +70,6 @@ ENTRY = 40
 _OUTSIDE = Heard(Way("", "", ""), Sent("", "", 0), 0)
 
 
-@dataclass(frozen=True, slots=True)
-class Port:
-    """An input, an output or a state: its name, such as `left[2].cube.x`, and its SI unit."""
-
-    name: str
-    unit: str
-
-
 Labels = tuple[Port, ...]
 
 
@@ -83,7 +77,8 @@ Labels = tuple[Port, ...]
 class StateSpace(Result):
     """A scene as a discrete state space with the sample time `frame_s`; `cut` is where it is cut, "" closed.
 
-    `notes` say what it leaves out.
+    `notes` say what it leaves out. Where numbers are `free`, `function` is a `casadi.Function` of them, one
+    argument each in SI, that gives A, B, C and D.
     """
 
     shown_by = "exports:state_space"
@@ -100,6 +95,8 @@ class StateSpace(Result):
     outputs: tuple[Port, ...]
     notes: tuple[str, ...]
     made_by: str
+    free: tuple[Port, ...] = ()
+    function: Any = None
 
     @property
     def matrices(self) -> tuple[Floats, Floats, Floats, Floats]:
@@ -140,10 +137,10 @@ class Numbers:
     arithmetic: Arithmetic
 
 
-def _steps(
+def steps_in_floats(
     group: PeerGroup, forces: Sequence[Device], count: int, durations: Sequence[Fraction]
 ) -> list[Matrix]:
-    """Return the exponentials of exact matrices, in floats."""
+    """Return [F G] of some durations in floats, of exact matrices: see `Numbers`."""
     columns = np.zeros((len(group.exact.a), count), dtype=object)
     for place, device in enumerate(forces):
         columns[device.velocity, place] = device.inverse
@@ -151,7 +148,7 @@ def _steps(
     return [step.matrix for step in found]
 
 
-IN_FLOATS = Numbers(lambda group: group.site, lambda group, one: float(one.inverse), _steps, FLOATS)
+IN_FLOATS = Numbers(lambda group: group.site, lambda group, one: float(one.inverse), steps_in_floats, FLOATS)
 
 
 def state_space(system: CompiledSystem, *, cut: str = "") -> StateSpace:
@@ -169,7 +166,8 @@ def state_space(system: CompiledSystem, *, cut: str = "") -> StateSpace:
     ApcError
         E950 nothing to cut at; E951 too many states; and those of `analysis.lifted_groups`.
     """
-    (a, b, c, d), (states, inputs, outputs) = lifted(system, cut, IN_FLOATS)
+    groups, exchange = lifted_groups(system)
+    (a, b, c, d), (states, inputs, outputs) = lifted(system, groups, exchange, cut, IN_FLOATS)
     if not all(np.isfinite(block).all() for block in (a, b, c, d)):
         raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
     frame_s, notes = about(system)
@@ -196,7 +194,7 @@ def made_by(system: CompiledSystem) -> str:
 
 
 def lifted(
-    system: CompiledSystem, cut: str, numbers: Numbers
+    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, cut: str, numbers: Numbers
 ) -> tuple[Blocks, tuple[Labels, Labels, Labels]]:
     """Return A, B, C and D of a scene in a kind of number, and the names of its states, inputs and outputs.
 
@@ -204,11 +202,12 @@ def lifted(
     ----------
     system, cut
         As for `state_space`.
+    groups, exchange
+        Its peers, from `analysis.lifted_groups`.
     numbers
         What the matrices are of.
     """
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
-        groups, exchange = lifted_groups(system)
         link = _link_of(system, cut)
         opened = [_open(system, group, "" if link else cut, numbers) for group in groups]
         _check_size(system, opened)
@@ -256,7 +255,7 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
     durations = step_durations(full)
     steps = numbers.steps(group, forces, count, [one * full.quantum for one in durations])
     frame = compose(site, full, dict(zip(durations, steps, strict=True)), numbers=numbers.arithmetic)
-    lifted = named(site.kind, full, frame, frame)
+    own = named(site.kind, full, frame, frame.mapped(np.zeros_like))
     names = [*(state.name for state in kind.states), *schedule.value_names]
     place_of = {one: len(kind.states) + k for k, one in enumerate(schedule.carried)}
     signals = [
@@ -270,7 +269,7 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
     inputs = [Port(f"force on {device.part}", "N") for device in forces]
     inputs += [Port(f"noise on {kind.states[place].name}", kind.states[place].unit) for place in noises]
     return _Opened(
-        group=group.with_site(site, group.exact, full, lifted),
+        group=group.with_site(site, group.exact, full, own),
         map=frame,
         states=tuple(map(Port, names, unit_of)),
         signals=tuple(port for port, _ in signals),

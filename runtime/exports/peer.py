@@ -376,7 +376,7 @@ def _forces(
         state = kind.states[row].name
         axis = slopes[velocity, :]
         if casadi.depends_on(axis, varying):
-            what = f"{name}: what pushes {state} is no sum of what is computed at ticks: it bends with the motion"
+            what = f"{name}: what pushes {state} is no sum of what ticks compute: it bends with the motion"
             hint = "a motor without a limit, which the real one has"
             raise ApcError(Mistake("E961", Place(system.origin.topology), what, hint=hint))
         device = find_device(site, vector, unit_of, part=state)

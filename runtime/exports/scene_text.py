@@ -3,7 +3,8 @@
 Takes: `Peer`s, when they send, how late each hears each. Gives: `CScene`, `c_scene`, `one_peer`;
 `scene_source`; `Variable`.
 Guarantees: time counts in whole quanta; of what happens at once all sends come first, then what is heard,
-then ticks, as everywhere; a value is looked at as it is just before an instant's ticks, as in a row of `simulate`.
+then ticks, as everywhere; a value is looked at as it is just before an instant's ticks, as in a row of
+`simulate`.
 Does not: know how a simulator calls it (see `fmu`).
 
 What a scene remembers is one struct, `model`, that can be copied: no pointer is in it.

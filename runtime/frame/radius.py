@@ -36,7 +36,8 @@ FEW = 16
 class Arithmetic:
     """How matrices of a kind of number are multiplied, added, subtracted and solved, and exact ones written.
 
-    `solve` gives X of M X = R, None where it can't be said, or where nobody asks it of such numbers.
+    `solve` gives X of M X = R, None where it can't be said, or where nobody asks it of such numbers;
+    `vanishes` says that a matrix is zero.
     """
 
     multiply: Callable[[Matrix, Matrix], Matrix]
@@ -44,6 +45,7 @@ class Arithmetic:
     subtract: Callable[[Matrix, Matrix], Matrix]
     exact: Callable[[Matrix], Matrix]
     solve: Callable[[Matrix, Matrix], Matrix | None] = lambda matrix, right: None
+    vanishes: Callable[[Matrix], bool] = lambda matrix: not matrix.any()
 
 
 def with_radius(value: Matrix, radius: Matrix) -> Matrix:

@@ -13,7 +13,8 @@ from typing import Any
 
 from apc.compiler.words import counted, wrapped
 from apc.exports.files import as_control
-from apc.exports.lifted import Port, StateSpace
+from apc.exports.lifted import StateSpace
+from apc.exports.words import Port
 from apc.present.forms import document, note
 
 MOST_NAMED = 6
@@ -24,6 +25,8 @@ def state_space_text(found: StateSpace) -> str:
     lines = [f"{found.topology}: {found.what} over one frame of {found.frame_s * 1e3:.6g} ms", ""]
     for word, ports in (("state", found.states), ("input", found.inputs), ("output", found.outputs)):
         lines += wrapped(f"{counted(len(ports), word)}: {_named(ports)}", "  ", "    ")
+    if found.free:
+        lines += wrapped(f"A, B, C and D are a function of {_named(found.free)}", "  ", "    ")
     lines += ["", *note(found.meaning), *(line for one in found.notes for line in note(one))]
     return "\n".join(lines)
 
@@ -40,5 +43,6 @@ def state_space_control(found: StateSpace) -> Any:
 
 def state_space_document(found: StateSpace) -> dict[str, Any]:
     """Return a state space as plain data."""
-    plain: dict[str, Any] = document(found, {"made_by": json.loads(found.made_by)})
+    function = found.function and found.function.serialize()
+    plain: dict[str, Any] = document(found, {"made_by": json.loads(found.made_by), "function": function})
     return {**plain, "meaning": found.meaning}

@@ -1,0 +1,196 @@
+"""A state space as a function of some of the scene's numbers.
+
+Takes: a `CompiledSystem`, names of its parameters. Gives: `with_free`.
+Guarantees: what follows from a free number by a formula follows from it here too; at the scene's own numbers
+the matrices are those of `lifted.state_space`, but for rounding.
+Does not: free a time: another delay is another order of events, another number of states.
+
+Where a free number moves a peer between the ticks (its mass, say), e^{Aτ} is squared from its Taylor series,
+as often as makes the scene's own Aτ small: for numbers up to `SPAN` times as large nothing is lost.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import lifted_groups, prepare, prepare_at_start
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.plain import symbolic
+from apc.eigen.peer_group import PeerGroup
+from apc.exports.lifted import Numbers, StateSpace, lifted, state_space, steps_in_floats
+from apc.exports.words import Port, words
+from apc.frame.devices import Device
+from apc.frame.linearize import site_of_entries
+from apc.frame.names import Free, find, unit_of
+from apc.frame.parameters import free_values
+from apc.frame.radius import Arithmetic
+from apc.frame.site import LinearSite
+from apc.network.nominal import refuse_channel_number
+
+Matrix = NDArray[Any]
+
+OPTION = "--free"
+
+# How many times as large Aτ may be as in the scene before the series ends too soon, and its terms: of
+# ‖Aτ‖ ≤ 1 the rest is less than 1/17!, 3e-15.
+SPAN, TERMS = 64, 16
+
+
+def with_free(system: CompiledSystem, names: Sequence[str], *, cut: str = "") -> StateSpace:
+    """Lift a scene, with its matrices as a function of some numbers.
+
+    Parameters
+    ----------
+    system, cut
+        As for `lifted.state_space`.
+    names
+        Parameters of the scene or of a group.
+
+    Raises
+    ------
+    ApcError
+        E622 no such parameter; E954 a time, or a scene whose start decides its slopes; and those of
+        `lifted.state_space`.
+    """
+    found = state_space(system, cut=cut)
+    frees = _frees(system, names)
+    ports = tuple(Port(free.label, unit_of(system, free.name)) for free in frees)
+    symbols = [casadi.SX.sym(word) for word in words(ports)]
+    prepared = prepare_at_start(system, prepare(system))
+    if prepared is None:
+        what = "where the scene is linearized does not follow from its numbers alone"
+        raise ApcError(Mistake("E954", Place(OPTION), what, hint=f"no {OPTION}"))
+    groups, exchange = lifted_groups(system, prepared=prepared)
+    apart = [part for group in groups for part in _by_groups(group, exchange.starts)]
+    values = dict(zip(frees, symbols, strict=True))
+
+    def numbers_of(group: PeerGroup) -> list[Any]:
+        place = int(np.searchsorted(exchange.starts, group.peers[0], side="right")) - 1
+        peer = int(group.peers[0] - exchange.starts[place])
+        return free_values(system, system.groups[place], peer, values, symbolic)
+
+    blocks, _ = lifted(system, apart, exchange, cut, _numbers(numbers_of))
+    function = casadi.Function(
+        "state_space", symbols, [_matrix(block) for block in blocks], words(ports), ["A", "B", "C", "D"]
+    )
+    return replace(found, free=ports, function=function)
+
+
+def _frees(system: CompiledSystem, names: Sequence[str]) -> list[Free]:
+    """Return what is free. Raises ApcError for what can't be."""
+    frees: list[Free] = []
+    for name in names:
+        free = find(system, name, Place(OPTION))
+        if free.name in {timing.name for timing in system.timings}:
+            what = f"{free.label} is a time: another one is another order of events, and another state"
+            hint = f'one value at a time: --set {free.label}="…"'
+            raise ApcError(Mistake("E954", Place(OPTION), what, hint=hint))
+        refuse_channel_number(system, free, Place(OPTION))
+        if any(free.meets(other) for other in frees):
+            what = f"{free.label} is named twice"
+            raise ApcError(Mistake("E954", Place(OPTION), what, hint=f"{OPTION} {free.label}"))
+        frees.append(free)
+    return frees
+
+
+def _by_groups(group: PeerGroup, starts: Any) -> list[PeerGroup]:
+    """Return equal peers apart by the scene's groups: a group's own number may be free."""
+    peers = np.array(list(group.peers), np.int64)
+    of = np.searchsorted(starts, peers, side="right")
+    return [replace(group, peers=own, count=len(own)) for one in np.unique(of) for own in [peers[of == one]]]
+
+
+def _numbers(numbers_of: Callable[[PeerGroup], list[Any]]) -> Numbers:
+    """Return what a frame is made of in CasADi's expressions."""
+
+    def vector(group: PeerGroup) -> Any:
+        return casadi.vertcat(*(casadi.SX(value) for value in numbers_of(group)))
+
+    def site(group: PeerGroup) -> LinearSite:
+        function = group.jacobians.function
+        rest = [casadi.DM.zeros(*function.size_in(place)) for place in range(4)]
+        found = function(*rest, vector(group), 0)
+        return site_of_entries(group.jacobians, [_plain(one) for one in found.nonzeros()], 0)
+
+    def inverse(group: PeerGroup, device: Device) -> Any:
+        rest = [casadi.DM.zeros(*device.symbolic.size_in(place)) for place in range(2)]
+        return _plain(device.symbolic(*rest, vector(group), 0))
+
+    def steps(
+        group: PeerGroup, forces: Sequence[Device], count: int, durations: Sequence[Fraction]
+    ) -> list[Matrix]:
+        own = site(group)
+        columns = np.zeros((len(own.a), count), dtype=object)
+        for place, device in enumerate(forces):
+            columns[device.velocity, place] = inverse(group, device)
+        moving = np.concatenate([own.a, own.b, columns], axis=1)
+        if not any(isinstance(one, casadi.SX) for one in moving.flat):
+            return [one.astype(object) for one in steps_in_floats(group, forces, count, durations)]
+        return [_step(moving, group.site.a, float(duration)) for duration in durations]
+
+    return Numbers(site, inverse, steps, SYMBOLS)
+
+
+def _step(moving: Matrix, now: Matrix, seconds: float) -> Matrix:
+    """Return [F G] for [A B] and a duration, of expressions; `now` is A in the scene's own numbers."""
+    n, width = moving.shape
+    generator = casadi.SX(width, width)
+    generator[:n, :] = _matrix(moving) * seconds
+    size = float(np.abs(now).sum(axis=1).max(initial=0.0)) * seconds
+    halvings = max(0, math.ceil(math.log2(max(size * SPAN, 1.0))))
+    small = generator / 2**halvings
+    found = casadi.SX.eye(width)
+    for term in range(TERMS, 0, -1):
+        found = casadi.SX.eye(width) + casadi.mtimes(small, found) / term
+    for _ in range(halvings):
+        found = casadi.mtimes(found, found)
+    step = np.zeros((n, width), dtype=object)
+    for row, column in zip(*found.sparsity().get_triplet(), strict=True):
+        if row < n:
+            step[row, column] = _plain(found[row, column])
+    return step
+
+
+def _plain(one: Any) -> Any:
+    """Return an expression, as a float if it is one."""
+    value = casadi.SX(one)
+    return float(value) if value.is_constant() else value
+
+
+def _tidy(matrix: Matrix) -> Matrix:
+    """Return a matrix whose constants are floats."""
+    for place in np.ndindex(matrix.shape):
+        if isinstance(matrix[place], casadi.SX):
+            matrix[place] = _plain(matrix[place])
+    return matrix
+
+
+def _vanishes(matrix: Matrix) -> bool:
+    return not any(isinstance(one, casadi.SX) or one for one in matrix.flat)
+
+
+def _matrix(block: Matrix) -> Any:
+    """Return an array as CasADi's matrix, sparse where it is zero."""
+    found = casadi.SX(*block.shape)
+    for place in np.ndindex(block.shape):
+        if isinstance(block[place], casadi.SX) or block[place]:
+            found[place] = block[place]
+    return found
+
+
+SYMBOLS = Arithmetic(
+    multiply=lambda left, right: _tidy(np.matmul(left.astype(object), right.astype(object))),
+    add=lambda one, other: _tidy(np.add(one.astype(object), other)),
+    subtract=lambda one, other: _tidy(np.subtract(one.astype(object), other)),
+    exact=lambda matrix: matrix.astype(object),
+    vanishes=_vanishes,
+)
