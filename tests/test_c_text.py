@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from apc.__main__ import run
 from apc.compiler.errors import ApcError
 from apc.exports.c_text import c_peer, identifier, in_order, number
 from apc.exports.peer import peer_of
 from apc.simulation.settings import DEFAULT, parse_method
 from apc.simulation.simulation import plan_of
-from tests.in_c import SANITIZED, build, compiler, differences, worst
-from tests.topologies import AVERAGE, SCENES, compiled, replaced
+from tests.in_c import SANITIZED, STRICT, build, compiler, differences, worst
+from tests.topologies import AVERAGE, ROOT, SCENES, compiled, replaced
 
 MOVED = replaced(AVERAGE, ("user: {count: 3}", "user: {count: 3, set: {device.x: [30 mm, -20 mm, 7 mm]}}"))
 RING = replaced(MOVED, ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
@@ -98,6 +99,28 @@ def test_nothing_in_it_changes_but_what_is_given(tmp_path: Path) -> None:
     assert included == {f'#include "{code.name}.h"', "#include <math.h>"}
 
 
+def test_the_loop_of_the_readme_compiles(tmp_path: Path) -> None:
+    assert (
+        run(
+            [
+                "export",
+                str(SCENES / "experiment-average.yaml"),
+                "--peer",
+                "left[1]",
+                "--out",
+                str(tmp_path / "left.c"),
+            ]
+        )
+        == 0
+    )
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    _, _, after = text.partition("<!-- compiled with left.h of experiment-average.yaml -->\n```c\n")
+    (tmp_path / "loop.c").write_text(after.partition("```")[0], encoding="ascii")
+    subprocess.run(
+        [compiler(), *STRICT, "-fsyntax-only", "loop.c", "left.c", "left_test.c"], cwd=tmp_path, check=True
+    )
+
+
 def test_numbers_of_any_size_and_none_do_no_harm(tmp_path: Path) -> None:
     """Under the sanitizers, what is measured and heard infinite, no number, tiny or huge."""
     plan = plan_of(compiled(LOSSY), DEFAULT)
@@ -131,8 +154,8 @@ def test_names_of_a_scene_are_names_in_c() -> None:
         (BENT, "", "device", "E960 user[1]: between ticks cube.x, cube.v move by CVODES, which is not "
                              "written as C. Write: --method rk4:0.1ms"),
         (MOVED, "", "box", "E961 --device: no mass of user[1] is called box. Write: --device cube"),
-        (TIED, "", None, "E961 user[1]: device and cube are tied to each other between ticks: no computer can "
-                         "move cube where device moves by itself."),
+        (TIED, "", None, "E961 user[1]: device and cube are tied to each other between ticks: no computer "
+                         "can move cube where device moves by itself."),
     ],
 )  # fmt: skip
 def test_what_it_cannot_hold_is_named(text: str, method: str, device: str | None, message: str) -> None:
