@@ -19,7 +19,7 @@ from apc.compiler.errors import ApcError
 from apc.exports.code import scene_unit
 from apc.exports.fmu import Unit, write_fmu
 from tests.in_c import STRICT, compiler
-from tests.test_c_text import BENT, INSIDE, LOSSY, MIXED, MOVED, PAIRS, PAPER
+from tests.test_c_text import BENT, INSIDE, LOSSY, LOSSY_HOLD, MIXED, MOVED, PAIRS, PAPER
 from tests.topologies import AVERAGE, compiled, replaced
 
 AT_ONCE = replaced(MOVED, ("{clock: network, delay: 8 ms}", "{clock: network, delay: 0 s}"))
@@ -28,6 +28,9 @@ OWN = replaced(
     (", set: {device.x: [30 mm, -20 mm, 7 mm]}", ""),
     ("damping: 5 N*s/m}", "damping: 5 N*s/m, x: 3 mm}"),
 )  # fmt: skip
+BURSTS = replaced(
+    MOVED, ("delay: 8 ms}", "delay: 8 ms, jitter: 4 ms, distribution: pareto, loss: {p: 10 %, r: 30 %}}")
+)
 SCENES = {
     "moved": MOVED,
     "paper": PAPER,
@@ -35,6 +38,10 @@ SCENES = {
     "a delay inside a tick": INSIDE,
     "pairs": PAIRS,
     "heard as it is sent": AT_ONCE,
+    "own masses": OWN,
+    "late and lost, zero": LOSSY,
+    "late and lost, hold": LOSSY_HOLD,
+    "bursts": BURSTS,
 }
 
 
@@ -64,6 +71,19 @@ def test_a_scene_is_played_as_simulate_plays_it(name: str, fmpy: Any, tmp_path: 
     assert rows.shape == course.values.shape
     assert np.abs(rows - course.values).max() < 1e-9 * max(1.0, np.abs(course.values).max())
     assert np.abs(course.values).max() > 1e-3
+
+
+def test_recorded_delays_are_played_one_after_another(fmpy: Any, tmp_path: Path) -> None:
+    (tmp_path / "delays.csv").write_text("delay [ms]\n8\n9.5\n\n21\n7\n8\n30\n", encoding="utf-8")
+    text = replaced(MOVED, ("delay: 8 ms}", "trace: delays.csv}"))
+    (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
+    system = apc.compile(tmp_path / "scene.yaml")
+    write_fmu(path := tmp_path / "scene.fmu", unit := scene_unit(system))
+    import fmpy as player
+
+    course = apc.simulate(system, duration="0.5 s")
+    found = player.simulate_fmu(path, stop_time=0.5, output_interval=unit.step)
+    assert np.abs(np.array([found[one.name] for one in course.signals]).T - course.values).max() < 1e-9
 
 
 def test_what_is_not_linear_is_played_by_the_steps_asked_for(fmpy: Any, tmp_path: Path) -> None:
@@ -188,7 +208,7 @@ def test_a_step_may_be_of_any_length_and_a_state_can_be_had_back(fmpy: Any, tmp_
     one.end()
 
 
-def test_a_peer_says_what_it_hears_and_sends_and_its_sources_compile_strictly(tmp_path: Path) -> None:
+def test_a_peer_says_what_it_hears_and_sends(tmp_path: Path) -> None:
     compiler()
     path, _ = written(LOSSY, tmp_path, peer="user[2]")
     with zipfile.ZipFile(path) as archive:
@@ -204,10 +224,18 @@ def test_a_peer_says_what_it_hears_and_sends_and_its_sources_compile_strictly(tm
     assert {"lan.user[1].coordination.x", "lan.user[1].missing"} <= heard
     assert causes["lan.coordination.x"] == "output"
     assert next(one for one in names if one.startswith("binaries/")).split("/")[1].endswith("64")
-    sources = [one.get("name") for one in told.iter("File")]
-    assert all(f"sources/{one}" in names for one in sources)
-    options = [*STRICT, "-fsyntax-only"]
-    subprocess.run([compiler(), *options, *map(str, sources)], cwd=tmp_path / "sources", check=True)
+    assert all(f"sources/{one.get('name')}" in names for one in told.iter("File"))
+
+
+@pytest.mark.parametrize("peer", ["", "user[2]"])
+def test_its_sources_compile_strictly(peer: str, tmp_path: Path) -> None:
+    unit = scene_unit(compiled(LOSSY), peer=peer)
+    for name, text in unit.texts.items():
+        (tmp_path / name).write_text(text, encoding="ascii")
+    sources = [name for name in unit.texts if name.endswith(".c")]
+    for options in (["-O0"], ["-O2"]):
+        command = [compiler(), *STRICT, *options, "-fPIC", "-shared", *sources, "-o", "all.so"]
+        subprocess.run(command, cwd=tmp_path, check=True)
 
 
 def test_the_same_scene_gives_the_same_texts() -> None:
@@ -231,7 +259,7 @@ def test_another_program_is_not_given_another_scene(fmpy: Any, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["scene.fmu"], "lan loses or delays packets by chance, which is not written as C. Write: --peer"),
+        (["scene.fmu"], "E960 user[1]: between ticks cube.x, cube.v move by CVODES"),
         (["peer.c"], 'E963 --peer: the peers differ, and a text of C is of one. Write: --peer "user[1]"'),
         (["peer.c", "--peer", "user[4]"], "E963 --peer: user[4] is none of the peers user[1] to user[3]"),
         (
@@ -249,7 +277,7 @@ def test_what_cannot_be_is_told_and_nothing_is_written(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "scene.yaml").write_text(LOSSY, encoding="utf-8")
+    (tmp_path / "scene.yaml").write_text(BENT, encoding="utf-8")
     assert run(["export", "--out", *words]) == 1
     assert message in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["scene.yaml"]

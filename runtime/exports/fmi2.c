@@ -1,6 +1,6 @@
 /* How a simulator calls it: FMI 2.0 for co-simulation (fmi-standard.org).
 
-Before this text stand `model`, `begin`, `run`, `real`, `flag`, QUANTA and SECONDS (a quantum is SECONDS/QUANTA
+Before this text stand `model`, `begin`, `run`, `real`, `flag`, `given`, QUANTA and SECONDS (a quantum is SECONDS/QUANTA
 s), and GUID. An instant is over when a step that begins with it has begun: what is heard at it can be set
 until then. A time between two instants shows what was last.
 */
@@ -131,7 +131,7 @@ FMI fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference which[], si
 FMI fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference which[], size_t count, const fmi2Real values[]) {
   Instance *own = c;
   for (size_t i = 0; i < count; i++) {
-    double *value = which[i] < INPUTS ? real(&own->model, which[i]) : 0;
+    double *value = given(which[i]) ? real(&own->model, which[i]) : 0;
     if (!value) return complain(own, "no number that can be set has this value reference");
     *value = values[i];
   }

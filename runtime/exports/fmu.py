@@ -101,9 +101,14 @@ static {type_} *{what}(model *m, unsigned which) {{
     engine = Path(__file__).with_name("fmi2.c").read_text(encoding="utf-8")
     return f"""\
 {scene_source(scene)}
-{accessors}#define QUANTA {float(scene.quantum.denominator)!r}
+{accessors}/* Whether it comes from outside: such numbers are the first. */
+static int given(unsigned which) {{
+  (void)which;
+  return {f"which < {inputs}u" if inputs else "0"};
+}}
+
+#define QUANTA {float(scene.quantum.denominator)!r}
 #define SECONDS {float(scene.quantum.numerator)!r}
-#define INPUTS {inputs}u
 #define GUID "GUID_OF_TEXTS"
 
 {engine}"""

@@ -17,7 +17,9 @@ from fractions import Fraction
 
 from apc.compiler.frozen import dataclass
 from apc.exports.c_text import CLOSE, OPEN, CPeer, c_peer, identifier, in_order, number
+from apc.exports.chance_text import Chance, chance_begin, chance_of, chance_source, chance_types
 from apc.exports.peer import Line, first_packet, group_of, lines_of, peer_of, refused, sites_of
+from apc.simulation.machine import luck_text
 from apc.simulation.settings import Method
 from apc.simulation.signals import LocalSignal
 from apc.simulation.simulation import Plan
@@ -44,7 +46,8 @@ class Variable:
 class Way:
     """A link in a scene: its period, phase and the channels of its packets.
 
-    `ring` packets of each peer are kept; `start` (peers, channels) is what is heard before the first arrives.
+    `ring` packets of each peer are kept; `start` (peers, channels) is what is heard before the first arrives;
+    `chance` is None where every packet takes its delay.
     """
 
     name: str
@@ -53,6 +56,7 @@ class Way:
     channels: tuple[str, ...]
     ring: int
     start: tuple[tuple[float, ...], ...]
+    chance: Chance | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,16 +108,9 @@ def c_scene(plan: Plan, method: Method) -> CScene:
     Raises
     ------
     ApcError
-        E960 its packets get lost or come late by chance, or it has more ways than fit a text; and as
-        `peer_of`.
+        E960 it has more ways than fit a text; and as `peer_of`, `chance_of`.
     """
     system, exchange = plan.system, plan.exchange
-    if plan.routes:
-        link = plan.routes[0].link
-        what = f"{link} loses or delays packets by chance, which is not written as C"
-        raise refused(
-            system, what, f'--peer "{exchange.peer_name(0)}": what it hears then comes from outside'
-        )
     first = sites_of(plan)
     sites = tuple(dict.fromkeys(first))
     total = exchange.peers * (exchange.peers - 1) if any(map(exchange.is_complete, exchange.links)) else 0
@@ -153,8 +150,10 @@ def c_scene(plan: Plan, method: Method) -> CScene:
         clock = clocks[exchange.links[link].clock]
         period = int(timings[clock.period] / quantum)
         start = tuple(first_packet(plan, link, peer, tuple(channels)) for peer in range(exchange.peers))
-        ring = latest.get(link, 0) // period + 2
-        ways.append(Way(link, period, int(timings[clock.phase] / quantum), tuple(channels), ring, start))
+        chance = chance_of(plan, link, quantum)
+        ring = max(latest.get(link, 0) // period + 2, chance.kept + 1 if chance else 0)
+        phase = int(timings[clock.phase] / quantum)
+        ways.append(Way(link, period, phase, tuple(channels), ring, start, chance))
     variables = tuple(
         Variable(
             f"{exchange.peer_name(peer)}.{one.name}",
@@ -252,12 +251,20 @@ def scene_source(scene: CScene) -> str:
         members.append(
             f"double {own}[{way.ring}][{len(scene.peers)}][{len(way.channels)}]; /* the newest packets */"
         )
-    tables = [_tables(scene, own, way) for own, way in zip(ways, scene.ways, strict=True)]
+        if way.chance is not None:
+            members.append(f"{own}_way ways_{own}[{len(way.chance.ways)}];")
+            begin += chance_begin(way.chance, own, len(way.channels))
+    tables = [_tables(own, way) for own, way in zip(ways, scene.ways, strict=True)]
     hears = [_hears(scene, s, ways) for s in range(len(scene.codes))] if scene.ways else []
+    types = "".join(
+        chance_types(way.chance, own, len(way.channels))
+        for own, way in zip(ways, scene.ways, strict=True)
+        if way.chance is not None
+    )
     return f"""\
 {includes}
 #include <limits.h>
-
+{_luck(scene)}{types}
 typedef struct {OPEN}
 {_lines(members)}{CLOSE} model;
 
@@ -274,11 +281,18 @@ static void run(model *m, long long until) {OPEN}
 """
 
 
+def _luck(scene: CScene) -> str:
+    """Return what the luck of packets is made of, if there is any."""
+    if all(way.chance is None for way in scene.ways):
+        return ""
+    return f"#include <math.h>\n#include <stdint.h>\n\ntypedef int64_t whole;\n{luck_text()}"
+
+
 def _lines(listed: Sequence[str], indent: int = 2) -> str:
     return "".join(f"{' ' * indent}{one}\n" for one in listed)
 
 
-def _tables(scene: CScene, own: str, way: Way) -> str:
+def _tables(own: str, way: Way) -> str:
     """Return what is heard of everybody before a packet arrives, and which packet is the newest."""
     rows = ",\n".join(f"    {OPEN}{', '.join(map(number, row))}{CLOSE}" for row in way.start)
     return f"""\
@@ -295,7 +309,7 @@ static const double *packet_{own}(const model *m, long long at, int sender) {OPE
   return number < 0 ? start[sender] : m->{own}[number % {way.ring}][sender];
 {CLOSE}
 
-"""
+{chance_source(way.chance, own, len(way.channels), way.ring) if way.chance is not None else ""}"""
 
 
 def _posted(scene: CScene, site: int, ways: Sequence[str]) -> list[str]:
@@ -317,6 +331,7 @@ def _posted(scene: CScene, site: int, ways: Sequence[str]) -> list[str]:
                 for k, channel in enumerate(way.channels)
                 if channel in names
             ),
+            *([f"  draw_{own}(m, number[i], newest_{own}(at));"] if way.chance is not None else []),
             CLOSE,
         ]
     return found
@@ -331,6 +346,9 @@ def _hears(scene: CScene, site: int, ways: Sequence[str]) -> str:
             continue
         line, mine = code.peer.line(way.name), code.lines[way.name]
         count, width = len(heard), len(heard[0])
+        if way.chance is not None:
+            body += _arrives(scene, site, own, way, way.chance)
+            continue
         for what, type_, table in (("senders", "int", heard), ("delays", "long long", late)):
             rows = ", ".join(f"{OPEN}{', '.join(map(str, row))}{CLOSE}" for row in table)
             body.append(f"static const {type_} {what}_{own}[{count}][{width}] = {OPEN}{rows}{CLOSE};")
@@ -348,3 +366,23 @@ static void hear{site}(model *m, int i, long long at) {OPEN}
 {_lines([*unused, *body])}{CLOSE}
 
 """
+
+
+def _arrives(scene: CScene, site: int, own: str, way: Way, chance: Chance) -> list[str]:
+    """Return the lines that bring what is in effect on a peer's ways to it."""
+    code = scene.codes[site]
+    line, mine = code.peer.line(way.name), code.lines[way.name]
+    receivers = [receiver for _, receiver in chance.ways]
+    first = [str(receivers.index(peer)) for peer, (one, _) in enumerate(scene.peers) if one == site]
+    packet = f"m->in{site}[i].{mine}[k]"
+    named = zip(line.channels, code.channels[way.name], strict=True)
+    missing = f"  {packet}.missing = m->ways_{own}[w].gap > m->ways_{own}[w].effective;"
+    return [
+        f"static const int first_{own}[{len(first)}] = {OPEN}{', '.join(first)}{CLOSE};",
+        f"for (int k = 0; k < {len(line.senders)}; k++) {OPEN}",
+        f"  const int w = first_{own}[i] + k;",
+        f"  arrive_{own}(m, w, at);",
+        *(f"  {packet}.{name} = m->ways_{own}[w].held[{way.channels.index(one)}];" for one, name in named),
+        *([missing] if line.missing else []),
+        CLOSE,
+    ]
