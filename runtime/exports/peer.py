@@ -42,6 +42,7 @@ from apc.simulation.signals import LocalSignal, local_signals
 from apc.simulation.simulation import Plan
 
 NO_DEVICE = "none"  # the word for a peer that moves nothing outside its computer
+MOST_HEARD = 20_000  # peers that one hears: each is a line of the text
 STEPS = "--method rk4:0.1ms"  # a method that is arithmetic, whatever moves
 
 
@@ -193,6 +194,9 @@ def peer_of(plan: Plan, number: int, method: Method, *, device: str | None = NO_
     ]
     instants, lengths = _instants(schedule)
     lines, channels = lines_of(plan, number)
+    if (heard := sum(len(one.senders) for one in lines)) > MOST_HEARD:
+        what = f"{name} hears {heard:,} peers; {MOST_HEARD:,} fit a text of C"
+        raise refused(system, what, "fewer peers, or a graph that is not complete")
     x, _, memories = start_values(site, [float(one) for one in vector])
     return Peer(
         system=system,
