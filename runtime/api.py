@@ -670,8 +670,8 @@ def export(
     model, set
         As for `analyze`.
     to
-        "control", "mat" or "npz": a state space; "c": one peer in C99; "fmu": a scene or a peer for
-        co-simulation. The suffix of `out` says it if not given.
+        "control", "mat" or "npz": a state space; "modelica": a model; "c": one peer in C99; "fmu": a scene
+        or a peer for co-simulation. The suffix of `out` says it if not given.
     out
         The file to write; nothing is written if not given.
     cut
@@ -691,7 +691,7 @@ def export(
     -------
     Result
         What was made, and written if asked: of a state space its matrices with the names and units of states,
-        inputs and outputs, and `.to_control()`.
+        inputs and outputs, and `.to_control()`; of a model its `.text`.
 
     Raises
     ------

@@ -16,6 +16,7 @@ What commands take beside the 60 to 120 MB of the program, at most and within a 
 | `simulate --out`: a signal; a number of a block | 2,000 (Parquet 24,000); 150 | `present.recording` |
 | the same: a number of all rows | MAT 32; Parquet 500 a signal and block | `present.recording` |
 | `simulate --runs`: a run | 300 each | `simulation.ensemble` |
+| `export`: a state space of n states and inputs | 40 n² | `exports.lifted` |
 | `sweep`: points × columns | 16 each, 150 without `--out` | `sweeps.sweep` |
 
 Other things have bounds of their own: states of a matrix, packets, ticks of a frame, points of a sweep.

@@ -14,7 +14,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import is_special
 
 # What goes into a device or pipe whose name has no suffix: text, as whoever reads there expects.
-TEXTS = (".csv", ".txt", ".json", ".svg")
+TEXTS = (".csv", ".txt", ".json", ".svg", ".py", ".mo")
 
 # What other programs take for standard output.
 DASH = Path("-")

@@ -114,7 +114,10 @@ HOUSE = (
         panels
         """,
     ),
-    ("apc.exports", "words lifted free files peer c_text chance_text scene_text fmu code export"),
+    (
+        "apc.exports",
+        "words lifted free files expressions modelica peer c_text chance_text scene_text fmu code export",
+    ),
     ("apc.benchmark", "timing truth bench hard scale"),
     (
         "apc.present",

@@ -111,7 +111,7 @@ E703 compiler/language: a cell or row of a table is wrong
 E801 runtime/frame: an operator runs over nobody
 E802 runtime/frame: the weights of a mean add up to nothing
 E803 runtime/eigen: an operator over equal peers has no linearization
-E804 runtime/analysis runtime/eigen runtime/large runtime/vary: too large a matrix, or equals not linear
+E804 runtime/analysis runtime/eigen runtime/exports runtime/large runtime/vary: too large, or not linear
 E805 runtime/frame: a frame is too long to be taken apart
 E806 runtime/analysis runtime/exports runtime/frame: numbers leave the range of floats
 E807 runtime/frame: an operator over the others has no linearization inside a loop
@@ -191,6 +191,7 @@ E951 runtime/exports: a state space is too large for the memory or a file
 E952 runtime/exports: a format to export to is not known
 E953 runtime/exports: an option means nothing to the format
 E954 runtime/exports: a number can't be left free
+E955 runtime/exports: Modelica has no words for what a scene says
 E960 runtime/exports: what a peer or a scene does is not written as C
 E961 runtime/exports: what of a peer is its device can't be said, or can't be told apart from a copy
 E962 runtime/exports: there is no C compiler, or it doesn't take a text

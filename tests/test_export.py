@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 import apc
 from apc.__main__ import run
+from apc.analysis.analysis import lifted_groups
 from apc.compiler.errors import ApcError
 from apc.exports.lifted import StateSpace, state_space
+from apc.frame.devices import Push, find_push
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
 Floats = NDArray[np.float64]
@@ -23,6 +25,14 @@ Floats = NDArray[np.float64]
 NAMES = ("mixed-clocks", "experiment-average", "client-server", "star-lecture", "two-users-waves", "finger")
 LATE = AVERAGE.replace("lan: {clock: network, delay: 8 ms}", "lan: {clock: network, delay: 3.5 ms}")
 PUSHED = AVERAGE + "hands:\n  hand: {type: ConstantForce, flange: device, force: 0 N}\n"
+
+HELD = """\
+topology: held
+clocks: {haptic: 1 ms}
+peers: {user: {count: 1}}
+masses: {device: {mass: 0.1 kg, damping: 5 N*s/m}}
+couplers: {wall: {type: SampledSpringDamper, a: device, b: ground, stiffness: 400 N/m, clock: haptic}}
+"""
 
 
 def scenes() -> dict[str, apc.CompiledSystem]:
@@ -99,6 +109,29 @@ def test_the_gain_margin_of_a_coupler_cut_open_is_that_of_its_stiffness(cut: str
     assert grows(found, margin.factor * (1 + 1e-8))
 
 
+def test_python_control_finds_the_margins_that_apc_finds() -> None:
+    """A loop of one peer and one tick a frame has one input and one output, cut at its wall."""
+    control = pytest.importorskip("control")
+    system = compiled(HELD)
+    gain, _, crossing, _ = control.margin(state_space(system, cut="wall").to_control())
+    margin = next(one for one in apc.margins(system).rows if one.parameter == "wall.stiffness")
+    assert gain == pytest.approx(margin.factor, rel=1e-9)
+    assert crossing / (2 * np.pi) == pytest.approx(margin.frequency_hz, rel=1e-9)
+
+
+def test_a_force_on_what_a_bar_joins_moves_both_its_ends() -> None:
+    """Of a tool m_t midway between m and m: M = [[m + m_t/4, m_t/4], [m_t/4, m + m_t/4]]."""
+    system = apc.compile(SCENES / "two-handed-tool.yaml")
+    (group,), _ = lifted_groups(system)
+    units = {one.name: one.unit for one in system.parameters}
+    found = [find_push(group.jacobians, group.parameters, units, None, place) for place in (0, 2)]
+    wanted = np.linalg.inv([[0.15, 0.05], [0.05, 0.15]])
+    for column, push in zip(wanted.T, found, strict=True):
+        assert isinstance(push, Push)
+        assert push.velocities == (1, 3)
+        assert [*map(float, push.inverses)] == pytest.approx(column, rel=1e-14)
+
+
 def pushed(text: str, peer: int, group: str = "user") -> tuple[apc.CompiledSystem, apc.CompiledSystem]:
     """Return a scene at rest, and the same with 1 N at a peer's device."""
     count = compiled(text).peers
@@ -128,15 +161,6 @@ def test_its_step_response_is_what_simulate_plays(text: str) -> None:
         assert np.abs(rows).max() > 1e-6  # something is compared
 
 
-HELD = """\
-topology: held
-clocks: {haptic: 1 ms}
-peers: {user: {count: 1}}
-masses: {device: {mass: 0.1 kg, damping: 5 N*s/m}}
-couplers: {wall: {type: SampledSpringDamper, a: device, b: ground, stiffness: 400 N/m, clock: haptic}}
-"""
-
-
 def test_what_a_force_and_noise_move_in_the_end_is_known() -> None:
     """A spring gives way by F/k; one that is told of a place too far by n pulls back by n."""
     found = state_space(compiled(HELD))
@@ -145,6 +169,24 @@ def test_what_a_force_and_noise_move_in_the_end_is_known() -> None:
     gains = dict(zip((port.name for port in found.outputs), steady.tolist(), strict=True))
     assert gains["user[1].device.x"] == pytest.approx([1 / 400, -1.0], rel=1e-12)
     assert gains["user[1].wall.f"] == pytest.approx([1.0, 0.0], abs=1e-9)
+
+
+@pytest.mark.parametrize("settings", [{}, {"wan.delay": "13.7 ms", "near.contact.stiffness": "700 N/m"}])
+def test_groups_of_unlike_clocks_answer_a_step_as_simulate_plays_it(settings: dict[str, str]) -> None:
+    text = (SCENES / "mixed-clocks.yaml").read_text(encoding="utf-8")
+    held = compiled(text + "hands:\n  hand: {type: ConstantForce, flange: device, force: 0 N}\n")
+    system = apc.set_parameters(held, settings)
+    found = state_space(system)
+    played = apc.simulate(system, set={"far.hand.force": "1 N"}, duration="0.4 s", jit=False)
+    at = {port.name: place for place, port in enumerate(found.inputs)}
+    x, push = np.zeros(len(found.a)), found.b[:, at["force on far[1].device"]]
+    every = round(found.frame_s / float(played.time[1] - played.time[0]))
+    for row in range(0, len(played.time), every):
+        for place, port in enumerate(found.outputs):
+            size = max(1e-3, np.abs(played[port.name]).max())
+            assert abs(found.c[place] @ x - played[port.name][row]) <= 1e-9 * size, port.name
+        x = found.a @ x + push
+    assert np.abs(played["near[1].cube.x"]).max() > 1e-5  # it came through
 
 
 def matrices(found: StateSpace) -> list[list[list[float]]]:
@@ -215,7 +257,7 @@ def test_words_for_names_are_never_alike() -> None:
         (["--out", "x.mat", "--to", "matlab"], "--to: E952 a format wants one of control"),
         (
             ["--out", "x.mat", "--cut", "lann"],
-            "--cut: E950 lann is no link or coupler of three-users-average",
+            "--cut: E950 lann is no link or coupler with ticks of three-users-average",
         ),
         (["--out", "x.npz", "--free", "lan.delay"], "--free: E954 lan.delay is a time"),
         (["--out", "x.npz", "--free", "device.mas"], "--free: E622 device.mas is no parameter"),
@@ -245,6 +287,13 @@ def test_what_cannot_be_is_told_and_nothing_is_written(
 def test_more_peers_than_the_memory_holds_are_refused_before_anything_is_built() -> None:
     many = compiled(replaced(AVERAGE, ("count: 3", "count: 1000000")))
     with pytest.raises(ApcError, match=r"E951 .* all 1,000,000 peers .* take about .* of memory"):
+        state_space(many)
+
+
+def test_different_peers_that_are_too_many_are_refused_too() -> None:
+    masses = ", ".join(f"{0.1 + k * 1e-4} kg" for k in range(400))
+    many = compiled(replaced(AVERAGE, ("{count: 3}", f"{{set: {{device.mass: [{masses}]}}}}")))
+    with pytest.raises(ApcError, match=r"E951 400 different peers .* Write: fewer peers"):
         state_space(many)
 
 
@@ -296,7 +345,7 @@ def test_the_function_is_in_the_file(tmp_path: Path) -> None:
     path = tmp_path / "family.npz"
     apc.export(ALL["average"], out=path, free=["coordination.stiffness"])
     with np.load(path, allow_pickle=False) as archive:
-        function = casadi.Function.deserialize(str(archive["function"]))
+        function = casadi.Function.deserialize(str(archive["casadi_function"]))
         assert archive["free"].tolist() == ["coordination.stiffness"]
     there = state_space(apc.set_parameters(ALL["average"], {"coordination.stiffness": "800 N/m"}))
     assert np.abs(np.array(function(800.0)[0]) - there.a).max() < 1e-12 * np.abs(there.a).max()

@@ -32,8 +32,8 @@ from apc.threads import start_single_threaded
     "--to",
     metavar="FORMAT",
     help="control: a script that makes a python-control StateSpace (.py); mat, npz: the same matrices for "
-    "MATLAB, SciPy, NumPy; c: one tick of a peer in C99, with a header and a driver; fmu: the scene or a "
-    "peer for co-simulation (FMI 2.0). Taken from --out if not given.",
+    "MATLAB, SciPy, NumPy; modelica: a flat model with clocks (.mo); c: one tick of a peer in C99, with "
+    "header and driver; fmu: the scene or a peer for co-simulation (FMI 2.0). Taken from --out if not given.",
 )
 @set_option
 @click.option(
@@ -47,8 +47,8 @@ from apc.threads import start_single_threaded
     "--free",
     multiple=True,
     metavar="PATH",
-    help="Leave a number free: A, B, C and D are a casadi.Function of it too, `function` in the file. May "
-    "be repeated.",
+    help="Leave a number free: A, B, C and D are a casadi.Function of it too, `casadi_function` in the "
+    "file. May be repeated.",
 )
 @click.option(
     "--peer", default="", metavar="NAME", help="For c and fmu: one peer, such as 'left[1]'. An FMU is of all."
@@ -84,11 +84,13 @@ def export_command(
 
     FILE is a topology or a compiled model. As a state space it is the whole
     loop over one frame, all peers in it: from a force on every mass and noise
-    on every measurement to every position, velocity and force. As C or an FMU
-    it is a peer as it computes, or all of them with the packets between.
+    on every measurement to every position, velocity and force. As a Modelica
+    model it is every equation, tick and packet; as C or an FMU a peer as it
+    computes, or all of them with the packets between.
 
     \b
         apc export --out loop.mat
+        apc export --out scene.mo
         apc export --to control --cut lan --out open_loop.py
         apc export --free coordination.stiffness --out family.npz
         apc export --peer "left[1]" --out left.c

@@ -77,6 +77,18 @@ def _npz(path: Path, found: Any) -> None:
     write_npz(path, found)
 
 
+def _modelica(system: CompiledSystem, asked: Asked) -> Result:
+    from apc.exports.modelica import modelica
+
+    return modelica(system)
+
+
+def _mo(path: Path, found: Any) -> None:
+    from apc.exports.modelica import write_modelica
+
+    write_modelica(path, found)
+
+
 def _code(system: CompiledSystem, asked: Asked) -> Result:
     from apc.exports.code import peer_code
 
@@ -105,6 +117,7 @@ FORMATS = (
     Format("control", ".py", "a script that makes a control.StateSpace", ("cut",), _state_space, _script),
     Format("mat", ".mat", "a state space for MATLAB and SciPy", ("cut", "free"), _state_space, _mat),
     Format("npz", ".npz", "a state space for NumPy", ("cut", "free"), _state_space, _npz),
+    Format("modelica", ".mo", "a flat model of Modelica 3.3 with clocks", (), _modelica, _mo),
     Format(
         "c",
         ".c",

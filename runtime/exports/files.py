@@ -142,7 +142,7 @@ def _variables(found: StateSpace) -> dict[str, Any]:
     if found.free:
         variables["free"] = [port.name for port in found.free]
         variables["free_units"] = [port.unit for port in found.free]
-        variables["function"] = found.function.serialize()
+        variables["casadi_function"] = found.function.serialize()
     return variables
 
 

@@ -21,14 +21,14 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import lifted_groups, prepare, prepare_at_start
+from apc.analysis.analysis import prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.plain import symbolic
 from apc.eigen.peer_group import PeerGroup
-from apc.exports.lifted import Numbers, StateSpace, lifted, state_space, steps_in_floats
+from apc.exports.lifted import Numbers, StateSpace, lifted, peers_of, state_space, steps_in_floats
 from apc.exports.words import Port, words
-from apc.frame.devices import Device
+from apc.frame.devices import Push
 from apc.frame.linearize import site_of_entries
 from apc.frame.names import Free, find, unit_of
 from apc.frame.parameters import free_values
@@ -69,7 +69,7 @@ def with_free(system: CompiledSystem, names: Sequence[str], *, cut: str = "") ->
     if prepared is None:
         what = "where the scene is linearized does not follow from its numbers alone"
         raise ApcError(Mistake("E954", Place(OPTION), what, hint=f"no {OPTION}"))
-    groups, exchange = lifted_groups(system, prepared=prepared)
+    groups, exchange = peers_of(system, prepared=prepared)
     apart = [part for group in groups for part in _by_groups(group, exchange.starts)]
     values = dict(zip(frees, symbols, strict=True))
 
@@ -78,7 +78,7 @@ def with_free(system: CompiledSystem, names: Sequence[str], *, cut: str = "") ->
         peer = int(group.peers[0] - exchange.starts[place])
         return free_values(system, system.groups[place], peer, values, symbolic)
 
-    blocks, _ = lifted(system, apart, exchange, cut, _numbers(numbers_of))
+    blocks, _, _ = lifted(system, apart, exchange, cut, _numbers(numbers_of))
     function = casadi.Function(
         "state_space", symbols, [_matrix(block) for block in blocks], words(ports), ["A", "B", "C", "D"]
     )
@@ -121,23 +121,24 @@ def _numbers(numbers_of: Callable[[PeerGroup], list[Any]]) -> Numbers:
         found = function(*rest, vector(group), 0)
         return site_of_entries(group.jacobians, [_plain(one) for one in found.nonzeros()], 0)
 
-    def inverse(group: PeerGroup, device: Device) -> Any:
-        rest = [casadi.DM.zeros(*device.symbolic.size_in(place)) for place in range(2)]
-        return _plain(device.symbolic(*rest, vector(group), 0))
+    def inverses(group: PeerGroup, push: Push) -> list[Any]:
+        rest = [casadi.DM.zeros(*push.symbolic.size_in(place)) for place in range(2)]
+        return [_plain(one) for one in casadi.vertsplit(push.symbolic(*rest, vector(group), 0))]
 
     def steps(
-        group: PeerGroup, forces: Sequence[Device], count: int, durations: Sequence[Fraction]
+        group: PeerGroup, forces: Sequence[Push], count: int, durations: Sequence[Fraction]
     ) -> list[Matrix]:
         own = site(group)
         columns = np.zeros((len(own.a), count), dtype=object)
-        for place, device in enumerate(forces):
-            columns[device.velocity, place] = inverse(group, device)
+        for place, push in enumerate(forces):
+            for velocity, inverse in zip(push.velocities, inverses(group, push), strict=True):
+                columns[velocity, place] = inverse
         moving = np.concatenate([own.a, own.b, columns], axis=1)
         if not any(isinstance(one, casadi.SX) for one in moving.flat):
             return [one.astype(object) for one in steps_in_floats(group, forces, count, durations)]
         return [_step(moving, group.site.a, float(duration)) for duration in durations]
 
-    return Numbers(site, inverse, steps, SYMBOLS)
+    return Numbers(site, inverses, steps, SYMBOLS)
 
 
 def _step(moving: Matrix, now: Matrix, seconds: float) -> Matrix:

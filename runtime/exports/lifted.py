@@ -1,7 +1,8 @@
 """A scene over one frame as a state space, all peers in it: from forces and noise to what is simulated.
 
 Takes: a `CompiledSystem`; a link or coupler to cut it at.
-Gives: `StateSpace`, `state_space`; `Numbers`, `lifted`, `steps_in_floats`: the same in any kind of number.
+Gives: `StateSpace`, `state_space`; `Numbers`, `lifted`, `peers_of`, `steps_in_floats`: the same in any kind
+of number.
 Guarantees: every event within a frame is in it, exactly but for rounding; its eigenvalues are those that
 `analyze` finds, and 0 for each force that nothing else remembers until the frame ends. Cut open and closed
 again by u = −y it is the closed loop.
@@ -30,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import lifted_groups, prepare
+from apc.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.frozen import dataclass
@@ -40,10 +41,10 @@ from apc.eigen.modes import dense_loop
 from apc.eigen.peer_group import PeerGroup, states_of
 from apc.exports.words import Port
 from apc.finite_equations import finite_equations
-from apc.frame.devices import Device, find_device
+from apc.frame.devices import Push, find_push
 from apc.frame.discretize import TOO_LARGE, discretize
 from apc.frame.exchange import Exchange
-from apc.frame.lift import FrameMap, check_packets, compose, named, step_durations
+from apc.frame.lift import MOST_PACKETS, FrameMap, check_packets, compose, named, step_durations
 from apc.frame.ports import with_holds, with_ports
 from apc.frame.radius import FLOATS, Arithmetic
 from apc.frame.schedule import Heard, Propagate, Schedule, Sent, Tick, Value, Way
@@ -127,28 +128,30 @@ class StateSpace(Result):
 class Numbers:
     """What a frame is made of in a kind of number.
 
-    `site` gives the matrices of some peers, `inverse` the 1/m of what is pushed, `steps` [F G] of each of
+    `site` gives the matrices of some peers, `inverses` the 1/m of what is pushed, `steps` [F G] of each of
     some durations in seconds, with so many inputs behind the holds, forces first.
     """
 
     site: Callable[[PeerGroup], LinearSite]
-    inverse: Callable[[PeerGroup, Device], Any]
-    steps: Callable[[PeerGroup, Sequence[Device], int, Sequence[Fraction]], list[Matrix]]
+    inverses: Callable[[PeerGroup, Push], Sequence[Any]]
+    steps: Callable[[PeerGroup, Sequence[Push], int, Sequence[Fraction]], list[Matrix]]
     arithmetic: Arithmetic
 
 
 def steps_in_floats(
-    group: PeerGroup, forces: Sequence[Device], count: int, durations: Sequence[Fraction]
+    group: PeerGroup, forces: Sequence[Push], count: int, durations: Sequence[Fraction]
 ) -> list[Matrix]:
     """Return [F G] of some durations in floats, of exact matrices: see `Numbers`."""
     columns = np.zeros((len(group.exact.a), count), dtype=object)
-    for place, device in enumerate(forces):
-        columns[device.velocity, place] = device.inverse
+    for place, push in enumerate(forces):
+        columns[list(push.velocities), place] = push.inverses
     found = discretize(group.exact.a, np.concatenate([group.exact.b, columns], axis=1), durations)
     return [step.matrix for step in found]
 
 
-IN_FLOATS = Numbers(lambda group: group.site, lambda group, one: float(one.inverse), steps_in_floats, FLOATS)
+IN_FLOATS = Numbers(
+    lambda group: group.site, lambda group, one: [*map(float, one.inverses)], steps_in_floats, FLOATS
+)
 
 
 def state_space(system: CompiledSystem, *, cut: str = "") -> StateSpace:
@@ -166,12 +169,26 @@ def state_space(system: CompiledSystem, *, cut: str = "") -> StateSpace:
     ApcError
         E950 nothing to cut at; E951 too many states; and those of `analysis.lifted_groups`.
     """
-    groups, exchange = lifted_groups(system)
-    (a, b, c, d), (states, inputs, outputs) = lifted(system, groups, exchange, cut, IN_FLOATS)
+    groups, exchange = peers_of(system)
+    (a, b, c, d), (states, inputs, outputs), unpushed = lifted(system, groups, exchange, cut, IN_FLOATS)
     if not all(np.isfinite(block).all() for block in (a, b, c, d)):
         raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
     frame_s, notes = about(system)
+    notes = (*notes, *unpushed)
     return StateSpace(system.name, cut, frame_s, a, b, c, d, states, inputs, outputs, notes, made_by(system))
+
+
+def peers_of(
+    system: CompiledSystem, *, prepared: Prepared | None = None
+) -> tuple[tuple[PeerGroup, ...], Exchange]:
+    """Return the peers of a system as `analysis.lifted_groups`, and what is too large as E951."""
+    try:
+        return lifted_groups(system, prepared=prepared)
+    except ApcError as error:
+        if any(one.code != "E804" for one in error.mistakes):
+            raise
+        what = error.mistakes[0].what
+        raise ApcError(Mistake("E951", Place(system.origin.topology), what, hint="fewer peers")) from None
 
 
 def about(system: CompiledSystem) -> tuple[float, tuple[str, ...]]:
@@ -195,8 +212,8 @@ def made_by(system: CompiledSystem) -> str:
 
 def lifted(
     system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, cut: str, numbers: Numbers
-) -> tuple[Blocks, tuple[Labels, Labels, Labels]]:
-    """Return A, B, C and D of a scene in a kind of number, and the names of its states, inputs and outputs.
+) -> tuple[Blocks, tuple[Labels, Labels, Labels], tuple[str, ...]]:
+    """Return A, B, C and D of a scene in a kind of number, the names of states, inputs, outputs, and notes.
 
     Parameters
     ----------
@@ -214,7 +231,11 @@ def lifted(
         loop = dense_loop([one.group for one in opened], exchange)
         of_schedule = {id(one.group.schedule): one for one in opened}
         sites = [of_schedule[id(site.schedule)] for site in loop.sites]
-        return _closed(loop, sites, _sent_units(system), link=link, cut=cut, arithmetic=numbers.arithmetic)
+        blocks, labels = _closed(
+            loop, sites, _sent_units(system), link=link, cut=cut, arithmetic=numbers.arithmetic
+        )
+    notes = () if cut else tuple(dict.fromkeys(note for one in opened for note in one.unpushed))
+    return blocks, labels, notes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,7 +244,8 @@ class _Opened:
 
     `states` and `signals` name entries of z and what is simulated, which are those at `places`; `drawn` are
     the entries of z that come in. `cuts` are the forces cut open, `computed` the entries of z that hold what
-    the ticks made of them, and the last of what is heard stands in their place.
+    the ticks made of them, and the last of what is heard stands in their place. `unpushed` says what no force
+    comes in at, and why.
     """
 
     group: PeerGroup
@@ -235,14 +257,15 @@ class _Opened:
     drawn: Places
     cuts: tuple[Port, ...]
     computed: tuple[int, ...]
+    unpushed: tuple[str, ...]
 
 
 def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) -> _Opened:
     """Let forces and noise into some peers, and cut the forces of a coupler open."""
     schedule = _remembering(group)
-    forces, noises = _masses(system, group), _measured(group.site)
+    (forces, unpushed), noises = _masses(system, group), _measured(group.site)
     plain = numbers.site(group)
-    wide = with_inputs(plain, forces, [numbers.inverse(group, one) for one in forces], noises)
+    wide = with_inputs(plain, forces, [numbers.inverses(group, one) for one in forces], noises)
     count = len(forces) + len(noises)
     nothing = np.zeros((0, sum(wide.b.shape)), dtype=wide.b.dtype)
     (site,), full, ports = with_ports([wide], schedule, count, [0], [nothing], [])
@@ -266,7 +289,7 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
         for one in local_signals(kind, group.schedule)
         if one.role != "hold"
     ]
-    inputs = [Port(f"force on {device.part}", "N") for device in forces]
+    inputs = [Port(f"force on {push.part}", "N") for push in forces]
     inputs += [Port(f"noise on {kind.states[place].name}", kind.states[place].unit) for place in noises]
     return _Opened(
         group=group.with_site(site, group.exact, full, own),
@@ -278,6 +301,7 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
         drawn=ports.drawn.ravel(),
         cuts=cuts,
         computed=computed,
+        unpushed=tuple(unpushed),
     )
 
 
@@ -312,19 +336,19 @@ def _instants(schedule: Schedule) -> dict[int, list[int]]:
     return found
 
 
-def _masses(system: CompiledSystem, group: PeerGroup) -> list[Device]:
-    """Return what of a peer has a mass, and so can be pushed, each axis of it by itself."""
+def _masses(system: CompiledSystem, group: PeerGroup) -> tuple[list[Push], list[str]]:
+    """Return what of a peer has a mass, and so can be pushed, each axis by itself; and why what can't."""
     unit_of = {one.name: one.unit for one in system.parameters}
-    found: dict[int, Device] = {}
-    for state in group.jacobians.kind.states:
-        if state.unit != "m":
-            continue
-        for part in (state.name.rpartition(".")[0], state.name):
-            one = find_device(group.jacobians, group.parameters, unit_of, group.listening, part=part)
-            if isinstance(one, Device):
-                found.setdefault(one.velocity, one)
-                break
-    return list(found.values())
+    found: dict[str, Push] = {}
+    refused: dict[str, None] = {}
+    for place, state in enumerate(group.jacobians.kind.states):
+        if state.unit == "m":
+            one = find_push(group.jacobians, group.parameters, unit_of, group.listening, place)
+            if isinstance(one, Push):
+                found.setdefault(one.part, one)
+            elif one is not None:
+                refused[f"no force of its own: {one}"] = None
+    return list(found.values()), list(refused)
 
 
 def _measured(site: LinearSite) -> list[int]:
@@ -336,7 +360,7 @@ def _measured(site: LinearSite) -> list[int]:
 
 
 def with_inputs(
-    site: LinearSite, forces: Sequence[Device], inverses: Sequence[Any], noises: Sequence[int]
+    site: LinearSite, forces: Sequence[Push], inverses: Sequence[Sequence[Any]], noises: Sequence[int]
 ) -> LinearSite:
     """Return a site with a hold for each force and for each noise, which is added to what is sampled.
 
@@ -345,13 +369,14 @@ def with_inputs(
     site
         In any kind of number.
     forces, inverses
-        What is pushed, and the 1/m of each.
+        What is pushed, and what that does to each of its velocities.
     noises
         The states whose samples are noisy.
     """
     columns = np.zeros((len(site.a), len(forces) + len(noises)), dtype=site.b.dtype)
-    for place, (device, inverse) in enumerate(zip(forces, inverses, strict=True)):
-        columns[device.velocity, place] = inverse
+    for place, (push, listed) in enumerate(zip(forces, inverses, strict=True)):
+        for velocity, inverse in zip(push.velocities, listed, strict=True):
+            columns[velocity, place] = inverse
     wide = with_holds(site, columns)
     if noises:
         matrices = [*((tick.u, tick.x) for tick in wide.ticks), *((send.u, send.x) for send in wide.sends)]
@@ -368,7 +393,8 @@ def _link_of(system: CompiledSystem, cut: str) -> str:
         return cut
     if cut and cut not in parts:
         known = [*links, *sorted(parts)]
-        what = f"{cut[:80]} is no link or coupler of {system.name} ({', '.join(known) or 'it has none'})"
+        listed = ", ".join(known) or "it has none"
+        what = f"{cut[:80]} is no link or coupler with ticks of {system.name} ({listed})"
         near = nearest(cut, known) or (known[0] if known else "")
         raise ApcError(Mistake("E950", Place("--cut"), what, hint=f"--cut {near}" if near else ""))
     return ""
@@ -396,6 +422,9 @@ def _cut_open(
         tick, count = ticks[partition], schedule.ticks[partition]
         if not count:
             continue
+        if heard + count > MOST_PACKETS:
+            what = f"{count:,} ticks a frame, each an input where it is cut, and {MOST_PACKETS} are the most"
+            raise ApcError(Mistake("E951", Place("--cut"), what, hint="--cut LINK"))
         outputs = len(tick.x)
         blocks = [np.vstack([block, block[output]]) for block in (tick.x, tick.u, tick.m, tick.r)]
         for block in blocks:

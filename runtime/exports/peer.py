@@ -194,9 +194,6 @@ def peer_of(plan: Plan, number: int, method: Method, *, device: str | None = NO_
     ]
     instants, lengths = _instants(schedule)
     lines, channels = lines_of(plan, number)
-    if (heard := sum(len(one.senders) for one in lines)) > MOST_HEARD:
-        what = f"{name} hears {heard:,} peers; {MOST_HEARD:,} fit a text of C"
-        raise refused(system, what, "fewer peers, or a graph that is not complete")
     x, _, memories = start_values(site, [float(one) for one in vector])
     return Peer(
         system=system,
@@ -501,6 +498,11 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], tuple[tuple[tup
         used = [i for i, name in enumerate(known.channels) if i in hears or name in sent[link]]
         channels = tuple(known.channels[i] for i in used)
         senders = [*_heard(system, exchange, link, number)] if hears else []
+        if len(senders) > MOST_HEARD:
+            what = (
+                f"{exchange.peer_name(number)} hears {len(senders):,} peers over {link}; {MOST_HEARD:,} fit"
+            )
+            raise refused(system, f"{what} a text of C", "fewer peers, or a graph that is not complete")
         law = exchange.links[link].channel
         found.append(
             Line(

@@ -18,7 +18,7 @@ from fractions import Fraction
 from apc.compiler.frozen import dataclass
 from apc.exports.c_text import CLOSE, OPEN, CPeer, c_peer, identifier, in_order, number
 from apc.exports.chance_text import Chance, chance_begin, chance_of, chance_source, chance_types
-from apc.exports.peer import Line, first_packet, group_of, lines_of, peer_of, refused, sites_of
+from apc.exports.peer import MOST_HEARD, Line, first_packet, group_of, lines_of, peer_of, refused, sites_of
 from apc.simulation.machine import luck_text
 from apc.simulation.settings import Method
 from apc.simulation.signals import LocalSignal
@@ -116,7 +116,8 @@ def c_scene(plan: Plan, method: Method) -> CScene:
     total = exchange.peers * (exchange.peers - 1) if any(map(exchange.is_complete, exchange.links)) else 0
     if max(total, exchange.peers) > MOST_WAYS:
         what = f"{exchange.peers:,} peers hear each other on {total:,} ways; {MOST_WAYS:,} fit a text of C"
-        raise refused(system, what, f'--peer "{exchange.peer_name(0)}"')
+        alone = f'--peer "{exchange.peer_name(0)}"' if exchange.peers <= MOST_HEARD else "fewer peers"
+        raise refused(system, what, alone)
     names = in_order(exchange.peer_name(one) for one in sites)
     codes = tuple(c_peer(peer_of(plan, one, method), name) for one, name in zip(sites, names, strict=True))
     places = [0] * len(sites)

@@ -1,14 +1,16 @@
 """What a hand holds: a peer's device, found in its equations, and the peer with a hand on it.
 
 Takes: a kind's Jacobians and exact numbers; a `CompiledSystem`.
-Gives: `Device`, `find_device`, `devices_of`; `HANDS`, `with_hands`, `clamped`, `held`; `refuse_hands`;
-`published`; `OWN_MASS`.
+Gives: `Device`, `find_device`, `devices_of`; `Push`, `find_push`; `HANDS`, `with_hands`, `clamped`, `held`;
+`refuse_hands`; `published`; `OWN_MASS`.
 Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
 Does not: ask whether it is stable (see `passivity` for hands of every kind).
 
 A device is what a peer moves and does not tell others about: what it tells them of is a copy of what all
 hold. With m v' = f + …, a slope of v' over anything at all is J = j/m, so 1/m = −(∂J/∂m)/J: what a force at
 that place does, whatever is rigidly connected with it. A copy of a shared mass is one of n: there J = n j/m.
+With M v' = f of several that move with one another, a mass of place i adds to M there: ∂J/∂m = −M⁻¹ eᵢ Jᵢ,
+whose columns say what a force at i does to all of them, M⁻¹ eᵢ.
 """
 
 from __future__ import annotations
@@ -133,6 +135,77 @@ def find_device(
         return f"a hand may hold any of {', '.join(found)} ({kind.name})"
     (one,) = found.values()
     return f"{one} ({kind.name})" if isinstance(one, str) else one
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Push:
+    """What a force at a part, or along an axis of it, does: so much to the rate of each of some velocities.
+
+    `inverses` are exact, per newton, for the numbers it was found with; `symbolic` gives them for any, as a
+    CasADi function (x, u, p, t).
+    """
+
+    part: str
+    velocities: tuple[int, ...]
+    inverses: tuple[Fraction, ...]
+    symbolic: Any  # casadi.Function
+
+
+def find_push(
+    site: SiteJacobians,
+    parameters: NDArray[np.float64],
+    unit_of: Mapping[str, str],
+    listening: Listening | None,
+    position: int,
+) -> Push | str | None:
+    """Return what a force along a position of a peer does, None where nothing has a mass, or why not.
+
+    Parameters
+    ----------
+    site, parameters, unit_of, listening
+        As for `find_device`.
+    position
+        Its place among the states.
+    """
+    kind, name = site.kind, site.kind.states[position].name
+    why = None
+    for part in (_part(name), name):
+        found = find_device(site, parameters, unit_of, listening, part=part)
+        if isinstance(found, Device):
+            return Push(found.part, (found.velocity,), (found.inverse,), found.symbolic)
+        why = found
+    driven = np.flatnonzero(site.pattern.a[position])
+    masses = [
+        place
+        for place, one in enumerate(kind.parameters)
+        if unit_of.get(one) == "kg" and _part(one) == _part(name)
+    ]
+    if why is None or len(driven) != 1 or len(masses) != 1 or not site.walkable:
+        return why
+    velocity, mass = int(driven[0]), masses[0]
+    x, u, _, _, p, t = start_arguments(site, exact_numbers(kind, parameters), Fraction, listening)
+    peers = kind.parameters.index(PEERS) if PEERS in kind.parameters else None
+    over = (mass,) if peers is None else (mass, peers)
+    slopes, change, *by_peers = evaluate_exact(_slopes(kind, velocity, over), [x, u, p, t])
+    at = next((k for k, (slope, by) in enumerate(zip(slopes, change, strict=True)) if slope and by), None)
+    if at is None:
+        return why
+    shared = None if peers is None or p[peers] * by_peers[0][at] != slopes[at] else peers
+    symbolic, moved = _column(kind, velocity, mass, at, shared)
+    (inverses,) = evaluate_exact(symbolic, [x, u, p, t])
+    return Push(_part(name), moved, tuple(inverses), symbolic)
+
+
+@functools.lru_cache(maxsize=64)
+def _column(kind: Kind, velocity: int, mass: int, at: int, peers: int | None) -> tuple[Any, tuple[int, ...]]:
+    """Return what a force at a velocity does to others' rates, from how slopes change with its mass."""
+    x, u, p, t = kind.derivative.sx_in()
+    rates = casadi.jacobian(kind.derivative(x, u, p, t), casadi.vertcat(x, u))[:, at]
+    changes = casadi.jacobian(rates, p[mass])
+    moved = tuple(changes.sparsity().row())
+    copies = 1 if peers is None else p[peers]
+    column = [-copies * changes[row] / rates[velocity] for row in moved]
+    return casadi.Function("push", [x, u, p, t], [casadi.vertcat(*column)]), moved
 
 
 def _part(name: str) -> str:

@@ -1,6 +1,8 @@
 """What an export is, in words and as plain data.
 
-Takes: what `exports` makes. Gives: `state_space_text`, `state_space_document`.
+Takes: what `exports` makes.
+Gives: `state_space_text`, `state_space_document`, `state_space_control`; `modelica_text`,
+`modelica_document`.
 Guarantees: at most 80 columns.
 Does not: write files.
 """
@@ -14,6 +16,7 @@ from typing import Any
 from apc.compiler.words import counted, wrapped
 from apc.exports.files import as_control
 from apc.exports.lifted import StateSpace
+from apc.exports.modelica import ModelicaModel
 from apc.exports.words import Port
 from apc.present.forms import document, note
 
@@ -46,3 +49,16 @@ def state_space_document(found: StateSpace) -> dict[str, Any]:
     function = found.function and found.function.serialize()
     plain: dict[str, Any] = document(found, {"made_by": json.loads(found.made_by), "function": function})
     return {**plain, "meaning": found.meaning}
+
+
+def modelica_text(found: ModelicaModel) -> str:
+    """Return what a Modelica model has."""
+    has = f"{counted(found.peers, 'peer')}, {counted(found.variables, 'variable')}, one equation each"
+    lines = [f"{found.topology}: the model {found.name} of Modelica 3.3", "", f"  {has}"]
+    return "\n".join([*lines, *(f"  {clock}" for clock in found.clocks)])
+
+
+def modelica_document(found: ModelicaModel) -> dict[str, Any]:
+    """Return a Modelica model as plain data."""
+    plain: dict[str, Any] = document(found)
+    return plain
