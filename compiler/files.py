@@ -1,8 +1,8 @@
 """What is read from disk and written to it, whoever named the file.
 
 Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `same_file`;
-`write_file`, `write_text`, `check_target`, `unwritable`, `is_special`, `is_stdout`, and for what is written
-piece by piece `begin_file`, `finish_file`, `drop_file`, `partial_name`.
+`write_file`, `write_text`, `write_texts`, `check_target`, `unwritable`, `is_special`, `is_stdout`, and for
+what is written piece by piece `begin_file`, `finish_file`, `drop_file`, `partial_name`.
 Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
 waited for. What is written is there whole or not at all: a file is replaced by one of its mode and owner, a
 link stays and its file is written; a device or pipe, or what standard output writes to, is written to, never
@@ -16,7 +16,7 @@ import os
 import shutil
 import stat
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -199,6 +199,26 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_bytes(f"{text}\n".encode())
 
     write_file(path, write)
+
+
+def write_texts(texts: Mapping[Path, str]) -> None:
+    """Write texts that belong together, all or none. Raises ApcError (E601) if one can't be written."""
+    ready: dict[Path, Path] = {}
+    try:
+        for path, text in texts.items():
+            try:
+                ready[path] = begin_file(path)
+                ready[path].write_bytes(text.encode())
+            except (OSError, ValueError) as error:
+                raise unwritable(path, error) from error
+        for path, temporary in ready.items():
+            try:
+                finish_file(temporary, path)
+            except (OSError, ValueError) as error:
+                raise unwritable(path, error) from error
+    finally:
+        for temporary in ready.values():
+            drop_file(temporary)
 
 
 def check_target(path: Path) -> None:

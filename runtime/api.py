@@ -688,6 +688,9 @@ def export(
     set: Mapping[str, str] | None = None,
     cut: str = "",
     free: Sequence[str] = (),
+    peer: str = "",
+    device: str = "",
+    method: str = "",
 ) -> Result:
     """Hand a scene over to other tools.
 
@@ -696,14 +699,22 @@ def export(
     model, set
         As for `analyze`.
     to
-        "control", "mat" or "npz": a state space; "modelica": a model. The suffix of `out`
-        says it if not given.
+        "control", "mat" or "npz": a state space; "modelica": a model; "c": one peer in C99; "fmu": a scene
+        or a peer for co-simulation. The suffix of `out` says it if not given.
     out
         The file to write; nothing is written if not given.
     cut
         The link or coupler to cut the loop open at.
     free
         Parameters that stay free: `.function` is a `casadi.Function` of them that gives A, B, C and D.
+    peer
+        Of "c" and "fmu": the peer, such as "left[1]". An FMU is of all peers if not given.
+    device
+        Of "c": the masses that move outside the peer's computer, "none" if none does; those that a hand holds
+        or that others are not told of if not given.
+    method
+        Of "c" and "fmu": how states move between ticks, as for `simulate`; such as "rk4:0.1 ms" where they
+        are not linear.
 
     Returns
     -------
@@ -722,7 +733,8 @@ def export(
     chosen = handing.format_of(to, path, option="=")
     system = _model(model, set)
     _check_out(model, system, path)
-    return handing.export(system, chosen, handing.Asked(cut, tuple(free)), path)
+    asked = handing.Asked(cut, tuple(free), peer, device, method)
+    return handing.export(system, chosen, asked, path)
 
 
 def show(path: str | Path, *, format: Format = "text") -> str:

@@ -115,13 +115,16 @@ HOUSE = (
         panels
         """,
     ),
-    ("apc.exports", "words lifted free files expressions modelica export"),
+    (
+        "apc.exports",
+        "words lifted free files expressions modelica peer c_text chance_text scene_text fmu code export",
+    ),
     ("apc.benchmark", "timing truth bench hard scale"),
     (
         "apc.present",
         """
-        forms pictures exports network recorded_network loop hands analysis vary comparison_picture comparison
-        region_picture region planar simulation still recording bench
+        forms pictures exports code network recorded_network loop hands analysis vary comparison_picture
+        comparison region_picture region planar simulation still recording bench
         """,
     ),
     # what a person calls

@@ -193,13 +193,17 @@ E952 runtime/exports: a format to export to is not known
 E953 runtime/exports: an option means nothing to the format
 E954 runtime/exports: a number can't be left free
 E955 runtime/exports: Modelica has no words for what a scene says
-E960 runtime/loop: there is no such peer
-E961 runtime/loop runtime/cli: a peer has no address, or it is none
-E962 runtime/loop: nobody told a peer when its scene begins
-E963 runtime/loop runtime/cli: a folder is no run, or can't be one
-E964 runtime/loop runtime/cli: a peer can't listen there, or its secret is none
-E965 runtime/loop: a scene has more peers than processes, or one of these was lost
-E966 runtime/loop: a device outside has no function, or that is at fault
+E960 runtime/exports: what a peer or a scene does is not written as C
+E961 runtime/exports: what of a peer is its device can't be said, or can't be told apart from a copy
+E962 runtime/exports: there is no C compiler, or it doesn't take a text
+E963 runtime/exports: a peer is to be named, or the name is none
+E970 runtime/loop: there is no such peer
+E971 runtime/loop runtime/cli: a peer has no address, or it is none
+E972 runtime/loop: nobody told a peer when its scene begins
+E973 runtime/loop runtime/cli: a folder is no run, or can't be one
+E974 runtime/loop runtime/cli: a peer can't listen there, or its secret is none
+E975 runtime/loop: a scene has more peers than processes, or one of these was lost
+E976 runtime/loop: a device outside has no function, or that is at fault
 """
 
 

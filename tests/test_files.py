@@ -14,6 +14,7 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler import files
+from apc.compiler.errors import ApcError
 from apc.compiler.files import (
     RefusedError,
     begin_file,
@@ -21,6 +22,7 @@ from apc.compiler.files import (
     finish_file,
     read_file,
     write_file,
+    write_texts,
 )
 from tests.topologies import AVERAGE, replaced, told
 
@@ -435,3 +437,12 @@ def test_a_scene_whose_name_is_no_text_is_simulated(tmp_path: Path, monkeypatch:
     name = os.fsdecode(b"b\xff.yaml")
     Path(name).write_text(AVERAGE, encoding="utf-8")
     assert run(["simulate", name, "--duration", "20 ms", "--no-jit", "--out", f"{name}.csv"]) == 0
+
+
+def test_texts_that_belong_together_are_written_all_or_none(tmp_path: Path) -> None:
+    (tmp_path / "b.h").mkdir()
+    with pytest.raises(ApcError, match="E601"):
+        write_texts({tmp_path / "a.c": "one", tmp_path / "b.h": "two"})
+    assert [one.name for one in tmp_path.iterdir()] == ["b.h"]
+    write_texts({tmp_path / "a.c": "one", tmp_path / "b.c": "two"})
+    assert ((tmp_path / "a.c").read_text(), (tmp_path / "b.c").read_text()) == ("one", "two")

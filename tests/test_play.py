@@ -270,7 +270,7 @@ def test_a_device_may_be_in_c(tmp_path: Path) -> None:
     device = device_function(tmp_path / "d.so")
     assert device(1.5, None) == 3.0
     assert device(1.5, 0.25) == -0.25
-    with pytest.raises(ApcError, match="E966"):
+    with pytest.raises(ApcError, match="E976"):
         device_function(tmp_path / "d.txt")
 
 
@@ -295,7 +295,7 @@ def test_all_peers_of_a_scene_on_this_machine(
     assert "packets were held back and lost at the sender" in capsys.readouterr().out
     (run_folder / "user-1.npz").write_bytes(b"PK")
     assert run(["compare", str(run_folder)]) == 1
-    assert "E963" in capsys.readouterr().err
+    assert "E973" in capsys.readouterr().err
 
 
 def test_what_cant_be_played_is_told(
@@ -311,16 +311,16 @@ def test_what_cant_be_played_is_told(
     Path("own/thesis.txt").write_text("mine", encoding="utf-8")
     Path("short.txt").write_text("abc", encoding="utf-8")
     listed = [
-        (["--peer", "user[4]", *other], "E960 a peer wants one of user[1], user[2], user[3], got user[4]."),
+        (["--peer", "user[4]", *other], "E970 a peer wants one of user[1], user[2], user[3], got user[4]."),
         (["--peer", "user[1]", "--to", "user[2]=127.0.0.1:1"], 'Write: --to "user[3]=HOST:PORT"'),
-        (["--peer", "user[1]", "--listen", "nowhere", *other], "E961 an address wants HOST:PORT"),
-        (["--peer", "user[1]", "--to", "user[2]"], "E961 an address wants PEER=HOST:PORT"),
+        (["--peer", "user[1]", "--listen", "nowhere", *other], "E971 an address wants HOST:PORT"),
+        (["--peer", "user[1]", "--to", "user[2]"], "E971 an address wants PEER=HOST:PORT"),
         (["--peer", "user[1]", "--listen", f"127.0.0.1:{port}", *other], f"can't listen at 127.0.0.1:{port}"),
         (["--peer", "user[1]", *other, "--wait", "100 ms"], "user[2], user[3] did not say within 0.1 s"),
-        (["--peer", "user[1]", *other, "--device", "no.py"], "E966"),
-        (["--out", "own"], "E963 is there already, and is no folder of a run"),
-        (["--secret-file", "short.txt"], "E964 a secret wants 16 bytes or more, got 3."),
-        (["--secret-file", "none.txt"], "E964"),
+        (["--peer", "user[1]", *other, "--device", "no.py"], "E976"),
+        (["--out", "own"], "E973 is there already, and is no folder of a run"),
+        (["--secret-file", "short.txt"], "E974 a secret wants 16 bytes or more, got 3."),
+        (["--secret-file", "none.txt"], "E974"),
     ]  # fmt: skip
     for words, message in listed:
         assert run(["play", "three.yaml", "--duration", "1 s", *words]) == 1, words
@@ -328,11 +328,11 @@ def test_what_cant_be_played_is_told(
     assert Path("own/thesis.txt").read_text(encoding="utf-8") == "mine"
     Path("empty").mkdir()
     assert run(["compare", "empty"]) == 1
-    assert "E963" in capsys.readouterr().err
+    assert "E973" in capsys.readouterr().err
     alone = replaced(MOVING, ("{count: 3,", "{count: 65,"))
     Path("many.yaml").write_text(alone, encoding="utf-8")
     assert run(["play", "many.yaml", "--duration", "1 s"]) == 1
-    assert "E965 65 peers would be as many processes: at most 64" in capsys.readouterr().err
+    assert "E975 65 peers would be as many processes: at most 64" in capsys.readouterr().err
     taken.close()
 
 

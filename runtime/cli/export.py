@@ -32,7 +32,8 @@ from apc.threads import start_single_threaded
     "--to",
     metavar="FORMAT",
     help="control: a script that makes a python-control StateSpace (.py); mat, npz: the same matrices for "
-    "MATLAB, SciPy, NumPy; modelica: a flat model with clocks (.mo). Taken from --out if not given.",
+    "MATLAB, SciPy, NumPy; modelica: a flat model with clocks (.mo); c: one tick of a peer in C99, with "
+    "header and driver; fmu: the scene or a peer for co-simulation (FMI 2.0). Taken from --out if not given.",
 )
 @set_option
 @click.option(
@@ -49,6 +50,22 @@ from apc.threads import start_single_threaded
     help="Leave a number free: A, B, C and D are a casadi.Function of it too, `casadi_function` in the "
     "file. May be repeated.",
 )
+@click.option(
+    "--peer", default="", metavar="NAME", help="For c and fmu: one peer, such as 'left[1]'. An FMU is of all."
+)
+@click.option(
+    "--device",
+    default="",
+    metavar="MASS",
+    help="For c: what the peer's computer doesn't move, several with commas between, or none. What a hand "
+    "holds, or others are not told of, if not given.",
+)
+@click.option(
+    "--method",
+    default="",
+    metavar="METHOD",
+    help="For c and fmu: how states move between ticks, as for simulate; rk4:STEP where they are not linear.",
+)
 @file_option("--out", "The file to write.", required=True)
 @json_option
 def export_command(
@@ -57,6 +74,9 @@ def export_command(
     settings: tuple[str, ...],
     cut: str,
     free: tuple[str, ...],
+    peer: str,
+    device: str,
+    method: str,
     out: Path,
     as_json: bool,
 ) -> None:
@@ -65,13 +85,16 @@ def export_command(
     FILE is a topology or a compiled model. As a state space it is the whole
     loop over one frame, all peers in it: from a force on every mass and noise
     on every measurement to every position, velocity and force. As a Modelica
-    model it is every equation, tick and packet.
+    model it is every equation, tick and packet; as C or an FMU a peer as it
+    computes, or all of them with the packets between.
 
     \b
         apc export --out loop.mat
         apc export --out scene.mo
         apc export --to control --cut lan --out open_loop.py
         apc export --free coordination.stiffness --out family.npz
+        apc export --peer "left[1]" --out left.c
+        apc export --out scene.fmu
     """
     start_single_threaded()
     from apc.exports.export import Asked, export, format_of
@@ -79,7 +102,7 @@ def export_command(
 
     chosen = format_of(to, out)
     system = open_scene(file, settings, {"--out": out}, told=note_aside)
-    found = export(system, chosen, Asked(cut, free), out)
+    found = export(system, chosen, Asked(cut, free, peer, device, method), out)
     print_result(found, as_json=as_json, err=beside(out))
     if not as_json:
         tell(f"\n{out} is written", err=beside(out))

@@ -142,7 +142,7 @@ def _clear(folder: Path) -> None:
         return
     if not folder.is_dir() or (any(folder.iterdir()) and not (folder / SCENE).is_file()):
         what = "is there already, and is no folder of a run"
-        raise ApcError(Mistake("E963", Place(str(folder)), what, hint="--out another.run"))
+        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="--out another.run"))
     for path in (*folder.glob("*.npz"), *folder.glob("*-to-*.csv")):
         path.unlink()
 
@@ -155,11 +155,11 @@ def _secret(path: Path | None) -> bytes:
     try:
         secret = read_file(path, 1 << 16).strip()
     except RefusedError as refused:
-        raise ApcError(Mistake("E964", Place("--secret-file"), f"{path} {refused.words}")) from None
+        raise ApcError(Mistake("E974", Place("--secret-file"), f"{path} {refused.words}")) from None
     if len(secret) < SHORTEST:
         hint = f"head -c 32 /dev/urandom | base64 > {path}"
         expected, got = f"{SHORTEST} bytes or more", str(len(secret))
-        raise ApcError(Mistake("E964", Place("--secret-file"), "a secret", expected, got, hint))
+        raise ApcError(Mistake("E974", Place("--secret-file"), "a secret", expected, got, hint))
     return secret
 
 
@@ -175,7 +175,7 @@ def _addresses(listen: str | None, to: tuple[str, ...], *, has_secret: bool):  #
         name, equals, address = text.partition("=")
         if not equals:
             expected, hint = "PEER=HOST:PORT", '--to "right[1]=192.0.2.7:5000"'
-            raise ApcError(Mistake("E961", Place("--to"), "an address", expected, text[:80], hint))
+            raise ApcError(Mistake("E971", Place("--to"), "an address", expected, text[:80], hint))
         others[name.strip()] = address_of(address.strip(), "--to")
     own = address_of(listen, "--listen") if listen else (LOOPBACK, 0)
     socket = listen_at(own)

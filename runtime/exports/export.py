@@ -25,10 +25,16 @@ from apc.suffixes import check_suffix
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What is asked of an export, each "" or () where it is not: where to `cut` the loop, `free` numbers."""
+    """What is asked of an export, each "" or () where it is not: where to `cut` the loop, `free` numbers.
+
+    `peer` is one alone, `device` what its computer doesn't move, `method` how it moves the others.
+    """
 
     cut: str = ""
     free: tuple[str, ...] = ()
+    peer: str = ""
+    device: str = ""
+    method: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,11 +89,44 @@ def _mo(path: Path, found: Any) -> None:
     write_modelica(path, found)
 
 
+def _code(system: CompiledSystem, asked: Asked) -> Result:
+    from apc.exports.code import peer_code
+
+    return peer_code(system, peer=asked.peer, device=asked.device, method=asked.method)
+
+
+def _unit(system: CompiledSystem, asked: Asked) -> Result:
+    from apc.exports.code import scene_unit
+
+    return scene_unit(system, peer=asked.peer, method=asked.method)
+
+
+def _texts(path: Path, found: Any) -> None:
+    from apc.exports.code import write_code
+
+    write_code(path, found)
+
+
+def _fmu(path: Path, found: Any) -> None:
+    from apc.exports.fmu import write_fmu
+
+    write_fmu(path, found)
+
+
 FORMATS = (
     Format("control", ".py", "a script that makes a control.StateSpace", ("cut",), _state_space, _script),
     Format("mat", ".mat", "a state space for MATLAB and SciPy", ("cut", "free"), _state_space, _mat),
     Format("npz", ".npz", "a state space for NumPy", ("cut", "free"), _state_space, _npz),
     Format("modelica", ".mo", "a flat model of Modelica 3.3 with clocks", (), _modelica, _mo),
+    Format(
+        "c",
+        ".c",
+        "one tick of a peer in C99, a header and a driver",
+        ("peer", "device", "method"),
+        _code,
+        _texts,
+    ),
+    Format("fmu", ".fmu", "a scene or a peer for co-simulation", ("peer", "method"), _unit, _fmu),
 )
 
 

@@ -37,19 +37,19 @@ DeviceFunction = Callable[[float, float | None], float]
 
 
 def device_function(path: Path) -> DeviceFunction:
-    """Return the function of a file. Raises ApcError E966 if there is none."""
+    """Return the function of a file. Raises ApcError E976 if there is none."""
     name = NAMES.get(path.suffix)
     hint = "--device device.py"
     if name is None:
         expected, got = f"one of {', '.join(NAMES)}", path.suffix or "none"
-        raise ApcError(Mistake("E966", Place(str(path)), "the suffix of --device", expected, got, hint))
+        raise ApcError(Mistake("E976", Place(str(path)), "the suffix of --device", expected, got, hint))
     try:
         if path.suffix == ".py":
             return runpy.run_path(str(path))[name]  # type: ignore[no-any-return] # what a user wrote
         function = ctypes.CDLL(str(path.resolve()))[name]
     except Exception as error:  # whatever the user's own code raises
         what = f"has no function {name}(time, force) that can be loaded: {type(error).__name__}: {error}"
-        raise ApcError(Mistake("E966", Place(str(path)), what, hint=hint)) from None
+        raise ApcError(Mistake("E976", Place(str(path)), what, hint=hint)) from None
     function.restype, function.argtypes = ctypes.c_double, [ctypes.c_double, ctypes.POINTER(ctypes.c_double)]
     return lambda time, force: float(
         function(time, None if force is None else ctypes.byref(ctypes.c_double(force)))
@@ -79,7 +79,7 @@ class Outside:
         found = self._asked(time, None)
         if not (isinstance(found, int | float | np.floating) and math.isfinite(found)):
             what = f"gave {found!r:.40} as its position at {time:.6g} s"
-            raise ApcError(Mistake("E966", Place("--device"), what, hint="return a finite number, in m"))
+            raise ApcError(Mistake("E976", Place("--device"), what, hint="return a finite number, in m"))
         position = float(found)
         if self.before is not None and time > self.before[0]:
             carry[self.device.velocity] = (position - self.before[1]) / (time - self.before[0])
@@ -100,4 +100,4 @@ class Outside:
             return self.exchange(time, force)
         except Exception as error:  # whatever the user's own code raises
             what = f"raised {type(error).__name__} at {time:.6g} s: {error}"
-            raise ApcError(Mistake("E966", Place("--device"), what)) from None
+            raise ApcError(Mistake("E976", Place("--device"), what)) from None

@@ -130,7 +130,7 @@ class Loop:
         Raises
         ------
         ApcError
-            E960 there is no such peer, E961 one that it sends to or hears has no address; those of `prepare`.
+            E970 there is no such peer, E971 one that it sends to or hears has no address; those of `prepare`.
         """
         self.system, self.name = system, peer
         self.exchange = build_exchange(system, resolve(system).timings)
@@ -162,17 +162,17 @@ class Loop:
         needed = {one for pair in pairs if self.own in pair for one in pair} - {self.own}
         if not needed:
             what = f"{self.name} sends nothing over a link and hears nothing: there is nobody to play with"
-            raise ApcError(Mistake("E961", Place(self.system.name), what, hint="apc simulate"))
+            raise ApcError(Mistake("E971", Place(self.system.name), what, hint="apc simulate"))
         missing = [self.exchange.peer_name(one) for one in sorted(needed - set(self.others))]
         if missing:
             hint = " ".join(f'--to "{one}=HOST:PORT"' for one in missing[:4])
             what = f"{self.name} sends to or hears {', '.join(missing[:4])}, which have no address"
-            raise ApcError(Mistake("E961", Place("--to"), what, hint=hint))
+            raise ApcError(Mistake("E971", Place("--to"), what, hint=hint))
 
     # ---- meeting
 
     def meet(self, patience: float) -> None:
-        """Find out when the scene begins. Raises ApcError E962 if nobody tells within so many seconds."""
+        """Find out when the scene begins. Raises ApcError E972 if nobody tells within so many seconds."""
         end, leads = now() + int(patience * NANO), self.own < min(self.others)
         self.player.warm_up()
         while not self.begins:
@@ -193,7 +193,7 @@ class Loop:
         told = "; ".join(f"{count} datagrams were dropped: {why}" for why, count in self.post.dropped.items())
         what = f"{names} did not say within {patience:g} s when the scene begins" + (told and f" ({told})")
         hint = "the same FILE, --set and --secret-file at every peer, started within --wait of each other"
-        return ApcError(Mistake("E962", Place(self.name), what, hint=hint))
+        return ApcError(Mistake("E972", Place(self.name), what, hint=hint))
 
     # ---- running
 
@@ -473,7 +473,7 @@ class _Emulated:
 
 
 def number_of(exchange: Exchange, name: str) -> int:
-    """Return the number of a peer called `left[1]`. Raises ApcError E960 if there is none."""
+    """Return the number of a peer called `left[1]`. Raises ApcError E970 if there is none."""
     found = PEER.match(name)
     group = exchange.groups.index(found["group"]) if found and found["group"] in exchange.groups else -1
     place = int(found["place"]) if found else 0
@@ -482,5 +482,5 @@ def number_of(exchange: Exchange, name: str) -> int:
     names = [exchange.peer_name(one) for one in range(min(exchange.peers, 4))]
     expected = f"one of {', '.join(names)}{', …' if exchange.peers > len(names) else ''}"
     raise ApcError(
-        Mistake("E960", Place(exchange.scene), "a peer", expected, cut(name) or "nothing", names[0])
+        Mistake("E970", Place(exchange.scene), "a peer", expected, cut(name) or "nothing", names[0])
     )

@@ -187,16 +187,16 @@ def trace_name(system: CompiledSystem, link: int, sender: int, receiver: int) ->
 
 
 def read_run(folder: Path) -> Run:
-    """Read a run. Raises ApcError E963 if a folder is none, damaged, or of several scenes."""
+    """Read a run. Raises ApcError E973 if a folder is none, damaged, or of several scenes."""
     files = sorted(folder.glob("*.npz"))
     if not (folder / SCENE).is_file() or not files:
         what = f"holds no run: {SCENE} and a file a peer, as apc play writes them"
-        raise ApcError(Mistake("E963", Place(str(folder)), what, hint="apc play FILE --out RUN"))
+        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out RUN"))
     system = store.load(folder / SCENE)
     peers = tuple(sorted((_read_peer(path) for path in files), key=lambda one: one.number))
     if len({one.digest for one in peers}) > 1:
         what = "holds peers of different scenes, or with different --set"
-        raise ApcError(Mistake("E963", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
+        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
     return Run(str(folder), system, peers)
 
 
@@ -218,4 +218,4 @@ def _read_peer(path: Path) -> PeerRun:
                 offsets={one: (trip, ahead) for one, trip, ahead in told["offsets"]},
             )
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise ApcError(Mistake("E963", Place(str(path)), f"is no peer of a run: {error}")) from None
+        raise ApcError(Mistake("E973", Place(str(path)), f"is no peer of a run: {error}")) from None

@@ -47,27 +47,27 @@ class Play:
 
 
 def address_of(text: str, option: str) -> Address:
-    """Read HOST:PORT. Raises ApcError E961 if it is none, or no such host is known."""
+    """Read HOST:PORT. Raises ApcError E971 if it is none, or no such host is known."""
     host, colon, port = text.rpartition(":")
     expected, hint = "HOST:PORT, the port from 0 to 65535", f'{option} "192.0.2.7:5000"'
     if not (colon and host and port.isascii() and port.isdecimal() and int(port) < 1 << 16):
-        raise ApcError(Mistake("E961", Place(option), "an address", expected, text[:80] or "nothing", hint))
+        raise ApcError(Mistake("E971", Place(option), "an address", expected, text[:80] or "nothing", hint))
     try:
         return socket.getaddrinfo(host, int(port), socket.AF_INET, socket.SOCK_DGRAM)[0][4][:2]  # type: ignore[return-value]
     except OSError as error:
         what = f"the host {host[:80]} is not known: {error.strerror or error}"
-        raise ApcError(Mistake("E961", Place(option), what, hint=hint)) from None
+        raise ApcError(Mistake("E971", Place(option), what, hint=hint)) from None
 
 
 def listen_at(address: Address) -> socket.socket:
-    """Return a socket that listens at an address. Raises ApcError E964 if it is taken or not this host's."""
+    """Return a socket that listens at an address. Raises ApcError E974 if it is taken or not this host's."""
     listening = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         listening.bind(address)
     except OSError as error:
         listening.close()
         what = f"can't listen at {address[0]}:{address[1]}: {error.strerror or error}"
-        raise ApcError(Mistake("E964", Place("--listen"), what, hint=f'--listen "{LOOPBACK}:0"')) from None
+        raise ApcError(Mistake("E974", Place("--listen"), what, hint=f'--listen "{LOOPBACK}:0"')) from None
     return listening
 
 
@@ -125,17 +125,17 @@ def play_all(system: CompiledSystem, how: Play) -> None:
     Raises
     ------
     ApcError
-        E965 the peers are too many, or one of them ended without a word; what one of them raises.
+        E975 the peers are too many, or one of them ended without a word; what one of them raises.
     """
     exchange = build_exchange(system, resolve(system).timings)
     if exchange.peers > MOST_PEERS:
         what = f"{exchange.peers:,} peers would be as many processes: at most {MOST_PEERS}"
-        raise ApcError(Mistake("E965", Place(system.name), what, hint='apc play FILE --peer "user[1]" …'))
+        raise ApcError(Mistake("E975", Place(system.name), what, hint='apc play FILE --peer "user[1]" …'))
     names = [exchange.peer_name(one) for one in range(exchange.peers)]
     sockets = {name: listen_at((LOOPBACK, 0)) for name in names}
     stop, end = multiprocessing.get_context("spawn").Pipe(duplex=False)
     shared = _Shared(model_bytes(system), sockets, how, stop)
-    lost = Mistake("E965", Place(system.name), "one of the peers ended without a word")
+    lost = Mistake("E975", Place(system.name), "one of the peers ended without a word")
     with local_processes(_play_named, shared, len(names), lost) as workers:
         running = {workers.submit(name) for name in names}
         while running:

@@ -5,7 +5,7 @@ Guarantees: the words are those of `numpy.random.Philox` with that key, whatever
 Does not: make numbers of them (see `channel`).
 
 Philox-4x64-10: Salmon et al., Parallel random numbers: as easy as 1, 2, 3, SC '11, section 4.3. The same
-stands in `simulation/engine.c`.
+stands in `simulation/luck.c`.
 """
 
 from __future__ import annotations

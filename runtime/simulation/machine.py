@@ -1,7 +1,8 @@
 """All peers' frames in machine code: the kernels as loops over peers, and the engine that plays them.
 
 Takes: a `Population`, the laws of its unreliable links.
-Gives: `library_of`, `Library`, `Machine`; `program_text`, the C text; `Kernel`.
+Gives: `library_of`, `Library`, `Machine`; `program_text`, the C text; `Kernel`; `straight_lines`,
+`luck_text`, `DISTRIBUTIONS`.
 Guarantees: the numbers of `stepwise` to a few roundings of the sums, and the same packets; the text depends
 on what a peer does in a frame, not on how many peers there are or on their numbers.
 Does not: compile (see `native`), or play kernels that are not straight code, such as solvers.
@@ -149,8 +150,13 @@ def program_text(kernels: Sequence[Kernel], looks: Sequence[PlainFunction]) -> s
     parts += [_look(place, one) for place, one in enumerate(looks)]
     parts.append(_table("kernels", "kernel", PARAMETERS.format(own="int own, "), len(kernels)))
     parts.append(_table("looks", "look", LOOKED, len(looks)))
-    parts.append(Path(__file__).with_name("engine.c").read_text(encoding="utf-8"))
+    parts += [luck_text(), Path(__file__).with_name("engine.c").read_text(encoding="utf-8")]
     return "\n".join(parts)
+
+
+def luck_text() -> str:
+    """Return the C text of the luck of packets."""
+    return Path(__file__).with_name("luck.c").read_text(encoding="utf-8")
 
 
 def _table(name: str, each: str, parameters: str, count: int) -> str:
@@ -170,7 +176,7 @@ def _kernel(place: int, kernel: Kernel) -> str:
         "frame",
     ]
     after, sent, rows = function.results
-    values, lines = _straight(function, inputs)
+    values, lines = straight_lines(function, inputs)
     stores = [f"carry[{k} * n + i] = {values[one]};" for k, one in enumerate(after)]
     stores += [f"sent[keys[{k}] * peers + i] = {values[one]};" for k, one in enumerate(sent)]
     stores += [
@@ -206,7 +212,7 @@ def _look(place: int, function: PlainFunction) -> str:
         "missing[s]",
         "t",
     ]
-    values, lines = _straight(function, inputs)
+    values, lines = straight_lines(function, inputs)
     body = "\n    ".join(lines)
     return f"""\
 static void look{place}({LOOKED}) {{
@@ -221,7 +227,7 @@ static void look{place}({LOOKED}) {{
 """
 
 
-def _straight(function: PlainFunction, inputs: Sequence[str]) -> tuple[list[str], list[str]]:
+def straight_lines(function: PlainFunction, inputs: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the names of a function's values, and the lines of C that make them."""
     used = {place for _, *places in function.operations for place in places}
     used |= {place for places in function.results for place in places}

@@ -176,7 +176,7 @@ def prepare(
     refuse_unheard_of(system)
     system = stamped(system)
     with finite_equations(system.name):
-        plan = _plan(system, settings.method)
+        plan = plan_of(system, settings.method)
         choices = _choices(plan, signals)
         members = _members(plan, choices, settings.method, live=live)
         population = build_population(plan.exchange, members, plan.routes)
@@ -250,7 +250,7 @@ def size_note(simulation: Simulation, *, decimal: bool) -> str:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Plan:
+class Plan:
     """What the peers of a scene do in a frame, before a function of it is built.
 
     `sites` are the Jacobians of each kind, `flows` what the method moves of it, `schedules` what happens in a
@@ -266,7 +266,7 @@ class _Plan:
     schedules: tuple[Schedule, ...]
 
 
-def _plan(system: CompiledSystem, method: Method) -> _Plan:
+def plan_of(system: CompiledSystem, method: Method) -> Plan:
     """Find out what happens in a frame, and refuse what can't be played."""
     numbers = resolve(system)
     sites = tuple(jacobians(kind) for kind in system.kinds)
@@ -282,10 +282,10 @@ def _plan(system: CompiledSystem, method: Method) -> _Plan:
         schedules = tuple(replace(one, quantum=ROW / one.frame) for one in schedules)
     _check_size(system, exchange, schedules)
     _check_step(system, numbers, schedules, method)
-    return _Plan(system, numbers, exchange, sites, flows, routes, schedules)
+    return Plan(system, numbers, exchange, sites, flows, routes, schedules)
 
 
-def _choices(plan: _Plan, signals: Sequence[str]) -> tuple[Choice, ...]:
+def _choices(plan: Plan, signals: Sequence[str]) -> tuple[Choice, ...]:
     """Return what is recorded of each group; refuse more than fits the memory."""
     system = plan.system
     available = [
@@ -297,7 +297,7 @@ def _choices(plan: _Plan, signals: Sequence[str]) -> tuple[Choice, ...]:
     return choices
 
 
-def _members(plan: _Plan, choices: Sequence[Choice], method: Method, *, live: bool) -> list[Member]:
+def _members(plan: Plan, choices: Sequence[Choice], method: Method, *, live: bool) -> list[Member]:
     """Return the groups as members of a population, those peers that are recorded apart from the others."""
     system, numbers, flows = plan.system, plan.numbers, plan.flows
     linear = [rates(kind, flow.rows if flow else ()) for kind, flow in zip(system.kinds, flows, strict=True)]

@@ -74,6 +74,7 @@ PARTS = (
     Part("scans", "Random scans", _own("random_scans"), _own("random_scans", "--points", "40")),
     Part("comparison", "Other programs", _own("comparison")),
     Part("work_precision", "Methods of simulation", _own("work_precision")),
+    Part("handed_over", "A scene handed over as code", _own("handed_over")),
     Part("simulate", "Simulation", _own("simulate"), _own("simulate", "--quick")),
     Part("language", "Compiling", _own("language"), _own("language", "--quick")),
     Part("populations", "Populations", _own("populations"), _own("populations", "--quick")),

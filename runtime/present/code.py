@@ -1,0 +1,103 @@
+"""What a scene handed over as code is, in words and as plain data.
+
+Takes: a `Code` or a `Unit`. Gives: `code_text`, `code_document`; `unit_text`, `unit_document`.
+Guarantees: at most 80 columns.
+Does not: write files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from apc.compiler.words import counted, wrapped
+from apc.exports.c_text import source
+from apc.exports.code import Code
+from apc.exports.fmu import Unit
+from apc.exports.peer import Line, Peer
+from apc.present.forms import document, note
+
+MOST_NAMED = 6
+
+
+def code_text(found: Code) -> str:
+    """Return what a peer's code takes and gives."""
+    peer, name = found.code.peer, found.code.name
+    period = float(peer.schedule.frame_s) / len(peer.instants) * 1e3
+    every = f"every {period:.6g} ms" if len({one.move for one in peer.instants}) == 1 else "at its instants"
+    measured = [f"{peer.kind.states[i].name} [{peer.kind.states[i].unit}]" for i in peer.measured]
+    inside = [one.name for i, one in enumerate(peer.kind.states) if i not in peer.outside]
+    rows = [
+        ("measures", measured),
+        ("hears", [f"{sender.name} over {line.link}" for line in peer.lines for sender in line.senders]),
+        ("puts out", [f"{one.name} [N]" for one in peer.forces]),
+        ("sends", [f"{name} over {line.link}" for line in _sending(peer) for name in line.channels]),
+        ("moves itself", inside),
+    ]
+    lines = [f"{found.topology}: {peer.name} in C99, {name}_tick {every}", ""]
+    for what, listed in rows:
+        lines += wrapped(f"{what} {_named(listed)}", "  ", "    ")
+    return "\n".join([*lines, "", *note(f"method between ticks: {found.method}; all numbers in SI units")])
+
+
+def code_document(found: Code) -> dict[str, Any]:
+    """Return a peer's code as plain data."""
+    peer = found.code.peer
+    return {
+        "topology": found.topology,
+        "peer": peer.name,
+        "name": found.code.name,
+        "method": found.method,
+        "measured": [peer.kind.states[place].name for place in peer.measured],
+        "heard": [
+            {"link": line.link, "from": [one.name for one in line.senders], "channels": list(line.channels)}
+            for line in peer.lines
+            if line.senders
+        ],
+        "forces": [one.name for one in peer.forces],
+        "sent": [{"link": line.link, "channels": list(line.channels)} for line in _sending(peer)],
+        "instants_s": [
+            float(sum(_lengths(peer)[:k]) * peer.schedule.quantum) for k in range(len(peer.instants))
+        ],
+        "source": source(found.code, f"{found.code.name}.h"),
+    }
+
+
+def unit_text(found: Unit) -> str:
+    """Return what an FMU takes and gives."""
+    inputs = [one.name for one in found.scene.variables if one.given]
+    outputs = [one.name for one in found.scene.variables if not one.given]
+    what = found.peer or counted(len(found.scene.peers), "peer")
+    lines = [f"{found.system.name}: {what} for co-simulation, FMI 2.0", ""]
+    lines += wrapped(f"{counted(len(inputs), 'input')}: {_named(inputs)}", "  ", "    ")
+    lines += wrapped(f"{counted(len(outputs), 'output')}: {_named(outputs)}", "  ", "    ")
+    told = f"steps of {found.step * 1e3:.6g} ms show every tick of the fastest clock, values before the tick"
+    if found.peer:
+        told += "; what it hears is set when it has arrived: delays and losses are the network's"
+    return "\n".join([*lines, "", *note(told)])
+
+
+def unit_document(found: Unit) -> dict[str, Any]:
+    """Return an FMU as plain data."""
+    return {
+        "topology": found.system.name,
+        "peer": found.peer or None,
+        "step_s": found.step,
+        "duration_s": found.duration,
+        "variables": [
+            document({"name": one.name, "unit": one.unit, "input": one.given})
+            for one in found.scene.variables
+        ],
+    }
+
+
+def _sending(peer: Peer) -> list[Line]:
+    return [line for line in peer.lines if line.sending >= 0]
+
+
+def _lengths(peer: Peer) -> list[int]:
+    return [peer.moves[one.move].quanta for one in peer.instants]
+
+
+def _named(names: Sequence[str]) -> str:
+    return ", ".join([*names[:MOST_NAMED], "…"] if len(names) > MOST_NAMED else names) or "nothing"

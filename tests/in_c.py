@@ -1,0 +1,191 @@
+"""Peers in C, compiled with all warnings and sanitizers, each a process that is fed row by row."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import apc
+from apc.exports.c_text import CPeer, c_peer, driver, header, source
+from apc.exports.peer import Peer, peer_of
+from apc.network.timetable import Timetable, luck_of
+from apc.simulation.settings import DEFAULT, parse_method
+from apc.simulation.simulation import Plan, plan_of
+
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+SANITIZED = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+
+
+def compiler() -> str:
+    """Return the C compiler of the machine; without one the test is skipped."""
+    found = shutil.which("gcc") or shutil.which("cc")
+    return found or pytest.skip("there is no C compiler")
+
+
+def build(code: CPeer, folder: Path, options: Sequence[str] = SANITIZED) -> Path:
+    """Return the driver of a peer, compiled."""
+    texts = {
+        f"{code.name}.h": header(code),
+        f"{code.name}.c": source(code, f"{code.name}.h"),
+        f"{code.name}_test.c": driver(code, f"{code.name}.h"),
+    }
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="ascii")
+    listed = [name for name in texts if name.endswith(".c")]
+    command = [compiler(), *STRICT, *options, *listed, "-o", code.name, "-lm"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder / code.name
+
+
+@dataclass
+class Running:
+    """A peer's process; what it said last, by name."""
+
+    peer: Peer
+    process: subprocess.Popen[str]
+    names: tuple[str, ...]
+    at: int = 0
+    turns: itertools.cycle[int] | None = None
+
+    @classmethod
+    def started(cls, code: CPeer, folder: Path) -> Running:
+        peer = code.peer
+        names = ["time", *(one.name for one in peer.forces)]
+        for line in peer.lines:
+            if line.sending >= 0:
+                names += [f"{line.link} sent", *(f"{line.link} {one}" for one in line.channels)]
+        ticking = {p for one in peer.instants for p in one.ticks}
+        names += [name for p in sorted(ticking) for name in peer.kind.clocks[p].outputs]
+        process = subprocess.Popen(
+            [build(code, folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        turns = itertools.cycle(peer.moves[one.move].quanta for one in peer.instants)
+        return cls(peer, process, tuple(names), 0, turns)
+
+    def done(self, row: Sequence[float]) -> dict[str, float]:
+        """Return what it does with a row, and go to its next instant."""
+        assert self.process.stdin is not None and self.process.stdout is not None and self.turns is not None
+        self.process.stdin.write((" ".join(map(repr, row)) or ".") + "\n")
+        self.process.stdin.flush()
+        said = [float(one) for one in self.process.stdout.readline().split()]
+        assert len(said) == len(self.names), f"{self.peer.name} ended"
+        self.at += next(self.turns)
+        return dict(zip(self.names, said, strict=True))
+
+    def end(self) -> None:
+        assert self.process.stdin is not None and self.process.stdout is not None
+        self.process.stdin.close()
+        rest = self.process.stdout.read()
+        assert self.process.wait(30) == 0 and not rest
+        self.process.stdout.close()
+
+
+def differences(
+    system: apc.CompiledSystem, folder: Path, *, duration: str, method: str = "", device: str | None = None
+) -> dict[str, tuple[float, float]]:
+    """Play a scene, and its peers in C with the devices' motion and the packets' arrivals of that run.
+
+    Packets go from peer to peer as they come out of C, late by what the scene says, or by what a `Timetable`
+    says where they get lost. Returns by signal the largest difference and the largest value.
+    """
+    how = parse_method(method) if method else DEFAULT
+    plan = plan_of(system, how)
+    course = apc.simulate(system, duration=duration, method=method or None, jit=False)
+    column = {one.name: course.values[:, place] for place, one in enumerate(course.signals)}
+    quantum = plan.schedules[0].quantum
+    marks = [round(float(Fraction(float(t)) / quantum)) for t in course.time]
+    running = [
+        Running.started(c_peer(peer_of(plan, k, how, device=device)), folder)
+        for k in range(plan.exchange.peers)
+    ]
+    network = _Network(plan, marks[-1])
+    off: dict[str, tuple[float, float]] = {}
+    while (at := min(one.at for one in running)) < marks[-1]:
+        row = int(np.searchsorted(marks, at, side="right")) - 1
+        for one in [one for one in running if one.at == at]:
+            peer = one.peer
+            given = [float(column[f"{peer.name}.{peer.kind.states[i].name}"][row]) for i in peer.measured]
+            heard = network.heard(peer, at)
+            said = one.done([*given, *heard])
+            network.send(peer, at, said)
+            assert said["time"] == float(at * quantum)
+            if at == marks[row] and one.at <= marks[row + 1]:
+                for name in one.names:
+                    key = f"{peer.name}.{name}"
+                    if key in column:
+                        his = float(column[key][row + 1])
+                        before = off.get(key, (0.0, 0.0))
+                        gap = 0.0 if said[name] == his else abs(said[name] - his)
+                        off[key] = max(before[0], gap), max(before[1], abs(his))
+    for one in running:
+        one.end()
+    return off
+
+
+class _Network:
+    """All packets that were sent, and which of them each peer hears."""
+
+    def __init__(self, plan: Plan, until: int) -> None:
+        self.plan, self.sent = plan, dict[tuple[str, int, int], Mapping[str, float]]()
+        self.quantum = plan.schedules[0].quantum
+        timings = plan.numbers.timings
+        clocks = {one.name: one for one in plan.system.clocks}
+        self.grid = {
+            link: (int(timings[own.period] / self.quantum), int(timings[own.phase] / self.quantum))
+            for link, one in plan.exchange.links.items()
+            for own in (clocks[one.clock],)
+        }
+        self.seen = {}
+        lucks = tuple(
+            luck_of(plan.system, timings, plan.exchange, route, self.quantum) for route in plan.routes
+        )
+        if lucks:
+            table = Timetable(plan.routes, lucks, seed=plan.system.experiment.seed, run=0)
+            for route, luck, seen in zip(plan.routes, lucks, table.take(until), strict=True):
+                ways = {tuple(pair): k for k, pair in enumerate(route.pairs.tolist())}
+                self.seen[route.link] = ways, luck.tick_phase, luck.tick_period, seen
+
+    def send(self, peer: Peer, at: int, said: Mapping[str, float]) -> None:
+        for line in peer.lines:
+            if line.sending >= 0 and said[f"{line.link} sent"]:
+                period, phase = self.grid[line.link]
+                packet = {one: said[f"{line.link} {one}"] for one in line.channels}
+                self.sent[line.link, peer.number, (at - phase) // period] = packet
+
+    def heard(self, peer: Peer, at: int) -> list[float]:
+        """Return the numbers that are heard at an instant, in the driver's order."""
+        found: list[float] = []
+        exchange, timings = self.plan.exchange, self.plan.numbers.timings
+        groups = np.searchsorted(exchange.starts, np.arange(exchange.peers), side="right") - 1
+        for line in peer.lines:
+            period, phase = self.grid[line.link]
+            for sender in line.senders:
+                late = exchange.delay(line.link, int(groups[sender.peer]), int(groups[peer.number]))
+                number, gone = (at - int(timings[late] / self.quantum) - phase) // period, False
+                if line.link in self.seen:
+                    ways, first, every, seen = self.seen[line.link]
+                    way, tick = ways[sender.peer, peer.number], (at - first) // every
+                    number = int(seen.packets[tick, way]) if tick >= 0 else -1
+                    gone = bool(seen.missing[tick, way]) if tick >= 0 else False
+                if number < 0:
+                    found += sender.start
+                else:
+                    packet = self.sent[line.link, sender.peer, number]
+                    found += [packet[one] for one in line.channels]
+                found += [int(gone)] if line.missing else []
+        return found
+
+
+def worst(off: Mapping[str, tuple[float, float]]) -> float:
+    """Return the largest difference, as a part of the largest value of its signal."""
+    assert off and any(size for _, size in off.values()), "something is compared"
+    return max(gap / size if size else gap for gap, size in off.values())

@@ -1,0 +1,165 @@
+"""A peer in C: what it computes is what `simulate` computes, and nothing else is in it."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from apc.__main__ import run
+from apc.compiler.errors import ApcError
+from apc.exports.c_text import c_peer, identifier, in_order, number
+from apc.exports.peer import peer_of
+from apc.simulation.settings import DEFAULT, parse_method
+from apc.simulation.simulation import plan_of
+from tests.in_c import SANITIZED, STRICT, build, compiler, differences, worst
+from tests.topologies import AVERAGE, ROOT, SCENES, compiled, replaced
+
+MOVED = replaced(AVERAGE, ("user: {count: 3}", "user: {count: 3, set: {device.x: [30 mm, -20 mm, 7 mm]}}"))
+RING = replaced(MOVED, ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
+PAPER = (SCENES / "experiment-average.yaml").read_text(encoding="utf-8").partition("\n")[2]
+MIXED = replaced(
+    (SCENES / "mixed-clocks.yaml").read_text(encoding="utf-8").partition("\n")[2],
+    ("near: {count: 2}", "near: {count: 2, set: {device.x: [30 mm, -20 mm]}}"),
+)
+INSIDE = replaced(MOVED, ("delay: 1 ms, link: lan", "delay: 2.3 ms, link: lan"))
+LOSSY = replaced(MOVED, ("delay: 8 ms}", "delay: 8 ms, loss: 20 %, jitter: 3 ms, on_loss: zero}"))
+LOSSY_HOLD = replaced(MOVED, ("delay: 8 ms}", "delay: 8 ms, loss: 20 %, jitter: 3 ms, reorder: all}"))
+PAIRS = replaced(
+    MOVED, ("type: AveragePosition, object: cube, stiffness: 500 N/m",
+            "type: SaturatedMesh, object: cube, stiffness: 500 N/m, limit: 2 N"),
+)  # fmt: skip
+
+# Of a graph that isn't complete a sum is one product an arc, here and there: not a bit is different. Over a
+# complete graph `simulate` takes the sum of all less its own.
+EXACT = {"ring": RING, "pairs": PAIRS}
+ROUNDED = {
+    "moved": MOVED,
+    "paper": PAPER,
+    "mixed clocks": MIXED,
+    "a delay inside a tick": INSIDE,
+    "late and lost, zero": LOSSY,
+    "late and lost, hold": LOSSY_HOLD,
+}
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_not_a_bit_of_its_forces_is_different(name: str, tmp_path: Path) -> None:
+    assert worst(differences(compiled(EXACT[name]), tmp_path, duration="0.4 s")) == 0.0
+
+
+@pytest.mark.parametrize("name", ROUNDED)
+def test_its_forces_are_those_of_simulate_to_the_last_bits(name: str, tmp_path: Path) -> None:
+    """A rounding of a sum over the others is all that differs, and what loops make of it in 0.4 s."""
+    assert worst(differences(compiled(ROUNDED[name]), tmp_path, duration="0.4 s")) < 2e-13
+
+
+@pytest.mark.parametrize("scene", ["planar-users", "two-users-waves", "two-users-passivity", "client-server"])
+def test_so_are_those_of_other_couplers(scene: str, tmp_path: Path) -> None:
+    text = (SCENES / f"{scene}.yaml").read_text(encoding="utf-8").partition("\n")[2]
+    device = "none" if scene == "client-server" else None
+    off = differences(compiled(text), tmp_path, duration="0.4 s", device=device)
+    assert max(gap for gap, _ in off.values()) < 1e-11
+
+
+# The copy lies against a soft wall by a law of the power 1.5, at every moment.
+BENT = replaced(
+    MOVED,
+    ("masses:\n", "masses:\n  stop: {mass: 1 kg, damping: 1 N*s/m}\n"),
+    ("couplers:\n", "couplers:\n  soft: {type: HuntCrossleyContact, a: cube, b: ground, half_width: 1 mm,"
+     " stiffness: 1e4 N/m^(3/2), damping: 10 N*s/m^(5/2)}\n"),
+)  # fmt: skip
+
+
+TIED = replaced(
+    MOVED, ("type: SampledSpringDamper", "type: SpringDamper"), (", clock: haptic, delay: 1 ms}", "}")
+)  # fmt: skip
+
+
+def test_what_is_not_linear_moves_by_the_same_steps(tmp_path: Path) -> None:
+    off = differences(compiled(BENT), tmp_path, duration="0.1 s", method="rk4:0.25ms", device="device")
+    assert worst(off) < 2e-13
+
+
+def test_nothing_in_it_changes_but_what_is_given(tmp_path: Path) -> None:
+    """No data of its own that could be written, and nothing called but what computes."""
+    plan = plan_of(compiled(PAPER), DEFAULT)
+    code = c_peer(peer_of(plan, 1, DEFAULT, device=None))
+    build(code, tmp_path, ("-O2",))
+    subprocess.run([compiler(), "-std=c99", "-c", f"{code.name}.c"], cwd=tmp_path, check=True)
+    told = subprocess.run(["nm", f"{code.name}.o"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    kinds = {line.split()[-2]: line.split()[-1] for line in told.stdout.splitlines()}
+    assert not set(kinds) & set("dDbBCgGsS"), told.stdout
+    called = {line.split()[-1] for line in told.stdout.splitlines() if line.split()[-2] == "U"}
+    assert called <= {"_GLOBAL_OFFSET_TABLE_", "__stack_chk_fail"}
+    text = (tmp_path / f"{code.name}.c").read_text(encoding="ascii")
+    included = {line for line in text.splitlines() if line.startswith("#include")}
+    assert included == {f'#include "{code.name}.h"', "#include <math.h>"}
+
+
+def test_the_loop_of_the_readme_compiles(tmp_path: Path) -> None:
+    assert (
+        run(
+            [
+                "export",
+                str(SCENES / "experiment-average.yaml"),
+                "--peer",
+                "left[1]",
+                "--out",
+                str(tmp_path / "left.c"),
+            ]
+        )
+        == 0
+    )
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    _, _, after = text.partition("<!-- compiled with left.h of experiment-average.yaml -->\n```c\n")
+    (tmp_path / "loop.c").write_text(after.partition("```")[0], encoding="ascii")
+    subprocess.run(
+        [compiler(), *STRICT, "-fsyntax-only", "loop.c", "left.c", "left_test.c"], cwd=tmp_path, check=True
+    )
+
+
+def test_numbers_of_any_size_and_none_do_no_harm(tmp_path: Path) -> None:
+    """Under the sanitizers, what is measured and heard infinite, no number, tiny or huge."""
+    plan = plan_of(compiled(LOSSY), DEFAULT)
+    code = c_peer(peer_of(plan, 0, DEFAULT, device=None))
+    program = build(code, tmp_path, SANITIZED)
+    some = np.random.default_rng(1).choice(
+        [0.0, -0.0, 1e308, -1e308, 5e-324, float("inf"), float("-inf"), float("nan"), 1.0], (500, 6)
+    )
+    rows = "".join(
+        f"{' '.join(map(repr, row[:4]))} {k % 2} {' '.join(map(repr, row[4:]))} {k % 3 // 2}\n"
+        for k, row in enumerate(some.tolist())
+    )
+    done = subprocess.run([program], input=rows, capture_output=True, text=True, check=True)
+    assert not done.stderr
+    assert len(done.stdout.splitlines()) == 500
+
+
+def test_names_of_a_scene_are_names_in_c() -> None:
+    assert [identifier(one) for one in ("left[1]", "device.x[2]", "1st", "int", "…")] == [
+        "left_1", "device_x_2", "n1st", "int_", "n",
+    ]  # fmt: skip
+    assert in_order(["a.b", "a_b", "a_b_2", "a[b]"], ["c"]) == ("a_b", "a_b_2", "a_b_2_2", "a_b_3")
+    assert [number(one) for one in (0.1, -2.0, 1e300)] == ["0.1", "(-2.0)", "1e+300"]
+
+
+@pytest.mark.parametrize(
+    ("text", "method", "device", "message"),
+    [
+        (BENT, "", None, "E961 user[1]: device and stop may be devices, or copies that its computer moves. "
+                         "Write: --device device,stop or --device device"),
+        (BENT, "", "device", "E960 user[1]: between ticks cube.x, cube.v move by CVODES, which is not "
+                             "written as C. Write: --method rk4:0.1ms"),
+        (MOVED, "", "box", "E961 --device: no mass of user[1] is called box. Write: --device cube"),
+        (TIED, "", None, "E961 user[1]: device and cube are tied to each other between ticks: no computer "
+                         "can move cube where device moves by itself."),
+    ],
+)  # fmt: skip
+def test_what_it_cannot_hold_is_named(text: str, method: str, device: str | None, message: str) -> None:
+    how = parse_method(method) if method else DEFAULT
+    with pytest.raises(ApcError) as error:
+        peer_of(plan_of(compiled(text), how), 0, how, device=device)
+    assert message in str(error.value)

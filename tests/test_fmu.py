@@ -1,0 +1,302 @@
+"""FMUs: another program opens them, finds nothing wrong, and plays what `simulate` plays."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+import xml.etree.ElementTree as xml
+import zipfile
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import apc
+from apc.__main__ import run
+from apc.compiler.errors import ApcError
+from apc.exports.code import scene_unit
+from apc.exports.fmu import Unit, write_fmu
+from tests.in_c import STRICT, compiler
+from tests.test_c_text import BENT, INSIDE, LOSSY, LOSSY_HOLD, MIXED, MOVED, PAIRS, PAPER
+from tests.topologies import AVERAGE, compiled, replaced
+
+AT_ONCE = replaced(MOVED, ("{clock: network, delay: 8 ms}", "{clock: network, delay: 0 s}"))
+OWN = replaced(
+    MOVED, ("user: {count: 3", "user: {count: 3, set: {device.mass: [0.1 kg, 0.2 kg, 0.15 kg]}"),
+    (", set: {device.x: [30 mm, -20 mm, 7 mm]}", ""),
+    ("damping: 5 N*s/m}", "damping: 5 N*s/m, x: 3 mm}"),
+)  # fmt: skip
+BURSTS = replaced(
+    MOVED, ("delay: 8 ms}", "delay: 8 ms, jitter: 4 ms, distribution: pareto, loss: {p: 10 %, r: 30 %}}")
+)
+SCENES = {
+    "moved": MOVED,
+    "paper": PAPER,
+    "mixed clocks": MIXED,
+    "a delay inside a tick": INSIDE,
+    "pairs": PAIRS,
+    "heard as it is sent": AT_ONCE,
+    "own masses": OWN,
+    "late and lost, zero": LOSSY,
+    "late and lost, hold": LOSSY_HOLD,
+    "bursts": BURSTS,
+}
+
+
+@pytest.fixture
+def fmpy() -> Any:
+    """Return FMPy, which the extra `test` installs."""
+    compiler()
+    pytest.importorskip("fmpy", reason="FMPy is not installed")
+    return pytest.importorskip("fmpy.validation", reason="FMPy is not installed")
+
+
+def written(text: str, folder: Path, *, peer: str = "", method: str = "") -> tuple[Path, Unit]:
+    unit = scene_unit(compiled(text), peer=peer, method=method)
+    write_fmu(path := folder / f"{unit.scene.name}.fmu", unit)
+    return path, unit
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_scene_is_played_as_simulate_plays_it(name: str, fmpy: Any, tmp_path: Path) -> None:
+    path, unit = written(SCENES[name], tmp_path)
+    assert not fmpy.validate_fmu(path)
+    import fmpy as player
+
+    course = apc.simulate(compiled(SCENES[name]), duration="1 s")
+    found = player.simulate_fmu(path, stop_time=1.0, output_interval=unit.step)
+    rows = np.array([found[one.name] for one in course.signals]).T
+    assert rows.shape == course.values.shape
+    assert np.abs(rows - course.values).max() < 1e-9 * max(1.0, np.abs(course.values).max())
+    assert np.abs(course.values).max() > 1e-3
+
+
+def test_recorded_delays_are_played_one_after_another(fmpy: Any, tmp_path: Path) -> None:
+    (tmp_path / "delays.csv").write_text("delay [ms]\n8\n9.5\n\n21\n7\n8\n30\n", encoding="utf-8")
+    text = replaced(MOVED, ("delay: 8 ms}", "trace: delays.csv}"))
+    (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
+    system = apc.compile(tmp_path / "scene.yaml")
+    write_fmu(path := tmp_path / "scene.fmu", unit := scene_unit(system))
+    import fmpy as player
+
+    course = apc.simulate(system, duration="0.5 s")
+    found = player.simulate_fmu(path, stop_time=0.5, output_interval=unit.step)
+    assert np.abs(np.array([found[one.name] for one in course.signals]).T - course.values).max() < 1e-9
+
+
+def test_what_is_not_linear_is_played_by_the_steps_asked_for(fmpy: Any, tmp_path: Path) -> None:
+    path, unit = written(BENT, tmp_path, method="rk4:0.5ms")
+    assert not fmpy.validate_fmu(path)
+    import fmpy as player
+
+    course = apc.simulate(compiled(BENT), duration="0.3 s", method="rk4:0.5ms")
+    found = player.simulate_fmu(path, stop_time=0.3, output_interval=unit.step)
+    rows = np.array([found[one.name] for one in course.signals]).T
+    assert np.abs(rows - course.values).max() < 1e-9
+
+
+class Instance:
+    """An FMU that is stepped by hand."""
+
+    def __init__(self, path: Path, folder: Path) -> None:
+        from fmpy import extract, read_model_description
+        from fmpy.fmi2 import FMU2Slave
+
+        told = read_model_description(str(path))
+        self.references = {one.name: one.valueReference for one in told.modelVariables}
+        self.inputs = [one.name for one in told.modelVariables if one.causality == "input"]
+        self.unit = FMU2Slave(
+            guid=told.guid,
+            unzipDirectory=extract(str(path), str(folder)),
+            modelIdentifier=told.coSimulation.modelIdentifier,
+            instanceName="one",
+        )
+        self.unit.instantiate()
+        self.unit.setupExperiment(startTime=0.0)
+        self.unit.enterInitializationMode()
+        self.unit.exitInitializationMode()
+
+    def read(self, *names: str) -> list[float]:
+        return list(self.unit.getReal([self.references[one] for one in names]))
+
+    def set(self, **values: float) -> None:
+        for name, value in values.items():
+            (self.unit.setBoolean if name.endswith("missing") else self.unit.setReal)(
+                [self.references[name]], [value]
+            )
+
+    def step(self, at: float, by: float) -> None:
+        self.unit.doStep(currentCommunicationPoint=at, communicationStepSize=by)
+
+    def end(self) -> None:
+        self.unit.terminate()
+        self.unit.freeInstance()
+
+
+@pytest.mark.parametrize(("text", "late"), [(MOVED, 8), (PAPER, 8), (AT_ONCE, 0)])
+def test_peers_joined_by_a_network_of_ones_own_are_the_scene(
+    text: str, late: int, fmpy: Any, tmp_path: Path
+) -> None:
+    """Each is told at every millisecond what the others' outputs were so long ago."""
+    system = compiled(text)
+    course = apc.simulate(system, duration="0.5 s")
+    names = [f"{group.name}[{k + 1}]" for group in system.groups for k in range(group.count)]
+    running = {}
+    for name in names:
+        path, unit = written(text, tmp_path, peer=name)
+        assert not fmpy.validate_fmu(path)
+        running[name] = Instance(path, tmp_path / unit.scene.name)
+    channels = ("coordination.x", "coordination.v") if "v" in str(unit.scene.variables) else ()
+    channels = tuple(one for one in channels if f"lan.{one}" in running[names[0]].references)
+    sent: list[dict[str, list[float]]] = []
+    column = {one.name: k for k, one in enumerate(course.signals)}
+    off = 0.0
+    for k in range(len(course.time)):
+        sent.append({name: one.read(*(f"lan.{c}" for c in channels)) for name, one in running.items()})
+        for name, one in running.items():
+            for signal in ("cube.x", "cube.v", "device.x", "coordination.f"):
+                (mine,) = one.read(signal)
+                off = max(off, abs(mine - course.values[k, column[f"{name}.{signal}"]]))
+            if k >= late:
+                one.set(**{
+                    f"lan.{other}.{c}": value
+                    for other in names if other != name
+                    for c, value in zip(channels, sent[k - late][other], strict=True)
+                })  # fmt: skip
+        for one in running.values():
+            one.step(k / 1000, 1 / 1000)
+    for one in running.values():
+        one.end()
+    assert off < 1e-9
+
+
+def test_a_step_may_be_of_any_length_and_a_state_can_be_had_back(fmpy: Any, tmp_path: Path) -> None:
+    path, _ = written(PAPER, tmp_path)
+    course = apc.simulate(compiled(PAPER), duration="0.2 s")
+    names = [one.name for one in course.signals]
+    one = Instance(path, tmp_path / "unzipped")
+    at, steps = (
+        Fraction(0),
+        [Fraction(37, 100000), Fraction(63, 100000), Fraction(2, 1000), Fraction(7, 3000)],
+    )
+    for k in range(60):
+        if k == 30:
+            state = one.unit.getFMUState()
+            kept = one.unit.serializeFMUState(state)
+            begun, before = at, one.read(*names)
+        by = steps[k % 4] if k % 12 < 8 else Fraction(1, 1000) - at % Fraction(1, 1000)
+        one.step(float(at), float(by))
+        at += by
+        if at % Fraction(1, 1000) == 0:
+            assert one.read(*names) == pytest.approx(course.values[int(at * 1000)].tolist(), abs=1e-9)
+    end = one.read(*names)
+    one.unit.setFMUState(one.unit.deSerializeFMUstate(kept))
+    assert one.read(*names) == before
+    at = begun
+    for k in range(30, 60):
+        by = steps[k % 4] if k % 12 < 8 else Fraction(1, 1000) - at % Fraction(1, 1000)
+        one.step(float(at), float(by))
+        at += by
+    assert one.read(*names) == end
+    one.unit.reset()
+    one.unit.setupExperiment(startTime=0.0)
+    one.unit.enterInitializationMode()
+    one.unit.exitInitializationMode()
+    assert one.read(*names) == course.values[0].tolist()
+    one.end()
+
+
+def test_a_peer_says_what_it_hears_and_sends(tmp_path: Path) -> None:
+    compiler()
+    path, _ = written(LOSSY, tmp_path, peer="user[2]")
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(tmp_path)
+        told = xml.fromstring(archive.read("modelDescription.xml"))
+        names = archive.namelist()
+    causes = {one.get("name"): one.get("causality") for one in told.iter("ScalarVariable")}
+    heard = {name for name, cause in causes.items() if cause == "input"}
+    assert heard == {
+        f"lan.user[{k}].{what}" for k in (1, 3) for what in ("coordination.x", "coordination.v", "missing")
+        if f"lan.user[{k}].{what}" in causes
+    }  # fmt: skip
+    assert {"lan.user[1].coordination.x", "lan.user[1].missing"} <= heard
+    assert causes["lan.coordination.x"] == "output"
+    assert next(one for one in names if one.startswith("binaries/")).split("/")[1].endswith("64")
+    assert all(f"sources/{one.get('name')}" in names for one in told.iter("File"))
+
+
+@pytest.mark.parametrize("peer", ["", "user[2]"])
+def test_its_sources_compile_strictly(peer: str, tmp_path: Path) -> None:
+    unit = scene_unit(compiled(LOSSY), peer=peer)
+    for name, text in unit.texts.items():
+        (tmp_path / name).write_text(text, encoding="ascii")
+    sources = [name for name in unit.texts if name.endswith(".c")]
+    for options in (["-O0"], ["-O2"]):
+        command = [compiler(), *STRICT, *options, "-fPIC", "-shared", *sources, "-o", "all.so"]
+        subprocess.run(command, cwd=tmp_path, check=True)
+
+
+def test_the_same_scene_gives_the_same_texts() -> None:
+    one, other = (scene_unit(compiled(MIXED)) for _ in range(2))
+    assert one.texts == other.texts
+    assert one.description == other.description
+
+
+def test_another_program_is_not_given_another_scene(fmpy: Any, tmp_path: Path) -> None:
+    """A library whose description was exchanged refuses to begin."""
+    path, _ = written(PAPER, tmp_path)
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(tmp_path)
+        (name,) = (one for one in archive.namelist() if one.startswith("binaries/"))
+    library = ctypes.CDLL(str(tmp_path / name))
+    library.fmi2Instantiate.restype = ctypes.c_void_p
+    assert library.fmi2Instantiate(b"one", 1, b"another", b"", None, 0, 0) is None
+    assert library.fmi2Instantiate(b"one", 0, b"another", b"", None, 0, 0) is None
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["scene.fmu"], "E960 user[1]: between ticks cube.x, cube.v move by CVODES"),
+        (["peer.c"], 'E963 --peer: the peers differ, and a text of C is of one. Write: --peer "user[1]"'),
+        (["peer.c", "--peer", "user[4]"], "E963 --peer: user[4] is none of the peers user[1] to user[3]"),
+        (
+            ["scene.fmu", "--peer", "usr[1]"],
+            'E963 --peer: no group of peers is called usr. Write: --peer "user[1]"',
+        ),
+        (["scene.fmu", "--device", "device"], "E953 --device means nothing to the format fmu. Write: --to c"),
+    ],
+)
+def test_what_cannot_be_is_told_and_nothing_is_written(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.yaml").write_text(BENT, encoding="utf-8")
+    assert run(["export", "--out", *words]) == 1
+    assert message in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.yaml"]
+
+
+def test_where_all_peers_are_alike_one_serves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    assert run(["export", "--out", "peer.c"]) == 0
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["peer.c", "peer.h", "peer_test.c", "scene.yaml"]
+
+
+def test_without_a_compiler_there_is_a_message_and_no_archive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("apc.exports.fmu.compiler", lambda: None)
+    with pytest.raises(ApcError, match=r"E962 no C compiler answers"):
+        written(PAPER, tmp_path)
+    monkeypatch.setattr("apc.exports.fmu.compiler", lambda: ("/bin/false", ""))
+    with pytest.raises(ApcError, match=r"E962 /bin/false doesn't compile it"):
+        written(PAPER, tmp_path)
+    assert not list(tmp_path.iterdir())
