@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from apc.analysis.switching import Switching
     from apc.benchmark.bench import Bench
     from apc.comparison.comparison import Comparison
+    from apc.frame.settable import Parameters
     from apc.hands.feel import Feel
     from apc.hands.passivity import PassiveHands
     from apc.moments.network import NetworkVerdict
@@ -449,6 +450,19 @@ def prove_box(
 
     system = _model(model, set)
     return proved_box(system, [parse_range(system, f"{name}={value}") for name, value in box.items()])
+
+
+def parameters(model: CompiledSystem | str | Path) -> Parameters:
+    """List what may be set of a scene: its names, values, units and limits.
+
+    Parameters
+    ----------
+    model
+        A compiled model, or the path of a topology or compiled model.
+    """
+    from apc.frame import settable
+
+    return settable.parameters(_model(model, None))
 
 
 def paper_route(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> PaperRoute:

@@ -43,7 +43,7 @@ HOUSE = (
     ),
     ("apc.compiler.functions", "casadi_writer reached exchange functions"),
     ("apc.compiler", "pipeline store"),
-    ("apc.compiler.view", "schema diagram svg layers picture stages listing"),
+    ("apc.compiler.view", "schema catalogue diagram svg layers picture stages listing"),
     (
         "apc",
         "threads memory finite_equations distribution suffixes optional option_value result tables processes",
@@ -51,7 +51,7 @@ HOUSE = (
     (
         "apc.frame",
         """
-        exact names parameters overrides
+        exact names parameters settable overrides
         discretize radius exchange
         site jacobians start devices linearize
         schedule liveness hyperperiod scheduling
@@ -119,7 +119,7 @@ HOUSE = (
         "apc.present",
         """
         forms pictures network hands analysis vary comparison_picture comparison region_picture region
-        planar simulation still recording bench
+        planar simulation still recording bench parameters graph
         """,
     ),
     # what a person calls
@@ -127,7 +127,10 @@ HOUSE = (
         "apc",
         "inputs api",
     ),
-    ("apc.cli", "options progress region simulate sweep compare critical feel bench analyze commands"),
+    (
+        "apc.cli",
+        "options progress region simulate sweep compare critical feel bench analyze library commands",
+    ),
     ("apc", "__main__"),
 )
 ORDER = tuple(f"{package}.{name}" for package, names in HOUSE for name in names.split())
