@@ -93,7 +93,7 @@ HOUSE = (
         "apc.vary",
         """
         wiring batch slopes crossings plane bracket counting loops evaluator ports leading many bends marginal
-        delays lags search counts growth critical margins sensitivity over_network
+        delays lags search counts growth critical locus margins sensitivity over_network
         """,
     ),
     ("apc.sweeps", "grid quantities work store cluster sweep"),
@@ -118,8 +118,8 @@ HOUSE = (
     (
         "apc.present",
         """
-        forms pictures network hands analysis vary comparison_picture comparison region_picture region
-        planar simulation still recording bench parameters graph
+        forms pictures network hands analysis eigenvalues vary comparison_picture comparison
+        region_picture region planar simulation still animation recording bench parameters graph
         """,
     ),
     # what a person calls

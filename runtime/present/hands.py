@@ -228,15 +228,10 @@ def feel_picture(found: Feel, kind: str = "bode") -> Any:
         ax.set_aspect("equal", adjustable="datalim")
         ax.set_xlabel("real part of the impedance (N·s/m)")
         ax.set_ylabel("imaginary part (N·s/m)")
-        for place in (0, len(found.frequency_hz) - 1):
-            at = found.impedance[place]
-            ax.annotate(
-                f"{found.frequency_hz[place]:.3g} Hz",
-                (at.real, at.imag),
-                (5, 5),
-                textcoords="offset points",
-                fontsize=8,
-            )
+        for place, mark in ((0, "o"), (len(found.frequency_hz) - 1, "s")):
+            at, label = found.impedance[place], f"{found.frequency_hz[place]:.3g} Hz"
+            ax.plot(at.real, at.imag, mark, color="#000000", markersize=5, label=label)
+        figure.legend(loc="outside lower center", fontsize=8, frameon=False, ncols=2)
         ax.set_title(f"{found.topology}: felt at {found.at}", fontsize=9)
         return figure
     figure = figures.Figure(figsize=(5.2, 5.2), layout="constrained")
@@ -256,7 +251,7 @@ def feel_picture(found: Feel, kind: str = "bode") -> Any:
             linestyle="-.",
             label=f"copies of {found.copy} apart (mm/N)",
         )
-    size.legend(fontsize=8, frameon=False)
+    figure.legend(loc="outside lower center", fontsize=8, frameon=False)
     size.set_ylabel("magnitude")
     phase.semilogx(found.frequency_hz, np.degrees(np.angle(found.impedance)), color="#000000")
     phase.set_ylabel("phase of the impedance (°)")

@@ -1,0 +1,74 @@
+"""Where the eigenvalues of a scene go as one of its numbers grows: the root locus, in the plane of z.
+
+Takes: a `CompiledSystem` and a `Critical` of it. Gives: `Locus`, `root_locus`.
+Guarantees: every point is of an analysis of the scene with that value, rigid modes left out, every packet on
+time; a value that the scene can't have is left out.
+Does not: prove anything; the crossings are those of `critical`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import analyze
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.compiler.frozen import dataclass
+from apc.compiler.timings import part
+from apc.frame.names import find
+from apc.frame.overrides import apply
+from apc.vary.evaluator import overrides_at
+
+if TYPE_CHECKING:
+    from apc.vary.critical import Critical
+
+POINTS = 160  # values looked at
+BEYOND = 2.0  # times what matters most is looked up to: the present value, and where stability changes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Locus:
+    """Eigenvalues by value: `eigenvalues[k]` (n_k,) are those at `values[k]`, in SI; `now` the present ones.
+
+    `critical` says which parameter it is, and where stability changes.
+    """
+
+    critical: Critical
+    frame_s: float
+    values: NDArray[np.float64]
+    eigenvalues: tuple[NDArray[np.complex128], ...]
+    now: NDArray[np.complex128]
+
+
+@part("locus")
+def root_locus(system: CompiledSystem, found: Critical) -> Locus:
+    """Follow the eigenvalues of a scene over the values at which its stability was looked at.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, all other numbers as they are.
+    found
+        What `critical` says of one of its parameters: that one is varied.
+    """
+    free = find(system, found.parameter, counts=True)
+    low, high = found.scanned
+    most = max([abs(found.present), *(one.value for one in found.crossings[:1]), found.value or 0.0])
+    high = min(high, BEYOND * most) if most > low else high
+    values = np.linspace(low, high, POINTS)
+    if found.counted:
+        values = np.unique(np.round(values))
+    kept, eigenvalues = [], []
+    for value in values.tolist():
+        try:
+            modes = analyze(apply(system, overrides_at(system, [free], [value]))).modes
+        except ApcError:
+            continue  # at its least value a mass, for one, is no mass
+        kept.append(value)
+        eigenvalues.append(np.array([mode.eigenvalue for mode in modes]))
+    here = analyze(system)
+    now = np.array([mode.eigenvalue for mode in here.modes])
+    return Locus(found, here.frame_s, np.array(kept), tuple(eigenvalues), now)
