@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
@@ -676,12 +675,11 @@ def show(path: str | Path, *, format: Format = "text") -> str:
         The file is at fault, or is a compiled model, which no longer has the equations as written.
     """
     from apc.compiler.view import listing
+    from apc.inputs import refuse_model
     from apc.present.forms import json_text
 
     path = Path(path)
-    if path.suffix == ".apc":
-        what = "is a compiled model, which no longer has the equations as they were written"
-        raise ApcError(Mistake("E615", Place(str(path)), what, hint=f"apc show {path.with_suffix('.yaml')}"))
+    refuse_model(path, "show")
     match format:
         case "text":
             return listing.show_text(path)

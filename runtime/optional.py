@@ -23,5 +23,5 @@ def need(module: str, extra: str) -> Any:
 
 
 def missing(what: str, hint: str) -> ApcError:
-    """Return the mistake (E875) that a library or program isn't there; `hint` installs it, or does without."""
+    """Return the mistake (E875) that a library or program isn't there; `hint` says what to do."""
     return ApcError(Mistake("E875", Place("apc"), what, hint=hint))

@@ -115,17 +115,20 @@ HOUSE = (
         """,
     ),
     ("apc.benchmark", "timing truth bench hard scale"),
+    ("apc", "inputs"),
+    ("apc.report", "contents"),
     (
         "apc.present",
         """
         forms pictures network hands analysis eigenvalues vary comparison_picture comparison
         region_picture region planar simulation still animation recording bench parameters graph
+        report
         """,
     ),
     # what a person calls
     (
         "apc",
-        "inputs api",
+        "api",
     ),
     (
         "apc.cli",

@@ -186,6 +186,8 @@ E935 runtime/hands: a frequency is none that a response is told of, or nothing t
 E936 runtime/hands: a device is named that is not there
 E940 runtime/comparison: what is to be compared is no stiffness, delay or loss
 E941 runtime/comparison: a scene has several stiffnesses, delays or losses to compare
+E950 runtime/present: a file is no report
+E951 runtime/cli: a report's number is another one, computed anew
 """
 
 

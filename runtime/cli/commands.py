@@ -21,6 +21,7 @@ from apc.cli.library import library_command, new_command
 from apc.cli.options import Group, beside, file_argument, file_option, tell
 from apc.cli.progress import at_work
 from apc.cli.region import region_command
+from apc.cli.report import report_command
 from apc.cli.simulate import simulate_command
 from apc.cli.sweep import sweep_command
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -70,6 +71,7 @@ def apc() -> None:
         apc simulate       what happens over time, as rows and a picture
         apc region         where it is stable over two parameters: curves, areas
         apc sweep          any of it at many values of some parameters
+        apc report         all of it as one page, to keep and to mail
         apc show           what the scene is made of, as text or a picture
         apc library        the components there are, and what one is
 
@@ -84,6 +86,7 @@ apc.add_command(critical_command)
 apc.add_command(feel_command)
 apc.add_command(library_command)
 apc.add_command(new_command)
+apc.add_command(report_command)
 apc.add_command(simulate_command)
 apc.add_command(region_command)
 apc.add_command(sweep_command)

@@ -78,10 +78,9 @@ def locus_picture(found: Locus, ax: Any = None) -> Any:
     """
     ax = _circle(ax)
     of = found.critical
-    points = np.concatenate([np.concatenate([one, one.conj()]) for one in found.eigenvalues])
-    colours = np.concatenate(
-        [np.full(2 * len(one), value) for one, value in zip(found.eigenvalues, found.values, strict=True)]
-    )
+    points = np.concatenate(found.eigenvalues)  # conjugates are among them
+    counts = [len(one) for one in found.eigenvalues]
+    colours = np.repeat(found.values, counts)
     drawn = ax.scatter(points.real, points.imag, c=colours, s=5, linewidths=0, cmap="viridis", zorder=3)
     unit = "" if of.unit == "1" else f" [{of.unit.replace('*', '·')}]"
     ax.figure.colorbar(drawn, ax=ax, label=f"{of.parameter}{unit}")
