@@ -120,7 +120,7 @@ HOUSE = (
     (
         "apc.present",
         """
-        forms pictures network hands analysis eigenvalues vary comparison_picture comparison
+        forms pictures notebook network hands eigenvalues analysis vary comparison_picture comparison
         region_picture region planar simulation still animation recording bench parameters graph
         report
         """,

@@ -14,6 +14,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
@@ -94,6 +95,10 @@ class Analysis(Result):
     left_out: tuple[str, ...] = ()
     translations: int = 0
     unfelt: tuple[str, ...] = ()
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the eigenvalues over the unit circle into a matplotlib Axes, or a figure of its own's."""
+        return self._shown("picture", ax)
 
     @property
     def settling_s(self) -> float | None:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import WIDTH, counted, in_hertz, measured, with_unit, wrapped
+from apc.present.eigenvalues import eigenvalues_picture
 from apc.present.forms import document, note
 
 if TYPE_CHECKING:
@@ -163,6 +164,11 @@ def analysis_document(result: Analysis) -> dict[str, Any]:
     modes = [document(mode, {"participation": dict(mode.participation)}) for mode in result.modes]
     found: dict[str, Any] = document(result, {"modes": modes})
     return found
+
+
+def analysis_picture(result: Analysis, ax: Any = None) -> Any:
+    """Draw the eigenvalues of an analysis; return the matplotlib Axes."""
+    return eigenvalues_picture(result, ax)
 
 
 def answer_text(found: Answer) -> str:

@@ -12,7 +12,6 @@ A PDF is printed by Chromium, where there is one.
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import re
@@ -36,6 +35,7 @@ from apc.present.eigenvalues import eigenvalues_picture, locus_picture
 from apc.present.forms import document
 from apc.present.graph import graph_picture
 from apc.present.hands import feel_picture
+from apc.present.pictures import svg_text
 from apc.present.region_picture import region_picture
 from apc.present.simulation import played_picture
 from apc.regions.region import Region
@@ -244,13 +244,8 @@ class _Pictures:
 
     def of(self, figure: Any, title: str) -> str:
         """Return a matplotlib Figure as an element of the page."""
-        matplotlib = need("matplotlib", "plot")
         self._count += 1
-        written = io.StringIO()
-        with matplotlib.rc_context({"svg.hashsalt": "apc", "svg.fonttype": "none"}):
-            figure.savefig(written, format="svg", metadata={"Date": None, "Creator": None})
-        drawn = re.sub(r"<metadata>.*?</metadata>", "", written.getvalue(), flags=re.DOTALL)
-        drawn = drawn[drawn.index("<svg") :]
+        drawn = svg_text(figure)
         drawn = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>p{self._count}-", drawn)
         labelled = f'<svg role="img" aria-label="{escape(title)}"'
         return f"<figure>{drawn.replace('<svg', labelled, 1)}</figure>"
