@@ -132,7 +132,7 @@ HOUSE = (
     ),
     (
         "apc.cli",
-        "options progress region simulate sweep compare critical feel bench analyze library commands",
+        "options progress region simulate sweep compare critical feel bench analyze library report commands",
     ),
     ("apc", "__main__"),
 )

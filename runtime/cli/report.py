@@ -8,7 +8,6 @@ Does not: compute.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -76,6 +75,8 @@ def report_command(
 
 def _check(path: Path) -> None:
     """Compute a report anew. Raises ApcError (E951) with everything that differs."""
+    import tempfile  # most commands need none
+
     from apc.present.report import kept_report, scene_again
     from apc.report.contents import report
 

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import WIDTH, counted, in_hertz, measured, with_unit, wrapped
-from apc.present.eigenvalues import eigenvalues_picture
 from apc.present.forms import document, note
 
 if TYPE_CHECKING:
@@ -168,6 +167,8 @@ def analysis_document(result: Analysis) -> dict[str, Any]:
 
 def analysis_picture(result: Analysis, ax: Any = None) -> Any:
     """Draw the eigenvalues of an analysis; return the matplotlib Axes."""
+    from apc.present.eigenvalues import eigenvalues_picture  # an analysis in words needs none of it
+
     return eigenvalues_picture(result, ax)
 
 

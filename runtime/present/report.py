@@ -25,7 +25,7 @@ from typing import Any
 
 from apc.analysis.analysis import Analysis
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import RefusedError, check_target, read_file, write_file, write_text
+from apc.compiler.files import RefusedError, check_target, read_file, unwritable, write_file, write_text
 from apc.compiler.timings import part
 from apc.compiler.words import counted, wrapped
 from apc.hands.feel import Feel
@@ -302,9 +302,7 @@ def _print(page: str, target: Path, path: Path) -> None:
             subprocess.run(command, capture_output=True, timeout=PRINTED, check=True)
             shutil.copyfile(printed, target)
         except (OSError, subprocess.SubprocessError) as error:
-            what = f"can't be printed: {type(error).__name__} of {Path(command[0]).name}"
-            hint = f"--out {path.with_suffix('.html')}"
-            raise ApcError(Mistake("E601", Place(str(path)), what, hint=hint)) from None
+            raise unwritable(path, OSError(None, f"{Path(command[0]).name} has not printed it")) from error
 
 
 def kept_report(path: Path) -> dict[str, Any]:
