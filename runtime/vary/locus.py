@@ -1,8 +1,8 @@
 """Where the eigenvalues of a scene go as one of its numbers grows: the root locus, in the plane of z.
 
 Takes: a `CompiledSystem` and a `Critical` of it. Gives: `Locus`, `root_locus`.
-Guarantees: every point is an eigenvalue of the frame with that value, what is rigid at every value left out, every
-packet on time; a value that the scene can't have is left out.
+Guarantees: every point is an eigenvalue of the frame with that value, what is rigid at every value left out,
+every packet on time; a value that the scene can't have is left out.
 Does not: prove anything; the crossings are those of `critical`.
 """
 
