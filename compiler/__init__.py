@@ -26,5 +26,5 @@ crowd                       how many peers there are, and how many each hears
 store                       the compiled model on disk
 seal, cache                 what this user's apc wrote; whether it still is what its texts compile to
 pipeline                    the stages one after another
-view                        schema; diagram; svg, layers, picture; stages, listing
+view                        schema; catalogue: the library; diagram; svg, layers, picture; stages, listing
 """

@@ -18,6 +18,7 @@ Every function of a kind takes some of these vectors, in this order:
 from __future__ import annotations
 
 from fractions import Fraction
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -364,6 +365,14 @@ class CompiledSystem:
     experiment: Experiment = Experiment()
     region: tuple[Axis, ...] = ()
     followers: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        """Return what it is in a line."""
+        return f"<CompiledSystem {self.name}: {self.peers} peer{'' if self.peers == 1 else 's'}>"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        return f"<pre>{escape(str(self))}</pre>"
 
     def __str__(self) -> str:
         """Return what the model holds, a line a kind of peer."""

@@ -2,7 +2,7 @@
 
 Takes: numbers and texts.
 Gives: `WIDTH`, `cut`, `counted`, `measured`, `known_digits`, `with_unit`, `in_hertz`,
-`time_left`, `wrapped`.
+`time_left`, `wrapped`, `beside`.
 Guarantees: no digit is shown that its number's error leaves open; a line is at most `WIDTH` columns wide, but
 for a word that has no place to break it at.
 Does not: know what is told, or print.
@@ -119,3 +119,10 @@ def wrapped(text: str, first: str = "", later: str = "") -> list[str]:
             between = ""
         between = " "
     return [*lines, line] if line.strip() else lines
+
+
+def beside(row: str, text: str) -> list[str]:
+    """Return a row of a table and what it is about: behind it where there is room, else in lines below it."""
+    if len(row) + 2 + len(text) <= WIDTH:
+        return [f"{row}  {text}".rstrip()]
+    return [row.rstrip(), *wrapped(text, " " * 6, " " * 6)]

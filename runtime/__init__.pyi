@@ -54,6 +54,9 @@ from .api import (
     paper_route as paper_route,
 )
 from .api import (
+    parameters as parameters,
+)
+from .api import (
     passive_hands as passive_hands,
 )
 from .api import (
@@ -93,6 +96,7 @@ from .benchmark.bench import Bench as Bench
 from .comparison.comparison import Comparison as Comparison
 from .compiler.compiled import CompiledSystem as CompiledSystem
 from .compiler.errors import ApcError as ApcError
+from .frame.settable import Parameters as Parameters
 from .hands.feel import Feel as Feel
 from .hands.passivity import PassiveHands as PassiveHands
 from .moments.network import NetworkVerdict as NetworkVerdict

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     from apc.analysis.switching import Switching
     from apc.benchmark.bench import Bench
     from apc.comparison.comparison import Comparison
+    from apc.frame.settable import Parameters
     from apc.hands.feel import Feel
     from apc.hands.passivity import PassiveHands
     from apc.moments.network import NetworkVerdict
@@ -481,6 +481,19 @@ def prove_box(
     return proved_box(system, [parse_range(system, f"{name}={value}") for name, value in box.items()])
 
 
+def parameters(model: CompiledSystem | str | Path) -> Parameters:
+    """List what may be set of a scene: its names, values, units and limits.
+
+    Parameters
+    ----------
+    model
+        A compiled model, or the path of a topology or compiled model.
+    """
+    from apc.frame import settable
+
+    return settable.parameters(_model(model, None))
+
+
 def paper_route(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> PaperRoute:
     """Return the lifted matrices of Rakhsha and Constantinescu, eqs. (18) to (20), rows and columns named.
 
@@ -754,12 +767,11 @@ def show(path: str | Path, *, format: Format = "text") -> str:
         The file is at fault, or is a compiled model, which no longer has the equations as written.
     """
     from apc.compiler.view import listing
+    from apc.inputs import refuse_model
     from apc.present.forms import json_text
 
     path = Path(path)
-    if path.suffix == ".apc":
-        what = "is a compiled model, which no longer has the equations as they were written"
-        raise ApcError(Mistake("E615", Place(str(path)), what, hint=f"apc show {path.with_suffix('.yaml')}"))
+    refuse_model(path, "show")
     match format:
         case "text":
             return listing.show_text(path)

@@ -166,6 +166,14 @@ def open_scene(
     return apply(system, overrides)
 
 
+def refuse_model(path: Path, command: str) -> None:
+    """Refuse a compiled model (E615) where a command tells of equations and texts as they were written."""
+    if path.suffix == ".apc":
+        what = "is a compiled model, which no longer has the equations as they were written"
+        hint = f"apc {command} {path.with_suffix('.yaml')}"
+        raise ApcError(Mistake("E615", Place(str(path)), what, hint=hint))
+
+
 def check_model_name(topology: Path) -> None:
     """Refuse a topology whose compiled model would take the place of something else.
 

@@ -1,6 +1,6 @@
 """Libraries that are there only where somebody asked for them: those of the extras plot, data and cluster.
 
-Takes: the name of a module, and of the extra that installs it. Gives: `need`.
+Takes: the name of a module, and of the extra that installs it. Gives: `need`, `missing`.
 Guarantees: a library that isn't there is a mistake with the line that installs it.
 Does not: import anything before it is needed.
 """
@@ -19,5 +19,9 @@ def need(module: str, extra: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        what = f"{module} is not installed"
-        raise ApcError(Mistake("E875", Place("apc"), what, hint=install_line(extra))) from error
+        raise missing(f"{module} is not installed", install_line(extra)) from error
+
+
+def missing(what: str, hint: str) -> ApcError:
+    """Return the mistake (E875) that a library or program isn't there; `hint` says what to do."""
+    return ApcError(Mistake("E875", Place("apc"), what, hint=hint))

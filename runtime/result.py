@@ -1,7 +1,8 @@
 """A result: data that other rooms compute with, and that a person can look at.
 
 Takes: nothing. Gives: `Result`.
-Guarantees: data know the name of what shows them and nothing of it: it is imported when it is asked for.
+Guarantees: data know the name of what shows them and nothing of it: it is imported when it is asked for. In a
+notebook a result is its text and its picture, elsewhere a line.
 Does not: show anything itself (see `present`).
 """
 
@@ -20,6 +21,21 @@ class Result:
 
     __slots__ = ()
     shown_by: ClassVar[str]
+
+    def __init_subclass__(cls) -> None:
+        """Give every result the short repr, which `dataclass` leaves to a class that has one."""
+        if "__repr__" not in vars(cls):
+            cls.__repr__ = Result.__repr__  # type: ignore[method-assign]
+
+    def __repr__(self) -> str:
+        """Return what it is in a line: its kind, and how its text begins."""
+        first = next((line.strip() for line in str(self).splitlines() if line.strip()), "")
+        return f"<{type(self).__name__} {first}>"
+
+    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
+        """Return what a notebook shows: the text, and as HTML the text with its picture."""
+        html: str = import_module("apc.present.notebook").html_of(self)
+        return {"text/plain": str(self), "text/html": html}
 
     def __str__(self) -> str:
         """Return the result as text of at most 80 columns."""

@@ -43,7 +43,7 @@ HOUSE = (
     ),
     ("apc.compiler.functions", "casadi_writer reached exchange functions"),
     ("apc.compiler", "pipeline store"),
-    ("apc.compiler.view", "schema diagram svg layers picture stages listing"),
+    ("apc.compiler.view", "schema catalogue diagram svg layers picture stages listing"),
     (
         "apc",
         "threads memory finite_equations distribution suffixes optional option_value result tables processes",
@@ -51,7 +51,7 @@ HOUSE = (
     (
         "apc.frame",
         """
-        exact names parameters overrides
+        exact names parameters settable overrides
         discretize radius exchange
         site jacobians start devices linearize
         schedule liveness hyperperiod ages scheduling
@@ -93,7 +93,7 @@ HOUSE = (
         "apc.vary",
         """
         wiring batch slopes crossings plane bracket counting loops evaluator ports leading many bends marginal
-        delays lags search counts growth critical margins sensitivity over_network
+        delays lags search counts growth critical locus margins sensitivity over_network
         """,
     ),
     ("apc.sweeps", "grid quantities work store cluster sweep"),
@@ -120,23 +120,26 @@ HOUSE = (
         "words lifted free files expressions modelica peer c_text chance_text scene_text fmu code export",
     ),
     ("apc.benchmark", "timing truth bench hard scale"),
+    ("apc", "inputs"),
+    ("apc.report", "contents"),
     (
         "apc.present",
         """
-        forms pictures exports code network recorded_network loop hands analysis vary comparison_picture
-        comparison region_picture region planar simulation still recording bench
+        forms pictures notebook exports code network recorded_network loop hands eigenvalues analysis vary
+        comparison_picture comparison region_picture region planar simulation still animation recording bench
+        parameters graph report
         """,
     ),
     # what a person calls
     (
         "apc",
-        "inputs api",
+        "api",
     ),
     (
         "apc.cli",
         """
-        options progress region simulate sweep compare critical feel export bench analyze network play
-        commands
+        options progress region simulate sweep compare critical feel export bench analyze network play library
+        report commands
         """,
     ),
     ("apc", "__main__"),

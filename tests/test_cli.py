@@ -30,6 +30,7 @@ COMMANDS = (
         "sweep",
         "bench",
         "schema",
+        "library",
     ),
 )
 

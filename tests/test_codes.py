@@ -31,7 +31,7 @@ E202 compiler/source: a key is not known where it stands
 E203 compiler/components compiler/scene compiler/source: a value has another form than is due
 E204 compiler/components compiler/language runtime/regions: a quantity has another unit than is due
 E205 compiler/components compiler/scene compiler/source: a name is taken, or a word of the language
-E206 compiler/components compiler/language compiler/scene: a name names nothing that is there
+E206 compiler/components compiler/language compiler/scene compiler/view: a name names nothing that is there
 E207 compiler/language compiler/scene runtime/cli: a number is out of its bounds
 E208 compiler/components compiler/scene: a number of peers or parts, or of numbers for them, does not fit
 E209 compiler/language: parameters depend on one another in a circle
@@ -204,6 +204,8 @@ E973 runtime/loop runtime/cli: a folder is no run, or can't be one
 E974 runtime/loop runtime/cli: a peer can't listen there, or its secret is none
 E975 runtime/loop: a scene has more peers than processes, or one of these was lost
 E976 runtime/loop: a device outside has no function, or that is at fault
+E990 runtime/present: a file is no report
+E991 runtime/cli: a report's number is another one, computed anew
 """
 
 

@@ -1,123 +1,239 @@
-"""`report`: what decides stands with its error, in 80 columns."""
+"""A report: one page that holds everything in itself, whose numbers are those of the commands."""
 
 from __future__ import annotations
 
-import dataclasses
+import json
+import re
+import shutil
+from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 
-from apc.analysis.analysis import analyze
-from apc.analysis.needs import needs
-from apc.compiler.words import WIDTH, measured
-from apc.present.analysis import analysis_text, compile_text
-from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, replaced
+import apc
+from apc.__main__ import run
+from apc.present import report as pages
+from apc.present.report import kept_report, report_page
+from apc.report.contents import Report, differences, report
+from tests.topologies import AVERAGE, SCENES, replaced
 
-LONG = replaced(AVERAGE, ("user: {count: 3}", "a_long_name_of_a_group: {count: 2, set: {device.mass: 1 kg}}"))
-LONG += "  # and more\n"
-
-
-@pytest.mark.parametrize("text", [AVERAGE, MESH, ONE_MASS, LONG])
-def test_no_line_is_wider_than_a_terminal(text: str) -> None:
-    system = compiled(text)
-    for told in (
-        compile_text(system, needs(system), Path("scene.apc"), 2e-16),
-        analysis_text(analyze(system)),
-    ):
-        assert max(len(line) for line in told.splitlines()) <= WIDTH
+SCENE = SCENES / "three-users-average.yaml"
+LONE = "topology: lone\npeers: {user: {count: 1}}\nmasses: {device: {mass: 1 kg, damping: 1 N*s/m}}\n"
 
 
-def test_compiling_tells_what_the_scene_needs() -> None:
-    system = compiled(AVERAGE)
-    assert compile_text(system, needs(system), Path("scene.apc"), 2.22e-16).splitlines() == [
-        "three-users-average → scene.apc",
-        "  8 states a peer (4 motion, 2 delayed force, 2 network), 3 peers; analysed as 2",
-        "    modes of 8",
-        "  frame 8 ms: haptic ticks 8 times, network once",
-        "  self-check: one frame event by event and lifted differ by 2e-16",
-    ]
+@pytest.fixture(scope="module")
+def found() -> Report:
+    return report([SCENE])
 
 
-def test_compiling_tells_what_was_left_out() -> None:
-    system = compiled(replaced(AVERAGE, ("  lan: {", "  wan: {clock: network}\n  lan: {")))
-    lines = compile_text(system, needs(system), Path("scene.apc"), 0.0).splitlines()
-    assert lines[-1] == "  left out: wan, as nobody hears what it would carry"
+@pytest.fixture(scope="module")
+def page(found: Report) -> str:
+    return report_page(found)
 
 
-def test_a_scene_without_clocks_says_so() -> None:
-    system = compiled(ONE_MASS)
-    told = compile_text(system, needs(system), Path("scene.apc"), 0.0)
-    assert "  frame 1 s: no clock is used, any frame will do" in told.splitlines()
+class Reader(HTMLParser):
+    """What of a page would be loaded or run, and whether every element is closed."""
+
+    VOID = ("meta", "link", "br", "img", "input")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.wanted: list[str] = []
+        self.scripts: list[str | None] = []
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Note what an element names."""
+        for name, value in attrs:
+            if name in ("src", "href", "xlink:href", "data", "action") and value:
+                self.wanted.append(value)
+            assert not name.startswith("on"), name
+        if tag == "script":
+            self.scripts.append(dict(attrs).get("type"))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Note what an empty element names."""
+        self.handle_starttag(tag, attrs)
+        if tag not in self.VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        """Check that what ends had begun last."""
+        assert self.open.pop() == tag
 
 
-def test_an_analysis_names_verdict_radius_and_error() -> None:
-    result = analyze(compiled(AVERAGE))
-    lines = analysis_text(result).splitlines()
-    assert lines[0] == "three-users-average: stable up to a common translation"
-    radius = next(line for line in lines if "spectral radius" in line)
-    assert f"{measured(result.spectral_radius, result.spectral_radius_error)} per frame of 8 ms" in radius
-    assert "  peers            3, 8 states each" in lines
-    assert "  method           modes, 1 translation left out" in lines
+def test_a_page_loads_nothing_and_runs_nothing(page: str) -> None:
+    reader = Reader()
+    reader.feed(page)
+    assert not reader.open
+    assert all(one.startswith(("#", "data:")) for one in reader.wanted)
+    assert reader.scripts == ["application/json"]
+    assert "default-src 'none'" in page
+    assert len(page.encode("utf-8")) < 5 * 2**20
 
 
-def test_a_conjugate_pair_is_one_row_and_the_rest_is_counted() -> None:
-    result = analyze(compiled(AVERAGE))
-    rows = [line for line in analysis_text(result).splitlines() if " Hz " in line or " – " in line]
-    alive = [mode for mode in result.modes if mode.magnitude > 1e-3]
-    assert len(rows) == sum(1 for mode in alive if mode.eigenvalue.imag >= 0)
-    dead = len(result.modes) - len(alive)
-    assert analysis_text(result).endswith(f"  and {dead} faster-dying ones (--json lists all)")
+def test_pictures_name_nothing_twice(page: str) -> None:
+    named = re.findall(r'id="([^"]+)"', page)
+    assert len(named) == len(set(named))
+    used = set(re.findall(r'(?:xlink:href="#|url\(#)([^")]+)', page))
+    assert used <= set(named)
 
 
-def test_what_rounding_makes_of_a_zero_changes_nothing_that_is_printed() -> None:
-    result = analyze(compiled(AVERAGE))
-    other = dataclasses.replace(
-        result,
-        modes=tuple(
-            dataclasses.replace(mode, eigenvalue=-1e-9j, magnitude=1e-9) if mode.magnitude < 1e-6 else mode
-            for mode in result.modes
-        ),
+def test_every_section_is_there_with_its_picture_table_and_command(page: str) -> None:
+    for key, title in pages.TITLES.items():
+        [section] = re.findall(rf'<section id="{key}">.*?</section>', page, re.DOTALL)
+        assert f"<h2>{title.replace('&', '&amp;')}</h2>" in section
+        if key == "network":
+            assert "no packet can get lost" in section
+            continue
+        assert "<table>" in section and "As by <code>apc " in section
+        assert ("<svg" in section) == (key != "compiled")
+    assert AVERAGE.splitlines()[0] in page  # the scene's own text
+    assert "prefers-color-scheme: dark" in page
+
+
+def test_the_numbers_are_those_of_the_commands(found: Report) -> None:
+    model = apc.compile(SCENE)
+    sections = {one.key: one for one in found.scenes[0].sections}
+
+    def value(key: str, table: int, name: str, column: int = 1) -> object:
+        return next(row[column] for row in sections[key].tables[table].rows if row[0] == name)
+
+    radius = value("verdict", 0, "spectral radius a frame")
+    assert radius == pytest.approx(apc.analyze(model).spectral_radius, abs=1e-12)
+    limit = value("limits", 0, "coordination.stiffness", 2)
+    assert limit == apc.critical(model, "coordination.stiffness").value
+    area = value("region", 0, "stable share of the rectangle")
+    assert area == pytest.approx(apc.region(model).stable_area / (5000 * 1500))
+
+
+def test_what_a_scene_says_is_text_and_no_markup(tmp_path: Path) -> None:
+    evil = "</pre></script><script>alert(1)</script><img src=x>"
+    path = tmp_path / "scene.yaml"
+    path.write_text(replaced(LONE, ("lone\n", f'lone\nabout: "{evil}"\n')), encoding="utf-8")
+    page = report_page(report([path]))
+    reader = Reader()
+    reader.feed(page)
+    assert reader.scripts == ["application/json"]
+    assert "<script>alert" not in page and "x" not in reader.wanted
+    (tmp_path / "r.html").write_text(page, encoding="utf-8")
+    assert kept_report(tmp_path / "r.html")["scenes"][0]["about"] == evil
+
+
+def test_sections_that_a_scene_cannot_fill_say_why(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(LONE, encoding="utf-8")
+    found = report([path])
+    why = {one.key: one.refused for one in found.scenes[0].sections if one.refused}
+    assert why["region"] == "the scene has fewer than two stiffnesses, and says no studies: region:"
+    assert why["network"] == "loss: there is no link"
+    assert all(f"Not here: {text}" in report_page(found).replace("&#x27;", "'") for text in why.values())
+
+
+def test_a_report_is_computed_anew_from_itself_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("users-table.yaml", "users.csv"):
+        shutil.copy(SCENES / name, tmp_path)
+    words = ["users-table.yaml", "--set", "arm.stiffness=60 N/m", "--out", "r.html"]
+    assert run(["report", *words]) == 0
+    for name in ("users-table.yaml", "users.csv"):
+        (tmp_path / name).unlink()
+    assert run(["report", "--check", "r.html"]) == 0
+    assert "r.html: every number is the same, computed anew" in capsys.readouterr().out
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["r.html"]
+    text = Path("r.html").read_text(encoding="utf-8")
+    kept = kept_report(Path("r.html"))
+    old = kept["scenes"][0]["sections"][1]["tables"][0]["rows"][1][1]
+    Path("r.html").write_text(text.replace(f"{old!r},", f"{old + 0.001!r},"), encoding="utf-8")
+    assert run(["report", "--check", "r.html"]) == 1
+    said = capsys.readouterr().err
+    assert "E991 Verdict, modes and margins: Verdict: value of spectral radius a frame is 0.9" in said
+
+
+def test_differences_are_by_more_than_roundings_and_their_own_errors() -> None:
+    def table(*rows: tuple[object, ...]) -> list[dict[str, object]]:
+        return [{"title": "T", "columns": ["what", "value", "error"], "rows": [list(row) for row in rows]}]
+
+    assert not differences(table(("a", 1.0, 1e-9)), table(("a", 1.0 + 1e-8, 1e-3)))
+    assert not differences(table(("a", 1.0, 0.2)), table(("a", 1.1, None)))
+    assert not differences(
+        table(("a", 1.0, None), ("b", 1e-17, None)), table(("a", 1.0, None), ("b", -3e-16, None))
     )
-    assert analysis_text(other) == analysis_text(result)
+    assert differences(table(("a", 1.0, 1e-9)), table(("a", 1.1, 1e-9))) == ["T: value of a is 1.1, not 1"]
+    assert differences(table(("a", None, None)), table(("a", 2.0, None))) == [
+        "T: value of a is 2, not nothing"
+    ]
+    assert differences(table(), table(("a", 1.0, None))) == ["T: 1 row, not the 0 that it has"]
+    assert differences([], table()) == ["T is new"] and differences(table(), []) == ["T is gone"]
 
 
 @pytest.mark.parametrize(
-    ("verdict", "words"),
+    "kept",
     [
-        ("stable", "Every motion dies out."),
-        ("drifts", "Nothing slows a common motion down."),
-        ("unstable", "Some motion grows"),
-        ("undecided: |ρ−1| below the error bound", "lies nearer to 1 than its error bound"),
+        "",
+        "<html></html>",
+        '<script type="application/json" id="apc-report">[]</script>',
+        '<script type="application/json" id="apc-report">{"scenes": [{"name": 3}]}</script>',
     ],
 )
-def test_every_verdict_is_told_in_words(verdict: str, words: str) -> None:
-    result = dataclasses.replace(analyze(compiled(ONE_MASS)), verdict=verdict)
-    assert words in analysis_text(result)
+def test_what_is_no_report_is_refused(kept: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "r.html"
+    path.write_text(kept, encoding="utf-8")
+    assert run(["report", "--check", str(path)]) == 1
+    assert "E990 is no report that apc has written, or is damaged" in capsys.readouterr().err
+    assert run(["report", "--check", str(tmp_path / "none.html")]) == 1
+    assert "E990" in capsys.readouterr().err
 
 
-def test_what_dies_out_at_once_is_counted_and_has_no_empty_table() -> None:
-    result = analyze(compiled(AVERAGE))
-    dead = tuple(dataclasses.replace(mode, magnitude=1e-9) for mode in result.modes[:2])
-    text = analysis_text(dataclasses.replace(result, modes=dead))
-    assert "magnitude" not in text
-    assert text.endswith("  2 modes die out within a frame (--json lists all)")
+@pytest.mark.parametrize(
+    "name", ["../out.yaml", "/tmp/out.yaml", "a/../../out.yaml", "C:out.yaml", "a\\..\\b"]
+)
+def test_a_report_from_somebody_writes_nowhere_else(
+    name: str, page: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "r.html"
+    old = json.dumps(["three-users-average.yaml", "x"])[:-5]
+    assert old in page
+    path.write_text(page.replace(old, json.dumps([name, "x"])[:-5]), encoding="utf-8")
+    assert run(["report", "--check", str(path)]) == 1
+    assert "E990 names a file outside of the scene's folder" in capsys.readouterr().err
 
 
-def test_a_share_that_would_show_as_zero_is_left_out() -> None:
-    result = analyze(compiled(AVERAGE))
-    first = dataclasses.replace(result.modes[0], participation=(("device.v", 0.9996), ("device.x", 0.0004)))
-    text = analysis_text(dataclasses.replace(result, modes=(first,)))
-    assert "device.v 100%" in text
-    assert " 0%" not in text
+def test_several_scenes_stand_side_by_side(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        (tmp_path / f"{name}.yaml").write_text(replaced(LONE, ("lone", name)), encoding="utf-8")
+    page = report_page(report([tmp_path / "one.yaml", tmp_path / "two.yaml"]))
+    [section] = re.findall(r'<section id="verdict">.*?</section>', page, re.DOTALL)
+    assert "<h3>one</h3>" in section and "<h3>two</h3>" in section
+    assert '<section id="compared">' in page and "apc compare one.yaml two.yaml" in page
 
 
-def test_only_what_is_known_to_be_faster_is_called_faster() -> None:
-    """A mode known to ±1 may be of any size: neither in the table nor among those that die faster."""
-    result = analyze(compiled(AVERAGE))
-    unknown = dataclasses.replace(result.modes[0], error=1.0)
-    text = " ".join(analysis_text(dataclasses.replace(result, modes=(*result.modes, unknown))).split())
-    assert "5 modes more (--json lists all), 1 of them known too roughly to say how fast it" in text
-    assert "faster-dying" not in text
-    alone = " ".join(analysis_text(dataclasses.replace(result, modes=(unknown, unknown))).split())
-    assert "2 modes (--json lists all), all of them known too roughly" in alone
-    assert "within a frame" not in alone
+def test_what_cannot_be_written_or_read_is_refused_before_anything_is_computed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(["report", str(SCENE), "--out", "r.txt"]) == 1
+    assert "E878 the suffix of --out" in capsys.readouterr().err
+    assert run(["report", str(SCENE), "--out", "no/r.html"]) == 1
+    assert "E601" in capsys.readouterr().err
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    assert run(["report", str(SCENE), "--out", "r.pdf"]) == 1
+    assert (
+        "E875 Chromium is not installed, which prints a .pdf. Write: --out r.html" in capsys.readouterr().err
+    )
+    assert run(["report", str(SCENE)]) == 2
+    assert run(["report", "scene.apc", "--out", "r.html"]) == 1
+    assert "E615" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not any(map(shutil.which, pages.BROWSERS)), reason="there is no Chromium")
+def test_a_pdf_is_printed(tmp_path: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(LONE, encoding="utf-8")
+    pages.save_report(report([tmp_path / "scene.yaml"]), tmp_path / "r.pdf")
+    assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["r.pdf", "scene.yaml"]

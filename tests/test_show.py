@@ -13,8 +13,10 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler.view.diagram import Diagram, build_diagram
+from apc.compiler.view.listing import show_page
 from apc.compiler.view.picture import place
 from apc.compiler.view.svg import Box, Line, Picture, Text, draw_svg
+from apc.present.graph import graph_picture
 from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, replaced, scene, told
 
 AVERAGE_FILE = SCENES / "three-users-average.yaml"
@@ -293,11 +295,14 @@ def test_the_file_says_the_format(
     assert out.read_text(encoding="utf-8").startswith(start)
 
 
+KINDS = ".txt, .json, .dot, .gv, .svg, .png, .pdf"
+
+
 @pytest.mark.parametrize(
     ("words", "name", "wanted"),
     [
-        ((), "scene.pdf", "one of .txt, .json, .dot, .gv, .svg, got .pdf. Write: --out scene.txt"),
-        ((), "scene", "one of .txt, .json, .dot, .gv, .svg, got none. Write: --out scene.txt"),
+        ((), "scene.jpg", f"one of {KINDS}, got .jpg. Write: --out scene.txt"),
+        ((), "scene", f"one of {KINDS}, got none. Write: --out scene.txt"),
         (("--format", "svg"), "scene.png", ".svg, got .png. Write: --out scene.svg"),
         (("--format", "dot"), "scene.svg", "one of .dot, .gv, got .svg. Write: --out scene.dot"),
     ],
@@ -328,3 +333,29 @@ def test_a_compiled_model_has_no_equations_to_show() -> None:
         "scene.apc: E615 is a compiled model, which no longer has the equations as they were written. "
         "Write: apc show scene.yaml"
     ]
+
+
+@pytest.mark.parametrize(("suffix", "magic"), [(".pdf", b"%PDF-"), (".png", b"\x89PNG"), (".svg", b"<svg")])
+def test_a_picture_is_what_its_name_says(suffix: str, magic: bytes, tmp_path: Path) -> None:
+    out = tmp_path / f"scene{suffix}"
+    assert run(["show", str(AVERAGE_FILE), "--out", str(out)]) == 0
+    assert out.read_bytes().startswith(magic)
+
+
+def test_the_drawn_page_has_every_text_of_the_svg_inside_it() -> None:
+    page = show_page(AVERAGE_FILE)
+    figure = graph_picture(page)
+    drawn = {text.get_text(): text for text in figure.axes[0].texts}
+    assert {mark.text for mark in page.marks if isinstance(mark, Text)} == set(drawn)
+    for text in drawn.values():
+        box = text.get_window_extent()
+        assert box.x0 >= 0 and box.x1 <= figure.bbox.width, text.get_text()
+
+
+def test_peers_that_a_picture_leaves_out_are_counted(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.yaml"
+    text = AVERAGE_FILE.read_text(encoding="utf-8").replace("count: 3", "count: 31")
+    scene.write_text(text.replace("lan: {", "lan: {graph: star, "), encoding="utf-8")
+    drawn = apc.show(scene, format="svg")
+    assert "31 peers, star graph" in drawn and "16 drawn, 15 left out" in drawn
+    assert "left out" not in apc.show(AVERAGE_FILE, format="svg")

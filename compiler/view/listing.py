@@ -1,7 +1,7 @@
 """What a scene is made of, as text for a person to read: what `apc show` tells.
 
 Takes: a topology's path.
-Gives: `show_text` and `show_document` (for JSON), `show_dot`, `show_svg`.
+Gives: `show_text` and `show_document` (for JSON), `show_dot`, `show_svg`, `show_page`.
 Guarantees: `show_text` has at most 80 columns wherever a name allows it; the same topology gives the same
 bytes.
 Does not: analyse, or compute anything new.
@@ -27,7 +27,7 @@ from apc.compiler.scene.scene import Scene
 from apc.compiler.view.diagram import Diagram, build_diagram, draw_dot, one_of, seconds
 from apc.compiler.view.picture import place
 from apc.compiler.view.stages import step_lines
-from apc.compiler.view.svg import draw_svg
+from apc.compiler.view.svg import Picture, draw_svg
 from apc.compiler.words import counted, wrapped
 
 PAIRWISE = ("max", "min")
@@ -40,7 +40,12 @@ def show_dot(path: Path) -> str:
 
 def show_svg(path: Path) -> str:
     """Return the graph of a topology as a picture, an SVG document."""
-    return draw_svg(place(_diagram(path)))
+    return draw_svg(show_page(path))
+
+
+def show_page(path: Path) -> Picture:
+    """Return the graph of a topology as marks on a page."""
+    return place(_diagram(path))
 
 
 def show_text(path: Path) -> str:

@@ -162,8 +162,11 @@ def _nets(
         lines = net.lines
         width = max(text_width(net.name, SIZE, bold=True), *(text_width(t, SMALL) for t in lines)) + 2 * PAD
         height = 2 * PAD + LINE * (1 + len(lines))
-        caption = f"{counted(diagram.peers, 'peer')}, {_shape(net)}"
-        band = max(height, THUMB + 2 * LINE)
+        captions = [f"{counted(diagram.peers, 'peer')}, {_shape(net)}"]
+        if diagram.peers > MOST_PEERS:
+            captions.append(f"{MOST_PEERS} drawn, {diagram.peers - MOST_PEERS:,} left out")
+        caption_width = max(text_width(caption, SMALL) for caption in captions)
+        band = max(height, THUMB + 2 * LINE * len(captions))
         wanted = sum(at[net.name]) / len(at[net.name]) - band / 2 if at[net.name] else y
         y = max(y, wanted)
         middle = y + band / 2
@@ -177,12 +180,13 @@ def _nets(
         for link, port_x, port_y in ports:
             if link == net.name:
                 marks += _to_net((port_x, port_y), (left, port_y), (x, middle))
-        thumb_x = x + width + 60 + max(THUMB, text_width(caption, SMALL)) / 2
+        thumb_x = x + width + 60 + max(THUMB, caption_width) / 2
         start, end = x + width + 4, thumb_x - THUMB / 2 - 12
         marks.append(Line(((start, middle), (end, middle)), FAINT, dashed=True, arrows=True))
         marks += _who_hears_whom(diagram, net, thumb_x, middle, crowd_colours)
-        marks.append(Text(thumb_x, middle + THUMB / 2 + LINE + 2, caption, middle=True, colour=FAINT))
-        right = max(right, thumb_x + max(THUMB, text_width(caption, SMALL)) / 2 + 6)
+        for i, caption in enumerate(captions, 1):
+            marks.append(Text(thumb_x, middle + THUMB / 2 + LINE * i + 2, caption, middle=True, colour=FAINT))
+        right = max(right, thumb_x + max(THUMB, caption_width) / 2 + 6)
         y += band + BETWEEN
     return marks, right, y
 
@@ -212,20 +216,15 @@ def _who_hears_whom(
     number = min(diagram.peers, MOST_PEERS)
     owners = [crowd.name for crowd in diagram.crowds for _ in range(min(crowd.count, MOST_PEERS))][:number]
     radius = THUMB / 2 - 8
-    at = [
-        (x - radius * math.cos(2 * math.pi * i / number), y - radius * math.sin(2 * math.pi * i / number))
-        for i in range(number)
-    ]
+    centre = net.shape == "star"  # the first peer, drawn in the middle
+    around = [2 * math.pi * i / max(1, number - centre) for i in range(number - centre)]
+    at = [(x - radius * math.cos(turn), y - radius * math.sin(turn)) for turn in around]
+    at = [(x, y), *at] if centre else at
     for one, two in _pairs(net, number):
-        if net.shape == "star" and one == 0:
-            # The first peer is the centre: it is drawn in the middle.
-            yield Line(((x, y), at[two]), FAINT, width=0.8)
-        else:
-            yield Line((at[one], at[two]), FAINT, width=0.8)
+        yield Line((at[one], at[two]), FAINT, width=0.8)
     for i, (dot_x, dot_y) in enumerate(at):
         colour = colours[owners[i]]
-        centre = net.shape == "star" and i == 0
-        yield Dot(x if centre else dot_x, y if centre else dot_y, 6 if i == 0 else 4.5, colour, INK)
+        yield Dot(dot_x, dot_y, 6 if i == 0 else 4.5, colour, INK)
 
 
 def _pairs(net: Net, number: int) -> list[tuple[int, int]]:

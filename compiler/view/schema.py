@@ -1,6 +1,7 @@
 """The language of topologies as a JSON Schema, so that an editor completes and checks while one types.
 
-Takes: a `Library`. Gives: `topology_schema`, a JSON Schema document (draft 2020-12).
+Takes: a `Library`. Gives: `topology_schema`, a JSON Schema document (draft 2020-12); `limits_of`,
+`in_unit`, `is_required` of a declared parameter.
 Guarantees: generated from what the compiler reads by, and the same library gives the same document; what
 the compiler accepts fits it.
 Does not: catch everything: names that refer to each other, and bounds in other units, stay the compiler's.
@@ -195,7 +196,7 @@ def _part(component: Component, quantities: _Quantities) -> Schema:
             about = f"start value of the {variable.about or name}"
             entries.setdefault(name, []).append({**quantities.of(variable.unit), "description": about})
     properties |= {name: found[0] if len(found) == 1 else _vector(found) for name, found in entries.items()}
-    required = [whole_and_index(p.name)[0] for p in component.parameters if _is_required(p)]
+    required = [whole_and_index(p.name)[0] for p in component.parameters if is_required(p)]
     return {
         "description": component.about,
         **_object(properties, required=dict.fromkeys(required)),
@@ -238,21 +239,26 @@ def _parameter(parameter: Parameter, quantities: _Quantities) -> Schema:
 
 
 def _bounds(parameter: Number) -> str:
-    told = ""
-    if parameter.minimum is not None:
-        told += f", {'>' if parameter.open_minimum else '≥'} {_shown(parameter, parameter.minimum)}"
-    if parameter.maximum is not None:
-        told += f", ≤ {_shown(parameter, parameter.maximum)}"
-    if parameter.default is not None:
-        told += f", {_shown(parameter, parameter.default)} if not given"
-    return told
+    told = "".join(f", {limit}" for limit in limits_of(parameter))
+    return (
+        told if parameter.default is None else f"{told}, {in_unit(parameter, parameter.default)} if not given"
+    )
 
 
-def _shown(parameter: Number, number: Any) -> str:
+def limits_of(parameter: Number) -> list[str]:
+    """Return where a parameter's values must lie, in its unit."""
+    low, high = parameter.minimum, parameter.maximum
+    told = [] if low is None else [f"{'>' if parameter.open_minimum else '≥'} {in_unit(parameter, low)}"]
+    return told if high is None else [*told, f"≤ {in_unit(parameter, high)}"]
+
+
+def in_unit(parameter: Number, number: Any) -> str:
+    """Return a number in SI as text, in the unit that a parameter declares."""
     return f"{float(number / parameter.unit.scale):.12g}"
 
 
-def _is_required(parameter: Parameter) -> bool:
+def is_required(parameter: Parameter) -> bool:
+    """Return whether a part must give a parameter itself."""
     if isinstance(parameter, Reference):
         return parameter.role in ("clock", "link", "table")
     return parameter.default is None

@@ -10,9 +10,11 @@ Does not: read files, or draw.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
@@ -46,6 +48,8 @@ from apc.frame.start import at_start
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded
+
+SETTLED = 0.02  # of where it began: a motion counts as settled
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +96,22 @@ class Analysis(Result):
     left_out: tuple[str, ...] = ()
     translations: int = 0
     unfelt: tuple[str, ...] = ()
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the eigenvalues over the unit circle into a matplotlib Axes, or a figure of its own's."""
+        return self._shown("picture", ax)
+
+    @property
+    def settling_s(self) -> float | None:
+        """Seconds after which the slowest motion is down to `SETTLED`; None if it doesn't die out.
+
+        frame · ln(`SETTLED`)/ln(spectral radius): frames of different length can be compared by it.
+        """
+        if self.stable is not True or self.spectral_radius >= 1:
+            return None
+        return (
+            self.frame_s * math.log(SETTLED) / math.log(self.spectral_radius) if self.spectral_radius else 0.0
+        )
 
 
 def prepare(system: CompiledSystem, *, order: Sequence[str] = ORDER) -> Prepared:

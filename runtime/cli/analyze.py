@@ -7,6 +7,7 @@ Does not: compute.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -14,12 +15,16 @@ import click
 from apc.analysis.methods import AUTO, METHODS
 from apc.cli.options import (
     Command,
+    beside,
+    check_plot,
     file_argument,
+    file_option,
     hands_option,
     json_option,
     note_aside,
     print_result,
     set_option,
+    tell,
 )
 from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -70,6 +75,7 @@ SECONDS_A_PEER = 1e-4
     help="Predict how one-sided contacts buzz, and play the scene for up to 80 s to lay it beside.",
 )
 @hands_option
+@file_option("--plot", "Draw the eigenvalues over the unit circle: .png, .svg or .pdf.")
 @json_option
 def analyze_command(
     file: str | None,
@@ -80,6 +86,7 @@ def analyze_command(
     every_convention: bool,
     with_buzz: bool,
     hands: str,
+    plot: Path | None,
     as_json: bool,
 ) -> None:
     """Say whether a scene is stable, by how much, and in which modes.
@@ -97,9 +104,11 @@ def analyze_command(
     from apc.frame.devices import HANDS, PASSIVE, published
     from apc.inputs import open_scene
 
-    system = open_scene(file, settings, hands=hands, told=note_aside)
+    check_plot(plot)
+    system = open_scene(file, settings, {"--plot": plot}, hands=hands, told=note_aside)
     if hands == PASSIVE:
         asked = {"--method": method != AUTO, "--conventions": every_convention, "--buzz": with_buzz}
+        asked["--plot"] = plot is not None
         refused = [name for name, given in asked.items() if given]
         _judge_passive(system, refused, box, certify=certify, as_json=as_json)
         return
@@ -120,7 +129,13 @@ def analyze_command(
             every_convention=every_convention,
             with_buzz=with_buzz,
         )
-    print_result(found, as_json=as_json)
+    if plot is not None:
+        from apc.present.eigenvalues import save_eigenvalues
+
+        save_eigenvalues(found.analysis, plot)
+    print_result(found, as_json=as_json, err=beside(plot))
+    if plot is not None and not as_json:
+        tell(f"\n{plot} is written", err=beside(plot))
 
 
 def _judge_passive(

@@ -8,7 +8,6 @@ Does not: compute, or decide exit codes (see `__main__`).
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import click
@@ -20,23 +19,25 @@ from apc.cli.critical import critical_command
 from apc.cli.export import export_command
 from apc.cli.feel import feel_command
 from apc.cli.network import network_command
+from apc.cli.library import library_command, new_command
 from apc.cli.options import Group, beside, file_argument, file_option, tell
 from apc.cli.play import play_command
 from apc.cli.progress import at_work
 from apc.cli.region import region_command
+from apc.cli.report import report_command
 from apc.cli.simulate import simulate_command
 from apc.cli.sweep import sweep_command
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import unwritable, write_text
+from apc.compiler.files import write_text
 from apc.compiler.timings import recording
 from apc.compiler.words import counted
+from apc.present.forms import json_text
 from apc.suffixes import check_suffix
 from apc.threads import start_single_threaded
 
 STAGES = ("source", "scene", "flat", "clocked", "sorted", "compiled")
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}\Z")
-SCHEMA_FILE = "topology.schema.json"
 FORMATS = {".txt": "text", ".json": "json", ".dot": "dot", ".gv": "dot", ".svg": "svg"}
+FORMATS |= {".png": "picture", ".pdf": "picture"}
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 80}
 
 
@@ -76,7 +77,9 @@ def apc() -> None:
         apc network        what a recording of ping or irtt amounts to
         apc play           the same in real time, over a network
         apc export         files that other tools read
+        apc report         all of it as one page, to keep and to mail
         apc show           what the scene is made of, as text or a picture
+        apc library        the components there are, and what one is
 
     Without FILE a command takes the only topology of the folder.
     """
@@ -88,44 +91,14 @@ apc.add_command(compare_command)
 apc.add_command(critical_command)
 apc.add_command(export_command)
 apc.add_command(feel_command)
+apc.add_command(library_command)
+apc.add_command(new_command)
+apc.add_command(report_command)
 apc.add_command(simulate_command)
 apc.add_command(network_command)
 apc.add_command(play_command)
 apc.add_command(region_command)
 apc.add_command(sweep_command)
-
-
-@apc.command()
-@click.argument("name", default="topology")
-def new(name: str) -> None:
-    """Write NAME.yaml, a commented topology to start from.
-
-    NAME is "topology" if not given. A file that exists is never overwritten.
-    """
-    if not NAME.match(name):
-        what = "a scene's name"
-        expected = "letters, digits, - and _, 63 at most, with a letter or digit first"
-        raise ApcError(Mistake("E612", Place(name[:80] or "''"), what, expected, "this", "apc new my-scene"))
-    from importlib.resources import files
-
-    text = files("apc.models").joinpath("scenes/template.yaml").read_text(encoding="utf-8")
-    # Its first line names the schema beside the library; a schema beside the new topology serves as well.
-    _, _, text = text.partition("\n")
-    if Path(SCHEMA_FILE).is_file():
-        text = f"# yaml-language-server: $schema={SCHEMA_FILE}\n{text}"
-    path = Path(f"{name}.yaml")
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text.replace("topology: my-scene", f"topology: {name}"))
-    except FileExistsError:
-        raise ApcError(
-            Mistake(
-                "E613", Place(str(path)), "exists already and is left as it is", hint="apc new another-name"
-            )
-        ) from None
-    except OSError as error:
-        raise unwritable(path, error) from None
-    tell(f"{path} is written. Next: apc compile {path}")
 
 
 @apc.command()
@@ -210,8 +183,13 @@ def _compile(path: Path) -> None:
     help="text: graph, equations, schedule. json: the same as one document. dot: the graph for Graphviz. "
     "svg: the graph as a picture. Taken from --out if not given, else text.",
 )
-@file_option("--out", "Write to this file instead of the terminal.")
-def show(file: str | None, format_: str | None, out: Path | None) -> None:
+@click.option(
+    "--parameters",
+    is_flag=True,
+    help="List what may be set instead: names, values, units, limits; as text or json.",
+)
+@file_option("--out", "Write to this file: .txt .json .dot .svg, or as a picture .png .pdf.")
+def show(file: str | None, format_: str | None, parameters: bool, out: Path | None) -> None:
     """Show what a scene is made of: its graph, equations and schedule.
 
     The graph has the parts of one peer and how they are joined, and the
@@ -222,12 +200,34 @@ def show(file: str | None, format_: str | None, out: Path | None) -> None:
     from apc.inputs import check_topology_outputs, find_input
 
     wanted = format_ or "text"
+    formats = {name: of for name, of in FORMATS.items() if not parameters or of in ("text", "json")}
     if out is not None and (out.suffix or not format_):
-        known = [suffix for suffix in FORMATS if format_ in (None, FORMATS[suffix])]
-        wanted = FORMATS[check_suffix(out, known, "--out")]
+        known = [suffix for suffix in formats if format_ in (None, formats[suffix])]
+        wanted = formats[check_suffix(out, known, "--out")]
+    if parameters:
+        _show_parameters(file, wanted, out)
+        return
     path = Path(file) if file else find_input(compiled_too=False)
     check_topology_outputs(path, {"--out": out})
+    if wanted == "picture":
+        from apc.present.graph import save_graph
+
+        assert out is not None
+        save_graph(path, out)
+        tell(f"{out} is written", err=beside(out))
+        return
     _print_or_write(shown(path, format=wanted), out)  # type: ignore[arg-type] # click checked the word
+
+
+def _show_parameters(file: str | None, wanted: str, out: Path | None) -> None:
+    """List what may be set of a scene."""
+    from apc.frame.settable import parameters
+    from apc.inputs import open_scene
+
+    if wanted not in ("text", "json"):
+        raise click.UsageError("--parameters is a table: --format text or json")
+    found = parameters(open_scene(file, (), {"--out": out}))
+    _print_or_write(json_text(found.to_dict()) if wanted == "json" else str(found), out)
 
 
 @apc.command()

@@ -14,8 +14,11 @@ import click
 
 from apc.cli.options import (
     Command,
+    beside,
+    check_plot,
     criterion_with,
     file_argument,
+    file_option,
     hands_option,
     in_option,
     json_option,
@@ -23,6 +26,7 @@ from apc.cli.options import (
     note_usual,
     print_result,
     set_option,
+    tell,
 )
 from apc.cli.progress import status_line
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -40,6 +44,7 @@ SCENES = (".yaml", ".yml", ".apc")
 @click.option("--lower", metavar='"VALUE UNIT"', help="Look no further down than this.")
 @in_option
 @hands_option
+@file_option("--plot", "Draw where the eigenvalues go as it grows (root locus): .png, .svg or .pdf.")
 @json_option
 def critical_command(
     path: str,
@@ -49,6 +54,7 @@ def critical_command(
     lower: str | None,
     criterion: str | None,
     hands: str,
+    plot: Path | None,
     as_json: bool,
 ) -> None:
     """Find the largest stable value of a parameter, with its error.
@@ -66,10 +72,21 @@ def critical_command(
     _check_order(path, file)
     asked = criterion_with(hands, criterion)
     note_usual(hands)
-    system = open_scene(file, settings, hands=hands, told=note_aside)
+    check_plot(plot)
+    if plot is not None and asked == "passive":
+        what = "--plot and --hands passive don't go together: what hands can draw has no eigenvalues"
+        raise ApcError(Mistake("E930", Place("--hands"), what, hint="--hands clamped"))
+    system = open_scene(file, settings, {"--plot": plot}, hands=hands, told=note_aside)
     with status_line() as told:
         found = critical(system, path, lower=lower, upper=upper, criterion=asked, told=told)
-    print_result(found, as_json=as_json)
+    if plot is not None:
+        from apc.present.eigenvalues import save_eigenvalues
+        from apc.vary.locus import root_locus
+
+        save_eigenvalues(root_locus(system, found), plot)
+    print_result(found, as_json=as_json, err=beside(plot))
+    if plot is not None and not as_json:
+        tell(f"\n{plot} is written", err=beside(plot))
 
 
 def _check_order(path: str, file: str | None) -> None:

@@ -2,7 +2,7 @@
 
 Takes: a result.
 Gives: `Command`, `Group`; `file_argument`, `file_option`, `set_option`, `in_option`, `hands_option`,
-`json_option`, `criterion_with`, `WholeNumber`; `print_result`, `tell`, `beside`.
+`json_option`, `check_plot`, `criterion_with`, `WholeNumber`; `print_result`, `tell`, `beside`.
 Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal.
 Does not: know any command.
 """
@@ -56,6 +56,14 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 def file_option(name: str, told: str, *, required: bool = False) -> Callable[[Function], Function]:
     """Return an option that names a file to write; `told` is its help."""
     return click.option(name, type=click.Path(path_type=Path), metavar="FILE", help=told, required=required)
+
+
+def check_plot(plot: Path | None) -> None:
+    """Refuse a picture that can't be drawn, before anything is computed."""
+    if plot is not None:
+        from apc.present.pictures import check_format
+
+        check_format(plot)
 
 
 def criterion_with(hands: str, criterion: str | None) -> str | None:

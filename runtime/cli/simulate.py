@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     metavar="PATTERN",
     help="Record only what fits, such as cube.x, 'left[2].*' or '*.v'. May be repeated.",
 )
-@file_option("--out", "Write the rows to this file: .csv, .parquet, .mat or .npz.")
+@file_option("--out", "Write the rows to this file: .csv, .parquet, .mat or .npz; or what moves: .gif, .mp4.")
 @file_option("--plot", "Draw them, a panel a quantity: .png, .svg or .pdf.")
 @file_option("--still", "Draw how it begins, the peers' bodies side by side: .png, .svg or .pdf.")
 @json_option
@@ -119,6 +119,7 @@ def simulate_command(
     \b
         apc simulate --duration "3 s" --plot run.png
         apc simulate --signals cube.x --out run.csv
+        apc simulate --out run.gif
         apc simulate --runs 1000 --seed 1 --jobs 4
         apc simulate --method semi-implicit:1ms --error
     """
@@ -164,9 +165,11 @@ class _Kept:
 def _check_files(out: Path | None, plot: Path | None, still: Path | None) -> None:
     """Refuse a file that can't be written, or a picture that can't be drawn, before anything is computed."""
     if out is not None:
+        from apc.present import animation
         from apc.present.recording import SUFFIXES
 
-        check_suffix(out, SUFFIXES, "--out")
+        if check_suffix(out, (*SUFFIXES, *animation.SUFFIXES), "--out") in animation.SUFFIXES:
+            animation.check_animation(out)
     for path, option in ((plot, "--plot"), (still, "--still")):
         if path is not None:
             from apc.present.pictures import check_format
@@ -193,17 +196,24 @@ def _play_many(system: CompiledSystem, how: Settings, runs: int, jobs: int, *, a
 
 def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bool) -> None:
     """Play a scene once, keep what is wanted of it, and print what it amounts to."""
+    from apc.present.animation import SUFFIXES, save_animation
     from apc.simulation.accuracy import compare_with
     from apc.simulation.simulation import prepare
     from apc.simulation.trajectory import Keeper, Played, provenance_of, trajectory_of
 
+    moving = kept.out if kept.out is not None and kept.out.suffix.lower() in SUFFIXES else None
+    if moving is not None and kept.signals:
+        raise click.UsageError(f"--signals chooses rows: a {moving.suffix} shows all that moves")
     simulation = prepare(system, how, signals=kept.signals)
-    keeper = Keeper(simulation) if kept.plot is not None else None
+    keeper = Keeper(simulation) if kept.plot is not None or moving is not None else None
     comparison = compare_with(simulation, signals=kept.signals) if kept.error else None
     sinks = [sink for sink in (keeper, comparison) if sink is not None]
-    summary, interrupted, out = _play_into(simulation, kept.out, sinks)
+    summary, interrupted, out = _play_into(simulation, kept.out if moving is None else None, sinks)
     estimate = comparison.estimate() if comparison is not None else None
     plot = kept.plot
+    if moving is not None and keeper is not None:
+        out = partial_name(moving) if interrupted else moving
+        save_animation(system, trajectory_of(simulation, keeper, summary, interrupted), out)
     if plot is not None and keeper is not None:
         from apc.present.simulation import save_picture
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,6 +142,18 @@ class Feel(Result):
     linearized: bool
     left_out: tuple[str, ...]
     notes: tuple[str, ...]
+
+    def plot(self, ax: Any = None, *, kind: str = "bode") -> Any:
+        """Draw Bode's plot or Nyquist's; return the matplotlib Figure.
+
+        Parameters
+        ----------
+        ax
+            The matplotlib Axes to draw into, of Bode's plot the magnitudes alone.
+        kind
+            "bode" or "nyquist".
+        """
+        return self._shown("picture", kind, ax)
 
 
 @part("feel")

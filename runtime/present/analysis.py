@@ -165,6 +165,13 @@ def analysis_document(result: Analysis) -> dict[str, Any]:
     return found
 
 
+def analysis_picture(result: Analysis, ax: Any = None) -> Any:
+    """Draw the eigenvalues of an analysis; return the matplotlib Axes."""
+    from apc.present.eigenvalues import eigenvalues_picture  # an analysis in words needs none of it
+
+    return eigenvalues_picture(result, ax)
+
+
 def answer_text(found: Answer) -> str:
     """Return what `apc analyze` prints: the analysis, and what stands beside it."""
     parts = [analysis_text(found.analysis), str(found.sensitivities), str(found.margins)]

@@ -15,21 +15,15 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from apc.optional import need
+from apc.present.pictures import COLOURS
 
 if TYPE_CHECKING:
     from apc.comparison.comparison import Comparison, Scheme
     from apc.vary.critical import Critical
 
-# Colours distinct in print and for colour-blind eyes (Okabe and Ito, 2008), and how bars are hatched.
-STYLES = (
-    ("#000000", ""),
-    ("#0072B2", "////"),
-    ("#D55E00", "\\\\\\\\"),
-    ("#009E73", "||||"),
-    ("#CC79A7", "xxxx"),
-    ("#E69F00", "----"),
-)
-COLUMNS = 4  # panels beside each other
+# How bars are hatched: as 7 colours and 8 hatches have no common divisor, the first 56 schemes all differ.
+HATCHES = ("", "////", "\\\\\\\\", "||||", "xxxx", "----", "....", "oooo")
+COLUMNS = 3  # panels beside each other
 PANEL, BAR = 2.4, 0.28  # inches: the width of a panel, the height of a bar
 FURTHER = 4.0  # times the longest bar that ends, to which one that does not is drawn at most
 LABEL = 24  # letters of a scheme's name in a line
@@ -37,6 +31,7 @@ LABEL = 24  # letters of a scheme's name in a line
 # A bar: its length, and whether it goes on beyond that; or a word where there is none.
 _Bar = tuple[float, bool] | str
 NONE = "–"
+BOUNDARY = 1.0  # the spectral radius from which on a motion grows
 
 
 def comparison_picture(found: Comparison) -> Any:
@@ -50,6 +45,7 @@ def comparison_picture(found: Comparison) -> Any:
     figures = need("matplotlib.figure", "plot")
     panels: list[tuple[str, list[_Bar]]] = [
         ("spectral radius a frame", [(one.analysis.spectral_radius, False) for one in found.schemes]),
+        ("settles within 2 % in (s)", [_settles(one) for one in found.schemes]),
         ("largest stable stiffness (N/m)", [_reach(one.stiffness, 1.0) for one in found.schemes]),
         ("delay that breaks it (ms)", [_reach(one.delay, 1e3) for one in found.schemes]),
         ("loss that breaks it (%)", [_reach(one.loss, 1e2) for one in found.schemes]),
@@ -61,12 +57,12 @@ def comparison_picture(found: Comparison) -> Any:
     rows = -(-len(panels) // COLUMNS)
     named = [f"{place + 1}  {one.topology}" for place, one in enumerate(found.schemes)]
     names = ["\n".join(textwrap.wrap(one, LABEL)) for one in named]
-    tall = 0.9 + BAR * 1.6 * len(names)
+    tall = 0.9 + BAR * 1.25 * len(names)
     size = (PANEL * COLUMNS + 1.4, tall * rows + 0.5)
     figure = figures.Figure(figsize=size, layout="constrained")
     axes = figure.subplots(rows, COLUMNS, squeeze=False, sharey=True).ravel()
-    for ax, (title, bars) in zip(axes, panels, strict=True):
-        _draw(ax, title, bars)
+    for place, (ax, (title, bars)) in enumerate(zip(axes, panels, strict=True)):
+        _draw(ax, title, bars, BOUNDARY if place == 0 else 0.0)
     axes[0].set_yticks(range(len(names)), names, fontsize=8)
     axes[0].invert_yaxis()
     _judge(axes[0], found.schemes)
@@ -74,6 +70,11 @@ def comparison_picture(found: Comparison) -> Any:
     if lines:
         figure.suptitle("\n".join(lines), fontsize=8.5)
     return figure
+
+
+def _settles(one: Scheme) -> _Bar:
+    seconds = one.analysis.settling_s
+    return NONE if seconds is None else (seconds, False)
 
 
 def _reach(found: Critical | None, scale: float) -> _Bar:
@@ -91,8 +92,8 @@ def _felt(one: Scheme, place: int) -> _Bar:
     return NONE if one.feel is None else (float(abs(one.feel.impedance[place])), False)
 
 
-def _draw(ax: Any, title: str, bars: Sequence[_Bar]) -> None:
-    """Draw one quantity of all schemes."""
+def _draw(ax: Any, title: str, bars: Sequence[_Bar], beyond: float) -> None:
+    """Draw one quantity of all schemes, the numbers behind the bars and behind what is `beyond`."""
     ax.set_title(title, fontsize=8.5)
     ax.tick_params(labelsize=8)
     ax.spines[["top", "right"]].set_visible(False)
@@ -100,12 +101,13 @@ def _draw(ax: Any, title: str, bars: Sequence[_Bar]) -> None:
     known = [bar for bar in bars if not isinstance(bar, str)]
     ended = max((length for length, on in known if not on), default=0.0)
     # What ends nowhere may be looked at a thousand times as far, and would leave no room for the others.
-    longest = max((min(one, FURTHER * ended or one) if on else one for one, on in known), default=0.0)
+    longest = max((min(one, FURTHER * ended or one) if on else one for one, on in known), default=beyond)
+    longest = max(longest, beyond)
     ax.set_xlim(0, 1.3 * longest if longest else 1.0)
     ax.set_ylim(-0.6, len(bars) - 0.4)
     ax.locator_params(axis="x", nbins=4)
     for place, bar in enumerate(bars):
-        colour, hatch = STYLES[place % len(STYLES)]
+        colour, hatch = COLOURS[place % len(COLOURS)], HATCHES[place % len(HATCHES)]
         if isinstance(bar, str):
             _write(ax, bar, 0.0, place)
             continue
@@ -113,7 +115,7 @@ def _draw(ax: Any, title: str, bars: Sequence[_Bar]) -> None:
         face = colour if not hatch else "white"
         drawn = min(length, longest)
         ax.barh(place, drawn, height=0.6, facecolor=face, edgecolor=colour, hatch=hatch, linewidth=0.8)
-        _write(ax, f"{'> ' if on else ''}{length:.4g}", drawn, place)
+        _write(ax, f"{'> ' if on else ''}{length:.4g}", max(drawn, beyond), place)
 
 
 def _write(ax: Any, text: str, x: float, y: int) -> None:
@@ -124,7 +126,7 @@ def _write(ax: Any, text: str, x: float, y: int) -> None:
 
 def _judge(ax: Any, schemes: Sequence[Scheme]) -> None:
     """Draw where the boundary is; write which scheme is not stable, and what one does that isn't linear."""
-    ax.axvline(1.0, color="0.4", linewidth=0.8, linestyle=(0, (3, 2)))
+    ax.axvline(BOUNDARY, color="0.4", linewidth=0.8, linestyle=(0, (3, 2)))
     for place, one in enumerate(schemes):
         said = [] if one.stable else ["unstable" if one.stable is False else "undecided"]
         if one.played is not None:

@@ -216,31 +216,29 @@ def feel_document(found: Feel) -> dict[str, Any]:
     return whole
 
 
-def feel_picture(found: Feel, kind: str = "bode") -> Any:
-    """Draw the impedance, and what arrives elsewhere, as Bode's plot or Nyquist's; return the Figure."""
+def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
+    """Draw the impedance, and what arrives elsewhere, as Bode's plot or Nyquist's; return the Figure.
+
+    Into an `ax` of somebody's, of Bode's plot the magnitudes alone are drawn.
+    """
     figures = need("matplotlib.figure", "plot")
     if kind == "nyquist":
-        figure = figures.Figure(figsize=(4.2, 4.0), layout="constrained")
-        ax = figure.subplots()
+        ax = ax or figures.Figure(figsize=(4.2, 4.0), layout="constrained").subplots()
         ax.plot(found.impedance.real, found.impedance.imag, color="#000000")
         ax.axvline(0.0, color="#999999", linewidth=0.6)
         ax.axhline(0.0, color="#999999", linewidth=0.6)
         ax.set_aspect("equal", adjustable="datalim")
         ax.set_xlabel("real part of the impedance (N·s/m)")
         ax.set_ylabel("imaginary part (N·s/m)")
-        for place in (0, len(found.frequency_hz) - 1):
-            at = found.impedance[place]
-            ax.annotate(
-                f"{found.frequency_hz[place]:.3g} Hz",
-                (at.real, at.imag),
-                (5, 5),
-                textcoords="offset points",
-                fontsize=8,
-            )
+        for place, mark in ((0, "o"), (len(found.frequency_hz) - 1, "s")):
+            at, label = found.impedance[place], f"{found.frequency_hz[place]:.3g} Hz"
+            ax.plot(at.real, at.imag, mark, color="#000000", markersize=5, label=label)
+        _legend(ax, below=0.16, columns=2)
         ax.set_title(f"{found.topology}: felt at {found.at}", fontsize=9)
-        return figure
-    figure = figures.Figure(figsize=(5.2, 5.2), layout="constrained")
-    size, phase = figure.subplots(2, 1, sharex=True)
+        return ax.figure
+    size, phase = ax, None
+    if ax is None:
+        size, phase = figures.Figure(figsize=(5.2, 5.6), layout="constrained").subplots(2, 1, sharex=True)
     size.loglog(found.frequency_hz, np.abs(found.impedance), color="#000000", label="impedance (N·s/m)")
     if found.between:
         size.loglog(
@@ -256,15 +254,25 @@ def feel_picture(found: Feel, kind: str = "bode") -> Any:
             linestyle="-.",
             label=f"copies of {found.copy} apart (mm/N)",
         )
-    size.legend(fontsize=8, frameon=False)
     size.set_ylabel("magnitude")
+    size.set_title(f"{found.topology}: felt at {found.at}", fontsize=9)
+    last = size if phase is None else phase
+    last.set_xlabel("frequency (Hz)")
+    handles, labels = size.get_legend_handles_labels()
+    _legend(last, below=0.2, columns=1, handles=handles, labels=labels)
+    if phase is None:
+        return size.figure
     phase.semilogx(found.frequency_hz, np.degrees(np.angle(found.impedance)), color="#000000")
     phase.set_ylabel("phase of the impedance (°)")
-    phase.set_xlabel("frequency (Hz)")
     if np.abs(np.angle(found.impedance)).max() <= np.pi / 2:
         phase.set_yticks(range(-90, 91, 45))
-    size.set_title(f"{found.topology}: felt at {found.at}", fontsize=9)
-    return figure
+    return size.figure
+
+
+def _legend(ax: Any, *, below: float, columns: int, **named: Any) -> None:
+    """Name curves below an Axes, so many of its heights, over nothing."""
+    look = {"fontsize": 8, "frameon": False, "ncols": columns}
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -below), **look, **named)
 
 
 def write_feel(path: Path, found: Feel, *, nyquist: bool = False) -> None:

@@ -1,7 +1,9 @@
 """What all pictures share: their formats, and how a figure becomes a file.
 
-Takes: a matplotlib Figure and a path. Gives: `FORMATS`, `check_format`, `check_result_path`, `write_figure`.
-Guarantees: the same figure gives the same bytes; a file is there whole or not at all.
+Takes: a matplotlib Figure and a path.
+Gives: `COLOURS`, `LINES`, `colours_of`; `FORMATS`, `check_format`, `check_result_path`, `write_figure`,
+`svg_text`.
+Guarantees: the same figure gives the same bytes; a file is there whole or not at all; text in an SVG is text.
 Does not: draw, or need a display.
 
 matplotlib is loaded when something is drawn and not before.
@@ -9,6 +11,8 @@ matplotlib is loaded when something is drawn and not before.
 
 from __future__ import annotations
 
+import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +23,29 @@ from apc.tables import SUFFIXES, check_table_path
 
 FORMATS = (".png", ".svg", ".pdf")
 DPI = 150
+SVG = {"svg.hashsalt": "apc", "svg.fonttype": "none"}  # the same names inside it; text is text
+
+# Colours distinct in print and for colour-blind eyes (Okabe and Ito, 2008), without the yellow, which white
+# paper swallows; and lines. As 7 and 8 have no common divisor, the first 56 pairs of them all differ.
+COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+LINES: tuple[Any, ...] = (
+    "-",
+    (0, (5, 2)),
+    (0, (5, 1.5, 1, 1.5)),
+    (0, (1, 1.2)),
+    (0, (8, 2, 1, 1, 1, 2)),
+    (0, (2.5, 1)),
+    (0, (10, 3)),
+    (0, (5, 1, 5, 1, 1, 1)),
+)
+
+
+def colours_of(count: int) -> list[Any]:
+    """Return as many colours as are asked for, no two alike: the style sheet's first ten, or a rainbow's."""
+    if count <= 10:
+        return [f"C{place}" for place in range(count)]
+    rainbow = need("matplotlib", "plot").colormaps["turbo"]
+    return [rainbow(0.03 + 0.94 * place / (count - 1)) for place in range(count)]
 
 
 def check_format(path: Path, option: str = "--plot") -> None:
@@ -44,15 +71,25 @@ def check_result_path(path: Path) -> str:
     return suffix
 
 
+def svg_text(figure: Any) -> str:
+    """Return a matplotlib Figure as an SVG element, for a page."""
+    matplotlib = need("matplotlib", "plot")
+    written = io.StringIO()
+    with matplotlib.rc_context(SVG):
+        figure.savefig(written, format="svg", metadata={"Date": None, "Creator": None})
+    drawn = written.getvalue()
+    return re.sub(r"<metadata>.*?</metadata>", "", drawn[drawn.index("<svg") :], flags=re.DOTALL)
+
+
 def write_figure(figure: Any, path: Path) -> None:
     """Write a matplotlib Figure, its format chosen by the suffix; the same figure gives the same bytes."""
-    # No date in the file, and the same names inside it.
+    # No date in the file.
     matplotlib = need("matplotlib", "plot")
     dates: dict[str, dict[str, None]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
     suffix = check_suffix(path, FORMATS, "--plot")
 
     def write(temporary: Path) -> None:
-        with matplotlib.rc_context({"svg.hashsalt": "apc"}):
+        with matplotlib.rc_context(SVG):
             figure.savefig(temporary, format=suffix[1:], dpi=DPI, metadata=dates.get(suffix))
 
     write_file(path, write)

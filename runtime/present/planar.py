@@ -1,7 +1,8 @@
 """A picture of how a scene begins whose bodies move in a plane or in space: each peer's plane, to scale.
 
 Takes: a `CompiledSystem`; what was recorded of a run.
-Gives: `moves_in_plane`, `Spot`, `Disc`, `Line`, `spots_of`, `draw_plane`; `paths_of`, `draw_paths`.
+Gives: `moves_in_plane`, `Spot`, `Disc`, `Line`, `Actor`, `spots_of`,
+`draw_plane`, `name_in_legend`; `paths_of`, `draw_paths`.
 Guarantees: everything is found in the equations: a body is a vector of positions (states in metres); where
 something is decided by the distance of two of them, or of one from a fixed point, in metres, there is a disc;
 where by the distance from a line or plane, there is a line. Of space the first two coordinates are drawn.
@@ -11,6 +12,7 @@ Does not: play the scene, or know what a part is called; draw bodies that move a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import field
 from typing import Any
 
 import casadi
@@ -22,6 +24,7 @@ from apc.compiler.frozen import dataclass
 from apc.compiler.language.vectors import entry, whole_and_index
 from apc.frame.jacobians import guards_of
 from apc.optional import need
+from apc.present.pictures import colours_of
 from apc.simulation.signals import Signal, sent_states
 
 Floats = NDArray[np.float64]
@@ -35,11 +38,12 @@ SAME = 1e-9  # relative: what is equal but for roundings
 
 @dataclass(frozen=True, slots=True)
 class Spot:
-    """A body at the start: where it is, in m, and its radius, 0 for a point."""
+    """A body at the start: where it is, in m, and its radius, 0 for a point; `state` is the vector of it."""
 
     name: str
     place: tuple[float, ...]
     radius: float
+    state: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +60,37 @@ class Line:
 
     normal: tuple[float, ...]
     offset: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Actor:
+    """A body in a picture, drawn by matplotlib as a `dot` in `ax` and maybe as a `shape` of half size `half`.
+
+    `states` are the signals that its coordinates are: `user[1].cube.x`, or the first two of a vector.
+    """
+
+    ax: Any
+    states: tuple[str, ...]
+    half: float  # mm
+    dot: Any
+    shape: Any
+
+    def move(self, place: Sequence[float]) -> None:
+        """Put it at (d,), in mm; along a line it stays in its row."""
+        if len(place) == 1:
+            self.dot.set_xdata(place)
+            if self.shape is not None:
+                self.shape.set_x(place[0] - self.half)
+            return
+        self.dot.set_data(place[:1], place[1:])
+        if self.shape is not None:
+            self.shape.set_center(place)
+
+
+def name_in_legend(figure: Any, actors: Sequence[Actor]) -> None:
+    """Name bodies of a picture below it, each once."""
+    handles = {actor.dot.get_label(): actor.dot for actor in actors}
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
 
 
 def vectors_of(kind: Kind) -> dict[str, list[int]]:
@@ -111,7 +146,7 @@ def spots_of(
             wide = next((name for name in own if bodies[name][0] in sent), own[1])
             radii[wide] = max(radii[wide], found.radius)
     spots = [
-        Spot(name.rpartition(".")[0], tuple(float(start[i]) for i in places), radii[name])
+        Spot(name.rpartition(".")[0], tuple(float(start[i]) for i in places), radii[name], name)
         for name, places in bodies.items()
     ]
     return spots, list(fixed)
@@ -177,8 +212,10 @@ def _probed(kind: Kind, vector: Sequence[float]) -> list[tuple[Floats, Floats, F
     return found
 
 
-def draw_plane(system: CompiledSystem, rows: Sequence[tuple[str, list[Spot], list[Disc | Line]]]) -> Any:
-    """Draw how a scene begins, a plane a peer; return the matplotlib Figure.
+def draw_plane(
+    system: CompiledSystem, rows: Sequence[tuple[str, list[Spot], list[Disc | Line]]], *, named: bool = True
+) -> tuple[Any, list[Actor]]:
+    """Draw how a scene begins, a plane a peer; return the matplotlib Figure and the bodies in it.
 
     Parameters
     ----------
@@ -186,6 +223,8 @@ def draw_plane(system: CompiledSystem, rows: Sequence[tuple[str, list[Spot], lis
         The compiled scene.
     rows
         The peers that are drawn: name, bodies, surfaces.
+    named
+        Whether a body's name stands beside it; else the names stand in a legend.
 
     Raises
     ------
@@ -199,21 +238,26 @@ def draw_plane(system: CompiledSystem, rows: Sequence[tuple[str, list[Spot], lis
     axes = figure.subplots(lines, columns, squeeze=False).ravel()
     names = list(dict.fromkeys(spot.name for _, spots, _ in rows for spot in spots))
     low, high = _extent(rows)
+    colours, actors = colours_of(len(names)), []
     for ax, (title, spots, surfaces) in zip(axes, rows, strict=False):
         for one in surfaces:
             _draw_surface(ax, one, spots, patches)
         labels: dict[tuple[float, ...], list[str]] = {}
         for spot in sorted(spots, key=lambda one: -one.radius):
-            colour = f"C{names.index(spot.name) % 10}"
+            colour = colours[names.index(spot.name)]
             place = tuple(MM * value for value in spot.place[:2])
+            shape = None
             if spot.radius:
-                ax.add_patch(
-                    patches.Circle(place, MM * spot.radius, facecolor=colour, alpha=0.35, edgecolor="k")
-                )
+                look = {"facecolor": colour, "alpha": 0.35, "edgecolor": "k"}
+                shape = patches.Circle(place, MM * spot.radius, **look)
+                ax.add_patch(shape)
             marker = "s" if spot.radius else "o"
-            ax.plot(*place, marker, color=colour, markersize=7, markeredgecolor="k")
+            look = {"color": colour, "markersize": 7, "markeredgecolor": "k", "label": spot.name}
+            (dot,) = ax.plot(*place, marker, **look)
+            states = tuple(f"{title}.{entry(spot.state, index)}" for index in (1, 2))
+            actors.append(Actor(ax, states, MM * spot.radius, dot, shape))
             labels.setdefault(place, []).append(spot.name)
-        for place, told in labels.items():
+        for place, told in labels.items() if named else ():
             ax.annotate(
                 ", ".join(told),
                 place,
@@ -240,7 +284,9 @@ def draw_plane(system: CompiledSystem, rows: Sequence[tuple[str, list[Spot], lis
     if alone := _on_a_line(system):
         caption += f"\nnot drawn, as they move along one axis: {', '.join(alone)}"
     figure.suptitle(f"{system.name}: at the start{caption}", fontsize=11)
-    return figure
+    if not named:
+        name_in_legend(figure, actors)
+    return figure, actors
 
 
 def paths_of(signals: Sequence[Signal]) -> list[tuple[int, int]]:

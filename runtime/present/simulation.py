@@ -1,7 +1,8 @@
 """Runs and ensembles of runs as text, plain data, tables and pictures.
 
 Takes: results of `simulation`. Gives: their texts, documents, tables and pictures; `provenance_json`.
-Guarantees: a text fits 80 columns. In a picture every curve is named, a colour a peer and a dash a part;
+Guarantees: a text fits 80 columns. In a picture every curve is named, a colour a peer and a dash a part, and
+those that are one are said to be; of more than ten peers each group has a colour, and the extremes are named;
 labels stand beside the panels, over nothing; a long run is drawn by the extremes of its rows, so that no
 swing is lost.
 Does not: compute, or need a display.
@@ -11,6 +12,7 @@ matplotlib is loaded when something is drawn and not before.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +24,7 @@ from apc.compiler.timings import part
 from apc.compiler.words import counted, in_hertz, wrapped
 from apc.optional import need
 from apc.present.forms import document, json_text, note
-from apc.present.pictures import check_format, write_figure
+from apc.present.pictures import check_format, colours_of, write_figure
 from apc.present.planar import draw_paths, paths_of
 from apc.simulation.settings import EXACT
 
@@ -50,6 +52,9 @@ QUANTITIES = {
     "N*m": ("torque", "N·m", 1.0),
 }
 DASHES = ("-", (0, (4, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (7, 2)), (0, (3, 1, 1, 1, 1, 1)))
+MOST_COLOURS = 10  # peers with a colour each; of more each group has one
+ROUNDING = 1e-9  # of what a panel spans
+LABEL = 36  # letters of a line of a legend
 MOST_CURVES = 24  # in a panel: more can't be told apart
 MOST_POINTS = 2000  # of a curve: about one a pixel and a half of a wide picture
 WIDTH, HEIGHT = 9.0, 2.4  # inches: of the figure, of a panel
@@ -316,24 +321,95 @@ def _panels(signals: Sequence[Signal]) -> dict[str, list[int]]:
 def _panel(ax: Any, trajectory: Trajectory, unit: str, places: Sequence[int]) -> None:
     title, shown, scale = QUANTITIES.get(unit, ("", unit, 1.0))
     signals = trajectory.signals
-    for place in places[:MOST_CURVES]:
-        time, values = thinned(trajectory.time, trajectory.values[:, place])
-        colour, dashes = _style(signals, places, place)
-        ax.plot(
-            time, scale * values, color=colour, linestyle=dashes, linewidth=1.0, label=signals[place].name
-        )
+    drawn = _by_group(trajectory, places) if _are_many(signals) else _one_by_one(trajectory, places)
+    for time, values, label, colour, dashes, high in drawn[:MOST_CURVES]:
+        if high is None:
+            ax.plot(time, scale * values, color=colour, linestyle=dashes, linewidth=1.0, label=label)
+        else:
+            look = {"facecolor": colour, "alpha": 0.2, "linewidth": 0}
+            ax.fill_between(time, scale * values, scale * high, label=label, **look)
     ax.set_ylabel(f"{title} [{shown}]" if title else f"[{shown}]")
     ax.margins(x=0)
     ax.grid(visible=True, linewidth=0.4, alpha=0.5)
-    _legend(ax, len(places))
+    _legend(ax, len(drawn))
 
 
-def _style(signals: Sequence[Signal], places: Sequence[int], place: int) -> tuple[str, Any]:
-    """Return a signal's colour, which is its peer's, and its dashes among those that a panel shows."""
-    one = signals[place]
-    peers = list(dict.fromkeys((signal.group, signal.peer) for signal in signals))
+# A curve, or with `high` what lies between two: time, values, its name, colour and dashes.
+_Curve = tuple[Floats, Floats, str, Any, Any, Floats | None]
+
+
+def _are_many(signals: Sequence[Signal]) -> bool:
+    """Return whether there are more peers than colours that are told apart at a glance."""
+    return len({(one.group, one.peer) for one in signals}) > MOST_COLOURS
+
+
+def _one_by_one(trajectory: Trajectory, places: Sequence[int]) -> list[_Curve]:
+    """Return a curve a signal, those that are the same as one: its name names them all."""
+    signals = trajectory.signals
+    found: list[_Curve] = []
+    for alike in _alike(trajectory.values, places):
+        names = ", ".join(signals[place].name for place in alike)
+        label = f"{names}: identical" if len(alike) > 1 else names
+        colour, dashes = _style(signals, places, alike[0])
+        time, values = thinned(trajectory.time, trajectory.values[:, alike[0]])
+        found.append((time, values, "\n".join(textwrap.wrap(label, LABEL)), colour, dashes, None))
+    return found
+
+
+def _alike(values: Floats, places: Sequence[int]) -> list[list[int]]:
+    """Return places by curve: in one those that differ by nothing but rounding, of what the panel spans."""
+    found: list[list[int]] = []
+    off = ROUNDING * float(np.ptp(values[:, places])) if len(places) else 0.0
+    for place in places:
+        for one in found:
+            if np.abs(values[:, place] - values[:, one[0]]).max() <= off:
+                one.append(place)
+                break
+        else:
+            found.append([place])
+    return found
+
+
+def _by_group(trajectory: Trajectory, places: Sequence[int]) -> list[_Curve]:
+    """Return of each quantity of a group what lies between all its peers, and the two that go furthest."""
+    signals = trajectory.signals
+    found: list[_Curve] = []
+    members: dict[tuple[str, str], list[int]] = {}
+    for place in places:
+        members.setdefault((signals[place].group, signals[place].local), []).append(place)
+    for (group, local), own in members.items():
+        values = trajectory.values[:, own]
+        colour, dashes = _style(signals, places, own[0])
+        if len(_alike(trajectory.values, own)) == 1:
+            label = f"{group}.{local}: {counted(len(own), 'peer')}" + (", identical" if len(own) > 1 else "")
+            found.append((*thinned(trajectory.time, values[:, 0]), label, colour, dashes, None))
+            continue
+        width = max(1, -(-len(values) // MOST_POINTS))
+        starts = np.arange(0, len(values), width)
+        low = np.minimum.reduceat(values.min(axis=1), starts)
+        high = np.maximum.reduceat(values.max(axis=1), starts)
+        label = f"{group}.{local}: all {len(own)} peers"
+        found.append((trajectory.time[starts], low, label, colour, dashes, high))
+        extremes = {"highest": int(values.max(axis=0).argmax()), "lowest": int(values.min(axis=0).argmin())}
+        for word, column in extremes.items():
+            label = f"{signals[own[column]].name}: {word}"
+            look = dashes if word == "highest" else DASHES[-1]
+            found.append((*thinned(trajectory.time, values[:, column]), label, colour, look, None))
+    return found
+
+
+def _style(signals: Sequence[Signal], places: Sequence[int], place: int) -> tuple[Any, Any]:
+    """Return a signal's colour, its peer's or where these are many its group's, and its dashes in a panel."""
+
+    def owner(signal: Signal) -> tuple[str, int]:
+        return (signal.group, 0 if many else signal.peer)
+
+    many = _are_many(signals)
+    owners = list(dict.fromkeys(map(owner, signals)))
     locals_ = list(dict.fromkeys(signals[other].local for other in places))
-    return f"C{peers.index((one.group, one.peer)) % 10}", DASHES[locals_.index(one.local) % len(DASHES)]
+    one = signals[place]
+    colour = colours_of(len(owners))[owners.index(owner(one))]
+    return colour, DASHES[locals_.index(one.local) % len(DASHES)]
 
 
 def _legend(ax: Any, curves: int) -> None:

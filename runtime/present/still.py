@@ -1,7 +1,7 @@
 """A picture of how a scene begins: every peer's bodies side by side, and the surfaces between them.
 
-Takes: a `CompiledSystem`. Gives: `Body`, `Wall`, `bodies_of`, `draw_still`, `save_still`; of bodies that
-move in a plane the picture of `planar`.
+Takes: a `CompiledSystem`. Gives: `Body`, `Wall`, `bodies_of`, `draw_still`, `save_still`, and `draw_actors`,
+the same picture with what moves in it (see `animation`); of bodies that move in a plane that of `planar`.
 Guarantees: everything is found in the equations: a body is a position (a state in metres); where something is
 decided by the distance of two of them, or of one from a fixed place, in metres, there is a surface.
 Does not: play the scene, or know what a part is called.
@@ -13,6 +13,7 @@ sent to the others, or else the second, is drawn with a half width of w, the oth
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,8 +28,8 @@ from apc.frame.jacobians import guards_of, jacobians
 from apc.frame.parameters import resolve
 from apc.frame.start import start_values
 from apc.optional import need
-from apc.present.pictures import check_format, write_figure
-from apc.present.planar import draw_plane, moves_in_plane, spots_of
+from apc.present.pictures import check_format, colours_of, write_figure
+from apc.present.planar import Actor, draw_plane, moves_in_plane, name_in_legend, spots_of
 from apc.simulation.signals import sent_states
 
 Floats = NDArray[np.float64]
@@ -41,11 +42,12 @@ WIDTH, ROW, MARGIN, DPI_POINTS = 7.0, 0.62, 1.1, 7.0  # inches: of the figure, a
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """A position of a peer at the start, in m, and half its width, 0 for a point."""
+    """A position of a peer at the start, in m, half its width, 0 for a point, and the `state` it is."""
 
     name: str
     place: float
     half_width: float
+    state: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +86,11 @@ def bodies_of(kind: Kind, vector: Sequence[float], start: Sequence[float]) -> tu
         elif len(moving) == 2 and slopes.sum() == 0:
             wide = next((i for i in moving if i in sent), moving[1])
             widths[wide] = max(widths[wide], abs(float(offset)))
-    bodies = [Body(kind.states[i].name.rpartition(".")[0], float(start[i]), widths[i]) for i in places]
+    names = [kind.states[i].name for i in places]
+    bodies = [
+        Body(name.rpartition(".")[0], float(start[i]), widths[i], name)
+        for i, name in zip(places, names, strict=True)
+    ]
     return bodies, [Wall(place) for place in walls]
 
 
@@ -123,24 +129,46 @@ def draw_still(system: CompiledSystem) -> Any:
     ApcError
         E875 matplotlib is not installed.
     """
+    figure, _ = draw_actors(system)
+    return figure
+
+
+def draw_actors(system: CompiledSystem, *, named: bool = True) -> tuple[Any, list[Actor]]:
+    """Draw how a scene begins as `draw_still`; return the Figure and the bodies in it, which can be moved.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    named
+        Whether a body's name stands beside it; else the names stand in a legend.
+    """
     figures, patches = need("matplotlib.figure", "plot"), need("matplotlib.patches", "plot")
     if moves_in_plane(system):
-        return draw_plane(system, _rows(system, spots_of))
+        return draw_plane(system, _rows(system, spots_of), named=named)
     rows = _rows(system, bodies_of)
     figure = figures.Figure(figsize=(WIDTH, ROW * len(rows) + MARGIN), layout="constrained")
     ax = figure.subplots()
     names = list(dict.fromkeys(body.name for _, bodies, _ in rows for body in bodies))
-    for y, (_, bodies, walls) in enumerate(rows):
+    actors = []
+    colours = colours_of(len(names))
+    for y, (peer, bodies, walls) in enumerate(rows):
         for wall in walls:
             ax.plot([MM * wall.place] * 2, [y - 0.45, y + 0.45], color="0.25", linewidth=3)
         for body in sorted(bodies, key=lambda one: -one.half_width):
-            colour = f"C{names.index(body.name) % 10}"
+            colour = colours[names.index(body.name)]
+            shape = None
             if body.half_width:
                 corner = (MM * (body.place - body.half_width), y - HEIGHT)
                 size = (2 * MM * body.half_width, 2 * HEIGHT)
-                ax.add_patch(patches.Rectangle(corner, *size, facecolor=colour, alpha=0.35, edgecolor="k"))
+                shape = patches.Rectangle(corner, *size, facecolor=colour, alpha=0.35, edgecolor="k")
+                ax.add_patch(shape)
             marker = "s" if body.half_width else "o"
-            ax.plot(MM * body.place, y, marker, color=colour, markersize=DPI_POINTS, markeredgecolor="k")
+            look = {"color": colour, "markersize": DPI_POINTS, "markeredgecolor": "k", "label": body.name}
+            (dot,) = ax.plot(MM * body.place, y, marker, **look)
+            actors.append(Actor(ax, (f"{peer}.{body.state}",), MM * body.half_width, dot, shape))
+            if not named:
+                continue
             above = HEIGHT if body.half_width else 0.12
             ax.annotate(
                 body.name,
@@ -159,7 +187,9 @@ def draw_still(system: CompiledSystem) -> Any:
     ax.set_xlabel("position [mm]")
     left = system.peers - len(rows)
     ax.set_title(f"{system.name}: at the start" + (f" ({left} more peers)" if left else ""), fontsize=11)
-    return figure
+    if not named:
+        name_in_legend(figure, actors)
+    return figure, actors
 
 
 def _rows(

@@ -1,0 +1,103 @@
+"""The commands `apc library` and `apc new`: what comes with the program, looked at and copied.
+
+Takes: words of a command line. Gives: text on stdout, new topologies.
+Guarantees: with --json, stdout holds one JSON document and nothing else; no file that exists is overwritten,
+and of several either all are written or none.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import click
+
+from apc.cli.options import Command, json_option, tell
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import unwritable
+from apc.present.forms import json_text
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}\Z")
+SCHEMA_FILE = "topology.schema.json"
+_FIRST_LINE = re.compile(r"\A# yaml-language-server:.*\n")
+_TOPOLOGY = re.compile(r"^topology:\s*[^\s#]+", re.MULTILINE)
+
+
+@click.command("library", cls=Command)
+@click.argument("name", required=False)
+@json_option
+def library_command(name: str | None, as_json: bool) -> None:
+    """List the components of the library, or show one.
+
+    NAME is a component or connector: what it is, its parameters with their
+    units, defaults and limits, where it is from, and its definition, equations
+    and all, as it is written.
+    """
+    from apc.compiler.view import catalogue
+
+    if name is None:
+        tell(json_text(catalogue.library_document()) if as_json else "\n".join(catalogue.library_lines()))
+    else:
+        tell(json_text(catalogue.component_document(name)) if as_json else catalogue.component_text(name))
+
+
+@click.command("new", cls=Command)
+@click.argument("name", required=False)
+@click.option("--like", metavar="SCENE", help="Copy this scene of the library, and the tables it names.")
+@click.option("--list", "listing", is_flag=True, help="Name the scenes of the library; write nothing.")
+def new_command(name: str | None, like: str | None, listing: bool) -> None:
+    """Write NAME.yaml, a commented topology to start from.
+
+    NAME is "topology" if not given, or the name of the scene that is copied.
+    A file that exists is never overwritten.
+    """
+    from apc.compiler.view import catalogue
+
+    if listing:
+        if name is not None or like is not None:
+            raise click.UsageError("--list names the scenes and writes none: no NAME or --like with it")
+        tell("\n".join(catalogue.scene_lines()))
+        return
+    source = catalogue.scene_named(catalogue.TEMPLATE if like is None else like)
+    name = name if name is not None else like or "topology"
+    if not NAME.match(name):
+        what = "a scene's name"
+        expected = "letters, digits, - and _, 63 at most, with a letter or digit first"
+        raise ApcError(Mistake("E612", Place(name[:80] or "''"), what, expected, "this", "apc new my-scene"))
+    path = Path(f"{name}.yaml")
+    # Its first line names the schema beside the library; a schema beside the new topology serves as well.
+    text = _FIRST_LINE.sub("", source.read_text(encoding="utf-8"))
+    text = _TOPOLOGY.sub(f"topology: {name}", text, count=1)
+    if Path(SCHEMA_FILE).is_file():
+        text = f"# yaml-language-server: $schema={SCHEMA_FILE}\n{text}"
+    tables = [one for one in catalogue.tables_of(source) if not _is_there(one)] if like is not None else []
+    _write({path: text, **{Path(one.name): one.read_text(encoding="utf-8") for one in tables}})
+    written = (
+        f"{' and '.join([str(path), *(one.name for one in tables)])} {'are' if tables else 'is'} written"
+    )
+    tell(f"{written}. Next: apc compile {path}")
+
+
+def _is_there(table: Path) -> bool:
+    """Return whether the folder has a table already, as it is."""
+    here = Path(table.name)
+    return here.is_file() and here.read_bytes() == table.read_bytes()
+
+
+def _write(texts: dict[Path, str]) -> None:
+    """Write new files, all or none. Raises ApcError: E613 one is there already, E601 one can't be written."""
+    written: list[Path] = []
+    try:
+        for path, text in texts.items():
+            with path.open("x", encoding="utf-8") as file:
+                written.append(path)
+                file.write(text)
+    except OSError as error:
+        for one in written:
+            one.unlink(missing_ok=True)
+        if not isinstance(error, FileExistsError):
+            raise unwritable(path, error) from None
+        hint = "apc new another-name" if path == next(iter(texts)) else f"mv {path} another-name{path.suffix}"
+        what = "exists already and is left as it is"
+        raise ApcError(Mistake("E613", Place(str(path)), what, hint=hint)) from None

@@ -1,0 +1,114 @@
+"""The command `apc report`.
+
+Takes: words of a command line. Gives: a page, or what differs from one.
+Guarantees: a file that can't be written is refused before anything is computed, and is there whole or not at
+all.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from apc.cli.options import Command, file_option, set_option, tell
+from apc.cli.progress import at_work
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.threads import start_single_threaded
+
+if TYPE_CHECKING:
+    from apc.report.contents import Report
+
+
+@click.command("report", cls=Command)
+@click.argument("files", nargs=-1, metavar="[FILE...]")
+@set_option
+@file_option("--out", "Write the page here: .html, or .pdf by Chromium.")
+@click.option(
+    "--check",
+    type=click.Path(path_type=Path),
+    metavar="REPORT",
+    help="Compute the numbers of a report.html anew, and say what differs.",
+)
+def report_command(
+    files: tuple[str, ...], settings: tuple[str, ...], out: Path | None, check: Path | None
+) -> None:
+    """Gather all that is known of scenes in one page.
+
+    One file that opens anywhere and loads nothing: the scene's picture and
+    text, what was compiled, the verdict with its bound and proof, modes,
+    margins, the stable region, what happens over time, how much may get lost,
+    what a hand feels; beside each picture its table and the command that makes
+    it, and what versions and texts made it. Several FILEs stand side by side.
+
+    \b
+        apc report average.yaml mesh.yaml --out report.html
+        apc report --check report.html
+    """
+    start_single_threaded()
+    if (out is None) == (check is None):
+        raise click.UsageError("--out FILE writes a report, --check REPORT reads one: one of them")
+    if check is not None:
+        if files or settings:
+            raise click.UsageError("--check computes what the report itself says: no FILE or --set with it")
+        _check(check)
+        return
+    assert out is not None
+    from apc.inputs import check_topology_outputs, find_input, refuse_model
+    from apc.present.report import check_report_path, report_text, save_report
+    from apc.report.contents import report
+
+    check_report_path(out)
+    paths = [Path(file) for file in files] or [find_input(compiled_too=False)]
+    for path in paths:
+        refuse_model(path, "report")
+        check_topology_outputs(path, {"--out": out})
+    with at_work("reporting"):
+        found = report(paths, settings)
+        save_report(found, out)
+    tell(report_text(found))
+    tell(f"\n{out} is written")
+
+
+def _check(path: Path) -> None:
+    """Compute a report anew. Raises ApcError (E991) with everything that differs."""
+    import tempfile  # most commands need none
+
+    from apc.present.report import kept_report, scene_again
+    from apc.report.contents import report
+
+    kept = kept_report(path)
+    mistakes, notes = [], []
+    for one in kept["scenes"]:
+        with tempfile.TemporaryDirectory(prefix="apc-report-") as folder, at_work("reporting"):
+            again = report([scene_again(one, Path(folder))], one["settings"])
+        place = Place(f"{path}: {one['name']}")
+        mistakes += [Mistake("E991", place, what) for what in _differs(one, again)]
+        now = dict(again.scenes[0].origin)
+        notes += [name for name, digest in one["origin"] if now.get(name) != digest]
+        notes += [name for name, version in again.versions if kept["versions"].get(name) != version]
+    for name in dict.fromkeys(notes):
+        tell(f"note: {name} is another one than the report was made with", err=True)
+    if mistakes:
+        raise ApcError(mistakes)
+    tell(f"{path}: every number is the same, computed anew")
+
+
+def _differs(kept: dict[str, Any], again: Report) -> Iterator[str]:
+    """Yield what differs between the sections of a scene that a report keeps and those made anew."""
+    from apc.present.report import TITLES
+    from apc.report.contents import differences
+
+    [now] = again.to_dict()["scenes"]
+    before = {one["key"]: one for one in kept["sections"]}
+    for section in now["sections"]:
+        title, old = TITLES[section["key"]], before.get(section["key"])
+        if old is None:
+            yield f"{title} is not in it"
+        elif old["refused"] != section["refused"]:
+            yield f"{title}: {section['refused'] or 'there is one'}, not: {old['refused'] or 'there is one'}"
+        else:
+            yield from (f"{title}: {what}" for what in differences(old["tables"], section["tables"]))

@@ -1,0 +1,117 @@
+"""A run as a moving picture: the bodies of every peer as `still` draws them, from frame to frame.
+
+Takes: a `CompiledSystem` and its `Trajectory`. Gives: `SUFFIXES`, `check_animation`, `save_animation`.
+Guarantees: what is shown is of the run's own rows, the nearest in time; everything that moves stays in sight;
+a run is slowed down or sped up to what can be watched, and how much is written above it; a file is there
+whole or not at all.
+Does not: play the scene, or need a display.
+
+matplotlib is loaded when something is drawn and not before; it writes GIF by Pillow, MP4 by ffmpeg.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.files import check_target, write_file
+from apc.compiler.timings import part
+from apc.optional import missing, need
+from apc.present.planar import MM, Actor
+from apc.present.still import draw_actors
+
+if TYPE_CHECKING:
+    from apc.simulation.trajectory import Trajectory
+
+SUFFIXES = (".gif", ".mp4")
+RATE = 20  # frames a second
+SHORTEST, LONGEST = 4.0, 12.0  # seconds that it can be watched for
+ROOM = 0.08  # of what is drawn, around it
+DPI = 90
+
+
+def check_animation(path: Path) -> None:
+    """Refuse a moving picture that can't be made: E601 the place, E875 matplotlib or ffmpeg isn't there."""
+    check_target(path)
+    writers = need("matplotlib.animation", "plot").writers
+    if path.suffix.lower() == ".mp4" and not writers.is_available("ffmpeg"):
+        what = "ffmpeg is not installed, which writes .mp4"
+        hint = f"--out {path.with_suffix('.gif')}, or install ffmpeg, as by: apt install ffmpeg"
+        raise missing(what, hint)
+
+
+@part("draw")
+def save_animation(system: CompiledSystem, found: Trajectory, path: Path) -> None:
+    """Draw a run into a file that moves, its format chosen by the suffix.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    found
+        Its run, with the positions of all bodies among the signals.
+    path
+        A .gif or .mp4.
+
+    Raises
+    ------
+    ApcError
+        E601 it can't be written, E875 matplotlib or ffmpeg is not installed.
+    """
+    check_animation(path)
+    moving = need("matplotlib.animation", "plot")
+    figure, actors = draw_actors(system, named=False)
+    columns = {signal.name: place for place, signal in enumerate(found.signals)}
+    tracks = [MM * found.values[:, [columns[name] for name in actor.states]] for actor in actors]
+    _keep_in_sight(actors, tracks)
+    start, end = float(found.time[0]), float(found.time[-1])
+    seconds = min(max(end - start, SHORTEST), LONGEST)
+    times = np.linspace(start, end, round(RATE * seconds) + 1)
+    rows = np.minimum(np.searchsorted(found.time, times), len(found.time) - 1)
+    title = figure.suptitle(" ", fontsize=11)
+    for ax in {id(actor.ax): actor.ax for actor in actors}.values():
+        ax.set_title(ax.get_title().partition(": at the start")[0].replace(system.name, ""), fontsize=9)
+    speed = (end - start) / seconds
+    told = "" if abs(speed - 1) < 1e-3 else f", {speed:.2g} × as fast as it is"
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # or every frame is laid out anew
+
+    def show(row: int) -> list[Any]:
+        title.set_text(f"{system.name}: {found.time[row]:.3f} s{told}")
+        for actor, track in zip(actors, tracks, strict=True):
+            actor.move(track[row])
+        return []
+
+    drawn = moving.FuncAnimation(figure, show, frames=rows.tolist(), init_func=list, cache_frame_data=False)
+
+    def write(temporary: Path) -> None:
+        named = temporary.with_name(f"{temporary.name}{path.suffix.lower()}")  # writers go by the suffix
+        try:
+            drawn.save(named, writer="ffmpeg" if named.suffix == ".mp4" else "pillow", fps=RATE, dpi=DPI)
+            named.replace(temporary)
+        finally:
+            named.unlink(missing_ok=True)
+
+    write_file(path, write)
+
+
+def _keep_in_sight(actors: Sequence[Actor], tracks: Sequence[NDArray[np.float64]]) -> None:
+    """Widen the axes to all that is ever there: those of planes alike and square, along a line only x."""
+    if not actors:
+        return
+    low = np.min([track.min(axis=0) - one.half for one, track in zip(actors, tracks, strict=True)], axis=0)
+    high = np.max([track.max(axis=0) + one.half for one, track in zip(actors, tracks, strict=True)], axis=0)
+    first = actors[0].ax
+    limits = np.array([first.get_xlim(), first.get_ylim()][: len(low)])
+    low, high = np.minimum(low, limits[:, 0]), np.maximum(high, limits[:, 1])
+    half = (high - low) * (0.5 + ROOM) if len(low) == 1 else (high - low).max() * (0.5 + ROOM) * np.ones(2)
+    middle = (low + high) / 2
+    for actor in actors:
+        actor.ax.set_xlim(middle[0] - half[0], middle[0] + half[0])
+        if len(low) == 2:
+            actor.ax.set_ylim(middle[1] - half[1], middle[1] + half[1])

@@ -1,0 +1,354 @@
+"""A report as one page of HTML, as a PDF, as text and as data; and read again from its page.
+
+Takes: a `Report`. Gives: `report_text`, `report_document`, `report_page`; `check_report_path`, `save_report`;
+`kept_report`, `scene_again`.
+Guarantees: the page holds everything in itself and forbids its reader to load anything; what a scene says is
+text in it and never markup; its numbers stand in it as JSON too. A report read again is data: what it names
+is written nowhere but in a folder of its own.
+Does not: compute.
+
+A PDF is printed by Chromium, where there is one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator, Sequence
+from html import escape
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from apc.analysis.analysis import Analysis
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import RefusedError, check_target, read_file, unwritable, write_file, write_text
+from apc.compiler.timings import part
+from apc.compiler.words import counted, wrapped
+from apc.hands.feel import Feel
+from apc.optional import missing, need
+from apc.present.comparison_picture import comparison_picture
+from apc.present.eigenvalues import eigenvalues_picture, locus_picture
+from apc.present.forms import document
+from apc.present.graph import graph_picture
+from apc.present.hands import feel_picture
+from apc.present.pictures import svg_text
+from apc.present.region_picture import region_picture
+from apc.present.simulation import played_picture
+from apc.regions.region import Region
+from apc.report.contents import Cell, Report, SceneReport, Table
+from apc.simulation.trajectory import Trajectory
+from apc.suffixes import check_suffix
+from apc.vary.locus import Locus
+
+FORMATS = (".html", ".pdf")
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
+PRINTED = 120.0  # seconds that a browser may take
+LARGEST = 200 * 2**20  # bytes of a report that is read again
+TITLES = {
+    "compiled": "What was compiled",
+    "verdict": "Verdict, modes and margins",
+    "limits": "How stiff, how late",
+    "region": "Where it is stable",
+    "response": "What happens over time",
+    "network": "How much may get lost",
+    "feel": "What a hand feels",
+}
+_KEPT = re.compile(r'<script type="application/json" id="apc-report">(.*?)</script>', re.DOTALL)
+_STYLE = """
+:root { color-scheme: light dark; --ink: #1f2933; --faint: #52606d; --page: #fff; --line: #cbd2d9;
+  --tint: #f5f7fa; --link: #0b5cad; }
+@media (prefers-color-scheme: dark) { :root { --ink: #e4e7eb; --faint: #9fb0c0; --page: #15191e;
+  --line: #3e4c59; --tint: #1f262d; --link: #7cc0ff; } }
+* { box-sizing: border-box; }
+body { margin: 0 auto; padding: 1.5rem; max-width: 110rem; color: var(--ink); background: var(--page);
+  font: 15px/1.5 system-ui, "DejaVu Sans", sans-serif; }
+h1 { font-size: 1.6rem; margin: 0; } h2 { margin: 2.2rem 0 .6rem; border-bottom: 1px solid var(--line); }
+h3 { font-size: 1rem; margin: 1rem 0 .3rem; } p { margin: .3rem 0; max-width: 60rem; }
+a { color: var(--link); } nav a { margin-right: 1rem; white-space: nowrap; }
+.scenes { display: grid; gap: 1.5rem;
+  grid-template-columns: repeat(auto-fit, minmax(min(100%, 30rem), 1fr)); }
+.scenes > * { min-width: 0; } .faint { color: var(--faint); }
+figure { margin: .6rem 0; padding: .5rem; background: #fff; border: 1px solid var(--line); border-radius: 4px;
+  overflow-x: auto; }
+figure svg { display: block; margin: auto; max-width: 100%; height: auto; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; }
+th, td { text-align: left; padding: .15rem .7rem .15rem 0; border-bottom: 1px solid var(--line);
+  vertical-align: top; } td.number { white-space: nowrap; }
+pre { background: var(--tint); padding: .6rem; overflow-x: auto; font-size: .8rem; line-height: 1.4; }
+code { background: var(--tint); padding: .1rem .3rem; overflow-wrap: anywhere; }
+@media print { body { padding: 0; max-width: none; font-size: 11px; } figure, tr { break-inside: avoid; }
+  h2, h3 { break-after: avoid; } pre { white-space: pre-wrap; } nav { display: none; } }
+"""
+
+
+def report_text(found: Report) -> str:
+    """Return what is printed of a report: a line a section, and why those are empty that are."""
+    lines = []
+    for one in found.scenes:
+        lines += ["", one.name]
+        for section in one.sections:
+            told = section.refused or f"{counted(len(section.tables), 'table')}, as {section.command}"
+            lines += wrapped(f"{TITLES[section.key]}: {told}", "  ", "    ")
+    return "\n".join(lines[1:])
+
+
+def report_document(found: Report) -> dict[str, Any]:
+    """Return a report as plain data: what is needed to compute it again, and all of its tables."""
+    scenes = [
+        {
+            "name": one.name,
+            "about": one.about,
+            "file": one.path.name,
+            "settings": list(one.settings),
+            "texts": [list(pair) for pair in one.texts],
+            "origin": [list(pair) for pair in one.origin],
+            "sections": [
+                {"key": section.key, "command": section.command, "refused": section.refused}
+                | {"told": list(section.told), "tables": document(section.tables)}
+                for section in one.sections
+            ],
+        }
+        for one in found.scenes
+    ]
+    return {"apc_report": 1, "versions": dict(found.versions), "scenes": scenes}
+
+
+@part("page")
+def report_page(found: Report) -> str:
+    """Return a report as one HTML document."""
+    named = ", ".join(one.name for one in found.scenes)
+    draw = _Pictures()
+    kept = json.dumps(report_document(found), ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
+    policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+    parts = [
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>{escape(named)}: a report of apc</title><style>{_STYLE}</style></head><body>",
+        f"<header><h1>{escape(named)}</h1>",
+        '<p class="faint">Every number here is that of the command beside it; '
+        "<code>apc report --check FILE</code> computes this page anew and says what differs.</p>",
+        f"<nav>{''.join(_link(key, title) for key, title in _titles(found))}</nav></header><main>",
+        *_row("scene", "The scene", [_scene(one, draw) for one in found.scenes]),
+    ]
+    if len(found.scenes) > 1:
+        shown = _refused(found.refused)
+        if found.comparison is not None:
+            files = " ".join(one.path.name for one in found.scenes)
+            shown = f"<p>As by {_code(f'apc compare {files} --out compared.svg')}.</p>"
+            shown += draw.of(comparison_picture(found.comparison), "schemes side by side")
+            shown += f"<pre>{escape(str(found.comparison))}</pre>"
+        parts += _row("compared", "Side by side", [shown])
+    for key, title in TITLES.items():
+        cells = [_section(one, key, draw, len(found.scenes) > 1) for one in found.scenes]
+        parts += _row(key, title, cells)
+    parts += _row("made", "What made it", [_made(one, found) for one in found.scenes])
+    parts += [f'</main><script type="application/json" id="apc-report">{kept}</script></body></html>\n']
+    return "\n".join(parts)
+
+
+def _titles(found: Report) -> Iterator[tuple[str, str]]:
+    yield "scene", "The scene"
+    if len(found.scenes) > 1:
+        yield "compared", "Side by side"
+    yield from TITLES.items()
+    yield "made", "What made it"
+
+
+def _link(key: str, title: str) -> str:
+    return f'<a href="#{key}">{escape(title)}</a> '
+
+
+def _code(text: str) -> str:
+    return f"<code>{escape(text)}</code>"
+
+
+def _refused(why: str) -> str:
+    return f'<p class="faint">Not here: {escape(why)}.</p>'
+
+
+def _row(key: str, title: str, cells: Sequence[str]) -> list[str]:
+    """Return a section of the page: the same of all scenes side by side."""
+    inner = "".join(f"<div>{cell}</div>" for cell in cells)
+    return [f'<section id="{key}"><h2>{escape(title)}</h2><div class="scenes">{inner}</div></section>']
+
+
+def _scene(one: SceneReport, draw: _Pictures) -> str:
+    from apc.compiler.view.listing import show_page  # of the topology as written
+
+    page = show_page(one.path)
+    texts = "".join(f"<h3>{escape(name)}</h3><pre>{escape(text)}</pre>" for name, text in one.texts)
+    settings = "".join(f"<li>{_code(text)}</li>" for text in one.settings)
+    told = f"<p>{escape(one.about)}</p>" + (f"<p>Set first:</p><ul>{settings}</ul>" if settings else "")
+    command = f"<p>As by {_code(f'apc show {one.path.name} --out scene.svg')}.</p>"
+    return f"<h3>{escape(one.name)}</h3>{told}{draw.of(graph_picture(page), page.title)}{command}{texts}"
+
+
+def _section(one: SceneReport, key: str, draw: _Pictures, several: bool) -> str:
+    section = next(each for each in one.sections if each.key == key)
+    head = f"<h3>{escape(one.name)}</h3>" if several else ""
+    if section.refused:
+        return head + _refused(section.refused)
+    told = "".join(f"<p>{escape(text)}</p>" for text in section.told)
+    pictures = "".join(draw.result(each, f"{one.name}: {TITLES[key]}") for each in section.drawn)
+    tables = "".join(map(_table, section.tables))
+    return f"{head}{told}{pictures}{tables}<p>As by {_code(section.command)}.</p>"
+
+
+def _table(table: Table) -> str:
+    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in table.columns)
+    rows = "".join(
+        f"<tr>{''.join(_cell(*pair) for pair in zip(row, table.columns, strict=True))}</tr>"
+        for row in table.rows
+    )
+    caption = f"<h3>{escape(table.title)}</h3>"
+    body = f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody>"
+    return f'{caption}<div class="scroll"><table>{body}</table></div>'
+
+
+def _cell(cell: Cell, column: str) -> str:
+    if isinstance(cell, int | float):
+        return f'<td class="number">{f"± {cell:.0e}" if column == "error" else f"{cell + 0:.9g}"}</td>'
+    return f"<td>{'–' if cell is None else escape(cell)}</td>"
+
+
+def _made(one: SceneReport, found: Report) -> str:
+    versions = Table("Versions", ("what", "version"), found.versions)
+    digests = Table("SHA-256 of what it is made of", ("what", "digest"), one.origin)
+    return f"<h3>{escape(one.name)}</h3>{_table(versions)}{_table(digests)}"
+
+
+class _Pictures:
+    """Draws figures into a page, each with names of its own inside it."""
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def result(self, found: Any, title: str) -> str:
+        """Return the picture of a result."""
+        if isinstance(found, Trajectory):
+            return self.of(played_picture(found), title)
+        if isinstance(found, Feel):
+            return self.of(feel_picture(found), title)
+        if isinstance(found, Region):
+            return self.of(region_picture(found).figure, title)
+        if isinstance(found, Locus):
+            return self.of(locus_picture(found).figure, title)
+        assert isinstance(found, Analysis)
+        return self.of(eigenvalues_picture(found).figure, title)
+
+    def of(self, figure: Any, title: str) -> str:
+        """Return a matplotlib Figure as an element of the page."""
+        self._count += 1
+        drawn = svg_text(figure)
+        drawn = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>p{self._count}-", drawn)
+        labelled = f'<svg role="img" aria-label="{escape(title)}"'
+        return f"<figure>{drawn.replace('<svg', labelled, 1)}</figure>"
+
+
+# ---- files ----
+
+
+def check_report_path(path: Path) -> None:
+    """Refuse a report that can't be written: E878 the suffix, E601 the place, E875 what is not installed."""
+    suffix = check_suffix(path, FORMATS, "--out")
+    check_target(path)
+    need("matplotlib", "plot")
+    if suffix == ".pdf":
+        _browser(path)
+
+
+def _browser(path: Path) -> str:
+    found = next((one for name in BROWSERS if (one := shutil.which(name))), None)
+    if found is None:
+        hint = f"--out {path.with_suffix('.html')}, or install it, as by: apt install chromium"
+        raise missing("Chromium is not installed, which prints a .pdf", hint)
+    return found
+
+
+def save_report(found: Report, path: Path) -> None:
+    """Write a report, its format chosen by the suffix.
+
+    Raises
+    ------
+    ApcError
+        As `check_report_path`; E601 the browser could not print it.
+    """
+    check_report_path(path)
+    page = report_page(found)
+    if path.suffix.lower() == ".pdf":
+        write_file(path, lambda temporary: _print(page, temporary, path))
+    else:
+        write_text(path, page)
+
+
+@part("print")
+def _print(page: str, target: Path, path: Path) -> None:
+    """Print a page to a PDF by a browser that knows nothing of its user."""
+    with tempfile.TemporaryDirectory(prefix="apc-report-") as folder:
+        source, printed = Path(folder, "report.html"), Path(folder, "report.pdf")
+        source.write_text(page, encoding="utf-8")
+        words = ["--headless", "--disable-gpu", "--no-pdf-header-footer", f"--print-to-pdf={printed}"]
+        words += [f"--user-data-dir={folder}/user", "--no-first-run"]
+        if hasattr(os, "geteuid") and os.geteuid() == 0:
+            words.append("--no-sandbox")  # Chromium refuses to start as root with one
+        command = [_browser(path), *words, source.as_uri()]
+        try:
+            subprocess.run(command, capture_output=True, timeout=PRINTED, check=True)
+            shutil.copyfile(printed, target)
+        except (OSError, subprocess.SubprocessError) as error:
+            raise unwritable(path, OSError(None, f"{Path(command[0]).name} has not printed it")) from error
+
+
+def kept_report(path: Path) -> dict[str, Any]:
+    """Return what a report's page keeps of itself.
+
+    Raises
+    ------
+    ApcError
+        E990 it is no page that `apc report` wrote, or is damaged.
+    """
+    what = "is no report that apc has written, or is damaged"
+    hint = "apc report scene.yaml --out report.html"
+    refusal = ApcError(Mistake("E990", Place(str(path)), what, hint=hint))
+    try:
+        found = _KEPT.search(read_file(path, LARGEST).decode("utf-8"))
+        kept: dict[str, Any] = json.loads(found[1]) if found else {}
+        for one in kept["scenes"]:
+            assert all(isinstance(one[name], str) for name in ("name", "file"))
+            assert all(isinstance(text, str) for text in one["settings"])
+            assert all(isinstance(text, str) for pair in one["texts"] for text in pair)
+            dict(one["origin"])
+            for section in one["sections"]:
+                for table in section["tables"]:
+                    _ = table["title"], [list(row) for row in table["rows"]], list(table["columns"])
+        dict(kept["versions"])
+    except RefusedError as refused:
+        raise ApcError(Mistake("E990", Place(str(path)), refused.words)) from None
+    except (ValueError, KeyError, TypeError, AssertionError, RecursionError):
+        raise refusal from None
+    return kept
+
+
+def scene_again(kept: dict[str, Any], folder: Path) -> Path:
+    """Write the texts of a scene that a report keeps into an empty folder; return the topology.
+
+    Raises
+    ------
+    ApcError
+        E990 a name among them leads out of the folder.
+    """
+    for name, text in kept["texts"]:
+        parts = PurePosixPath(name).parts
+        if not parts or name.startswith("/") or "\\" in name or ":" in name or ".." in parts:
+            what = f"names a file outside of the scene's folder: {name[:80]}"
+            raise ApcError(Mistake("E990", Place(kept["name"][:80]), what))
+        path = folder.joinpath(*parts)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    return folder / PurePosixPath(kept["file"]).name

@@ -1,0 +1,1 @@
+"""Everything that is known of scenes, gathered for a page that is kept and computed again."""

@@ -1,0 +1,158 @@
+"""What comes with the program, seen from an empty folder: the library, its scenes, and what may be set."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import apc
+from apc.__main__ import run
+from apc.compiler.components.library import Library
+from apc.compiler.view.catalogue import scenes
+from apc.frame.settable import parameters
+from apc.present.forms import json_text
+from tests.topologies import AVERAGE
+
+Call = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
+    monkeypatch.chdir(tmp_path)
+
+    def run_it(*words: str) -> tuple[int, str, str]:
+        code = run(list(words))
+        return code, *capsys.readouterr()
+
+    return run_it
+
+
+def test_every_component_has_one_line(call: Call) -> None:
+    code, out, _ = call("library")
+    lines = [line for line in out.splitlines() if line.startswith("  ")]
+    assert code == 0
+    assert sorted(line.split()[0] for line in lines) == list(Library().names)
+    assert all(len(line) <= 80 for line in out.splitlines())
+    rooms = json.loads(call("library", "--json")[1])
+    assert sorted(one["name"] for room in rooms.values() for one in room) == list(Library().names)
+
+
+@pytest.mark.parametrize("name", Library().names)
+def test_every_component_is_shown_with_its_parameters_and_equations(call: Call, name: str) -> None:
+    code, out, _ = call("library", name)
+    assert code == 0
+    facts = json.loads(call("library", name, "--json")[1])
+    component = Library().component(name)
+    if component is not None:
+        own = {one.name.partition("[")[0] for one in component.parameters}
+        assert {one["name"] for one in facts["parameters"]} == own
+        assert set(facts["equations"]) == {one.text for one in component.equations}
+        for text in (*own, *(one.text for one in component.equations)):
+            assert text in out
+
+
+def test_a_parameter_is_told_with_unit_default_and_limits(call: Call) -> None:
+    [force] = [
+        one
+        for one in json.loads(call("library", "Touch", "--json")[1])["parameters"]
+        if one["name"] == "force_limit"
+    ]
+    assert (force["unit"], force["value"], force["limits"]) == ("N", "3.3", "> 0")
+    facts = {one["name"]: one for one in json.loads(call("library", "GodObject", "--json")[1])["parameters"]}
+    assert facts["point"]["value"] == "[0, 0]"
+    assert facts["normal"]["value"] == "needed"
+    assert facts["clock"]["limits"] == "a clock"
+
+
+def test_a_misspelt_component_or_scene_is_told_with_the_nearest(call: Call) -> None:
+    assert call("library", "AveragePositon") == (
+        1,
+        "",
+        "apc library: E206 the library has no AveragePositon. Write: apc library AveragePosition\n",
+    )
+    assert call("new", "--like", "three-user-average")[2] == (
+        "--like: E206 the library has no scene three-user-average. "
+        "Write: apc new --like three-users-average\n"
+    )
+
+
+def test_every_scene_of_the_library_is_listed_and_copied_so_that_it_is_sound(call: Call) -> None:
+    listed = [line.split()[0] for line in call("new", "--list")[1].splitlines() if line.startswith("  ")]
+    assert listed == list(scenes())
+    for name in listed:
+        assert call("new", "--like", name)[0] == 0
+        assert call("compile", f"{name}.yaml", "--until", "scene")[0] == 0
+        assert Path(f"{name}.yaml").read_text(encoding="utf-8").count(f"topology: {name}") == 1
+
+
+def test_a_copy_takes_another_name_and_brings_the_tables_it_names(call: Call) -> None:
+    assert call("new", "mine", "--like", "users-table")[1] == (
+        "mine.yaml and users.csv are written. Next: apc compile mine.yaml\n"
+    )
+    assert apc.compile("mine.yaml").name == "mine"
+    assert call("new", "other", "--like", "users-table")[0] == 0  # the table is there as it is
+    Path("users.csv").write_text("device.mass [kg]\n1\n", encoding="utf-8")
+    assert call("new", "third", "--like", "users-table")[2] == (
+        "users.csv: E613 exists already and is left as it is. Write: mv users.csv another-name.csv\n"
+    )
+    assert not Path("third.yaml").exists()
+
+
+def test_what_is_listed_is_what_may_be_set(call: Call) -> None:
+    for name in ("three-users-average", "unlike-devices", "users-table", "lossy-average", "planar-users"):
+        model = apc.compile(scenes()[name])
+        listed = [one for one in parameters(model).rows if not one.fixed]
+        for one in listed:
+            unit = "" if one.unit == "1" else one.unit
+            value = max(one.low, one.minimum or 0.0)
+            apc.set_parameters(model, {one.name: f"{value!r} {unit}".strip()})
+        known = {
+            one.name.removeprefix("trainee.").removeprefix("surgeon.").removeprefix("user.") for one in listed
+        }
+        assert {one.name for one in model.parameters if " " not in one.name} - known <= {
+            "peers",
+            "user.count",
+            "surgeon.count",
+            "trainee.count",
+        } | {one.name for one in model.parameters if one.name.startswith("count(")}
+
+
+def test_limits_are_those_that_are_kept() -> None:
+    model = apc.compile(scenes()["lossy-average"])
+    for one in parameters(model).rows:
+        unit = "" if one.unit == "1" else one.unit
+        beyond = [one.minimum - 1.0] if one.minimum is not None else []
+        beyond += [one.maximum + 1.0] if one.maximum is not None else []
+        beyond += [one.minimum] if one.minimum is not None and one.open_minimum else []
+        for value in beyond:
+            with pytest.raises(apc.ApcError):
+                apc.set_parameters(model, {one.name: f"{value!r} {unit}".strip()})
+
+
+def test_a_group_has_rows_of_its_own_and_a_fixed_count_says_why(call: Call) -> None:
+    call("new", "--like", "users-table")
+    out = call("show", "users-table.yaml", "--parameters")[1]
+    assert "user.device.mass" in out and "0.08 to 0.25 kg" in out
+    assert "not to be set: device.mass has a value for each peer" in " ".join(out.split())
+    call("show", "users-table.yaml", "--parameters", "--out", "p.json")
+    [mass] = [
+        one
+        for one in json.loads(Path("p.json").read_text(encoding="utf-8"))["rows"]
+        if one["name"] == "user.device.mass"
+    ]
+    assert (mass["low"], mass["high"], mass["unit"], mass["minimum"]) == (0.08, 0.25, "kg", 0.0)
+    assert (
+        json_text(apc.parameters("users-table.yaml").to_dict()) == Path("p.json").read_text("utf-8").rstrip()
+    )
+
+
+def test_parameters_are_listed_of_a_compiled_model_too_and_in_no_picture(call: Call) -> None:
+    Path("scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    call("compile")
+    assert call("show", "scene.apc", "--parameters")[1] == call("show", "scene.yaml", "--parameters")[1]
+    code, _, err = call("show", "--parameters", "--out", "p.svg")
+    assert (code, err.partition(".svg")[0]) == (1, "p") and "E878" in err
+    assert call("show", "--parameters", "--format", "dot")[0] == 2
