@@ -265,6 +265,19 @@ class Ports:
     port: Any  # casadi.Function
 
 
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """What the size of a variable should stay within: the parameter `limit`, which no function need take.
+
+    `value(x, u, p, t) -> the variable (1,)`; None for one that is a state.
+    """
+
+    name: str
+    unit: str
+    limit: str
+    value: Any | None  # casadi.Function
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Kind:
     """All peers of one structure. `derivative(x, u, p, t) -> dx/dt (n_x,)`.
@@ -284,6 +297,7 @@ class Kind:
     ports: Ports | None = None
     rounded: tuple[tuple[int, tuple[Fraction, ...]], ...] = ()
     hands: tuple[str, ...] = ()
+    limits: tuple[Limit, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -86,6 +86,7 @@ E509 compiler/equations: what rigid joints hold can't be determined
 E510 compiler/equations: a state has no start value
 E511 compiler/equations: equations that depend on one another leave their unknowns open
 E512 compiler/equations: a constant is no number
+E513 compiler/functions: what has a limit is computed at ticks
 E601 compiler runtime: a file can't be written
 E602 compiler: a compiled model can't be read
 E603 compiler: a compiled model is of another format version

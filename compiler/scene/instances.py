@@ -127,6 +127,7 @@ class PartReader:
                 index=index,
                 count=entry.count,
                 free_connectors=self._free_connectors(name, entry),
+                hand=entry.section == "hands",
             )
             part = Part(
                 name if entry.count is None else f"{name}[{index}]",

@@ -360,8 +360,9 @@ def _rewritten(
     )
     sends = tuple(replace(one, send=again(one.send)) for one in kind.sends)
     ports = None if kind.ports is None else Ports(kind.ports.parts, again(kind.ports.port))
+    limits = tuple(one if one.value is None else replace(one, value=again(one.value)) for one in kind.limits)
     derivative = again(kind.derivative, rates)
-    return replace(kind, derivative=derivative, clocks=clocks, sends=sends, ports=ports)
+    return replace(kind, derivative=derivative, clocks=clocks, sends=sends, ports=ports, limits=limits)
 
 
 def published(name: str) -> dict[str, tuple[str, str, str]]:
