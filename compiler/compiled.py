@@ -284,7 +284,7 @@ class Kind:
 
     A float among the values of a parameter is exact, but where `rounded` has it: by the parameter's place in
     `parameters`, the rationals that floats round, each float at most one of them. `hands` are the parts that
-    the scene calls hands.
+    the scene calls hands, if they answer to how they are moved; `held` the parts that any hand is joined to.
     """
 
     name: str
@@ -298,6 +298,7 @@ class Kind:
     rounded: tuple[tuple[int, tuple[Fraction, ...]], ...] = ()
     hands: tuple[str, ...] = ()
     limits: tuple[Limit, ...] = ()
+    held: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

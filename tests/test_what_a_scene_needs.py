@@ -118,8 +118,8 @@ def test_a_scene_keeps_what_it_needs_and_no_more(name: str) -> None:
         assert one.unread == UNREAD.get(name, ())
         assert one.written == (of_kinds if isinstance(of_kinds, int) else of_kinds[place])
         assert one.written + MADE.get(name, 0) == one.computed + len(one.same) + len(one.unread)
-        # The same as another is a position or a velocity at a joint, or the force on its other side, and what a
-    # motor or a stop without limits gives.
+        # The same as another is a position or a velocity at a joint, the force on its other side, or what a
+        # motor or a stop without limits gives.
         assert all(re.search(r"\.([xvf](\[[12]\])?|given|stopped)\Z", signal) for signal, _ in one.same)
         assert {name for name, _ in one.without} <= {out for clock in kind.clocks for out in clock.outputs}
     # As many equations as states, outputs and channels, and each of them is read.

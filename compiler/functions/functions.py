@@ -27,6 +27,7 @@ from apc.compiler.compiled import (
     State,
 )
 from apc.compiler.components.component import OTHERS
+from apc.compiler.components.parts import GROUND
 from apc.compiler.equations.clocks import HoldCrossing, ReceiveCrossing
 from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.structure import SortedKind, SortedSystem
@@ -208,6 +209,15 @@ class _KindBuilder:
                 and _answers(part)
             ),
             limits=tuple(self._limit(*one, writer, inputs) for one in self.limited.items()),
+            held=tuple(
+                dict.fromkeys(
+                    other
+                    for part in self.scene.parts
+                    if part.section == "hands" and part.name in self.kind.clocked.flat.parts
+                    for _, other, _ in part.connections
+                    if other != GROUND
+                )
+            ),
         )
 
     def _limit(self, name: str, limited: _Limited, writer: Writer, inputs: _Inputs) -> Limit:

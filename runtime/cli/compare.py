@@ -27,7 +27,10 @@ from apc.cli.options import (
     tell,
 )
 from apc.cli.progress import status_line
+from apc.compiler.errors import ApcError
 from apc.threads import start_single_threaded
+
+UNHELD = ("E931", "E932")  # a scene that can't have such hands: the others can
 
 
 @click.command("compare", cls=Command)
@@ -42,6 +45,12 @@ from apc.threads import start_single_threaded
 @set_option
 @in_option
 @hands_option
+@click.option(
+    "--at",
+    default="",
+    metavar="PEER.PART",
+    help="The device whose hand feels: left[1].device, or an axis of it. The first peer's that has one.",
+)
 @file_option("--out", "Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json.")
 @json_option
 def compare_command(
@@ -50,6 +59,7 @@ def compare_command(
     settings: tuple[str, ...],
     criterion: str | None,
     hands: str,
+    at: str,
     out: Path | None,
     as_json: bool,
 ) -> None:
@@ -79,9 +89,18 @@ def compare_command(
         check_result_path(out)
     asked = criterion_with(hands, criterion)
     note_usual(hands)
-    systems = [open_scene(file, settings, {"--out": out}, hands=hands, told=note_aside) for file in files]
+    systems, refused = [], {}
+    for place, file in enumerate(files):
+        try:
+            system = open_scene(file, settings, {"--out": out}, hands=hands, told=note_aside)
+        except ApcError as error:
+            if error.mistakes[0].code not in UNHELD:
+                raise
+            system = open_scene(file, settings, {"--out": out})
+            refused[place] = error.mistakes[0].reason
+        systems.append(system)
     with status_line() as told:
-        found = compare(systems, over=over, criterion=asked, told=told)
+        found = compare(systems, over=over, criterion=asked, at=at, refused=refused, told=told)
     if out is not None:
         write_comparison(out, found)
     print_result(found, as_json=as_json, err=beside(out))

@@ -6,9 +6,10 @@ Gives: `Device`, `find_device`, `devices_of`; `HANDS`, `with_hands`, `clamped`, 
 Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
 Does not: ask whether it is stable (see `passivity` for hands of every kind).
 
-A device is what a peer moves and does not tell others about: what it tells them of is a copy of what all
-hold. With m v' = f + …, a slope of v' over anything at all is J = j/m, so 1/m = −(∂J/∂m)/J: what a force at
-that place does, whatever is rigidly connected with it. A copy of a shared mass is one of n: there J = n j/m.
+A device is the part that a hand of the scene is joined to. Where there is none, it is what a peer moves and
+does not tell others about: what it tells them of is a copy of what all hold. With m v' = f + …, a slope of v'
+over anything at all is J = j/m, so 1/m = −(∂J/∂m)/J: what a force at that place does, whatever is rigidly
+connected with it. A copy of a shared mass is one of n: there J = n j/m.
 """
 
 from __future__ import annotations
@@ -83,9 +84,11 @@ def find_device(
         The kind, a vector (n_p,) of its parameters, their units, and what it hears at the start.
     part
         The part that is meant, or the axis of one that moves along several, `device.x[2]`; without it, the
-        only one that others are not told about.
+        only one that a hand is joined to, or else that others are not told about.
     """
     kind = site.kind
+    owners = {_part(one.name) for one in kind.states}
+    gripped = {own for own in owners for one in kind.held if own == one or own.startswith(f"{one}.")}
     if not (site.walkable and kind.derivative.is_a("SXFunction")):
         return f"{kind.name} has a nonlinear loop"
     told_of = {
@@ -103,7 +106,8 @@ def find_device(
     for place, state in enumerate(kind.states):
         driven = np.flatnonzero(site.pattern.a[place])
         own = _part(state.name)
-        wanted = part in (own, state.name) if part else own not in told_of
+        wanted = own in gripped if gripped else own not in told_of
+        wanted = part in (own, state.name) if part else wanted
         if state.unit != "m" or not wanted or len(driven) != 1 or site.pattern.b[place].any():
             continue
         velocity = int(driven[0])
@@ -174,7 +178,7 @@ def devices_of(system: CompiledSystem, *, part: str = "", option: str = "--hands
     system
         The compiled scene.
     part
-        The part that is meant; without it, the only one that others are not told about.
+        The part that is meant; without it, as `find_device`.
     option
         What asked for it.
 
