@@ -345,4 +345,6 @@ def test_a_name_whose_size_contradicts_itself_is_told_of(tmp_path: Path) -> None
         "hands: {hand: {type: Odd, flange: device, force: 1 N}}\n"
     )
     [line] = told_of(compiled, text, library(tmp_path, odd))
-    assert line.partition("E4")[2] == ""
+    assert line.partition("E4")[2] == (
+        "06 {-spun, force} wants a number like spun, got a vector of 2. Write: norm({-spun, force})"
+    )

@@ -22,7 +22,8 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.closing import Loop, close_loop
-from apc.eigen.peer_group import PeerGroup, states_of, used_ways
+from apc.eigen.modes import arrange
+from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of, used_ways
 from apc.eigen.peers import group_of_row, peer_groups
 from apc.eigen.rigid import LENGTHS, what_stands
 from apc.eigen.spectrum import (
@@ -174,6 +175,14 @@ def analyze(
             spectrum, notes = _solve_ring(system, plan.groups, exchange, certify=certify)
         elif plan.method == "determinant":
             spectrum, notes = _solve_determinant(plan.loops), ()
+            if (
+                method == "auto"
+                and spectrum.stable is None
+                and all(one.states <= MOST_STATES for one in plan.loops)
+            ):  # matrices bound what the determinant leaves open
+                arranged = arrange(plan.groups, exchange)
+                plan = replace(plan, method=arranged.method, notes=arranged.notes)
+                spectrum = _solve_closed(system, plan.loops, certify=certify)
         else:
             spectrum, notes = _solve_closed(system, plan.loops, certify=certify), ()
         if method == "determinant" and not np.isfinite(spectrum.spectral_radius_error):
