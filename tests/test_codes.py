@@ -109,7 +109,7 @@ E626 compiler: a number of peers can't be
 E701 compiler/language: a table can't be read
 E702 compiler/language compiler/scene: a table's headings or columns are not those due
 E703 compiler/language: a cell or row of a table is wrong
-E801 runtime/frame: an operator runs over nobody
+E801 compiler/functions runtime/frame: an operator runs over nobody
 E802 runtime/frame: the weights of a mean add up to nothing
 E803 runtime/eigen: an operator over equal peers has no linearization
 E804 runtime/analysis runtime/eigen runtime/large runtime/vary: too large a matrix, or equals not linear

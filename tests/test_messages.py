@@ -59,12 +59,12 @@ TOPOLOGY = [
     (
         "haptic: 1 ms",
         "haptic: 1",
-        "4:11: E204 haptic wants s, got 1 (no unit). Write: haptic: 1 ms",
+        "4:11: E204 haptic wants ms, got 1 (no unit). Write: haptic: 1 ms",
     ),
     (
         "haptic: 1 ms",
         "haptic: 1 kg",
-        "4:11: E204 haptic wants s, got 1 kg. Write: haptic: 1 s",
+        "4:11: E204 haptic wants ms, got 1 kg. Write: haptic: 1 ms",
     ),
     (
         "haptic: 1 ms",
@@ -74,7 +74,7 @@ TOPOLOGY = [
     (
         "haptic: 1 ms",
         "haptic: [1 ms]",
-        "4:11: E203 haptic wants a single value, got a list. Write: haptic: 1 s",
+        "4:11: E203 haptic wants a single value, got a list. Write: haptic: 1 ms",
     ),
     (
         "haptic: 1 ms",
@@ -109,7 +109,7 @@ TOPOLOGY = [
     (
         "haptic: 1 ms",
         "haptic:",
-        "4:10: E203 haptic wants a single value, got nothing. Write: haptic: 1 s",
+        "4:10: E203 haptic wants a single value, got nothing. Write: haptic: 1 ms",
     ),
     (
         "haptic: 1 ms",
@@ -405,12 +405,12 @@ TOPOLOGY = [
     (
         "clock: haptic, delay: 1 ms}",
         "clock: haptic, delay: -1 ms}",
-        "12:108: E207 delay wants 0 s or more, got -0.001 s.",
+        "12:108: E207 delay wants 0 ms or more, got -1 ms.",
     ),
     (
         "clock: haptic, delay: 1 ms}",
         "clock: haptic, delay: 1 m}",
-        "12:108: E204 delay wants s, got 1 m. Write: delay: 1 s",
+        "12:108: E204 delay wants ms, got 1 m. Write: delay: 1 ms",
     ),
     (
         "link: lan}",
@@ -928,7 +928,7 @@ def test_the_line_is_shown_with_a_caret_under_the_place(
 ) -> None:
     text = replaced(AVERAGE, ("haptic: 1 ms", "haptic: 1 kg"))
     assert told(tmp_path, monkeypatch, {"scene.yaml": text}) == [
-        "scene.yaml:4:11: E204 haptic wants s, got 1 kg. Write: haptic: 1 s\n"
+        "scene.yaml:4:11: E204 haptic wants ms, got 1 kg. Write: haptic: 1 ms\n"
         "      haptic: 1 kg\n"
         "              ^"
     ]
@@ -986,7 +986,7 @@ def test_all_mistakes_of_a_file_come_together_in_its_order_each_once(
         ("studies:", "experiment: {seed: x}\nstudies:"),
     )
     assert [one.splitlines()[0] for one in told(tmp_path, monkeypatch, {"scene.yaml": text})] == [
-        "scene.yaml:4:11: E204 haptic wants s, got 1 kg. Write: haptic: 1 s",
+        "scene.yaml:4:11: E204 haptic wants ms, got 1 kg. Write: haptic: 1 ms",
         "scene.yaml:5:12: E207 the period of clock network wants more than 0 s, got 0 s. Write: "
         "network: 1 ms",
         "scene.yaml:7:26: E206 set names device.mas, which is no parameter or variable of a part; "
@@ -996,7 +996,7 @@ def test_all_mistakes_of_a_file_come_together_in_its_order_each_once(
         "scene.yaml:12:48: E206 contact joins its a to devise, which is no part of this topology; "
         "the nearest is device. Write: device",
         "scene.yaml:12:76: E204 stiffness wants N/m, got 1000 N. Write: stiffness: 1000 N/m",
-        "scene.yaml:12:106: E207 delay wants 0 s or more, got -0.001 s.",
+        "scene.yaml:12:106: E207 delay wants 0 ms or more, got -1 ms.",
         "scene.yaml:13:24: E206 there is no component AveragPosition; the nearest is "
         "AveragePosition. Write: AveragePosition",
         "scene.yaml:15:36: E222 a unit wants * or / between two names, got m. Write: s*m",

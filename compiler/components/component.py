@@ -144,7 +144,8 @@ class Component:
 
     `locals` are names that stand alone on the left of an equation without being declared; they take the
     dimension of the right-hand side. `passed` are the connectors that belong to an inner part: (connector,
-    inner part, its connector). `grips` are the connectors that a hand is joined to where it names none.
+    inner part, its connector). `grips` are the connectors a hand is joined to where it names none; `peers` is
+    for how many peers it is, 0 for any number.
     """
 
     name: str
@@ -160,6 +161,7 @@ class Component:
     passed: tuple[tuple[str, str, str], ...]
     place: Place
     grips: tuple[str, ...] = ()
+    peers: int = 0
 
     def parameter(self, name: str) -> Parameter | None:
         """Return the parameter of this name, or None."""

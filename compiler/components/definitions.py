@@ -47,6 +47,7 @@ from apc.compiler.source.reading import (
     read_mapping,
     read_name,
     read_text,
+    whole_number,
 )
 from apc.compiler.source.source import Source
 from apc.compiler.words import counted
@@ -55,6 +56,7 @@ COMPONENT_KEYS = (
     "component",
     "about",
     "source",
+    "peers",
     "extends",
     "connectors",
     "parameters",
@@ -151,10 +153,24 @@ def _read_declarations(
     about = read_text(root.get("about"), "about", mistakes) or ""
     cited = read_text(root.get("source"), "source", mistakes) or ""
     place = title.place if title is not None else root.place
+    peers = _peers(root.get("peers"), mistakes)
     _check_distinct(connectors, parameters, variables, mistakes)
     if base is None:
         draft = Component(
-            name, about, cited, connectors, parameters, variables, (), (), equations, (), (), place, grips
+            name,
+            about,
+            cited,
+            connectors,
+            parameters,
+            variables,
+            (),
+            (),
+            equations,
+            (),
+            (),
+            place,
+            grips,
+            peers,
         )
     else:
         draft = replace(
@@ -168,6 +184,7 @@ def _read_declarations(
             equations=(*base.equations, *equations),
             place=place,
             grips=(*base.grips, *grips),
+            peers=peers or base.peers,
         )
     _check_limits(draft.variables, draft, mistakes)
     if root.get("parts") is None and root.get("connect") is None:
@@ -190,6 +207,19 @@ def _check_limits(variables: Iterable[Variable], within: Component | None, mista
             expected = f"a parameter in {format_dimension(variable.unit.dimension)}"
             what = f"the limit of {variable.name}"
             mistakes.add("E204", variable.place, what, expected=expected, got=got)
+
+
+def _peers(node: Node | None, mistakes: Mistakes) -> int:
+    """Read `peers: 2`: for how many peers a component that follows others is; 0 for any number."""
+    if node is None:
+        return 0
+    found = whole_number(node)
+    if found is not None and found >= 2:
+        return found
+    mistakes.add(
+        "E203", node.place, "peers", expected="a whole number from 2 on", got=form(node), hint="peers: 2"
+    )
+    return 0
 
 
 def _base(node: Node | None, library: Definitions, mistakes: Mistakes) -> Component | None:

@@ -40,6 +40,7 @@ from apc.compiler.functions.exchange import (
     Timings,
     all_parameters,
     check_channels,
+    check_heard,
     compiled_groups,
     followers_of,
     used_clocks,
@@ -70,10 +71,11 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     rows = _shared_rows([builder.reached for builder in builders])
     kinds = [builder.build(rows) for builder in builders]
     check_channels(scene, kinds)
+    numbers = {group: i for i, kind in enumerate(system.kinds) for group in kind.clocked.flat.groups}
+    check_heard(scene, {group: kinds[place] for group, place in numbers.items()})
     dropped = [item for builder in builders for item in builder.dropped]
     links, unheard = used_links(scene, kinds, timings)
     clocks, silent = used_clocks(scene, kinds, links, timings)
-    numbers = {group: i for i, kind in enumerate(system.kinds) for group in kind.clocked.flat.groups}
     parameters = all_parameters(scene, kinds, links)
     groups = compiled_groups(scene, kinds, numbers, links, timings)
     return CompiledSystem(

@@ -164,7 +164,7 @@ def analyze(
         E804 a system of too many states for its matrix, E806 numbers beyond floats, E850 a method that can't
         serve this scene; and those of `plan.refuse_varying` and `peers.peer_groups`.
     """
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         numbers = resolve(system)
         prepared = timed(system, prepared or prepare(system), numbers)
         exchange = build_exchange(system, numbers.timings)
@@ -274,7 +274,7 @@ def _solve_closed(system: CompiledSystem, loops: Sequence[Loop], *, certify: boo
     """Solve loops by their matrices."""
     closed = tuple(close_loop(loop) for loop in loops)
     if not all(np.isfinite(one.matrix).all() and np.isfinite(one.error).all() for one in closed):
-        raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
+        raise ApcError(Mistake("E806", Place(system.origin.topology), TOO_LARGE))
     return solve_spectrum(closed, certify=certify)
 
 

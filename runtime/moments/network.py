@@ -299,7 +299,7 @@ def judge_network(
     """
     if not unreliable(system):
         return None
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         found = growth(system, prepared)
         worst = worst_case(system, prepared) if any(law.mean_loss for _, law in unreliable(system)) else None

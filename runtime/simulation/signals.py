@@ -207,4 +207,4 @@ def _refuse(system: CompiledSystem, available: Sequence[Sequence[LocalSignal]], 
     )
     what = f"no signal fits {pattern[:80]!r}; the signals of a peer are {', '.join(list(names)[:12])}"
     hint = f"--signals {nearest(pattern, names)}" if nearest(pattern, names) else f"names such as {EXAMPLE}"
-    raise ApcError(Mistake("E873", Place(system.name), what, hint=hint))
+    raise ApcError(Mistake("E873", Place(system.origin.topology), what, hint=hint))
