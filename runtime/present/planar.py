@@ -1,8 +1,8 @@
 """A picture of how a scene begins whose bodies move in a plane or in space: each peer's plane, to scale.
 
 Takes: a `CompiledSystem`; what was recorded of a run.
-Gives: `moves_in_plane`, `Spot`, `Disc`, `Line`, `spots_of`, `draw_plane`; `paths_of`, `draw_paths`; `deciding`,
-`write_name`.
+Gives: `moves_in_plane`, `Spot`, `Disc`, `Line`, `spots_of`, `draw_plane`; `paths_of`, `draw_paths`;
+`deciding`, `write_name`.
 Guarantees: everything is found in the equations: a body is a vector of positions (states in metres); where
 something is decided by the distance of two of them, or of one from a fixed point, in metres, there is a disc;
 where by the distance from a line or plane, there is a line. Of space the first two coordinates are drawn.
@@ -151,7 +151,7 @@ def _tidy(number: float) -> float:
 
 
 def deciding(kind: Kind) -> Iterator[tuple[Any, Any, Any]]:
-    """Yield of each function its states, its parameters, and in a column what it decides by, of these alone."""
+    """Yield of each function its states, its parameters, and what it decides by on them alone."""
     for function in (kind.derivative, *(one.tick for one in kind.clocks)):
         if not function.is_a("SXFunction"):
             continue
