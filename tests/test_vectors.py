@@ -348,3 +348,9 @@ def test_a_name_whose_size_contradicts_itself_is_told_of(tmp_path: Path) -> None
     assert line.partition("E4")[2] == (
         "06 {-spun, force} wants a number like spun, got a vector of 2. Write: norm({-spun, force})"
     )
+
+
+@pytest.mark.parametrize("text", ["{}", "a.x + {}", "{ }*2"])
+def test_a_vector_without_entries_is_told(text: str) -> None:
+    with pytest.raises(ApcError, match=r"E322 a vector has entries; one of zeros is \{0, 0\}"):
+        parse_expression(text, HERE)
