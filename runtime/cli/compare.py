@@ -30,8 +30,6 @@ from apc.cli.progress import status_line
 from apc.compiler.errors import ApcError
 from apc.threads import start_single_threaded
 
-UNHELD = ("E931", "E932")  # a scene that can't have such hands: the others can
-
 
 @click.command("compare", cls=Command)
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
@@ -81,6 +79,7 @@ def compare_command(
     """
     start_single_threaded()
     from apc.comparison.comparison import compare
+    from apc.frame.devices import UNHELD
     from apc.inputs import open_scene
     from apc.present.comparison import write_comparison
     from apc.present.pictures import check_result_path

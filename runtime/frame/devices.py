@@ -2,7 +2,7 @@
 
 Takes: a kind's Jacobians and exact numbers; a `CompiledSystem`.
 Gives: `Device`, `find_device`, `devices_of`; `HANDS`, `with_hands`, `clamped`, `held`; `refuse_hands`;
-`published`; `OWN_MASS`.
+`published`; `OWN_MASS`, `UNHELD`.
 Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
 Does not: ask whether it is stable (see `passivity` for hands of every kind).
 
@@ -40,6 +40,9 @@ if TYPE_CHECKING:
 # How hands can be taken: as the scene has them, holding devices fast, or as a mass, damper and spring each;
 # and as all that give back no more energy than they got, which changes no scene.
 FREE, CLAMPED, HELD, PASSIVE = HANDS = ("free", "clamped", "held", "passive")
+
+# Codes of a scene that can't have the hands asked for, where another could.
+UNHELD = ("E931", "E932")
 
 # What a peer without a device lacks.
 OWN_MASS = "a mass of its own at each peer, as masses: {device: {mass: 0.1 kg}}"
