@@ -274,13 +274,26 @@ class Ports:
     port: Any  # casadi.Function
 
 
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """What the size of a variable should stay within: the parameter `limit`, which no function need take.
+
+    `value(x, u, p, t) -> the variable (1,)`; None for one that is a state.
+    """
+
+    name: str
+    unit: str
+    limit: str
+    value: Any | None  # casadi.Function
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Kind:
     """All peers of one structure. `derivative(x, u, p, t) -> dx/dt (n_x,)`.
 
     A float among the values of a parameter is exact, but where `rounded` has it: by the parameter's place in
     `parameters`, the rationals that floats round, each float at most one of them. `hands` are the parts that
-    the scene calls hands.
+    the scene calls hands, if they answer to how they are moved; `held` the parts that any hand is joined to.
     """
 
     name: str
@@ -293,6 +306,8 @@ class Kind:
     ports: Ports | None = None
     rounded: tuple[tuple[int, tuple[Fraction, ...]], ...] = ()
     hands: tuple[str, ...] = ()
+    limits: tuple[Limit, ...] = ()
+    held: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

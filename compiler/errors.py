@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import unicodedata
 from collections.abc import Iterable
+from dataclasses import replace
 
 from apc.compiler.frozen import dataclass
 
@@ -103,7 +104,17 @@ class Mistake:
             text += "."
         if self.hint:
             text += f" Write: {self.hint}"
-        return visible("".join(" " if c.isspace() else c for c in text))  # one line, whatever was got
+        return _in_one_line(text)
+
+    @property
+    def reason(self) -> str:
+        """What is wrong, without what to write in its place."""
+        return replace(self, hint="").sentence
+
+
+def _in_one_line(text: str) -> str:
+    """Return a text in one line, whatever it quotes."""
+    return visible("".join(" " if c.isspace() else c for c in text))
 
 
 class ApcError(Exception):

@@ -17,6 +17,7 @@ from apc.compiler.components.library import Library, definition_of
 from apc.compiler.equations.clocks import ClockedSystem, partition
 from apc.compiler.equations.flatten import FlatSystem, flatten
 from apc.compiler.equations.structure import SortedSystem, sort
+from apc.compiler.errors import ApcError
 from apc.compiler.functions.functions import build_functions
 from apc.compiler.scene.scene import Scene, build_scene, library_folders
 from apc.compiler.source.nodes import Mapping, Scalar, Sequence
@@ -51,8 +52,14 @@ def check_definition(path: Path) -> str:
     kind, name = definition_of(source)
     if not kind:
         return ""
-    library = Library((path.parent,))
-    _ = library.component(name) if kind == "component" else library.connector(name)
+    beside: list[ApcError] = []
+    library = Library((path.parent,), beside)
+    try:
+        _ = library.component(name) if kind == "component" else library.connector(name)
+    except ApcError as error:  # its own mistakes first
+        beside.insert(0, error)
+    if beside:
+        raise ApcError(mistake for error in beside for mistake in error.mistakes)
     return f"{name}, a {kind}"
 
 

@@ -297,6 +297,7 @@ def _is_kind_consistent(kind: Kind, timings: set[str], clocks: set[str], paramet
     partitions = {partition.clock: partition for partition in kind.clocks}
     n_x, n_u, n_p = len(kind.states), len(kind.holds), len(kind.parameters)
     parameters_of = set(kind.parameters)  # what starts is looked up among them
+    states = {state.name for state in kind.states}
     return (
         parameters.issuperset(kind.parameters)
         and _are_different(kind.parameters)
@@ -320,6 +321,9 @@ def _is_kind_consistent(kind: Kind, timings: set[str], clocks: set[str], paramet
             0 <= memory < len(partition.outputs) for partition in kind.clocks for memory in partition.memories
         )
         and (kind.ports is None or kind.ports.port.sizes == ([n_x, n_u, n_p, 1], [2 * len(kind.ports.parts)]))
+        and parameters.issuperset(one.limit for one in kind.limits)
+        and all(one.value is None or one.value.sizes == ([n_x, n_u, n_p, 1], [1]) for one in kind.limits)
+        and states.issuperset(one.name for one in kind.limits if one.value is None)
         and all(hold.delay in timings and hold.clock in partitions for hold in kind.holds)
         and all(0 <= hold.output < len(partitions[hold.clock].outputs) for hold in kind.holds)
         and kind.derivative.sizes == ([n_x, n_u, n_p, 1], [n_x])

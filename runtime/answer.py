@@ -62,7 +62,7 @@ class Answer(Result):
     one was asked for. `network` is the verdict over the network as it is, with what moves the growth of mean
     squares and how far that lets each number grow; None where all packets are on time.
     `switching` says whether contacts may open and close at will, None where nothing switches; `buzz` is None
-    where it was not asked for.
+    where it was not asked for, and where there is none to predict, which `no_buzz` says.
     """
 
     shown_by = "analysis:answer"
@@ -77,6 +77,7 @@ class Answer(Result):
     conventions: Conventions
     detailed: bool
     box: BoxProof | None
+    no_buzz: str = ""
 
 
 def judge(
@@ -134,7 +135,7 @@ def answer(
     Raises
     ------
     ApcError
-        As `analysis.analyze`, `box_proof.prove_box` and `buzz.buzz`.
+        As `analysis.analyze` and `box_proof.prove_box`.
     """
     prepared = prepare(system)
     found = judge(system, method=method, certify=certify, prepared=prepared)
@@ -144,6 +145,7 @@ def answer(
         notes = (*notes, compared.not_repeated)
     moved = sensitivities_of(system, prepared, found)
     nominal = _margins(system, prepared, found)
+    buzz, no_buzz = _buzz(system, prepared, modes) if with_buzz else (None, "")
     return Answer(
         analysis=replace(found, notes=(*found.notes, *notes)),
         network=_over_network(system, prepared, found, nominal, certify=certify),
@@ -151,10 +153,11 @@ def answer(
         margins=nominal,
         contact_modes=modes,
         switching=_switching(system, prepared, modes) if modes else None,
-        buzz=_buzz(system, prepared, modes) if with_buzz else None,
+        buzz=buzz,
         conventions=compared,
         detailed=every_convention,
         box=proved_box(system, box) if box else None,
+        no_buzz=no_buzz,
     )
 
 
@@ -183,11 +186,14 @@ def _switching(system: CompiledSystem, prepared: Prepared, modes: ContactModes) 
     return switching(system, modes, prepared=prepared)
 
 
-def _buzz(system: CompiledSystem, prepared: Prepared, modes: ContactModes | None) -> Buzz:
-    """Return the buzz of contacts; imported here, as few analyses ask for it."""
+def _buzz(system: CompiledSystem, prepared: Prepared, modes: ContactModes | None) -> tuple[Buzz | None, str]:
+    """Return the buzz of contacts, or why there is none; imported here, as few analyses ask for it."""
     from apc.simulation.buzz import buzz
 
-    return buzz(system, prepared=prepared, modes=modes)
+    try:
+        return buzz(system, prepared=prepared, modes=modes), ""
+    except ApcError as error:
+        return None, error.mistakes[0].reason
 
 
 def proved_box(system: CompiledSystem, box: Sequence[Range], *, passive: bool = False) -> BoxProof:

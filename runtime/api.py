@@ -231,6 +231,7 @@ def compare(
     set: Mapping[str, str] | None = None,
     over: Sequence[str] = (),
     criterion: Criterion | None = None,
+    at: str = "",
 ) -> Comparison:
     """Put schemes side by side: verdicts, largest stable stiffness, delay, loss, what is felt, what it costs.
 
@@ -244,6 +245,8 @@ def compare(
         Which stiffness, delay or loss is looked at, where a model has several; each takes those it has.
     criterion
         As for `critical`.
+    at
+        The device whose hand feels, as for `feel`.
 
     Returns
     -------
@@ -258,7 +261,7 @@ def compare(
     """
     from apc.comparison import comparison
 
-    return comparison.compare([_model(one, set) for one in models], over=over, criterion=criterion)
+    return comparison.compare([_model(one, set) for one in models], over=over, criterion=criterion, at=at)
 
 
 def passive_hands(

@@ -102,7 +102,7 @@ HOUSE = (
         """
         settings integrate propagate flow quadrature forcing
         signals pairs program writing native hearing population machine stepwise
-        simulation blocks accuracy summary trajectory ensemble buzz
+        simulation blocks accuracy limits summary trajectory ensemble buzz
         """,
     ),
     ("apc", "answer"),

@@ -122,7 +122,7 @@ CASES = {
     ),
     "negative delay": (
         edited("8 ms}", "-8 ms}"),
-        "scene.yaml:15:32: E207 delay wants 0 s or more, got -0.008 s.",
+        "scene.yaml:15:32: E207 delay wants 0 ms or more, got -8 ms.",
     ),
     "unknown clock": (
         edited("clock: haptic, delay: 1 ms}", "clock: hapti, delay: 1 ms}"),

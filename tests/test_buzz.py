@@ -219,8 +219,10 @@ def test_it_is_shown_where_it_is_asked_for(
     assert asked["buzz"]["lines"][0]["frequency_hz"] == pytest.approx(46.95, abs=0.05)
     assert asked["buzz_note"] == ""
     Path("scene.yaml").write_text(AVERAGE, encoding="utf-8")
-    assert run(["analyze", "--buzz"]) == 1
-    assert "E864 no buzz to predict: nothing touches" in capsys.readouterr().err
+    assert run(["analyze", "--buzz"]) == 0
+    told = capsys.readouterr().out
+    assert told.startswith("three-users-average: stable")
+    assert told.endswith("no buzz to predict: nothing touches.\n")
 
 
 PRESSED = """\

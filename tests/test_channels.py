@@ -193,8 +193,8 @@ def test_a_trace_that_is_not_there_is_told_where_it_is_named() -> None:
                 "60: E261 1-k wants PROBABILITY, got 3. Write: 1-k: 3 %",
             ],
         ),
-        ("jitter: -5 ms", ["46: E207 jitter wants 0 s or more, got -0.005 s."]),
-        ("jitter: 5", ["46: E204 jitter wants s, got 5 (no unit). Write: jitter: 5 ms"]),
+        ("jitter: -5 ms", ["46: E207 jitter wants 0 ms or more, got -5 ms."]),
+        ("jitter: 5", ["46: E204 jitter wants ms, got 5 (no unit). Write: jitter: 5 ms"]),
         (
             "jitter: 5 ms, distribution: gauss",
             [
@@ -232,7 +232,7 @@ def test_a_slip_is_told_once_where_it_is(text: str, messages: list[str]) -> None
 
 def test_a_negative_delay_is_told() -> None:
     text = says("loss: 1 %").replace("delay: 8 ms,", "delay: -8 ms,")
-    assert told(scene, text) == [f"{AT}32: E207 delay wants 0 s or more, got -0.008 s."]
+    assert told(scene, text) == [f"{AT}32: E207 delay wants 0 ms or more, got -8 ms."]
 
 
 @pytest.mark.parametrize("more", ["loss: 1 %", "jitter: 1 ms", "delays: {user: {user: 3 ms}}"])

@@ -64,10 +64,10 @@ def test_json_is_one_document_with_what_made_it(capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ([], "three-users-average: E877 the scene says no duration."),
+        ([], "scene.yaml: E877 the scene says no duration."),
         (["--duration", "3"], '--duration: E204 duration wants s, got 3 (no unit). Write: --duration "3 s"'),
-        (["--duration", "-1 s"], "three-users-average: E877 the duration wants more than 0 s, got -1 s."),
-        (["--duration", "1 s", "--signals", "cube.y"], "three-users-average: E873 no signal fits 'cube.y';"),
+        (["--duration", "-1 s"], "scene.yaml: E877 the duration wants more than 0 s, got -1 s."),
+        (["--duration", "1 s", "--signals", "cube.y"], "scene.yaml: E873 no signal fits 'cube.y';"),
         (["--duration", "1 s", "--out", "run.doc"], "run.doc: E878 the suffix of --out wants one of .csv,"),
         (["--duration", "1 s", "--out", "no/run.csv"], "no/run.csv: E601 can't be written: No such file"),
         (["--duration", "1 s", "--method", "euler:1ms"], "--method: E910 the method wants one of exact,"),
@@ -75,12 +75,12 @@ def test_json_is_one_document_with_what_made_it(capsys: pytest.CaptureFixture[st
             ["--duration", "1 s", "--method", "rk4:-1 ms"],
             "--method: E911 the step of rk4 wants more than 0 s",
         ),
-        (["--duration", "1e9 s"], "three-users-average: E915 the duration wants at most 1e+06 s"),
+        (["--duration", "1e9 s"], "scene.yaml: E915 the duration wants at most 1e+06 s"),
         (
             ["--duration", "1 s", "--method", "rk4:0"],
             "--method: E204 the step of rk4 wants s, got 0 (no unit). Write: rk4:0.1ms",
         ),
-        (["--duration", "1 s", "--method", "rk4:3 ms"], "three-users-average: E913 the step of rk4 wants at"),
+        (["--duration", "1 s", "--method", "rk4:3 ms"], "scene.yaml: E913 the step of rk4 wants at"),
         (["--duration", "1 s", "--still", "run.doc"], "run.doc: E878 the suffix of --still wants one of"),
         (["--duration", "1 s", "--plot", "run.doc"], "run.doc: E878 the suffix of --plot wants one of .png,"),
     ],

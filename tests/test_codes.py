@@ -86,6 +86,7 @@ E509 compiler/equations: what rigid joints hold can't be determined
 E510 compiler/equations: a state has no start value
 E511 compiler/equations: equations that depend on one another leave their unknowns open
 E512 compiler/equations: a constant is no number
+E513 compiler/functions: what has a limit is computed at ticks
 E601 compiler runtime: a file can't be written
 E602 compiler: a compiled model can't be read
 E603 compiler: a compiled model is of another format version
@@ -108,7 +109,7 @@ E626 compiler: a number of peers can't be
 E701 compiler/language: a table can't be read
 E702 compiler/language compiler/scene: a table's headings or columns are not those due
 E703 compiler/language: a cell or row of a table is wrong
-E801 runtime/frame: an operator runs over nobody
+E801 compiler/functions runtime/frame: an operator runs over nobody
 E802 runtime/frame: the weights of a mean add up to nothing
 E803 runtime/eigen: an operator over equal peers has no linearization
 E804 runtime/analysis runtime/eigen runtime/exports runtime/large runtime/vary: too large, or not linear

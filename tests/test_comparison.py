@@ -113,9 +113,48 @@ def test_without_an_experiment_nothing_is_played_and_linear_schemes_need_none() 
     (one,) = compare([compiled(BOUNCING)]).schemes
     assert one.played is None
     assert dict(one.missing)["played"] == (
-        'apc simulate: the scene says no duration. Write: experiment: {duration: 3 s}  (or --duration "3 s")'
+        "apc simulate: the scene says no duration."  # what to write is for that command
     )
     assert "in time" not in str(both())
+
+
+HELD = replaced(
+    AVERAGE, ("links:", "hands: {arm: {type: SpringDamperArm, flange: device, stiffness: 100 N/m}}\nlinks:")
+)
+
+
+def test_a_scheme_that_refuses_has_its_place_and_says_why(tmp_path: Path) -> None:
+    files = []
+    for name, text in (("free", AVERAGE), ("held", HELD)):
+        (tmp_path / name).mkdir()
+        files.append(tmp_path / name / "scene.yaml")
+        files[-1].write_text(text, encoding="utf-8")
+    out = tmp_path / "found.json"
+    assert run(["compare", *map(str, files), "--hands", "passive", "--out", str(out)]) == 0
+    one, other = json.loads(out.read_text(encoding="utf-8"))["schemes"]
+    assert one["analysis"] is not None
+    assert not one["refused"]
+    assert (other["analysis"], other["stiffness"], other["feel"], other["stable"]) == (None,) * 4
+    assert (other["verdict"], other["refused"]) == (
+        "refused",
+        "--hands passive: user has a hand already, arm.",
+    )
+    found = compare([compiled(AVERAGE), compiled(HELD)], criterion="passive", refused={1: "why not."})
+    assert "  2  refused" in str(found)
+    assert "why not." in str(found)
+    assert found.schemes[1].effort == effort(compiled(HELD))
+    assert found.to_dataframe()["missing"][1] == "why not."
+
+
+def test_a_hand_feels_where_it_is_asked_to(capsys: pytest.CaptureFixture[str]) -> None:
+    planar = (SCENES / "planar-users.yaml").read_text(encoding="utf-8")
+    (one,) = compare([compiled(planar)], at="user[2].device.x[1]").schemes
+    assert one.feel is not None
+    assert one.feel.at == "user[2].device.x[1]"
+    assert compare([compiled(planar)]).schemes[0].feel is None
+    (proxied,) = compare([compiled((SCENES / "two-users-proxies.yaml").read_text(encoding="utf-8"))]).schemes
+    assert proxied.feel is not None
+    assert proxied.feel.at == "left[1].device"  # which the hands are joined to, not the proxy
 
 
 # ---- what it costs ----

@@ -519,3 +519,13 @@ def test_a_scene_before_its_parameter_is_told_the_order(
     wanted = "E841 the command wants a parameter or delay, then the scene"
     assert said.err == f"apc critical: {wanted}, got {got}. Write: {line}\n"
     assert run(line.split()[1:]) == 0
+
+
+def test_a_scan_from_a_value_that_means_nothing_begins_beyond_it() -> None:
+    """A wave impedance of 0 divides by zero: the least value scanned is above it."""
+    waves = replaced(
+        (SCENES / "two-users-waves.yaml").read_text(encoding="utf-8"), ("delay: 8 ms", "delay: 72 ms")
+    )
+    found = critical(compiled(waves), "coordination.impedance", upper="1 N*s/m")
+    assert found.verdict == "stable at every value scanned"
+    assert 0 < found.scanned[0] < 1e-9

@@ -519,17 +519,18 @@ def test_stylus_arms_hold_a_device_through_fingers_that_give(name: str) -> None:
 
 # ---- devices ----
 
-# Force in N, stiffness in N/m and damping in N·s/m as chai3d 7c76b1f has them, in
+# Force in N, stiffness in N/m, damping in N·s/m, radius of the workspace in m as chai3d 7c76b1f has them, in
 # src/devices/CDeltaDevices.cpp and CPhantomDevices.cpp.
+LIMITS = ("force", "stiffness", "damping", "position")
 DEVICES = {
-    "Falcon": (8.0, 3000.0, 20.0),
-    "Omega3": (12.0, 5000.0, 30.0),
-    "Delta3": (20.0, 5000.0, 30.0),
-    "Sigma7": (12.0, 4000.0, 30.0),
-    "Lambda7": (12.0, 8000.0, 30.0),
-    "Touch": (3.3, 400.0, 4.0),
-    "PhantomOmni": (3.3, 700.0, 5.0),
-    "PhantomDesktop": (7.9, 1000.0, 5.0),
+    "Falcon": (8.0, 3000.0, 20.0, 0.04),
+    "Omega3": (12.0, 5000.0, 30.0, 0.075),
+    "Delta3": (20.0, 5000.0, 30.0, 0.15),
+    "Sigma7": (12.0, 4000.0, 30.0, 0.075),
+    "Lambda7": (12.0, 8000.0, 30.0, 0.1125),
+    "Touch": (3.3, 400.0, 4.0, 0.075),
+    "PhantomOmni": (3.3, 700.0, 5.0, 0.1),
+    "PhantomDesktop": (7.9, 1000.0, 5.0, 0.1),
 }
 
 
@@ -537,7 +538,7 @@ DEVICES = {
 def test_device_presets_have_the_published_limits_and_move_as_a_mass(name: str) -> None:
     text = replaced(ONE_MASS, ("{mass", f"{{type: {name}, mass"))
     system = compiled(text)
-    limits = [values(system)[f"device.{limit}_limit"] for limit in ("force", "stiffness", "damping")]
+    limits = [values(system)[f"device.{limit}_limit"] for limit in LIMITS]
     assert tuple(limits) == DEVICES[name]
     assert not {"device.force_limit", "device.stiffness_limit"} & set(system.kinds[0].parameters)
     assert rates(system, {"device.v": 0.3}) == rates(compiled(ONE_MASS), {"device.v": 0.3})
@@ -556,7 +557,8 @@ def test_haptic_device_is_a_device_whose_limits_are_given() -> None:
         ONE_MASS,
         (
             "{mass",
-            "{type: HapticDevice, force_limit: 1 N, stiffness_limit: 2 N/m, damping_limit: 3 N*s/m, mass",
+            "{type: HapticDevice, force_limit: 1 N, stiffness_limit: 2 N/m, damping_limit: 3 N*s/m,"
+            " position_limit: 1 m, mass",
         ),
     )
     assert rates(compiled(text), {"device.v": 0.3}) == rates(compiled(ONE_MASS), {"device.v": 0.3})

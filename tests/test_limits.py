@@ -107,7 +107,7 @@ def test_delays_of_forces_are_refused_by_what_they_keep(monkeypatch: pytest.Monk
     monkeypatch.setattr(scheduling, "_build", lambda *_: pytest.fail("a schedule is built"))
     late = compiled(replaced(AVERAGE, ("clock: haptic, delay: 1 ms}", "clock: haptic, delay: 10 s}")))
     assert told(check_frame, late) == [
-        "three-users-average: E805 with contact.delay = 10 s each peer keeps 10,001 values that are computed "
+        "scene.yaml: E805 with contact.delay = 10 s each peer keeps 10,001 values that are computed "
         "and do not act yet; at most 1,000 can be analysed. Write: contact.delay: 0.998 s, or a slower clock"
     ]
 

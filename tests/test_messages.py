@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,7 +12,8 @@ from apc.__main__ import run
 from apc.compiler.errors import ApcError
 from apc.compiler.language.expression import FUNCTIONS
 from apc.compiler.pipeline import check_definition, run_stages
-from tests.topologies import AVERAGE, replaced
+from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
+from tests.topologies import told as told_of
 
 # A component of the user's own, in a folder beside the topology.
 PAD = """\
@@ -59,12 +62,12 @@ TOPOLOGY = [
     (
         "haptic: 1 ms",
         "haptic: 1",
-        "4:11: E204 haptic wants s, got 1 (no unit). Write: haptic: 1 ms",
+        "4:11: E204 haptic wants ms, got 1 (no unit). Write: haptic: 1 ms",
     ),
     (
         "haptic: 1 ms",
         "haptic: 1 kg",
-        "4:11: E204 haptic wants s, got 1 kg. Write: haptic: 1 s",
+        "4:11: E204 haptic wants ms, got 1 kg. Write: haptic: 1 ms",
     ),
     (
         "haptic: 1 ms",
@@ -74,7 +77,7 @@ TOPOLOGY = [
     (
         "haptic: 1 ms",
         "haptic: [1 ms]",
-        "4:11: E203 haptic wants a single value, got a list. Write: haptic: 1 s",
+        "4:11: E203 haptic wants a single value, got a list. Write: haptic: 1 ms",
     ),
     (
         "haptic: 1 ms",
@@ -109,7 +112,7 @@ TOPOLOGY = [
     (
         "haptic: 1 ms",
         "haptic:",
-        "4:10: E203 haptic wants a single value, got nothing. Write: haptic: 1 s",
+        "4:10: E203 haptic wants a single value, got nothing. Write: haptic: 1 ms",
     ),
     (
         "haptic: 1 ms",
@@ -405,12 +408,12 @@ TOPOLOGY = [
     (
         "clock: haptic, delay: 1 ms}",
         "clock: haptic, delay: -1 ms}",
-        "12:108: E207 delay wants 0 s or more, got -0.001 s.",
+        "12:108: E207 delay wants 0 ms or more, got -1 ms.",
     ),
     (
         "clock: haptic, delay: 1 ms}",
         "clock: haptic, delay: 1 m}",
-        "12:108: E204 delay wants s, got 1 m. Write: delay: 1 s",
+        "12:108: E204 delay wants ms, got 1 m. Write: delay: 1 ms",
     ),
     (
         "link: lan}",
@@ -928,7 +931,7 @@ def test_the_line_is_shown_with_a_caret_under_the_place(
 ) -> None:
     text = replaced(AVERAGE, ("haptic: 1 ms", "haptic: 1 kg"))
     assert told(tmp_path, monkeypatch, {"scene.yaml": text}) == [
-        "scene.yaml:4:11: E204 haptic wants s, got 1 kg. Write: haptic: 1 s\n"
+        "scene.yaml:4:11: E204 haptic wants ms, got 1 kg. Write: haptic: 1 ms\n"
         "      haptic: 1 kg\n"
         "              ^"
     ]
@@ -986,7 +989,7 @@ def test_all_mistakes_of_a_file_come_together_in_its_order_each_once(
         ("studies:", "experiment: {seed: x}\nstudies:"),
     )
     assert [one.splitlines()[0] for one in told(tmp_path, monkeypatch, {"scene.yaml": text})] == [
-        "scene.yaml:4:11: E204 haptic wants s, got 1 kg. Write: haptic: 1 s",
+        "scene.yaml:4:11: E204 haptic wants ms, got 1 kg. Write: haptic: 1 ms",
         "scene.yaml:5:12: E207 the period of clock network wants more than 0 s, got 0 s. Write: "
         "network: 1 ms",
         "scene.yaml:7:26: E206 set names device.mas, which is no parameter or variable of a part; "
@@ -996,7 +999,7 @@ def test_all_mistakes_of_a_file_come_together_in_its_order_each_once(
         "scene.yaml:12:48: E206 contact joins its a to devise, which is no part of this topology; "
         "the nearest is device. Write: device",
         "scene.yaml:12:76: E204 stiffness wants N/m, got 1000 N. Write: stiffness: 1000 N/m",
-        "scene.yaml:12:106: E207 delay wants 0 s or more, got -0.001 s.",
+        "scene.yaml:12:106: E207 delay wants 0 ms or more, got -1 ms.",
         "scene.yaml:13:24: E206 there is no component AveragPosition; the nearest is "
         "AveragePosition. Write: AveragePosition",
         "scene.yaml:15:36: E222 a unit wants * or / between two names, got m. Write: s*m",
@@ -1060,3 +1063,67 @@ def test_check_refuses_what_compile_refuses(tmp_path: Path, capsys: pytest.Captu
         told.append(capsys.readouterr().err)
     assert told[0] == told[1]
     assert "E805 all clocks stand as before only after" in told[0]
+
+
+DEAF = """
+topology: deaf
+clocks: {haptic: 1 ms, network: 8 ms}
+peers: {user: {count: 3}}
+masses: {cube: {mass: 0.6 kg, damping: 5 N*s/m, shared: true}}
+couplers: {coordination: {type: AveragePosition, object: cube, stiffness: 500 N/m, clock: haptic, link: lan}}
+links:
+  lan: {clock: network, delay: 8 ms, graph: {arcs: [[1, 2], [2, 1]]}}
+"""
+
+
+def test_a_peer_that_hears_nobody_is_told_where_the_link_stands() -> None:
+    assert told_of(compiled, DEAF) == [
+        "scene.yaml:8:3: E801 user[3] hears nobody over lan: there is no mean over nobody."
+        " Write: an arc to user[3] in its graph"
+    ]
+    assert not told_of(compiled, replaced(DEAF, ("[2, 1]]", "[2, 1], [1, 3]]")))
+    assert not told_of(compiled, replaced(DEAF, ("AveragePosition", "FullMesh")))  # a sum over nobody is 0
+
+
+@pytest.mark.parametrize(
+    ("part", "sentence"),
+    [
+        (
+            "{type: RampForce, flange: cube, force: 1 N, rise: 1}",
+            "rise wants s, got 1 (no unit). Write: rise: 1 s",
+        ),
+        (
+            "{type: StepForce, flange: cube, force: 1 N, start: 2}",
+            "start wants s, got 2 (no unit). Write: start: 2 s",
+        ),
+    ],
+)
+def test_the_unit_to_write_is_that_of_the_parameter(part: str, sentence: str) -> None:
+    [line] = told_of(compiled, f"{DEAF}hands: {{push: {part}}}\n")
+    assert line.partition("E204 ")[2] == sentence
+
+
+def test_wave_variables_are_for_two_peers(tmp_path: Path) -> None:
+    waves = (SCENES / "two-users-waves.yaml").read_text(encoding="utf-8")
+    [line] = told_of(compiled, replaced(waves, ("count: 2", "count: 3")))
+    assert line.partition("E208 ")[2] == (
+        "coordination (WaveCoupling) wants 2 peers, got 3."
+        " Write: count: 2, or groups that make 2: at: [left, right]"
+    )
+    count = next(one for one in compiled(waves).parameters if one.name == "user.count")
+    assert (count.minimum, count.maximum) == (1.0, 2.0)
+    own = "component: Own\npeers: 1\nconnectors: {a: Flange}\nequations: [a.f = 0]\n"
+    text = replaced(DEAF, ("type: AveragePosition, object: cube, stiffness: 500 N/m", "type: Own, a: cube"))
+    assert told_of(compiled, text, library(tmp_path, own))[0].partition("E203 ")[2] == (
+        "peers wants a whole number from 2 on, got 1. Write: peers: 2"
+    )
+
+
+def test_a_component_is_told_of_before_the_files_beside_it(tmp_path: Path, capsys: Any) -> None:
+    (tmp_path / "empty.yaml").write_text("", encoding="utf-8")
+    (tmp_path / "own.yaml").write_text(
+        "component: Own\nconnectors: {a: Flange}\nequations: [a.f = b.x]\n", encoding="utf-8"
+    )
+    assert run(["check", str(tmp_path / "own.yaml")]) == 1
+    lines = [one for one in capsys.readouterr().err.splitlines() if one.startswith(str(tmp_path))]
+    assert [re.search(r"E\d+", one)[0] for one in lines] == ["E303", "E219"]  # type: ignore[index] # both have one

@@ -111,7 +111,7 @@ def test_a_condition_that_holds_in_the_whole_window_has_no_curve() -> None:
             "colgate:K=it.damping",
             "overlay: E204 K, the stiffness of the virtual wall, wants N/m, got it.damping in N*s/m.",
         ),
-        ("colgate:T=1", "overlay: E204 T wants s, got 1 (no unit). Write: T: 1 ms"),
+        ("colgate:T=1", "overlay: E204 T wants ms, got 1 (no unit). Write: T: 1 ms"),
     ],
 )
 def test_a_faulty_overlay_gets_one_clear_message(text: str, message: str) -> None:

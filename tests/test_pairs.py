@@ -246,9 +246,8 @@ def test_machine_code_gives_the_same(tmp_path: Path) -> None:
 
 
 def test_nobody_has_no_maximum(tmp_path: Path) -> None:
-    system = scene(tmp_path, FORCES["max"][0], "delay: 8 ms, graph: {arcs: [[1, 2], [2, 1], [1, 3]]}")
     with pytest.raises(ApcError, match=r"E801 far\[2\] hears nobody over lan: there is no max over nobody"):
-        prepare(system, Settings(DURATION))
+        scene(tmp_path, FORCES["max"][0], "delay: 8 ms, graph: {arcs: [[1, 2], [2, 1], [1, 3]]}")
 
 
 def test_so_many_pairs_that_the_memory_would_not_hold_them_are_refused(

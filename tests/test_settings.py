@@ -67,11 +67,11 @@ def test_what_is_no_method_is_told_in_one_line(text: str, said: str) -> None:
 def test_a_step_that_the_scene_has_no_room_for_is_refused() -> None:
     system = compiled(AVERAGE)
     assert told(check_step, system, Method("rk4", step=2 * MS), MS, MS) == [
-        "three-users-average: E913 the step of rk4 wants at most the period of the fastest clock, 1 ms, "
+        "scene.yaml: E913 the step of rk4 wants at most the period of the fastest clock, 1 ms, "
         "got 2 ms. Write: --method rk4:1ms"
     ]
     [said] = told(check_step, system, Method("rk4", step=MS / 10**7), MS, MS)
-    assert said.startswith("three-users-average: E913 the step of rk4 wants at least 1e-06 ms,")
+    assert said.startswith("scene.yaml: E913 the step of rk4 wants at least 1e-06 ms,")
     check_step(system, Method("rk4", step=MS), MS, MS)
     check_step(system, DEFAULT, MS, MS)
 

@@ -218,7 +218,7 @@ def test_what_cant_be_simulated_is_refused_by_name() -> None:
         ("1000 N/m, clock: haptic, delay: 1 ms", "1000 N/m^(3/2)"),
     ).partition("studies:")[0]
     assert told(simulate, compiled(AVERAGE)) == [
-        "three-users-average: E877 the scene says no duration. Write: experiment: {duration: 3 s}  "
+        "scene.yaml: E877 the scene says no duration. Write: experiment: {duration: 3 s}  "
         '(or --duration "3 s")'
     ]
     with pytest.raises(ApcError, match=r"E870 the motion of device\.v, cube\.v is not linear .* contact:"):

@@ -120,9 +120,7 @@ def test_a_duration_has_to_be_known_and_positive() -> None:
         return simulate(compiled(AVERAGE), duration=duration)
 
     assert [one.split()[1] for one in told(run, None)] == ["E877"]
-    assert told(run, Fraction(-1)) == [
-        "three-users-average: E877 the duration wants more than 0 s, got -1 s."
-    ]
+    assert told(run, Fraction(-1)) == ["scene.yaml: E877 the duration wants more than 0 s, got -1 s."]
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])

@@ -20,7 +20,8 @@ from apc.compiler.language.grammar import parse_equation, parse_expression
 from apc.compiler.language.vectors import sizes_of, whole_and_index, written_equation, written_out
 from apc.compiler.pipeline import run_stages
 from tests.test_messages import told
-from tests.topologies import ROOT
+from tests.topologies import ROOT, compiled, library
+from tests.topologies import told as told_of
 
 HERE = Place("a.yaml")
 SIZES = {("a", "x"): 2, ("b", "x"): 2, ("r",): 3, ("s",): 3, ("open",): None}
@@ -332,3 +333,24 @@ def test_scenes_of_vectors_compile_or_are_told_what_is_wrong(tmp_path: Path) -> 
     outcomes = {sort: int(count) for count, sort in re.findall(r"(\d+)  vectors: (\w+)", ran.stdout)}
     assert outcomes["compiled"] > 20
     assert sum(outcomes.values()) == 100
+
+
+def test_a_name_whose_size_contradicts_itself_is_told_of(tmp_path: Path) -> None:
+    odd = (
+        "component: Odd\nconnectors: {flange: Flange}\nparameters: {force: {unit: N}}\n"
+        "equations: [flange.f = -force, 'spun = {-spun, force}']\n"
+    )
+    text = (
+        "topology: odd\npeers: {user: {count: 1}}\nmasses: {device: {mass: 1 kg}}\n"
+        "hands: {hand: {type: Odd, flange: device, force: 1 N}}\n"
+    )
+    [line] = told_of(compiled, text, library(tmp_path, odd))
+    assert line.partition("E4")[2] == (
+        "06 {-spun, force} wants a number like spun, got a vector of 2. Write: norm({-spun, force})"
+    )
+
+
+@pytest.mark.parametrize("text", ["{}", "a.x + {}", "{ }*2"])
+def test_a_vector_without_entries_is_told(text: str) -> None:
+    with pytest.raises(ApcError, match=r"E322 a vector has entries; one of zeros is \{0, 0\}"):
+        parse_expression(text, HERE)

@@ -29,13 +29,17 @@ ROLES = ("clock", "link", "graph", "delays", "loss", "trace", "table")
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """A variable of a component or connector; `start` is None for one that needs no start value."""
+    """A variable of a component or connector; `start` is None for one that needs no start value.
+
+    `limit` is the parameter that its size should stay within, empty if there is none.
+    """
 
     name: str
     unit: Unit
     start: Fraction | None
     about: str
     place: Place
+    limit: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +144,8 @@ class Component:
 
     `locals` are names that stand alone on the left of an equation without being declared; they take the
     dimension of the right-hand side. `passed` are the connectors that belong to an inner part: (connector,
-    inner part, its connector).
+    inner part, its connector). `grips` are the connectors a hand is joined to where it names none; `peers` is
+    for how many peers it is, 0 for any number.
     """
 
     name: str
@@ -155,6 +160,8 @@ class Component:
     inner: tuple[Inner, ...]
     passed: tuple[tuple[str, str, str], ...]
     place: Place
+    grips: tuple[str, ...] = ()
+    peers: int = 0
 
     def parameter(self, name: str) -> Parameter | None:
         """Return the parameter of this name, or None."""

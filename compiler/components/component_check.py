@@ -163,7 +163,11 @@ class ComponentNames:
 
         self.sizes |= dict.fromkeys(undeclared)
         settled: dict[tuple[str, ...], int | None] = {}
-        while settled != (settled := {name: size(*one) for name, one in undeclared.items()}):
+        for _ in range(
+            len(undeclared) + 1
+        ):  # each round settles some; a size that contradicts itself never is
+            if settled == (settled := {name: size(*one) for name, one in undeclared.items()}):
+                break
             self.sizes |= settled
         self.sizes |= {name: found or 0 for name, found in settled.items()}
 

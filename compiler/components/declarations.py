@@ -100,13 +100,14 @@ def read_variables(node: Node | None, mistakes: Mistakes) -> tuple[Variable, ...
         body = read_mapping(value, key.text, mistakes, hint=f"{key.text}: {{unit: {meant}}}")
         if name is None or body is None:
             continue
-        body = check_keys(body, ("unit", "size", "start", "about"), f"variable {name}", mistakes)
+        body = check_keys(body, ("unit", "size", "start", "limit", "about"), f"variable {name}", mistakes)
         unit, size = _unit(body, name, mistakes), _size(body, name, mistakes)
         starts = _entries(body.get("start"), "start", name, unit, size, mistakes)
         about = read_text(body.get("about"), "about", mistakes) or ""
+        limit = read_text(body.get("limit"), "limit", mistakes, hint="limit: force_limit") or ""
         if unit is not None and size is not None:
             named = zip(vector_entries(name, size), starts, strict=True)
-            found += [Variable(one, unit, start, about, key.place) for one, start in named]
+            found += [Variable(one, unit, start, about, key.place, limit) for one, start in named]
     return tuple(found)
 
 

@@ -9,7 +9,7 @@ Does not: know any topology, or which component is used where.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from typing import Protocol, TypeVar
 
@@ -33,6 +33,7 @@ from apc.compiler.components.declarations import (
 from apc.compiler.components.parts import MOST_PARTS, Scope, read_count, read_entry
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
+from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import PEERS
 from apc.compiler.language.vectors import entries as elements
 from apc.compiler.language.vectors import whole_and_index
@@ -42,9 +43,11 @@ from apc.compiler.source.reading import (
     brief,
     check_keys,
     entries,
+    form,
     read_mapping,
     read_name,
     read_text,
+    whole_number,
 )
 from apc.compiler.source.source import Source
 from apc.compiler.words import counted
@@ -53,6 +56,7 @@ COMPONENT_KEYS = (
     "component",
     "about",
     "source",
+    "peers",
     "extends",
     "connectors",
     "parameters",
@@ -76,6 +80,7 @@ def read_connector(source: Source) -> Connector:
     flows = read_variables(root.get("flows"), mistakes)
     name = read_text(root.get("connector"), "connector", mistakes) or ""
     about = read_text(root.get("about"), "about", mistakes) or ""
+    _check_limits((*potentials, *flows), None, mistakes)
     mistakes.raise_if_any()
     if len(potentials) != len(flows):
         what = (
@@ -141,17 +146,31 @@ def _read_declarations(
     title = root.get("component")
     name = (read_name(title, "a component", mistakes) if isinstance(title, Scalar) else None) or "?"
     base = _base(root.get("extends"), library, mistakes)
-    connectors = _connectors(root.get("connectors"), library, mistakes)
+    connectors, grips = _connectors(root.get("connectors"), library, mistakes)
     parameters = read_parameters(root.get("parameters"), mistakes)
     variables = read_variables(root.get("variables"), mistakes)
     equations = read_equations(root.get("equations"), unread)
     about = read_text(root.get("about"), "about", mistakes) or ""
     cited = read_text(root.get("source"), "source", mistakes) or ""
     place = title.place if title is not None else root.place
+    peers = _peers(root.get("peers"), mistakes)
     _check_distinct(connectors, parameters, variables, mistakes)
     if base is None:
         draft = Component(
-            name, about, cited, connectors, parameters, variables, (), (), equations, (), (), place
+            name,
+            about,
+            cited,
+            connectors,
+            parameters,
+            variables,
+            (),
+            (),
+            equations,
+            (),
+            (),
+            place,
+            grips,
+            peers,
         )
     else:
         draft = replace(
@@ -164,11 +183,43 @@ def _read_declarations(
             variables=_overridden(base.variables, variables, mistakes),
             equations=(*base.equations, *equations),
             place=place,
+            grips=(*base.grips, *grips),
+            peers=peers or base.peers,
         )
+    _check_limits(draft.variables, draft, mistakes)
     if root.get("parts") is None and root.get("connect") is None:
         return draft
     inner, passed = _read_inner(root, draft, library, mistakes)
     return replace(draft, inner=(*draft.inner, *inner), passed=(*draft.passed, *passed))
+
+
+def _check_limits(variables: Iterable[Variable], within: Component | None, mistakes: Mistakes) -> None:
+    """Record limits of variables that are no number of the same dimension of the component around."""
+    numbers = {one.name: one.unit.dimension for one in (within.numbers if within else ())}
+    for variable in variables:
+        if not variable.limit:
+            continue
+        if variable.limit not in numbers:
+            what = f"the limit of {variable.name} is {brief(variable.limit)}, which is no number here"
+            add_unknown("E206", variable.place, what, variable.limit, list(numbers), mistakes)
+        elif numbers[variable.limit] != variable.unit.dimension:
+            got = f"{variable.limit} in {format_dimension(numbers[variable.limit])}"
+            expected = f"a parameter in {format_dimension(variable.unit.dimension)}"
+            what = f"the limit of {variable.name}"
+            mistakes.add("E204", variable.place, what, expected=expected, got=got)
+
+
+def _peers(node: Node | None, mistakes: Mistakes) -> int:
+    """Read `peers: 2`: for how many peers a component that follows others is; 0 for any number."""
+    if node is None:
+        return 0
+    found = whole_number(node)
+    if found is not None and found >= 2:
+        return found
+    mistakes.add(
+        "E203", node.place, "peers", expected="a whole number from 2 on", got=form(node), hint="peers: 2"
+    )
+    return 0
 
 
 def _base(node: Node | None, library: Definitions, mistakes: Mistakes) -> Component | None:
@@ -374,12 +425,23 @@ def _check_distinct(
 
 def _connectors(
     node: Node | None, library: Definitions, mistakes: Mistakes
-) -> tuple[tuple[str, Connector], ...]:
-    found = []
+) -> tuple[tuple[tuple[str, Connector], ...], tuple[str, ...]]:
+    """Read `connectors: {flange: Flange, grip: {type: Flange, for: hands}}`, and which are for hands."""
+    found, grips = [], []
     for key, value in entries(
         read_mapping(node, "connectors", mistakes, hint="connectors: {flange: Flange}")
     ):
         name = read_name(key, "a connector", mistakes)
+        of_hands = isinstance(value, Mapping)
+        if isinstance(value, Mapping):
+            body = check_keys(value, ("type", "for"), f"connector {key.text}", mistakes)
+            meant = body.get("for")
+            if meant is None or read_text(meant, "for", mistakes, hint="for: hands") not in (None, "hands"):
+                place = value.place if meant is None else meant.place
+                got = "nothing" if meant is None else form(meant)
+                hint = f"{key.text}: {{type: Flange, for: hands}}"
+                mistakes.add("E203", place, f"what {key.text} is for", expected="hands", got=got, hint=hint)
+            value = body.get("type") or body
         type_name = read_text(value, key.text, mistakes, hint=f"{key.text}: Flange")
         if name is None or type_name is None:
             continue
@@ -390,4 +452,5 @@ def _connectors(
             add_unknown("E206", value.place, what, type_name, known, mistakes)
         else:
             found.append((name, connector))
-    return tuple(found)
+            grips += [name] if of_hands else []
+    return tuple(found), tuple(grips)

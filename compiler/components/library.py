@@ -26,10 +26,11 @@ class Library:
     """Hands out components by name, each read and checked when it is first asked for.
 
     A user's component takes the place of the built-in one of its name. In the built-in library a component's
-    file has its name in kebab case, so that a scene reads only the files it needs.
+    file has its name in kebab case, so that a scene reads only the files it needs. A user's file that can't
+    be read is a mistake; with `aside`, one that is put there.
     """
 
-    def __init__(self, folders: tuple[Path, ...] = ()) -> None:
+    def __init__(self, folders: tuple[Path, ...] = (), aside: list[ApcError] | None = None) -> None:
         self._sources: dict[str, Source] = {}
         self._texts: dict[str, str] = {}
         self._components: dict[str, Component] = {}
@@ -39,7 +40,13 @@ class Library:
         self._open: list[str] = []  # the components being read, each asked for by the one before
         own: dict[str, Path] = {}
         for path in (path for folder in folders for path in files_below(folder, SUFFIX)):
-            source = _read(path)
+            try:
+                source = _read(path)
+            except ApcError as error:
+                if aside is None:
+                    raise
+                aside.append(error)
+                continue
             _, name = definition_of(source)
             if not name:
                 continue

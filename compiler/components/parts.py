@@ -81,6 +81,7 @@ def read_entry(
     index: int = 1,
     count: int | None = None,
     free_connectors: Collection[str] = (),
+    hand: bool = False,
 ) -> Entry:
     """Read the entry of a part.
 
@@ -100,6 +101,8 @@ def read_entry(
         Which element of an array of how many this is; `count` None for a part that is no array.
     free_connectors
         Those of its connectors that may be left unjoined here, as those of a mass.
+    hand
+        Whether it is a hand, which takes the connectors that are for hands.
     """
     connectors = dict(component.connectors)
     numbers = {p.name: p.unit.text for p in component.parameters if isinstance(p, Number)}
@@ -115,7 +118,7 @@ def read_entry(
     )
     vectors = {parts[0]: size for parts, size in sizes_of((one,) for one in numbers).items()}
     body, faulty = _entry_by_entry(body, numbers, vectors, scope, mistakes)
-    reader = _EntryReader(name, body, place, scope, mistakes, index, count, vectors, faulty)
+    reader = _EntryReader(name, body, place, scope, mistakes, index, count, vectors, faulty, hand)
     told = reader.parameters(component)
     starts = reader.starts(component)
     connections = tuple(
@@ -201,7 +204,8 @@ class _Told:
 class _EntryReader:
     """Reads one entry, value by value; what is missing or at fault is reported and left out.
 
-    `vectors` are the sizes of those among its numbers, `faulty` those that were reported already.
+    `vectors` are the sizes of those among its numbers, `faulty` those that were reported already; `hand` says
+    that it is the entry of a hand.
     """
 
     def __init__(
@@ -215,7 +219,9 @@ class _EntryReader:
         count: int | None,
         vectors: Mapping[str, int],
         faulty: Collection[str],
+        hand: bool,
     ) -> None:
+        self.hand = hand
         self.vectors = vectors
         self.faulty = faulty
         self.name = name
@@ -421,11 +427,12 @@ class _EntryReader:
         named = found["connector"]
         if named in fitting:
             return str(named)
+        meant = [name for name in fitting if (name in component.grips) == self.hand] or fitting
         if named is not None:
             what = f"{other} ({component.name}) has no {type_name} called {brief(named)}"
             add_unknown("E206", node.place, what, named, fitting, self.mistakes)
-        elif len(fitting) == 1:
-            return fitting[0]
+        elif len(meant) == 1:
+            return meant[0]
         elif fitting:
             what = f"{other} ({component.name}) has {len(fitting)} connectors of type {type_name}"
             self.mistakes.add("E210", node.place, what, hint=f"{connector}: {other}.{fitting[0]}")

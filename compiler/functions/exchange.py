@@ -12,6 +12,8 @@ from dataclasses import replace
 from fractions import Fraction
 from graphlib import TopologicalSorter
 
+import numpy as np
+
 from apc.compiler.compiled import (
     PEERS,
     Channel,
@@ -39,7 +41,7 @@ from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import Value, renamed
 from apc.compiler.scene.channels import SceneChannel
 from apc.compiler.scene.links import SceneLink
-from apc.compiler.scene.scene import Scene
+from apc.compiler.scene.scene import Scene, SceneGroup
 
 NO_DELAY = "no delay"
 LOSS_ABOUT = (
@@ -152,6 +154,48 @@ def check_channels(scene: Scene, kinds: Sequence[Kind]) -> None:
             hint = "a link of its own for what only some groups send"
             mistakes.add("E215", link.place, what, hint=hint)
     mistakes.raise_if_any()
+
+
+def check_heard(scene: Scene, kinds: Mapping[str, Kind]) -> None:
+    """Refuse a graph, given arc by arc, that leaves a peer deaf which takes a mean, maximum or minimum.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    kinds
+        The kind of each group, by its name.
+
+    Raises
+    ------
+    ApcError
+        E801 for each such link.
+    """
+    mistakes = Mistakes()
+    counts = [group.count for group in scene.groups]
+    for link in scene.links:
+        if link.graph.shape != "arcs":
+            continue  # on any other everybody hears somebody
+        taken = [_taken(kinds[group.name], link.name) for group in scene.groups]
+        sends = [any(one.link == link.name for one in kinds[group.name].sends) for group in scene.groups]
+        senders, receivers = link.graph.arcs.T
+        deaf = np.repeat([bool(one) for one in taken], counts)
+        deaf[receivers[np.repeat(sends, counts)[senders]]] = False
+        if deaf.any():
+            first = int(deaf.argmax())
+            starts = np.cumsum([0, *counts])
+            place = int(np.searchsorted(starts, first, "right")) - 1
+            name = f"{scene.groups[place].name}[{first - starts[place] + 1}]"
+            what = f"{name} hears nobody over {link.name}: there is no {taken[place]} over nobody"
+            hint = f"an arc to {name} in its graph"
+            mistakes.add("E801", link.place, what, hint=hint)
+    mistakes.raise_if_any()
+
+
+def _taken(kind: Kind, link: str) -> str:
+    """Return what a kind takes over those it hears over a link that is nothing over nobody, if anything."""
+    found = (one.operator for clock in kind.clocks for one in clock.receives if one.link == link)
+    return next((one for one in found if one in ("mean", "max", "min")), "")
 
 
 def _link(link: SceneLink, timings: Timings) -> Link:
@@ -353,9 +397,23 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
         formula = _formula(None if group.counted is None else group.counted.expression)
         exact = Fraction(group.count)
         about = f"number of peers of group {group.name}"
-        found[name] = Parameter(name, "1", float(exact), formula, minimum=1.0, about=about, exact=exact)
+        most = _most_peers(scene, group)
+        found[name] = Parameter(
+            name, "1", float(exact), formula, minimum=1.0, maximum=most, about=about, exact=exact
+        )
     found[PEERS] = Parameter(PEERS, "1", float(scene.peers), about="number of peers")
     return tuple(found.values())
+
+
+def _most_peers(scene: Scene, group: SceneGroup) -> float | None:
+    """Return how many peers a group can have, the others as they are, by the components that say so."""
+    counts = {one.name: one.count for one in scene.groups}
+    room = [
+        part.component.peers - sum(counts[name] for name in part.groups if name != group.name)
+        for part in scene.parts
+        if part.component.peers and group.name in part.groups
+    ]
+    return float(min(room)) if room else None
 
 
 def followers_of(

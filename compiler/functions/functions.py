@@ -9,7 +9,7 @@ Does not: write files, or put numbers in the place of parameters.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import casadi
@@ -19,6 +19,7 @@ from apc.compiler.compiled import (
     CompiledSystem,
     Hold,
     Kind,
+    Limit,
     Origin,
     Ports,
     Receive,
@@ -26,17 +27,20 @@ from apc.compiler.compiled import (
     State,
 )
 from apc.compiler.components.component import OTHERS
+from apc.compiler.components.parts import GROUND
 from apc.compiler.equations.clocks import HEARD_AGE, HoldCrossing, ReceiveCrossing
 from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.structure import SortedKind, SortedSystem
 from apc.compiler.equations.symbolic import derivative_symbol
 from apc.compiler.equations.terms import Symbol, Term, symbol
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.functions.casadi_writer import Writer
 from apc.compiler.functions.exchange import (
     Timings,
     all_parameters,
     check_channels,
+    check_heard,
     compiled_groups,
     followers_of,
     used_clocks,
@@ -48,6 +52,7 @@ from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import names
 from apc.compiler.language.recordings import TimeTable
 from apc.compiler.language.unit_text import format_dimension
+from apc.compiler.language.vectors import whole_and_index
 from apc.compiler.scene.instances import Part
 from apc.compiler.scene.scene import Scene
 
@@ -58,14 +63,19 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     """Write every kind as CasADi functions, and what lies between the sites beside them."""
     scene = system.scene
     timings = Timings(scene)
-    builders = [_KindBuilder(scene, one, timings) for one in reached_together(system.kinds)]
+    limited = [_limited(scene, kind) for kind in system.kinds]
+    builders = [
+        _KindBuilder(scene, one, timings, own)
+        for one, own in zip(reached_together(system.kinds, limited), limited, strict=True)
+    ]
     rows = _shared_rows([builder.reached for builder in builders])
     kinds = [builder.build(rows) for builder in builders]
     check_channels(scene, kinds)
+    numbers = {group: i for i, kind in enumerate(system.kinds) for group in kind.clocked.flat.groups}
+    check_heard(scene, {group: kinds[place] for group, place in numbers.items()})
     dropped = [item for builder in builders for item in builder.dropped]
     links, unheard = used_links(scene, kinds, timings)
     clocks, silent = used_clocks(scene, kinds, links, timings)
-    numbers = {group: i for i, kind in enumerate(system.kinds) for group in kind.clocked.flat.groups}
     parameters = all_parameters(scene, kinds, links)
     groups = compiled_groups(scene, kinds, numbers, links, timings)
     return CompiledSystem(
@@ -83,6 +93,25 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
         scene.region,
         followers_of(parameters, timings.found, groups),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Limited:
+    """The limit of a variable, a parameter's name, and where the variable is declared."""
+
+    limit: str
+    place: Place
+
+
+def _limited(scene: Scene, kind: SortedKind) -> dict[str, _Limited]:
+    """Return the limits of a kind, by the variables that have one."""
+    return {
+        f"{part.name}.{variable.name}": _Limited(f"{part.name}.{variable.limit}", variable.place)
+        for part in scene.parts
+        if part.name in kind.clocked.flat.parts
+        for variable in part.component.variables
+        if variable.limit
+    }
 
 
 def _shared_rows(kinds: Sequence[Reached]) -> dict[str, str]:
@@ -125,8 +154,11 @@ _Channels = dict[str, tuple[str, int]]  # of each send: its link, and its row in
 class _KindBuilder:
     """One kind's functions: what is read of it was found before, and is written."""
 
-    def __init__(self, scene: Scene, reached: Reached, timings: Timings) -> None:
+    def __init__(
+        self, scene: Scene, reached: Reached, timings: Timings, limited: Mapping[str, _Limited]
+    ) -> None:
         kind = reached.kind
+        self.limited = limited
         self.kind = kind
         self.scene = scene
         self.tables: dict[str, TimeTable] = {
@@ -179,7 +211,30 @@ class _KindBuilder:
                 and part.name in self.kind.clocked.flat.parts
                 and _answers(part)
             ),
+            limits=tuple(self._limit(*one, writer, inputs) for one in self.limited.items()),
+            held=tuple(
+                dict.fromkeys(
+                    other
+                    for part in self.scene.parts
+                    if part.section == "hands" and part.name in self.kind.clocked.flat.parts
+                    for _, other, _ in part.connections
+                    if other != GROUND
+                )
+            ),
         )
+
+    def _limit(self, name: str, limited: _Limited, writer: Writer, inputs: _Inputs) -> Limit:
+        """Write a variable that has a limit, unless it is a state."""
+        if symbol(name) in self.reached.clocked:
+            what = f"{name} has a limit and is computed at ticks; a limit is of what holds at every moment"
+            own = whole_and_index(name.rpartition(".")[2])[0]
+            hint = f"acting = hold({own}), with the limit of acting"
+            raise ApcError(Mistake("E513", limited.place, what, hint=hint))
+        value = None
+        if name not in self.kind.states:
+            column = writer.column([writer.translate(self.reached.watched[name])])
+            value = self._function("limited", writer, inputs, "value", column)
+        return Limit(name, self._unit(name), limited.limit, value)
 
     def _writer(self, names: Iterable[str]) -> tuple[Writer, _Inputs]:
         """Return a writer of continuous quantities, and the inputs they are written in."""

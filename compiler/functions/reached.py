@@ -23,12 +23,13 @@ from apc.compiler.functions.casadi_writer import Definition
 class Reached:
     """One kind: what defines each symbol, which crossings there are, and which symbols are read.
 
-    `heard` are names of sends that other kinds hear: what this kind sends under them is read, too.
+    `heard` are names of sends that other kinds hear: what this kind sends under them is read, too, and so are
+    the variables `watched`, where there are such.
     `holds`, `previous` and `receives` are the crossings that are read, by their symbols; `edges` what a
     reduction runs over, for those that do; `sends` everything the kind could send.
     """
 
-    def __init__(self, kind: SortedKind, heard: Collection[str] = ()) -> None:
+    def __init__(self, kind: SortedKind, heard: Collection[str] = (), watched: Collection[str] = ()) -> None:
         self.kind = kind
         self.continuous: dict[Symbol, Definition] = kind.partitions[0].definitions
         self.clocked: dict[Symbol, Definition] = {
@@ -47,7 +48,10 @@ class Reached:
             {symbol(receive.symbol): receive for receive in kind.receives},
         )
         told = [s for name in self.sends if name in heard for s in self.sends[name].expression.free_symbols]
-        self.symbols = self._closure([*(derivative_symbol(name) for name in kind.states), *told])
+        aliases = dict(kind.aliases)
+        self.watched = {name: aliases.get(name, symbol(name)) for name in watched}
+        shown = [s for value in self.watched.values() for s in value.free_symbols]
+        self.symbols = self._closure([*(derivative_symbol(name) for name in kind.states), *told, *shown])
         self.holds = {s: hold for s, hold in self._known.holds.items() if s in self.symbols}
         self.previous = {s: one for s, one in self._known.previous.items() if s in self.symbols}
         self.receives = {s: receive for s, receive in self._known.receives.items() if s in self.symbols}
@@ -125,11 +129,15 @@ class Reached:
                     yield from self.sends[name].expression.free_symbols
 
 
-def reached_together(kinds: Sequence[SortedKind]) -> list[Reached]:
-    """Return what is read of each kind, where each sends what any of them hears."""
+def reached_together(
+    kinds: Sequence[SortedKind], watched: Sequence[Collection[str]] | None = None
+) -> list[Reached]:
+    """Return what is read of each kind, its `watched` too, where each sends what any of them hears."""
     heard: set[str] = set()
     while True:
-        found = [Reached(kind, heard) for kind in kinds]
+        found = [
+            Reached(kind, heard, own) for kind, own in zip(kinds, watched or [()] * len(kinds), strict=True)
+        ]
         now = {name for one in found for name in one.heard}
         if now <= heard or len(kinds) == 1:  # what a kind hears itself is reached as it is
             return found

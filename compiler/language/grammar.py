@@ -263,6 +263,8 @@ class _Parser:
                 self.step()
                 entries = self.arguments("}", "an entry of a vector")
                 end = self.expect("}", "an opened {").end
+                if not entries:
+                    self.fail("E322", "a vector has entries; one of zeros is {0, 0}", at=token.start)
                 return self.built(Vector(entries, start=token.start, end=end), *entries)
             case "+":
                 self.step()

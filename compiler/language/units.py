@@ -123,8 +123,6 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
     elif (confused := _confused(found.unit, wanted.dimension)) is not None:
         name, right = confused
         got += f" ({name} is {spelled(name)}: case matters)"
-    if found.unit == NO_UNIT and right == "s" and "duration" not in what:
-        right = "ms"  # the size of a scene's delays and periods
     hint = f"{what}: {number.group().strip()}" + ("" if wanted.text == "1" else f" {right}")
     raise ApcError(Mistake("E204", place, what, named, got, hint))
 

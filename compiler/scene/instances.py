@@ -114,6 +114,10 @@ class PartReader:
             what = f"{name} ({entry.component.name}) follows the other peers and"
             hint = f"at: [{', '.join(self.counts)}]" if len(self.counts) > 1 else "count: 2"
             self.mistakes.add("E208", entry.place, what, expected="at least 2 peers", got="1", hint=hint)
+        if (due := entry.component.peers) and peers > due:
+            what, expected = f"{name} ({entry.component.name})", f"{due} peers"
+            hint = f"count: {due}, or groups that make {due}: at: [left, right]"
+            self.mistakes.add("E208", entry.place, what, expected=expected, got=f"{peers:,}", hint=hint)
         found: list[Part] = []
         for index in range(1, (entry.count or 1) + 1):
             read = read_entry(
@@ -127,6 +131,7 @@ class PartReader:
                 index=index,
                 count=entry.count,
                 free_connectors=self._free_connectors(name, entry),
+                hand=entry.section == "hands",
             )
             part = Part(
                 name if entry.count is None else f"{name}[{index}]",

@@ -91,7 +91,7 @@ def _read_delays(
     """Read the delays of pairs of groups that differ from the link's."""
     delays = []
     for sender, receiver, written in read_pairs(node, counts, numbers.mistakes):
-        value = numbers.read(written, f"the delay from {sender} to {receiver}", SECOND, "s")
+        value = numbers.read(written, f"the delay from {sender} to {receiver}", SECOND, "ms")
         if value is not None and value.number < 0:
             numbers.mistakes.add("E207", value.place, "a delay", expected="0 s or more", got=str(value))
         elif value is not None:

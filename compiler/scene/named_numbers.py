@@ -146,10 +146,10 @@ class NamedNumbers:
             read_binding(node, what, dimension, unit, self.dimension, self.names, self.mistakes)
         )
 
-    def read_time(self, node: Node | None, what: str) -> Value | None:
-        """Read a duration; a rate in Hz counts as its reciprocal."""
+    def read_time(self, node: Node | None, what: str, unit: str = "ms") -> Value | None:
+        """Read a time, mostly in `unit`; a rate in Hz counts as its reciprocal."""
         if not (isinstance(node, Scalar) and node.text.rstrip().endswith("Hz")):
-            return self.read(node, what, SECOND, "s")
+            return self.read(node, what, SECOND, unit)
         rate = self.read(node, what, SECOND.power(-1), "Hz")
         if rate is None:
             return None

@@ -21,7 +21,7 @@ SettableNames = Mapping[str, list[tuple[str, Settable]]]
 
 
 def read_experiment(
-    node: Node | None, read_time: Callable[[Node | None, str], Value | None], mistakes: Mistakes
+    node: Node | None, read_time: Callable[[Node | None, str, str], Value | None], mistakes: Mistakes
 ) -> Experiment:
     """Read `experiment: {duration: 3 s, seed: 1}`.
 
@@ -30,7 +30,7 @@ def read_experiment(
     node
         The section.
     read_time
-        Reads a duration in seconds; its second argument says what it is, for messages.
+        Reads a duration in seconds; its other arguments say what it is, and in what unit, for messages.
     mistakes
         Takes E203 and E207.
     """
@@ -38,7 +38,7 @@ def read_experiment(
     if section is None:
         return Experiment()
     section = check_keys(section, ("duration", "seed"), "experiment", mistakes)
-    duration = read_time(section.get("duration"), "duration")
+    duration = read_time(section.get("duration"), "duration", "s")
     if duration is not None and duration.number <= 0:
         got = str(duration)
         mistakes.add("E207", duration.place, "duration", expected="more than 0 s", got=got)

@@ -147,6 +147,12 @@ def _node(scene: Scene, part: Part, name: str, count: int) -> Vertex:
     component = part.component
     role = ROLES[part.section]
     lines = [] if component.name == DEFAULT_TYPES.get(part.section) else [component.name]
+    axes = max(
+        (whole_and_index(one.name)[1] for _, type_ in component.connectors for one in type_.potentials),
+        default=0,
+    )
+    if role == "mass" and axes > 1:
+        lines.append("in a plane" if axes == 2 else "in space")
     if count > 1:
         lines[:0] = [f"{count} of them"]
     if part.groups != tuple(group.name for group in scene.groups):

@@ -24,7 +24,8 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.closing import Loop, close_loop
-from apc.eigen.peer_group import PeerGroup, states_of, used_ways
+from apc.eigen.modes import arrange
+from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of, used_ways
 from apc.eigen.peers import group_of_row, peer_groups
 from apc.eigen.rigid import LENGTHS, what_stands
 from apc.eigen.spectrum import (
@@ -183,7 +184,7 @@ def analyze(
         E804 a system of too many states for its matrix, E806 numbers beyond floats, E850 a method that can't
         serve this scene; and those of `plan.refuse_varying` and `peers.peer_groups`.
     """
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         numbers = resolve(system)
         prepared = timed(system, prepared or prepare(system), numbers)
         exchange = build_exchange(system, numbers.timings)
@@ -194,6 +195,14 @@ def analyze(
             spectrum, notes = _solve_ring(system, plan.groups, exchange, certify=certify)
         elif plan.method == "determinant":
             spectrum, notes = _solve_determinant(plan.loops), ()
+            if (
+                method == "auto"
+                and spectrum.stable is None
+                and all(one.states <= MOST_STATES for one in plan.loops)
+            ):  # matrices bound what the determinant leaves open
+                arranged = arrange(plan.groups, exchange)
+                plan = replace(plan, method=arranged.method, notes=arranged.notes)
+                spectrum = _solve_closed(system, plan.loops, certify=certify)
         else:
             spectrum, notes = _solve_closed(system, plan.loops, certify=certify), ()
         if method == "determinant" and not np.isfinite(spectrum.spectral_radius_error):
@@ -285,7 +294,7 @@ def _solve_closed(system: CompiledSystem, loops: Sequence[Loop], *, certify: boo
     """Solve loops by their matrices."""
     closed = tuple(close_loop(loop) for loop in loops)
     if not all(np.isfinite(one.matrix).all() and np.isfinite(one.error).all() for one in closed):
-        raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
+        raise ApcError(Mistake("E806", Place(system.origin.topology), TOO_LARGE))
     return solve_spectrum(closed, certify=certify)
 
 

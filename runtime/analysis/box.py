@@ -212,7 +212,7 @@ def open_sites(
             raise ApcError(Mistake("E831", _PLACE, f"{one.free.label} is left open twice"))
     if not all(site.parameters_suffice for site in prepared.jacobians):
         what = f"{system.name} is not linear: where it is linearized may move with the parameters"
-        raise ApcError(Mistake("E832", Place(system.name), what))
+        raise ApcError(Mistake("E832", Place(system.origin.topology), what))
     field = Ratios.of(len(ranges))
     opened = [_opened(system, group, ranges, field) for group in system.groups]
     for share in GENERIC:
@@ -317,5 +317,5 @@ def _open_site(group: PeerGroup, vector: Sequence[Any], system: CompiledSystem) 
         flat = evaluate_exact(built.function, [*zeros, list(vector), [Fraction(0)]], rounded=refuse)[0]
     except NotRational as reason:
         what = f"the equations of {group.name} {reason}"
-        raise ApcError(Mistake("E832", Place(system.name), what)) from None
+        raise ApcError(Mistake("E832", Place(system.origin.topology), what)) from None
     return site_of_entries(built, flat, Fraction(0))

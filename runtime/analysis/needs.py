@@ -60,7 +60,7 @@ class Needs(Result):
 
 def needs(system: CompiledSystem) -> Needs:
     """Count what a scene keeps from frame to frame."""
-    with finite_equations(system.name):
+    with finite_equations(system.origin.topology):
         return _needs(system)
 
 

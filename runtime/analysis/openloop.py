@@ -110,7 +110,7 @@ def open_loop(system: CompiledSystem, whole: ClosedSystem) -> OpenLoop:
             f"the paper's matrices for {len(sites)} peers at {ratio} force ticks a frame have more than "
             f"{MOST_ROWS:,} rows"
         )
-        raise ApcError(Mistake("E862", Place(system.name), what, hint=_INSTEAD))
+        raise ApcError(Mistake("E862", Place(system.origin.topology), what, hint=_INSTEAD))
     heard, places = _heard_rows(whole, starts, timings, frame)
     fast: list[Input] = []
     slow: list[Input] = []
@@ -278,4 +278,4 @@ def _misfits(group: PeerGroup) -> Iterator[str]:
 
 def _not_of_the_form(system: CompiledSystem, missing: Mapping[str, None]) -> ApcError:
     what = "the paper's route is written for another form of scene; missing: " + "; ".join(missing)
-    return ApcError(Mistake("E861", Place(system.name), what, hint=_INSTEAD))
+    return ApcError(Mistake("E861", Place(system.origin.topology), what, hint=_INSTEAD))

@@ -108,7 +108,7 @@ def paper_route(system: CompiledSystem) -> PaperRoute:
         E861 the scene has not the form the route is written for: the message says what is missing. E862 it
         has, but the matrices would be too large. And whatever the analysis of the scene raises.
     """
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         return _route(open_loop(system, whole_system(system)))
 
 
@@ -128,7 +128,7 @@ def analyze_paper(system: CompiledSystem) -> Analysis:
     ApcError
         As `paper_route`.
     """
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         whole = whole_system(system)
         loop = open_loop(system, whole)
         rigid = find_rigid_modes(whole)

@@ -80,7 +80,7 @@ def check_frame(system: CompiledSystem) -> float:
     schedules = build_schedules(system, numbers.timings, [site.pattern for site in sites])
     chance = random.Random(SEED)  # NumPy's own takes longer to import than this to check
     largest = 0.0
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         for site, schedule, parameters in _checked(system, numbers, sites, schedules):
             exact = linearize_exact(site, parameters)
             lifted = lift(linearize(site, parameters), schedule, exact=exact)
@@ -91,7 +91,7 @@ def check_frame(system: CompiledSystem) -> float:
             size = _terms(lifted, z, r)
             proven = _terms(lifted.error, z, r)
             if not (np.isfinite(size).all() and np.isfinite(proven).all()):
-                raise ApcError(Mistake("E806", Place(system.name), TOO_LARGE))
+                raise ApcError(Mistake("E806", Place(system.origin.topology), TOO_LARGE))
             stepped = _precisely_stepped(exact, schedule, parameters, z, r, UNIT * size + TINY)
             apart = np.abs(stepped - mapped)
             # What has died out to below the error of a step is measured by that error.

@@ -18,8 +18,8 @@ from apc.cli.compare import compare_command
 from apc.cli.critical import critical_command
 from apc.cli.export import export_command
 from apc.cli.feel import feel_command
-from apc.cli.network import network_command
 from apc.cli.library import library_command, new_command
+from apc.cli.network import network_command
 from apc.cli.options import Group, beside, file_argument, file_option, tell
 from apc.cli.play import play_command
 from apc.cli.progress import at_work

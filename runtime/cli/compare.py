@@ -27,6 +27,7 @@ from apc.cli.options import (
     tell,
 )
 from apc.cli.progress import status_line
+from apc.compiler.errors import ApcError
 from apc.threads import start_single_threaded
 
 
@@ -42,6 +43,12 @@ from apc.threads import start_single_threaded
 @set_option
 @in_option
 @hands_option
+@click.option(
+    "--at",
+    default="",
+    metavar="PEER.PART",
+    help="The device whose hand feels: left[1].device, or an axis of it. The first peer's that has one.",
+)
 @file_option("--out", "Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json.")
 @json_option
 def compare_command(
@@ -50,6 +57,7 @@ def compare_command(
     settings: tuple[str, ...],
     criterion: str | None,
     hands: str,
+    at: str,
     out: Path | None,
     as_json: bool,
 ) -> None:
@@ -77,6 +85,7 @@ def compare_command(
         _compare_run(Path(files[0]), as_json=as_json)
         return
     from apc.comparison.comparison import compare
+    from apc.frame.devices import UNHELD
     from apc.inputs import open_scene
     from apc.present.comparison import write_comparison
     from apc.present.pictures import check_result_path
@@ -85,9 +94,18 @@ def compare_command(
         check_result_path(out)
     asked = criterion_with(hands, criterion)
     note_usual(hands)
-    systems = [open_scene(file, settings, {"--out": out}, hands=hands, told=note_aside) for file in files]
+    systems, refused = [], {}
+    for place, file in enumerate(files):
+        try:
+            system = open_scene(file, settings, {"--out": out}, hands=hands, told=note_aside)
+        except ApcError as error:
+            if error.mistakes[0].code not in UNHELD:
+                raise
+            system = open_scene(file, settings, {"--out": out})
+            refused[place] = error.mistakes[0].reason
+        systems.append(system)
     with status_line() as told:
-        found = compare(systems, over=over, criterion=asked, told=told)
+        found = compare(systems, over=over, criterion=asked, at=at, refused=refused, told=told)
     if out is not None:
         write_comparison(out, found)
     print_result(found, as_json=as_json, err=beside(out))

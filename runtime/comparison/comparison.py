@@ -9,11 +9,12 @@ Does not: compute any of it itself, or say which scheme is the better one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
-from apc.comparison.choice import DELAY, LOSS, STIFFNESS, check_over, choose
+from apc.comparison.choice import DELAY, LOSS, STIFFNESS, Choice, check_over, choose
 from apc.comparison.effort import Effort, effort
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from apc.hands.passivity import PassiveHands
 
 FREQUENCIES = (1.0, 10.0)  # Hz, at which is told what a hand feels
+NOTHING: Mapping[int, str] = MappingProxyType({})  # refused
 
 
 _Found = TypeVar("_Found")
@@ -50,12 +52,13 @@ class Scheme:
     `passive` that of `analyze --hands passive`, where stable means that. `played` is what `simulate` tells of
     a scene that is not linear, where all else is of its linearization; None of one that is. `stiffness`,
     `delay` and `loss` are those of `critical`; `feel` that of `feel` at `FREQUENCIES`, at the device of the
-    first peer that has one. `missing` says why a part is None, by its name.
+    first peer that has one. `missing` says why a part is None, by its name. A scene that can't be asked at
+    all, as one with hands can't about passive ones, is `refused`, with why: only its effort is known.
     """
 
     topology: str
     peers: int
-    analysis: Analysis
+    analysis: Analysis | None
     network: NetworkVerdict | None
     passive: PassiveHands | None
     played: Played | None
@@ -65,16 +68,24 @@ class Scheme:
     feel: Feel | None
     effort: Effort
     missing: tuple[tuple[str, str], ...]
+    refused: str = ""
 
     @property
     def verdict(self) -> str:
         """The verdict by what stable means: with passive hands, over the network as it is, or nominal."""
-        return (self.passive or self.network or self.analysis).verdict
+        judged = self.passive or self.network or self.analysis
+        return "refused" if judged is None else judged.verdict
 
     @property
     def stable(self) -> bool | None:
         """Whether it is stable, in the same sense."""
-        return (self.passive or self.network or self.analysis).stable
+        judged = self.passive or self.network or self.analysis
+        return None if judged is None else judged.stable
+
+    @property
+    def linearized(self) -> bool:
+        """Whether all but what is played is of a linearization."""
+        return self.analysis is not None and self.analysis.linearized
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -118,6 +129,8 @@ def compare(
     *,
     over: Sequence[str] = (),
     criterion: str | None = None,
+    at: str = "",
+    refused: Mapping[int, str] = NOTHING,
     told: Told | None = None,
 ) -> Comparison:
     """Ask the same of several scenes.
@@ -130,42 +143,54 @@ def compare(
         Which stiffness, delay and loss are varied, in the scenes that have them: see `choice.choose`.
     criterion
         What stable means, as for `vary.critical.critical`.
+    at
+        The device whose hand feels, as `hands.feel.feel` takes it; if not given, of the first peer with one.
+    refused
+        Of scenes, by their places, that can't be asked: why. They have a place in the table all the same.
     told
         Is told how far the work is.
 
     Raises
     ------
     ApcError
-        E940, E941 and E622, as `choice`; E898 no such criterion; those of `analysis.analyze` and
-        `passivity.passive_hands`.
+        E940, E941 and E622, as `choice`; E898 no such criterion.
     """
     check_over(systems, over)
-    for system in systems:
+    asked = {place: system for place, system in enumerate(systems) if place not in refused}
+    for system in asked.values():
         criterion_of(system, criterion, Place("criterion"))
-    chosen = [choose(system, over) for system in systems]
+    chosen = {place: choose(system, over) for place, system in asked.items()}
     schemes = []
-    for system, axes in zip(systems, chosen, strict=True):
-        names = {axis: one.name for axis, one in axes.items()}
-        missing = {axis: one.why for axis, one in axes.items() if one.why}
-        schemes.append(_scheme(system, names, missing, criterion, told))
+    for place, system in enumerate(systems):
+        why = refused.get(place, "")
+        if not why:
+            try:
+                schemes.append(_scheme(system, chosen[place], criterion, at, told))
+                continue
+            except ApcError as error:
+                why = error.mistakes[0].reason
+        nothing = (None,) * 8
+        schemes.append(Scheme(system.name, system.peers, *nothing, effort(system), (), why))
     return Comparison(tuple(schemes), _notes(schemes))
 
 
 def _scheme(
     system: CompiledSystem,
-    names: dict[str, str],
-    missing: dict[str, str],
+    axes: Mapping[str, Choice],
     criterion: str | None,
+    at: str,
     told: Told | None,
 ) -> Scheme:
-    """Return what is told of one scene."""
+    """Return what is told of one scene. Raises ApcError, as `analyze` and `passive_hands`, if it can't be."""
+    names = {axis: one.name for axis, one in axes.items()}
+    missing = {axis: one.why for axis, one in axes.items() if one.why}
     say = told or (lambda _: None)
 
     def had(key: str, command: str, compute: Callable[[], _Found]) -> _Found | None:
         try:
             return compute()
-        except ApcError as error:  # what it says to write is for the command
-            missing[key] = f"{command}: {error.mistakes[0].sentence}"
+        except ApcError as error:
+            missing[key] = f"{command}: {error.mistakes[0].reason}"
             return None
 
     def crossing(axis: str) -> Critical | None:
@@ -191,7 +216,7 @@ def _scheme(
         stiffness=crossing(STIFFNESS),
         delay=crossing(DELAY),
         loss=crossing(LOSS),
-        feel=had("feel", "apc feel", lambda: _feel(system, prepared)),
+        feel=had("feel", "apc feel", lambda: _feel(system, prepared, at)),
         effort=effort(system),
         missing=tuple(missing.items()),
     )
@@ -209,16 +234,18 @@ def _played(system: CompiledSystem, say: Told) -> Played:
     )
 
 
-def _feel(system: CompiledSystem, prepared: Prepared) -> Feel:
-    """Return what is felt at the first device there is: a server has none."""
+def _feel(system: CompiledSystem, prepared: Prepared, at: str) -> Feel:
+    """Return what is felt, at the first device there is if it isn't said: a server has none."""
+    if at:
+        return feel(system, FREQUENCIES, at=at, quick=True, prepared=prepared)
     unit_of, numbers = {one.name: one.unit for one in system.parameters}, resolve(system)
     holding = [
         group.name
         for place, group in enumerate(system.groups)
         if find_device(prepared.jacobians[group.kind], numbers.parameters[place][0], unit_of) is not None
     ]
-    at = f"{holding[0]}[1]" if holding else ""
-    return feel(system, FREQUENCIES, at=at, quick=True, prepared=prepared)
+    first = f"{holding[0]}[1]" if holding else ""
+    return feel(system, FREQUENCIES, at=first, quick=True, prepared=prepared)
 
 
 def _passive(system: CompiledSystem, prepared: Prepared) -> PassiveHands:
@@ -231,8 +258,8 @@ def _passive(system: CompiledSystem, prepared: Prepared) -> PassiveHands:
 def _notes(schemes: Sequence[Scheme]) -> tuple[str, ...]:
     """Say in what the schemes differ beside their couplings."""
     peers = dict.fromkeys(one.peers for one in schemes)
-    frames = dict.fromkeys(one.analysis.frame_s for one in schemes)
-    judged = dict.fromkeys(one.network is None for one in schemes)
+    frames = dict.fromkeys(one.analysis.frame_s for one in schemes if one.analysis is not None)
+    judged = dict.fromkeys(one.network is None for one in schemes if one.analysis is not None)
     notes = {
         f"they have different numbers of peers: {', '.join(f'{one:,}' for one in peers)}": len(peers) > 1,
         "their frames differ, and with them what a spectral radius is of: "

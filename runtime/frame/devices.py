@@ -2,13 +2,14 @@
 
 Takes: a kind's Jacobians and exact numbers; a `CompiledSystem`.
 Gives: `Device`, `find_device`, `devices_of`; `Push`, `find_push`; `HANDS`, `with_hands`, `clamped`, `held`;
-`refuse_hands`; `published`; `OWN_MASS`.
+`refuse_hands`; `published`; `OWN_MASS`, `UNHELD`.
 Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
 Does not: ask whether it is stable (see `passivity` for hands of every kind).
 
-A device is what a peer moves and does not tell others about: what it tells them of is a copy of what all
-hold. With m v' = f + …, a slope of v' over anything at all is J = j/m, so 1/m = −(∂J/∂m)/J: what a force at
-that place does, whatever is rigidly connected with it. A copy of a shared mass is one of n: there J = n j/m.
+A device is the part that a hand of the scene is joined to. Where there is none, it is what a peer moves and
+does not tell others about: what it tells them of is a copy of what all hold. With m v' = f + …, a slope of v'
+over anything at all is J = j/m, so 1/m = −(∂J/∂m)/J: what a force at that place does, whatever is rigidly
+connected with it. A copy of a shared mass is one of n: there J = n j/m.
 With M v' = f of several that move with one another, a mass of place i adds to M there: ∂J/∂m = −M⁻¹ eᵢ Jᵢ,
 whose columns say what a force at i does to all of them, M⁻¹ eᵢ.
 """
@@ -41,6 +42,9 @@ if TYPE_CHECKING:
 # How hands can be taken: as the scene has them, holding devices fast, or as a mass, damper and spring each;
 # and as all that give back no more energy than they got, which changes no scene.
 FREE, CLAMPED, HELD, PASSIVE = HANDS = ("free", "clamped", "held", "passive")
+
+# Codes of a scene that can't have the hands asked for, where another could.
+UNHELD = ("E931", "E932")
 
 # What a peer without a device lacks.
 OWN_MASS = "a mass of its own at each peer, as masses: {device: {mass: 0.1 kg}}"
@@ -85,9 +89,11 @@ def find_device(
         The kind, a vector (n_p,) of its parameters, their units, and what it hears at the start.
     part
         The part that is meant, or the axis of one that moves along several, `device.x[2]`; without it, the
-        only one that others are not told about.
+        only one that a hand is joined to, or else that others are not told about.
     """
     kind = site.kind
+    owners = {_part(one.name) for one in kind.states}
+    gripped = {own for own in owners for one in kind.held if own == one or own.startswith(f"{one}.")}
     if not (site.walkable and kind.derivative.is_a("SXFunction")):
         return f"{kind.name} has a nonlinear loop"
     told_of = {
@@ -105,7 +111,8 @@ def find_device(
     for place, state in enumerate(kind.states):
         driven = np.flatnonzero(site.pattern.a[place])
         own = _part(state.name)
-        wanted = part in (own, state.name) if part else own not in told_of
+        wanted = own in gripped if gripped else own not in told_of
+        wanted = part in (own, state.name) if part else wanted
         if state.unit != "m" or not wanted or len(driven) != 1 or site.pattern.b[place].any():
             continue
         velocity = int(driven[0])
@@ -247,7 +254,7 @@ def devices_of(system: CompiledSystem, *, part: str = "", option: str = "--hands
     system
         The compiled scene.
     part
-        The part that is meant; without it, the only one that others are not told about.
+        The part that is meant; without it, as `find_device`.
     option
         What asked for it.
 
@@ -433,8 +440,9 @@ def _rewritten(
     )
     sends = tuple(replace(one, send=again(one.send)) for one in kind.sends)
     ports = None if kind.ports is None else Ports(kind.ports.parts, again(kind.ports.port))
+    limits = tuple(one if one.value is None else replace(one, value=again(one.value)) for one in kind.limits)
     derivative = again(kind.derivative, rates)
-    return replace(kind, derivative=derivative, clocks=clocks, sends=sends, ports=ports)
+    return replace(kind, derivative=derivative, clocks=clocks, sends=sends, ports=ports, limits=limits)
 
 
 def published(name: str) -> dict[str, tuple[str, str, str]]:

@@ -89,7 +89,7 @@ def times_in_use(
     for name, delay in delays.items():
         if delay < 0:
             got = f"{float(delay):g} s"
-            raise ApcError(Mistake("E809", Place(system.name), name, "0 s or more", got))
+            raise ApcError(Mistake("E809", Place(system.origin.topology), name, "0 s or more", got))
     if not clocks:  # nothing is sampled: any frame will do
         clocks = dict(clock_of) or {"": Clock("", "", "")}
     period = {name: timings[clock.period] if name else Fraction(1) for name, clock in clocks.items()}
@@ -124,4 +124,4 @@ def _check_frame_length(
             f"({clocks}); at most {MOST_TICKS} can be analysed"
         )
         hint = "periods that are simple multiples of one another"
-        raise ApcError(Mistake("E805", Place(system.name), what, hint=hint))
+        raise ApcError(Mistake("E805", Place(system.origin.topology), what, hint=hint))

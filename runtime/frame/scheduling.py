@@ -191,7 +191,7 @@ def _check_held(
         most = float(three.create_decimal_from_float(float(seconds * left / held[longest])))
         fits = f"{longest}: {most:g} s, or a slower clock" if left > 0 else ""
         hint = fits or "shorter delays of all forces, or a slower clock"
-        raise ApcError(Mistake("E805", Place(system.name), what, hint=hint))
+        raise ApcError(Mistake("E805", Place(system.origin.topology), what, hint=hint))
 
 
 def _check_depth(system: CompiledSystem, depth: Mapping[Sent, int]) -> None:
@@ -204,7 +204,9 @@ def _check_depth(system: CompiledSystem, depth: Mapping[Sent, int]) -> None:
             f"at most {MOST_PACKETS:,} can be named"
         )
         raise ApcError(
-            Mistake("E805", Place(system.name), what, hint="a shorter delay, or a slower link clock")
+            Mistake(
+                "E805", Place(system.origin.topology), what, hint="a shorter delay, or a slower link clock"
+            )
         )
 
 

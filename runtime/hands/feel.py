@@ -199,7 +199,7 @@ def feel(
     verdict = judge(system, prepared=prepared)
     if verdict.stable is False and not unstable:
         raise _unstable(system, verdict.spectral_radius)
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         responses = _responses(system, prepared, port, other)
         s = np.asarray(2j * np.pi * found, dtype=np.complex128)
         own, *aliases, across, error = responses.steady(s, ALIASES)

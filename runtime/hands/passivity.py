@@ -149,7 +149,7 @@ def passive_hands(
     refuse_hands(system, OPTION)
     prepared = prepared or prepare(system)
     fixed = analyze(clamped(system, option=OPTION), certify=certify)
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         opened = open_ports(system, *lifted_groups(system, prepared=prepared), option=OPTION)
         cuts = (
             [] if isinstance(opened, str) else [port_loop(opened, one, option=OPTION) for one in opened.loops]
@@ -233,7 +233,7 @@ def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool 
         Whether bounds are asked for.
     """
     refuse_hands(system, OPTION)
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         loops = port_loops(system, prepared, option=OPTION)
         found, scale = [(-np.inf, -np.inf, -np.inf)], 1.0
         if not isinstance(loops, str):

@@ -86,14 +86,14 @@ def populations(
     """
     if sum(map(len, numbers.rows)) > MOST_DIFFERENT:
         what = f"{system.peers:,} peers, some of whom differ, and {MOST_DIFFERENT:,} are the most of these"
-        raise ApcError(Mistake("E804", Place(system.name), what, hint="smaller counts"))
+        raise ApcError(Mistake("E804", Place(system.origin.topology), what, hint="smaller counts"))
     states = [
         states_of(schedule, jacobians[group.kind])
         for group, schedule in zip(system.groups, schedules, strict=True)
     ]
     needed = ENTRY * sum(len(rows) * n**2 for rows, n in zip(numbers.parameters, states, strict=True))
     what = f"{sum(map(len, numbers.parameters)):,} different peers of up to {max(states)} states"
-    refuse_beyond(needed, "E804", Place(system.name), what, "fewer peers that differ")
+    refuse_beyond(needed, "E804", Place(system.origin.topology), what, "fewer peers that differ")
     found = []
     for place, (group, schedule) in enumerate(zip(system.groups, schedules, strict=True)):
         site, parameters = jacobians[group.kind], numbers.parameters[place]

@@ -317,7 +317,7 @@ def judge_network(
     """
     if not unreliable(system):
         return None
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         found = growth(system, prepared)
         lost = [link for link, law in unreliable(system) if law.mean_loss]

@@ -156,13 +156,13 @@ def trace_of_worst(system: CompiledSystem) -> CompiledSystem:
     pattern = found.unstable_pattern
     if pattern is None:
         what = f"--trace-of worst has nothing to play: {found.note}"
-        raise ApcError(Mistake("E897", Place(system.name), what, hint="apc simulate"))
+        raise ApcError(Mistake("E897", Place(system.origin.topology), what, hint="apc simulate"))
     seconds = {timing.name: float(timing.value) for timing in system.timings}
     for link in system.links:
         delays = {seconds[link.delay], *(seconds[one.delay] for one in link.delays)}
         if link.channel is not None and len(delays) > 1:
             what = f"--trace-of worst gives all packets of {link.name} one delay, and they have several"
-            raise ApcError(Mistake("E897", Place(system.name), what, hint="apc simulate"))
+            raise ApcError(Mistake("E897", Place(system.origin.topology), what, hint="apc simulate"))
 
     def played(link: Link) -> Link:
         if link.channel is None:

@@ -111,7 +111,7 @@ def channel_law(system: CompiledSystem, link: Link, delay: Fraction) -> ChannelL
         for parameter in group.values:
             if parameter.name in loss:
                 what = f"{parameter.name} is of a link, the same for all peers: {group.name} can't set it"
-                raise ApcError(Mistake("E891", Place(system.name), what))
+                raise ApcError(Mistake("E891", Place(system.origin.topology), what))
     value = {parameter.name: parameter.value for parameter in system.parameters}
     seconds = {timing.name: float(timing.value) for timing in system.timings}
     p, r, one_minus_h, one_minus_k = (value[name] for name in loss) if loss else (0.0, 1.0, 1.0, 0.0)

@@ -171,7 +171,9 @@ def _check_luck(system: CompiledSystem, route: Route, luck: Luck) -> None:
             f"{float(luck.quantum):.6g} s, of which periods, phases and delays are whole multiples: at most "
             f"{LONGEST} of them"
         )
-        raise ApcError(Mistake("E892", Place(system.name), what, hint="periods and delays in whole µs"))
+        raise ApcError(
+            Mistake("E892", Place(system.origin.topology), what, hint="periods and delays in whole µs")
+        )
     packets = luck.kept(route) * ways
     if packets > MOST_PACKETS:
         what = (
@@ -179,7 +181,7 @@ def _check_luck(system: CompiledSystem, route: Route, luck: Luck) -> None:
             f"{packets} packets are kept; at most {MOST_PACKETS} can be followed"
         )
         hint = "a shorter delay or jitter, fewer peers, or graph: ring"
-        raise ApcError(Mistake("E892", Place(system.name), what, hint=hint))
+        raise ApcError(Mistake("E892", Place(system.origin.topology), what, hint=hint))
 
 
 class Listener:
@@ -363,7 +365,7 @@ def _routes_over(
             f"{link.name} is unreliable, and {peers} peers that all hear each other are "
             f"{peers * (peers - 1)} ways with packets of their own; at most {MOST_WAYS} can be followed"
         )
-        raise ApcError(Mistake("E892", Place(system.name), what, hint="graph: ring"))
+        raise ApcError(Mistake("E892", Place(system.origin.topology), what, hint="graph: ring"))
     kind_of = np.repeat([group.kind for group in system.groups], np.diff(exchange.starts))
     pairs, weights = exchange.arcs(link.name)
     order = np.lexsort((pairs[:, 0], pairs[:, 1]))  # receiver by receiver: what each hears stands together

@@ -126,7 +126,7 @@ def analysis_text(result: Analysis) -> str:
     words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
     if result.rigid_modes > 1 and result.verdict == "stable up to a common translation":
         words = (
-            f"{result.rigid_modes} motions are held back by nothing, of all peers together or of some\n"
+            f"{result.rigid_modes} motions are held back by nothing, of all peers together or of some "
             "beside others: moved so they stay where they are. Every other motion dies out."
         )
     if result.linearized:
@@ -135,7 +135,7 @@ def analysis_text(result: Analysis) -> str:
         words += "\nWhat it does in time is played: apc simulate"
     if not result.states_per_peer:
         words = "Nothing here is free to move."
-    lines += [f"  {line}" for line in words.splitlines()]
+    lines += [line for one in words.splitlines() for line in wrapped(one, "  ", "  ")]
     removed = ""
     if result.translations:
         removed = f", {counted(result.translations, 'translation')} left out"
@@ -183,6 +183,8 @@ def answer_text(found: Answer) -> str:
         parts.append(str(found.switching))
     if found.buzz is not None:
         parts.append(str(found.buzz))
+    if found.no_buzz:
+        parts.append("\n".join(wrapped(f"{found.analysis.topology}: {found.no_buzz}")))
     if found.detailed:
         parts.append(str(found.conventions))
     elif found.conventions.warning:
@@ -216,7 +218,7 @@ def answer_document(found: Answer) -> dict[str, Any]:
         "contact_modes": found.contact_modes.to_dict() if found.contact_modes else None,
         "switching": found.switching.to_dict() if found.switching else None,
         "buzz": found.buzz.to_dict() if found.buzz else None,
-        "buzz_note": "" if found.buzz else NOT_PLAYED,
+        "buzz_note": "" if found.buzz else found.no_buzz or NOT_PLAYED,
         "warnings": [found.conventions.warning] if found.conventions.warning else [],
     }
     if found.detailed:

@@ -67,7 +67,7 @@ def comparison_text(found: Comparison) -> str:
     named = [(f"{one.topology}, {counted(one.peers, 'peer', ',d')}",) for one in schemes]
     lines += _table(("",), named)
     lines += _table(("verdict", "spectral radius a frame"), [_verdict(one, feet) for one in schemes])
-    if any(one.analysis.linearized for one in schemes):
+    if any(one.linearized for one in schemes):
         lines += _table(("in time", "played"), [_in_time(one, feet) for one in schemes])
     for key, heading in VARIED:
         lines += _table((heading, "of"), [_varied(one, key, feet) for one in schemes])
@@ -121,6 +121,8 @@ def _why(one: Scheme, key: str) -> tuple[str, ...]:
 
 
 def _verdict(one: Scheme, feet: _Footnotes) -> tuple[str, str]:
+    if one.analysis is None:
+        return one.verdict, f"{NONE}{feet.mark([one.refused])}"
     told = list(_why(one, "verdict"))
     if one.network is not None and one.network.mean_square_radius is not None:
         root, error = math.sqrt(one.network.mean_square_radius), one.network.error or 0.0
@@ -137,7 +139,9 @@ def _verdict(one: Scheme, feet: _Footnotes) -> tuple[str, str]:
 
 def _in_time(one: Scheme, feet: _Footnotes) -> tuple[str, str]:
     """Return the verdict of a simulation, where that of an analysis is of a linearization."""
-    if not one.analysis.linearized:
+    if one.analysis is None:
+        return NONE, NONE
+    if not one.linearized:
         return "as its verdict says: it is linear", ""
     if one.played is None:
         return f"{NONE}{feet.mark(_why(one, 'played'))}", NONE
@@ -200,6 +204,7 @@ def _document(one: Scheme) -> dict[str, Any]:
         **told,
         "effort": document(one.effort),
         "missing": dict(one.missing),
+        "refused": one.refused,
     }
 
 
@@ -264,6 +269,7 @@ def _columns() -> list[Column]:
 
 def _row(one: Scheme) -> Row:
     """Return a row of the table."""
+    analysis = one.analysis
     varied = [
         cell
         for found in (one.stiffness, one.delay, one.loss)
@@ -288,9 +294,9 @@ def _row(one: Scheme) -> Row:
         one.peers,
         one.verdict,
         None if one.played is None else one.played.summary.verdict,
-        one.analysis.frame_s,
-        one.analysis.spectral_radius,
-        one.analysis.spectral_radius_error,
+        None if analysis is None else analysis.frame_s,
+        None if analysis is None else analysis.spectral_radius,
+        None if analysis is None else analysis.spectral_radius_error,
         None if one.network is None else one.network.mean_square_radius,
         *varied,
         None if one.feel is None else one.feel.at,
@@ -298,5 +304,5 @@ def _row(one: Scheme) -> Row:
         one.effort.operations,
         one.effort.sent,
         one.effort.sent_by_all,
-        "; ".join(f"{key}: {text}" for key, text in one.missing) or None,
+        "; ".join(f"{key}: {text}" for key, text in one.missing) or one.refused or None,
     )

@@ -44,7 +44,7 @@ def comparison_picture(found: Comparison) -> Any:
     """
     figures = need("matplotlib.figure", "plot")
     panels: list[tuple[str, list[_Bar]]] = [
-        ("spectral radius a frame", [(one.analysis.spectral_radius, False) for one in found.schemes]),
+        ("spectral radius a frame", [_radius(one) for one in found.schemes]),
         ("settles within 2 % in (s)", [_settles(one) for one in found.schemes]),
         ("largest stable stiffness (N/m)", [_reach(one.stiffness, 1.0) for one in found.schemes]),
         ("delay that breaks it (ms)", [_reach(one.delay, 1e3) for one in found.schemes]),
@@ -73,7 +73,7 @@ def comparison_picture(found: Comparison) -> Any:
 
 
 def _settles(one: Scheme) -> _Bar:
-    seconds = one.analysis.settling_s
+    seconds = None if one.analysis is None else one.analysis.settling_s
     return NONE if seconds is None else (seconds, False)
 
 
@@ -86,6 +86,10 @@ def _reach(found: Critical | None, scale: float) -> _Bar:
     if found.value is None and found.verdict.startswith("stable"):
         return found.scanned[1] * scale, True
     return "unstable" if found.verdict.startswith("unstable") else NONE
+
+
+def _radius(one: Scheme) -> _Bar:
+    return one.verdict if one.analysis is None else (one.analysis.spectral_radius, False)
 
 
 def _felt(one: Scheme, place: int) -> _Bar:
@@ -128,7 +132,7 @@ def _judge(ax: Any, schemes: Sequence[Scheme]) -> None:
     """Draw where the boundary is; write which scheme is not stable, and what one does that isn't linear."""
     ax.axvline(BOUNDARY, color="0.4", linewidth=0.8, linestyle=(0, (3, 2)))
     for place, one in enumerate(schemes):
-        said = [] if one.stable else ["unstable" if one.stable is False else "undecided"]
+        said = [] if one.stable or one.refused else ["unstable" if one.stable is False else "undecided"]
         if one.played is not None:
             said.append(f"{one.played.summary.verdict} in time")
         if said:

@@ -52,7 +52,7 @@ def passive_text(found: PassiveHands) -> str:
         lines += wrapped(_worst(found, worst), "  ", "  ")
     lines += ["", f"  devices clamped  spectral radius {measured(found.clamped_radius, found.clamped_error)}"]
     if found.proof:
-        lines.append(f"  proof            {found.proof}")
+        lines += wrapped(found.proof, "  proof            ", " " * 19)
     if found.modes:
         rows = [("  mode", "damping", "needed", "at", "at rest", ""), *map(_mode, found.modes)]
         widths = [max(len(row[column]) for row in rows) for column in range(6)]

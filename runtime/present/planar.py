@@ -1,8 +1,8 @@
 """A picture of how a scene begins whose bodies move in a plane or in space: each peer's plane, to scale.
 
 Takes: a `CompiledSystem`; what was recorded of a run.
-Gives: `moves_in_plane`, `Spot`, `Disc`, `Line`, `Actor`, `spots_of`,
-`draw_plane`, `name_in_legend`; `paths_of`, `draw_paths`.
+Gives: `moves_in_plane`, `Spot`, `Disc`, `Line`, `Actor`, `spots_of`, `draw_plane`, `name_in_legend`;
+`paths_of`, `draw_paths`; `deciding`, `write_name`.
 Guarantees: everything is found in the equations: a body is a vector of positions (states in metres); where
 something is decided by the distance of two of them, or of one from a fixed point, in metres, there is a disc;
 where by the distance from a line or plane, there is a line. Of space the first two coordinates are drawn.
@@ -11,7 +11,7 @@ Does not: play the scene, or know what a part is called; draw bodies that move a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import field
 from typing import Any
 
@@ -184,27 +184,41 @@ def _tidy(number: float) -> float:
     return float(f"{number:.9g}") if abs(number) > SAME else 0.0
 
 
-def _probed(kind: Kind, vector: Sequence[float]) -> list[tuple[Floats, Floats, Floats]]:
-    """Return states (k, n_x) and, for each function that decides something, its values (k,) and slopes."""
-    found = []
-    points = np.random.default_rng(1).uniform(-1, 1, (PROBES, len(kind.states)))
+def deciding(kind: Kind) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield of each function its states, its parameters, and what it decides by on them alone."""
     for function in (kind.derivative, *(one.tick for one in kind.clocks)):
         if not function.is_a("SXFunction"):
             continue
         inputs = function.sx_in()
         x, p = inputs[0], inputs[-2]
         others = casadi.vertcat(*(one for i, one in enumerate(inputs) if i not in (0, len(inputs) - 2)))
-        guards = [
-            one
-            for one in guards_of(casadi.densify(function(*inputs)), x)
-            if not casadi.depends_on(one, others)
-        ]
-        if not guards:
-            continue
-        column = casadi.vertcat(*guards)
+        guards = guards_of(casadi.densify(function(*inputs)), x)
+        if own := [one for one in guards if not casadi.depends_on(one, others)]:
+            yield x, p, casadi.densify(casadi.vertcat(*own))
+
+
+def write_name(ax: Any, name: str, place: Sequence[float], above: float) -> None:
+    """Write a body's name so many points above a place."""
+    ax.annotate(
+        name,
+        place,
+        (0, above),
+        textcoords="offset points",
+        ha="center",
+        va="bottom",
+        fontsize=7,
+        bbox={"facecolor": "w", "linewidth": 0, "alpha": 0.7, "pad": 0.5},
+    )
+
+
+def _probed(kind: Kind, vector: Sequence[float]) -> list[tuple[Floats, Floats, Floats]]:
+    """Return states (k, n_x) and, for each function that decides something, its values (k,) and slopes."""
+    found = []
+    points = np.random.default_rng(1).uniform(-1, 1, (PROBES, len(kind.states)))
+    for x, p, column in deciding(kind):
         at = casadi.Function("at", [x, p], [column, casadi.densify(casadi.jacobian(column, x))])
         numbers = [[np.asarray(one, dtype=np.float64) for one in at(point, vector)] for point in points]
-        for row in range(len(guards)):
+        for row in range(column.numel()):
             values = np.array([value[row, 0] for value, _ in numbers])
             slopes = np.array([slope[row] for _, slope in numbers])
             if np.isfinite(values).all() and np.isfinite(slopes).all():
@@ -258,16 +272,7 @@ def draw_plane(
             actors.append(Actor(ax, states, MM * spot.radius, dot, shape))
             labels.setdefault(place, []).append(spot.name)
         for place, told in labels.items() if named else ():
-            ax.annotate(
-                ", ".join(told),
-                place,
-                (0, 6),
-                textcoords="offset points",
-                ha="center",
-                va="bottom",
-                fontsize=7,
-                bbox={"facecolor": "w", "linewidth": 0, "alpha": 0.7, "pad": 0.5},
-            )
+            write_name(ax, ", ".join(told), place, 6)
         ax.set_xlim(low[0], high[0])
         ax.set_ylim(low[1], high[1])
         ax.set_aspect("equal")

@@ -291,7 +291,7 @@ def open_recording(path: Path, simulation: Simulation) -> Recording:
     elif suffix == ".parquet":
         each += IN_PARQUET[0] + IN_PARQUET[1] * -(-simulation.rows // block)
     needed, what = columns * each, f"{simulation.rows:,} rows of {columns:,} columns in {path.name}"
-    refuse_beyond(needed, "E876", Place(simulation.system.name), what, "fewer --signals")
+    refuse_beyond(needed, "E876", Place(simulation.system.origin.topology), what, "fewer --signals")
     return Recording(path, simulation)
 
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from apc.simulation.accuracy import ErrorEstimate
     from apc.simulation.buzz import Buzz
     from apc.simulation.ensemble import Ensemble, MeanSquare, Statistics
+    from apc.simulation.limits import Broken
     from apc.simulation.signals import Signal
     from apc.simulation.trajectory import Played, Provenance, Trajectory
 
@@ -55,6 +56,7 @@ DASHES = ("-", (0, (4, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (7, 2)), (0, (
 MOST_COLOURS = 10  # peers with a colour each; of more each group has one
 ROUNDING = 1e-9  # of what a panel spans
 LABEL = 36  # letters of a line of a legend
+MOST_LIMITS = 4  # that are told as text; the document has all
 MOST_CURVES = 24  # in a panel: more can't be told apart
 MOST_POINTS = 2000  # of a curve: about one a pixel and a half of a wide picture
 WIDTH, HEIGHT = 9.0, 2.4  # inches: of the figure, of a panel
@@ -117,6 +119,7 @@ def played_text(found: Played) -> str:
     if summary.largest_force and (summary.largest_force[1] or summary.verdict != "rests"):
         name, size, at = summary.largest_force
         rows.append(("largest force", f"{_quantity(size, 'N')}, {name} at {_quantity(at, 's')}"))
+    rows += [("beyond limit", text) for text in _beyond(summary.broken)]
     if summary.overshoot:
         rows.append(("overshoot", f"{100 * summary.overshoot[1]:.3g} %, {summary.overshoot[0]}"))
     for name, distance in summary.copies:
@@ -136,6 +139,16 @@ def played_text(found: Played) -> str:
     for title, text in rows:
         lines += wrapped(text, f"  {title:<15}", " " * 17)
     return "\n".join(lines)
+
+
+def _beyond(broken: Sequence[Broken]) -> list[str]:
+    """Return which limits were broken, in their order, each with when and by how much."""
+    lines = [
+        f"{one.signal} from {_quantity(one.first_s, 's')} on: at most {_quantity(one.most, one.unit)} "
+        f"at {_quantity(one.at_s, 's')}, beyond {one.limit} by {_quantity(one.most - one.value, one.unit)}"
+        for one in broken[:MOST_LIMITS]
+    ]
+    return lines + ([f"and {len(broken) - MOST_LIMITS} more"] if len(broken) > MOST_LIMITS else [])
 
 
 def _quantity(value: float, unit: str) -> str:
@@ -180,6 +193,7 @@ def played_document(found: Played) -> dict[str, Any]:
         "interrupted": found.interrupted,
         "swing": None if swing is None else {"signal": swing[0], "size": swing[1], "frequency_hz": swing[2]},
         "overshoot": named(summary.overshoot, "part"),
+        "limits_broken": [document(one) for one in summary.broken],
         "largest_force": None if force is None else {"signal": force[0], "N": force[1], "time_s": force[2]},
         "copies_apart": dict(summary.copies),
         "work_J": dict(summary.work),

@@ -24,18 +24,26 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
-from apc.frame.jacobians import guards_of, jacobians
+from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
 from apc.frame.start import start_values
 from apc.optional import need
 from apc.present.pictures import check_format, colours_of, write_figure
-from apc.present.planar import Actor, draw_plane, moves_in_plane, name_in_legend, spots_of
+from apc.present.planar import (
+    MM,
+    Actor,
+    deciding,
+    draw_plane,
+    moves_in_plane,
+    name_in_legend,
+    spots_of,
+    write_name,
+)
 from apc.simulation.signals import sent_states
 
 Floats = NDArray[np.float64]
 
 MOST_PEERS = 12  # drawn: more rows can't be told apart
-MM = 1e3
 HEIGHT = 0.36  # half of a body's, of the distance of two rows
 WIDTH, ROW, MARGIN, DPI_POINTS = 7.0, 0.62, 1.1, 7.0  # inches: of the figure, a row, title and axis; points
 
@@ -97,22 +105,15 @@ def bodies_of(kind: Kind, vector: Sequence[float], start: Sequence[float]) -> tu
 def _distances(kind: Kind, vector: Sequence[float]) -> list[tuple[Floats, float]]:
     """Return the slopes (n_x,) and the value at the origin of what decides, where that is linear."""
     found = []
-    for function in (kind.derivative, *(one.tick for one in kind.clocks)):
-        if not function.is_a("SXFunction"):
-            continue
-        inputs = function.sx_in()
-        x, p = inputs[0], inputs[-2]
-        column = casadi.vertcat(*guards_of(casadi.densify(function(*inputs)), x))
+    for x, p, column in deciding(kind):
         slopes = casadi.jacobian(column, x)
-        at = casadi.Function("at", inputs, [casadi.densify(slopes), casadi.densify(column)])
-        zeros = [np.zeros(one.shape) for one in inputs]
-        zeros[-2] = np.reshape(vector, p.shape)
-        numbers = [np.asarray(one, dtype=np.float64) for one in at(*zeros)]
-        for row in range(column.numel()):
-            others = casadi.vertcat(*(one for i, one in enumerate(inputs) if i not in (0, len(inputs) - 2)))
-            alone = not casadi.depends_on(column[row], others)
-            if alone and not casadi.depends_on(slopes[row, :], x):
-                found.append((numbers[0][row], float(numbers[1][row, 0])))
+        at = casadi.Function("at", [x, p], [casadi.densify(slopes), column])
+        numbers = [np.asarray(one, dtype=np.float64) for one in at(np.zeros(x.shape), vector)]
+        found += [
+            (numbers[0][row], float(numbers[1][row, 0]))
+            for row in range(column.numel())
+            if not casadi.depends_on(slopes[row, :], x)
+        ]
     return found
 
 
@@ -170,16 +171,7 @@ def draw_actors(system: CompiledSystem, *, named: bool = True) -> tuple[Any, lis
             if not named:
                 continue
             above = HEIGHT if body.half_width else 0.12
-            ax.annotate(
-                body.name,
-                (MM * body.place, y - above),
-                (0, 2),
-                textcoords="offset points",
-                ha="center",
-                va="bottom",
-                fontsize=7,
-                bbox={"facecolor": "w", "linewidth": 0, "alpha": 0.7, "pad": 0.5},
-            )
+            write_name(ax, body.name, (MM * body.place, y - above), 2)
     ax.set_ylim(len(rows) - 0.45, -0.55)
     ax.set_yticks(range(len(rows)), [name for name, _, _ in rows])
     ax.margins(x=0.08)

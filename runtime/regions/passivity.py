@@ -18,7 +18,7 @@ from apc.compiler.frozen import dataclass
 Floats = NDArray[np.float64]
 
 # The symbols of the conditions: unit and meaning.
-UNITS = {"K": "N/m", "B": "N*s/m", "b": "N*s/m", "T": "s", "t_d": "s", "c": "N", "D": "m"}
+UNITS = {"K": "N/m", "B": "N*s/m", "b": "N*s/m", "T": "ms", "t_d": "ms", "c": "N", "D": "m"}
 MEANINGS = {
     "K": "stiffness of the virtual wall",
     "B": "damping of the virtual wall, on the backward difference of positions",

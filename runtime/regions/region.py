@@ -261,7 +261,7 @@ def region(
         else:
             refuse_time(system, one, PLACE, meant)
     rectangle = rectangle_of(*axes)
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         used = [prepared.jacobians[group.kind] for group in system.groups]
         affine = all(site.affine for site in used)

@@ -73,7 +73,7 @@ def blocks(simulation: Simulation, *, run: int = 0, player: Player | None = None
 
 def _unsolved(simulation: Simulation, frame: int) -> ApcError:
     """Return the mistake of a frame that could not be played."""
-    place = Place(simulation.system.name)
+    place = Place(simulation.system.origin.topology)
     at = f"after {float(frame * simulation.frame * simulation.quantum):g} s"
     if not simulation.tolerances:
         what = f"an equation has no solution, or a loop none that Newton's method finds, {at}"

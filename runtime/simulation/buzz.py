@@ -183,7 +183,7 @@ def _seconds(system: CompiledSystem, prepared: Prepared, modes: ContactModes | N
 
 def _refused(system: CompiledSystem, why: str) -> ApcError:
     what = f"no buzz to predict: {why}"
-    return ApcError(Mistake("E864", Place(system.name), what, hint="apc simulate"))
+    return ApcError(Mistake("E864", Place(system.origin.topology), what, hint="apc simulate"))
 
 
 def _contacts(

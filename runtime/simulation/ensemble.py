@@ -187,14 +187,16 @@ def play_many(
         E876 too many runs to keep; E894 nothing in the scene is left to chance; E895 a process ended without
         a word; and those of `simulation.prepare`.
     """
-    refuse_beyond(RUN * runs, "E876", Place(system.name), f"{runs:,} runs", "fewer --runs")
+    refuse_beyond(RUN * runs, "E876", Place(system.origin.topology), f"{runs:,} runs", "fewer --runs")
     if not any(link.channel is not None for link in system.links):
         what = f"nothing in {system.name} is left to chance: every run would be the same"
-        raise ApcError(Mistake("E894", Place(system.name), what, hint="links: {lan: {…, loss: 2 %}}"))
+        raise ApcError(
+            Mistake("E894", Place(system.origin.topology), what, hint="links: {lan: {…, loss: 2 %}}")
+        )
     seed = system.experiment.seed if settings.seed is None else settings.seed
     settings = replace(settings, seed=seed)
     parts = [range(first, min(first + PART, runs)) for first in range(0, runs, PART)]
-    place = Place(system.name)
+    place = Place(system.origin.topology)
     done: list[Run] = []
     interrupted = False
     try:
@@ -217,7 +219,7 @@ def _mean_square(system: CompiledSystem) -> MeanSquare | None:
     if not unreliable(system):
         return None
     try:
-        with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+        with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
             prepared = analysis.prepare(system)
             found = growth(system, prepared)
     except ApcError as error:  # what can't be analysed can be played

@@ -135,10 +135,10 @@ def refuse_unheard_of(system: CompiledSystem) -> None:
                         f"{receive.name} hears {receive.link}, over which its peer sends nothing: it has no "
                         "value of its own to stand in for a missing one"
                     )
-                    raise ApcError(Mistake("E893", Place(system.name), what, hint="on_loss: hold"))
+                    raise ApcError(Mistake("E893", Place(system.origin.topology), what, hint="on_loss: hold"))
                 if receive.link in zero and receive.before:
                     what = f"{receive.name}: what stood in for a missing value at the tick before is not kept"
-                    raise ApcError(Mistake("E893", Place(system.name), what, hint="on_loss: hold"))
+                    raise ApcError(Mistake("E893", Place(system.origin.topology), what, hint="on_loss: hold"))
 
 
 def build_population(

@@ -155,7 +155,7 @@ def check_step(system: CompiledSystem, method: Method, fastest: Fraction, longes
     """
     if method.step is None:
         return
-    place, what = Place(system.name), f"the step of {method.name}"
+    place, what = Place(system.origin.topology), f"the step of {method.name}"
     if method.step > fastest:
         expected = f"at most the period of the fastest clock, {_ms(fastest)}"
         hint = f"--method {method.name}:{_ms(fastest).replace(' ', '')}"

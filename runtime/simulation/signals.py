@@ -28,9 +28,10 @@ EXAMPLE = "'cube.x', 'left[2].*' or '*.v'"
 
 @dataclass(frozen=True, slots=True)
 class LocalSignal:
-    """Something of a site that can be recorded: "state", "output" (as newly computed) or "hold" (acting).
+    """Something of a site that can be recorded.
 
-    `place` is the state, the (clock partition, output), or the hold.
+    `role` is "state", "output" (as newly computed), "hold" (acting) or "limited" (of what has a limit and is
+    none of these); `place` is the state, the (clock partition, output), the hold, or the limit.
     """
 
     name: str
@@ -62,6 +63,11 @@ def local_signals(kind: Kind, schedule: Schedule) -> tuple[LocalSignal, ...]:
         if h in late:
             unit = kind.clocks[p].units[hold.output]
             found.append(LocalSignal(f"{hold.name} acting", unit, "hold", (h,)))
+    found += [
+        LocalSignal(one.name, one.unit, "limited", (place,))
+        for place, one in enumerate(kind.limits)
+        if one.value is not None
+    ]
     return tuple(found)
 
 
@@ -201,4 +207,4 @@ def _refuse(system: CompiledSystem, available: Sequence[Sequence[LocalSignal]], 
     )
     what = f"no signal fits {pattern[:80]!r}; the signals of a peer are {', '.join(list(names)[:12])}"
     hint = f"--signals {nearest(pattern, names)}" if nearest(pattern, names) else f"names such as {EXAMPLE}"
-    raise ApcError(Mistake("E873", Place(system.name), what, hint=hint))
+    raise ApcError(Mistake("E873", Place(system.origin.topology), what, hint=hint))

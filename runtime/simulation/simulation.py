@@ -175,7 +175,7 @@ def prepare(
     """
     refuse_unheard_of(system)
     system = stamped(system)
-    with finite_equations(system.name):
+    with finite_equations(system.origin.topology):
         plan = plan_of(system, settings.method)
         choices = _choices(plan, signals)
         members = _members(plan, choices, settings.method, live=live)
@@ -229,7 +229,7 @@ def check_length(system: CompiledSystem, duration: Fraction, *, runs: int = 1) -
     each = f" in each of {runs:,} runs" if runs > 1 else ""
     expected = f"at most {longest:.6g} s{each}: a row a tick, {MOST_ROWS:,} in all"
     got, hint = f"{float(duration):.6g} s", f'--duration "{longest:.6g} s"'
-    raise ApcError(Mistake("E915", Place(system.name), "the duration", expected, got, hint))
+    raise ApcError(Mistake("E915", Place(system.origin.topology), "the duration", expected, got, hint))
 
 
 def size_note(simulation: Simulation, *, decimal: bool) -> str:
@@ -366,7 +366,9 @@ def _check_size(
         total += group.count * (own + sum(schedule.depths))
     total += NUMBERS_A_PAIR * count_pairs(system, exchange)
     what = f"{system.peers:,} peers hold {total:,} numbers in a frame, which"
-    refuse_beyond(NUMBER * total, "E874", Place(system.name), what, "fewer peers, or fewer --signals")
+    refuse_beyond(
+        NUMBER * total, "E874", Place(system.origin.topology), what, "fewer peers, or fewer --signals"
+    )
 
 
 def _recorded_and_not(choice: Choice) -> list[tuple[Integers, tuple[LocalSignal, ...]]]:

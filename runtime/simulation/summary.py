@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
 from apc.simulation.blocks import Block
+from apc.simulation.limits import Broken, LimitWatch
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation
 
@@ -58,7 +59,8 @@ class Summary:
 
     `verdict` is "rests", "settles", "dies away", "shakes", "moves on" or "diverges"; `settled` is the time
     from which on it stays, in seconds. `overshoot` is a part of the way from first to last. `copies` are
-    (name, distance at the end) of what is sent to the others as it is. `work` is (part, J).
+    (name, distance at the end) of what is sent to the others as it is. `work` is (part, J). `broken` are the
+    limits that recorded signals went beyond, the first one first.
     """
 
     verdict: str
@@ -74,6 +76,7 @@ class Summary:
     signals: int
     end: float
     extents: tuple[Extent, ...]
+    broken: tuple[Broken, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +118,7 @@ class Watch:
         self.listed = simulation.signals if signals is None else tuple(signals)
         self.signals = len(self.listed)
         self.positions = [i for i, one in enumerate(self.listed) if is_position(one)]
-        self.forces = [i for i, one in enumerate(self.listed) if one.unit == "N"]
+        self.forces = [i for i, one in enumerate(self.listed) if one.unit == "N" and one.role != "limited"]
         n = self.signals * runs
         rows = int(simulation.settings.duration / (simulation.frame * simulation.quantum)) + 1
         rows *= len(simulation.marks)
@@ -135,6 +138,7 @@ class Watch:
         self.first: Floats = np.zeros(n)
         self.last: Floats = np.zeros(n)
         self.peak, self.peak_at = np.zeros(n), np.zeros(n)
+        self.limits = LimitWatch(self.simulation.system, self.listed if self.runs == 1 else ())
         self.rows = 0
 
     def take(self, time: Floats, values: Floats) -> None:
@@ -145,6 +149,7 @@ class Watch:
             self.first = values[0].copy()
         self.last = values[-1].copy()
         self.rows += len(time)
+        self.limits.take(time, values)
         for column in self.forces if self.runs == 1 else ():
             size = np.abs(values[:, column])
             at = size.argmax()
@@ -267,6 +272,7 @@ class Watch:
             signals=len(signals),
             end=self.ends[-1],
             extents=extents,
+            broken=self.limits.broken(),
         )
 
     def copies(self) -> list[tuple[str, str, Floats]]:

@@ -156,7 +156,7 @@ class Keeper:
         numbers = simulation.rows * len(simulation.signals)
         what = f"{len(simulation.signals):,} signals over {float(simulation.settings.duration):g} s"
         hint = "fewer --signals, a shorter --duration, or --out FILE.parquet alone"
-        refuse_beyond(NUMBER * numbers, "E876", Place(simulation.system.name), what, hint)
+        refuse_beyond(NUMBER * numbers, "E876", Place(simulation.system.origin.topology), what, hint)
         self.signals = len(simulation.signals)
         self.time: list[Floats] = []
         self.values: list[Floats] = []
@@ -283,8 +283,10 @@ def duration_of(system: CompiledSystem, duration: Fraction | None) -> Fraction:
     if found is None:
         what = "the scene says no duration"
         hint = 'experiment: {duration: 3 s}  (or --duration "3 s")'
-        raise ApcError(Mistake("E877", Place(system.name), what, hint=hint))
+        raise ApcError(Mistake("E877", Place(system.origin.topology), what, hint=hint))
     if found <= 0:
         expected, got = "more than 0 s", f"{float(found):g} s"
-        raise ApcError(Mistake("E877", Place(system.name), "the duration", expected=expected, got=got))
+        raise ApcError(
+            Mistake("E877", Place(system.origin.topology), "the duration", expected=expected, got=got)
+        )
     return found

@@ -163,7 +163,7 @@ class _Writer:
         self.taken = 0
         for now, event in events:
             if now in self.schedule.marks and self._is_first_at(now, event):
-                self.rows += [self._signal(one) for one in self.recorded]
+                self.rows += [self._signal(one, now) for one in self.recorded]
             self._step(now, event)
             self.rest.pop(0)
         keys = self._after() if last else self._between()
@@ -231,12 +231,15 @@ class _Writer:
     def _time(self, now: int) -> Any:
         return seconds_at(self.schedule, self.inputs[1], now)
 
-    def _signal(self, signal: LocalSignal) -> Any:
+    def _signal(self, signal: LocalSignal, now: int) -> Any:
         match signal.role:
             case "state":
                 return self.known["x", signal.place[0]]
             case "output":
                 return self.known["newest", signal.place]
+            case "limited":
+                limited: Any = self.kind.limits[signal.place[0]].value
+                return limited(self._x(), self._u(), self._p(), self._time(now))
             case _:
                 return self.known["u", signal.place[0]]
 

@@ -78,7 +78,11 @@ def search_counts(
     first = _whole(low, max(1, least_peers(system.kinds) - others), place)
     placed = any(link.graph.shape != "complete" for link in system.links)
     span = PLACED_SPAN if placed else SPAN  # there each peer has a place of its own
-    last = _whole(high, max(math.ceil(span * present), first + 1), place)
+    most = min(
+        (one.maximum for one in system.parameters if one.name == free.name and one.maximum is not None),
+        default=math.inf,
+    )
+    last = _whole(high, int(min(max(math.ceil(span * present), first + 1), most)), place)
     known: dict[int, bool | None] = {}
 
     def at(count: int) -> bool | None:

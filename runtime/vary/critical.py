@@ -128,7 +128,7 @@ def critical(
     by_growth = chosen_criterion in BY_GROWTH
     if not by_growth:
         refuse_channel_number(system, free, _PLACE, instead=f"--in {MEAN_SQUARE}")
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         timed, counted = reaches_time(system, free), reaches_count(system, free)
         unit = unit_of(system, free.name)
         present = float(delay_now(system, free)) if timed else parameter_of(system, free).value
@@ -200,7 +200,7 @@ def _at_start(system: CompiledSystem, prepared: Prepared) -> Prepared:
     if found is None:
         what = "how the scene moves hangs on what is heard at the start: a delay can't be searched"
         hint = "apc critical of a stiffness or damping"
-        raise ApcError(Mistake("E845", Place(system.name), what, hint=hint))
+        raise ApcError(Mistake("E845", Place(system.origin.topology), what, hint=hint))
     return found
 
 

@@ -142,11 +142,14 @@ class LoopSheet:
         return over_all(self, values, points)
 
     def alone(self, values: Floats) -> Complexes:
-        """Return the eigenvalues (k, n) of the sites hearing nothing at values (k,)."""
+        """Return the eigenvalues (k, n) of sites hearing nothing at values (k,), NaN at one of no meaning."""
         level = np.repeat(self.base[None], len(values), axis=0)
         level[:, self.column] = values
         maps, _ = self.evaluator.maps(self.place, level, np.zeros(level.shape))
-        return np.linalg.eigvals(maps.p).astype(np.complex128)
+        found = np.full(maps.p.shape[:-1], np.nan, np.complex128)
+        sound = np.isfinite(maps.p).all(axis=(1, 2))
+        found[sound] = np.linalg.eigvals(maps.p[sound])
+        return found
 
 
 def loop_evaluator(

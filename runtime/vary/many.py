@@ -319,7 +319,7 @@ def _family(
     columns = tuple(column for column in range(len(varied)) if column not in times)
     free = tuple(varied[column].free for column in columns)
     try:
-        with finite_equations(system.name), np.errstate(all="ignore"):
+        with finite_equations(system.origin.topology), np.errstate(all="ignore"):
             timed_system = apply(system, given)
             there = generic(timed_system, free)
             numbers = resolve(there)

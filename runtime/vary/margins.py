@@ -97,7 +97,7 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None) -> Marg
     prepared
         From `analysis.prepare`, of this system with any numbers.
     """
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         start = prepare_at_start(system, prepared)
         found = _parameter_margins(system, coupler_parameters(system), start or prepared)

@@ -62,7 +62,12 @@ def network_margins(system: CompiledSystem, prepared: Prepared, nominal: Margins
     nominal
         The margins over the nominal network: how far to look from a value of 0.
     """
-    with part("margins"), single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with (
+        part("margins"),
+        single_threaded(),
+        finite_equations(system.origin.topology),
+        np.errstate(all="ignore"),
+    ):
         free = [*coupler_parameters(system), *_of_channels(system)]
         here = _looked_at(system, prepared, len(free))
         if isinstance(here, str):
@@ -156,7 +161,12 @@ def network_sensitivities(system: CompiledSystem, prepared: Prepared) -> Sensiti
     system, prepared
         The compiled scene, and what `analysis.prepare` made of it.
     """
-    with part("sensitivities"), single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with (
+        part("sensitivities"),
+        single_threaded(),
+        finite_equations(system.origin.topology),
+        np.errstate(all="ignore"),
+    ):
         free = [*varied(system), *_of_channels(system)]
         here = _looked_at(system, prepared, len(free))
         if isinstance(here, str):

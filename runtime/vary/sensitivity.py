@@ -100,7 +100,7 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
     ApcError
         As `analysis.lifted_groups`.
     """
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         free = varied(system)
         family = evaluator(system, free, prepared=prepared or prepare(system))
         here = np.array([parameter_of(system, one).value for one in free])

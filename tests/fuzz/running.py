@@ -52,9 +52,12 @@ _FOREIGN = ("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Pop
             "compile")  # fmt: skip
 
 _CYTHON = b"_getframe()"  # what Cython has compiled when it writes a traceback
-# What `dataclasses` writes for a class of many objects, of its fields' names, and runs: nothing of a file is
-# in it.
-_METHODS = re.compile(rb"def __create_fn__\([\w, ]*\):\n def __(init|eq|hash|setattr|delattr|[lg][te])__\(")
+# What `dataclasses` writes for a class of many objects, of its fields' names, and SymPy for products of some
+# number of unknowns, and runs: nothing of a file is in it.
+_METHODS = re.compile(
+    rb"def __create_fn__\([\w, ]*\):\n def __(init|eq|hash|setattr|delattr|[lg][te])__\("
+    rb"|def monomial_[a-z]+\((A, B|A, k|A, B, k)\):\n(    [\w (),:=+*<>-]+\n)+\Z"
+)
 _OWN_TEXT = re.compile(r'<code object <module> .*"<string>", line 1>')
 _MODULE = re.compile(r'<code object <module> .*\.py", line 1>')  # what runs when a module is loaded
 
@@ -133,7 +136,16 @@ def _warm_up() -> None:
     pipeline.Library = _WarmLibrary  # type: ignore[misc] # for the fuzzer's own processes
     frozen.OFTEN = -1  # nor does a class of many objects get written methods there, which are compiled
     # What is loaded when it is first needed, and compiles text then: for a hint, for a large scene.
-    for module in ("numpy.ma", "numpy.random", "difflib", "tempfile", "traceback", "scipy.linalg"):
+    loaded = (
+        "numpy.ma",
+        "numpy.random",
+        "difflib",
+        "tempfile",
+        "traceback",
+        "scipy.linalg",
+        "sympy.physics.units",
+    )
+    for module in loaded:
         importlib.import_module(module)
     for scene in ("three-users-average", "finger", "users-table"):
         run_stages(MODELS / "scenes" / f"{scene}.yaml", until="compiled")
