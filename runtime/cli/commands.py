@@ -17,6 +17,7 @@ from apc.cli.analyze import analyze_command
 from apc.cli.bench import bench_command
 from apc.cli.compare import compare_command
 from apc.cli.critical import critical_command
+from apc.cli.explore import explore_command
 from apc.cli.feel import feel_command
 from apc.cli.options import Group, beside, file_argument, file_option, tell
 from apc.cli.progress import at_work
@@ -66,6 +67,7 @@ def apc() -> None:
         apc analyze        stable or not, by how much, in which modes
         apc critical       the largest stable value of a parameter
         apc compare        schemes side by side: the same asked of several files
+        apc explore        all of it in the browser, with sliders
         apc feel           what a hand feels at its device, at each frequency
         apc simulate       what happens over time, as rows and a picture
         apc region         where it is stable over two parameters: curves, areas
@@ -80,6 +82,7 @@ apc.add_command(analyze_command)
 apc.add_command(bench_command)
 apc.add_command(compare_command)
 apc.add_command(critical_command)
+apc.add_command(explore_command)
 apc.add_command(feel_command)
 apc.add_command(simulate_command)
 apc.add_command(region_command)
