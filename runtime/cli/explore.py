@@ -14,7 +14,6 @@ from apc.cli.options import (
     Command,
     WholeNumber,
     file_argument,
-    hands_option,
     note_aside,
     set_option,
     tell,

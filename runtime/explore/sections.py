@@ -9,8 +9,7 @@ Does not: know the browser, or keep an answer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from functools import lru_cache
 from typing import Any
@@ -19,32 +18,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
-from apc.analysis.needs import needs
-from apc.compiler.compiled import Column, CompiledSystem
-from apc.compiler.errors import ApcError
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
-from apc.compiler.words import in_hertz, with_unit
+from apc.compiler.words import in_hertz
 from apc.eigen.spectrum import Mode
-from apc.frame.names import Free, Range, named_times
+from apc.explore.motion import motion_of
+from apc.explore.sliders import text_of
+from apc.finite_equations import finite_equations
+from apc.frame.names import Free, Range, unit_of
 from apc.frame.overrides import Override, apply
-from apc.network.nominal import left_out
+from apc.hands.asked import read_frequencies
+from apc.hands.feel import feel
+from apc.moments.network import judge_network
+from apc.present.region_picture import drawn_points, stable_outlines
 from apc.processes import model_of_bytes
 from apc.regions.region import region
 from apc.threads import single_threaded
-from apc.vary.evaluator import reaches_count, reaches_time
+from apc.vary.critical import critical
+from apc.vary.evaluator import evaluator, reaches_count, reaches_time
+from apc.vary.growth import MEAN_SQUARE
+from apc.vary.margins import margins
 
-Floats = NDArray[np.float64]
-
-# Frequencies at which it is told what a hand feels, and the lowest, in Hz.
-FREQUENCIES, LOWEST = 120, 0.1
-# Values at which the roots of a slider are found: more lie on each other.
-ROOTS = 61
-# Values of what has no matrices in rows: each is an analysis.
-FEW_ROOTS = 16
-# How fast the struck device starts, in m/s, and how long that is watched, in s, where the scene doesn't say.
-STRUCK, WATCHED = 0.1, Fraction(1)
-# Rows of a motion that are shown, and peers.
-ROWS, PEERS = 400, 8
+# How far a boundary that is drawn may be off, relative to a coordinate: nobody sees less.
+DRAWN = 1e-5
+# Frequencies at which it is told what a hand feels, and the lowest.
+FREQUENCIES, LOWEST = 120, "0.1 Hz"
+# Values of a slider at which eigenvalues are found; of a time or a count, where each takes an analysis.
+ROOTS, FEW_ROOTS = 61, 16
+EMPTY = np.zeros(0, dtype=np.complex128)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,12 +89,6 @@ def compute(model: bytes, task: Task) -> Told:
         return Told(SECTIONS[task.section](changed, prepared, task.asked))
     except ApcError as error:
         return Told(None, "\n".join(one.sentence for one in error.mistakes))
-    except NothingToShowError as nothing:
-        return Told(None, str(nothing))
-
-
-class NothingToShowError(Exception):
-    """A scene has nothing for a section; the text says why."""
 
 
 def _verdict(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, Any]:
@@ -128,23 +124,137 @@ def _limits(found: Analysis) -> str:
 
 
 def _region(system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Range, str]) -> dict[str, Any]:
-    from apc.present.region_picture import stable_outlines
-
     x, y, criterion = asked
-    found = region(system, (x, y), criterion=criterion, prepared=prepared)
-    whole = float(found.rectangle.width.prod())
+    found = region(system, (x, y), tolerance=DRAWN, criterion=criterion, prepared=prepared)
     return {
         "outlines": stable_outlines(found),
-        "curves": [curve.points for curve in found.curves],
+        "curves": [drawn_points(found, number) for number in range(len(found.curves))],
         "x": (x.free.label, x.unit, float(x.low), float(x.high)),
         "y": (y.free.label, y.unit, float(y.low), float(y.high)),
-        "share": found.stable_area / whole,
+        "share": found.stable_area / float(found.rectangle.width.prod()),
         "notes": found.left_out,
         "stepped": found.stepped,
     }
 
 
+def _roots(
+    system: CompiledSystem, prepared: Prepared, asked: tuple[Free, tuple[Fraction, ...]]
+) -> dict[str, Any]:
+    """Return the eigenvalues at values of a slider: from matrices in rows, or one analysis after another."""
+    free, values = asked
+    if reaches_time(system, free) or reaches_count(system, free):
+        some = _thinned(values, FEW_ROOTS)
+        rows = [_eigenvalues(system, prepared, Override(free, one)) for one in some]
+    else:
+        some = _thinned(values, ROOTS)
+        with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+            matrices = evaluator(system, [free], prepared=prepared).matrices(
+                np.array(some, np.float64)[:, None]
+            )
+            finite = [np.isfinite(one).all(axis=(1, 2)) for one in matrices]
+            rows = [
+                np.concatenate(
+                    [
+                        np.linalg.eigvals(one[row])
+                        for one, sound in zip(matrices, finite, strict=True)
+                        if sound[row]
+                    ]
+                    or [EMPTY]
+                )
+                for row in range(len(some))
+            ]
+    found = np.concatenate(rows)
+    return {
+        "real": found.real,
+        "imag": found.imag,
+        "name": [
+            text_of(one, unit_of(system, free.name)) for one, row in zip(some, rows, strict=True) for _ in row
+        ],
+        "slider": free.label,
+        "from": text_of(some[0], unit_of(system, free.name)),
+        "to": text_of(some[-1], unit_of(system, free.name)),
+    }
+
+
+def _thinned(values: Sequence[Fraction], most: int) -> list[Fraction]:
+    """Return so many of the values at most, the first and the last among them."""
+    places = np.unique(np.linspace(0, len(values) - 1, min(most, len(values))).astype(int))
+    return [values[place] for place in places.tolist()]
+
+
+def _eigenvalues(system: CompiledSystem, prepared: Prepared, override: Override) -> NDArray[np.complex128]:
+    """Return the eigenvalues of an analysis; none where the value can't be."""
+    try:
+        found = analyze(apply(system, [override]), prepared=prepared)
+    except ApcError:
+        return EMPTY
+    return np.array([mode.eigenvalue for mode in found.modes], dtype=np.complex128)
+
+
+def _margins(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, Any]:
+    return {"text": str(margins(system, prepared=prepared))}
+
+
+def _motion(system: CompiledSystem, _: Prepared, struck: bool) -> dict[str, Any]:
+    return {"motion": motion_of(system, struck=struck)}
+
+
+def _feel(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, Any]:
+    frequencies = read_frequencies(system, None, LOWEST, None, FREQUENCIES)
+    found = feel(system, frequencies, quick=True, prepared=prepared)
+    return {
+        "at": found.at,
+        "frequency": found.frequency_hz,
+        "magnitude": np.abs(found.impedance),
+        "phase": np.degrees(np.angle(found.impedance)),
+        "notes": (*found.notes, *found.left_out),
+    }
+
+
+def _network(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, Any]:
+    """Return the verdict over the network, and the loss and the jitter of each link at which it changes."""
+    links = [link for link in system.links if link.channel is not None]
+    if not links:
+        name = system.links[0].name if system.links else "lan"
+        what = "no link here loses packets or delays them by chance: there is nothing to look for"
+        hint = f"links: {{{name}: {{…, loss: 1 %, jitter: 1 ms}}}}"
+        raise ApcError(Mistake("E954", Place(system.name), what, hint=hint))
+    verdict = judge_network(system, prepared)
+    texts = ["Here packets are always on time." if verdict is None else str(verdict)]
+    for link in links:
+        assert link.channel is not None
+        loss, jitter = link.channel.loss, link.channel.jitter
+        for name in [loss.p if loss else None, jitter]:
+            if name is not None:
+                texts.append(_critical(system, name))
+    return {"text": "\n\n".join(texts)}
+
+
+def _critical(system: CompiledSystem, name: str) -> str:
+    try:
+        return str(critical(system, name, criterion=MEAN_SQUARE))
+    except ApcError as error:
+        return f"{name}: {error.mistakes[0].sentence}"
+
+
+def _numbers(
+    system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Range, str] | None
+) -> dict[str, Any]:
+    """Return what is downloaded: the analysis and the region as `--json` prints them."""
+    told = {"analyze": analyze(system, prepared=prepared).to_dict()}
+    if asked is not None:
+        x, y, criterion = asked
+        told["region"] = region(system, (x, y), criterion=criterion, prepared=prepared).to_dict()
+    return told
+
+
 SECTIONS: dict[str, Callable[[CompiledSystem, Prepared, Any], dict[str, Any]]] = {
     "verdict": _verdict,
     "region": _region,
+    "roots": _roots,
+    "margins": _margins,
+    "motion": _motion,
+    "feel": _feel,
+    "network": _network,
+    "numbers": _numbers,
 }

@@ -60,7 +60,9 @@ class Gate(AuthProvider):  # type: ignore[misc] # Bokeh's types are not looked a
             raise HTTPError(403, reason=f"This page is {own} and no other")
         given = handler.get_query_argument(TOKEN, "")
         if not hmac.compare_digest(given.encode(), self.token.encode()):
-            raise HTTPError(403, reason="The link that apc explore printed has the token that is missing here")
+            raise HTTPError(
+                403, reason="The link that apc explore printed has the token that is missing here"
+            )
         return "user"
 
 
@@ -101,7 +103,6 @@ def bound(make: Callable[[Document], None], port: int) -> tuple[BaseServer, str]
     http = HTTPServer(application)
     http.add_sockets(sockets)
     return BaseServer(IOLoop.current(), application, http), f"http://{address}/?{TOKEN}={token}"
-
 
 
 def run(server: BaseServer, link: str, *, browser: bool) -> None:

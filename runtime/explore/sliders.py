@@ -185,7 +185,10 @@ def _times(system: CompiledSystem, studied: dict[str, tuple[Fraction, Fraction]]
             continue
         span = None
         if timing.name in periods:
-            about, values = "from tick to tick", _periods(value, [now[p] for p in periods if p != timing.name])
+            about, values = (
+                "from tick to tick",
+                _periods(value, [now[p] for p in periods if p != timing.name]),
+            )
         elif timing.name in phases:
             period = now[phases[timing.name].period]
             about, values = "of the first tick", [period * k / 20 for k in range(20)]
@@ -281,9 +284,7 @@ def overrides_of(sliders: Sequence[Slider], places: Sequence[int]) -> list[Overr
     ]
 
 
-def axes_of(
-    sliders: Sequence[Slider], places: Sequence[int], chosen: tuple[int, int]
-) -> tuple[Range, Range]:
+def axes_of(sliders: Sequence[Slider], places: Sequence[int], chosen: tuple[int, int]) -> tuple[Range, Range]:
     """Return the axes of a region over two sliders: their spans, wide enough for their values."""
     found = []
     for number in chosen:

@@ -1,6 +1,6 @@
 """A picture of how a scene begins: every peer's bodies side by side, and the surfaces between them.
 
-Takes: a `CompiledSystem`. Gives: `Body`, `Wall`, `bodies_of`, `draw_still`, `save_still`; of bodies that
+Takes: a `CompiledSystem`. Gives: `Body`, `Wall`, `bodies_of`, `rows_of`, `draw_still`, `save_still`; of bodies that
 move in a plane the picture of `planar`.
 Guarantees: everything is found in the equations: a body is a position (a state in metres); where something is
 decided by the distance of two of them, or of one from a fixed place, in metres, there is a surface.
@@ -125,8 +125,8 @@ def draw_still(system: CompiledSystem) -> Any:
     """
     figures, patches = need("matplotlib.figure", "plot"), need("matplotlib.patches", "plot")
     if moves_in_plane(system):
-        return draw_plane(system, _rows(system, spots_of))
-    rows = _rows(system, bodies_of)
+        return draw_plane(system, rows_of(system, spots_of))
+    rows = rows_of(system, bodies_of)
     figure = figures.Figure(figsize=(WIDTH, ROW * len(rows) + MARGIN), layout="constrained")
     ax = figure.subplots()
     names = list(dict.fromkeys(body.name for _, bodies, _ in rows for body in bodies))
@@ -162,11 +162,19 @@ def draw_still(system: CompiledSystem) -> Any:
     return figure
 
 
-def _rows(
+def rows_of(
     system: CompiledSystem,
     seen: Callable[[Kind, Sequence[float], Sequence[float]], tuple[list[B], list[S]]],
 ) -> list[tuple[str, list[B], list[S]]]:
-    """Return the peers that are drawn: name, and the bodies and surfaces that are seen of its start."""
+    """Return the peers that are drawn: name, and the bodies and surfaces that are seen of its start.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    seen
+        `bodies_of`, or `planar.spots_of` of what moves in a plane.
+    """
     numbers = resolve(system)
     sites = [jacobians(kind) for kind in system.kinds]
     found: list[tuple[str, list[B], list[S]]] = []
