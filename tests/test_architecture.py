@@ -127,7 +127,8 @@ HOUSE = (
         "apc",
         "inputs api",
     ),
-    ("apc.cli", "options progress region simulate sweep compare critical feel bench analyze commands"),
+    ("apc.explore", "sliders written motion sections desk figures page server"),
+    ("apc.cli", "options progress region simulate sweep compare critical feel bench analyze explore commands"),
     ("apc", "__main__"),
 )
 ORDER = tuple(f"{package}.{name}" for package, names in HOUSE for name in names.split())

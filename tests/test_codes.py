@@ -186,6 +186,11 @@ E935 runtime/hands: a frequency is none that a response is told of, or nothing t
 E936 runtime/hands: a device is named that is not there
 E940 runtime/comparison: what is to be compared is no stiffness, delay or loss
 E941 runtime/comparison: a scene has several stiffnesses, delays or losses to compare
+E950 runtime/explore: a number has no slider
+E951 runtime/explore: a process that computes ended
+E952 runtime/explore: a port can't be listened on
+E953 runtime/explore: a scene has nothing that moves, or that a push could move
+E954 runtime/explore: a scene has no unreliable link
 """
 
 

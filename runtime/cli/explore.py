@@ -8,13 +8,14 @@ Does not: compute.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import click
 
 from apc.cli.options import (
     Command,
     WholeNumber,
     file_argument,
-    note_aside,
     set_option,
     tell,
 )
@@ -48,15 +49,19 @@ def explore_command(file: str | None, settings: tuple[str, ...], port: int, no_b
         apc explore three-users.yaml --set "lan.delay=16 ms" --no-browser
     """
     start_single_threaded()
-    from apc.inputs import open_scene
+    from apc.inputs import find_input, open_scene
     from apc.optional import need
 
     need("bokeh.server.server", "explore")
+    from apc.compiler.source.source import read_source
     from apc.explore.page import open_page, scene_of
     from apc.explore.server import bound, run
 
-    system = open_scene(file, settings, told=note_aside)
-    scene = scene_of(system)
+    path = Path(file) if file else find_input(compiled_too=True)
+    system = open_scene(str(path), ())
+    topology = path.with_suffix(".yaml")
+    text = read_source(topology).text if topology.is_file() else None
+    scene = scene_of(system, settings, text)
     server, link = bound(lambda document: open_page(scene, document), port)
     tell(link)
     run(server, link, browser=not no_browser)

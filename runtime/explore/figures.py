@@ -41,6 +41,8 @@ HEIGHT = 330
 ROUND, BEYOND, ROOM = 1.12, 1.05, 0.1
 CIRCLE = np.exp(1j * np.linspace(0, 2 * np.pi, 241))
 
+# How far below each other the bodies of a peer stand that move along a line, of the distance of two peers.
+STAGGER = 0.3
 # Seconds that a whole motion is played in.
 SECONDS = 10
 INSTANT = """
@@ -83,6 +85,7 @@ FOCUS = InlineStyleSheet(
 STYLE = InlineStyleSheet(
     css="""
     :host { font: 14px/1.45 system-ui, sans-serif; color: #1a1a1a; }
+    .bk-clearfix { display: block; min-width: 0; } /* a wide table scrolls, the page does not */
     p { margin: 0 0 6px; } pre { font-size: 12px; overflow-x: auto; margin: 6px 0; }
     strong.unstable { color: #A03C00; } strong.stable { color: #00587A; }
     .old { opacity: .55; } .why { color: #5a2a00; }
@@ -94,7 +97,7 @@ STYLE = InlineStyleSheet(
 def _plot(name: str, **settings: Any) -> Any:
     """Return a figure as all are: as wide as its place, with few tools."""
     plot = figure(
-        name=name,
+        name=f"{name}-plot",
         height=HEIGHT,
         sizing_mode="stretch_width",
         tools="pan,wheel_zoom,box_zoom,reset,save",
@@ -134,7 +137,8 @@ class Words:
         self.model.text = (
             f"<p><strong class='{kind}'>{escape(found['verdict'])}</strong>, spectral radius "
             f"{found['radius']:.9g} per frame</p><p>{escape(found['limits'])}</p>"
-            f"<details><summary>All modes</summary><pre tabindex='0'>{escape(found['text'])}</pre></details>"
+            + "".join(f"<p>{escape(one)}</p>" for one in found["notes"])
+            + f"<details><summary>All modes</summary><pre tabindex='0'>{escape(found['text'])}</pre></details>"
         )
 
     def table(self, text: str) -> None:
@@ -279,7 +283,13 @@ class MotionFigure:
         self.bodies = ColumnDataSource(columns("x", "y", "width", "height", "name", "colour"))
         self.walls = ColumnDataSource(columns("x", "top", "bottom"))
         self.discs = ColumnDataSource(columns("x", "y", "radius"))
-        self.plot = _plot("response", x_axis_label="time [s]", y_axis_label="position [mm]")
+        self.plot = _plot(
+            "response",
+            x_axis_label="time [s]",
+            y_axis_label="position [mm]",
+            x_range=Range1d(0, 1),
+            y_range=Range1d(0, 1),
+        )
         self.plot.multi_line(
             "xs", "ys", source=self.lines, line_color="colour", line_dash="dash", line_width=2
         )
@@ -320,6 +330,7 @@ class MotionFigure:
             step=1,
             value=0,
             title="time",
+            name="time",
             tooltips=False,
             sizing_mode="stretch_width",
             stylesheets=[FOCUS],
@@ -359,7 +370,8 @@ class MotionFigure:
         }
         planar = motion.bodies[0].y is not None
         heights = [
-            np.full(len(motion.time), float(one.row)) if one.y is None else one.y for one in motion.bodies
+            np.full(len(motion.time), one.row + STAGGER * names.index(one.name)) if one.y is None else one.y
+            for one in motion.bodies
         ]
         x, y = np.stack([one.x for one in motion.bodies], axis=1), np.stack(heights, axis=1)
         sizes = [one.size for one in motion.bodies]
@@ -367,7 +379,7 @@ class MotionFigure:
             "x": x[0],
             "y": y[0],
             "width": [2 * one for one in sizes],
-            "height": [2 * one if planar else 0.7 * (one > 0) for one in sizes],
+            "height": [2 * one if planar else 0.5 * (one > 0) for one in sizes],
             "name": labels if planar else [one.name for one in motion.bodies],
             "colour": colours,
         }
@@ -385,19 +397,21 @@ class MotionFigure:
         fixed = [at for _, at in motion.walls]
         low, high = min([x.min() - reach, *fixed]), max([x.max() + reach, *fixed])
         room = ROOM * (high - low) or 1.0
+        self.plot.x_range.update(start=0.0, end=float(motion.time[-1]))
+        self.plot.y_range.update(start=float(x.min()) - room, end=float(x.max()) + room)
         self.stage.x_range.update(start=low - room, end=high + room)
         if planar:
             self.stage.y_range.update(start=float(y.min()) - reach - room, end=float(y.max()) + reach + room)
             self.stage.yaxis.axis_label = "position [mm]"
         else:
-            self.stage.y_range.update(start=len(peers) - 0.4, end=-0.6)
+            self.stage.y_range.update(start=len(peers) - 0.3, end=-0.5)
             self.stage.yaxis.ticker = list(range(len(peers)))
             self.stage.yaxis.major_label_overrides = dict(enumerate(peers))
         slower = SECONDS / float(motion.time[-1])
         legend = "; ".join(f"{name} {word}" for name, word in zip(names, DASH_WORDS, strict=False))
         self.words.say(
             *motion.told,
-            f"A colour is a peer, a kind of line a body: {legend}. Played {slower:.2g} times slower than it is.",
+            f"A colour is a peer, a kind of line a body: {legend}. Played {slower:.2g} times slower.",
             *([f"{motion.others} more peers are not shown."] if motion.others else []),
         )
 
@@ -407,19 +421,26 @@ class FeelFigure:
 
     def __init__(self) -> None:
         self.source = ColumnDataSource(columns("frequency", "magnitude", "phase"))
-        self.plot = _plot("feel", x_axis_type="log", y_axis_type="log", y_axis_label="impedance [N·s/m]")
+        self.plot = _plot(
+            "feel",
+            x_axis_type="log",
+            y_axis_type="log",
+            y_axis_label="impedance [N·s/m]",
+            x_range=Range1d(0.1, 60),
+            y_range=Range1d(1, 100),
+        )
         self.phase = _plot(
             "phase",
             x_axis_type="log",
             x_axis_label="frequency [Hz]",
             y_axis_label="phase [°]",
             x_range=self.plot.x_range,
+            y_range=Range1d(-180, 180),
         )
         self.plot.height, self.phase.height = 2 * HEIGHT // 3, HEIGHT // 2
         for plot, column in ((self.plot, "magnitude"), (self.phase, "phase")):
             plot.line("frequency", column, source=self.source, line_color=BLUE, line_width=2)
             plot.add_tools(HoverTool(tooltips=[("Hz", "@frequency"), (column, f"@{column}")], mode="vline"))
-        self.phase.y_range = Range1d(-180, 180)
         self.phase.yaxis.ticker = [-180, -90, 0, 90, 180]
         self.words = Words("feel-words")
 
@@ -427,8 +448,11 @@ class FeelFigure:
         """Draw what is felt."""
         self.source.data = {name: found[name] for name in ("frequency", "magnitude", "phase")}
         f, size = found["frequency"], found["magnitude"]
+        self.plot.x_range.update(start=f[0], end=f[-1])
+        self.plot.y_range.update(start=size.min() / (1 + ROOM), end=size.max() * (1 + ROOM))
         self.words.say(
-            f"At {found['at']}: {size[0]:.4g} N·s/m at {f[0]:.3g} Hz, {size[-1]:.4g} N·s/m at {f[-1]:.3g} Hz.",
+            f"At {found['at']}: {size[0]:.4g} N·s/m at {f[0]:.3g} Hz,"
+            f" {size[-1]:.4g} N·s/m at {f[-1]:.3g} Hz.",
             *found["notes"],
         )
 

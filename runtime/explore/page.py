@@ -17,12 +17,13 @@ from urllib.parse import quote
 from bokeh.document import Document
 from bokeh.events import Tap
 from bokeh.layouts import column, row
-from bokeh.models import ColumnDataSource, CustomJS, CustomJSTickFormatter, Div, Select
+from bokeh.models import Button, ColumnDataSource, CustomJS, CustomJSTickFormatter, Div, Select
 from bokeh.models import Slider as Handle
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.frozen import dataclass
+from apc.distribution import program_version
 from apc.explore.desk import Desk
 from apc.explore.figures import FOCUS, FeelFigure, MotionFigure, RegionFigure, RootsFigure, Words
 from apc.explore.sections import Task, Told
@@ -35,7 +36,10 @@ from apc.explore.sliders import (
     sliders_of,
     with_value,
 )
-from apc.frame.overrides import Override
+from apc.explore.written import with_values
+from apc.frame.names import Range
+from apc.frame.overrides import Override, apply
+from apc.present.forms import json_text
 from apc.processes import model_bytes
 from apc.vary.growth import MEAN_SQUARE, NOMINAL
 
@@ -69,18 +73,71 @@ window.apc_link = setTimeout(() => {
 """
 
 
+# What is downloaded is handed to the page as a text, and from there to a file.
+SAVED = """
+const [name, text] = [out.data.name[0], out.data.text[0]]
+const link = document.createElement('a')
+link.href = URL.createObjectURL(new Blob([text]))
+link.download = name
+link.click()
+setTimeout(() => URL.revokeObjectURL(link.href), 1000)
+"""
+# The figures as they are seen, below each other.
+PICTURED = """
+const parts = plots.map(plot => Bokeh.index.get_one(plot).export('auto', true).canvas)
+const whole = document.createElement('canvas')
+whole.width = Math.max(...parts.map(one => one.width))
+whole.height = parts.reduce((sum, one) => sum + one.height, 0)
+const pen = whole.getContext('2d')
+pen.fillStyle = '#ffffff'
+pen.fillRect(0, 0, whole.width, whole.height)
+let top = 0
+for (const one of parts) { pen.drawImage(one, 0, top); top += one.height }
+whole.toBlob(blob => {
+  const link = document.createElement('a')
+  link.href = URL.createObjectURL(blob)
+  link.download = name
+  link.click()
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000)
+})
+"""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What all tabs share: the scene, its bytes for those who compute, its sliders, and who may be an axis."""
+    """What all tabs share: the scene, its bytes for those who compute, its sliders, what they are set to.
+
+    `text` is the topology, None where there is only a compiled model.
+    """
 
     system: CompiledSystem
     model: bytes
     sliders: tuple[Slider, ...]
+    settings: tuple[str, ...]
+    text: str | None
 
 
-def scene_of(system: CompiledSystem) -> Scene:
-    """Return what the tabs of a scene share."""
-    return Scene(system, model_bytes(system), sliders_of(system))
+def scene_of(system: CompiledSystem, settings: Sequence[str], text: str | None) -> Scene:
+    """Return what the tabs of a scene share.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    settings
+        Numbers that are set at first, each `NAME=QUANTITY`.
+    text
+        The topology.
+
+    Raises
+    ------
+    ApcError
+        E950 a number without a slider; those of `overrides.parse_override` and `overrides.apply`.
+    """
+    sliders = sliders_of(system)
+    found = [set_to(system, sliders, one) for one in settings]
+    apply(system, [Override(sliders[place].free, value) for place, value in found])
+    return Scene(system, model_bytes(system), sliders, tuple(settings), text)
 
 
 def open_page(scene: Scene, document: Document) -> None:
@@ -92,11 +149,13 @@ class Page:
     """One tab: its sliders and where they are, its figures, and who computes for it."""
 
     def __init__(self, scene: Scene, document: Document) -> None:
-        self.system, self.document = scene.system, document
+        self.scene, self.system, self.document = scene, scene.system, document
         self.sliders, self.places = list(scene.sliders), [one.start for one in scene.sliders]
         self.chosen = self._axes_at_first()
         self.message = Words("message")
         self.message.model.text = ""
+        for one in scene.settings:
+            self._start_at(one)
         self._take_link(document.session_context.request.arguments)
         self.verdict, self.margins, self.network = Words("verdict"), Words("margins"), Words("network")
         self.region, self.roots = RegionFigure(), RootsFigure()
@@ -123,14 +182,17 @@ class Page:
                 self.chosen["xy".index(name)] = (axes or self.chosen)[0]
             elif name not in ("token", "bokeh-session-id"):
                 try:
-                    place, value = set_to(self.system, self.sliders, f"{name}={text}")
+                    self._start_at(f"{name}={text}")
                 except ApcError as error:
                     wrong += [one.sentence for one in error.mistakes]
-                    continue
-                self.sliders[place] = with_value(self.sliders[place], value)
-                self.places[place] = self.sliders[place].values.index(value)
         if wrong:
             self.message.say("The link says what can't be:", *wrong)
+
+    def _start_at(self, setting: str) -> None:
+        """Set a slider before the page is shown; its value need be none that the slider had."""
+        place, value = set_to(self.system, self.sliders, setting)
+        apply(self.system, [Override(self.sliders[place].free, value)])
+        self.sliders[place], self.places[place] = with_value(self.sliders[place], value)
 
     def _lay_out(self) -> None:
         self.handles = [self._handle(place) for place in range(len(self.sliders))]
@@ -155,6 +217,7 @@ class Page:
         controls: list[Any] = [self.message.model, *self.selects]
         if any(link.channel is not None for link in self.system.links):
             controls.append(self.meant)
+        controls.append(row(*self._buttons(), sizing_mode="stretch_width"))
         for kind in dict.fromkeys(one.kind for one in self.sliders):
             heading = Div(text=f"<h2 style='font-size:15px;margin:10px 0 0'>{kind.capitalize()}</h2>")
             own = [handle for handle, one in zip(self.handles, self.sliders, strict=True) if one.kind == kind]
@@ -185,6 +248,45 @@ class Page:
         self.document.title = f"{self.system.name} · apc"
         self.document.template = files("apc.explore").joinpath("page.html").read_text(encoding="utf-8")
         self.document.template_variables["about"] = self.system.about
+
+    def _buttons(self) -> list[Button]:
+        """Return the buttons that download the topology, the picture and the numbers."""
+        self.out = ColumnDataSource({"name": [""], "text": [""]})
+        self.out.js_on_change("data", CustomJS(args={"out": self.out}, code=SAVED))
+        topology, picture, numbers = (
+            Button(
+                label=label, stylesheets=[FOCUS], name=f"save-{label.lower()}", sizing_mode="stretch_width"
+            )
+            for label in ("Topology", "Picture", "Numbers")
+        )
+        topology.on_click(self._save_topology)
+        plots = [self.region.plot, self.roots.plot, self.motion.plot, self.feel.plot, self.feel.phase]
+        name = f"{self.system.name}.png"
+        picture.js_on_event("button_click", CustomJS(args={"plots": plots, "name": name}, code=PICTURED))
+        numbers.on_click(self._ask_numbers)
+        return [topology, picture, numbers]
+
+    def _save_topology(self) -> None:
+        """Hand over the topology with the values of the sliders."""
+        if self.scene.text is None:
+            self.message.say("There is no topology beside this compiled model, whose text could be given.")
+            return
+        values = {one.free: one.texts[place] for one, place in self._pairs() if place != one.start}
+        text = with_values(self.scene.text, self.system, values)
+        self.out.data = {"name": [f"{self.system.name}.yaml"], "text": [text]}
+
+    def _ask_numbers(self) -> None:
+        """Have the numbers computed that are downloaded."""
+        overrides = tuple(overrides_of(self.sliders, self.places))
+        self._ask("numbers", overrides, self._region_asked())
+
+    def _save_numbers(self, found: Mapping[str, Any]) -> None:
+        values = {one.label: one.texts[place] for one, place in self._pairs()}
+        told = {"topology": self.system.name, "apc": program_version(), "set": values, **found}
+        self.out.data = {"name": [f"{self.system.name}.json"], "text": [json_text(told)]}
+
+    def _pairs(self) -> list[tuple[Slider, int]]:
+        return list(zip(self.sliders, self.places, strict=True))
 
     def _handle(self, place: int) -> Handle:
         """Return the slider of a number, which counts its values."""
@@ -243,17 +345,22 @@ class Page:
 
     def _ask_region(self, overrides: tuple[Override, ...]) -> None:
         """Ask for the region, if there are two axes: nobody waits for it where it takes long."""
-        region = self.desks[1]
-        if len(set(self.chosen)) < 2:
+        asked, region = self._region_asked(), self.desks[1]
+        if asked is None:
             region.forget("region")
             self.region.clear("A region has two different parameters: choose another one for an axis.")
             return
-        axes = axes_of(self.sliders, self.places, (self.chosen[0], self.chosen[1]))
         # What stands on an axis has all its values there.
-        others = tuple(one for one in overrides if one.free not in (axes[0].free, axes[1].free))
-        criterion = NOMINAL if self.meant.value == LIVE else MEAN_SQUARE
-        region.ask(Task("region", others, (*axes, criterion)))
+        others = tuple(one for one in overrides if one.free not in (asked[0].free, asked[1].free))
+        region.ask(Task("region", others, asked))
         self.region.mark(*(float(self.sliders[one].values[self.places[one]]) for one in self.chosen))
+
+    def _region_asked(self) -> tuple[Range, Range, str] | None:
+        """Return the axes of the region, and what stable means there; None if there are no two axes."""
+        if len(set(self.chosen)) < 2:
+            return None
+        axes = axes_of(self.sliders, self.places, (self.chosen[0], self.chosen[1]))
+        return (*axes, NOMINAL if self.meant.value == LIVE else MEAN_SQUARE)
 
     def _ask(self, section: str, overrides: tuple[Override, ...], asked: Any = None) -> None:
         desk = next(desk for desk in self.desks if section in desk.order)
@@ -266,11 +373,7 @@ class Page:
 
     def _query(self) -> str:
         """Return the part of the link that holds values and axes."""
-        pairs = [
-            (one.label, one.texts[place])
-            for one, place in zip(self.sliders, self.places, strict=True)
-            if place != one.start
-        ]
+        pairs = [(one.label, one.texts[place]) for one, place in self._pairs() if place != one.start]
         pairs += [
             (name, self.sliders[number].label) for name, number in zip((X, Y), self.chosen, strict=True)
         ]
@@ -295,6 +398,8 @@ class Page:
                 self.motion.show(found["motion"])
             case "feel" if found is not None:
                 self.feel.show(found)
+            case "numbers" if found is not None:
+                self._save_numbers(found)
             case "margins" | "network" if found is not None:
                 self._words(section).table(found["text"])
             case "region":

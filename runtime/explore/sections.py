@@ -99,6 +99,7 @@ def _verdict(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, A
         "stable": found.stable,
         "radius": found.spectral_radius,
         "limits": _limits(found),
+        "notes": found.left_out,
         "text": str(found),
         "real": values.real,
         "imag": values.imag,
@@ -148,21 +149,9 @@ def _roots(
     else:
         some = _thinned(values, ROOTS)
         with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
-            matrices = evaluator(system, [free], prepared=prepared).matrices(
-                np.array(some, np.float64)[:, None]
-            )
-            finite = [np.isfinite(one).all(axis=(1, 2)) for one in matrices]
-            rows = [
-                np.concatenate(
-                    [
-                        np.linalg.eigvals(one[row])
-                        for one, sound in zip(matrices, finite, strict=True)
-                        if sound[row]
-                    ]
-                    or [EMPTY]
-                )
-                for row in range(len(some))
-            ]
+            source = evaluator(system, [free], prepared=prepared)
+            matrices = source.matrices(np.array(some, np.float64)[:, None])
+            rows = [_roots_of([one[row] for one in matrices]) for row in range(len(some))]
     found = np.concatenate(rows)
     return {
         "real": found.real,
@@ -174,6 +163,11 @@ def _roots(
         "from": text_of(some[0], unit_of(system, free.name)),
         "to": text_of(some[-1], unit_of(system, free.name)),
     }
+
+
+def _roots_of(matrices: Sequence[Floats]) -> NDArray[np.complex128]:
+    """Return the eigenvalues of all matrices that there are."""
+    return np.concatenate([EMPTY, *(np.linalg.eigvals(one) for one in matrices if np.isfinite(one).all())])
 
 
 def _thinned(values: Sequence[Fraction], most: int) -> list[Fraction]:
@@ -224,9 +218,8 @@ def _network(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, A
     for link in links:
         assert link.channel is not None
         loss, jitter = link.channel.loss, link.channel.jitter
-        for name in [loss.p if loss else None, jitter]:
-            if name is not None:
-                texts.append(_critical(system, name))
+        names = [loss.p if loss else None, jitter]
+        texts += [_critical(system, name) for name in names if name is not None]
     return {"text": "\n\n".join(texts)}
 
 

@@ -1,7 +1,7 @@
 """Which numbers of a scene have a slider, and the values that each can be set to.
 
 Takes: a `CompiledSystem`.
-Gives: `Slider`, `sliders_of`, `set_to`; `text_of`, `place_of`, `axes_of`.
+Gives: `Slider`, `sliders_of`, `set_to`, `with_value`; `text_of`, `place_of`, `overrides_of`, `axes_of`.
 Guarantees: every value is an exact rational within the parameter's bounds, and the scene's own is among them;
 what a slider says of a value, `apc --set` takes.
 Does not: draw, or analyse.
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from math import ceil, floor, lcm, log10
 
@@ -134,7 +135,9 @@ def _bounds(system: CompiledSystem, free: Free) -> tuple[Fraction | None, Fracti
 def _span(
     system: CompiledSystem, free: Free, now: Fraction, low: Fraction | None, high: Fraction | None
 ) -> tuple[Fraction, Fraction]:
-    """Return a range of even steps around a value: to three times it, and from its negative's if it may."""
+    """Return a range around a value: all that it may be, or to three times it, from its negative's if it may."""
+    if low is not None and high is not None:
+        return low, high
     alike = [abs(one.number) for one in system.parameters if one.unit == unit_of(system, free.name)]
     size = abs(now) or max(alike, default=Fraction(0)) or Fraction(1)
     least = -ROOM * size if low is None else low
@@ -263,16 +266,12 @@ def set_to(system: CompiledSystem, sliders: Sequence[Slider], text: str) -> tupl
     raise ApcError(Mistake("E950", Place("explore"), what))
 
 
-def with_value(slider: Slider, value: Fraction) -> Slider:
-    """Return a slider with one more value, of the same start."""
-    if value in slider.values:
-        return slider
+def with_value(slider: Slider, value: Fraction) -> tuple[Slider, int]:
+    """Return a slider that has a value, and the value's place; it begins where it did."""
     listed = tuple(sorted({*slider.values, value}))
     texts = tuple(text_of(one, slider.unit) for one in listed)
-    now = slider.values[slider.start]
-    return Slider(
-        slider.free, slider.unit, slider.kind, slider.about, listed, texts, listed.index(now), slider.span
-    )
+    start = listed.index(slider.values[slider.start])
+    return replace(slider, values=listed, texts=texts, start=start), listed.index(value)
 
 
 def overrides_of(sliders: Sequence[Slider], places: Sequence[int]) -> list[Override]:
