@@ -128,7 +128,10 @@ HOUSE = (
         "inputs api",
     ),
     ("apc.explore", "sliders written motion sections desk figures page server"),
-    ("apc.cli", "options progress region simulate sweep compare critical feel bench analyze explore commands"),
+    (
+        "apc.cli",
+        "options progress region simulate sweep compare critical feel bench analyze explore commands",
+    ),
     ("apc", "__main__"),
 )
 ORDER = tuple(f"{package}.{name}" for package, names in HOUSE for name in names.split())

@@ -42,6 +42,7 @@ class Desk:
     order: tuple[str, ...]
     later: Callable[[Callable[[], None]], None]
     deliver: Deliver
+    last: dict[str, Task] = field(default_factory=dict)
     waiting: dict[str, tuple[int, Task]] = field(default_factory=dict)
     shown: dict[str, int] = field(default_factory=dict)
     numbers: itertools.count[int] = field(default_factory=itertools.count)
@@ -50,7 +51,10 @@ class Desk:
     workers: Workers[Task, Told] | None = None
 
     def ask(self, task: Task) -> None:
-        """Compute a section anew, in the place of what it waited for."""
+        """Compute a section anew, in the place of what it waited for, unless that is what was asked last."""
+        if self.last.get(task.section) == task:
+            return
+        self.last[task.section] = task
         self.waiting[task.section] = (next(self.numbers), task)
         if self.busy is not None:
             _, running, since = self.busy
@@ -60,6 +64,7 @@ class Desk:
 
     def forget(self, section: str) -> None:
         """Compute a section no longer, and drop the answer that is on its way."""
+        self.last.pop(section, None)
         self.waiting.pop(section, None)
         self.shown[section] = next(self.numbers)
 
@@ -91,6 +96,7 @@ class Desk:
             told = done.result()
         except (BrokenProcessPool, CancelledError):
             self._end()
+            self.last.pop(task.section, None)
             told = Told(None, LOST.sentence)
         if number > self.shown.get(task.section, -1):
             self.shown[task.section] = number

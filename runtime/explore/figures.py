@@ -138,7 +138,8 @@ class Words:
             f"<p><strong class='{kind}'>{escape(found['verdict'])}</strong>, spectral radius "
             f"{found['radius']:.9g} per frame</p><p>{escape(found['limits'])}</p>"
             + "".join(f"<p>{escape(one)}</p>" for one in found["notes"])
-            + f"<details><summary>All modes</summary><pre tabindex='0'>{escape(found['text'])}</pre></details>"
+            + "<details><summary>All modes</summary>"
+            f"<pre tabindex='0'>{escape(found['text'])}</pre></details>"
         )
 
     def table(self, text: str) -> None:
@@ -209,7 +210,7 @@ class RegionFigure:
         steps = (
             ("Between the edges of its cells the boundary is drawn straight.",) if found["stepped"] else ()
         )
-        self.words.say(f"Stable in {100 * found['share']:.4g} % of what is shown.", *steps, *found["notes"])
+        self.words.say(f"Stable in {100 * found['share']:.3g} % of what is shown.", *steps, *found["notes"])
 
     def clear(self, why: str) -> None:
         """Show no region, and why."""

@@ -44,7 +44,7 @@ from apc.processes import model_bytes
 from apc.vary.growth import MEAN_SQUARE, NOMINAL
 
 # Who computes what, first things first: what is redrawn while a slider moves waits for nothing else.
-DESKS = (("verdict", "roots"), ("region",), ("motion", "feel", "margins", "network", "numbers"))
+DESKS = (("verdict",), ("region",), ("numbers", "roots", "motion", "feel", "margins", "network"))
 X, Y = "x", "y"  # arguments of the link: the sliders on the axes of the region
 STRUCK, BEGINS = "the first peer's device is struck", "as the scene begins"
 LIVE, SLOW = "every packet is on time", "packets as they are lost and late (takes long)"
@@ -278,6 +278,7 @@ class Page:
     def _ask_numbers(self) -> None:
         """Have the numbers computed that are downloaded."""
         overrides = tuple(overrides_of(self.sliders, self.places))
+        self.desks[2].forget("numbers")  # who asks twice wants two files
         self._ask("numbers", overrides, self._region_asked())
 
     def _save_numbers(self, found: Mapping[str, Any]) -> None:

@@ -165,7 +165,7 @@ def _roots(
     }
 
 
-def _roots_of(matrices: Sequence[Floats]) -> NDArray[np.complex128]:
+def _roots_of(matrices: Sequence[NDArray[np.float64]]) -> NDArray[np.complex128]:
     """Return the eigenvalues of all matrices that there are."""
     return np.concatenate([EMPTY, *(np.linalg.eigvals(one) for one in matrices if np.isfinite(one).all())])
 

@@ -135,7 +135,7 @@ def _bounds(system: CompiledSystem, free: Free) -> tuple[Fraction | None, Fracti
 def _span(
     system: CompiledSystem, free: Free, now: Fraction, low: Fraction | None, high: Fraction | None
 ) -> tuple[Fraction, Fraction]:
-    """Return a range around a value: all that it may be, or to three times it, from its negative's if it may."""
+    """Return a range around a value: all that it may be, or to `ROOM` times it, below 0 too if it may."""
     if low is not None and high is not None:
         return low, high
     alike = [abs(one.number) for one in system.parameters if one.unit == unit_of(system, free.name)]
