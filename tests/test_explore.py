@@ -338,7 +338,7 @@ class Tab:
 
     def __init__(self, browser: Any, link: str) -> None:
         self.page = browser.new_page(viewport={"width": 1280, "height": 900})
-        self.page.set_default_timeout(120_000)
+        self.page.set_default_timeout(60_000)
         self.errors: list[str] = []
         self.hosts: set[str] = set()
         self.page.on("console", lambda one: self.errors.append(one.text) if one.type == "error" else None)

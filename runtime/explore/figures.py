@@ -20,7 +20,6 @@ from bokeh.models import (
     CustomJSTickFormatter,
     Div,
     HoverTool,
-    InlineStyleSheet,
     Range1d,
     Slider,
     Toggle,
@@ -73,17 +72,14 @@ if (cb_obj.active) {{
   }}, {1000 * SECONDS} / {ROWS})
 }}
 """
-FOCUS = InlineStyleSheet(
-    css="""
+FOCUS = """
     :host { font: 13px/1.4 system-ui, sans-serif; color: #1a1a1a; }
     .noUi-handle:focus-visible, button:focus-visible, select:focus-visible
       { outline: 3px solid #0072B2; outline-offset: 1px; }
     .noUi-target { border-color: #767676; margin: 0 8px; }
     .noUi-handle { border-color: #595959; }
     """
-)
-STYLE = InlineStyleSheet(
-    css="""
+STYLE = """
     :host { font: 14px/1.45 system-ui, sans-serif; color: #1a1a1a; }
     .bk-clearfix { display: block; min-width: 0; } /* a wide table scrolls, the page does not */
     p { margin: 0 0 6px; } pre { font-size: 12px; overflow-x: auto; margin: 6px 0; }
@@ -91,7 +87,6 @@ STYLE = InlineStyleSheet(
     .old { opacity: .55; } .why { color: #5a2a00; }
     summary { cursor: pointer; } summary:focus-visible { outline: 2px solid #0072B2; }
     """
-)
 
 
 def _plot(name: str, **settings: Any) -> Any:

@@ -44,7 +44,8 @@ from apc.processes import model_bytes
 from apc.vary.growth import MEAN_SQUARE, NOMINAL
 
 # Who computes what, first things first: what is redrawn while a slider moves waits for nothing else.
-DESKS = (("verdict",), ("region",), ("numbers", "roots", "motion", "feel", "margins", "network"))
+QUICK, LATER = 0, 1
+DESKS = (("verdict", "region"), ("numbers", "roots", "motion", "feel", "margins", "network"))
 X, Y = "x", "y"  # arguments of the link: the sliders on the axes of the region
 STRUCK, BEGINS = "the first peer's device is struck", "as the scene begins"
 LIVE, SLOW = "every packet is on time", "packets as they are lost and late (takes long)"
@@ -278,7 +279,7 @@ class Page:
     def _ask_numbers(self) -> None:
         """Have the numbers computed that are downloaded."""
         overrides = tuple(overrides_of(self.sliders, self.places))
-        self.desks[2].forget("numbers")  # who asks twice wants two files
+        self.desks[LATER].forget("numbers")  # who asks twice wants two files
         self._ask("numbers", overrides, self._region_asked())
 
     def _save_numbers(self, found: Mapping[str, Any]) -> None:
@@ -346,7 +347,7 @@ class Page:
 
     def _ask_region(self, overrides: tuple[Override, ...]) -> None:
         """Ask for the region, if there are two axes: nobody waits for it where it takes long."""
-        asked, region = self._region_asked(), self.desks[1]
+        asked, region = self._region_asked(), self.desks[QUICK]
         if asked is None:
             region.forget("region")
             self.region.clear("A region has two different parameters: choose another one for an axis.")
