@@ -225,7 +225,7 @@ class Page:
             controls += [heading, *own]
         region, roots, motion, feel = self.region, self.roots, self.motion, self.feel
         roots_of_page: dict[str, Any] = {
-            "controls": _below(*controls, tags=[self.link]),
+            "controls": _below(*controls, tags=[self.link, self.out]),
             "verdict": self.verdict.model,
             "margins": self.margins.model,
             "region": _below(region.plot, region.words.model),

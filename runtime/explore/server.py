@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import errno
 import hmac
+import logging
 import secrets
 import signal
 from collections.abc import Callable
@@ -117,6 +118,9 @@ def run(server: BaseServer, link: str, *, browser: bool) -> None:
     """
     import webbrowser
 
+    # Who is refused is told so; the terminal is not, and no link with its token is printed again.
+    for name in ("tornado.access", "tornado.general"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     if browser:
         server.io_loop.add_callback(webbrowser.open, link)
     signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
