@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import os
 import re
@@ -10,8 +11,6 @@ import signal
 import socket
 import subprocess
 import sys
-import urllib.error
-import urllib.request
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -464,11 +463,13 @@ def test_whoever_sees_no_pictures_and_has_no_mouse_finds_everything_by_name(brow
 
 
 def status(link: str, **headers: str) -> int:
+    parts = urlsplit(link)
+    connection = http.client.HTTPConnection(parts.netloc, timeout=60)
     try:
-        with urllib.request.urlopen(urllib.request.Request(link, headers=headers)) as answer:
-            return int(answer.status)
-    except urllib.error.HTTPError as error:
-        return error.code
+        connection.request("GET", f"{parts.path}?{parts.query}", headers=headers)
+        return connection.getresponse().status
+    finally:
+        connection.close()
 
 
 def test_only_this_machine_with_the_token_and_no_other_origin_gets_in(link: str, tmp_path: Path) -> None:

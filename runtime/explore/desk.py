@@ -57,9 +57,13 @@ class Desk:
         self.last[task.section] = task
         self.waiting[task.section] = (next(self.numbers), task)
         if self.busy is not None:
-            _, running, since = self.busy
-            if running.section in self.waiting and time.monotonic() - since > PATIENCE:
+            number, running, since = self.busy
+            first = self.order.index(task.section) <= self.order.index(running.section)
+            if first and time.monotonic() - since > PATIENCE:
                 self._end()
+                self.waiting.setdefault(
+                    running.section, (number, running)
+                )  # what is still wanted comes after
         self._next()
 
     def forget(self, section: str) -> None:

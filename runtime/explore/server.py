@@ -15,7 +15,7 @@ import hmac
 import logging
 import secrets
 import signal
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 from bokeh.application import Application
@@ -46,16 +46,16 @@ class Gate(AuthProvider):  # type: ignore[misc] # Bokeh's types are not looked a
         super().__init__()
 
     @property
-    def get_user(self) -> Callable[[Any], str]:
-        """What Bokeh asks of every request for the page, its data and its socket."""
+    def get_user_async(self) -> Callable[[Any], Awaitable[str]]:
+        """What Bokeh asks of every request for the page, its data and its socket, before it looks at it."""
         return self._user
 
     @property
     def login_url(self) -> str:
-        """Where Bokeh would send whoever `get_user` does not let in; it refuses them instead."""
+        """Where Bokeh would send whoever `get_user_async` does not let in; it refuses them instead."""
         return "/"
 
-    def _user(self, handler: Any) -> str:
+    async def _user(self, handler: Any) -> str:
         request, own = handler.request, f"http://{self.address}"
         if request.host != self.address or request.headers.get("Origin", own) != own:
             raise HTTPError(403, reason=f"This page is {own} and no other")
