@@ -118,8 +118,8 @@ def run(server: BaseServer, link: str, *, browser: bool) -> None:
     """
     import webbrowser
 
-    # Who is refused is told so; the terminal is not, and no link with its token is printed again.
-    for name in ("tornado.access", "tornado.general"):
+    # Who is refused is told so; the terminal is not, nor of tabs that close, and no token is printed again.
+    for name in ("tornado.access", "tornado.general", "bokeh.server.views.ws"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if browser:
         server.io_loop.add_callback(webbrowser.open, link)
