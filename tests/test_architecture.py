@@ -138,10 +138,11 @@ HOUSE = (
     (
         "apc.cli",
         """
-        options progress region simulate sweep compare critical feel export bench analyze network play library
-        report commands
+        options progress region simulate sweep compare critical feel export explore bench analyze network play
+        library report commands
         """,
     ),
+    ("apc.explore", "sliders written motion sections desk figures page server"),
     ("apc", "__main__"),
 )
 ORDER = tuple(f"{package}.{name}" for package, names in HOUSE for name in names.split())

@@ -205,6 +205,11 @@ E973 runtime/loop runtime/cli: a folder is no run, or can't be one
 E974 runtime/loop runtime/cli: a peer can't listen there, or its secret is none
 E975 runtime/loop: a scene has more peers than processes, or one of these was lost
 E976 runtime/loop: a device outside has no function, or that is at fault
+E980 runtime/explore: a number has no slider
+E981 runtime/explore: a process that computes ended
+E982 runtime/explore: a port can't be listened on
+E983 runtime/explore: a scene has nothing that moves, or that a push could move
+E984 runtime/explore: a scene has no unreliable link
 E990 runtime/present: a file is no report
 E991 runtime/cli: a report's number is another one, computed anew
 """

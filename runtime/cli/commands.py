@@ -16,6 +16,7 @@ from apc.cli.analyze import analyze_command
 from apc.cli.bench import bench_command
 from apc.cli.compare import compare_command
 from apc.cli.critical import critical_command
+from apc.cli.explore import explore_command
 from apc.cli.export import export_command
 from apc.cli.feel import feel_command
 from apc.cli.library import library_command, new_command
@@ -70,6 +71,7 @@ def apc() -> None:
         apc analyze        stable or not, by how much, in which modes
         apc critical       the largest stable value of a parameter
         apc compare        schemes side by side: the same asked of several files
+        apc explore        all of it in the browser, with sliders
         apc feel           what a hand feels at its device, at each frequency
         apc simulate       what happens over time, as rows and a picture
         apc region         where it is stable over two parameters: curves, areas
@@ -90,6 +92,7 @@ apc.add_command(bench_command)
 apc.add_command(compare_command)
 apc.add_command(critical_command)
 apc.add_command(export_command)
+apc.add_command(explore_command)
 apc.add_command(feel_command)
 apc.add_command(library_command)
 apc.add_command(new_command)

@@ -1,7 +1,8 @@
 """A picture of how a scene begins: every peer's bodies side by side, and the surfaces between them.
 
-Takes: a `CompiledSystem`. Gives: `Body`, `Wall`, `bodies_of`, `draw_still`, `save_still`, and `draw_actors`,
-the same picture with what moves in it (see `animation`); of bodies that move in a plane that of `planar`.
+Takes: a `CompiledSystem`. Gives: `Body`, `Wall`, `bodies_of`, `rows_of`, `draw_still`, `save_still`, and
+`draw_actors`, the same picture with what moves in it (see `animation`); of bodies that move in a plane that of
+`planar`.
 Guarantees: everything is found in the equations: a body is a position (a state in metres); where something is
 decided by the distance of two of them, or of one from a fixed place, in metres, there is a surface.
 Does not: play the scene, or know what a part is called.
@@ -146,8 +147,8 @@ def draw_actors(system: CompiledSystem, *, named: bool = True) -> tuple[Any, lis
     """
     figures, patches = need("matplotlib.figure", "plot"), need("matplotlib.patches", "plot")
     if moves_in_plane(system):
-        return draw_plane(system, _rows(system, spots_of), named=named)
-    rows = _rows(system, bodies_of)
+        return draw_plane(system, rows_of(system, spots_of), named=named)
+    rows = rows_of(system, bodies_of)
     figure = figures.Figure(figsize=(WIDTH, ROW * len(rows) + MARGIN), layout="constrained")
     ax = figure.subplots()
     names = list(dict.fromkeys(body.name for _, bodies, _ in rows for body in bodies))
@@ -184,11 +185,19 @@ def draw_actors(system: CompiledSystem, *, named: bool = True) -> tuple[Any, lis
     return figure, actors
 
 
-def _rows(
+def rows_of(
     system: CompiledSystem,
     seen: Callable[[Kind, Sequence[float], Sequence[float]], tuple[list[B], list[S]]],
 ) -> list[tuple[str, list[B], list[S]]]:
-    """Return the peers that are drawn: name, and the bodies and surfaces that are seen of its start."""
+    """Return the peers that are drawn: name, and the bodies and surfaces that are seen of its start.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    seen
+        `bodies_of`, or `planar.spots_of` of what moves in a plane.
+    """
     numbers = resolve(system)
     sites = [jacobians(kind) for kind in system.kinds]
     found: list[tuple[str, list[B], list[S]]] = []

@@ -1,0 +1,68 @@
+"""The command `apc explore`.
+
+Takes: words of a command line. Gives: the link of a page on stdout.
+Guarantees: what can't be explored, a port that is taken and a library that is missing are told before a page
+is served; Ctrl-C ends the command.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from apc.cli.options import (
+    Command,
+    WholeNumber,
+    file_argument,
+    set_option,
+    tell,
+)
+from apc.threads import start_single_threaded
+
+
+@click.command("explore", cls=Command)
+@file_argument
+@set_option
+@click.option(
+    "--port",
+    type=WholeNumber(0, 65535),
+    default=0,
+    metavar="N",
+    help="Listen on this port of this machine; any that is free if not given.",
+)
+@click.option("--no-browser", is_flag=True, help="Only print the link.")
+def explore_command(file: str | None, settings: tuple[str, ...], port: int, no_browser: bool) -> None:
+    """Open a page in the browser: sliders, and what follows from them.
+
+    Sliders of the scene's parameters, delays, periods and number of users;
+    beside them the stable region of two of them, the verdict and what limits
+    it, eigenvalues, the response to a push, what a hand feels, how much loss
+    and jitter the network may have, redrawn as a slider moves. A click in the
+    region sets both its sliders. The link holds the values; buttons download
+    the topology with them, the picture and the numbers. FILE is a topology or
+    a compiled model. The page is this machine's own, for whoever has the link
+    that is printed; Ctrl-C ends it.
+
+    \b
+        apc explore three-users.yaml --set "lan.delay=16 ms" --no-browser
+    """
+    start_single_threaded()
+    from apc.inputs import find_input, open_scene
+    from apc.optional import need
+
+    need("bokeh.server.server", "explore")
+    from apc.compiler.source.source import read_source
+    from apc.explore.page import open_page, scene_of
+    from apc.explore.server import bound, run
+
+    path = Path(file) if file else find_input(compiled_too=True)
+    system = open_scene(str(path), ())
+    topology = path.with_suffix(".yaml")
+    text = read_source(topology).text if topology.is_file() else None
+    scene = scene_of(system, settings, text)
+    server, link = bound(lambda document: open_page(scene, document), port)
+    tell(link)
+    run(server, link, browser=not no_browser)
+    tell("ended", err=True)

@@ -1,0 +1,1 @@
+"""A scene in the browser: sliders, and what they do; README.md beside this file says how."""

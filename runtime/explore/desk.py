@@ -1,0 +1,108 @@
+"""Who computes for a page: processes of its own, each of which does what was asked last, first things first.
+
+Takes: a compiled model as bytes; tasks.
+Gives: `Desk`.
+Guarantees: the page never waits; of what was asked of a section, only the newest is still computed, and an
+answer older than one that was given already is dropped; what hangs is ended when it is no longer wanted.
+Does not: know what is computed, or show it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack
+from dataclasses import field
+
+from apc.compiler.errors import Mistake, Place
+from apc.compiler.frozen import dataclass
+from apc.explore.sections import Task, Told, compute
+from apc.processes import Workers, local_processes
+
+# Seconds after which work that is no longer wanted is ended: to start afresh takes about one.
+PATIENCE = 3.0
+
+LOST = Mistake("E981", Place("explore"), "the process that computes ended without a word: too little memory?")
+
+# Is told a section, and what it has to show.
+Deliver = Callable[[str, Told], None]
+
+
+@dataclass(slots=True, eq=False)
+class Desk:
+    """One process with its waiting tasks, by section; `order` says which goes first.
+
+    All of it is called from the one thread that serves pages; `later` hands a call to that thread.
+    """
+
+    model: bytes
+    order: tuple[str, ...]
+    later: Callable[[Callable[[], None]], None]
+    deliver: Deliver
+    last: dict[str, Task] = field(default_factory=dict)
+    waiting: dict[str, tuple[int, Task]] = field(default_factory=dict)
+    shown: dict[str, int] = field(default_factory=dict)
+    numbers: itertools.count[int] = field(default_factory=itertools.count)
+    busy: tuple[int, Task, float] | None = None
+    stack: ExitStack = field(default_factory=ExitStack)
+    workers: Workers[Task, Told] | None = None
+
+    def ask(self, task: Task) -> None:
+        """Compute a section anew, in the place of what it waited for, unless that is what was asked last."""
+        if self.last.get(task.section) == task:
+            return
+        self.last[task.section] = task
+        self.waiting[task.section] = (next(self.numbers), task)
+        if self.busy is not None:
+            number, running, since = self.busy
+            first = self.order.index(task.section) <= self.order.index(running.section)
+            if first and time.monotonic() - since > PATIENCE:
+                self._end()
+                self.waiting.setdefault(
+                    running.section, (number, running)
+                )  # what is still wanted comes after
+        self._next()
+
+    def forget(self, section: str) -> None:
+        """Compute a section no longer, and drop the answer that is on its way."""
+        self.last.pop(section, None)
+        self.waiting.pop(section, None)
+        self.shown[section] = next(self.numbers)
+
+    def close(self) -> None:
+        """End the process, whatever it does."""
+        self.waiting.clear()
+        self._end()
+
+    def _end(self) -> None:
+        self.busy, self.workers = None, None
+        self.stack.close()
+
+    def _next(self) -> None:
+        if self.busy is not None or not self.waiting:
+            return
+        if self.workers is None:
+            self.workers = self.stack.enter_context(local_processes(compute, self.model, 1, LOST))
+        section = min(self.waiting, key=self.order.index)
+        number, task = self.waiting.pop(section)
+        self.busy = (number, task, time.monotonic())
+        future = self.workers.submit(task)
+        future.add_done_callback(lambda done: self.later(lambda: self._done(number, task, done)))
+
+    def _done(self, number: int, task: Task, done: Future[Told]) -> None:
+        if self.busy is None or self.busy[0] != number:
+            return  # it was ended, and is no longer asked
+        self.busy = None
+        try:
+            told = done.result()
+        except (BrokenProcessPool, CancelledError):
+            self._end()
+            self.last.pop(task.section, None)
+            told = Told(None, LOST.sentence)
+        if number > self.shown.get(task.section, -1):
+            self.shown[task.section] = number
+            self.deliver(task.section, told)
+        self._next()

@@ -1,0 +1,463 @@
+"""The figures of the page, and the words beside them.
+
+Takes: what `sections` tell.
+Gives: `Words`; `RegionFigure`, `RootsFigure`, `MotionFigure`, `FeelFigure`; `FOCUS`.
+Guarantees: what a figure shows stands beside it in words, for whoever does not see it; nothing is told by
+colour alone.
+Does not: compute, or know sliders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from html import escape
+from typing import Any
+
+import numpy as np
+from bokeh.models import (
+    ColumnDataSource,
+    CustomJS,
+    CustomJSTickFormatter,
+    Div,
+    HoverTool,
+    Range1d,
+    Slider,
+    Toggle,
+)
+from bokeh.plotting import figure
+
+from apc.explore.motion import ROWS, Motion
+
+# Colours that are distinct in print and for colour-blind eyes: Okabe and Ito, 2008.
+BLUE, ORANGE, GREY, INK = "#0072B2", "#D55E00", "#595959", "#1a1a1a"
+COLOURS = (BLUE, ORANGE, "#009E73", "#CC79A7", "#000000", "#56B4E9", "#E69F00", "#7F3C8D")
+DASHES, DASH_WORDS = (
+    ("solid", "dashed", "dotted", "dotdash"),
+    ("drawn through", "dashed", "dotted", "dash and dot"),
+)
+HEIGHT = 330
+# Room around the unit circle, and around eigenvalues beyond it; around bodies, as a share of their way.
+ROUND, BEYOND, ROOM = 1.12, 1.05, 0.1
+CIRCLE = np.exp(1j * np.linspace(0, 2 * np.pi, 241))
+
+# How far below each other the bodies of a peer stand that move along a line, of the distance of two peers.
+STAGGER = 0.3
+# Seconds that a whole motion is played in.
+SECONDS = 10
+INSTANT = """
+const time = frames.data.time
+return time.length ? time[Math.min(Math.round(tick), time.length - 1)].toFixed(3) + ' s' : ''
+"""
+# Changed in place: what is shown at an instant is this tab's, and not sent anywhere.
+SHOWING = """
+const {time, x, y} = frames.data
+if (time.length) {
+  const k = Math.min(Math.round(slider.value), time.length - 1)
+  for (let body = 0; body < x[k].length; body++) {
+    bodies.data.x[body] = x[k][body]
+    bodies.data.y[body] = y[k][body]
+  }
+  instant.data.x[0] = time[k]
+  bodies.change.emit()
+  instant.change.emit()
+}
+"""
+PLAYING = f"""
+clearInterval(window.apc_playing)
+cb_obj.label = cb_obj.active ? 'Pause' : 'Play'
+if (cb_obj.active) {{
+  window.apc_playing = setInterval(() => {{
+    const count = frames.data.time.length
+    if (count) slider.value = (Math.round(slider.value) + 1) % count
+  }}, {1000 * SECONDS} / {ROWS})
+}}
+"""
+FOCUS = """
+    :host { font: 13px/1.4 system-ui, sans-serif; color: #1a1a1a; }
+    .noUi-handle:focus-visible, button:focus-visible, select:focus-visible
+      { outline: 3px solid #0072B2; outline-offset: 1px; }
+    .noUi-target { border-color: #767676; margin: 0 8px; }
+    .noUi-handle { border-color: #595959; }
+    """
+STYLE = """
+    :host { font: 14px/1.45 system-ui, sans-serif; color: #1a1a1a; }
+    .bk-clearfix { display: block; min-width: 0; } /* a wide table scrolls, the page does not */
+    p { margin: 0 0 6px; } pre { font-size: 12px; overflow-x: auto; margin: 6px 0; }
+    strong.unstable { color: #A03C00; } strong.stable { color: #00587A; }
+    .old { opacity: .55; } .why { color: #5a2a00; }
+    summary { cursor: pointer; } summary:focus-visible { outline: 2px solid #0072B2; }
+    """
+
+
+def _plot(name: str, **settings: Any) -> Any:
+    """Return a figure as all are: as wide as its place, with few tools."""
+    plot = figure(
+        name=f"{name}-plot",
+        height=HEIGHT,
+        sizing_mode="stretch_width",
+        tools="pan,wheel_zoom,box_zoom,reset,save",
+        active_scroll=None,
+        **settings,
+    )
+    plot.toolbar.logo = None
+    plot.toolbar.autohide = True
+    plot.axis.axis_label_text_font_style = "normal"
+    plot.axis.axis_label_text_color = plot.axis.major_label_text_color = INK
+    return plot
+
+
+def _legend_below(plot: Any) -> None:
+    """Put the legend where it covers nothing."""
+    legend = plot.legend[0]
+    legend.update(orientation="horizontal", border_line_color=None, padding=0, label_text_color=INK)
+    plot.center.remove(legend)
+    plot.add_layout(legend, "above")
+
+
+class Words:
+    """A text of the page, which is read aloud when it changes."""
+
+    def __init__(self, name: str) -> None:
+        self.model = Div(
+            text="<p>Computing …</p>", name=name, stylesheets=[STYLE], sizing_mode="stretch_width"
+        )
+
+    def say(self, *lines: str) -> None:
+        """Show lines, as they are."""
+        self.model.text = "".join(f"<p>{escape(line)}</p>" for line in lines)
+
+    def verdict(self, found: Mapping[str, Any]) -> None:
+        """Show a verdict, what limits it, and behind a lid all that `apc analyze` prints."""
+        kind = {True: "stable", False: "unstable"}.get(found["stable"], "")
+        self.model.text = (
+            f"<p><strong class='{kind}'>{escape(found['verdict'])}</strong>, spectral radius "
+            f"{found['radius']:.9g} per frame</p><p>{escape(found['limits'])}</p>"
+            + "".join(f"<p>{escape(one)}</p>" for one in found["notes"])
+            + "<details><summary>All modes</summary>"
+            f"<pre tabindex='0'>{escape(found['text'])}</pre></details>"
+        )
+
+    def table(self, text: str) -> None:
+        """Show a text whose columns stand below each other."""
+        self.model.text = f"<pre tabindex='0'>{escape(text)}</pre>"
+
+    def nothing(self, why: str) -> None:
+        """Say why there is nothing to show."""
+        self.model.text = f"<p class='why'>{escape(why)}</p>"
+
+
+class RegionFigure:
+    """The stable region of two parameters, and where in it the scene is."""
+
+    def __init__(self) -> None:
+        self.plot = _plot("region", x_range=Range1d(0, 1), y_range=Range1d(0, 1))
+        self.inside = ColumnDataSource({"xs": [], "ys": []})
+        self.boundary = ColumnDataSource({"xs": [], "ys": []})
+        self.point = ColumnDataSource({"x": [], "y": []})
+        self.plot.multi_polygons(
+            "xs",
+            "ys",
+            source=self.inside,
+            fill_color=BLUE,
+            fill_alpha=0.14,
+            hatch_pattern="/",
+            hatch_color=BLUE,
+            hatch_alpha=0.25,
+            hatch_scale=10,
+            hatch_weight=0.7,
+            line_width=0,
+            legend_label="stable",
+        )
+        self.plot.multi_line("xs", "ys", source=self.boundary, line_color=BLUE, line_width=2)
+        self.plot.scatter(
+            "x",
+            "y",
+            source=self.point,
+            size=13,
+            marker="circle_cross",
+            line_color="#000000",
+            fill_color="#ffffff",
+            line_width=2,
+            legend_label="the sliders",
+        )
+        _legend_below(self.plot)
+        self.words = Words("region-words")
+
+    def show(self, found: Mapping[str, Any]) -> None:
+        """Draw a region."""
+        outlines = [np.asarray(one) for one in found["outlines"]]
+        rings = {
+            axis: [[[one[:, n] for one in outlines]]] if outlines else []
+            for n, axis in enumerate(("xs", "ys"))
+        }
+        self.inside.data = rings
+        self.boundary.data = {
+            "xs": [one[:, 0] for one in found["curves"]],
+            "ys": [one[:, 1] for one in found["curves"]],
+        }
+        for axis, span, which in (
+            (self.plot.xaxis, self.plot.x_range, found["x"]),
+            (self.plot.yaxis, self.plot.y_range, found["y"]),
+        ):
+            label, unit, low, high = which
+            axis.axis_label = label if unit == "1" else f"{label} [{unit.replace('*', '·')}]"
+            span.update(start=low, end=high)
+        steps = (
+            ("Between the edges of its cells the boundary is drawn straight.",) if found["stepped"] else ()
+        )
+        self.words.say(f"Stable in {100 * found['share']:.3g} % of what is shown.", *steps, *found["notes"])
+
+    def clear(self, why: str) -> None:
+        """Show no region, and why."""
+        self.inside.data = self.boundary.data = {"xs": [], "ys": []}
+        self.words.nothing(why)
+
+    def mark(self, x: float, y: float) -> None:
+        """Mark where the scene is."""
+        self.point.data = {"x": [x], "y": [y]}
+
+
+class RootsFigure:
+    """Eigenvalues over the unit circle, and the way they take as a slider moves."""
+
+    def __init__(self) -> None:
+        self.plot = _plot(
+            "roots",
+            x_range=Range1d(-ROUND, ROUND),
+            y_range=Range1d(-ROUND, ROUND),
+            x_axis_label="real part",
+            y_axis_label="imaginary part",
+            tooltips=[("mode", "@name"), ("eigenvalue", "@x + @y i")],
+        )
+        self.now = ColumnDataSource({"x": [], "y": [], "name": []})
+        self.way = ColumnDataSource({"x": [], "y": [], "name": []})
+        self.plot.line(CIRCLE.real, CIRCLE.imag, line_color=GREY, line_width=1.5)
+        self.plot.scatter(
+            "x", "y", source=self.way, size=3, fill_color=BLUE, line_color=None, legend_label="as it moves"
+        )
+        self.plot.scatter(
+            "x",
+            "y",
+            source=self.now,
+            size=10,
+            marker="x",
+            line_color=ORANGE,
+            line_width=2,
+            legend_label="now",
+        )
+        # As wide as high: a circle is one.
+        self.plot.update(sizing_mode="fixed", width=HEIGHT + 30, height=HEIGHT + 30)
+        _legend_below(self.plot)
+        self.words, self.way_words = Words("roots-words"), Words("way-words")
+        self.way_words.say("Move a slider: dots show the way the eigenvalues take.")
+
+    def show(self, found: Mapping[str, Any]) -> None:
+        """Draw the eigenvalues of an analysis."""
+        self.now.data = {"x": found["real"], "y": found["imag"], "name": found["names"]}
+        size = BEYOND * float(np.hypot(found["real"], found["imag"]).max(initial=0.0))
+        reach = max(ROUND, size)
+        self.plot.x_range.update(start=-reach, end=reach)
+        self.plot.y_range.update(start=-reach, end=reach)
+        outside = int((np.hypot(found["real"], found["imag"]) > 1).sum())
+        self.words.say(f"{len(found['real'])} eigenvalues, {outside} of them outside the unit circle.")
+
+    def way_of(self, found: Mapping[str, Any]) -> None:
+        """Draw where the eigenvalues go as a slider goes through all its values."""
+        self.way.data = {"x": found["real"], "y": found["imag"], "name": found["name"]}
+        self.way_words.say(
+            f"Dots: where they are for {found['slider']} from {found['from']} to {found['to']}."
+        )
+
+
+class MotionFigure:
+    """The response over time, and the bodies that move: played, stopped, or taken to any time."""
+
+    def __init__(self) -> None:
+        self.lines = ColumnDataSource(columns("xs", "ys", "colour", "dash", "name"))
+        self.instant = ColumnDataSource({"x": [0.0]})
+        self.frames = ColumnDataSource(columns("time", "x", "y"))
+        self.bodies = ColumnDataSource(columns("x", "y", "width", "height", "name", "colour"))
+        self.walls = ColumnDataSource(columns("x", "top", "bottom"))
+        self.discs = ColumnDataSource(columns("x", "y", "radius"))
+        self.plot = _plot(
+            "response",
+            x_axis_label="time [s]",
+            y_axis_label="position [mm]",
+            x_range=Range1d(0, 1),
+            y_range=Range1d(0, 1),
+        )
+        self.plot.multi_line(
+            "xs", "ys", source=self.lines, line_color="colour", line_dash="dash", line_width=2
+        )
+        self.plot.vspan("x", source=self.instant, line_color="#000000", line_dash="dotted")
+        self.plot.add_tools(HoverTool(tooltips=[("", "@name")]))
+        self.stage = _plot(
+            "stage", x_axis_label="position [mm]", x_range=Range1d(0, 1), y_range=Range1d(0, 1)
+        )
+        self.stage.vbar("x", 0.0, "top", "bottom", source=self.walls, line_color="#404040", line_width=4)
+        self.stage.circle(
+            "x", "y", radius="radius", source=self.discs, fill_color="#d0d0d0", line_color="#404040"
+        )
+        self.stage.rect(
+            "x",
+            "y",
+            "width",
+            "height",
+            source=self.bodies,
+            fill_color="colour",
+            fill_alpha=0.3,
+            line_color="#000000",
+        )
+        self.stage.scatter("x", "y", source=self.bodies, size=9, fill_color="colour", line_color="#000000")
+        self.stage.text(
+            "x",
+            "y",
+            "name",
+            source=self.bodies,
+            y_offset=-8,
+            text_align="center",
+            text_baseline="bottom",
+            text_font_size="11px",
+            text_color=INK,
+        )
+        self.time = Slider(
+            start=0,
+            end=ROWS - 1,
+            step=1,
+            value=0,
+            title="time",
+            name="time",
+            tooltips=False,
+            sizing_mode="stretch_width",
+            stylesheets=[FOCUS],
+            format=CustomJSTickFormatter(args={"frames": self.frames}, code=INSTANT),
+        )
+        showing = CustomJS(
+            args={
+                "slider": self.time,
+                "frames": self.frames,
+                "bodies": self.bodies,
+                "instant": self.instant,
+            },
+            code=SHOWING,
+        )
+        self.time.js_on_change("value", showing)
+        self.frames.js_on_change("data", showing)
+        self.play = Toggle(label="Play", width=90, stylesheets=[FOCUS])
+        self.play.js_on_change(
+            "active", CustomJS(args={"slider": self.time, "frames": self.frames}, code=PLAYING)
+        )
+        self.words = Words("motion-words")
+
+    def show(self, motion: Motion) -> None:
+        """Draw a motion, and put the bodies where they are at the time that is shown."""
+        peers, names = (
+            list(dict.fromkeys(column))
+            for column in zip(*((one.peer, one.name) for one in motion.bodies), strict=True)
+        )
+        colours = [COLOURS[peers.index(one.peer) % len(COLOURS)] for one in motion.bodies]
+        labels = [f"{one.peer}.{one.name}" for one in motion.bodies]
+        self.lines.data = {
+            "xs": [motion.time for _ in motion.bodies],
+            "ys": [one.x for one in motion.bodies],
+            "colour": colours,
+            "dash": [DASHES[names.index(one.name) % len(DASHES)] for one in motion.bodies],
+            "name": labels,
+        }
+        planar = motion.bodies[0].y is not None
+        heights = [
+            np.full(len(motion.time), one.row + STAGGER * names.index(one.name)) if one.y is None else one.y
+            for one in motion.bodies
+        ]
+        x, y = np.stack([one.x for one in motion.bodies], axis=1), np.stack(heights, axis=1)
+        sizes = [one.size for one in motion.bodies]
+        self.bodies.data = {
+            "x": x[0],
+            "y": y[0],
+            "width": [2 * one for one in sizes],
+            "height": [2 * one if planar else 0.5 * (one > 0) for one in sizes],
+            "name": labels if planar else [one.name for one in motion.bodies],
+            "colour": colours,
+        }
+        rows = [row for row, _ in motion.walls]
+        self.walls.data = {
+            "x": [at for _, at in motion.walls],
+            "top": [row + 0.45 for row in rows],
+            "bottom": [row - 0.45 for row in rows],
+        }
+        self.discs.data = {
+            name: [one[n] for one in motion.discs] for n, name in enumerate(("x", "y", "radius"))
+        }
+        self.frames.data = {"time": motion.time, "x": list(x), "y": list(y)}
+        reach = max(sizes)
+        fixed = [at for _, at in motion.walls]
+        low, high = min([x.min() - reach, *fixed]), max([x.max() + reach, *fixed])
+        room = ROOM * (high - low) or 1.0
+        self.plot.x_range.update(start=0.0, end=float(motion.time[-1]))
+        self.plot.y_range.update(start=float(x.min()) - room, end=float(x.max()) + room)
+        self.stage.x_range.update(start=low - room, end=high + room)
+        if planar:
+            self.stage.y_range.update(start=float(y.min()) - reach - room, end=float(y.max()) + reach + room)
+            self.stage.yaxis.axis_label = "position [mm]"
+        else:
+            self.stage.y_range.update(start=len(peers) - 0.3, end=-0.5)
+            self.stage.yaxis.ticker = list(range(len(peers)))
+            self.stage.yaxis.major_label_overrides = dict(enumerate(peers))
+        slower = SECONDS / float(motion.time[-1])
+        legend = "; ".join(f"{name} {word}" for name, word in zip(names, DASH_WORDS, strict=False))
+        self.words.say(
+            *motion.told,
+            f"A colour is a peer, a kind of line a body: {legend}. Played {slower:.2g} times slower.",
+            *([f"{motion.others} more peers are not shown."] if motion.others else []),
+        )
+
+
+class FeelFigure:
+    """What a hand feels at its device: force by velocity, over frequency."""
+
+    def __init__(self) -> None:
+        self.source = ColumnDataSource(columns("frequency", "magnitude", "phase"))
+        self.plot = _plot(
+            "feel",
+            x_axis_type="log",
+            y_axis_type="log",
+            y_axis_label="impedance [N·s/m]",
+            x_range=Range1d(0.1, 60),
+            y_range=Range1d(1, 100),
+        )
+        self.phase = _plot(
+            "phase",
+            x_axis_type="log",
+            x_axis_label="frequency [Hz]",
+            y_axis_label="phase [°]",
+            x_range=self.plot.x_range,
+            y_range=Range1d(-180, 180),
+        )
+        self.plot.height, self.phase.height = 2 * HEIGHT // 3, HEIGHT // 2
+        for plot, column in ((self.plot, "magnitude"), (self.phase, "phase")):
+            plot.line("frequency", column, source=self.source, line_color=BLUE, line_width=2)
+            plot.add_tools(HoverTool(tooltips=[("Hz", "@frequency"), (column, f"@{column}")], mode="vline"))
+        self.phase.yaxis.ticker = [-180, -90, 0, 90, 180]
+        self.words = Words("feel-words")
+
+    def show(self, found: Mapping[str, Any]) -> None:
+        """Draw what is felt."""
+        self.source.data = {name: found[name] for name in ("frequency", "magnitude", "phase")}
+        f, size = found["frequency"], found["magnitude"]
+        self.plot.x_range.update(start=f[0], end=f[-1])
+        self.plot.y_range.update(start=size.min() / (1 + ROOM), end=size.max() * (1 + ROOM))
+        self.words.say(
+            f"At {found['at']}: {size[0]:.4g} N·s/m at {f[0]:.3g} Hz,"
+            f" {size[-1]:.4g} N·s/m at {f[-1]:.3g} Hz.",
+            *found["notes"],
+        )
+
+    def clear(self, why: str) -> None:
+        """Show no impedance, and why."""
+        self.source.data = columns("frequency", "magnitude", "phase")
+        self.words.nothing(why)
+
+
+def columns(*names: str) -> dict[str, list[Any]]:
+    """Return empty columns."""
+    return {name: [] for name in names}

@@ -1,0 +1,162 @@
+"""A scene played for the page: a push and what follows of it, and the bodies that move.
+
+Takes: a `CompiledSystem`.
+Gives: `Motion`, `Body`, `motion_of`; `STRUCK`.
+Guarantees: rows are those of `simulation`, some of them left out where more are not seen; what grows without
+end is shown until it has left the picture, and says so.
+Does not: draw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Column, CompiledSystem, Kind
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
+from apc.compiler.language.vectors import entry, whole_and_index
+from apc.present.planar import Disc, moves_in_plane, spots_of
+from apc.present.still import bodies_of, rows_of
+from apc.simulation.signals import sent_states
+from apc.simulation.trajectory import simulate
+
+Floats = NDArray[np.float64]
+
+# How fast the struck device starts, in m/s, and how long that is watched, in s, where the scene says nothing.
+STRUCK, WATCHED = 0.1, Fraction(1)
+# Rows that are shown: more are not seen.
+ROWS = 300
+# In m: what moves farther than this from where it started has left the picture.
+FAR = 1.0
+MM = 1e3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """A body of a peer: where it is (rows,) in mm, along its line or in its plane; `size` is half its width.
+
+    `row` counts the peers that are shown.
+    """
+
+    peer: str
+    name: str
+    row: int
+    x: Floats
+    y: Floats | None
+    size: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """What is seen of a scene: times (rows,) in s, bodies, and what stands still: (row, mm), or discs.
+
+    `told` says it in words; `others` is how many peers are not shown.
+    """
+
+    time: Floats
+    bodies: tuple[Body, ...]
+    walls: tuple[tuple[int, float], ...]
+    discs: tuple[tuple[float, float, float], ...]
+    told: tuple[str, ...]
+    others: int
+
+
+def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
+    """Play a scene: as it begins, or with the first peer's device struck besides.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    struck
+        Whether the first peer's device starts with `STRUCK`.
+
+    Raises
+    ------
+    ApcError
+        E983 nothing to strike or to see; those of `trajectory.simulate`.
+    """
+    planar = moves_in_plane(system)
+    rows: Sequence[Any] = rows_of(system, spots_of if planar else bodies_of)
+    told = []
+    if struck:
+        system, what = _struck(system)
+        told.append(f"{what} is struck: it starts at {STRUCK * MM:g} mm/s.")
+    names = [
+        f"{peer}.{one}"
+        for peer, bodies, _ in rows
+        for body in bodies
+        for one in _coordinates(system, peer, body)
+    ]
+    if not names:
+        raise ApcError(Mistake("E983", Place(system.name), "nothing here has a position that could be shown"))
+    duration = system.experiment.duration or WATCHED
+    played = simulate(system, duration=duration, signals=names)
+    values, time = played.values, played.time
+    apart = np.abs(values - values[0]).max(axis=1) > FAR
+    if apart.any():
+        last = max(int(np.argmax(apart)), 2)
+        values, time = values[:last], time[:last]
+        told.append(f"Shown until something is {FAR:g} m from where it began.")
+    some = np.unique(np.linspace(0, len(time) - 1, min(ROWS, len(time))).astype(int))
+    columns = {one.name: MM * values[some, place] for place, one in enumerate(played.signals)}
+    found = []
+    for row, (peer, bodies, _) in enumerate(rows):
+        for body in bodies:
+            own = [columns[f"{peer}.{one}"] for one in _coordinates(system, peer, body)]
+            size = MM * (body.radius if planar else body.half_width)
+            found.append(Body(peer, body.name, row, own[0], own[1] if planar else None, size))
+    fixed = [(row, one) for row, (_, _, walls) in enumerate(rows) for one in walls]
+    told.append(f"It {played.summary.verdict}.")
+    return Motion(
+        time=time[some],
+        bodies=tuple(found),
+        walls=tuple((row, MM * one.place) for row, one in fixed if not planar),
+        discs=tuple(
+            dict.fromkeys(
+                (MM * one.centre[0], MM * one.centre[1], MM * one.radius)
+                for _, one in fixed
+                if isinstance(one, Disc)
+            )
+        ),
+        told=tuple(told),
+        others=system.peers - len(rows),
+    )
+
+
+def _coordinates(system: CompiledSystem, peer: str, body: Any) -> list[str]:
+    """Return the signals that say where a body is: one, or the first two of a vector."""
+    group = next(one for one in system.groups if one.name == peer.partition("[")[0])
+    states = [one.name for one in system.kinds[group.kind].states if one.unit == "m"]
+    own = [one for one in states if whole_and_index(one)[0].rpartition(".")[0] == body.name]
+    wholes = [whole_and_index(one)[0] for one in own if whole_and_index(one)[1]]
+    return [entry(wholes[0], 1), entry(wholes[0], 2)] if wholes else own[:1]
+
+
+def _struck(system: CompiledSystem) -> tuple[CompiledSystem, str]:
+    """Return the scene with the first peer's device moving at the start, and the name of what moves."""
+    group = system.groups[0]
+    kind: Kind = system.kinds[group.kind]
+    sent = sent_states(kind)
+    moving = [place for place, one in enumerate(kind.states) if one.unit == "m/s"]
+    own = [place for place in moving if place not in sent] or moving
+    if not own:
+        raise ApcError(
+            Mistake("E983", Place(system.name), "nothing here has a velocity that a push could change")
+        )
+    state = kind.states[own[0]]
+    known = {column.name: column.values for column in group.columns}
+    present = [one.value for one in (*system.parameters, *group.values) if one.name == state.start][-1]
+    values = np.array(known.get(state.start, np.full(group.count, present)), dtype=np.float64)
+    values[0] += STRUCK
+    columns = (*(one for one in group.columns if one.name != state.start), Column(state.start, values))
+    changed = replace(group, columns=columns)
+    return replace(
+        system, groups=(changed, *system.groups[1:])
+    ), f"{group.name}[1].{state.name.rpartition('.')[0]}"

@@ -1,0 +1,421 @@
+"""The page: sliders to the left, and beside them what follows, redrawn as they move.
+
+Takes: a compiled model; a Bokeh document, one a tab.
+Gives: `Scene`, `scene_of`, `open_page`.
+Guarantees: whatever a slider says is what is computed; nothing is computed on the thread that serves the
+page; the link holds the values of the sliders that were moved, and a link with values opens with them.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from typing import Any
+from urllib.parse import quote
+
+from bokeh.document import Document
+from bokeh.events import Tap
+from bokeh.layouts import column, row
+from bokeh.models import Button, ColumnDataSource, CustomJS, CustomJSTickFormatter, Div, Select
+from bokeh.models import Slider as Handle
+
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.compiler.frozen import dataclass
+from apc.distribution import program_version
+from apc.explore.desk import Desk
+from apc.explore.figures import FOCUS, FeelFigure, MotionFigure, RegionFigure, RootsFigure, Words
+from apc.explore.sections import Task, Told
+from apc.explore.sliders import (
+    Slider,
+    axes_of,
+    overrides_of,
+    place_of,
+    set_to,
+    sliders_of,
+    with_value,
+)
+from apc.explore.written import with_values
+from apc.frame.names import Range
+from apc.frame.overrides import Override, apply
+from apc.present.forms import json_text
+from apc.processes import model_bytes
+from apc.vary.growth import MEAN_SQUARE, NOMINAL
+
+# Who computes what, first things first: what is redrawn while a slider moves waits for nothing else.
+QUICK, LATER = 0, 1
+DESKS = (("verdict", "region"), ("numbers", "roots", "motion", "feel", "margins", "network"))
+X, Y = "x", "y"  # arguments of the link: the sliders on the axes of the region
+STRUCK, BEGINS = "the first peer's device is struck", "as the scene begins"
+LIVE, SLOW = "every packet is on time", "packets as they are lost and late (takes long)"
+
+# Handles get their sliders' names, and say values as the page shows them.
+NAMED = """
+for (const slider of sliders) {
+  const handle = Bokeh.index.get_one(slider).shadow_el.querySelector('.noUi-handle')
+  handle.setAttribute('aria-label', slider.title)
+  const tell = () => {
+    const text = slider.format.compute(slider.value)
+    if (handle.getAttribute('aria-valuetext') !== text) handle.setAttribute('aria-valuetext', text)
+  }
+  new MutationObserver(tell).observe(handle, {attributeFilter: ['aria-valuetext']})
+  tell()
+}
+document.documentElement.dataset.ready = 'yes'
+"""
+# Browsers refuse more than a few changes of the link a second.
+LINKED = """
+clearTimeout(window.apc_link)
+window.apc_link = setTimeout(() => {
+  const token = new URLSearchParams(location.search).get('token')
+  history.replaceState(null, '', '?token=' + encodeURIComponent(token) + link.data.query[0])
+}, 250)
+"""
+
+
+# What is downloaded is handed to the page as a text, and from there to a file.
+SAVED = """
+const [name, text] = [out.data.name[0], out.data.text[0]]
+const link = document.createElement('a')
+link.href = URL.createObjectURL(new Blob([text]))
+link.download = name
+link.click()
+setTimeout(() => URL.revokeObjectURL(link.href), 1000)
+"""
+# The figures as they are seen, below each other.
+PICTURED = """
+const parts = plots.map(plot => Bokeh.index.get_one(plot).export('auto', true).canvas)
+const whole = document.createElement('canvas')
+whole.width = Math.max(...parts.map(one => one.width))
+whole.height = parts.reduce((sum, one) => sum + one.height, 0)
+const pen = whole.getContext('2d')
+pen.fillStyle = '#ffffff'
+pen.fillRect(0, 0, whole.width, whole.height)
+let top = 0
+for (const one of parts) { pen.drawImage(one, 0, top); top += one.height }
+whole.toBlob(blob => {
+  const link = document.createElement('a')
+  link.href = URL.createObjectURL(blob)
+  link.download = name
+  link.click()
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000)
+})
+"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What all tabs share: the scene, its bytes for those who compute, its sliders, what they are set to.
+
+    `text` is the topology, None where there is only a compiled model.
+    """
+
+    system: CompiledSystem
+    model: bytes
+    sliders: tuple[Slider, ...]
+    settings: tuple[str, ...]
+    text: str | None
+
+
+def scene_of(system: CompiledSystem, settings: Sequence[str], text: str | None) -> Scene:
+    """Return what the tabs of a scene share.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    settings
+        Numbers that are set at first, each `NAME=QUANTITY`.
+    text
+        The topology.
+
+    Raises
+    ------
+    ApcError
+        E980 a number without a slider; those of `overrides.parse_override` and `overrides.apply`.
+    """
+    sliders = sliders_of(system)
+    found = [set_to(system, sliders, one) for one in settings]
+    apply(system, [Override(sliders[place].free, value) for place, value in found])
+    return Scene(system, model_bytes(system), sliders, tuple(settings), text)
+
+
+def open_page(scene: Scene, document: Document) -> None:
+    """Fill the document of a new tab."""
+    Page(scene, document)
+
+
+class Page:
+    """One tab: its sliders and where they are, its figures, and who computes for it."""
+
+    def __init__(self, scene: Scene, document: Document) -> None:
+        self.scene, self.system, self.document = scene, scene.system, document
+        self.sliders, self.places = list(scene.sliders), [one.start for one in scene.sliders]
+        self.chosen = self._axes_at_first()
+        self.message = Words("message")
+        self.message.model.text = ""
+        for one in scene.settings:
+            self._start_at(one)
+        self._take_link(document.session_context.request.arguments)
+        self.verdict, self.margins, self.network = Words("verdict"), Words("margins"), Words("network")
+        self.region, self.roots = RegionFigure(), RootsFigure()
+        self.motion, self.feel = MotionFigure(), FeelFigure()
+        self.moving, self.last = False, self.chosen[0] if self.chosen else 0
+        self.link = ColumnDataSource({"query": [""]})
+        self.link.js_on_change("data", CustomJS(args={"link": self.link}, code=LINKED))
+        self.desks = [Desk(scene.model, order, self._later, self._deliver) for order in DESKS]
+        self._lay_out()
+        document.on_session_destroyed(lambda session_context: self._close())
+        self._moved()
+
+    def _axes_at_first(self) -> list[int]:
+        """Return the sliders on the axes of the region: those the scene studies come first."""
+        return [place for place, one in enumerate(self.sliders) if one.span is not None][:2]
+
+    def _take_link(self, arguments: Mapping[str, list[bytes]]) -> None:
+        """Set the sliders as the link says."""
+        wrong = []
+        for name, values in arguments.items():
+            text = values[-1].decode("utf-8", "replace")
+            if name in (X, Y):
+                axes = [place for place, one in enumerate(self.sliders) if one.span and one.label == text]
+                self.chosen["xy".index(name)] = (axes or self.chosen)[0]
+            elif name not in ("token", "bokeh-session-id"):
+                try:
+                    self._start_at(f"{name}={text}")
+                except ApcError as error:
+                    wrong += [one.sentence for one in error.mistakes]
+        if wrong:
+            self.message.say("The link says what can't be:", *wrong)
+
+    def _start_at(self, setting: str) -> None:
+        """Set a slider before the page is shown; its value need be none that the slider had."""
+        place, value = set_to(self.system, self.sliders, setting)
+        apply(self.system, [Override(self.sliders[place].free, value)])
+        self.sliders[place], self.places[place] = with_value(self.sliders[place], value)
+
+    def _lay_out(self) -> None:
+        self.handles = [self._handle(place) for place in range(len(self.sliders))]
+        names = [one.label for one in self.sliders if one.span is not None]
+        self.selects = [
+            Select(title=f"Region: {way} axis", value=self.sliders[place].label, options=names, width=250)
+            for way, place in zip(("horizontal", "vertical"), self.chosen, strict=True)
+        ]
+        for select in self.selects:
+            select.on_change("value", lambda attr, old, new: self._choose())
+        self.region.plot.on_event(Tap, self._tapped)
+        duration = self.system.experiment.duration
+        self.begins = Select(
+            title="What is played",
+            options=[STRUCK, BEGINS],
+            value=BEGINS if duration else STRUCK,
+            stylesheets=[FOCUS],
+        )
+        self.begins.on_change("value", lambda attr, old, new: self._moved())
+        self.meant = Select(title="Stable, where", options=[LIVE, SLOW], value=LIVE, stylesheets=[FOCUS])
+        self.meant.on_change("value", lambda attr, old, new: self._moved())
+        controls: list[Any] = [self.message.model, *self.selects]
+        if any(link.channel is not None for link in self.system.links):
+            controls.append(self.meant)
+        controls.append(row(*self._buttons(), sizing_mode="stretch_width"))
+        for kind in dict.fromkeys(one.kind for one in self.sliders):
+            heading = Div(text=f"<h2 style='font-size:15px;margin:10px 0 0'>{kind.capitalize()}</h2>")
+            own = [handle for handle, one in zip(self.handles, self.sliders, strict=True) if one.kind == kind]
+            controls += [heading, *own]
+        region, roots, motion, feel = self.region, self.roots, self.motion, self.feel
+        roots_of_page: dict[str, Any] = {
+            "controls": _below(*controls, tags=[self.link, self.out]),
+            "verdict": self.verdict.model,
+            "margins": self.margins.model,
+            "region": _below(region.plot, region.words.model),
+            "roots": _below(roots.plot, roots.words.model, roots.way_words.model),
+            "motion": _below(
+                self.begins,
+                motion.stage,
+                row(motion.play, motion.time, sizing_mode="stretch_width"),
+                motion.plot,
+                motion.words.model,
+            ),
+            "feel": _below(feel.plot, feel.phase, feel.words.model),
+            "network": self.network.model,
+        }
+        for name, root in roots_of_page.items():
+            root.name = name
+            self.document.add_root(root)
+        self.document.js_on_event(
+            "document_ready", CustomJS(args={"sliders": [*self.handles, self.motion.time]}, code=NAMED)
+        )
+        self.document.title = f"{self.system.name} · apc"
+        self.document.template = files("apc.explore").joinpath("page.html").read_text(encoding="utf-8")
+        self.document.template_variables["about"] = self.system.about
+
+    def _buttons(self) -> list[Button]:
+        """Return the buttons that download the topology, the picture and the numbers."""
+        self.out = ColumnDataSource({"name": [""], "text": [""]})
+        self.out.js_on_change("data", CustomJS(args={"out": self.out}, code=SAVED))
+        topology, picture, numbers = (
+            Button(
+                label=label, stylesheets=[FOCUS], name=f"save-{label.lower()}", sizing_mode="stretch_width"
+            )
+            for label in ("Topology", "Picture", "Numbers")
+        )
+        topology.on_click(self._save_topology)
+        plots = [self.region.plot, self.roots.plot, self.motion.plot, self.feel.plot, self.feel.phase]
+        name = f"{self.system.name}.png"
+        picture.js_on_event("button_click", CustomJS(args={"plots": plots, "name": name}, code=PICTURED))
+        numbers.on_click(self._ask_numbers)
+        return [topology, picture, numbers]
+
+    def _save_topology(self) -> None:
+        """Hand over the topology with the values of the sliders."""
+        if self.scene.text is None:
+            self.message.say("There is no topology beside this compiled model, whose text could be given.")
+            return
+        values = {one.free: one.texts[place] for one, place in self._pairs() if place != one.start}
+        text = with_values(self.scene.text, self.system, values)
+        self.out.data = {"name": [f"{self.system.name}.yaml"], "text": [text]}
+
+    def _ask_numbers(self) -> None:
+        """Have the numbers computed that are downloaded."""
+        overrides = tuple(overrides_of(self.sliders, self.places))
+        self.desks[LATER].forget("numbers")  # who asks twice wants two files
+        self._ask("numbers", overrides, self._region_asked())
+
+    def _save_numbers(self, found: Mapping[str, Any]) -> None:
+        values = {one.label: one.texts[place] for one, place in self._pairs()}
+        told = {"topology": self.system.name, "apc": program_version(), "set": values, **found}
+        self.out.data = {"name": [f"{self.system.name}.json"], "text": [json_text(told)]}
+
+    def _pairs(self) -> list[tuple[Slider, int]]:
+        return list(zip(self.sliders, self.places, strict=True))
+
+    def _handle(self, place: int) -> Handle:
+        """Return the slider of a number, which counts its values."""
+        one = self.sliders[place]
+        texts = [text.replace("*", "·") for text in one.texts]
+        handle = Handle(
+            start=0,
+            end=max(len(texts) - 1, 1),
+            step=1,
+            value=self.places[place],
+            title=one.label,
+            format=CustomJSTickFormatter(args={"texts": texts}, code="return texts[Math.round(tick)]"),
+            tooltips=False,
+            sizing_mode="stretch_width",
+            stylesheets=[FOCUS],
+            disabled=len(texts) == 1,
+        )
+        handle.on_change("value", lambda attr, old, new: self._set({place: round(new)}))
+        return handle
+
+    def _set(self, places: Mapping[int, int]) -> None:
+        """Take the values of sliders that were moved, and move those that were not moved by hand."""
+        if self.moving:
+            return
+        for number, place in places.items():
+            self.places[number], self.last = place, number
+        self.moving = True
+        for number, place in places.items():
+            self.handles[number].value = place
+        self.moving = False
+        self._moved()
+
+    def _tapped(self, event: Any) -> None:
+        """Set the sliders of both axes to where the region was clicked."""
+        pairs = zip(self.chosen, (event.x, event.y), strict=True)
+        self._set({number: place_of(self.sliders[number], at) for number, at in pairs})
+
+    def _choose(self) -> None:
+        """Take other axes for the region."""
+        labels = [one.label for one in self.sliders]
+        self.chosen = [labels.index(select.value) for select in self.selects]
+        self._moved()
+
+    def _moved(self) -> None:
+        """Ask for everything anew."""
+        overrides = tuple(overrides_of(self.sliders, self.places))
+        moved = self.sliders[self.last]
+        others = tuple(one for one in overrides if one.free != moved.free)
+        self._ask("verdict", overrides)
+        self._ask("roots", others, (moved.free, moved.values))
+        self._ask_region(overrides)
+        self._ask("motion", overrides, self.begins.value == STRUCK)
+        for section in ("feel", "margins", "network"):
+            self._ask(section, overrides)
+        self.link.data = {"query": [self._query()]}
+
+    def _ask_region(self, overrides: tuple[Override, ...]) -> None:
+        """Ask for the region, if there are two axes: nobody waits for it where it takes long."""
+        asked, region = self._region_asked(), self.desks[QUICK]
+        if asked is None:
+            region.forget("region")
+            self.region.clear("A region has two different parameters: choose another one for an axis.")
+            return
+        # What stands on an axis has all its values there.
+        others = tuple(one for one in overrides if one.free not in (asked[0].free, asked[1].free))
+        region.ask(Task("region", others, asked))
+        self.region.mark(*(float(self.sliders[one].values[self.places[one]]) for one in self.chosen))
+
+    def _region_asked(self) -> tuple[Range, Range, str] | None:
+        """Return the axes of the region, and what stable means there; None if there are no two axes."""
+        if len(set(self.chosen)) < 2:
+            return None
+        axes = axes_of(self.sliders, self.places, (self.chosen[0], self.chosen[1]))
+        return (*axes, NOMINAL if self.meant.value == LIVE else MEAN_SQUARE)
+
+    def _ask(self, section: str, overrides: tuple[Override, ...], asked: Any = None) -> None:
+        desk = next(desk for desk in self.desks if section in desk.order)
+        desk.ask(Task(section, overrides, asked))
+
+    def _close(self) -> None:
+        """End those who compute for this tab."""
+        for desk in self.desks:
+            desk.close()
+
+    def _query(self) -> str:
+        """Return the part of the link that holds values and axes."""
+        pairs = [(one.label, one.texts[place]) for one, place in self._pairs() if place != one.start]
+        pairs += [
+            (name, self.sliders[number].label) for name, number in zip((X, Y), self.chosen, strict=True)
+        ]
+        return "".join(f"&{quote(name)}={quote(text, safe='')}" for name, text in pairs)
+
+    def _later(self, call: Any) -> None:
+        """Call on the thread of the page; a page that is closed by then is told nothing more."""
+        self.document.add_next_tick_callback(call)
+
+    def _deliver(self, section: str, told: Told) -> None:
+        """Show what a section tells."""
+        found = told.found
+        match section:
+            case "verdict" if found is not None:
+                self.verdict.verdict(found)
+                self.roots.show(found)
+            case "roots" if found is not None:
+                self.roots.way_of(found)
+            case "region" if found is not None:
+                self.region.show(found)
+            case "motion" if found is not None:
+                self.motion.show(found["motion"])
+            case "feel" if found is not None:
+                self.feel.show(found)
+            case "numbers" if found is not None:
+                self._save_numbers(found)
+            case "margins" | "network" if found is not None:
+                self._words(section).table(found["text"])
+            case "region":
+                self.region.clear(told.why)
+            case "feel":
+                self.feel.clear(told.why)
+            case _:
+                self._words(section).nothing(told.why)
+
+    def _words(self, section: str) -> Words:
+        words = {"verdict": self.verdict, "roots": self.roots.way_words, "motion": self.motion.words}
+        return (words | {"margins": self.margins, "network": self.network}).get(section, self.message)
+
+
+def _below(*models: Any, tags: Sequence[Any] = ()) -> Any:
+    """Return models below each other, as wide as their place."""
+    return column(*models, sizing_mode="stretch_width", tags=list(tags))

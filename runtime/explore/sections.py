@@ -1,0 +1,253 @@
+"""What each section of the page shows, computed where the page doesn't wait for it.
+
+Takes: a compiled model as bytes, and a `Task`: a section, the numbers that were moved, what it is asked.
+Gives: `Task`, `Told`, `compute`; `SECTIONS`.
+Guarantees: every number is one that the function of the public API gives; a section that a scene has nothing
+for says so in words; what is at fault is told as `apc` tells it.
+Does not: know the browser, or keep an answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
+from apc.compiler.words import in_hertz
+from apc.eigen.spectrum import Mode
+from apc.explore.motion import motion_of
+from apc.explore.sliders import text_of
+from apc.finite_equations import finite_equations
+from apc.frame.names import Free, Range, unit_of
+from apc.frame.overrides import Override, apply
+from apc.hands.asked import read_frequencies
+from apc.hands.feel import feel
+from apc.moments.network import judge_network
+from apc.present.region_picture import drawn_points, stable_outlines
+from apc.processes import model_of_bytes
+from apc.regions.region import region
+from apc.threads import single_threaded
+from apc.vary.critical import critical
+from apc.vary.evaluator import evaluator, reaches_count, reaches_time
+from apc.vary.growth import MEAN_SQUARE
+from apc.vary.margins import margins
+
+# How far a boundary that is drawn may be off, relative to a coordinate: nobody sees less.
+DRAWN = 1e-5
+# Frequencies at which it is told what a hand feels, and the lowest.
+FREQUENCIES, LOWEST = 120, "0.1 Hz"
+# Values of a slider at which eigenvalues are found; of a time or a count, where each takes an analysis.
+ROOTS, FEW_ROOTS = 61, 16
+EMPTY = np.zeros(0, dtype=np.complex128)
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What is to be computed: a section, the numbers that were moved, and what else the section asks."""
+
+    section: str
+    overrides: tuple[Override, ...]
+    asked: Any = None
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What a section has to show, as plain data and arrays; None with the reason in `why`."""
+
+    found: Mapping[str, Any] | None
+    why: str = ""
+
+
+@lru_cache(maxsize=1)
+def _opened(model: bytes) -> tuple[CompiledSystem, Prepared]:
+    """Return the scene of a page, and what all its analyses share."""
+    system = model_of_bytes(model)
+    return system, prepare(system)
+
+
+def compute(model: bytes, task: Task) -> Told:
+    """Return what a section shows.
+
+    Parameters
+    ----------
+    model
+        The compiled model, from `processes.model_bytes`.
+    task
+        What is asked.
+    """
+    try:
+        system, prepared = _opened(model)
+        changed = apply(system, task.overrides)
+        return Told(SECTIONS[task.section](changed, prepared, task.asked))
+    except ApcError as error:
+        return Told(None, "\n".join(one.sentence for one in error.mistakes))
+
+
+def _verdict(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, Any]:
+    found = analyze(system, prepared=prepared)
+    values = np.array([mode.eigenvalue for mode in found.modes], dtype=np.complex128)
+    return {
+        "verdict": found.verdict + (", linearized" if found.linearized else ""),
+        "stable": found.stable,
+        "radius": found.spectral_radius,
+        "limits": _limits(found),
+        "notes": found.left_out,
+        "text": str(found),
+        "real": values.real,
+        "imag": values.imag,
+        "names": [_named(mode) for mode in found.modes],
+    }
+
+
+def _named(mode: Mode) -> str:
+    at = "" if np.isnan(mode.frequency_hz) else f" at {in_hertz(mode.frequency_hz)}"
+    return f"{mode.shape}{at}"
+
+
+def _limits(found: Analysis) -> str:
+    """Return in a sentence which motion decides the verdict."""
+    if not found.modes:
+        return "Nothing moves."
+    leading = found.modes[0]
+    parts = sorted(leading.participation, key=lambda one: -one[1])[:2]
+    moves = " and ".join(name for name, _ in parts)
+    changes = "grows" if leading.magnitude > 1 else "dies out most slowly"
+    times = f"by {leading.magnitude:.6g} each {found.frame_s * 1e3:.6g} ms"
+    return f"{_named(leading)[0].upper()}{_named(leading)[1:]} {changes}, {times}: mostly {moves}."
+
+
+def _region(system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Range, str]) -> dict[str, Any]:
+    x, y, criterion = asked
+    found = region(system, (x, y), tolerance=DRAWN, criterion=criterion, prepared=prepared)
+    return {
+        "outlines": stable_outlines(found),
+        "curves": [drawn_points(found, number) for number in range(len(found.curves))],
+        "x": (x.free.label, x.unit, float(x.low), float(x.high)),
+        "y": (y.free.label, y.unit, float(y.low), float(y.high)),
+        "share": found.stable_area / float(found.rectangle.width.prod()),
+        "notes": found.left_out,
+        "stepped": found.stepped,
+    }
+
+
+def _roots(
+    system: CompiledSystem, prepared: Prepared, asked: tuple[Free, tuple[Fraction, ...]]
+) -> dict[str, Any]:
+    """Return the eigenvalues at values of a slider: from matrices in rows, or one analysis after another."""
+    free, values = asked
+    if reaches_time(system, free) or reaches_count(system, free):
+        some = _thinned(values, FEW_ROOTS)
+        rows = [_eigenvalues(system, prepared, Override(free, one)) for one in some]
+    else:
+        some = _thinned(values, ROOTS)
+        with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
+            source = evaluator(system, [free], prepared=prepared)
+            matrices = source.matrices(np.array(some, np.float64)[:, None])
+            rows = [_roots_of([one[row] for one in matrices]) for row in range(len(some))]
+    found = np.concatenate(rows)
+    return {
+        "real": found.real,
+        "imag": found.imag,
+        "name": [
+            text_of(one, unit_of(system, free.name)) for one, row in zip(some, rows, strict=True) for _ in row
+        ],
+        "slider": free.label,
+        "from": text_of(some[0], unit_of(system, free.name)),
+        "to": text_of(some[-1], unit_of(system, free.name)),
+    }
+
+
+def _roots_of(matrices: Sequence[NDArray[np.float64]]) -> NDArray[np.complex128]:
+    """Return the eigenvalues of all matrices that there are."""
+    return np.concatenate([EMPTY, *(np.linalg.eigvals(one) for one in matrices if np.isfinite(one).all())])
+
+
+def _thinned(values: Sequence[Fraction], most: int) -> list[Fraction]:
+    """Return so many of the values at most, the first and the last among them."""
+    places = np.unique(np.linspace(0, len(values) - 1, min(most, len(values))).astype(int))
+    return [values[place] for place in places.tolist()]
+
+
+def _eigenvalues(system: CompiledSystem, prepared: Prepared, override: Override) -> NDArray[np.complex128]:
+    """Return the eigenvalues of an analysis; none where the value can't be."""
+    try:
+        found = analyze(apply(system, [override]), prepared=prepared)
+    except ApcError:
+        return EMPTY
+    return np.array([mode.eigenvalue for mode in found.modes], dtype=np.complex128)
+
+
+def _margins(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, Any]:
+    return {"text": str(margins(system, prepared=prepared))}
+
+
+def _motion(system: CompiledSystem, _: Prepared, struck: bool) -> dict[str, Any]:
+    return {"motion": motion_of(system, struck=struck)}
+
+
+def _feel(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, Any]:
+    frequencies = read_frequencies(system, None, LOWEST, None, FREQUENCIES)
+    found = feel(system, frequencies, quick=True, prepared=prepared)
+    return {
+        "at": found.at,
+        "frequency": found.frequency_hz,
+        "magnitude": np.abs(found.impedance),
+        "phase": np.degrees(np.angle(found.impedance)),
+        "notes": (*found.notes, *found.left_out),
+    }
+
+
+def _network(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, Any]:
+    """Return the verdict over the network, and the loss and the jitter of each link at which it changes."""
+    links = [link for link in system.links if link.channel is not None]
+    if not links:
+        name = system.links[0].name if system.links else "lan"
+        what = "no link here loses packets or delays them by chance: there is nothing to look for"
+        hint = f"links: {{{name}: {{…, loss: 1 %, jitter: 1 ms}}}}"
+        raise ApcError(Mistake("E984", Place(system.name), what, hint=hint))
+    verdict = judge_network(system, prepared)
+    texts = ["Here packets are always on time." if verdict is None else str(verdict)]
+    for link in links:
+        assert link.channel is not None
+        loss, jitter = link.channel.loss, link.channel.jitter
+        names = [loss.p if loss else None, jitter]
+        texts += [_critical(system, name) for name in names if name is not None]
+    return {"text": "\n\n".join(texts)}
+
+
+def _critical(system: CompiledSystem, name: str) -> str:
+    try:
+        return str(critical(system, name, criterion=MEAN_SQUARE))
+    except ApcError as error:
+        return f"{name}: {error.mistakes[0].sentence}"
+
+
+def _numbers(
+    system: CompiledSystem, prepared: Prepared, asked: tuple[Range, Range, str] | None
+) -> dict[str, Any]:
+    """Return what is downloaded: the analysis and the region as `--json` prints them."""
+    told = {"analyze": analyze(system, prepared=prepared).to_dict()}
+    if asked is not None:
+        x, y, criterion = asked
+        told["region"] = region(system, (x, y), criterion=criterion, prepared=prepared).to_dict()
+    return told
+
+
+SECTIONS: dict[str, Callable[[CompiledSystem, Prepared, Any], dict[str, Any]]] = {
+    "verdict": _verdict,
+    "region": _region,
+    "roots": _roots,
+    "margins": _margins,
+    "motion": _motion,
+    "feel": _feel,
+    "network": _network,
+    "numbers": _numbers,
+}

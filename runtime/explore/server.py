@@ -1,0 +1,133 @@
+"""The server of a page: on this machine alone, for whoever has the link.
+
+Takes: what makes a document for each tab; a port.
+Gives: `serve`, `bound`.
+Guarantees: it listens on the loopback interface; a request without the link's token, or that comes from a
+page of another origin, is refused, on whatever path of the page; no file is served but the program's own
+scripts; a tab's session can't be entered from another.
+Does not: know what the page shows.
+"""
+
+from __future__ import annotations
+
+import errno
+import hmac
+import logging
+import secrets
+import signal
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from bokeh.application import Application
+from bokeh.application.handlers.function import FunctionHandler
+from bokeh.document import Document
+from bokeh.server.auth_provider import AuthProvider
+from bokeh.server.server import BaseServer
+from bokeh.server.tornado import BokehTornado
+from bokeh.server.util import bind_sockets
+from tornado.httpserver import HTTPServer
+from tornado.ioloop import IOLoop
+from tornado.web import HTTPError
+
+from apc.compiler.errors import ApcError, Mistake, Place
+
+HOST = "127.0.0.1"
+TOKEN = "token"  # the argument of the link that holds it
+
+# How often it is looked for tabs that were closed, and after how long they count as such, in ms.
+LOOKED, CLOSED = 2_000, 10_000
+
+
+class Gate(AuthProvider):  # type: ignore[misc] # Bokeh's types are not looked at
+    """Lets in whoever has the token, and no page of another origin."""
+
+    def __init__(self, address: str, token: str) -> None:
+        self.address, self.token = address, token
+        super().__init__()
+
+    @property
+    def get_user_async(self) -> Callable[[Any], Awaitable[str]]:
+        """What Bokeh asks of every request for the page, its data and its socket, before it looks at it."""
+        return self._user
+
+    @property
+    def login_url(self) -> str:
+        """Where Bokeh would send whoever `get_user_async` does not let in; it refuses them instead."""
+        return "/"
+
+    async def _user(self, handler: Any) -> str:
+        request, own = handler.request, f"http://{self.address}"
+        if request.host != self.address or request.headers.get("Origin", own) != own:
+            raise HTTPError(403, reason=f"This page is {own} and no other")
+        given = handler.get_query_argument(TOKEN, "")
+        if not hmac.compare_digest(given.encode(), self.token.encode()):
+            raise HTTPError(
+                403, reason="The link that apc explore printed has the token that is missing here"
+            )
+        return "user"
+
+
+def bound(make: Callable[[Document], None], port: int) -> tuple[BaseServer, str]:
+    """Return a server that listens, and the link to it.
+
+    Parameters
+    ----------
+    make
+        Fills the document of a new tab.
+    port
+        Where to listen; any free one if 0.
+
+    Raises
+    ------
+    ApcError
+        E982 the port is taken, or not ours to take.
+    """
+    try:
+        sockets, port = bind_sockets(HOST, port)
+    except OSError as error:
+        why = {errno.EADDRINUSE: "is taken", errno.EACCES: "may not be taken by you"}
+        what = f"port {port} {why.get(error.errno or 0, f'can not be used: {error.strerror}')}"
+        raise ApcError(Mistake("E982", Place("--port"), what, hint="--port 0  (any that is free)")) from None
+    token, address = secrets.token_urlsafe(24), f"{HOST}:{port}"
+    application = BokehTornado(
+        {"/": Application(FunctionHandler(make))},
+        absolute_url=f"http://{address}/",
+        extra_websocket_origins=[address],
+        auth_provider=Gate(address, token),
+        sign_sessions=True,
+        secret_key=secrets.token_bytes(32),
+        check_unused_sessions_milliseconds=LOOKED,
+        unused_session_lifetime_milliseconds=CLOSED,
+        include_headers=[],
+        include_cookies=[],
+    )
+    http = HTTPServer(application)
+    http.add_sockets(sockets)
+    return BaseServer(IOLoop.current(), application, http), f"http://{address}/?{TOKEN}={token}"
+
+
+def run(server: BaseServer, link: str, *, browser: bool) -> None:
+    """Serve until Ctrl-C, or until somebody ends this process.
+
+    Parameters
+    ----------
+    server, link
+        As `bound` returns them.
+    browser
+        Whether to open the link.
+    """
+    import webbrowser
+
+    # Who is refused is told so; the terminal is not, nor of tabs that close, and no token is printed again.
+    for name in ("tornado.access", "tornado.general", "bokeh.server.views.ws"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    if browser:
+        server.io_loop.add_callback(webbrowser.open, link)
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    server.start()
+    try:
+        server.io_loop.start()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        server.stop()

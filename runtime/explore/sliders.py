@@ -1,0 +1,297 @@
+"""Which numbers of a scene have a slider, and the values that each can be set to.
+
+Takes: a `CompiledSystem`.
+Gives: `Slider`, `sliders_of`, `set_to`, `with_value`; `text_of`, `place_of`, `overrides_of`, `axes_of`.
+Guarantees: every value is an exact rational within the parameter's bounds, and the scene's own is among them;
+what a slider says of a value, `apc --set` takes.
+Does not: draw, or analyse.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from math import ceil, floor, lcm, log10
+
+from apc.compiler.compiled import CompiledSystem, group_count
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.frozen import dataclass
+from apc.compiler.words import with_unit
+from apc.frame.names import Free, Range, named_times, parameter_of, unit_of
+from apc.frame.overrides import Override, parse_override
+from apc.vary.evaluator import free_parameters
+
+# How many values a slider has at most: one a pixel of its length, no more can be told apart by hand.
+STEPS = 200
+# A positive number runs over so many decades to either side of its value; with so many values a decade.
+DECADES, A_DECADE = 2, 48
+# Digits of a value on a logarithmic slider.
+DIGITS = 3
+# Frames of more ticks than this take longer than a slider may.
+MOST_TICKS = 200
+# A clock's periods are these multiples and shares of the other clocks' periods.
+RATIOS = 16
+# Beyond the present value, as a share of it, a range goes on at least so far.
+ROOM = Fraction(3)
+# Fewest and most peers of a group, beyond the present count.
+COUNTS = 4
+
+PARAMETERS, TIMES, PEOPLE = "parameters", "delays and periods", "users"
+
+
+@dataclass(frozen=True, slots=True)
+class Slider:
+    """A number with its values, in SI, rising, and what each is called; `start` is the place of the scene's.
+
+    `kind` is one of `PARAMETERS`, `TIMES` and `PEOPLE`; `span` is the range an axis of a region has, None
+    where it can't be one.
+    """
+
+    free: Free
+    unit: str
+    kind: str
+    about: str
+    values: tuple[Fraction, ...]
+    texts: tuple[str, ...]
+    start: int
+    span: tuple[Fraction, Fraction] | None
+
+    @property
+    def label(self) -> str:
+        """The name as `--set` takes it."""
+        return self.free.label
+
+
+def sliders_of(system: CompiledSystem) -> tuple[Slider, ...]:
+    """Return the sliders of a scene: what follows from no other number, and each group's number of peers.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers that the sliders begin with.
+    """
+    starts = {state.start for kind in system.kinds for state in kind.states}
+    starts |= {name for kind in system.kinds for clock in kind.clocks for name in clock.starts}
+    studied = {axis.parameter: (axis.low, axis.high) for axis in system.region}
+    found = []
+    for free in free_parameters(system):
+        one = parameter_of(system, free)
+        if free.name in starts and one.value == 0:
+            continue  # where nothing is said of a start, nobody looks for a slider of it
+        low, high = _bounds(system, free)
+        span = studied.get(free.label) or _span(system, free, one.number, low, high)
+        if one.value > 0 and one.unit != "1" and free.label not in studied:
+            values = _decades(one.number, low, high)
+        else:
+            values = _even(one.number, *_within(span, one.number), low, high)
+        found.append(_slider(system, free, PARAMETERS, one.about, values, one.number, span))
+    found.sort(key=lambda one: one.label not in studied)
+    return (*found, *_times(system, studied), *_people(system))
+
+
+def _slider(
+    system: CompiledSystem,
+    free: Free,
+    kind: str,
+    about: str,
+    values: Iterable[Fraction],
+    now: Fraction,
+    span: tuple[Fraction, Fraction] | None,
+) -> Slider:
+    unit = unit_of(system, free.name)
+    listed = tuple(sorted({*values, now}))
+    texts = tuple(text_of(one, unit) for one in listed)
+    return Slider(free, unit, kind, about, listed, texts, listed.index(now), span)
+
+
+def text_of(value: Fraction, unit: str) -> str:
+    """Return a value as `--set` takes it; a time in milliseconds."""
+    if unit == "s":
+        return f"{_digits(value * 1000)} ms"
+    return with_unit(_digits(value), unit)
+
+
+def _digits(value: Fraction) -> str:
+    """Return a number as the language reads it: the same rational again."""
+    near = f"{float(value):.12g}"
+    return near if Fraction(near) == value else repr(float(value)) if _is_float(value) else str(value)
+
+
+def _is_float(value: Fraction) -> bool:
+    return Fraction(repr(float(value))) == value
+
+
+def _bounds(system: CompiledSystem, free: Free) -> tuple[Fraction | None, Fraction | None]:
+    """Return the least and the largest value a parameter may have; above an open bound, a little more."""
+    one = parameter_of(system, free)
+    low = None if one.minimum is None else Fraction(repr(one.minimum))
+    if low is not None and one.open_minimum:
+        low += abs(one.number - low) / 10**DECADES
+    return low, None if one.maximum is None else Fraction(repr(one.maximum))
+
+
+def _span(
+    system: CompiledSystem, free: Free, now: Fraction, low: Fraction | None, high: Fraction | None
+) -> tuple[Fraction, Fraction]:
+    """Return a range around a value: all that it may be, or to `ROOM` times it, below 0 too if it may."""
+    if low is not None and high is not None:
+        return low, high
+    alike = [abs(one.number) for one in system.parameters if one.unit == unit_of(system, free.name)]
+    size = abs(now) or max(alike, default=Fraction(0)) or Fraction(1)
+    least = -ROOM * size if low is None else low
+    most = _nice(ROOM * size)
+    return least, min(most, high) if high is not None else most
+
+
+def _within(span: tuple[Fraction, Fraction], value: Fraction) -> tuple[Fraction, Fraction]:
+    return min(span[0], value), max(span[1], value)
+
+
+def _nice(value: Fraction) -> Fraction:
+    """Return a positive number rounded up to two digits."""
+    unit = Fraction(10) ** (floor(log10(float(value))) - 1)
+    return ceil(value / unit) * unit
+
+
+def _even(
+    now: Fraction, least: Fraction, most: Fraction, low: Fraction | None, high: Fraction | None
+) -> list[Fraction]:
+    """Return values in even steps of a round size."""
+    exact = (most - least) / STEPS
+    power = Fraction(10) ** floor(log10(float(exact)))
+    step = next(power * one for one in (1, 2, 5, 10) if power * one >= exact)
+    values = [step * k for k in range(ceil(least / step), floor(most / step) + 1)]
+    ends = [one for one in (least, most) if (low is None or one >= low) and (high is None or one <= high)]
+    return [*values, *ends, now]
+
+
+def _decades(now: Fraction, low: Fraction | None, high: Fraction | None) -> list[Fraction]:
+    """Return values of few digits, even on a logarithmic scale."""
+    middle = log10(float(now))
+    count = DECADES * A_DECADE
+    listed = [Fraction(f"{10 ** (middle + k / A_DECADE):.{DIGITS}g}") for k in range(-count, count + 1)]
+    return [one for one in listed if (low is None or one >= low) and (high is None or one <= high)]
+
+
+def _times(system: CompiledSystem, studied: dict[str, tuple[Fraction, Fraction]]) -> list[Slider]:
+    """Return the sliders of delays, phases and periods that follow from nothing."""
+    periods = {clock.period: clock for clock in system.clocks}
+    phases = {clock.phase: clock for clock in system.clocks}
+    now = {timing.name: timing.value for timing in system.timings}
+    longest = max((now[name] for name in periods), default=Fraction(1))
+    found = []
+    for timing in named_times(system):
+        free, value = Free(timing.name), timing.value
+        if timing.formula is not None:
+            continue
+        span = None
+        if timing.name in periods:
+            about, values = (
+                "from tick to tick",
+                _periods(value, [now[p] for p in periods if p != timing.name]),
+            )
+        elif timing.name in phases:
+            period = now[phases[timing.name].period]
+            about, values = "of the first tick", [period * k / 20 for k in range(20)]
+        else:
+            about = _about(system, timing.name)
+            span = studied.get(timing.name, (Fraction(0), _nice(max(ROOM * value, 4 * longest))))
+            values = _even(value, *_within(span, value), Fraction(0), None)
+        found.append(_slider(system, free, TIMES, about, values, value, span))
+    return sorted(found, key=lambda one: (one.span is None, one.free.name in phases))
+
+
+def _about(system: CompiledSystem, name: str) -> str:
+    return next((one.about for one in system.parameters if one.name == name), "")
+
+
+def _periods(now: Fraction, others: Sequence[Fraction]) -> list[Fraction]:
+    """Return periods with which frames stay short: multiples and shares of the other clocks'."""
+    if not others:
+        return _decades(now, None, None)
+    listed = {other * k for other in others for k in range(1, RATIOS + 1)}
+    listed |= {other / k for other in others for k in range(1, RATIOS + 1)}
+    return [
+        one
+        for one in listed
+        if now / 10 <= one <= now * 10 and _frame([one, *others]) / min(one, *others) <= MOST_TICKS
+    ]
+
+
+def _frame(periods: Sequence[Fraction]) -> Fraction:
+    """Return the least common multiple of periods."""
+    below = lcm(*(one.denominator for one in periods))
+    return Fraction(lcm(*(int(one * below) for one in periods)), below)
+
+
+def _people(system: CompiledSystem) -> list[Slider]:
+    """Return the sliders of how many peers groups have, where that is no list of their own numbers."""
+    found = []
+    for group in system.groups:
+        free = Free(group_count(group.name))
+        one = parameter_of(system, free)
+        if group.columns or one.formula is not None:
+            continue
+        least = 2 if len(system.groups) == 1 else 1
+        most = COUNTS * max(group.count, 3)
+        values = [Fraction(k) for k in range(least, most + 1)]
+        span = (Fraction(least), Fraction(most))
+        about = f"how many peers {group.name} has"
+        found.append(_slider(system, free, PEOPLE, about, values, Fraction(group.count), span))
+    return found
+
+
+def place_of(slider: Slider, value: Fraction | float) -> int:
+    """Return the place of the value of a slider that is nearest."""
+    after = bisect_left(slider.values, value)
+    places = [one for one in (after - 1, after) if 0 <= one < len(slider.values)]
+    return min(places, key=lambda one: abs(slider.values[one] - Fraction(value)))
+
+
+def set_to(system: CompiledSystem, sliders: Sequence[Slider], text: str) -> tuple[int, Fraction]:
+    """Return which slider `NAME=QUANTITY` sets, and to what.
+
+    Raises
+    ------
+    ApcError
+        E980 what is set has no slider; and those of `overrides.parse_override`.
+    """
+    found = parse_override(system, text)
+    for place, one in enumerate(sliders):
+        if one.free == found.free:
+            return place, found.value
+    what = f"{found.free.label} has no slider: it follows from other numbers, or differs from peer to peer"
+    raise ApcError(Mistake("E980", Place("explore"), what))
+
+
+def with_value(slider: Slider, value: Fraction) -> tuple[Slider, int]:
+    """Return a slider that has a value, and the value's place; it begins where it did."""
+    listed = tuple(sorted({*slider.values, value}))
+    texts = tuple(text_of(one, slider.unit) for one in listed)
+    start = listed.index(slider.values[slider.start])
+    return replace(slider, values=listed, texts=texts, start=start), listed.index(value)
+
+
+def overrides_of(sliders: Sequence[Slider], places: Sequence[int]) -> list[Override]:
+    """Return what sets the sliders that were moved."""
+    return [
+        Override(one.free, one.values[place])
+        for one, place in zip(sliders, places, strict=True)
+        if place != one.start
+    ]
+
+
+def axes_of(sliders: Sequence[Slider], places: Sequence[int], chosen: tuple[int, int]) -> tuple[Range, Range]:
+    """Return the axes of a region over two sliders: their spans, wide enough for their values."""
+    found = []
+    for number in chosen:
+        one, value = sliders[number], sliders[number].values[places[number]]
+        assert one.span is not None
+        low, high = one.span
+        room = (high - low) / 10
+        low = low if value >= low else value - room
+        high = high if value <= high else _nice(value + room)
+        found.append(Range(one.free, one.unit, low, high))
+    return found[0], found[1]

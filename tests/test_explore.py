@@ -1,0 +1,506 @@
+"""The page of a scene: its sliders say what they set, its answers are the API's, and nobody else gets in."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+import pytest
+
+import apc
+from apc.__main__ import run
+from apc.compiler.compiled import CompiledSystem
+from apc.frame.names import Free
+from apc.frame.overrides import parse_override
+from tests.topologies import AVERAGE, SCENES
+
+pytest.importorskip("bokeh")
+
+from apc.explore.desk import Desk
+from apc.explore.motion import STRUCK, motion_of
+from apc.explore.sections import Task, Told, compute
+from apc.explore.sliders import Slider, axes_of, overrides_of, place_of, set_to, sliders_of, with_value
+from apc.explore.written import with_values
+from apc.processes import Workers, model_bytes
+
+LOSSY = AVERAGE.replace("delay: 8 ms}", "delay: 8 ms, loss: 10 %, jitter: 1 ms}")
+
+
+def compiled(text: str, folder: Path) -> CompiledSystem:
+    (folder / "scene.yaml").write_text(text, encoding="utf-8")
+    return apc.compile(folder / "scene.yaml")
+
+
+def named(sliders: tuple[Slider, ...], label: str) -> Slider:
+    return next(one for one in sliders if one.label == label)
+
+
+# The sliders.
+
+
+@pytest.mark.parametrize(
+    "name", ["three-users-average", "experiment-average", "mixed-clocks", "lossy-average"]
+)
+def test_what_a_slider_says_is_what_set_takes(name: str) -> None:
+    system = apc.compile(SCENES / f"{name}.yaml")
+    for one in sliders_of(system):
+        assert list(one.values) == sorted(set(one.values)), one.label
+        for value, text in zip(one.values, one.texts, strict=True):
+            assert parse_override(system, f"{one.label}={text}").value == value
+
+
+def test_every_number_of_the_paper_s_scene_has_a_slider(tmp_path: Path) -> None:
+    sliders = sliders_of(compiled(AVERAGE, tmp_path))
+    assert [one.label for one in sliders] == [
+        *("contact.stiffness", "coordination.stiffness", "device.mass", "device.damping", "cube.mass"),
+        *("cube.damping", "contact.damping", "coordination.damping", "contact.delay", "coordination.delay"),
+        *("lan.delay", "haptic.period", "network.period", "haptic.phase", "network.phase", "user.count"),
+    ]
+    stiffness = named(sliders, "contact.stiffness")
+    assert stiffness.texts[stiffness.start] == "1000 N/m"
+    assert stiffness.span == (0, 5000)  # the study's
+    mass = named(sliders, "device.mass")
+    ratios = [float(b / a) for a, b in zip(mass.values, mass.values[1:], strict=False)]
+    assert mass.values[0] == Fraction(1, 1000) and mass.values[-1] == 10  # four decades
+    assert max(ratios) / min(ratios) < 1.02  # even on a logarithmic scale, but for three digits
+    assert named(sliders, "user.count").texts == tuple(str(k) for k in range(2, 13))
+    assert named(sliders, "lan.delay").texts[0] == "0 ms"
+
+
+def test_periods_of_a_slider_keep_frames_short(tmp_path: Path) -> None:
+    for label, other in (("haptic.period", Fraction(8, 1000)), ("network.period", Fraction(1, 1000))):
+        for period in named(sliders_of(compiled(AVERAGE, tmp_path)), label).values:
+            ratio = max(period, other) / min(period, other)
+            assert ratio.denominator == 1  # one is a multiple of the other
+
+
+def test_a_value_that_a_slider_has_not_gets_a_place_of_its_own(tmp_path: Path) -> None:
+    system = compiled(AVERAGE, tmp_path)
+    sliders = sliders_of(system)
+    place, value = set_to(system, sliders, "contact.stiffness=1234.5 N/m")
+    moved, at = with_value(sliders[place], value)
+    assert moved.texts[at] == "1234.5 N/m" and moved.values[moved.start] == 1000
+    (override,) = overrides_of([moved], [at])
+    assert override.value == Fraction("1234.5")
+    assert overrides_of([moved], [moved.start]) == []
+    assert moved.values[place_of(moved, 1234.0)] == Fraction("1234.5")
+
+
+def test_what_follows_from_others_has_no_slider(tmp_path: Path) -> None:
+    text = AVERAGE.replace("stiffness: 500 N/m", "stiffness: kt/(peers - 1)")
+    system = compiled(text.replace("clocks:", "parameters: {kt: 1000 N/m}\nclocks:"), tmp_path)
+    sliders = sliders_of(system)
+    assert "kt" in [one.label for one in sliders]
+    with pytest.raises(apc.ApcError, match=r"E980 coordination\.stiffness has no slider"):
+        set_to(system, sliders, "coordination.stiffness=500 N/m")
+
+
+def test_the_axes_of_a_region_hold_the_point_that_is_shown(tmp_path: Path) -> None:
+    sliders = sliders_of(compiled(AVERAGE, tmp_path))
+    masses = (2, 3)
+    places = [one.start for one in sliders]
+    for number in masses:
+        places[number] = len(sliders[number].values) - 1
+    for axis, number in zip(axes_of(sliders, places, masses), masses, strict=True):
+        assert axis.low < sliders[number].values[-1] < axis.high
+
+
+# What is computed.
+
+
+def test_sections_tell_what_the_api_tells(tmp_path: Path) -> None:
+    system = compiled(AVERAGE, tmp_path)
+    sliders, model = sliders_of(system), model_bytes(system)
+    places = [one.start for one in sliders]
+    places[sliders.index(named(sliders, "lan.delay"))] += 40
+    overrides = tuple(overrides_of(sliders, places))
+    setting = {one.free.label: f"{float(one.value) * 1e3!r} ms" for one in overrides}
+    verdict = compute(model, Task("verdict", overrides)).found
+    expected = apc.analyze(system, set=setting)
+    assert verdict is not None and verdict["radius"] == expected.spectral_radius
+    assert verdict["stable"] is expected.stable and verdict["text"] == str(expected)
+    axes = axes_of(sliders, places, (0, 1))
+    region = compute(model, Task("region", overrides, (*axes, "nominal"))).found
+    whole = apc.region(system, set=setting)
+    assert region is not None
+    assert region["share"] == pytest.approx(whole.stable_area / (5000 * 1500), rel=1e-4)  # drawn to 1e-5
+    margins = compute(model, Task("margins", overrides)).found
+    assert margins is not None and margins["text"] == str(apc.margins(system, set=setting))
+    feel = compute(model, Task("feel", overrides)).found
+    assert feel is not None
+    felt = apc.feel(system, feel["frequency"], set=setting)
+    assert np.array_equal(feel["magnitude"], np.abs(felt.impedance))
+
+
+@pytest.mark.parametrize("label", ["coordination.stiffness", "lan.delay", "user.count"])
+def test_the_roots_of_a_slider_are_the_eigenvalues_of_analyses(label: str, tmp_path: Path) -> None:
+    system = compiled(AVERAGE, tmp_path)
+    slider = named(sliders_of(system), label)
+    found = compute(model_bytes(system), Task("roots", (), (slider.free, slider.values))).found
+    assert found is not None and found["slider"] == label
+    for text in (slider.texts[0], slider.texts[-1]):
+        roots = (found["real"] + 1j * found["imag"])[np.array(found["name"]) == text]
+        modes = apc.analyze(system, set={label: text}).modes
+        leading = [one.eigenvalue for one in modes if one.magnitude > 1e-2]
+        for one in leading:
+            assert np.abs(roots - one).min() < 1e-9
+
+
+def test_a_section_that_a_scene_has_nothing_for_says_so(tmp_path: Path) -> None:
+    model = model_bytes(compiled(AVERAGE, tmp_path))
+    told = compute(model, Task("network", ()))
+    assert told.found is None
+    assert "no link here loses packets" in told.why and "loss: 1 %" in told.why
+    unstable = (parse_override(compiled(AVERAGE, tmp_path), "contact.stiffness=5000 N/m"),)
+    assert "unstable" in compute(model, Task("feel", unstable)).why
+
+
+def test_loss_and_jitter_are_the_critical_ones(tmp_path: Path) -> None:
+    system = compiled(LOSSY.replace(", jitter: 1 ms", ""), tmp_path)
+    found = compute(model_bytes(system), Task("network", ())).found
+    assert found is not None
+    assert str(apc.judge_network(system)) in found["text"]
+    assert str(apc.critical(system, "lan.loss")) in found["text"]
+
+
+def test_a_struck_device_moves_as_its_equation_says(tmp_path: Path) -> None:
+    """m v' = −b v from v(0) = 0.1 m/s: x = v m/b (1 − e^(−b t/m))."""
+    text = "topology: one\npeers: {user: {count: 1}}\nmasses: {device: {mass: 2 kg, damping: 3 N*s/m}}\n"
+    motion = motion_of(compiled(text, tmp_path), struck=True)
+    (body,) = motion.bodies
+    expected = 1e3 * STRUCK * 2 / 3 * (1 - np.exp(-1.5 * motion.time))
+    assert np.allclose(body.x, expected, rtol=1e-9, atol=1e-12)
+    with pytest.raises(apc.ApcError, match="E983"):
+        motion_of(compiled("topology: none\npeers: {user: {count: 1}}\nmasses: {}\n", tmp_path), struck=True)
+
+
+# Who computes it.
+
+
+class Held:
+    """Workers that do nothing until they are told to."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Task, Future[Told]]] = []
+
+    def submit(self, task: Task) -> Future[Told]:
+        self.asked.append((task, Future()))
+        return self.asked[-1][1]
+
+    def finish(self, place: int) -> None:
+        task, future = self.asked[place]
+        future.set_result(Told({"of": task.asked}))
+
+
+def test_an_old_answer_never_takes_the_place_of_a_newer_one() -> None:
+    held, shown = Held(), []
+    desk = Desk(
+        b"", ("a", "b"), lambda call: call(), lambda section, told: shown.append((section, told.found))
+    )
+    desk.workers = Workers(held.submit, 1, lambda _: None)
+    desk.ask(Task("b", (), 1))
+    for number in (2, 3, 4):  # while it computes, the newest waits in the place of those before it
+        desk.ask(Task("b", (), number))
+    desk.ask(Task("a", (), 5))
+    held.finish(0)
+    held.finish(1)
+    held.finish(2)
+    assert shown == [("b", {"of": 1}), ("a", {"of": 5}), ("b", {"of": 4})]
+    desk.ask(Task("b", (), 6))
+    desk.forget("b")
+    held.finish(3)
+    assert len(shown) == 3
+
+
+# The topology with other values.
+
+
+@pytest.mark.parametrize(
+    ("label", "value", "line"),
+    [
+        ("contact.stiffness", "800 N/m", "stiffness: 800 N/m, clock: haptic"),
+        ("contact.damping", "2 N*s/m", "delay: 1 ms, damping: 2 N*s/m}"),
+        ("network.period", "4 ms", "network: 4 ms"),
+        ("network.phase", "1 ms", "network: {period: 8 ms, phase: 1 ms}"),
+        ("lan.delay", "3 ms", "delay: 3 ms}"),
+        ("user.count", "5", "user: {count: 5}"),
+    ],
+)
+def test_a_value_is_written_where_it_stands(label: str, value: str, line: str, tmp_path: Path) -> None:
+    system = compiled(AVERAGE, tmp_path)
+    text = with_values(AVERAGE, system, {Free(label): value})
+    assert line in text
+    changed = compiled(text, tmp_path)
+    expected = apc.analyze(system, set={label: value})
+    assert apc.analyze(changed).spectral_radius == pytest.approx(expected.spectral_radius, rel=1e-12)
+    assert len(text.splitlines()) == len(AVERAGE.splitlines())  # and comments stay where they were
+    assert "# a copy at each peer" in text
+
+
+def test_a_number_of_one_group_is_written_there() -> None:
+    path = SCENES / "experiment-average.yaml"
+    system = apc.compile(path)
+    text = with_values(path.read_text("utf-8"), system, {Free("hand.force", "left"): "3 N"})
+    assert re.search(r"left:.*hand\.force: 3 N", text)
+
+
+# What can't be.
+
+
+def test_what_can_t_be_explored_is_told_before_a_page_is_served(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(AVERAGE, encoding="utf-8")
+    assert run(["explore", str(path), "--set", "contact.stiffness=5 kg"]) == 1
+    assert "E204" in capsys.readouterr().err
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert run(["explore", str(path), "--no-browser", "--port", str(port)]) == 1
+    told = capsys.readouterr()
+    assert told.err == f"--port: E982 port {port} is taken. Write: --port 0  (any that is free)\n"
+    assert not told.out
+    monkeypatch.setitem(sys.modules, "bokeh.server.server", None)
+    assert run(["explore", str(path)]) == 1
+    assert (
+        "E875 bokeh.server.server is not installed. Write: pip install '.[explore]'"
+        in capsys.readouterr().err
+    )
+
+
+# In a browser.
+
+CHROMIUM = next(
+    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))),
+    None,
+)
+MODEL = "Bokeh.documents[0].get_model_by_name"
+READY = "document.documentElement.dataset.ready == 'yes'"
+VERDICT = f"{MODEL}('verdict').text"
+
+
+@contextmanager
+def served(path: Path, *words: str) -> Iterator[str]:
+    """Serve a scene and give its link; at the end Ctrl-C ends it, and it has nothing to complain of."""
+    command = [sys.executable, "-m", "apc", "explore", str(path), "--no-browser", *words]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        yield process.stdout.readline().strip()
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+        assert (process.returncode, err) == (0, "ended\n")
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture(scope="module")
+def link(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    path = tmp_path_factory.mktemp("explore") / "scene.yaml"
+    path.write_text(AVERAGE, encoding="utf-8")
+    with served(path) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    if CHROMIUM is None:
+        pytest.skip("no Chromium on this machine")
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with playwright.sync_playwright() as started:
+        root = hasattr(os, "geteuid") and os.geteuid() == 0  # whom Chromium's sandbox does not serve
+        found = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"] if root else [])
+        yield found
+        found.close()
+
+
+class Tab:
+    """A page in the browser, and what it complained of and asked for."""
+
+    def __init__(self, browser: Any, link: str) -> None:
+        self.page = browser.new_page(viewport={"width": 1280, "height": 900})
+        self.page.set_default_timeout(60_000)
+        self.errors: list[str] = []
+        self.hosts: set[str] = set()
+        self.page.on("console", lambda one: self.errors.append(one.text) if one.type == "error" else None)
+        self.page.on("pageerror", lambda one: self.errors.append(str(one)))
+        self.page.on("request", lambda one: self.hosts.add(urlsplit(one.url).netloc))
+        self.page.on("websocket", lambda one: self.hosts.add(urlsplit(one.url).netloc))
+        self.page.goto(link)
+        self.page.wait_for_function(READY)
+        self.page.wait_for_function(f"!{VERDICT}.includes('Computing')")
+
+    def press(self, label: str, key: str, times: int) -> str:
+        """Press a key on a slider; return what the slider says then."""
+        handle = self.page.get_by_role("slider", name=label, exact=True)
+        for _ in range(times):
+            handle.press(key)
+        return str(handle.get_attribute("aria-valuetext"))
+
+    def radius(self, expected: float) -> None:
+        """Wait until the verdict has a spectral radius."""
+        self.page.wait_for_function(f"{VERDICT}.includes('spectral radius {expected:.9g} ')")
+
+    def close(self, link: str) -> None:
+        assert self.errors == []
+        assert self.hosts == {urlsplit(link).netloc}
+        self.page.close()
+
+
+def area(tab: Tab) -> str:
+    return str(tab.page.evaluate(f"{MODEL}('region-words').text"))
+
+
+def test_a_slider_that_is_moved_changes_region_and_verdict_to_what_the_api_says(
+    browser: Any, link: str, tmp_path: Path
+) -> None:
+    system = compiled(AVERAGE, tmp_path)
+    first, second = Tab(browser, link), Tab(browser, link)
+    first.radius(apc.analyze(system).spectral_radius)
+    text = first.press("lan.delay", "PageUp", 9).replace("·", "*")
+    setting = {"lan.delay": text}
+    assert text != "8 ms"
+    first.radius(apc.analyze(system, set=setting).spectral_radius)
+    share = apc.region(system, set=setting).stable_area / (5000 * 1500)
+    first.page.wait_for_function(f"{MODEL}('region-words').text.includes('{100 * share:.3g} %')")
+    # An axis of the region: the point moves, and the verdict becomes another.
+    text = first.press("contact.stiffness", "End", 1).replace("·", "*")
+    found = apc.analyze(system, set=setting | {"contact.stiffness": text})
+    assert found.stable is False
+    first.radius(found.spectral_radius)
+    assert "class='unstable'" in first.page.evaluate(VERDICT)
+    # The link holds the values, and opens with them; the second tab knows nothing of it.
+    first.page.wait_for_function("location.search.includes('contact.stiffness=5000')")
+    assert parse_qs(urlsplit(first.page.url).query)["lan.delay"] == [setting["lan.delay"]]
+    third = Tab(browser, first.page.url)
+    third.radius(found.spectral_radius)
+    second.radius(apc.analyze(system).spectral_radius)
+    assert second.press("lan.delay", "Tab", 1) == "8 ms"
+    for tab in (first, second, third):
+        tab.close(link)
+
+
+def test_a_click_in_the_region_sets_both_sliders(browser: Any, link: str) -> None:
+    tab = Tab(browser, link)
+    tab.page.wait_for_function(f"{MODEL}('region-words').text.includes('Stable in')")
+    inner = tab.page.evaluate(
+        f"""(() => {{
+          const view = Bokeh.index.get_one({MODEL}('region-plot'))
+          const box = view.canvas_view.el.getBoundingClientRect(), frame = view.frame.bbox
+          return [box.x + frame.x + 0.8 * frame.width, box.y + frame.y + 0.4 * frame.height]
+        }})()"""
+    )
+    tab.page.mouse.click(*inner)
+    tab.page.wait_for_function("location.search.includes('contact.stiffness')")
+    chosen = parse_qs(urlsplit(tab.page.url).query)
+    x, y = (float(chosen[name][0].split()[0]) for name in ("contact.stiffness", "coordination.stiffness"))
+    assert x == pytest.approx(0.8 * 5000, abs=50) and y == pytest.approx(0.6 * 1500, abs=15)
+    tab.close(link)
+
+
+def test_a_motion_is_played_stopped_and_taken_to_any_time(browser: Any, link: str) -> None:
+    tab = Tab(browser, link)
+    tab.page.wait_for_function(f"{MODEL}('motion-words').text.includes('is struck')")
+    assert tab.press("time", "End", 1) == "1.000 s"
+    tab.press("time", "Home", 1)
+    tab.page.get_by_role("button", name="Play").click()
+    tab.page.wait_for_function(f"{MODEL}('time').value > 5")
+    tab.page.get_by_role("button", name="Pause").click()
+    at = tab.page.evaluate(f"{MODEL}('time').value")
+    tab.page.wait_for_timeout(300)
+    assert tab.page.evaluate(f"{MODEL}('time').value") == at
+    tab.close(link)
+
+
+def test_topology_and_numbers_are_downloaded_with_the_values(browser: Any, link: str, tmp_path: Path) -> None:
+    tab = Tab(browser, link)
+    text = tab.press("device.damping", "PageUp", 3).replace("·", "*")
+    found = {}
+    for label in ("Topology", "Picture", "Numbers"):
+        with tab.page.expect_download() as waited:
+            tab.page.get_by_role("button", name=label).click()
+        found[label] = tmp_path / waited.value.suggested_filename
+        waited.value.save_as(found[label])
+    expected = apc.analyze(compiled(AVERAGE, tmp_path), set={"device.damping": text})
+    assert apc.analyze(found["Topology"]).spectral_radius == expected.spectral_radius
+    assert found["Picture"].read_bytes().startswith(b"\x89PNG")
+    numbers = json.loads(found["Numbers"].read_text("utf-8"))
+    assert numbers["set"]["device.damping"] == text
+    assert numbers["analyze"]["spectral_radius"] == expected.spectral_radius
+    assert numbers["region"]["x"]["parameter"] == "contact.stiffness"
+    tab.close(link)
+
+
+def test_whoever_sees_no_pictures_and_has_no_mouse_finds_everything_by_name(browser: Any, link: str) -> None:
+    tab = Tab(browser, link)
+    names = [one.get_attribute("aria-label") for one in tab.page.get_by_role("slider").all()]
+    assert None not in names and {"lan.delay", "user.count", "time"} <= set(names)
+    headings = [one.inner_text() for one in tab.page.get_by_role("heading").all()]
+    assert {"Verdict", "Stable region", "Eigenvalues", "Response", "What the hand feels"} <= set(headings)
+    for width in (1280, 800):
+        tab.page.set_viewport_size({"width": width, "height": 900})
+        tab.page.wait_for_timeout(500)
+        assert tab.page.evaluate("document.documentElement.scrollWidth") <= width
+    tab.close(link)
+
+
+def status(link: str, **headers: str) -> int:
+    parts = urlsplit(link)
+    connection = http.client.HTTPConnection(parts.netloc, timeout=60)
+    try:
+        connection.request("GET", f"{parts.path}?{parts.query}", headers=headers)
+        return connection.getresponse().status
+    finally:
+        connection.close()
+
+
+def test_only_this_machine_with_the_token_and_no_other_origin_gets_in(link: str, tmp_path: Path) -> None:
+    address, bare = urlsplit(link).netloc, link.partition("?")[0]
+    assert link.startswith("http://127.0.0.1:")
+    assert status(link) == 200
+    for wrong in (bare, f"{bare}?token=", f"{link}x", f"{bare}?token=%ff"):
+        assert status(wrong) in (400, 403)
+    assert status(link, Origin="http://example.org") == 403
+    assert status(link, Host="example.org") == 403
+    for path in ("metadata", "autoload.js?bokeh-autoload-element=1"):
+        assert status(f"{bare}{path}") == 403
+    upgrade = {
+        "Connection": "Upgrade",
+        "Upgrade": "websocket",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+    }
+    query = urlsplit(link).query
+    assert status(f"{bare}ws", **upgrade) == 403
+    assert status(f"{bare}ws?{query}", **upgrade, Origin="http://example.org") == 403
+    for path in ("etc/passwd", "static/../../../../../../etc/passwd", "scene.yaml", "static/extensions/x/y"):
+        assert status(f"{bare}{path}?{query}") in (403, 404)
+    with socket.socket() as other:  # another address of this machine
+        own = next((one for one in _addresses() if not one.startswith("127.")), None)
+        if own:
+            assert other.connect_ex((own, int(address.partition(":")[2]))) != 0
+
+
+def _addresses() -> list[str]:
+    try:
+        return list(socket.gethostbyname_ex(socket.gethostname())[2])
+    except OSError:
+        return []
