@@ -1,8 +1,8 @@
 """A picture of how a scene begins: every peer's bodies side by side, and the surfaces between them.
 
 Takes: a `CompiledSystem`. Gives: `Body`, `Wall`, `bodies_of`, `rows_of`, `draw_still`, `save_still`, and
-`draw_actors`, the same picture with what moves in it (see `animation`); of bodies that move in a plane that of
-`planar`.
+`draw_actors`, the same picture with what moves in it (see `animation`); of bodies that move in a plane that
+of `planar`.
 Guarantees: everything is found in the equations: a body is a position (a state in metres); where something is
 decided by the distance of two of them, or of one from a fixed place, in metres, there is a surface.
 Does not: play the scene, or know what a part is called.
