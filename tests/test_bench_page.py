@@ -11,7 +11,7 @@ import pytest
 
 from tests.bench.__main__ import BESIDE, HERE, PAGE, PARTS, Part, main, run, sections
 from tests.bench.judge import HEAD, Judge
-from tests.bench.readme import BLOCK, ERROR, README, pictures, printed
+from tests.bench.readme import BLOCK, ERROR, PAGES, ROOT, pictures, printed, whole
 
 HELPERS = {  # not run by themselves
     "__init__",
@@ -117,23 +117,23 @@ def test_the_page_has_a_section_a_part_and_gives_them_back() -> None:
     assert text.endswith("\n".join(sections(text).values()))
 
 
-def test_every_picture_of_the_readme_is_drawn_by_a_command_that_stands_there() -> None:
-    text = README.read_text(encoding="utf-8")
-    shown = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
+def test_every_picture_of_the_pages_is_drawn_by_a_command_that_stands_there() -> None:
+    text = whole()
+    shown = list(dict.fromkeys(re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)))
     found = pictures(text)
     assert shown
     assert list(found) == shown
     assert {words[1] for words in found.values()} == {"region", "simulate", "compare", "-m"}
     for picture, words in found.items():
         assert words[-1] == picture
-        assert all((README.parent / word).is_file() for word in words if word.endswith(".yaml"))
-    assert {path.name for path in (README.parent / "models" / "figures").iterdir()} == {
+        assert all((ROOT / word).is_file() for word in words if word.endswith(".yaml"))
+    assert {path.name for path in (ROOT / "models" / "figures").iterdir()} == {
         Path(picture).name for picture in shown
     }
 
 
-def test_every_printed_block_of_the_readme_has_a_maker_that_prints_it() -> None:
-    text = README.read_text(encoding="utf-8")
+def test_every_printed_block_of_the_pages_has_a_maker_that_prints_it() -> None:
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
     assert len(BLOCK.findall(text)) == text.count("```text\n") > 0
     for words, block in BLOCK.findall(text):
         if words == ERROR:  # the commands are run by the tests of the README
@@ -146,4 +146,4 @@ def test_every_number_of_the_readmes_prose_on_regions_stands_on_the_page() -> No
     low, high = 1.5116401379, 1.8485695579
     assert f"{low:.10f}" in page
     assert f"{high:.10f}" in page
-    assert f"{low:.2f} to {high:.2f} times" in README.read_text(encoding="utf-8")
+    assert f"{low:.2f} to {high:.2f} times" in whole()

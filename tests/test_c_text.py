@@ -113,7 +113,7 @@ def test_the_loop_of_the_readme_compiles(tmp_path: Path) -> None:
         )
         == 0
     )
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    text = (ROOT / "runtime" / "exports" / "README.md").read_text(encoding="utf-8")
     _, _, after = text.partition("<!-- compiled with left.h of experiment-average.yaml -->\n```c\n")
     (tmp_path / "loop.c").write_text(after.partition("```")[0], encoding="ascii")
     subprocess.run(

@@ -14,11 +14,13 @@ from apc.__main__ import run
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
+ROOMS = sorted((ROOT / "runtime").glob("*/README.md"))
+WHOLE = "\n".join([TEXT, *(page.read_text(encoding="utf-8") for page in ROOMS)])
 
 
 def block_after(mark: str) -> str:
     """Return the fenced block that follows a mark."""
-    found = re.search(re.escape(mark) + r"\n```\w*\n(.*?)```", TEXT, re.DOTALL)
+    found = re.search(re.escape(mark) + r"\n```\w*\n(.*?)```", WHOLE, re.DOTALL)
     assert found, mark
     return found.group(1)
 
@@ -125,7 +127,7 @@ def test_every_command_of_the_program_stands_in_the_table() -> None:
 
 
 def test_every_file_linked_exists() -> None:
-    for page in (ROOT / "README.md", ROOT / "models" / "README.md"):
+    for page in (ROOT / "README.md", ROOT / "models" / "README.md", *ROOMS):
         for target in re.findall(r"\]\((?!http|#)([^)]+)\)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), target
 

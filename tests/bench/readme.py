@@ -1,7 +1,7 @@
-"""The pictures and the printed blocks of README.md, made again: `python -m tests.bench.readme`.
+"""The pictures and printed blocks of README.md and the rooms' pages: `python -m tests.bench.readme` makes them.
 
-A picture is drawn by the command that stands beside it there, a block is what the command in its mark prints.
-The numbers of its prose about regions are those of `tests.bench.region`.
+A picture is drawn by the command that stands on one of the pages, a block is what the command in its mark
+prints. The numbers of its prose about regions are those of `tests.bench.region`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-README = ROOT / "README.md"
+PAGES = (ROOT / "README.md", *sorted((ROOT / "runtime").glob("*/README.md")))
 
 # How a command that draws a picture begins.
 MAKERS = ("apc ", "python -m tests.bench.losses ", "python -m tests.bench.hands ")
@@ -24,13 +24,18 @@ BLOCK = re.compile(r"<!-- output: (?P<words>[^>]*) -->\n```text\n(?P<text>.*?)``
 ERROR, FINE, BROKEN = "error", "stiffness: 500 N/m", "stiffness: 500"
 
 
+def whole() -> str:
+    """Return all pages as one text, its links as they are from the first."""
+    return "\n".join(page.read_text(encoding="utf-8").replace("](../../", "](") for page in PAGES)
+
+
 def pictures(text: str) -> dict[str, list[str]]:
     """Return the words that draw each picture of models/figures, as they stand in the text.
 
     A command that writes to regions.svg draws models/figures/regions.svg; where it names its picture another
     way, the picture's own name tells the scene that is played.
     """
-    shown = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
+    shown = dict.fromkeys(re.findall(r"!\[[^]]*\]\(([^)]+)\)", text))
     blocks = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
     commands = [shlex.split(block.replace("\\\n", " ")) for block in blocks if block.startswith(MAKERS)]
     found = {}
@@ -70,8 +75,7 @@ def _run(words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
 
 def main() -> None:
     """Draw and write everything; say what is other than before."""
-    text = README.read_text(encoding="utf-8")
-    failed = 0
+    text, failed = whole(), 0
     for picture, words in pictures(text).items():
         before = (ROOT / picture).read_bytes() if (ROOT / picture).is_file() else b""
         ran = _run(words, ROOT)
@@ -86,7 +90,8 @@ def main() -> None:
         print(f"{block['words']:<42} {'as before' if new == block['text'] else 'new'}")
         return f"<!-- output: {block['words']} -->\n```text\n{new}```"
 
-    README.write_text(BLOCK.sub(again, text), encoding="utf-8")
+    for page in PAGES:
+        page.write_text(BLOCK.sub(again, page.read_text(encoding="utf-8")), encoding="utf-8")
     raise SystemExit(bool(failed))
 
 
