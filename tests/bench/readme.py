@@ -1,4 +1,4 @@
-"""The pictures and printed blocks of README.md and the rooms' pages: `python -m tests.bench.readme` makes them.
+"""The pictures and printed blocks of README.md and the rooms' pages: this module makes them again.
 
 A picture is drawn by the command that stands on one of the pages, a block is what the command in its mark
 prints. The numbers of its prose about regions are those of `tests.bench.region`.
