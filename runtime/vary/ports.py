@@ -222,7 +222,8 @@ def _inertias(opened: Opened) -> Callable[[Floats], Floats]:
     def inertias(vectors: Floats) -> Floats:
         same = (vectors[:, followed] == vectors[:1, followed]).all()
         used = vectors[:1] if same else vectors
-        found = function.map(len(used))(*zeros[:2], used.T, zeros[2])
+        every = function if len(used) == 1 else function.map(len(used))
+        found = every(*zeros[:2], used.T, zeros[2])
         return np.asarray(found, dtype=np.float64).ravel()
 
     return inertias
