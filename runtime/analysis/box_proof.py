@@ -1,7 +1,7 @@
 """Proof that a scene is stable for every value of some parameters in a box.
 
 Takes: a `CompiledSystem` and ranges.
-Gives: `BoxProof`, `prove_box`; `Cell`, `halved`, `Halved`, `middle`, `site_at`, `range_ball`, `ball_radii`;
+Gives: `BoxProof`, `prove_box`; `Cell`, `search_box`, `middle`, `site_at`, `range_ball`, `ball_radii`;
 `BITS`, `UNDECIDED`.
 Guarantees: stable means proved for every point of the box, unstable proved at the point that is named.
 Does not: find the boundary (see the share that is left open).
@@ -143,7 +143,7 @@ def _prove_box(name: str, box: Box) -> BoxProof:
             return _answer(name, box, UNSTABLE, False, 1, 1.0, point)
     cells, left, where = 0, 1.0 if notes else 0.0, tuple[Fraction, ...]()
     for question in questions:
-        found = halved(whole, partial(_reach_out, question), partial(_is_unstable, question))
+        found = _halved(whole, partial(_reach_out, question), partial(_is_unstable, question))
         cells += found.cells
         if found.unstable:
             return _answer(name, box, UNSTABLE, False, cells, 1.0, found.point)
@@ -155,7 +155,7 @@ def _prove_box(name: str, box: Box) -> BoxProof:
 
 
 @dataclass(frozen=True, slots=True)
-class Halved:
+class _Halved:
     """What a search in the box found: where it is unstable, or is left open."""
 
     cells: int
@@ -182,22 +182,51 @@ def _question(system: ClosedSystem, sites: tuple[LinearSite, ...], free: RigidMo
     return _Question(system, sites, free.exact, independent_places(free.basis.T))
 
 
-def halved(
-    whole: Cell,
+def search_box(
+    name: str,
+    ranges: Sequence[Range],
     reach_out: Callable[[Cell], Floats | None],
     is_unstable: Callable[[tuple[Fraction, ...]], bool],
-) -> Halved:
-    """Prove cell after cell, the largest first.
+    *,
+    stable: str,
+    unstable: str,
+) -> BoxProof:
+    """Look at the middle and the corners of a box, then prove it cell by cell.
 
     Parameters
     ----------
-    whole
-        The box.
+    name, ranges
+        The scene's, and the parameters left open.
     reach_out
         Returns None when a cell is proved, or else how much each parameter matters in it.
     is_unstable
         Whether it is proved unstable at a point.
+    stable, unstable
+        The verdicts.
     """
+    whole: Cell = tuple((one.low, one.high) for one in ranges)
+
+    def answer(verdict: str, cells: int, left: float, point: Sequence[Fraction]) -> BoxProof:
+        known = {stable: True, unstable: False}.get(verdict)
+        return BoxProof(name, tuple(ranges), verdict, known, cells, left, tuple(map(float, point)), ())
+
+    for point in (middle(whole), *itertools.product(*whole)):
+        if is_unstable(point):
+            return answer(unstable, 1, 1.0, point)
+    found = _halved(whole, reach_out, is_unstable)
+    if found.unstable:
+        return answer(unstable, found.cells, 1.0, found.point)
+    if found.open_share:
+        return answer(UNDECIDED, found.cells, found.open_share, found.point)
+    return answer(stable, found.cells, 0.0, ())
+
+
+def _halved(
+    whole: Cell,
+    reach_out: Callable[[Cell], Floats | None],
+    is_unstable: Callable[[tuple[Fraction, ...]], bool],
+) -> _Halved:
+    """Prove cell after cell, the largest first; all as in `search_box`."""
     waiting = deque([whole])
     looked = 0
     while waiting and looked < MOST_CELLS:
@@ -208,13 +237,13 @@ def halved(
             continue
         inner = middle(cell)
         if is_unstable(inner):
-            return Halved(looked, 1.0, True, inner)
+            return _Halved(looked, 1.0, True, inner)
         widest = int(np.argmax(reach))
         low, high = cell[widest]
         for half in ((low, inner[widest]), (inner[widest], high)):
             waiting.append((*cell[:widest], half, *cell[widest + 1 :]))
     share = float(sum((_volume(cell) for cell in waiting), Fraction(0)) / _volume(whole))
-    return Halved(looked, share, False, middle(waiting[0]) if waiting else ())
+    return _Halved(looked, share, False, middle(waiting[0]) if waiting else ())
 
 
 def middle(cell: Cell) -> tuple[Fraction, ...]:

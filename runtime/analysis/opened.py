@@ -40,8 +40,8 @@ from apc.frame.discretize import UNIT, discretize
 from apc.frame.exchange import build_exchange
 from apc.frame.lift import FrameMap, compose, step_durations, with_roundings
 from apc.frame.parameters import resolve
+from apc.frame.ports import with_cuts
 from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
-from apc.frame.schedule import Heard, Sent, Tick, Value, Way
 from apc.frame.site import LinearSite
 
 Floats = NDArray[np.float64]
@@ -49,9 +49,6 @@ Matrix = NDArray[Any]
 
 # States and ticks of contacts of one loop worth a proof: a Riccati equation of so many takes a second.
 MOST_STATES = 150
-
-# What comes from outside stands where packets do, and is of no link.
-_OUTSIDE = Heard(Way("", "", ""), Sent("", "", 0), 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,41 +198,13 @@ def _cut_open(group: PeerGroup, pushes: Sequence[Push]) -> Opened:
         step: with_radius(one.matrix, one.roundings * UNIT * one.size)
         for step, one in zip(steps, found, strict=True)
     }
-    wide, carried, heard = bare.site, list(schedule.carried), len(schedule.heard)
-    rows: dict[int, list[int]] = {}
     ticks: list[tuple[str, int]] = []
     slopes = []
     for one in pushes:
-        listed, own = list(wide.ticks), group.site.ticks[one.partition]
-        tick, outputs = listed[one.partition], len(listed[one.partition].x)
-        force = np.zeros((outputs + 1, 1))
-        force[one.output] = 1.0
-        listed[one.partition] = replace(
-            tick,
-            x=np.vstack([tick.x, own.x[one.output]]),
-            u=np.vstack([tick.u, own.u[one.output]]),
-            m=np.vstack([tick.m, own.m[one.output]]),
-            r=np.hstack([np.vstack([tick.r, np.zeros((1, tick.r.shape[1]))]), force]),
-        )
-        wide = replace(wide, ticks=tuple(listed))
         count = schedule.ticks[one.partition]
-        carried += [Value(one.partition, outputs, index - count) for index in range(count)]
-        rows.setdefault(one.partition, []).append(heard + len(ticks))
         ticks += [(one.part, index) for index in range(count)]
         slopes += [tuple(map(Fraction, group.exact.ticks[one.partition].x[one.output]))] * count
-    events = tuple(
-        replace(one, heard=(*one.heard, *((row + one.index,) for row in rows.get(one.partition, ()))))
-        if isinstance(one, Tick)
-        else one
-        for one in schedule.events
-    )
-    whole = replace(
-        schedule,
-        events=events,
-        carried=tuple(carried),
-        heard=(*schedule.heard, *(_OUTSIDE,) * len(ticks)),
-        repeats=None,
-    )
+    wide, whole = with_cuts(group.site, schedule, [(one.partition, one.output) for one in pushes])
     wide_map = compose(with_roundings(wide), whole, off, numbers=RADII)
     plain = not any(one.slopes[one.states :].any() for one in pushes)
     jumps = next((one.part for one in pushes if one.sector), "")

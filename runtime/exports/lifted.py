@@ -45,9 +45,9 @@ from apc.frame.devices import Push, find_push
 from apc.frame.discretize import TOO_LARGE, discretize
 from apc.frame.exchange import Exchange
 from apc.frame.lift import MOST_PACKETS, FrameMap, check_packets, compose, named, step_durations
-from apc.frame.ports import with_holds, with_ports
+from apc.frame.ports import OUTSIDE, with_cuts, with_holds, with_ports
 from apc.frame.radius import FLOATS, Arithmetic
-from apc.frame.schedule import Heard, Propagate, Schedule, Sent, Tick, Value, Way
+from apc.frame.schedule import Propagate, Schedule, Tick, Value
 from apc.frame.site import LinearSite
 from apc.memory import refuse_beyond
 from apc.network.nominal import left_out
@@ -66,9 +66,6 @@ Blocks = tuple[Matrix, Matrix, Matrix, Matrix]
 
 # Bytes of an entry of the closed matrix while it is made: the matrix, its parts, and what is sent.
 ENTRY = 40
-
-# What comes from outside stands where packets do, and is of no link.
-_OUTSIDE = Heard(Way("", "", ""), Sent("", "", 0), 0)
 
 
 Labels = tuple[Port, ...]
@@ -287,7 +284,7 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
             one.place[0] if one.role == "state" else place_of[Value(one.place[0], one.place[1], -1)],
         )
         for one in local_signals(kind, group.schedule)
-        if one.role != "hold"
+        if one.role in ("state", "output")
     ]
     inputs = [Port(f"force on {push.part}", "N") for push in forces]
     inputs += [Port(f"noise on {kind.states[place].name}", kind.states[place].unit) for place in noises]
@@ -412,49 +409,23 @@ def _cut_open(
     site: LinearSite, schedule: Schedule, listed: Sequence[tuple[int, int]]
 ) -> tuple[LinearSite, Schedule, tuple[Port, ...], tuple[int, ...]]:
     """Let forces come from outside at each tick, what the tick computes of them being remembered beside."""
-    ticks, carried = list(site.ticks), list(schedule.carried)
-    heard, n_x = len(schedule.heard), len(site.kind.states)
-    rows: dict[int, list[int]] = {}
+    cuts = [(partition, output) for partition, output in listed if schedule.ticks[partition]]
+    count = sum(schedule.ticks[partition] for partition, _ in cuts)
+    if len(schedule.heard) + count > MOST_PACKETS:
+        what = f"{count:,} ticks a frame, each an input where it is cut, and {MOST_PACKETS} are the most"
+        raise ApcError(Mistake("E951", Place("--cut"), what, hint="--cut LINK"))
     ports: list[Port] = []
-    computed: list[int] = []
     at = _instants(schedule)
-    for partition, output in listed:
-        tick, count = ticks[partition], schedule.ticks[partition]
-        if not count:
-            continue
-        if heard + count > MOST_PACKETS:
-            what = f"{count:,} ticks a frame, each an input where it is cut, and {MOST_PACKETS} are the most"
-            raise ApcError(Mistake("E951", Place("--cut"), what, hint="--cut LINK"))
-        outputs = len(tick.x)
-        blocks = [np.vstack([block, block[output]]) for block in (tick.x, tick.u, tick.m, tick.r)]
-        for block in blocks:
-            block[output] = 0
-        force = np.zeros((outputs + 1, 1), dtype=tick.r.dtype)
-        force[output] = 1
-        x, u, m, r = blocks
-        ticks[partition] = replace(tick, x=x, u=u, m=m, r=np.hstack([r, force]))
+    for partition, output in cuts:
         clock = site.kind.clocks[partition]
-        for index in range(count):
+        for index in range(schedule.ticks[partition]):
             when = float(at[partition][index] * schedule.quantum * 1000)
             ports.append(Port(f"{clock.outputs[output]} at {when:.6g} ms", clock.units[output]))
-            computed.append(n_x + len(carried))
-            carried.append(Value(partition, outputs, index - count))
-        rows.setdefault(partition, []).append(heard)
-        heard += count
-    events = tuple(
-        replace(one, heard=(*one.heard, *((row + one.index,) for row in rows.get(one.partition, ()))))
-        if isinstance(one, Tick)
-        else one
-        for one in schedule.events
-    )
-    whole = replace(
-        schedule,
-        events=events,
-        carried=tuple(carried),
-        heard=(*schedule.heard, *(_OUTSIDE,) * len(ports)),
-        value_names=(*schedule.value_names, *(f"{port.name} computed" for port in ports)),
-    )
-    return replace(site, ticks=tuple(ticks)), whole, tuple(ports), tuple(computed)
+    wide, whole = with_cuts(site, schedule, cuts)
+    names = (*schedule.value_names, *(f"{port.name} computed" for port in ports))
+    first = len(site.kind.states) + len(schedule.carried)
+    computed = tuple(range(first, first + count))
+    return wide, replace(whole, value_names=names), tuple(ports), computed
 
 
 def _check_size(system: CompiledSystem, opened: Sequence[_Opened]) -> None:
@@ -549,7 +520,7 @@ def _named(port: Port, peer: str) -> Port:
 def _open_rows(one: _Opened, link: str) -> list[int]:
     """Return which rows of what a peer hears come from outside."""
     heard = one.group.schedule.heard
-    return [row for row, what in enumerate(heard) if what is _OUTSIDE or (link and what.way.link == link)]
+    return [row for row, what in enumerate(heard) if what is OUTSIDE or (link and what.way.link == link)]
 
 
 def _heard_ports(one: _Opened, link: str, units: Mapping[tuple[str, str], str]) -> list[Port]:

@@ -1,7 +1,7 @@
 """A peer with ways in and out: values that come from outside in a frame, and what is read of it there.
 
 Takes: a `LinearSite` whose last holds are the ways in, and its `Schedule`.
-Gives: `Ports`, `with_holds`, `with_ports`.
+Gives: `Ports`, `with_holds`, `with_ports`; `with_cuts`, `OUTSIDE`.
 Guarantees: the peer moves as before; what comes in and what is read are entries of z, so that every step of
 the kernel takes them along.
 Does not: say what comes in, or lift.
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import ClockPartition, Hold, Kind
 from apc.compiler.frozen import dataclass
-from apc.frame.schedule import Act, Event, Propagate, Schedule, Tick, Value
+from apc.frame.schedule import Act, Event, Heard, Propagate, Schedule, Sent, Tick, Value, Way
 from apc.frame.site import LinearSite, LinearTick
 
 Matrix = NDArray[Any]
@@ -29,6 +29,9 @@ Places = NDArray[np.intp]
 
 # The clocks of what comes in and of what is read, which no scene can name so.
 INPUTS, READINGS = "what comes in", "what is read"
+
+# What comes from outside stands where packets do, and is of no link.
+OUTSIDE = Heard(Way("", "", ""), Sent("", "", 0), 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +70,55 @@ def with_holds(site: LinearSite, columns: Matrix) -> LinearSite:
         ticks=tuple(replace(tick, u=widened(tick.u)) for tick in site.ticks),
         sends=tuple(replace(send, u=widened(send.u)) for send in site.sends),
     )
+
+
+def with_cuts(
+    site: LinearSite, schedule: Schedule, cuts: Sequence[tuple[int, int]]
+) -> tuple[LinearSite, Schedule]:
+    """Return a site some of whose computed values come from outside, and its schedule.
+
+    What a tick would compute of such a value is one more output of its partition. Cut by cut and tick by tick
+    these are the last that is carried, and what comes in the last that is heard.
+
+    Parameters
+    ----------
+    site
+        The site, of floats or of rationals.
+    schedule
+        What happens in a frame.
+    cuts
+        The partition and output of each value.
+    """
+    ticks, clocks = list(site.ticks), list(site.kind.clocks)
+    carried, heard = list(schedule.carried), list(schedule.heard)
+    rows: dict[int, list[int]] = {}
+    for partition, output in cuts:
+        tick, own, count = ticks[partition], clocks[partition], schedule.ticks[partition]
+        outputs = len(tick.x)
+        blocks = [np.vstack([block, block[output]]) for block in (tick.x, tick.u, tick.m, tick.r)]
+        for block in blocks:
+            block[output] = 0
+        outside = np.zeros((outputs + 1, 1), dtype=tick.r.dtype)
+        outside[output] = 1
+        x, u, m, r = blocks
+        ticks[partition] = replace(tick, x=x, u=u, m=m, r=np.hstack([r, outside]))
+        clocks[partition] = replace(
+            own,
+            outputs=(*own.outputs, f"{own.outputs[output]} computed"),
+            units=(*own.units, own.units[output]),
+        )
+        rows.setdefault(partition, []).append(len(heard))
+        carried += [Value(partition, outputs, index - count) for index in range(count)]
+        heard += [OUTSIDE] * count
+    events = tuple(
+        replace(one, heard=(*one.heard, *((row + one.index,) for row in rows.get(one.partition, ()))))
+        if isinstance(one, Tick)
+        else one
+        for one in schedule.events
+    )
+    kind = replace(site.kind, clocks=tuple(clocks))
+    cut = replace(schedule, events=events, carried=tuple(carried), heard=tuple(heard), repeats=None)
+    return replace(site, kind=kind, ticks=tuple(ticks)), cut
 
 
 def with_ports(

@@ -13,6 +13,7 @@ mean, a push at one of them is 1/n of the first and 1 − 1/n of the second.
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 
@@ -56,13 +57,13 @@ MOST_KICKS = 4000
 class Modes:
     """A scene as modes of which any device may be pushed: that of all classes first, then each class apart.
 
-    `bases` are the modes' rigid motions. A class is a site of the first: `apart` gives its own mode,
+    `plain` are the modes of the scene as it is. A class is a site of the first: `apart` gives its own mode,
     `members` how many peers it stands for, `class_of` the class of a peer. `device` is what is pushed,
     `other` what else is looked at.
     """
 
     loops: tuple[Pushed, ...]
-    bases: tuple[Floats, ...]
+    plain: tuple[Loop, ...]
     apart: dict[int, int]
     class_of: dict[int, int]
     members: tuple[int, ...]
@@ -134,8 +135,7 @@ def open_modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Po
         for place, alike in enumerate(common.sites):
             if loop.sites[0].name == alike.name:
                 apart[place] = number
-    bases = tuple(find_rigid_modes(loop).basis for loop in plain)
-    return Modes(loops, bases, apart, class_of, counts, held[port], held[other]), exchange
+    return Modes(loops, plain, apart, class_of, counts, held[port], held[other]), exchange
 
 
 def held_device(system: CompiledSystem, group: PeerGroup, part: str, unit_of: Mapping[str, str]) -> Device:
@@ -226,7 +226,8 @@ class AbstractResponses(ABC):
         is within.
         """
         turns = s.imag * self.frame / (2 * np.pi)
-        near = (np.abs(turns - np.round(turns)) < NEAR) & (turns > 0.5) & self.drifting
+        near = (np.abs(turns - np.round(turns)) < NEAR) & (turns > 0.5)
+        near = near & self.drifting if near.any() else near
         found = [nothing(s) for _ in range(len(aliases) + 2)]
         if not near.all():
             for (value, off), (own, doubt) in zip(found, self.at(s[~near], aliases), strict=True):
@@ -254,7 +255,16 @@ class Responses(AbstractResponses):
         named = self.copies[self.own]
         self.copy = named[0] if named else ""
         self.frame = float(modes.loops[0].frame)
-        self.drifting = any(basis.size for basis in modes.bases)
+
+    @functools.cached_property
+    def bases(self) -> tuple[Floats, ...]:
+        """The rigid motions of each mode."""
+        return tuple(find_rigid_modes(loop).basis for loop in self.modes.plain)
+
+    @functools.cached_property
+    def drifting(self) -> bool:  # type: ignore[override]  # asked for only at multiples of the frame rate
+        """Whether the scene may rest anywhere."""
+        return any(basis.size for basis in self.bases)
 
     def at(self, s: Complex, aliases: Sequence[int] = (0,), *, apart: bool = True) -> list[Carried]:
         """Return the velocity here at each alias, the velocity there, and the copy's error (k,)."""

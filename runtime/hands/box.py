@@ -13,7 +13,6 @@ in between (see `dissipation`), and proves the cell. A cell where that fails is 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from fractions import Fraction
 from functools import partial
@@ -26,13 +25,12 @@ from apc.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.analysis.box import open_sites
 from apc.analysis.box_proof import (
     BITS,
-    UNDECIDED,
     BoxProof,
     Cell,
     ball_radii,
-    halved,
     middle,
     range_ball,
+    search_box,
     site_at,
 )
 from apc.compiler.compiled import CompiledSystem
@@ -123,27 +121,12 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
     """
     refuse_hands(system, OPTION)
     with single_threaded(), np.errstate(all="ignore"), precision(BITS):
-        whole: Cell = tuple((one.low, one.high) for one in ranges)
         asked = _question(system, ranges)
         if isinstance(asked, str):
-            inner = tuple(map(float, middle(whole)))
+            inner = tuple(map(float, middle(tuple((one.low, one.high) for one in ranges))))
             return BoxProof(system.name, tuple(ranges), UNSTABLE, False, 1, 1.0, inner, (asked,))
-        for point in (middle(whole), *itertools.product(*whole)):
-            if _is_unstable(asked, point):
-                return _answer(asked, UNSTABLE, False, 1, 1.0, point)
-        found = halved(whole, partial(_reach_out, asked), partial(_is_unstable, asked))
-    if found.unstable:
-        return _answer(asked, UNSTABLE, False, found.cells, 1.0, found.point)
-    if found.open_share:
-        return _answer(asked, UNDECIDED, None, found.cells, found.open_share, found.point)
-    return _answer(asked, STABLE, True, found.cells, 0.0, ())
-
-
-def _answer(
-    asked: _Question, verdict: str, stable: bool | None, cells: int, left: float, point: Sequence[Fraction]
-) -> BoxProof:
-    where = tuple(map(float, point))
-    return BoxProof(asked.system.name, asked.ranges, verdict, stable, cells, left, where, ())
+        looks = partial(_reach_out, asked), partial(_is_unstable, asked)
+        return search_box(system.name, ranges, *looks, stable=STABLE, unstable=UNSTABLE)
 
 
 def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question | str:

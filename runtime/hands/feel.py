@@ -209,17 +209,7 @@ def feel(
             1.01 * off / np.where(value == 0, np.inf, np.abs(value)) for value, off in (own, across, error)
         ]
         steady = verdict.stable is not False and not quick
-        viscosity = None
-        slow = _slow(responses) if not quick else None
-
-        def damping_of(other_scene: CompiledSystem) -> tuple[float, float] | None:
-            own = _slow(_responses(other_scene, prepare(other_scene), port, other))
-            return None if own is None else (own.damping, own.errors[1])
-
-        if slow is not None:
-            # Of slow motions all move alike: none holds back, and none stays behind.
-            together = abs(slow.stiffness) <= slow.errors[2] and _alike(responses)
-            viscosity = network_viscosity(system, (slow.damping, slow.errors[1]), together, damping_of)
+        slow, viscosity = (None, None) if quick else _slowly(system, responses, port, other)
         modal = responses if steady and isinstance(responses, Responses) else None
         hinf = _extremes(modal) if modal else ()
         h2 = _noise(system, modal) if modal else ()
@@ -266,6 +256,23 @@ def _responses(system: CompiledSystem, prepared: Prepared, port: Port, other: Po
         return PopulationResponses(system, prepared, port, other)
     modes, exchange = open_modes(system, prepared, port, other)
     return Responses(modes, exchange, port.peer, other.peer)
+
+
+def _slowly(
+    system: CompiledSystem, responses: AbstractResponses, port: Port, other: Port
+) -> tuple[Slow | None, Viscosity | None]:
+    """Return what is felt of slow motions, and what of its damping comes of the network."""
+    slow = _slow(responses)
+    if slow is None:
+        return None, None
+
+    def damping_of(changed: CompiledSystem) -> tuple[float, float] | None:
+        own = _slow(_responses(changed, prepare(changed), port, other))
+        return None if own is None else (own.damping, own.errors[1])
+
+    # Of slow motions all move alike: none holds back, and none stays behind.
+    together = abs(slow.stiffness) <= slow.errors[2] and _alike(responses)
+    return slow, network_viscosity(system, (slow.damping, slow.errors[1]), together, damping_of)
 
 
 def _alike(responses: AbstractResponses) -> bool:
@@ -319,7 +326,7 @@ def _extremes(responses: Responses) -> tuple[Extremes, ...]:
     for number in (0, modes.apart.get(responses.own)):
         if number is None:
             continue
-        loop, basis = modes.loops[number], modes.bases[number]
+        loop, basis = modes.loops[number], responses.bases[number]
         site = 0 if number else responses.own
         rows = [("velocity", responses.device.velocity)]
         copy = responses.copies[responses.own]
@@ -364,7 +371,7 @@ def _variance(
     if weights is None:
         return None
     total = off = 0.0
-    loop, basis = modes.loops[0], modes.bases[0]
+    loop, basis = modes.loops[0], responses.bases[0]
     held = [place for place, site in enumerate(loop.sites) if site.device is not None]
     if weights.common:
         sources = {place: 1 / modes.members[place] for place in held}
@@ -376,7 +383,7 @@ def _variance(
     if number is not None and weights.apart:
         sources = {0: 1 - 1 / modes.members[responses.own]}
         found = noise_variance(
-            modes.loops[number], ticks, sources, weights.apart, modes.bases[number], sensors=sensors
+            modes.loops[number], ticks, sources, weights.apart, responses.bases[number], sensors=sensors
         )
         if found is None:
             return None

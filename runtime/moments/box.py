@@ -32,9 +32,9 @@ from apc.analysis.box_proof import (
     BoxProof,
     Cell,
     ball_radii,
-    halved,
     middle,
     range_ball,
+    search_box,
     site_at,
 )
 from apc.compiler.compiled import CompiledSystem
@@ -96,35 +96,14 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
     """
     with single_threaded(), np.errstate(all="ignore"), precision(BITS):
         asked = _question(system, ranges)
-        whole: Cell = tuple((one.low, one.high) for one in ranges)
         loops, _ = peer_classes(asked.told)
         for loop in loops:
             bare = without_packets(loop)
             if not stays_rigid(bare, [asked.open.sites[group.name] for group in bare.sites]):
                 note = f"{loop.name} moves freely in a direction that changes with the parameters"
-                return _answer(asked, UNDECIDED, None, 0, 1.0, (), note)
-        for point in (middle(whole), *itertools.product(*whole)):
-            if _is_unstable(asked, point):
-                return _answer(asked, UNSTABLE, False, 1, 1.0, point)
-        found = halved(whole, partial(_reach_out, asked), partial(_is_unstable, asked))
-    if found.unstable:
-        return _answer(asked, UNSTABLE, False, found.cells, 1.0, found.point)
-    if found.open_share:
-        return _answer(asked, UNDECIDED, None, found.cells, found.open_share, found.point)
-    return _answer(asked, STABLE, True, found.cells, 0.0, ())
-
-
-def _answer(
-    asked: _Question,
-    verdict: str,
-    stable: bool | None,
-    cells: int,
-    left: float,
-    point: Sequence[Fraction],
-    note: str = "",
-) -> BoxProof:
-    where, notes = tuple(float(value) for value in point), (note,) if note else ()
-    return BoxProof(asked.system.name, asked.ranges, verdict, stable, cells, left, where, notes)
+                return BoxProof(system.name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), (note,))
+        looks = partial(_reach_out, asked), partial(_is_unstable, asked)
+        return search_box(system.name, ranges, *looks, stable=STABLE, unstable=UNSTABLE)
 
 
 def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:

@@ -93,7 +93,9 @@ class NetworkVerdict(Result):
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """What second moments grow by in a frame, with bounds; estimates where `exact` is False.
+    """One number, below 1 where a scene is stable, with bounds; an estimate where `exact` is False.
+
+    Of a lossy network it is what second moments grow by in a frame, of passive hands what they can draw.
 
     `why` says why there is none, `note` what it is; `proved` that every rounding is in the bounds; `quick`
     that it took some milliseconds. `errors` works out how far copies are from each other.
@@ -111,7 +113,7 @@ class Growth:
 
     @property
     def stable(self) -> bool | None:
-        """Whether second moments die out, None where bounds leave it open."""
+        """Whether it is below 1, None where bounds leave it open."""
         return True if self.high < 1 else False if self.low > 1 else None
 
 

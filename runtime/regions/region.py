@@ -10,6 +10,7 @@ Does not: draw, or write files (see `present`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +24,7 @@ from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.finite_equations import finite_equations
-from apc.frame.names import Range, notes_for_all_groups
+from apc.frame.names import Free, Range, notes_for_all_groups
 from apc.frame.overrides import apply
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.regions.axes import PLACE
@@ -267,37 +268,19 @@ def region(
         affine = all(site.affine for site in used)
         times = [place for place, one in enumerate(free) if reaches_time(system, one)]
         counts = [place for place, one in enumerate(free) if reaches_count(system, one)]
-        if counts and (len(counts) == 2 or times or not affine or meant in BY_GROWTH):
-            label = axes[counts[0]].free.label
-            why = (
-                "two numbers of peers"
-                if len(counts) == 2
-                else "a time beside it"
-                if times
-                else f"what is stable {BY_GROWTH[meant]}"
-                if meant in BY_GROWTH
-                else "a scene that is not linear"
-            )
-            what = f"{label} is a number of peers: no steps are drawn for {why}"
-            raise ApcError(Mistake("E903", PLACE, what, hint=f"apc critical {label}"))
+        if counts:
+            _check_count(axes[counts[0]], len(counts) == 2, bool(times), meant, affine=affine)
         times += counts
-        source: Source
-        ports = port_evaluator(system, free, prepared) if meant == PASSIVE else None
-        if ports is not None:
-            source = ports
-        elif meant in BY_GROWTH:
+        source = _source(system, free, prepared, meant, timed=bool(times))
+        if isinstance(source, GrowthEvaluator):
             times = []
-            source = GrowthEvaluator(system, free, prepared, PLACE, meant)
-        elif times:
-            source = PointEvaluator(system, free, prepared)
-        else:
-            source = evaluator_of_many(system, free, PLACE, prepared=prepared)
         found: Striped | None = None
         start = prepare_at_start(system, prepared) if len(times) == 1 else None
         if start is not None:
             found = trace_strips(system, axes, times[0], start, cells=cells, tolerance=tolerance, told=told)
         # Of one point at a time what hands can draw is known as the damping needed, which jumps.
-        stepped = (bool(times) or (meant == PASSIVE and ports is None)) and found is None
+        by_point = meant == PASSIVE and isinstance(source, GrowthEvaluator)
+        stepped = (bool(times) or by_point) and found is None
         if found is None:
             found = _surveyed(source, rectangle, stepped, cells, tolerance, told)
         curves = tuple(_curve(source, rectangle, arc) for arc in found.arcs)
@@ -321,6 +304,34 @@ def region(
         ),
         system=system,
     )
+
+
+def _check_count(axis: Range, both: bool, timed: bool, meant: str, *, affine: bool) -> None:
+    """Refuse a number of peers beside what no steps are drawn for: ApcError E903."""
+    reasons = {
+        "two numbers of peers": both,
+        "a time beside it": timed,
+        f"what is stable {BY_GROWTH.get(meant, '')}": meant in BY_GROWTH,
+        "a scene that is not linear": not affine,
+    }
+    why = next((one for one, applies in reasons.items() if applies), "")
+    if why:
+        what = f"{axis.free.label} is a number of peers: no steps are drawn for {why}"
+        raise ApcError(Mistake("E903", PLACE, what, hint=f"apc critical {axis.free.label}"))
+
+
+def _source(
+    system: CompiledSystem, free: Sequence[Free], prepared: Prepared, meant: str, *, timed: bool
+) -> Source:
+    """Return what gives the matrices of a criterion; `timed`: a time or a number of peers varies."""
+    ports = port_evaluator(system, free, prepared) if meant == PASSIVE else None
+    if ports is not None:
+        return ports
+    if meant in BY_GROWTH:
+        return GrowthEvaluator(system, tuple(free), prepared, PLACE, meant)
+    if timed:
+        return PointEvaluator(system, tuple(free), prepared)
+    return evaluator_of_many(system, free, PLACE, prepared=prepared)
 
 
 def _surveyed(

@@ -142,10 +142,10 @@ def critical(
                 return growth_at(changed, prepared, [], _PLACE, criterion=chosen_criterion).stable
             return analyze(changed, prepared=prepared).stable
 
+        low, high = (None if one is None else float(one) for one in limits)
         if counted:
             found = search_counts(system, free, limits, present, stable_of, _PLACE, told=told)
         elif by_growth:
-            low, high = (None if one is None else float(one) for one in limits)
             found = search_growth(
                 *(system, free, low, high, present, prepared, _PLACE), told=told, criterion=chosen_criterion
             )
@@ -153,23 +153,13 @@ def critical(
             start = _at_start(system, prepared)
             found = search_delay(system, free, limits[0] or Fraction(0), limits[1], start, told=told)
         else:
-            low, high = (None if one is None else float(one) for one in limits)
             found = search(system, free, low, high, prepared, told=told)
 
         def stable_now() -> bool | None:
             return stable_of(system)
 
         chosen = _chosen(found, present, stable_now)
-        side = found.stable[0] if found.stable else None
-        if not chosen and found.scanned[0] <= present <= found.scanned[1]:
-            # Floats alone say of which side all samples are; the analysis bounds its error.
-            side = side if stable_now() == side else None
-    words = {True: "stable", False: "unstable", None: "undecided"}[side]
-    verdict = f"{words} at every value scanned"
-    if not found.enters:
-        verdict = f"{words} whatever its value: nothing that decides stability depends on it"
-        if chosen_criterion == PASSIVE and side is False:
-            verdict = f"{words} whatever its value: apc analyze --hands passive says why"
+        verdict = "" if chosen else _everywhere(found, present, stable_now, chosen_criterion)
     return Critical(
         topology=system.name,
         parameter=free.label,
@@ -185,13 +175,27 @@ def critical(
         known=found.known,
         looked=found.looked,
         enters=found.enters,
-        verdict="" if chosen else verdict,
+        verdict=verdict,
         left_out=left_out(system, linear=linear, network=chosen_criterion != MEAN_SQUARE),
         criterion=chosen_criterion,
         groups=values_by_group(system, free),
         stretches=found.stretches,
         counted=counted,
     )
+
+
+def _everywhere(found: Search, present: float, stable_now: Callable[[], bool | None], criterion: str) -> str:
+    """Return the one verdict of all values, where none was found at which it changes."""
+    side = found.stable[0] if found.stable else None
+    if found.scanned[0] <= present <= found.scanned[1]:
+        # Floats alone say of which side all samples are; the analysis bounds its error.
+        side = side if stable_now() == side else None
+    words = {True: "stable", False: "unstable", None: "undecided"}[side]
+    if found.enters:
+        return f"{words} at every value scanned"
+    if criterion == PASSIVE and side is False:
+        return f"{words} whatever its value: apc analyze --hands passive says why"
+    return f"{words} whatever its value: nothing that decides stability depends on it"
 
 
 def _at_start(system: CompiledSystem, prepared: Prepared) -> Prepared:

@@ -1,7 +1,7 @@
 """The evaluator of a system's matrices over some of its parameters, whatever kind of scene it is.
 
 Takes: a `CompiledSystem` and the parameters that vary.
-Gives: `evaluator`, `evaluator_of_many`, `PointEvaluator`; `free_parameters`, `reaches_time`,
+Gives: `evaluator`, `evaluator_of_many`, `PointEvaluator`; `Asked`; `free_parameters`, `reaches_time`,
 `reaches_count`, `overrides_at`.
 Guarantees: peers that are alike at some values only are kept apart.
 Does not: vary times (see `delays`).
@@ -24,9 +24,11 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import arrange, split
+from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.frame.discretize import UNIT
+from apc.frame.exchange import Exchange
 from apc.frame.names import Free, is_named, parameter_of
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import free_rows, scope_of
@@ -241,13 +243,11 @@ def evaluator(
     ApcError
         As `analysis.lifted_groups`.
     """
-    prepared = prepared or prepare(system)
-    known = tuple(map(id, prepared.jacobians))
-    return _evaluator(_Asked(system, tuple(free), known, prepared.order, prepared))
+    return _evaluator(Asked.of(system, free, prepared or prepare(system)))
 
 
 @dataclass(frozen=True, slots=True)
-class _Asked:
+class Asked:
     """All that an evaluator follows from; `known` are the identities of the Jacobians in `prepared`."""
 
     system: CompiledSystem
@@ -256,16 +256,29 @@ class _Asked:
     order: tuple[str, ...]
     prepared: Prepared = field(compare=False)
 
+    @classmethod
+    def of(cls, system: CompiledSystem, free: Sequence[Free], prepared: Prepared) -> Asked:
+        """Return what is asked of a scene, from `analysis.prepare`, over parameters that vary."""
+        return cls(system, tuple(free), tuple(map(id, prepared.jacobians)), prepared.order, prepared)
+
+    @property
+    def parameters_suffice(self) -> bool:
+        """Whether numbers alone say how all peers move, wherever they are."""
+        used = [self.prepared.jacobians[group.kind] for group in self.system.groups]
+        return all(site.parameters_suffice for site in used)
+
+    def lifted_anywhere(self) -> tuple[tuple[PeerGroup, ...], Exchange]:
+        """Return the peers in groups, alike where they are so at every value, and what they exchange."""
+        return lifted_groups(generic(self.system, self.free), prepared=self.prepared)
+
 
 @lru_cache(maxsize=KEPT)
-def _evaluator(of: _Asked) -> BatchEvaluator | PointEvaluator:
+def _evaluator(of: Asked) -> BatchEvaluator | PointEvaluator:
     """Prepare a system, see `evaluator`."""
-    used = [of.prepared.jacobians[group.kind] for group in of.system.groups]
-    if not all(site.parameters_suffice for site in used):
+    if not of.parameters_suffice:
         lifted_groups(of.system, prepared=of.prepared)  # what is refused at every value is refused here
         return PointEvaluator(of.system, of.free, of.prepared)
-    groups, exchange = lifted_groups(generic(of.system, of.free), prepared=of.prepared)
-    return batch_evaluator(of.system, of.free, groups, exchange)
+    return batch_evaluator(of.system, of.free, *of.lifted_anywhere())
 
 
 def long_loops(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) -> LoopEvaluator | None:
@@ -276,12 +289,12 @@ def long_loops(system: CompiledSystem, free: Sequence[Free], prepared: Prepared)
     system, free, prepared
         As for `evaluator`, which raises the same.
     """
-    used = [prepared.jacobians[group.kind] for group in system.groups]
+    asked = Asked.of(system, free, prepared)
     if max(sum(schedule.depths) for schedule in prepared.schedules) * system.peers <= MANY_PACKETS:
         return None
-    if not all(site.parameters_suffice for site in used):
+    if not asked.parameters_suffice:
         return None
-    groups, exchange = lifted_groups(generic(system, free), prepared=prepared)
+    groups, exchange = asked.lifted_anywhere()
     loops = arrange(groups, exchange).loops
     if not any(len(loop.packets) > max(MANY_PACKETS, loop.states / 2) for loop in loops):
         return None

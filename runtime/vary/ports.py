@@ -10,7 +10,7 @@ Does not: vary a time, or ask what hands can draw (see `regions.peaks`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -18,7 +18,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups
+from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Feedback, Loop, StateLayout, close, feedback_of, lay_out_loop
@@ -31,7 +31,7 @@ from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of
 from apc.hands.passivity import OPTION, frequency_of, worst_at
 from apc.hands.port import EVEN, Cut, Maps, Opened, Openings, PortLoop, open_ports, port_loop
 from apc.vary.batch import BatchEvaluator, batch_evaluator, is_beyond
-from apc.vary.evaluator import generic
+from apc.vary.evaluator import Asked
 from apc.vary.wiring import site_key
 
 Floats = NDArray[np.float64]
@@ -186,29 +186,16 @@ def port_evaluator(system: CompiledSystem, free: Sequence[Free], prepared: Prepa
         As `passivity.passive_hands`.
     """
     refuse_hands(system, OPTION)
-    known = tuple(map(id, prepared.jacobians))
-    return _evaluator(_Asked(system, tuple(free), known, prepared.order, prepared))
-
-
-@dataclass(frozen=True, slots=True)
-class _Asked:
-    """All that an evaluator follows from; `known` are the identities of the Jacobians in `prepared`."""
-
-    system: CompiledSystem
-    free: tuple[Free, ...]
-    known: tuple[int, ...]
-    order: tuple[str, ...]
-    prepared: Prepared = field(compare=False)
+    return _evaluator(Asked.of(system, free, prepared))
 
 
 @lru_cache(maxsize=KEPT)
-def _evaluator(of: _Asked) -> PortEvaluator | None:
+def _evaluator(of: Asked) -> PortEvaluator | None:
     """Prepare a scene, see `port_evaluator`."""
-    system, free, prepared = of.system, of.free, of.prepared
-    if not all(prepared.jacobians[group.kind].parameters_suffice for group in system.groups):
+    if not of.parameters_suffice:
         return None
-    groups, exchange = lifted_groups(generic(system, free), prepared=prepared)
-    openings = open_ports(system, groups, exchange, option=OPTION)
+    groups, exchange = of.lifted_anywhere()
+    openings = open_ports(of.system, groups, exchange, option=OPTION)
     if isinstance(openings, str):
         return None
     wired = []
@@ -217,8 +204,8 @@ def _evaluator(of: _Asked) -> PortEvaluator | None:
         layout = lay_out_loop(loop)
         wired.append(_Wired(loop, tuple(feedback_of(loop, layout)), layout, cut, port))
     return PortEvaluator(
-        free=free,
-        batch=batch_evaluator(system, free, groups, exchange, matrices=False),
+        free=of.free,
+        batch=batch_evaluator(of.system, of.free, groups, exchange, matrices=False),
         openings=openings,
         inertias={id(one): _inertias(one) for one in openings.groups},
         wired=tuple(wired),
@@ -235,7 +222,8 @@ def _inertias(opened: Opened) -> Callable[[Floats], Floats]:
     def inertias(vectors: Floats) -> Floats:
         same = (vectors[:, followed] == vectors[:1, followed]).all()
         used = vectors[:1] if same else vectors
-        found = function.map(len(used))(*zeros[:2], used.T, zeros[2])
+        every = function if len(used) == 1 else function.map(len(used))
+        found = every(*zeros[:2], used.T, zeros[2])
         return np.asarray(found, dtype=np.float64).ravel()
 
     return inertias
