@@ -298,8 +298,8 @@ def test_a_stand_in_for_what_was_heard_before_is_refused(tmp_path: Path) -> None
     with pytest.raises(ApcError) as refused:
         apc.simulate(system, duration="10 ms")
     assert str(refused.value) == (
-        "aged: E893 mean(previous(others.it.x)): what stood in for a missing value at the tick before is not "
-        "kept. Write: on_loss: hold"
+        "scene.yaml: E893 mean(previous(others.it.x)): what stood in for a missing value at the tick before "
+        "is not kept. Write: on_loss: hold"
     )
 
 

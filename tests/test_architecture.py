@@ -135,6 +135,7 @@ HOUSE = (
         "apc",
         "api",
     ),
+    ("apc.explore", "sliders written motion sections desk figures page server"),
     (
         "apc.cli",
         """
@@ -142,7 +143,6 @@ HOUSE = (
         library report commands
         """,
     ),
-    ("apc.explore", "sliders written motion sections desk figures page server"),
     ("apc", "__main__"),
 )
 ORDER = tuple(f"{package}.{name}" for package, names in HOUSE for name in names.split())

@@ -130,7 +130,7 @@ E841 runtime/cli: the words of a command stand in another order
 E842 runtime/vary: limits leave nothing to search
 E843 runtime/vary: a limit is out of its parameter's bounds
 E844 runtime/vary: a time can't be varied continuously
-E845 runtime/vary: a delay can't be searched in a scene that is not linear
+E845 runtime/analysis: a delay can't be searched in a scene that is not linear
 E846 runtime/vary: events coincide too often to be searched
 E850 runtime runtime/analysis: a method can't serve a scene
 E861 runtime/analysis: a scene has not the paper's form

@@ -11,6 +11,22 @@ from apc.frame.overrides import Override, apply
 from apc.vary.margins import margins
 from tests.topologies import AVERAGE, compiled, replaced
 
+DEAD_RECKONING = """
+topology: dead-reckoning
+clocks: {haptic: 1 ms, network: 8 ms}
+peers: {user: {count: 2}}
+masses:
+  device: {mass: 0.1 kg, damping: 5 N*s/m}
+  cube:   {mass: 0.6 kg, damping: 5 N*s/m, shared: true}
+couplers:
+  contact:      {type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic,
+                 delay: 1 ms}
+  coordination: {type: DeadReckoning, object: cube, stiffness: 200 N/m, damping: 5 N*s/m,
+                 threshold: 0.1 mm, clock: haptic, period: 1 ms, delay: 1 ms, link: lan}
+links: {lan: {clock: network, delay: 8 ms, loss: 0 %}}
+hands: {arm: {type: SpringDamperArm, flange: device, stiffness: 100 N/m, damping: 2 N*s/m}}
+"""
+
 
 def test_every_stiffness_damping_and_delay_of_a_coupler_has_a_margin_that_holds() -> None:
     system = compiled(AVERAGE)
@@ -29,6 +45,20 @@ def test_every_stiffness_damping_and_delay_of_a_coupler_has_a_margin_that_holds(
             value = Fraction(one.value * (1 + side))
             assert analyze(apply(system, [Override(Free(name), value)])).stable is stable
         assert one.factor == (one.value / one.present if one.present else None)
+
+
+def test_a_delay_moves_where_a_kind_starts_if_its_equations_ask_how_old_packets_are() -> None:
+    system = compiled(DEAD_RECKONING)
+    found = {one.parameter: one for one in margins(system).rows}
+    contact, link = found["contact.delay"], found["coordination.delay"]
+    assert contact.value is not None
+    assert link.value is None
+    for name, value, stable in [
+        ("contact.delay", contact.value * (1 - 1e-9), True),
+        ("contact.delay", contact.value * (1 + 1e-9), False),
+        *(("coordination.delay", share * link.scanned, True) for share in (0.3, 0.6, 0.9)),
+    ]:
+        assert analyze(apply(system, [Override(Free(name), Fraction(value))])).stable is stable
 
 
 def test_a_scene_that_is_not_stable_has_no_margins_and_says_so() -> None:

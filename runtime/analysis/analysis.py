@@ -58,13 +58,15 @@ class Prepared:
     """What analyses of one system with different numbers have in common.
 
     The Jacobians (one a kind) hold for any numbers; the schedules (one a group) for these timings and this
-    order of coincident events.
+    order of coincident events. With `starting` the Jacobians are those where each kind starts (see
+    `prepare_at_start`).
     """
 
     jacobians: tuple[SiteJacobians, ...]
     schedules: tuple[Schedule, ...]
     timings: Mapping[str, Fraction]
     order: tuple[str, ...]
+    starting: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,10 +149,16 @@ def prepare_at_start(system: CompiledSystem, prepared: Prepared) -> Prepared | N
         As `plan.refuse_varying`.
     """
     refuse_varying(system, prepared.jacobians)
+    found = _starting(system, prepared.jacobians)
+    return None if found is None else replace(prepared, jacobians=found, starting=True)
+
+
+def _starting(system: CompiledSystem, sites: tuple[SiteJacobians, ...]) -> tuple[SiteJacobians, ...] | None:
+    """Return the Jacobians of each kind where it starts, None where one's don't follow from parameters."""
     used = {group.kind for group in system.groups}
-    sites = [at_start(site) if kind in used else site for kind, site in enumerate(prepared.jacobians)]
-    found = tuple(site for site in sites if site is not None)
-    return replace(prepared, jacobians=found) if len(found) == len(sites) else None
+    listed = [at_start(site) if kind in used else site for kind, site in enumerate(sites)]
+    found = tuple(site for site in listed if site is not None)
+    return found if len(found) == len(sites) else None
 
 
 @part("analysis")
@@ -359,8 +367,31 @@ def timed(system: CompiledSystem, prepared: Prepared, numbers: Numbers) -> Prepa
     """Return what was prepared, with the schedules of these timings."""
     if numbers.timings == prepared.timings:
         return prepared
-    sites = at_timings(system, prepared.jacobians, numbers.timings, prepared.order)
-    return _scheduled(system, sites, numbers.timings, prepared.order)
+    return prepared_at(system, prepared, numbers.timings)
+
+
+def prepared_at(system: CompiledSystem, prepared: Prepared, timings: Mapping[str, Fraction]) -> Prepared:
+    """Return what was prepared for other timings: with their schedules, and with the ages they make.
+
+    Raises
+    ------
+    ApcError
+        E845 where what is heard at these timings decides how a kind moves where it starts.
+    """
+    sites = at_timings(system, prepared.jacobians, timings, prepared.order)
+    if prepared.starting and sites is not prepared.jacobians:
+        found = _starting(system, sites)
+        if found is None:
+            raise hangs_on_heard(system)
+        sites = found
+    return replace(_scheduled(system, sites, timings, prepared.order), starting=prepared.starting)
+
+
+def hangs_on_heard(system: CompiledSystem) -> ApcError:
+    """Return the refusal of a delay of a scene whose kinds' parameters don't say how these start."""
+    what = "how the scene moves hangs on what is heard at the start: a delay can't be searched"
+    hint = "apc critical of a stiffness or damping"
+    return ApcError(Mistake("E845", Place(system.origin.topology), what, hint=hint))
 
 
 def _scheduled(

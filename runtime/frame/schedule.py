@@ -118,16 +118,18 @@ class Send:
 class Tick:
     """Clock partition `partition` computes, tick `index`; `heard` are each receive's rows of r, to add.
 
-    `variant` is which of the partition's columns it computes (see `ClockPartition.variants`).
+    `variant` is which of the partition's columns it computes (see `ClockPartition.variants`), None of one.
     """
 
     partition: int
     index: int
     heard: tuple[tuple[int, ...], ...]
-    variant: int = 0
+    variant: int | None = None
 
     def rows(self, outputs: int) -> slice:
-        """Return its own rows, of a partition's that has so many outputs."""
+        """Return its own rows, of a partition's that has so many outputs: all where it has one column."""
+        if self.variant is None:
+            return slice(None)
         return slice(self.variant * outputs, (self.variant + 1) * outputs)
 
 

@@ -344,7 +344,7 @@ def _computations(
     for (p, index), row in heard_at.items():
         places = tuple(tuple(place_of[one] for one in receive) for receive in row)
         partition = pattern.kind.clocks[p]
-        variant = partition.variants[index % len(partition.variants)] if partition.variants else 0
+        variant = partition.variants[index % len(partition.variants)] if partition.variants else None
         yield times.clocks[partition.clock].at(index), rank, Tick(p, index, places, variant)
 
 

@@ -15,7 +15,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from apc.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
+from apc.analysis.analysis import Prepared, analyze, hangs_on_heard, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
@@ -202,9 +202,7 @@ def _at_start(system: CompiledSystem, prepared: Prepared) -> Prepared:
     """Return what was prepared, as the parameters say; refuse a delay of a scene where they don't suffice."""
     found = prepare_at_start(system, prepared)
     if found is None:
-        what = "how the scene moves hangs on what is heard at the start: a delay can't be searched"
-        hint = "apc critical of a stiffness or damping"
-        raise ApcError(Mistake("E845", Place(system.origin.topology), what, hint=hint))
+        raise hangs_on_heard(system)
     return found
 
 

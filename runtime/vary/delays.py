@@ -22,18 +22,16 @@ from fractions import Fraction
 
 import numpy as np
 
-from apc.analysis.analysis import Prepared, lifted_groups
+from apc.analysis.analysis import Prepared, lifted_groups, prepared_at
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.multiples import common_divisor
 from apc.compiler.words import time_left
-from apc.frame.ages import at_timings
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
 from apc.frame.schedule import Act, Propagate, Schedule
-from apc.frame.scheduling import build_schedules
 from apc.vary.batch import BatchEvaluator, batch_evaluator
 
 # Pieces of one search: each is some schedules and matrices, a hundredth of a second and more.
@@ -261,16 +259,13 @@ def _piece(
     """Build the evaluator of one piece from its schedules at a value inside."""
     value = low + INSIDE * (high - low)
     inside = system_with_delay(system, free, value)
-    timings = resolve(inside).timings
-    sites = at_timings(system, prepared.jacobians, timings, prepared.order)
-    schedules = build_schedules(system, timings, [site.pattern for site in sites], order=prepared.order)
+    shared = prepared_at(system, prepared, resolve(inside).timings)
     durations: dict[int, tuple[float, float]] = {}
-    for schedule, group in zip(schedules, system.groups, strict=True):
+    for schedule, group in zip(shared.schedules, system.groups, strict=True):
         for quanta, slope in _steps(schedule, system.kinds[group.kind], slopes).items():
             durations[quanta] = (float(quanta * schedule.quantum - slope * value), float(slope))
     if not follows and not any(slope for _, slope in durations.values()):
         return Piece(low, high, None, inside)
-    shared = Prepared(sites, schedules, timings, prepared.order)
     groups, exchange = lifted_groups(inside, prepared=shared)
     found = batch_evaluator(inside, (free,), groups, exchange, durations=durations, follows=follows)
     return Piece(low, high, found, inside)
