@@ -14,10 +14,10 @@ from typing import Literal
 from apc.compiler.cache import origin_texts
 from apc.compiler.compiled import CompiledSystem, Origin
 from apc.compiler.components.library import Library, definition_of
-from apc.compiler.equations.clocks import ClockedSystem, partition
+from apc.compiler.equations.clocks import ClockedSystem, check_alone, partition
 from apc.compiler.equations.flatten import FlatSystem, flatten
 from apc.compiler.equations.structure import SortedSystem, sort
-from apc.compiler.errors import ApcError
+from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.functions.functions import build_functions
 from apc.compiler.scene.scene import Scene, build_scene, library_folders
 from apc.compiler.source.nodes import Mapping, Scalar, Sequence
@@ -54,8 +54,13 @@ def check_definition(path: Path) -> str:
         return ""
     beside: list[ApcError] = []
     library = Library((path.parent,), beside)
+    mistakes = Mistakes()
     try:
-        _ = library.component(name) if kind == "component" else library.connector(name)
+        if kind == "component":
+            check_alone(library.component(name), Place(str(path)), mistakes)
+        else:
+            library.connector(name)
+        mistakes.raise_if_any()
     except ApcError as error:  # its own mistakes first
         beside.insert(0, error)
     if beside:

@@ -1034,6 +1034,55 @@ def test_every_mistake_of_a_component_is_told_at_once(tmp_path: Path) -> None:
     ]
 
 
+CLOCKED = """\
+component: Pad
+connectors: {a: Flange, b: Flange}
+parameters: {k: {unit: N/m}, clock: clock}
+equations:
+  - a.f = k*(sample(a.x) - sample(b.x))
+  - b.f = -a.f
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        (
+            "",
+            "",
+            "5:5: E505 Pad.a.f acts on what it is joined to at all times, and is on clock clock. "
+            "Write: a.f = hold(k*(sample(a.x) - sample(b.x)))",
+        ),
+        (
+            "clock: clock}",
+            "clock: clock, slow: clock}",
+            "5:14: E504 Pad samples, and has clocks clock, slow. Write: sample(a.x, clock)",
+        ),
+        (
+            ", clock: clock}",
+            "}",
+            "5:14: E504 Pad samples but has no parameter that names one clock. "
+            "Write: parameters: {clock: clock}",
+        ),
+        (
+            "a: Flange, b: Flange}\nparameters: {k: {unit: N/m}, clock: clock}",
+            "a: PlanarFlange, b: PlanarFlange}\nparameters: {k: {unit: N/m}, clock: clock, slow: clock}",
+            "5:14: E504 Pad samples, and has clocks clock, slow. Write: sample(a.x, clock)",
+        ),
+    ],
+)
+def test_what_no_scene_can_mend_of_clocks_is_told_of_a_component_by_itself(
+    old: str, new: str, told: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "pad.yaml"
+    path.write_text(CLOCKED.replace(old, new, 1))
+    with pytest.raises(ApcError) as caught:
+        check_definition(path)
+    found = [str(mistake).partition("\n")[0] for mistake in caught.value.mistakes]
+    assert found[0] == f"{path}:{told}"
+    assert len(found) == 1 + told.count("E504"), "a sample each"
+
+
 def test_a_component_is_checked_by_itself_and_is_no_topology(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -80,6 +80,14 @@ def test_a_good_component_has_the_radius_of_its_spring(
     assert found.spectral_radius == pytest.approx(sampled_spring(stiffness), abs=1e-12)
 
 
+@pytest.mark.parametrize("jump", ["floor", "sign"])
+def test_a_loop_that_the_value_of_a_jump_opens_is_none(jump: str, tmp_path: Path) -> None:
+    """What jumps is asked of ground, which is at 0: nothing but der(a.x) = 0 is left to find the force by."""
+    equations = [f"F*{jump}(b.x/L)*sqrt(a.f/F) = K*T0*der(a.x)", "b.f = -a.f", "z = a.x"]
+    found = apc.analyze(model(tmp_path, equations))
+    assert (found.rigid_modes, found.spectral_radius) == (1, 0)
+
+
 @pytest.mark.parametrize(
     "equations",
     [

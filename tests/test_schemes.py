@@ -5,6 +5,7 @@ Each law stands here as its source has it; the matrix of a frame, and its eigenv
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -96,6 +97,28 @@ def test_predicted_average_is_its_law(delay: int, age: int | None) -> None:
         ("delay: 8 ms", f"delay: {delay} ms"),
     )
     same(compiled(text), ByHand([[DEVICE, (0.2, 5.0, 0.0)]] * 3, everybody(3), law, told=1, late=delay))
+
+
+@pytest.mark.parametrize("delay", [0, 8, 10, 50, 200])
+@pytest.mark.parametrize("ratio", [2, 5, 8])
+def test_reported_average_is_a_mean_begun_anew_at_each_packet(ratio: int, delay: int) -> None:
+    """By hand the sum starts from nothing at each packet, and is told over how many ticks there are."""
+    calls = itertools.count()
+
+    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
+        begins = next(calls) // 2 % ratio == 0  # each tick asks both peers
+        total = x[1][0] + (0 if begins else memory[0])
+        push, pull = contact(x), 500 * (x[1][0] - mean(heard, 2)) + 5 * x[1][1]
+        return [-push, push - pull], [total], [total / ratio]
+
+    text = replaced(
+        scene("two-users-reported"),
+        ("network: 8 ms", f"network: {ratio} ms"),
+        ("interval: 8 ms", f"interval: {ratio} ms"),
+        ("delay: 8 ms", f"delay: {delay} ms"),
+    )
+    hand = ByHand([[DEVICE, CUBE]] * 2, everybody(2), law, told=1, memory=1, out=1, ratio=ratio, late=delay)
+    same(compiled(text), hand)
 
 
 def test_a_prediction_of_age_nought_is_the_average() -> None:
@@ -378,6 +401,7 @@ def test_every_linear_scheme_stands_beside_the_papers() -> None:
         "two-users-filtered-waves",
         "two-users-damped",
         "three-users-predicted",
+        "two-users-reported",
     ]
     found = compare([compiled(scene(name)) for name in names])
     assert [one.topology for one in found.schemes] == names
@@ -390,4 +414,7 @@ def test_every_linear_scheme_stands_beside_the_papers() -> None:
         assert one.feel is not None
     assert found.schemes[1].feel is not None
     assert found.schemes[1].feel.at == "client[1].device", "the server holds no device"
-    assert [one.loss is None for one in found.schemes] == [True, *[False] * 5]
+    without = [one.topology for one in found.schemes if one.loss is None]
+    assert without == ["three-users-average", "three-users-predicted"], (
+        "no loss to vary; by the ages of packets"
+    )

@@ -91,6 +91,8 @@ def at(text: str, point: dict[str, float]) -> Any:
         ("cos(-x)", "cos(x)"),
         ("asin(-x) + asin(x) + cosh(-x) - cosh(x)", "0"),
         ("acos(1) + tan(0) + atan(0)", "0"),
+        ("floor(-2/3) + sign(-2/3) + floor(0*x) + sign(3)", "-1"),
+        ("floor(-sqrt(2)) + sign(1 - sqrt(2)) + floor(sqrt(2)*sqrt(2))", "-1"),
         ("der(x*y)", "D(x*y)"),
     ],
 )

@@ -41,6 +41,7 @@ KEPT = {
     "two-handed-tool": [(6, 2, 2)],  # two devices and a copy; the tool is midway
     "two-users-damped": [(4, 2, 2)],
     "two-users-proxies": [(4, 2, 2)],
+    "two-users-reported": [(4, 5, 1)],  # the mean as it grows, and what was told, at either clock
     "two-users-filtered-waves": [(4, 5, 2)],  # as below, and the filter
     "two-users-waves": [(4, 4, 2)],  # the outgoing wave until it is sent, and the point that moves
     "unlike-devices": [(4, 2, 2)],
@@ -71,6 +72,7 @@ WRITTEN: dict[str, int | list[int]] = {
     "two-handed-tool": 4 * 3 + 3 + 3 + 4 + 6 + 4,
     "two-users-damped": 6 + 3 + 2 + 3 + 2,
     "two-users-filtered-waves": 6 + 3 + 7 + 3 + 2,
+    "two-users-reported": 6 + 3 + 8 + 3 + 2,
     "two-users-waves": 6 + 3 + 7 + 3 + 2,
     "users-table": ARMED,
 }
@@ -82,9 +84,9 @@ UNREAD = {  # forces within one rigid body
 }
 MADE = {"two-handed-tool": 1}  # equations that nobody wrote: the bar's, differentiated, for der(tool.v)
 # What is remembered to be looked at again, and what is held at once, until it is sent.
-AGAIN = ("wall.x", "coordination.heard", "coordination.p(")
-SENT = ("coordination.out", "coordination.pull")
-HELD = ("client-server", "two-users-waves", "two-users-filtered-waves")
+AGAIN = ("wall.x", "coordination.heard", "coordination.p(", "coordination.shown", "coordination.seen")
+SENT = ("coordination.out", "coordination.pull", "coordination.told")
+HELD = ("client-server", "two-users-reported", "two-users-waves", "two-users-filtered-waves")
 
 
 def functions(system: CompiledSystem) -> list[Any]:

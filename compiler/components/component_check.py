@@ -131,6 +131,7 @@ class ComponentNames:
             for equation in reversed(self.component.equations)
             if isinstance(equation.left, Name)
             and len(equation.left.parts) == 1
+            and not equation.left.parts[0].endswith("]")
             and equation.left.parts not in self.dimensions
         }
         # An unknown name on the right is reported once, by `check`.
@@ -315,8 +316,9 @@ class ComponentNames:
                 known = sorted(
                     ".".join(parts) for parts in self.dimensions if not whole_and_index(parts[-1])[1]
                 )
-                what = f"{self.component.name} has no {brief(shown)}"
-                add_unknown("E303", place_in(place, text, node.start), what, shown, known, mistakes)
+                whole, _ = whole_and_index(shown)
+                what = f"{self.component.name} has no {brief(whole)}"
+                add_unknown("E303", place_in(place, text, node.start), what, whole, known, mistakes)
         return wrong
 
     def _is_bad_index(self, parts: tuple[str, ...], place: Place, mistakes: Mistakes) -> bool:

@@ -58,6 +58,13 @@ class ClockInference:
                 what = f"{equation.origin} hears the other peers but has no parameter that names one clock"
                 self.mistakes.add("E504", equation.place, what, hint="parameters: {clock: clock}")
 
+    def joined(self, potential: str, flow: str) -> None:
+        """Record a flow that a part gives on a clock, beside a potential that it takes as continuous."""
+        given, its = self._given.get(flow), self.of(flow)
+        beside = self._clock_of_set.get(self._find(potential))
+        if given is not None and its != CONTINUOUS and beside == CONTINUOUS:
+            self._report_flow(flow, its, given)
+
     def _find(self, name: str) -> str:
         root = name
         while (parent := self._parents.get(root, root)) != root:

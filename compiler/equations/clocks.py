@@ -23,11 +23,18 @@ from dataclasses import replace
 from fractions import Fraction
 
 from apc.compiler.compiled import count_of
-from apc.compiler.components.component import OTHERS
+from apc.compiler.components.component import OTHERS, Component
 from apc.compiler.equations.clock_inference import CONTINUOUS, ClockInference, domain
-from apc.compiler.equations.flatten import FlatEquation, FlatKind, FlatSend, FlatSystem, is_made
+from apc.compiler.equations.flatten import (
+    FlatEquation,
+    FlatKind,
+    FlatSend,
+    FlatSystem,
+    flatten_alone,
+    is_made,
+)
 from apc.compiler.equations.reductions import Of, affine_in_others, hears_others, of_others
-from apc.compiler.errors import Mistakes
+from apc.compiler.errors import Mistakes, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.language.expression import (
     Binary,
@@ -42,6 +49,21 @@ from apc.compiler.language.expression import (
 from apc.compiler.scene.scene import Scene
 
 HEARD_AGE = f"{OTHERS}.age"  # in what a reduction runs over; no send has this name, as a part's stands before
+
+
+def check_alone(component: Component, place: Place, mistakes: Mistakes) -> None:
+    """Record what a component by itself says of clocks that no scene can mend."""
+    flat = flatten_alone(component, place, mistakes)
+    if mistakes:
+        return
+    clocks = ClockInference({variable.name for variable in flat.variables}, mistakes)
+    for index, equation in enumerate(flat.equations):
+        clocks.visit(f"equation {index}", equation)
+    clocks.finish()
+    for name, connector in component.connectors:
+        for potential, flow in zip(connector.potentials, connector.flows, strict=True):
+            whole = f"{component.name}.{name}"
+            clocks.joined(f"{whole}.{potential.name}", f"{whole}.{flow.name}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,6 +35,7 @@ from apc.compiler.language.expression import (
     walk,
 )
 from apc.compiler.language.values import Value
+from apc.compiler.language.vectors import whole_and_index
 from apc.compiler.scene.instances import Part
 from apc.compiler.scene.scene import Scene, SceneGroup
 
@@ -194,6 +195,33 @@ def _is_linear_reduction(call: Call) -> bool:
     return call.function in ("mean", "sum") and not any(
         isinstance(node, Call) and node.function == "age" for node in walk(call)
     )
+
+
+def flatten_alone(component: Component, place: Place, mistakes: Mistakes) -> FlatKind:
+    """Write out a component by itself: a clock or link has the name it has there, an option its first word.
+
+    What parts inside give is not written.
+    """
+    options = tuple((p.name, p.words[0]) for p in component.parameters if isinstance(p, Option))
+    references = tuple((p.name, p.name) for p in component.parameters if isinstance(p, Reference))
+    part = Part(component.name, "", component, (), options, references, (), (), (), False, (), place)
+    instance = _Instance(part, {}, mistakes)
+    equations, sends = tuple(instance.equations()), tuple(instance.sends())
+    variables = (*instance.variables(), *instance.held_variables)
+    return FlatKind(
+        component.name, (), (), (part.name,), variables, (*equations, *instance.held_equations), sends
+    )
+
+
+def _as_written(expression: Expr, text: str) -> Expr:
+    """Return an entry of an expression between vectors as it stands in the text: without its index."""
+
+    def whole(node: Expr) -> Expr | None:
+        if isinstance(node, Name):
+            return Name((*node.parts[:-1], whole_and_index(node.parts[-1])[0]))
+        return None
+
+    return expression if format_expression(expression) in text else transform(expression, whole)
 
 
 class _Instance:
@@ -365,7 +393,8 @@ class _Instance:
             hint = "parameters: {clock: clock}"
             if self.clocks:
                 what = f"{self.component.name} samples, and has clocks {', '.join(sorted(self.clocks))}"
-                hint = format_expression(Call("sample", (node.arguments[0], Name((min(self.clocks),)))))
+                own = _as_written(node.arguments[0], where.text)
+                hint = format_expression(Call("sample", (own, Name((min(self.clocks),)))))
             self.mistakes.add("E504", place, what, hint=hint)
             clock = "?"
         return Call("sample", (argument, Name((clock,))))

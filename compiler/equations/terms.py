@@ -415,6 +415,10 @@ def apply(name: str, *arguments: Term) -> Term:
         return power(first, HALF)
     if name == "abs" and isinstance(first, Number):
         return Number(_size(first.value))
+    if name in ("floor", "sign") and not first.free_symbols:
+        value = first.value if isinstance(first, Number) else constant(first)
+        if math.isfinite(value):
+            return Number(math.floor(value) if name == "floor" else (value > 0) - (value < 0))
     if name == "log":
         if first == ONE or (not first.free_symbols and constant(first) <= 0):
             return ZERO if first == ONE else NO_NUMBER

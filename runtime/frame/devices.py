@@ -96,13 +96,7 @@ def find_device(
     gripped = {own for own in owners for one in kind.held if own == one or own.startswith(f"{one}.")}
     if not (site.walkable and kind.derivative.is_a("SXFunction")):
         return f"{kind.name} has a nonlinear loop"
-    told_of = {
-        _part(kind.states[place].name)
-        for send, sending in zip(site.pattern.sends, kind.sends, strict=True)
-        for row, unit in zip(send.x, sending.units, strict=True)
-        if unit == "m"
-        for place in np.flatnonzero(row)
-    }
+    told_of = _told_of(site)
     masses = tuple(place for place, name in enumerate(kind.parameters) if unit_of.get(name) == "kg")
     x, u, _, _, p, t = start_arguments(site, exact_numbers(kind, parameters), Fraction, listening)
     peers = kind.parameters.index(PEERS) if PEERS in kind.parameters else None
@@ -142,6 +136,21 @@ def find_device(
         return f"a hand may hold any of {', '.join(found)} ({kind.name})"
     (one,) = found.values()
     return f"{one} ({kind.name})" if isinstance(one, str) else one
+
+
+def _told_of(site: SiteJacobians) -> set[str]:
+    """Return the parts whose positions others are told: as they are, or in what was computed to be sent."""
+    kind = site.kind
+    ticks = {tick.clock: tick for tick in site.pattern.ticks}
+    computed = [ticks[hold.clock].x[hold.output] for hold in kind.holds]
+    return {
+        _part(kind.states[place].name)
+        for send, sending in zip(site.pattern.sends, kind.sends, strict=True)
+        for row, held, unit in zip(send.x, send.u, sending.units, strict=True)
+        if unit == "m"
+        for one in (row, *(computed[hold] for hold in np.flatnonzero(held)))
+        for place in np.flatnonzero(one)
+    }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
