@@ -38,7 +38,7 @@ from tests.topologies import AVERAGE, clocked, compiled, flat, ordered, scene, s
                 "  haptic: contact.f, coordination.own, coordination.received, coordination.f",
                 "  sample on haptic: contact.a.x",
                 "  hold of haptic: contact.f, after contact.delay s",
-                "  receive on haptic over lan: mean of coordination.x",
+                "  receive on haptic over lan: mean of others.coordination.x",
                 "  send over lan: coordination.x = coordination.object.x",
             ),
         ),

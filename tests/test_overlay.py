@@ -101,7 +101,7 @@ def test_a_condition_that_holds_in_the_whole_window_has_no_curve() -> None:
         (
             "colgate:K=it.stiffness,b=device.damping,B=0 N*s/m",
             "overlay: E886 b > K T/2 + |B| needs T, the sampling period. "
-            "Write: colgate:K=it.stiffness,b=device.damping,B=0 N*s/m,T=… (a parameter or a quantity in s)",
+            "Write: colgate:K=it.stiffness,b=device.damping,B=0 N*s/m,T=… (a parameter or a quantity in ms)",
         ),
         (
             "colgate:K=it.stifness",
