@@ -57,7 +57,8 @@ def check_definition(path: Path) -> str:
     mistakes = Mistakes()
     try:
         if kind == "component":
-            check_alone(library.component(name), Place(str(path)), mistakes)
+            if component := library.component(name):
+                check_alone(component, Place(str(path)), mistakes)
         else:
             library.connector(name)
         mistakes.raise_if_any()

@@ -1083,6 +1083,49 @@ def test_what_no_scene_can_mend_of_clocks_is_told_of_a_component_by_itself(
     assert len(found) == 1 + told.count("E504"), "a sample each"
 
 
+HEARING = """\
+component: Pad
+connectors: {a: Flange}
+sends: {x: sample(a.x)}
+parameters: {k: {unit: N/m}, role: {options: [client, server], default: client}, clock: clock, link: link}
+equations:
+  - a.f = hold(k*(sample(a.x) - mean(others.x)))
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        (
+            "hold(k*(sample(a.x) - mean(others.x)))",
+            "k*(sample(a.x) - mean(others.x))",
+            "6:5: E505 Pad.a.f acts on what it is joined to at all times, and is on clock clock. "
+            "Write: a.f = hold(k*(sample(a.x) - mean(others.x)))",
+        ),
+        (
+            "hold(k*",
+            "hold((if role == clients then 2 else 1)*k*",
+            "6:28: E206 role has no option clients; the nearest is client. Write: client",
+        ),
+        (
+            "- a.f = hold(k*(sample(a.x) - mean(others.x)))",
+            "- a.f = k*s\n  - der(s) = (a.x - mean(others.x))/time\nvariables: {s: {unit: m, start: 0}}",
+            "7:5: E505 in `der(Pad.s) = (Pad.a.x - mean(others.Pad.x))/time` of Pad, mean(others.Pad.x) is "
+            "on clock clock and the rest is continuous. Write: hold(mean(others.Pad.x))",
+        ),
+    ],
+)
+def test_a_component_that_hears_is_told_one_mistake_and_the_line_to_write(
+    old: str, new: str, told: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "pad.yaml"
+    assert old in HEARING
+    path.write_text(HEARING.replace(old, new, 1))
+    with pytest.raises(ApcError) as caught:
+        check_definition(path)
+    assert [str(mistake).partition("\n")[0] for mistake in caught.value.mistakes] == [f"{path}:{told}"]
+
+
 def test_a_component_is_checked_by_itself_and_is_no_topology(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

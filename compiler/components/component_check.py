@@ -300,9 +300,18 @@ class ComponentNames:
             return None
 
     def _check_names(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
-        wrong = False
+        options = {p.name: p for p in self.component.parameters if isinstance(p, Option)}
+        wrong, told = False, set[int]()
         for node in walk(expression):
-            if isinstance(node, Name) and node.parts not in self.dimensions:
+            if isinstance(node, Compare) and isinstance(node.left, Name) and isinstance(node.right, Name):
+                option, word = options.get(".".join(node.left.parts)), ".".join(node.right.parts)
+                if option is not None and node.operator in ("==", "!="):  # else it was decided
+                    wrong = True
+                    told |= {node.left.start, node.right.start}
+                    what = f"{option.name} has no option {brief(word)}"
+                    at = place_in(place, text, node.right.start)
+                    add_unknown("E206", at, what, word, option.words, mistakes)
+            if isinstance(node, Name) and node.parts not in self.dimensions and node.start not in told:
                 wrong = True
                 shown = ".".join(node.parts)
                 if node.parts[0] == OTHERS:

@@ -124,7 +124,9 @@ class ClockInference:
         def own(node: Expr) -> Expr | None:
             """Write a name as the part does, and a sample at its one clock without that."""
             if isinstance(node, Name):
-                return Name(tuple(".".join(node.parts).removeprefix(f"{given.origin}.").split(".")))
+                heard = node.parts[:1] == (OTHERS,)  # others.part.x
+                whole = ".".join(node.parts[heard:]).removeprefix(f"{given.origin}.")
+                return Name((*node.parts[:heard], *whole.split(".")))
             if isinstance(node, Call) and node.function == "sample" and node.arguments[1:] == (at,):
                 return Call("sample", (transform(node.arguments[0], own),))
             return None
@@ -174,8 +176,9 @@ class ClockInference:
         elif hears_others(call):
             for argument in call.arguments:
                 self._visit(argument, domain, equation, heard=True)
-            self._hearing.setdefault(domain, equation)
-            if equation.clock is not None:
+            if equation.clock is None:
+                self._hearing.setdefault(domain, equation)
+            else:
                 self._pin(domain, equation.clock, text, equation)
         else:
             if call.function == "previous" and equation.clock is not None:
