@@ -30,7 +30,7 @@ from apc.loop.beside import compare_run
 from apc.loop.device import device_function
 from apc.loop.packets import Address, Answer, Data, Hello, Post
 from apc.loop.peer import Loop
-from apc.loop.run import delays_of, read_run, run_of, write_peer, write_scene
+from apc.loop.run import delays_of, read_run, run_of, write_run
 from apc.network.recorded import describe
 from tests.topologies import AVERAGE, replaced
 
@@ -117,9 +117,7 @@ def test_peers_do_what_is_simulated_with_the_packets_they_heard(
         one.start()
     for one in threads:
         one.join()
-    write_scene(tmp_path, lossy)
-    for loop in every:
-        write_peer(tmp_path, run_of(loop, DIGEST, ()), lossy)
+    write_run(tmp_path, lossy, [run_of(loop, DIGEST, ()) for loop in every])
     found = read_run(tmp_path)
     assert [one.name for one in found.peers] == ["user[1]", "user[2]", "user[3]"]
     beside = compare_run(found)
@@ -310,9 +308,20 @@ def test_what_cant_be_played_is_told(
     Path("own").mkdir()
     Path("own/thesis.txt").write_text("mine", encoding="utf-8")
     Path("short.txt").write_text("abc", encoding="utf-8")
+    there = sorted(str(one) for one in Path().rglob("*"))
     listed = [
         (["--peer", "user[4]", *other], "E970 a peer wants one of user[1], user[2], user[3], got user[4]."),
+        (["--peer", "user[1]", "--to", "user[9]=127.0.0.1:1"], '--to: E970 a peer wants one of user[1]'),
         (["--peer", "user[1]", "--to", "user[2]=127.0.0.1:1"], 'Write: --to "user[3]=HOST:PORT"'),
+        (["--peer", "user[1]", *other, "--to", "user[2]=127.0.0.1:9"], "E971 user[2] is given twice"),
+        (["--peer", "user[1]", *other, "--to", "user[1]=127.0.0.1:9"], "E971 user[1] is the peer that"),
+        (["--peer", "user[1]", "--to", "user[2]=127.0.0.1:0"], '0. Write: --to "user[2]=192.'),
+        (["--peer", "user[1]", *other[:2], "--to", "user[3]=127.0.0.1:1"], "two peers have one address"),
+        (["--peer", "user[1]", "--to", "user[2]=[::1]:9"], "is not known by an IPv4 address"),
+        (["--peer", "user[1]", *other, "--wait", "-1 s"], "E207 the time wants 0 s or more, got -1 s"),
+        (["--peer", "user[1]", *other, "--out", "own"], "E973 is there already, and is no folder of a run"),
+        (["--out", "three.yaml"], "E973 is there already, and is no folder."),
+        (["--out", "no/such/folder"], "E601"),
         (["--peer", "user[1]", "--listen", "nowhere", *other], "E971 an address wants HOST:PORT"),
         (["--peer", "user[1]", "--to", "user[2]"], "E971 an address wants PEER=HOST:PORT"),
         (["--peer", "user[1]", "--listen", f"127.0.0.1:{port}", *other], f"can't listen at 127.0.0.1:{port}"),
@@ -326,6 +335,9 @@ def test_what_cant_be_played_is_told(
         assert run(["play", "three.yaml", "--duration", "1 s", *words]) == 1, words
         assert message in " ".join(capsys.readouterr().err.split()), words
     assert Path("own/thesis.txt").read_text(encoding="utf-8") == "mine"
+    assert (
+        sorted(str(one) for one in Path().rglob("*")) == there
+    )  # nothing is begun
     Path("empty").mkdir()
     assert run(["compare", "empty"]) == 1
     assert "E973" in capsys.readouterr().err
