@@ -335,9 +335,7 @@ def test_what_cant_be_played_is_told(
         assert run(["play", "three.yaml", "--duration", "1 s", *words]) == 1, words
         assert message in " ".join(capsys.readouterr().err.split()), words
     assert Path("own/thesis.txt").read_text(encoding="utf-8") == "mine"
-    assert (
-        sorted(str(one) for one in Path().rglob("*")) == there
-    )  # nothing is begun
+    assert sorted(str(one) for one in Path().rglob("*")) == there  # nothing is begun
     Path("empty").mkdir()
     assert run(["compare", "empty"]) == 1
     assert "E973" in capsys.readouterr().err

@@ -287,7 +287,7 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
             one.place[0] if one.role == "state" else place_of[Value(one.place[0], one.place[1], -1)],
         )
         for one in local_signals(kind, group.schedule)
-        if one.role != "hold"
+        if one.role in ("state", "output")
     ]
     inputs = [Port(f"force on {push.part}", "N") for push in forces]
     inputs += [Port(f"noise on {kind.states[place].name}", kind.states[place].unit) for place in noises]
