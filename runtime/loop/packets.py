@@ -40,6 +40,7 @@ DROPPED = {
     "other scene": "of another scene, or of one with another --set",
     "forged": "without the secret's seal",
     "heard before": "heard before",
+    "joining": "before it had joined",
     "early": "of a time that was still to come",
     "late": "of a time long past",
     "unasked": "an answer to nothing that was asked",

@@ -53,6 +53,8 @@ NANO = 10**9
 # Seconds after which a packet that has not come is given up, and times its nominal delay if that is more.
 GIVEN_UP, TIMES = 1, 4
 KNOCK = NANO // 20  # from one hello to the next
+# Round trips by which another's clock is known, the shortest of them, and what lies between two.
+TRIPS, BETWEEN = 10, NANO // 200
 HEAD_START = NANO // 2  # between telling when a scene begins and its beginning
 LARGEST = 1 << 16  # bytes of a datagram
 AHEAD = 1024  # packets whose luck is drawn at once
@@ -147,6 +149,7 @@ class Loop:
         # Of each other the shortest round trip, and how far its clock was ahead then.
         self.offsets: dict[int, tuple[int, int]] = {}
         self.asked: dict[int, tuple[int, int]] = {}  # by what is to be answered: who was asked, and when
+        self.told: tuple[int, int] | None = None  # who told when the scene begins, and when by that clock
         self.present: set[int] = set()
         self.first = 0  # the frame with which it joins
         self.stopped = False
@@ -190,17 +193,27 @@ class Loop:
         end, leads = now() + int(patience * NANO), self.own < min(self.others)
         self.player.warm_up()
         while not self.begins:
-            for other, address in self.others.items():
-                number, time = LUCK.getrandbits(64), now()
-                self.asked[number] = other, time
-                self._send(self.post.hello(time, number), address)
+            self._knock()
             self.take_in(now() + KNOCK)
+            if self.told is not None:
+                for _ in range(TRIPS):
+                    self._knock()
+                    self.take_in(now() + BETWEEN)
+                other, begins = self.told
+                self.begins = begins - self.offsets[other][1]
             if leads and not self.begins and self.present == set(self.others):
                 self.begins = now() + HEAD_START
             if not self.begins and now() > end:
                 raise self._alone(patience)
         if now() > self.begins:  # who begins late, or again, comes in with the frame after the next
             self.first = (now() - self.begins) // self.frame_ns + 2
+
+    def _knock(self) -> None:
+        """Ask all others whether they are there."""
+        for other, address in self.others.items():
+            number, time = LUCK.getrandbits(64), now()
+            self.asked[number] = other, time
+            self._send(self.post.hello(time, number), address)
 
     def _alone(self, patience: float) -> ApcError:
         missing = sorted(set(self.others) - self.present) or sorted(self.others)[:1]
@@ -281,8 +294,8 @@ class Loop:
         trip = (came - asked) - (answer.time - answer.came)
         ahead = ((answer.came - asked) + (answer.time - came)) // 2
         self.offsets[answer.sender] = min(self.offsets.get(answer.sender, (trip, ahead)), (trip, ahead))
-        if answer.begins and not self.begins:
-            self.begins = answer.begins - self.offsets[answer.sender][1]
+        if answer.begins and self.told is None:
+            self.told = answer.sender, answer.begins
 
     def _send(self, datagram: bytes, address: Address) -> None:
         try:
@@ -428,8 +441,10 @@ class _OnePeer(Stepwise):
         """Return why a packet is let go, empty if it isn't."""
         if packet.sender not in link.ways or len(packet.values) != len(link.channels_of(packet.sender)):
             return "malformed"
+        if not self.loop.begins:
+            return "joining"
         frame, frame_now = packet.count // link.slots, came // self.loop.frame_ns
-        if not self.loop.begins or frame > frame_now + 1:
+        if frame > frame_now + 1:
             return "early"
         # Of the frames that are kept the oldest may be overwritten by one that is early.
         if frame < frame_now - (self.population.hearing.ring - 3):
