@@ -31,6 +31,11 @@ PAIRS = replaced(
     MOVED, ("type: AveragePosition, object: cube, stiffness: 500 N/m",
             "type: SaturatedMesh, object: cube, stiffness: 500 N/m, limit: 2 N"),
 )  # fmt: skip
+AGED = replaced(
+    (SCENES / "three-users-scheduled.yaml").read_text(encoding="utf-8"),
+    ("{count: 3}", "{count: 3, set: {device.x: [3 mm, -2 mm, 1 mm]}}"),
+    ("loss: 0 %", "loss: 20 %, jitter: 3 ms"),
+)  # fmt: skip
 
 # Of a graph that isn't complete a sum is one product an arc, here and there: not a bit is different. Over a
 # complete graph `simulate` takes the sum of all less its own.
@@ -42,6 +47,7 @@ ROUNDED = {
     "a delay inside a tick": INSIDE,
     "late and lost, zero": LOSSY,
     "late and lost, hold": LOSSY_HOLD,
+    "packets that say how old they are": AGED,
 }
 
 
@@ -56,7 +62,10 @@ def test_its_forces_are_those_of_simulate_to_the_last_bits(name: str, tmp_path: 
     assert worst(differences(compiled(ROUNDED[name]), tmp_path, duration="0.4 s")) < 2e-13
 
 
-@pytest.mark.parametrize("scene", ["planar-users", "two-users-waves", "two-users-passivity", "client-server"])
+@pytest.mark.parametrize(
+    "scene",
+    ["planar-users", "two-users-waves", "two-users-passivity", "client-server"],
+)
 def test_so_are_those_of_other_couplers(scene: str, tmp_path: Path) -> None:
     text = (SCENES / f"{scene}.yaml").read_text(encoding="utf-8").partition("\n")[2]
     device = "none" if scene == "client-server" else None

@@ -124,10 +124,23 @@ def test_a_trace_is_a_column_of_delays_lost_ones_infinite(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("delay [ms]\n8\n-1\n", ":3:1: E703 a delay wants a time of 0 or more, or lost, got -1."),
-        ("n,delay [ms]\n1,8\n2,soon\n", ":3:3: E703 a delay wants a time of 0 or more, or lost, got soon."),
-        ("n,delay [ms]\n1,nan\n", ":2:3: E703 a delay wants a time of 0 or more, or lost, got nan."),
-        ("n,delay [ms]\n1,inf\n", ":2:3: E703 a delay wants a time of 0 or more, or lost, got inf."),
+        (
+            "delay [ms]\n8\n-1\n",
+            ":3:1: E703 a delay wants a time from 0 to 1e+09 s, or lost, got -1.",
+        ),
+        (
+            "n,delay [ms]\n1,8\n2,soon\n",
+            ":3:3: E703 a delay wants a time from 0 to 1e+09 s, or lost, got soon.",
+        ),
+        ("delay [ms]\n1e308\n", ":2:1: E703 a delay wants a time from 0 to 1e+09 s, or lost, got 1e308."),
+        (
+            "n,delay [ms]\n1,nan\n",
+            ":2:3: E703 a delay wants a time from 0 to 1e+09 s, or lost, got nan.",
+        ),
+        (
+            "n,delay [ms]\n1,inf\n",
+            ":2:3: E703 a delay wants a time from 0 to 1e+09 s, or lost, got inf.",
+        ),
         ("n,delay [ms]\n1\n", ":2:1: E703 the row has 1 cells and there are 2 headings."),
         (
             "delay\n8\n",

@@ -22,7 +22,15 @@ from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 Floats = NDArray[np.float64]
 
 # Groups of unlike clocks and delays, contacts, a server, packets heard in the frame they are sent in.
-NAMES = ("mixed-clocks", "experiment-average", "client-server", "star-lecture", "two-users-waves", "finger")
+NAMES = (
+    "mixed-clocks",
+    "experiment-average",
+    "client-server",
+    "star-lecture",
+    "two-users-waves",
+    "finger",
+    "limited-motor",
+)
 LATE = AVERAGE.replace("lan: {clock: network, delay: 8 ms}", "lan: {clock: network, delay: 3.5 ms}")
 PUSHED = AVERAGE + "hands:\n  hand: {type: ConstantForce, flange: device, force: 0 N}\n"
 

@@ -102,6 +102,7 @@ def test_rumoca_plays_the_papers_scene_at_any_times_as_simulate_does(times: str)
         ("limited-motor", {}),
         ("users-table", {}),
         ("god-object", {}),
+        ("three-users-scheduled", {"device.v": "30 mm/s"}),
         ("finger", {}),
         ("lifted-box", {}),
     ],

@@ -8,8 +8,11 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import multiprocessing
 import random
+import select
 import shutil
+import signal
 import socket
 import struct
 import subprocess
@@ -26,12 +29,13 @@ import apc
 from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.loop.beside import compare_run
+from apc.loop.beside import Ticks, compare_run
 from apc.loop.device import device_function
 from apc.loop.packets import Address, Answer, Data, Hello, Post
 from apc.loop.peer import Loop
-from apc.loop.run import delays_of, read_run, run_of, write_peer, write_scene
+from apc.loop.run import delays_of, read_run, run_of, write_run
 from apc.network.recorded import describe
+from apc.present.loop import ticks_text
 from tests.topologies import AVERAGE, replaced
 
 DIGEST = hashlib.sha256(b"a scene").digest()
@@ -117,9 +121,7 @@ def test_peers_do_what_is_simulated_with_the_packets_they_heard(
         one.start()
     for one in threads:
         one.join()
-    write_scene(tmp_path, lossy)
-    for loop in every:
-        write_peer(tmp_path, run_of(loop, DIGEST, ()), lossy)
+    write_run(tmp_path, lossy, [run_of(loop, DIGEST, ()) for loop in every])
     found = read_run(tmp_path)
     assert [one.name for one in found.peers] == ["user[1]", "user[2]", "user[3]"]
     beside = compare_run(found)
@@ -310,9 +312,20 @@ def test_what_cant_be_played_is_told(
     Path("own").mkdir()
     Path("own/thesis.txt").write_text("mine", encoding="utf-8")
     Path("short.txt").write_text("abc", encoding="utf-8")
+    there = sorted(str(one) for one in Path().rglob("*"))
     listed = [
         (["--peer", "user[4]", *other], "E970 a peer wants one of user[1], user[2], user[3], got user[4]."),
+        (["--peer", "user[1]", "--to", "user[9]=127.0.0.1:1"], '--to: E970 a peer wants one of user[1]'),
         (["--peer", "user[1]", "--to", "user[2]=127.0.0.1:1"], 'Write: --to "user[3]=HOST:PORT"'),
+        (["--peer", "user[1]", *other, "--to", "user[2]=127.0.0.1:9"], "E971 user[2] is given twice"),
+        (["--peer", "user[1]", *other, "--to", "user[1]=127.0.0.1:9"], "E971 user[1] is the peer that"),
+        (["--peer", "user[1]", "--to", "user[2]=127.0.0.1:0"], '0. Write: --to "user[2]=192.'),
+        (["--peer", "user[1]", *other[:2], "--to", "user[3]=127.0.0.1:1"], "two peers have one address"),
+        (["--peer", "user[1]", "--to", "user[2]=[::1]:9"], "is not known by an IPv4 address"),
+        (["--peer", "user[1]", *other, "--wait", "-1 s"], "E207 the time wants 0 s or more, got -1 s"),
+        (["--peer", "user[1]", *other, "--out", "own"], "E973 is there already, and is no folder of a run"),
+        (["--out", "three.yaml"], "E973 is there already, and is no folder."),
+        (["--out", "no/such/folder"], "E601"),
         (["--peer", "user[1]", "--listen", "nowhere", *other], "E971 an address wants HOST:PORT"),
         (["--peer", "user[1]", "--to", "user[2]"], "E971 an address wants PEER=HOST:PORT"),
         (["--peer", "user[1]", "--listen", f"127.0.0.1:{port}", *other], f"can't listen at 127.0.0.1:{port}"),
@@ -326,6 +339,7 @@ def test_what_cant_be_played_is_told(
         assert run(["play", "three.yaml", "--duration", "1 s", *words]) == 1, words
         assert message in " ".join(capsys.readouterr().err.split()), words
     assert Path("own/thesis.txt").read_text(encoding="utf-8") == "mine"
+    assert sorted(str(one) for one in Path().rglob("*")) == there  # nothing is begun
     Path("empty").mkdir()
     assert run(["compare", "empty"]) == 1
     assert "E973" in capsys.readouterr().err
@@ -343,3 +357,76 @@ def test_a_ways_delays_begin_with_the_first_that_came_and_end_with_the_last(scen
     assert np.isinf(found[1])
     assert found[[0, 2]] == pytest.approx([10e-9, 14e-9])
     assert struct.calcsize("<d") == 8
+
+
+def test_an_answer_is_taken_whenever_it_comes_and_once(scene: CompiledSystem) -> None:
+    """A peer that starts slowly answers old hellos: these are answers too; a replay and a guess are not."""
+    loop = next(loops(scene, "1"))
+    loop.asked = {17: (1, 1_000), 18: (1, 2_000)}
+    for nonce in (17, 18, 17, 19):
+        loop._met(Answer(1, 5_000, nonce, 4_000, 9_000), 6_000)
+    assert loop.post.dropped == {"unasked": 2}
+    assert loop.offsets[1][0] == 6_000 - 2_000 - 1_000  # the shorter round trip
+    loop._met(Answer(2, 5_000, 18, 4_000, 9_000), 6_000)
+    assert loop.post.dropped == {"unasked": 3}
+
+
+def test_what_ends_a_loop_leaves_what_was_done(scene: CompiledSystem, tmp_path: Path) -> None:
+    """Told to end, however late it is; a device that raises, or gives no number, is told with its time."""
+    faults = {
+        "raise OSError('gone')": "raised OSError at 0.05 s: gone",
+        "return None": "gave None as its position at 0.05 s",
+        "return '1'": "gave '1' as its position at 0.05 s",
+    }
+    for fault, message in faults.items():
+        text = f"def device(time, force):\n    if time >= 0.05:\n        {fault}\n    return 0.002\n"
+        (tmp_path / "device.py").write_text(text, encoding="utf-8")
+        every = list(loops(scene, "1/10"))
+        others = dict(zip(("user[2]", "user[3]"), every[0].others.values(), strict=True))
+        device = device_function(tmp_path / "device.py")
+        own = Loop(
+            scene, "user[1]", every[0].socket, others, digest=DIGEST, duration=Fraction(1, 10), device=device
+        )
+        own.begins = 1  # long ago: every tick is late
+        own.run()
+        assert message in str(own.trouble)
+        found = run_of(own, DIGEST, ())
+        assert found.time[-1] == pytest.approx(0.047)  # of whole frames
+        stop, end = multiprocessing.Pipe(duplex=False)
+        told = Loop(
+            scene, "user[1]", every[0].socket, others, digest=DIGEST, duration=Fraction(1, 10), stop=stop
+        )
+        told.begins = 1
+        end.close()
+        told.run()
+        assert told.stopped
+        assert told.trouble is None
+
+
+def test_ctrl_c_ends_a_peer_and_what_it_did_is_kept(tmp_path: Path) -> None:
+    """While it waits for others nothing is written; while it plays, alone or all, what was done is."""
+    (tmp_path / "three.yaml").write_text(replaced(MOVING, ("{count: 3,", "{count: 2,")), encoding="utf-8")
+    nobody = ("--peer", "user[1]", "--to", "user[2]=127.0.0.1:1", "--duration", "9 s", "--out", "no.run")
+    waiting = command(tmp_path, *nobody, "--wait", "600 s")
+    playing = command(tmp_path, "--duration", "600 s", "--out", "all.run")
+    for _ in range(600):  # both print when they have been at work for so long
+        if select.select([playing.stderr], [], [], 1.0)[0]:
+            break
+    for one in (waiting, playing):
+        one.send_signal(signal.SIGINT)
+    assert "stopped" in waiting.communicate(timeout=240)[1]
+    assert waiting.returncode == 130
+    assert not (tmp_path / "no.run").exists()
+    told = playing.communicate(timeout=240)
+    if playing.returncode != 130:  # the scene had begun
+        assert playing.returncode == 0, told[1]
+        assert "stopped before the end" in told[0]
+        assert all(one.stopped for one in read_run(tmp_path / "all.run").peers)
+
+
+def test_tables_fit_a_terminal_whatever_peers_are_called() -> None:
+    name = "a_peer_with_a_long_name_of_its_own[1]"
+    ticks = Ticks(name, 60_000, (1e-4,) * 4, (1e-4,) * 4, 0.0, stopped=False, not_given=(), dropped={})
+    lines = ticks_text([ticks])
+    assert max(map(len, lines)) <= 80
+    assert f"  {name}" in lines

@@ -43,6 +43,19 @@ no answer yet for icmp_seq=2
 no answer yet for icmp_seq=4
 [1600000000.064000] 64 bytes from 192.0.2.7: icmp_seq=4 ttl=57 time=40.0 ms
 """
+GERMAN = """\
+PING host.example (192.0.2.7) 56(84) Bytes an Daten.
+64 Bytes von 192.0.2.7: icmp_seq=1 ttl=57 Zeit=16.4 ms
+Von 192.0.2.1 icmp_seq=2 Zielhost nicht erreichbar
+64 Bytes von 192.0.2.7: icmp_seq=3 ttl=57 Zeit=0,5 ms
+
+--- host.example Ping-Statistiken ---
+4 Pakete übertragen, 2 empfangen, 50% Paketverlust, Zeit 60ms
+"""
+JAPANESE = """\
+64 バイト応答 送信元 192.0.2.7: icmp_seq=1 ttl=57 時間=16.4ミリ秒
+64 バイト応答 送信元 192.0.2.7: icmp_seq=3 ttl=57 時間=2ミリ秒
+"""
 MACOS = """\
 PING host.example (192.0.2.7): 56 data bytes
 Request timeout for icmp_seq 0
@@ -81,11 +94,13 @@ def irtt(*trips: float | str) -> str:
         (IPUTILS, [8.2, 15.5, 9.1, LOST, LOST, LOST], 0.01),
         (STAMPED, [8.2, LOST, 8.0, 20.0], 0.008),
         (MACOS, [LOST, 0.125, LOST], math.nan),
+        (GERMAN, [8.2, LOST, 0.25, LOST], 0.02),
+        (JAPANESE, [8.2, LOST, 1.0], math.nan),
         (BUSYBOX, [6.1725, LOST, 500.0], math.nan),
         (WINDOWS, [6.0, LOST, 0.5], math.nan),
         (irtt(16.0, "true", 17.0, "true_up", "true_down"), [8.0, LOST, 8.5, LOST, LOST], 0.008),
     ],
-    ids=["iputils", "stamped", "macOS", "BusyBox", "Windows", "irtt"],
+    ids=["iputils", "stamped", "macOS", "German", "Japanese", "BusyBox", "Windows", "irtt"],
 )
 def test_every_packet_has_its_delay_in_the_order_of_sending(
     text: str, delays: list[float], interval: float
@@ -114,6 +129,9 @@ def test_no_text_is_taken_for_a_recording_that_is_none() -> None:
         '{"round_trips": []}',
         "seq=5",
         "{" * 100_000,
+        "64 bytes from 192.0.2.7: icmp_seq=1 ttl=57\n16 bytes from 192.0.2.7: icmp_seq=2 ttl=57",  # untimed
+        f"icmp_seq=1 time={'9' * 5000} ms\n{'9' * 5000} packets transmitted, 1 received, 0% packet loss",
+        f"icmp_seq={'9' * 5000} time=1 ms",
         irtt("true").replace("0", "-1", 1),
     ):
         probe = read_probe(text)

@@ -6,8 +6,9 @@ round trips only (irtt knows more if two clocks agree, which nothing shows): hal
 and says so.
 Does not: tell text of the file, which may be somebody's.
 
-ping is that of iputils, BusyBox, BSD and macOS (`icmp_seq=7 … time=12.3 ms`), which counts packets, or of
-Windows in English (`bytes=32 time=12ms TTL=57`), which doesn't; irtt is what `irtt client -o FILE` writes.
+ping is that of iputils, BusyBox, BSD and macOS (`icmp_seq=7 … time=12.3 ms`, the word for time in whatever
+language), which counts packets, or of Windows in English (`bytes=32 time=12ms TTL=57`), which doesn't; irtt
+is what `irtt client -o FILE` writes.
 """
 
 from __future__ import annotations
@@ -27,14 +28,16 @@ HALVED = (
     "round trips were recorded: half of each stands for one way, as if both took as long, and a packet "
     "lost on either way counts as lost"
 )
-_COUNTED = re.compile(r"\b(?:icmp_)?seq[= ](?P<count>\d+)")
-_TOOK = re.compile(r"\btime[=<](?P<time>\d+(?:[.,]\d+)?) ?(?P<unit>ms|us|s)\b")
+_COUNTED = re.compile(r"\b(?:icmp_)?seq[= ](?P<count>\d{1,18})")
+_TOOK = re.compile(r"\w[=<] ?(?P<time>\d{1,15}(?:[.,]\d+)?) ?(?P<unit>ms|us|s|мс|ミリ秒|毫秒|밀리초)(?!\w)")
+_ANSWERED = re.compile(r"\bttl=\d", re.IGNORECASE)
 _STAMP = re.compile(r"\[(?P<stamp>\d+\.\d+)\] ")
 _WINDOWS = re.compile(r"\bbytes=\d+ time[=<](?P<time>\d+)ms TTL=")
 _WINDOWS_LOST = re.compile(r"(?:Request timed out|Destination (?:host|net) unreachable|General failure)\.")
-_SUMMARY = re.compile(r"(?P<sent>\d+) packets transmitted.*?(?:, time (?P<time>\d+) ?ms)?$")
+# Of any language: sent, received, per cent lost, and with iputils how long it took.
+_SUMMARY = re.compile(r"^(?P<sent>\d{1,18}) [^\d,]+, \d+ .*%[^\d]*(?:, [^\d,]+ (?P<time>\d{1,18}) ?\w+)?$")
 _WRAPS = 1 << 16  # a packet's number has 16 bits
-_SECONDS = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
+_SECONDS = {"us": 1e-6, "s": 1.0}  # any other unit is a word for milliseconds
 # Of numbers that leave a gap: what one line may claim to be lost.
 _LONGEST_GAP = 1 << 15
 
@@ -89,7 +92,7 @@ def _ping(lines: Iterable[str]) -> Probe | None:
     trips: dict[int, float] = {}
     stamps: list[tuple[int, float]] = []
     sent = total = 0
-    turns, last = 0, 0
+    turns, last, untimed = 0, 0, False
     for line in lines:
         counted = _COUNTED.search(line)
         if counted is None:
@@ -105,11 +108,13 @@ def _ping(lines: Iterable[str]) -> Probe | None:
         took = _TOOK.search(line)
         if took is None:
             trips.setdefault(number, math.inf)  # no answer yet: one may come
+            untimed |= _ANSWERED.search(line) is not None
         elif math.isinf(trips.get(number, math.inf)):  # and not the second of two answers
-            trips[number] = float(took["time"].replace(",", ".")) * _SECONDS[took["unit"]]
+            trips[number] = float(took["time"].replace(",", ".")) * _SECONDS.get(took["unit"], 1e-3)
             if (stamp := _STAMP.match(line)) is not None:
                 stamps.append((number, float(stamp["stamp"]) - trips[number]))
-    if not trips:
+    # Answers whose time can't be read, as of packets too small for ping to time them, are no losses.
+    if not trips or (untimed and not np.isfinite(list(trips.values())).any()):
         return None
     first = min(1, *trips)
     final = max(*trips, first + sent - 1 if sent - len(trips) <= _LONGEST_GAP else 0)

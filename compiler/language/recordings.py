@@ -27,6 +27,7 @@ from apc.compiler.source.reading import brief
 DELAY = "delay"  # the column of a trace that is read
 TABLE_SUFFIX = ".csv"  # a file of another suffix may be what ping or irtt wrote
 RECORDINGS = "packets as ping or irtt wrote them, or a table with a column delay [ms]"
+LATEST_DELAY = 1e9  # seconds: a longer one is no packet's, and its square would leave the range of floats
 LOST = "lost"  # a packet that never arrived, in a trace; so is a cell with nothing in it
 
 
@@ -158,8 +159,9 @@ def _delay(cells: list[str], own: int, names: Headings, row: Place, mistakes: Mi
         number = plain_float(cell)
     except ValueError:
         number = math.nan
-    if number >= 0:
-        return number * float(names[own][1].scale)
+    if 0 <= (delay := number * float(names[own][1].scale)) <= LATEST_DELAY:
+        return delay
     place = row.shifted(sum(len(other) + 1 for other in cells[:own]) + 1)
-    mistakes.add("E703", place, "a delay", expected=f"a time of 0 or more, or {LOST}", got=brief(cell))
+    expected = f"a time from 0 to {LATEST_DELAY:.0e} s, or {LOST}"
+    mistakes.add("E703", place, "a delay", expected=expected, got=brief(cell))
     return math.nan

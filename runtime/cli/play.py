@@ -98,7 +98,7 @@ def play_command(
     start_single_threaded()
     from apc.inputs import open_scene
     from apc.loop.device import device_function
-    from apc.loop.run import read_run, write_scene
+    from apc.loop.run import check_folder, read_run, write_run
     from apc.loop.start import Play, play_all, play_one
     from apc.option_value import option_value
     from apc.simulation.trajectory import duration_of, parse_duration
@@ -107,44 +107,41 @@ def play_command(
     asked = parse_duration(duration) if duration is not None else None
     folder = out or Path(f"{system.name}.run")
     how = Play(
-        folder=folder,
         duration=duration_of(system, asked),
         secret=_secret(secret_file),
         emulate=emulate,
         seed=seed,
         patience=float(option_value("--wait", patience, what="a time", unit="s")),
     )
+    if how.patience < 0:
+        raise ApcError(Mistake("E207", Place("--wait"), "the time", "0 s or more", patience, '--wait "30 s"'))
+    check_folder(folder)
     if peer is None:
         if listen or to or device:
             raise click.UsageError("--listen, --to and --device are of one peer: --peer says which")
-        _clear(folder)
-        write_scene(folder, system)
         with at_work("playing"):
-            play_all(system, how)
-        from apc.loop.beside import compare_run
-
-        print_result(compare_run(read_run(folder)), as_json=as_json)
+            parts = play_all(system, how)
     else:
         listening, addresses = _addresses(listen, to, has_secret=bool(how.secret))
         outside = None if device is None else device_function(device)
-        write_scene(folder, system)
         with at_work("playing"):
-            play_one(system, peer, listening, addresses, how, device=outside)
+            parts = (play_one(system, peer, listening, addresses, how, device=outside),)
+    troubles = [one.trouble for one in parts if one.trouble is not None]
+    played = [one.run for one in parts if one.run is not None]
+    if played:
+        write_run(folder, system, played, whole=peer is None)
+    for trouble in troubles:
+        if played:
+            note_aside(f"{folder} holds what was played until then")
+        raise trouble
+    if not played:
+        raise KeyboardInterrupt
+    if peer is None:
+        from apc.loop.beside import compare_run
+
+        print_result(compare_run(read_run(folder)), as_json=as_json)
     if not as_json:
         tell(f"\n{folder} holds the run; apc compare {folder}")
-
-
-def _clear(folder: Path) -> None:
-    """Refuse a folder that holds something else than a run; of a run take away the peers' files."""
-    from apc.loop.run import SCENE
-
-    if not folder.exists():
-        return
-    if not folder.is_dir() or (any(folder.iterdir()) and not (folder / SCENE).is_file()):
-        what = "is there already, and is no folder of a run"
-        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="--out another.run"))
-    for path in (*folder.glob("*.npz"), *folder.glob("*-to-*.csv")):
-        path.unlink()
 
 
 def _secret(path: Path | None) -> bytes:
@@ -172,11 +169,16 @@ def _addresses(listen: str | None, to: tuple[str, ...], *, has_secret: bool):  #
 
     others = {}
     for text in to:
-        name, equals, address = text.partition("=")
-        if not equals:
+        name, equals, address = (one.strip() for one in text.partition("="))
+        if not (equals and name):
             expected, hint = "PEER=HOST:PORT", '--to "right[1]=192.0.2.7:5000"'
-            raise ApcError(Mistake("E971", Place("--to"), "an address", expected, text[:80], hint))
-        others[name.strip()] = address_of(address.strip(), "--to")
+            raise ApcError(
+                Mistake("E971", Place("--to"), "an address", expected, text[:80] or "nothing", hint)
+            )
+        if name in others:
+            what = f"{name} is given twice"
+            raise ApcError(Mistake("E971", Place("--to"), what, hint=f'--to "{name}={address}"'))
+        others[name] = address_of(address, "--to", name)
     own = address_of(listen, "--listen") if listen else (LOOPBACK, 0)
     socket = listen_at(own)
     if not is_loopback(own) and not has_secret:

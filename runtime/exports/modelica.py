@@ -42,6 +42,7 @@ from apc.exports.expressions import (
 )
 from apc.exports.words import word
 from apc.finite_equations import finite_equations
+from apc.frame.ages import stamped
 from apc.frame.exchange import Exchange, build_exchange, check_mean
 from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
@@ -95,7 +96,7 @@ def modelica(system: CompiledSystem) -> ModelicaModel:
         E955 what the scene says and Modelica has no words for; E801, E802 a mean that can't be.
     """
     with finite_equations(system.name):
-        return _Writer(system).model()
+        return _Writer(stamped(system)).model()
 
 
 class _Writer:

@@ -33,18 +33,19 @@ SEAL = 16  # bytes of the keyed hash
 LARGEST = 65_507  # bytes of a datagram over IPv4
 MOST_VALUES = (LARGEST - HEAD.size - DATA_BODY.size - SEAL) // 8
 
-# Why a datagram was dropped, in the order in which that is looked at.
-DROPPED = (
-    "stranger",
-    "malformed",
-    "other scene",
-    "forged",
-    "heard before",
-    "early",
-    "late",
-    "unasked",
-    "not sent",
-)
+# Why a datagram was dropped, in the order in which that is looked at, and how a person is told.
+DROPPED = {
+    "stranger": "of a stranger",
+    "malformed": "torn, or of another version",
+    "other scene": "of another scene, or of one with another --set",
+    "forged": "without the secret's seal",
+    "heard before": "heard before",
+    "joining": "before it had joined",
+    "early": "of a time that was still to come",
+    "late": "of a time long past",
+    "unasked": "an answer to nothing that was asked",
+    "not sent": "not taken by this system",
+}
 
 Address = tuple[str, int]
 

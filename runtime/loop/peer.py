@@ -20,7 +20,7 @@ import re
 import select
 import socket
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from multiprocessing.connection import Connection
@@ -31,15 +31,15 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Channel, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.words import cut
+from apc.compiler.words import counted, cut
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.parameters import resolve
 from apc.loop.device import DeviceFunction, Outside
-from apc.loop.packets import Address, Answer, Data, Hello, Post
+from apc.loop.packets import DROPPED, Address, Answer, Data, Hello, Post
 from apc.loop.realtime import now
 from apc.network.channel import ChannelLaw, PacketSource, channel_law
 from apc.network.timetable import START, Seen
-from apc.simulation.blocks import pushes
+from apc.simulation.blocks import pushes, unsolved
 from apc.simulation.population import instants_within
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
@@ -53,6 +53,8 @@ NANO = 10**9
 # Seconds after which a packet that has not come is given up, and times its nominal delay if that is more.
 GIVEN_UP, TIMES = 1, 4
 KNOCK = NANO // 20  # from one hello to the next
+# Round trips by which another's clock is known, the shortest of them, and what lies between two.
+TRIPS, BETWEEN = 10, NANO // 200
 HEAD_START = NANO // 2  # between telling when a scene begins and its beginning
 LARGEST = 1 << 16  # bytes of a datagram
 AHEAD = 1024  # packets whose luck is drawn at once
@@ -81,7 +83,7 @@ def live_scene(system: CompiledSystem) -> CompiledSystem:
 
 
 class StoppedError(RuntimeError):
-    """The loop was told to end."""
+    """The loop is to end: it was told so, or its device is at fault."""
 
 
 class Loop:
@@ -134,8 +136,8 @@ class Loop:
         """
         self.system, self.name = system, peer
         self.exchange = build_exchange(system, resolve(system).timings)
-        self.own = number_of(self.exchange, peer)
-        self.others = {number_of(self.exchange, one): address for one, address in addresses.items()}
+        self.own = number_of(self.exchange, peer, "--peer")
+        self.others = {number_of(self.exchange, one, "--to"): address for one, address in addresses.items()}
         settings = Settings(duration, jit=False, seed=seed)
         self.simulation = prepare(live_scene(system), settings, signals=[f"{peer}.*"], live=True)
         self.frame_ns = int(self.simulation.frame * self.simulation.quantum * NANO)
@@ -146,12 +148,13 @@ class Loop:
         self.begins = 0  # when the scene begins, by this host's clock; 0 while not known
         # Of each other the shortest round trip, and how far its clock was ahead then.
         self.offsets: dict[int, tuple[int, int]] = {}
-        self.asked: dict[
-            int, tuple[int, int]
-        ] = {}  # of each other: what it is to answer, and when it was asked
+        self.asked: dict[int, tuple[int, int]] = {}  # by what is to be answered: who was asked, and when
+        self.told: tuple[int, int] | None = None  # who told when the scene begins, and when by that clock
         self.present: set[int] = set()
         self.first = 0  # the frame with which it joins
         self.stopped = False
+        self.trouble: ApcError | None = None  # why it ended before its end, where nobody stopped it
+        self.stop = stop
         self.watched: list[socket.socket | Connection] = [listening, *([stop] if stop else [])]
         self.rows: list[Floats] = []
         self.player = _OnePeer(self, device, emulate=emulate)
@@ -163,6 +166,12 @@ class Loop:
         if not needed:
             what = f"{self.name} sends nothing over a link and hears nothing: there is nobody to play with"
             raise ApcError(Mistake("E971", Place(self.system.name), what, hint="apc simulate"))
+        if self.own in self.others:
+            what = f"{self.name} is the peer that is played: --to says where the others are"
+            raise ApcError(Mistake("E971", Place("--to"), what, hint=f"--listen HOST:PORT for {self.name}"))
+        if len(set(self.others.values())) < len(self.others):
+            what = "two peers have one address: a packet is known by where it comes from"
+            raise ApcError(Mistake("E971", Place("--to"), what, hint="a port of its own for each"))
         missing = [self.exchange.peer_name(one) for one in sorted(needed - set(self.others))]
         if missing:
             hint = " ".join(f'--to "{one}=HOST:PORT"' for one in missing[:4])
@@ -172,14 +181,26 @@ class Loop:
     # ---- meeting
 
     def meet(self, patience: float) -> None:
-        """Find out when the scene begins. Raises ApcError E972 if nobody tells within so many seconds."""
+        """Find out when the scene begins.
+
+        Raises
+        ------
+        ApcError
+            E972 nobody tells within so many seconds.
+        StoppedError
+            It was told to end before.
+        """
         end, leads = now() + int(patience * NANO), self.own < min(self.others)
         self.player.warm_up()
         while not self.begins:
-            for other, address in self.others.items():
-                self.asked[other] = LUCK.getrandbits(64), now()
-                self._send(self.post.hello(self.asked[other][1], self.asked[other][0]), address)
+            self._knock()
             self.take_in(now() + KNOCK)
+            if self.told is not None:
+                for _ in range(TRIPS):
+                    self._knock()
+                    self.take_in(now() + BETWEEN)
+                other, begins = self.told
+                self.begins = begins - self.offsets[other][1]
             if leads and not self.begins and self.present == set(self.others):
                 self.begins = now() + HEAD_START
             if not self.begins and now() > end:
@@ -187,10 +208,18 @@ class Loop:
         if now() > self.begins:  # who begins late, or again, comes in with the frame after the next
             self.first = (now() - self.begins) // self.frame_ns + 2
 
+    def _knock(self) -> None:
+        """Ask all others whether they are there."""
+        for other, address in self.others.items():
+            number, time = LUCK.getrandbits(64), now()
+            self.asked[number] = other, time
+            self._send(self.post.hello(time, number), address)
+
     def _alone(self, patience: float) -> ApcError:
         missing = sorted(set(self.others) - self.present) or sorted(self.others)[:1]
         names = ", ".join(self.exchange.peer_name(one) for one in missing)
-        told = "; ".join(f"{count} datagrams were dropped: {why}" for why, count in self.post.dropped.items())
+        dropped = self.post.dropped.items()
+        told = "; ".join(f"{counted(count, 'datagram')} dropped: {DROPPED[why]}" for why, count in dropped)
         what = f"{names} did not say within {patience:g} s when the scene begins" + (told and f" ({told})")
         hint = "the same FILE, --set and --secret-file at every peer, started within --wait of each other"
         return ApcError(Mistake("E972", Place(self.name), what, hint=hint))
@@ -198,24 +227,24 @@ class Loop:
     # ---- running
 
     def run(self) -> None:
-        """Play until the end, or until Ctrl-C."""
+        """Play until the end, or until it is told to end, or its device or an equation gives up."""
         simulation, first = self.simulation, self.first
-        while first < self.frames and not self.stopped:
+        while first < self.frames:
             count = min(simulation.length, self.frames - first)
             given = pushes(simulation, first)
             played = self.player.play(first, count, given)
             self.rows.append(played.rows[: played.frames * len(simulation.marks)].copy())
-            self.stopped |= played.frames < count
-            first += count
+            first += played.frames
+            if played.frames < count:
+                if not (self.stopped or self.trouble):
+                    self.trouble = unsolved(simulation, first)
+                return
 
     def wait(self, instant: int) -> int:
         """Take in what comes until an instant of the scene, in nanoseconds; return how late it is then."""
         if not self.begins:  # warming up
             return 0
-        try:
-            self.take_in(self.begins + instant)
-        except KeyboardInterrupt:
-            raise StoppedError from None
+        self.take_in(self.begins + instant)
         return now() - self.begins - instant
 
     # ---- the network
@@ -228,12 +257,13 @@ class Loop:
                 _, _, datagram, address = heapq.heappop(held)
                 self._send(datagram, address)
             self._read()
-            if (time := now()) >= until:
-                return
-            left = min(until, held[0][0] if held else until) - time
+            left = min(until, held[0][0] if held else until) - now()
             ready, _, _ = select.select(self.watched, [], [], max(left, 0) / NANO)
-            if ready and isinstance(ready[-1], Connection):
+            if self.stop in ready:
+                self.stopped = True
                 raise StoppedError
+            if now() >= until:
+                return
 
     def _read(self) -> None:
         for _ in range(AT_ONCE):
@@ -255,16 +285,17 @@ class Loop:
 
     def _met(self, answer: Answer, came: int) -> None:
         """Learn another's clock, and when the scene begins, by a round trip (RFC 5905, section 8)."""
-        nonce, asked = self.asked.get(answer.sender, (None, 0))
-        if nonce != answer.nonce:
+        other, asked = self.asked.get(answer.nonce, (None, 0))
+        if other != answer.sender:
             self.post.drop("unasked")
             return
+        del self.asked[answer.nonce]
         self.present.add(answer.sender)
         trip = (came - asked) - (answer.time - answer.came)
         ahead = ((answer.came - asked) + (answer.time - came)) // 2
         self.offsets[answer.sender] = min(self.offsets.get(answer.sender, (trip, ahead)), (trip, ahead))
-        if answer.begins and not self.begins:
-            self.begins = answer.begins - self.offsets[answer.sender][1]
+        if answer.begins and self.told is None:
+            self.told = answer.sender, answer.begins
 
     def _send(self, datagram: bytes, address: Address) -> None:
         try:
@@ -326,12 +357,24 @@ class _OnePeer(Stepwise):
         self.instant = instant
         outside = self.outside if self.loop.begins else None
         if outside and (index == 0 or self.begin_at[index] > self.begin_at[index - 1]):
-            outside.measure(instant / NANO, self.carries[self.member])
+            self._of_device(outside.measure, instant / NANO, self.carries[self.member])
         super()._segment(number, index, seen, rows, pushes, marks, pushed)
         if outside and index:  # before it nothing ticks: a frame begins with what is sent then
             self._push(outside, index)
         self._hand_over(number, index)
-        self.log.append((instant, late, now() - begun))
+        took = now() - begun
+        if self.log and self.log[-1][0] == instant:  # what a frame begins with, and its first tick
+            _, late, before = self.log.pop()
+            took += before
+        self.log.append((instant, late, took))
+
+    def _of_device(self, asked: Callable[..., None], *what: object) -> None:
+        """Ask the device outside; where it is at fault the loop ends, and what was done stays."""
+        try:
+            asked(*what)
+        except ApcError as error:
+            self.loop.trouble = error
+            raise StoppedError from None
 
     def _push(self, outside: Outside, index: int) -> None:
         """Tell the device outside what force acts from this instant on."""
@@ -339,7 +382,7 @@ class _OnePeer(Stepwise):
         held = list(program.segments[index].held)
         carry = self.carries[self.member][:, 0]
         u = np.where(np.array(held) < 0, 0.0, carry[held])
-        outside.push(self.instant / NANO, carry[: program.layout.states], u)
+        self._of_device(outside.push, self.instant / NANO, carry[: program.layout.states], u)
 
     def _sees(self, place: int, tick: int, seen: tuple[Seen, ...]) -> tuple[Integers, Flags]:
         """Return the packets that are here, and which should be.
@@ -398,8 +441,10 @@ class _OnePeer(Stepwise):
         """Return why a packet is let go, empty if it isn't."""
         if packet.sender not in link.ways or len(packet.values) != len(link.channels_of(packet.sender)):
             return "malformed"
+        if not self.loop.begins:
+            return "joining"
         frame, frame_now = packet.count // link.slots, came // self.loop.frame_ns
-        if not self.loop.begins or frame > frame_now + 1:
+        if frame > frame_now + 1:
             return "early"
         # Of the frames that are kept the oldest may be overwritten by one that is early.
         if frame < frame_now - (self.population.hearing.ring - 3):
@@ -472,8 +517,21 @@ class _Emulated:
         return PacketSource(law, link.name, [[loop.own, other]], seed=loop.simulation.seed)
 
 
-def number_of(exchange: Exchange, name: str) -> int:
-    """Return the number of a peer called `left[1]`. Raises ApcError E970 if there is none."""
+def number_of(exchange: Exchange, name: str, option: str) -> int:
+    """Return the number of a peer called `left[1]`, as given to an option.
+
+    Parameters
+    ----------
+    exchange
+        Who is there.
+    name, option
+        What was given, and to what.
+
+    Raises
+    ------
+    ApcError
+        E970 there is no such peer.
+    """
     found = PEER.match(name)
     group = exchange.groups.index(found["group"]) if found and found["group"] in exchange.groups else -1
     place = int(found["place"]) if found else 0
@@ -481,6 +539,5 @@ def number_of(exchange: Exchange, name: str) -> int:
         return int(exchange.starts[group]) + place - 1
     names = [exchange.peer_name(one) for one in range(min(exchange.peers, 4))]
     expected = f"one of {', '.join(names)}{', …' if exchange.peers > len(names) else ''}"
-    raise ApcError(
-        Mistake("E970", Place(exchange.scene), "a peer", expected, cut(name) or "nothing", names[0])
-    )
+    hint = f'{option} "{names[0]}{"=HOST:PORT" if option == "--to" else ""}"'
+    raise ApcError(Mistake("E970", Place(option), "a peer", expected, cut(name) or "nothing", hint))

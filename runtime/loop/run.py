@@ -1,6 +1,6 @@
 """What a peer of a run did and heard, on disk: one file a peer, a trace a way, and the scene they played.
 
-Takes: a `Loop` that has ended. Gives: `PeerRun`, `Run`, `run_of`, `write_peer`, `write_scene`, `read_run`.
+Takes: a `Loop` that has ended. Gives: `PeerRun`, `Run`, `run_of`, `check_folder`, `write_run`, `read_run`.
 Guarantees: a file is whole or not there; nothing of it is run when it is read.
 Does not: judge it (see `beside`).
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import unwritable, write_file, write_text
+from apc.compiler.files import check_target, unwritable, write_file, write_text
 from apc.compiler.frozen import dataclass
 from apc.loop.peer import NANO, Loop
 from apc.simulation.blocks import instants_of
@@ -116,16 +116,55 @@ def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
     )
 
 
-def write_scene(folder: Path, system: CompiledSystem) -> None:
-    """Make a run's folder and write the scene into it. Raises ApcError E601 if that can't be."""
+def check_folder(folder: Path) -> None:
+    """Refuse, before anything is played, a folder that can't hold a run.
+
+    Raises
+    ------
+    ApcError
+        E973 it holds something else, E601 nothing can be written there.
+    """
+    if folder.exists() and not folder.is_dir():
+        what = "is there already, and is no folder"
+    elif folder.exists() and any(folder.iterdir()) and not (folder / SCENE).is_file():
+        what = "is there already, and is no folder of a run"
+    else:
+        check_target(folder / SCENE if folder.exists() else folder)
+        return
+    raise ApcError(Mistake("E973", Place(str(folder)), what, hint="--out another.run"))
+
+
+def write_run(folder: Path, system: CompiledSystem, peers: Sequence[PeerRun], *, whole: bool = False) -> None:
+    """Write what peers did.
+
+    Parameters
+    ----------
+    folder
+        Where to; made if it isn't there.
+    system
+        The scene.
+    peers
+        Some of its peers, or all.
+    whole
+        Whether these are all that stay in the folder.
+
+    Raises
+    ------
+    ApcError
+        E601 it can't be written.
+    """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(exist_ok=True)
+        for path in (*folder.glob("*.npz"), *folder.glob("*-to-*.csv")) if whole else ():
+            path.unlink()
     except OSError as error:
         raise unwritable(folder, error) from None
     store.save(system, folder / SCENE)
+    for one in peers:
+        _write_peer(folder, one, system)
 
 
-def write_peer(folder: Path, peer: PeerRun, system: CompiledSystem) -> None:
+def _write_peer(folder: Path, peer: PeerRun, system: CompiledSystem) -> None:
     """Write what a peer did, and a trace of every way that it heard. Raises ApcError E601 if it can't."""
     told = {
         **{name: getattr(peer, name) for name in PLAIN},

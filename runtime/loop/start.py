@@ -1,9 +1,9 @@
 """Peers started: one here, or all of a scene as processes of this machine.
 
-Takes: a compiled scene, addresses. Gives: `Play`, `play_one`, `play_all`; `address_of`, `listen_at`,
+Takes: a compiled scene, addresses. Gives: `Play`, `Part`, `play_one`, `play_all`; `address_of`, `listen_at`,
 `is_loopback`.
-Guarantees: every process ends with the one that started it; Ctrl-C ends all, and what was done is written.
-Does not: step (see `peer`).
+Guarantees: every process ends with the one that started it; Ctrl-C ends all, and what was done is given.
+Does not: step (see `peer`), or write (see `run`).
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ from __future__ import annotations
 import hashlib
 import ipaddress
 import multiprocessing
+import signal
 import socket
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, wait
+from contextlib import contextmanager, nullcontext
 from fractions import Fraction
 from multiprocessing.connection import Connection
-from pathlib import Path
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -25,9 +26,9 @@ from apc.frame.exchange import build_exchange
 from apc.frame.parameters import resolve
 from apc.loop.device import DeviceFunction
 from apc.loop.packets import Address
-from apc.loop.peer import Loop
+from apc.loop.peer import Loop, StoppedError
 from apc.loop.realtime import claim
-from apc.loop.run import run_of, write_peer
+from apc.loop.run import PeerRun, run_of
 from apc.processes import local_processes, model_bytes, model_of_bytes
 
 MOST_PEERS = 64  # processes of one machine
@@ -36,9 +37,8 @@ LOOPBACK = "127.0.0.1"
 
 @dataclass(frozen=True, slots=True)
 class Play:
-    """How a scene is played: `duration` in seconds, into `folder`; `patience` in seconds for others."""
+    """How a scene is played: `duration` in seconds; `patience` in seconds for others."""
 
-    folder: Path
     duration: Fraction
     secret: bytes
     emulate: bool
@@ -46,16 +46,41 @@ class Play:
     patience: float
 
 
-def address_of(text: str, option: str) -> Address:
-    """Read HOST:PORT. Raises ApcError E971 if it is none, or no such host is known."""
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A peer's part of a run, None if it ended before the scene began; its `trouble`, if it ended by that."""
+
+    run: PeerRun | None
+    trouble: ApcError | None = None
+
+
+def address_of(text: str, option: str, peer: str = "") -> Address:
+    """Read HOST:PORT.
+
+    Parameters
+    ----------
+    text
+        What was given.
+    option, peer
+        To what, for messages; `--to` is given a peer's name before.
+
+    Raises
+    ------
+    ApcError
+        E971 if it is none, or no such host is known by an IPv4 address.
+    """
     host, colon, port = text.rpartition(":")
-    expected, hint = "HOST:PORT, the port from 0 to 65535", f'{option} "192.0.2.7:5000"'
-    if not (colon and host and port.isascii() and port.isdecimal() and int(port) < 1 << 16):
+    least = 1 if peer else 0  # a port to send to, or to have one chosen
+    expected = f"HOST:PORT, the port from {least} to 65535"
+    hint = f'{option} "{peer and f"{peer}="}192.0.2.7:5000"'
+    valid = colon and host and port.isascii() and port.isdecimal() and len(port) < 6
+    if not (valid and least <= int(port) < 1 << 16):
         raise ApcError(Mistake("E971", Place(option), "an address", expected, text[:80] or "nothing", hint))
     try:
         return socket.getaddrinfo(host, int(port), socket.AF_INET, socket.SOCK_DGRAM)[0][4][:2]  # type: ignore[return-value]
-    except OSError as error:
-        what = f"the host {host[:80]} is not known: {error.strerror or error}"
+    except (OSError, UnicodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else str(error)
+        what = f"the host {host[:80]} is not known by an IPv4 address: {why}"
         raise ApcError(Mistake("E971", Place(option), what, hint=hint)) from None
 
 
@@ -84,21 +109,36 @@ def play_one(
     how: Play,
     stop: Connection | None = None,
     device: DeviceFunction | None = None,
-) -> None:
-    """Play one peer, and write what it did.
+) -> Part:
+    """Play one peer.
 
     Parameters
     ----------
-    system, peer, listening, addresses, stop, device
+    system, peer, listening, addresses, device
         As for `Loop`.
     how
-        For how long, and where to.
+        For how long, and how.
+    stop
+        As for `Loop`; Ctrl-C if not given.
 
     Raises
     ------
     ApcError
-        Those of `Loop`, `Loop.meet` and `write_peer`.
+        Those of `Loop` and `Loop.meet`.
     """
+    with _interrupts() if stop is None else nullcontext(stop) as told:
+        return _play(system, peer, listening, addresses, how, told, device)
+
+
+def _play(
+    system: CompiledSystem,
+    peer: str,
+    listening: socket.socket,
+    addresses: Mapping[str, Address],
+    how: Play,
+    stop: Connection,
+    device: DeviceFunction | None,
+) -> Part:
     digest = hashlib.sha256(model_bytes(system)).digest()
     loop = Loop(
         system,
@@ -114,13 +154,35 @@ def play_one(
         device=device,
     )
     not_given = claim()
-    loop.meet(how.patience)
+    try:
+        loop.meet(how.patience)
+    except StoppedError:
+        return Part(None)
     loop.run()
-    write_peer(how.folder, run_of(loop, digest, not_given), system)
+    return Part(run_of(loop, digest, not_given) if any(map(len, loop.rows)) else None, loop.trouble)
 
 
-def play_all(system: CompiledSystem, how: Play) -> None:
-    """Play all peers of a scene on loopback, a process each; Ctrl-C ends all, and what was done is kept.
+@contextmanager
+def _interrupts() -> Iterator[Connection]:
+    """Give what can be read once Ctrl-C was pressed; pressed again, it ends what it finds."""
+    stop, end = multiprocessing.Pipe(duplex=False)
+
+    def pressed(*_: object) -> None:
+        if end.closed:
+            raise KeyboardInterrupt
+        end.close()
+
+    before = signal.signal(signal.SIGINT, pressed)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
+        end.close()
+        stop.close()
+
+
+def play_all(system: CompiledSystem, how: Play) -> tuple[Part, ...]:
+    """Play all peers of a scene on loopback, a process each; Ctrl-C ends all, and what was done is given.
 
     Raises
     ------
@@ -134,6 +196,7 @@ def play_all(system: CompiledSystem, how: Play) -> None:
     names = [exchange.peer_name(one) for one in range(exchange.peers)]
     sockets = {name: listen_at((LOOPBACK, 0)) for name in names}
     stop, end = multiprocessing.get_context("spawn").Pipe(duplex=False)
+    parts = []
     shared = _Shared(model_bytes(system), sockets, how, stop)
     lost = Mistake("E975", Place(system.name), "one of the peers ended without a word")
     with local_processes(_play_named, shared, len(names), lost) as workers:
@@ -147,8 +210,10 @@ def play_all(system: CompiledSystem, how: Play) -> None:
             for one in done:
                 if (error := one.exception()) is not None:
                     raise workers.trouble(error) or error
+                parts.append(one.result())
     for listening in sockets.values():
         listening.close()
+    return tuple(parts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +226,8 @@ class _Shared:
     stop: Connection
 
 
-def _play_named(shared: _Shared, name: str) -> None:
+def _play_named(shared: _Shared, name: str) -> Part:
     """Play one peer in a process of its own."""
     addresses = {other: one.getsockname() for other, one in shared.sockets.items() if other != name}
-    play_one(model_of_bytes(shared.model), name, shared.sockets[name], addresses, shared.how, shared.stop)
+    listening = shared.sockets[name]
+    return play_one(model_of_bytes(shared.model), name, listening, addresses, shared.how, shared.stop)

@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from apc.compiler.words import counted, wrapped
+from apc.compiler.words import WIDTH, counted, wrapped
+from apc.loop.packets import DROPPED
 from apc.present.forms import document, note
 from apc.present.recorded_network import recording_document
 
@@ -44,19 +45,20 @@ def run_comparison_text(found: RunComparison) -> str:
 def ticks_text(ticks: Iterable[Ticks]) -> list[str]:
     """Return how late ticks were, a row a peer."""
     listed = list(ticks)
-    width = max([len(one.peer) for one in listed], default=0)
     lines = []
     for what, shares in (("late by", "late"), ("took", "took")):
-        heads = "".join(f"{heading:>10}" for heading in HEADINGS)
-        lines.append(f"  {what:<{width}}  {'ticks':>11}{heads}")
+        rows = [(what, f"{'instants':>11}" + "".join(f"{heading:>12}" for heading in HEADINGS))]
         for one in listed:
-            cells = "".join(f"{f'{1e3 * value:.3f} ms':>10}" for value in getattr(one, shares))
-            lines.append(f"  {one.peer:<{width}}  {one.ticks:>11,}{cells}")
+            cells = "".join(f"{f'{1e3 * value:.3f} ms':>12}" for value in getattr(one, shares))
+            rows.append((one.peer, f"{one.ticks:>11,}{cells}"))
+        lines += _rows(rows)
     for one in listed:
         said = [f"not given: {why}" for why in one.not_given]
         said += [f"joined at {one.joined:.4g} s"] if one.joined else []
         said += ["stopped before the end"] if one.stopped else []
-        said += [f"{count:,} datagrams dropped: {why}" for why, count in one.dropped.items()]
+        said += [
+            f"{counted(count, 'datagram', ',')} dropped: {DROPPED[why]}" for why, count in one.dropped.items()
+        ]
         if said:
             lines += wrapped(f"{one.peer}: {'; '.join(said)}", "  ", "    ")
     return lines
@@ -64,13 +66,26 @@ def ticks_text(ticks: Iterable[Ticks]) -> list[str]:
 
 def _ways_text(ways: Iterable[WayRun]) -> list[str]:
     listed = [(f"{one.link} {one.sender} to {one.receiver}", one) for one in ways]
-    width = max([len(name) for name, _ in listed], default=0)
-    lines = [f"  {'way':<{width}}  {'packets':>9}{'lost':>8}{'half within':>13}{'all within':>13}"]
+    rows = [("way", f"{'packets':>9}{'lost':>8}{'half within':>13}{'all within':>13}")]
     for name, one in listed:
         came = one.came
         middle = f"{1e3 * dict(came.quantiles).get(0.5, came.mean):.3f} ms"
         cells = f"{came.packets:>9,}{came.lost.count:>8,}{middle:>13}{f'{1e3 * came.longest:.3f} ms':>13}"
-        lines += [f"  {name:<{width}}  {cells}", f"    {one.trace}"]
+        rows += [(name, cells), (f"  {one.trace}", "")]
+    return _rows(rows)
+
+
+def _rows(rows: Iterable[tuple[str, str]]) -> list[str]:
+    """Return rows of names and equally wide cells; a name that leaves these no room has a line to itself."""
+    listed = list(rows)
+    wide = max(len(cells) for _, cells in listed)
+    width = max([len(name) for name, cells in listed if cells and len(name) + wide + 4 <= WIDTH], default=0)
+    lines = []
+    for name, cells in listed:
+        if cells and len(name) <= width:
+            lines.append(f"  {name:<{width}}  {cells}")
+        else:
+            lines += [f"  {name}", *([f"  {'':<{width}}  {cells}"] if cells else [])]
     return lines
 
 

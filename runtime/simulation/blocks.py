@@ -1,6 +1,6 @@
 """A scene played in time: blocks of rows.
 
-Takes: a `Simulation`. Gives: `Block`, `blocks`; `instants_of`, `pushes`.
+Takes: a `Simulation`. Gives: `Block`, `blocks`; `instants_of`, `pushes`, `unsolved`.
 Guarantees: a row for time 0 and for every tick of the fastest clock until the end, values before the tick;
 the memory used does not grow with the duration; no number that is not finite is given out.
 Does not: keep, write or judge what comes out (see `trajectory`, `recording`, `summary`).
@@ -68,10 +68,10 @@ def blocks(simulation: Simulation, *, run: int = 0, player: Player | None = None
         if block.stopped:
             return
         if runner.failed is not None:
-            raise _unsolved(simulation, runner.failed)
+            raise unsolved(simulation, runner.failed)
 
 
-def _unsolved(simulation: Simulation, frame: int) -> ApcError:
+def unsolved(simulation: Simulation, frame: int) -> ApcError:
     """Return the mistake of a frame that could not be played."""
     place = Place(simulation.system.origin.topology)
     at = f"after {float(frame * simulation.frame * simulation.quantum):g} s"

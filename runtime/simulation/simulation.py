@@ -174,9 +174,9 @@ def prepare(
         step that does not fit; and those of `build_schedules`, `build_population` and `routes_of`.
     """
     refuse_unheard_of(system)
-    system = stamped(system)
     with finite_equations(system.origin.topology):
         plan = plan_of(system, settings.method)
+        system = plan.system
         choices = _choices(plan, signals)
         members = _members(plan, choices, settings.method, live=live)
         population = build_population(plan.exchange, members, plan.routes)
@@ -267,7 +267,11 @@ class Plan:
 
 
 def plan_of(system: CompiledSystem, method: Method) -> Plan:
-    """Find out what happens in a frame, and refuse what can't be played."""
+    """Find out what happens in a frame, and refuse what can't be played.
+
+    The plan's system is `stamped`: where ages are asked for, packets say when they were sent.
+    """
+    system = stamped(system)
     numbers = resolve(system)
     sites = tuple(jacobians(kind) for kind in system.kinds)
     flows = tuple(_flow(system, numbers, place, site, method) for place, site in enumerate(sites))

@@ -75,6 +75,7 @@ PARTS = (
     Part("comparison", "Other programs", _own("comparison")),
     Part("work_precision", "Methods of simulation", _own("work_precision")),
     Part("handed_over", "A scene handed over as code", _own("handed_over")),
+    Part("play", "Peers in real time", _own("play"), _own("play", "--seconds", "5")),
     Part("simulate", "Simulation", _own("simulate"), _own("simulate", "--quick")),
     Part("language", "Compiling", _own("language"), _own("language", "--quick")),
     Part("populations", "Populations", _own("populations"), _own("populations", "--quick")),
