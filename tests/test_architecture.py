@@ -121,7 +121,7 @@ HOUSE = (
     ),
     ("apc.benchmark", "timing truth bench hard scale"),
     ("apc", "inputs"),
-    ("apc.report", "contents"),
+    ("apc.reports", "contents"),
     (
         "apc.present",
         """
@@ -130,6 +130,7 @@ HOUSE = (
         parameters graph report
         """,
     ),
+    ("apc.explore", "sliders written motion sections desk figures server page"),
     # what a person calls
     (
         "apc",
@@ -142,7 +143,6 @@ HOUSE = (
         library report commands
         """,
     ),
-    ("apc.explore", "sliders written motion sections desk figures page server"),
     ("apc", "__main__"),
 )
 ORDER = tuple(f"{package}.{name}" for package, names in HOUSE for name in names.split())
