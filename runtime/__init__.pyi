@@ -66,6 +66,9 @@ from .api import (
     region as region,
 )
 from .api import (
+    report as report,
+)
+from .api import (
     save as save,
 )
 from .api import (
@@ -102,6 +105,7 @@ from .hands.passivity import PassiveHands as PassiveHands
 from .moments.network import NetworkVerdict as NetworkVerdict
 from .network.recorded import NetworkRecording as NetworkRecording
 from .regions.region import Region as Region
+from .reports.contents import Report as Report
 from .simulation.buzz import Buzz as Buzz
 from .simulation.trajectory import Trajectory as Trajectory
 from .sweeps.sweep import Sweep as Sweep

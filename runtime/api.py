@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from apc.moments.network import NetworkVerdict
     from apc.network.recorded import NetworkRecording
     from apc.regions.region import Region
+    from apc.reports.contents import Report
     from apc.result import Result
     from apc.simulation.buzz import Buzz
     from apc.simulation.trajectory import Trajectory
@@ -751,6 +752,50 @@ def export(
     _check_out(model, system, path)
     asked = handing.Asked(cut, tuple(free), peer, device, method)
     return handing.export(system, chosen, asked, path)
+
+
+def report(
+    files: str | Path | Sequence[str | Path],
+    out: str | Path | None = None,
+    *,
+    set: Mapping[str, str] | None = None,
+) -> Report:
+    """Gather all that is known of scenes, for one page.
+
+    Parameters
+    ----------
+    files
+        Topologies, YAML files; several stand side by side.
+    out
+        The page to write, `.html` or `.pdf`; nothing is written if not given.
+    set
+        As for `analyze`, of all of them.
+
+    Returns
+    -------
+    Report
+        Its `.scenes`, each with sections of tables, which are those of the other functions.
+
+    Raises
+    ------
+    ApcError
+        The input is at fault, or the page can't be written.
+    """
+    from apc.inputs import check_topology_outputs, refuse_model
+    from apc.present.report import check_report_path, save_report
+    from apc.reports import contents
+
+    paths = [Path(one) for one in ([files] if isinstance(files, str | Path) else files)]
+    for path in paths:
+        refuse_model(path, "report")
+        if out is not None:
+            check_topology_outputs(path, {"out=": Path(out)})
+    if out is not None:
+        check_report_path(Path(out))
+    found = contents.report(paths, [f"{name}={value}" for name, value in (set or {}).items()])
+    if out is not None:
+        save_report(found, Path(out))
+    return found
 
 
 def show(path: str | Path, *, format: Format = "text") -> str:

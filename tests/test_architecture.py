@@ -121,7 +121,7 @@ HOUSE = (
     ),
     ("apc.benchmark", "timing truth bench hard scale"),
     ("apc", "inputs"),
-    ("apc.report", "contents"),
+    ("apc.reports", "contents"),
     (
         "apc.present",
         """
@@ -130,6 +130,7 @@ HOUSE = (
         parameters graph report
         """,
     ),
+    ("apc.explore", "sliders written motion sections desk figures server page"),
     # what a person calls
     (
         "apc",

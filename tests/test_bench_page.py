@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import importlib.util
 import re
 import subprocess
@@ -34,6 +36,21 @@ def test_every_benchmark_is_part_of_the_page() -> None:
     named = {word.removeprefix("tests.bench.") for part in PARTS for word in part.words[:1]} - {"apc"}
     assert named == modules
     assert len({part.name for part in PARTS}) == len(PARTS)
+
+
+@pytest.mark.parametrize("path", sorted(HERE.rglob("*.py")), ids=lambda path: path.stem)
+def test_what_a_benchmark_imports_of_the_program_is_there(path: Path) -> None:
+    for one in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(one, ast.ImportFrom) and (one.module or "").split(".")[0] == "apc":
+            names = [alias.name for alias in one.names]
+            found = importlib.import_module(one.module or "")
+            gone = [name for name in names if not hasattr(found, name) and not _module(one.module, name)]
+            assert not gone, f"{one.module} has no {gone}"
+
+
+def _module(package: str | None, name: str) -> bool:
+    """Say whether a name is that of a module of a package."""
+    return importlib.util.find_spec(f"{package}.{name}") is not None
 
 
 def test_a_quick_run_is_of_the_same_program() -> None:

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
 from fractions import Fraction
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -31,6 +32,7 @@ from tests.topologies import AVERAGE, SCENES
 
 pytest.importorskip("bokeh")
 
+from apc.explore import figures, sections
 from apc.explore.desk import Desk
 from apc.explore.motion import STRUCK, motion_of
 from apc.explore.sections import Task, Told, compute
@@ -38,6 +40,7 @@ from apc.explore.sliders import Slider, axes_of, overrides_of, place_of, set_to,
 from apc.explore.written import with_values
 from apc.processes import Workers, model_bytes
 
+NOTHING = "topology: none\npeers: {user: {count: 1}}\nmasses: {}\n"
 LOSSY = AVERAGE.replace("delay: 8 ms}", "delay: 8 ms, loss: 10 %, jitter: 1 ms}")
 
 
@@ -186,7 +189,16 @@ def test_a_struck_device_moves_as_its_equation_says(tmp_path: Path) -> None:
     expected = 1e3 * STRUCK * 2 / 3 * (1 - np.exp(-1.5 * motion.time))
     assert np.allclose(body.x, expected, rtol=1e-9, atol=1e-12)
     with pytest.raises(apc.ApcError, match="E983"):
-        motion_of(compiled("topology: none\npeers: {user: {count: 1}}\nmasses: {}\n", tmp_path), struck=True)
+        motion_of(compiled(NOTHING, tmp_path), struck=True)
+
+
+def test_what_goes_wrong_in_a_section_is_told_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> dict[str, Any]:
+        raise ValueError("shapes differ")
+
+    monkeypatch.setitem(sections.SECTIONS, "feel", broken)
+    told = compute(model_bytes(compiled(AVERAGE, tmp_path)), Task("feel", ()))
+    assert told.why == "This is a bug of apc, not of your scene: ValueError: shapes differ"
 
 
 # Who computes it.
@@ -213,7 +225,7 @@ def test_an_old_answer_never_takes_the_place_of_a_newer_one() -> None:
         b"", ("a", "b"), lambda call: call(), lambda section, told: shown.append((section, told.found))
     )
     desk.workers = Workers(held.submit, 1, lambda _: None)
-    desk.ask(Task("b", (), 1))
+    assert desk.ask(Task("b", (), 1)) and not desk.ask(Task("b", (), 1))
     for number in (2, 3, 4):  # while it computes, the newest waits in the place of those before it
         desk.ask(Task("b", (), number))
     desk.ask(Task("a", (), 5))
@@ -292,6 +304,7 @@ CHROMIUM = next(
     None,
 )
 MODEL = "Bokeh.documents[0].get_model_by_name"
+PAGE = files("apc.explore").joinpath("page.html").read_text(encoding="utf-8")
 READY = "document.documentElement.dataset.ready == 'yes'"
 VERDICT = f"{MODEL}('verdict').text"
 
@@ -460,6 +473,84 @@ def test_whoever_sees_no_pictures_and_has_no_mouse_finds_everything_by_name(brow
         tab.page.wait_for_timeout(500)
         assert tab.page.evaluate("document.documentElement.scrollWidth") <= width
     tab.close(link)
+
+
+def test_a_scene_without_two_axes_is_shown_without_a_region(browser: Any, tmp_path: Path) -> None:
+    (tmp_path / "none.yaml").write_text(NOTHING, encoding="utf-8")
+    with served(tmp_path / "none.yaml") as link:
+        tab = Tab(browser, f"{link}&x-axis=user.count")
+        tab.page.wait_for_function(f"{MODEL}('region-words').text.includes('this scene has fewer')")
+        assert "user.count can be no axis" in tab.page.evaluate(f"{MODEL}('message').text")
+        assert tab.page.get_by_role("combobox", name="Region: horizontal axis").count() == 0
+        assert tab.press("user.count", "ArrowRight", 1) == "2"
+        tab.page.wait_for_function("location.search.includes('user.count=2')")
+        tab.page.wait_for_function(f"{MODEL}('motion-words').text.includes('velocity')")
+        assert not tab.page.get_by_role("button", name="Play").is_visible()
+        tab.close(link)
+
+
+def test_a_scene_may_name_its_numbers_as_the_link_does(browser: Any, tmp_path: Path) -> None:
+    text = AVERAGE.replace("clocks:", "parameters: {x: 1000 N/m, y: 500 N/m, token: 5 N*s/m}\nclocks:", 1)
+    text = text.replace("stiffness: 1000 N/m", "stiffness: x").replace("stiffness: 500 N/m", "stiffness: y")
+    system = compiled(
+        text.replace("mass: 0.1 kg, damping: 5 N*s/m", "mass: 0.1 kg, damping: token"), tmp_path
+    )
+    with served(tmp_path / "scene.yaml") as link:
+        tab = Tab(browser, link)
+        setting = {name: tab.press(name, "PageDown", 1).replace("·", "*") for name in ("x", "token")}
+        radius = apc.analyze(system, set=setting).spectral_radius
+        tab.radius(radius)
+        tab.page.wait_for_function("new URLSearchParams(location.search).getAll('token').length == 2")
+        again = Tab(browser, tab.page.url)
+        again.radius(radius)
+        assert again.page.evaluate(f"{MODEL}('message').text") == ""
+        tab.close(link)
+        again.close(link)
+
+
+def test_a_region_that_takes_long_keeps_nothing_waiting(browser: Any) -> None:
+    path = SCENES / "experiment-average.yaml"
+    system = apc.compile(path)
+    with served(path) as link:
+        tab = Tab(browser, link)
+        tab.page.wait_for_function(f"{MODEL}('region-words').text.includes('is not linear')")
+        text = tab.press("cube.damping", "PageDown", 2).replace("·", "*")
+        tab.radius(apc.analyze(system, set={"cube.damping": text}).spectral_radius)
+        assert "is not linear" in tab.page.evaluate(f"{MODEL}('region-words').text")
+        tab.close(link)
+
+
+# What is written, and what is drawn beside it, by the style sheets of the page.
+GRAPHICS = {
+    *figures.COLOURS,
+    figures.GREY,
+    *re.findall(r"(?:outline|border-color): [^;]*?(#\w{6})", figures.FOCUS),
+}
+TEXTS = {figures.INK, *re.findall(r"(?<![-\w])color: (#\w{6})", figures.STYLE + figures.FOCUS + PAGE)}
+
+
+def luminance(colour: np.ndarray[Any, Any]) -> float:
+    """WCAG 2.1: relative luminance of sRGB in 0 to 1."""
+    linear = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def turned(colour: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """`invert(92%) hue-rotate(180deg)` of Filter Effects Module Level 1, sections 5 and 6."""
+    luma = np.array([0.213, 0.715, 0.072])
+    return np.clip((2 * luma - np.eye(3)) @ (0.92 + (1 - 2 * 0.92) * colour), 0, 1)
+
+
+@pytest.mark.parametrize("seen", [np.asarray, turned], ids=["light", "dark"])
+def test_what_is_written_and_drawn_stands_out_in_light_and_in_dark(seen: Any) -> None:
+    """WCAG 2.1, 1.4.3 and 1.4.11: 4.5 for texts, 3 for graphics, against what is behind them."""
+    assert "filter: invert(92%) hue-rotate(180deg)" in PAGE and len(TEXTS) > 4
+    page = luminance(seen(np.ones(3)))
+    for colours, least in ((TEXTS, 4.5), (GRAPHICS, 3.0)):
+        for one in colours:
+            own = luminance(seen(np.array([int(one[k : k + 2], 16) / 255 for k in (1, 3, 5)])))
+            low, high = sorted((own, page))
+            assert (high + 0.05) / (low + 0.05) >= least, one
 
 
 def status(link: str, **headers: str) -> int:

@@ -286,8 +286,8 @@ def test_a_scene_in_which_nothing_ticks_is_refused_by_name() -> None:
     with pytest.raises(ApcError) as caught:
         feel(compiled(ONE_MASS), [1.0])
     assert str(caught.value) == (
-        "scene.yaml: E935 has nothing that ticks, and what is felt is told of samples and held forces. "
-        "Write: a coupler with a clock, as SampledSpringDamper"
+        "scene.yaml: E935 the scene has nothing that ticks, and what is felt is told of samples and "
+        "held forces. Write: a coupler with a clock, as SampledSpringDamper"
     )
 
 

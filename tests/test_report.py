@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 from html.parser import HTMLParser
@@ -12,9 +13,11 @@ import pytest
 
 import apc
 from apc.__main__ import run
+from apc.compiler.errors import Mistake, Place
 from apc.present import report as pages
 from apc.present.report import kept_report, report_page
-from apc.report.contents import Report, differences, report
+from apc.reports import contents
+from apc.reports.contents import Report, Table, differences, report
 from tests.topologies import AVERAGE, SCENES, replaced
 
 SCENE = SCENES / "three-users-average.yaml"
@@ -132,6 +135,41 @@ def test_sections_that_a_scene_cannot_fill_say_why(tmp_path: Path) -> None:
     assert all(f"Not here: {text}" in report_page(found).replace("&#x27;", "'") for text in why.values())
 
 
+def test_over_an_unreliable_link_loss_and_jitter_are_looked_at_and_the_region_says_what_stable_means(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def refusing(system: apc.CompiledSystem, name: str) -> apc.Critical:  # what it answers takes minutes
+        asked.append(name)
+        raise apc.ApcError(Mistake("E898", Place("here"), f"{name} takes too long"))
+
+    monkeypatch.setattr(contents, "critical", refusing)
+    path = tmp_path / "scene.yaml"
+    lossy = ("delay: 8 ms}", "delay: 8 ms, loss: 10 %, jitter: 1 ms}")
+    path.write_text(replaced(AVERAGE, lossy, ("count: 3", "count: 2")), "utf-8")
+    [scene] = apc.report(path).scenes
+    sections = {one.key: one for one in scene.sections}
+    assert {"lan.loss", "lan.jitter"} <= set(asked)
+    told = " ".join((sections["network"].refused, *sections["network"].told))
+    assert "loss: lan.loss takes too long" in told and "jitter: lan.jitter takes too long" in told
+    assert "with every packet on time" in sections["region"].told[-1]
+    assert "--in mean-square --out region.svg" in sections["region"].told[-1]
+    assert "--in nominal" in sections["region"].command
+
+
+def test_from_python_a_report_is_a_result_and_a_page(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(LONE, encoding="utf-8")
+    found = apc.report(path, tmp_path / "r.html", set={"device.mass": "2 kg"})
+    assert isinstance(found, apc.Report) and found.scenes[0].settings == ("device.mass=2 kg",)
+    assert kept_report(tmp_path / "r.html")["scenes"][0]["settings"] == ["device.mass=2 kg"]
+    again = apc.report([path], set={"device.mass": "2 kg"})
+    assert (tmp_path / "r.html").read_text("utf-8") == report_page(again) + "\n"
+    with pytest.raises(apc.ApcError, match="E616"):
+        apc.report(path, path)
+
+
 def test_a_report_is_computed_anew_from_itself_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -201,6 +239,12 @@ def test_a_report_from_somebody_writes_nowhere_else(
     path.write_text(page.replace(old, json.dumps([name, "x"])[:-5]), encoding="utf-8")
     assert run(["report", "--check", str(path)]) == 1
     assert "E990 names a file outside of the scene's folder" in capsys.readouterr().err
+
+
+def test_a_number_that_there_is_not_is_a_dash() -> None:
+    table = Table("T", ("where", "frequency [Hz]"), (("a", math.nan), ("b", None), ("c", 2.5)))
+    shown = re.findall(r"<td[^>]*>([^<]*)</td>", pages._table(table))
+    assert shown == ["a", "–", "b", "–", "c", "2.5"]
 
 
 def test_several_scenes_stand_side_by_side(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.threads import start_single_threaded
 
 if TYPE_CHECKING:
-    from apc.report.contents import Report
+    from apc.reports.contents import Report
 
 
 @click.command("report", cls=Command)
@@ -59,7 +59,7 @@ def report_command(
     assert out is not None
     from apc.inputs import check_topology_outputs, find_input, refuse_model
     from apc.present.report import check_report_path, report_text, save_report
-    from apc.report.contents import report
+    from apc.reports.contents import report
 
     check_report_path(out)
     paths = [Path(file) for file in files] or [find_input(compiled_too=False)]
@@ -78,7 +78,7 @@ def _check(path: Path) -> None:
     import tempfile  # most commands need none
 
     from apc.present.report import kept_report, scene_again
-    from apc.report.contents import report
+    from apc.reports.contents import report
 
     kept = kept_report(path)
     mistakes, notes = [], []
@@ -100,7 +100,7 @@ def _check(path: Path) -> None:
 def _differs(kept: dict[str, Any], again: Report) -> Iterator[str]:
     """Yield what differs between the sections of a scene that a report keeps and those made anew."""
     from apc.present.report import TITLES
-    from apc.report.contents import differences
+    from apc.reports.contents import differences
 
     [now] = again.to_dict()["scenes"]
     before = {one["key"]: one for one in kept["sections"]}

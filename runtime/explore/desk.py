@@ -50,10 +50,13 @@ class Desk:
     stack: ExitStack = field(default_factory=ExitStack)
     workers: Workers[Task, Told] | None = None
 
-    def ask(self, task: Task) -> None:
-        """Compute a section anew, in the place of what it waited for, unless that is what was asked last."""
+    def ask(self, task: Task) -> bool:
+        """Compute a section anew, in the place of what it waited for, unless that is what was asked last.
+
+        Say whether it is.
+        """
         if self.last.get(task.section) == task:
-            return
+            return False
         self.last[task.section] = task
         self.waiting[task.section] = (next(self.numbers), task)
         if self.busy is not None:
@@ -61,10 +64,10 @@ class Desk:
             first = self.order.index(task.section) <= self.order.index(running.section)
             if first and time.monotonic() - since > PATIENCE:
                 self._end()
-                self.waiting.setdefault(
-                    running.section, (number, running)
-                )  # what is still wanted comes after
+                if running.section in self.last:  # what is still wanted comes after
+                    self.waiting.setdefault(running.section, (number, running))
         self._next()
+        return True
 
     def forget(self, section: str) -> None:
         """Compute a section no longer, and drop the answer that is on its way."""

@@ -26,11 +26,13 @@ from bokeh.models import (
 )
 from bokeh.plotting import figure
 
+from apc.compiler.words import counted
 from apc.explore.motion import ROWS, Motion
 
-# Colours that are distinct in print and for colour-blind eyes: Okabe and Ito, 2008.
+# Colours that are distinct in print and for colour-blind eyes: Okabe and Ito, 2008, the lightest two of them
+# darkened until they stand out from white as graphics have to (WCAG 2.1, 1.4.11).
 BLUE, ORANGE, GREY, INK = "#0072B2", "#D55E00", "#595959", "#1a1a1a"
-COLOURS = (BLUE, ORANGE, "#009E73", "#CC79A7", "#000000", "#56B4E9", "#E69F00", "#7F3C8D")
+COLOURS = (BLUE, ORANGE, "#009E73", "#CC79A7", "#000000", "#6A86E8", "#A87300", "#7F3C8D")
 DASHES, DASH_WORDS = (
     ("solid", "dashed", "dotted", "dotdash"),
     ("drawn through", "dashed", "dotted", "dash and dot"),
@@ -60,6 +62,7 @@ if (time.length) {
   instant.data.x[0] = time[k]
   bodies.change.emit()
   instant.change.emit()
+  slider.properties.title.change.emit() // which shows the time
 }
 """
 PLAYING = f"""
@@ -185,6 +188,7 @@ class RegionFigure:
 
     def show(self, found: Mapping[str, Any]) -> None:
         """Draw a region."""
+        self.plot.visible = True
         outlines = [np.asarray(one) for one in found["outlines"]]
         rings = {
             axis: [[[one[:, n] for one in outlines]]] if outlines else []
@@ -209,6 +213,7 @@ class RegionFigure:
 
     def clear(self, why: str) -> None:
         """Show no region, and why."""
+        self.plot.visible = False
         self.inside.data = self.boundary.data = {"xs": [], "ys": []}
         self.words.nothing(why)
 
@@ -259,7 +264,7 @@ class RootsFigure:
         self.plot.x_range.update(start=-reach, end=reach)
         self.plot.y_range.update(start=-reach, end=reach)
         outside = int((np.hypot(found["real"], found["imag"]) > 1).sum())
-        self.words.say(f"{len(found['real'])} eigenvalues, {outside} of them outside the unit circle.")
+        self.words.say(f"{counted(len(found['real']), 'eigenvalue')}, {outside} outside the unit circle.")
 
     def way_of(self, found: Mapping[str, Any]) -> None:
         """Draw where the eigenvalues go as a slider goes through all its values."""
@@ -351,6 +356,7 @@ class MotionFigure:
 
     def show(self, motion: Motion) -> None:
         """Draw a motion, and put the bodies where they are at the time that is shown."""
+        self._visible(True)
         peers, names = (
             list(dict.fromkeys(column))
             for column in zip(*((one.peer, one.name) for one in motion.bodies), strict=True)
@@ -411,6 +417,15 @@ class MotionFigure:
             *([f"{motion.others} more peers are not shown."] if motion.others else []),
         )
 
+    def clear(self, why: str) -> None:
+        """Show no motion, and why."""
+        self._visible(False)
+        self.words.nothing(why)
+
+    def _visible(self, there: bool) -> None:
+        for one in (self.stage, self.play, self.time, self.plot):
+            one.visible = there
+
 
 class FeelFigure:
     """What a hand feels at its device: force by velocity, over frequency."""
@@ -442,6 +457,7 @@ class FeelFigure:
 
     def show(self, found: Mapping[str, Any]) -> None:
         """Draw what is felt."""
+        self.plot.visible = self.phase.visible = True
         self.source.data = {name: found[name] for name in ("frequency", "magnitude", "phase")}
         f, size = found["frequency"], found["magnitude"]
         self.plot.x_range.update(start=f[0], end=f[-1])
@@ -454,6 +470,7 @@ class FeelFigure:
 
     def clear(self, why: str) -> None:
         """Show no impedance, and why."""
+        self.plot.visible = self.phase.visible = False
         self.source.data = columns("frequency", "magnitude", "phase")
         self.words.nothing(why)
 

@@ -27,6 +27,7 @@ from apc.distribution import program_version
 from apc.explore.desk import Desk
 from apc.explore.figures import FOCUS, FeelFigure, MotionFigure, RegionFigure, RootsFigure, Words
 from apc.explore.sections import Task, Told
+from apc.explore.server import TOKEN
 from apc.explore.sliders import (
     Slider,
     axes_of,
@@ -41,13 +42,18 @@ from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
 from apc.present.forms import json_text
 from apc.processes import model_bytes
+from apc.vary.evaluator import reaches_count, reaches_time
 from apc.vary.growth import MEAN_SQUARE, NOMINAL
 
-# Who computes what, first things first: what is redrawn while a slider moves waits for nothing else.
+# Who computes what, first things first: what is redrawn while a slider moves waits for nothing else. A region
+# whose points are analysed one by one takes many seconds, and comes last.
 QUICK, LATER = 0, 1
-DESKS = (("verdict", "region"), ("numbers", "roots", "motion", "feel", "margins", "network"))
-X, Y = "x", "y"  # arguments of the link: the sliders on the axes of the region
+DESKS = (("verdict", "region"), ("numbers", "roots", "motion", "feel", "margins", "network", "region"))
+# Arguments of the link: the sliders on the axes of the region. No name of a scene has a hyphen.
+X, Y = "x-axis", "y-axis"
 STRUCK, BEGINS = "the first peer's device is struck", "as the scene begins"
+SAME_AXES = "A region has two different parameters: choose another one for an axis."
+NO_AXES = "A region has two parameters, and this scene has fewer that are numbers of a range."
 LIVE, SLOW = "every packet is on time", "packets as they are lost and late (takes long)"
 
 # Handles get their sliders' names, and say values as the page shows them.
@@ -161,6 +167,7 @@ class Page:
         self.verdict, self.margins, self.network = Words("verdict"), Words("margins"), Words("network")
         self.region, self.roots = RegionFigure(), RootsFigure()
         self.motion, self.feel = MotionFigure(), FeelFigure()
+        self.linear: bool | None = None  # not known before the first verdict
         self.moving, self.last = False, self.chosen[0] if self.chosen else 0
         self.link = ColumnDataSource({"query": [""]})
         self.link.js_on_change("data", CustomJS(args={"link": self.link}, code=LINKED))
@@ -170,8 +177,9 @@ class Page:
         self._moved()
 
     def _axes_at_first(self) -> list[int]:
-        """Return the sliders on the axes of the region: those the scene studies come first."""
-        return [place for place, one in enumerate(self.sliders) if one.span is not None][:2]
+        """Return the sliders on the axes of the region, those the scene studies first; none without two."""
+        found = [place for place, one in enumerate(self.sliders) if one.span is not None]
+        return found[:2] if len(found) > 1 else []
 
     def _take_link(self, arguments: Mapping[str, list[bytes]]) -> None:
         """Set the sliders as the link says."""
@@ -180,8 +188,11 @@ class Page:
             text = values[-1].decode("utf-8", "replace")
             if name in (X, Y):
                 axes = [place for place, one in enumerate(self.sliders) if one.span and one.label == text]
-                self.chosen["xy".index(name)] = (axes or self.chosen)[0]
-            elif name not in ("token", "bokeh-session-id"):
+                if axes and self.chosen:
+                    self.chosen[(X, Y).index(name)] = axes[0]
+                else:
+                    wrong.append(f"{text} can be no axis of the region")
+            elif name != "bokeh-session-id" and (name != TOKEN or len(values) > 1):  # a number may be a token
                 try:
                     self._start_at(f"{name}={text}")
                 except ApcError as error:
@@ -200,7 +211,7 @@ class Page:
         names = [one.label for one in self.sliders if one.span is not None]
         self.selects = [
             Select(title=f"Region: {way} axis", value=self.sliders[place].label, options=names, width=250)
-            for way, place in zip(("horizontal", "vertical"), self.chosen, strict=True)
+            for way, place in zip(("horizontal", "vertical"), self.chosen, strict=False)
         ]
         for select in self.selects:
             select.on_change("value", lambda attr, old, new: self._choose())
@@ -323,7 +334,7 @@ class Page:
 
     def _tapped(self, event: Any) -> None:
         """Set the sliders of both axes to where the region was clicked."""
-        pairs = zip(self.chosen, (event.x, event.y), strict=True)
+        pairs = zip(self.chosen, (event.x, event.y), strict=False)
         self._set({number: place_of(self.sliders[number], at) for number, at in pairs})
 
     def _choose(self) -> None:
@@ -335,10 +346,11 @@ class Page:
     def _moved(self) -> None:
         """Ask for everything anew."""
         overrides = tuple(overrides_of(self.sliders, self.places))
-        moved = self.sliders[self.last]
-        others = tuple(one for one in overrides if one.free != moved.free)
         self._ask("verdict", overrides)
-        self._ask("roots", others, (moved.free, moved.values))
+        if self.sliders:
+            moved = self.sliders[self.last]
+            others = tuple(one for one in overrides if one.free != moved.free)
+            self._ask("roots", others, (moved.free, moved.values))
         self._ask_region(overrides)
         self._ask("motion", overrides, self.begins.value == STRUCK)
         for section in ("feel", "margins", "network"):
@@ -347,15 +359,34 @@ class Page:
 
     def _ask_region(self, overrides: tuple[Override, ...]) -> None:
         """Ask for the region, if there are two axes: nobody waits for it where it takes long."""
-        asked, region = self._region_asked(), self.desks[QUICK]
+        asked = self._region_asked()
         if asked is None:
-            region.forget("region")
-            self.region.clear("A region has two different parameters: choose another one for an axis.")
+            for desk in self.desks:
+                desk.forget("region")
+            self.region.clear(SAME_AXES if self.chosen else NO_AXES)
+            return
+        if self.linear is None:
             return
         # What stands on an axis has all its values there.
         others = tuple(one for one in overrides if one.free not in (asked[0].free, asked[1].free))
-        region.ask(Task("region", others, asked))
+        slow = self._slow(asked)
+        self.desks[QUICK if slow else LATER].forget("region")
+        if self.desks[LATER if slow else QUICK].ask(Task("region", others, asked)) and slow:
+            self.region.clear(f"Computing, after all else: {slow}, which takes a while.")
         self.region.mark(*(float(self.sliders[one].values[self.places[one]]) for one in self.chosen))
+
+    def _slow(self, asked: tuple[Range, Range, str]) -> str:
+        """Return why a region can't be redrawn as fast as a slider moves; nothing if it can."""
+        x, y, criterion = asked
+        if criterion == MEAN_SQUARE:
+            return "it looks at packets as they are lost and late"
+        if not self.linear:
+            return "the scene is not linear, and is linearized at its start for each point by itself"
+        if any(reaches_time(self.system, one.free) for one in (x, y)):
+            return "as a time varies, each point has a schedule of its own"
+        if any(reaches_count(self.system, one.free) for one in (x, y)):
+            return "each number of peers is analysed by itself"
+        return ""
 
     def _region_asked(self) -> tuple[Range, Range, str] | None:
         """Return the axes of the region, and what stable means there; None if there are no two axes."""
@@ -377,7 +408,7 @@ class Page:
         """Return the part of the link that holds values and axes."""
         pairs = [(one.label, one.texts[place]) for one, place in self._pairs() if place != one.start]
         pairs += [
-            (name, self.sliders[number].label) for name, number in zip((X, Y), self.chosen, strict=True)
+            (name, self.sliders[number].label) for name, number in zip((X, Y), self.chosen, strict=False)
         ]
         return "".join(f"&{quote(name)}={quote(text, safe='')}" for name, text in pairs)
 
@@ -388,6 +419,9 @@ class Page:
     def _deliver(self, section: str, told: Told) -> None:
         """Show what a section tells."""
         found = told.found
+        if section == "verdict" and self.linear is None:
+            self.linear = found is not None and found["linear"]
+            self._ask_region(tuple(overrides_of(self.sliders, self.places)))
         match section:
             case "verdict" if found is not None:
                 self.verdict.verdict(found)
@@ -408,11 +442,13 @@ class Page:
                 self.region.clear(told.why)
             case "feel":
                 self.feel.clear(told.why)
+            case "motion":
+                self.motion.clear(told.why)
             case _:
                 self._words(section).nothing(told.why)
 
     def _words(self, section: str) -> Words:
-        words = {"verdict": self.verdict, "roots": self.roots.way_words, "motion": self.motion.words}
+        words = {"verdict": self.verdict, "roots": self.roots.way_words}
         return (words | {"margins": self.margins, "network": self.network}).get(section, self.message)
 
 

@@ -89,6 +89,8 @@ def compute(model: bytes, task: Task) -> Told:
         return Told(SECTIONS[task.section](changed, prepared, task.asked))
     except ApcError as error:
         return Told(None, "\n".join(one.sentence for one in error.mistakes))
+    except Exception as error:  # the other sections go on
+        return Told(None, f"This is a bug of apc, not of your scene: {type(error).__name__}: {error}")
 
 
 def _verdict(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, Any]:
@@ -97,6 +99,7 @@ def _verdict(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, A
     return {
         "verdict": found.verdict + (", linearized" if found.linearized else ""),
         "stable": found.stable,
+        "linear": not found.linearized,
         "radius": found.spectral_radius,
         "limits": _limits(found),
         "notes": found.left_out,

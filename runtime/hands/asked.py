@@ -136,7 +136,7 @@ def _fastest_clock(system: CompiledSystem) -> tuple[Fraction, Fraction]:
     used = {part.clock for kind in system.kinds for part in kind.clocks} | {one.clock for one in system.links}
     clocks = [one for one in system.clocks if one.name in used]
     if not clocks:
-        what = "has nothing that ticks, and what is felt is told of samples and held forces"
+        what = "the scene has nothing that ticks, and what is felt is told of samples and held forces"
         hint = "a coupler with a clock, as SampledSpringDamper"
         raise ApcError(Mistake("E935", Place(system.origin.topology), what, hint=hint))
     clock = min(clocks, key=lambda one: timings[one.period])

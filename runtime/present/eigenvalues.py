@@ -90,7 +90,8 @@ def locus_picture(found: Locus, ax: Any = None) -> Any:
             continue
         nearest = found.eigenvalues[int(np.abs(found.values - one.value).argmin())]
         at = nearest[np.abs(np.abs(nearest) - 1).argmin()]
-        label = f"changes at {with_unit(f'{one.value:.6g}', of.unit)}, {in_hertz(one.frequency_hz)}"
+        told = "" if np.isnan(one.frequency_hz) else f", {in_hertz(one.frequency_hz)}"
+        label = f"changes at {with_unit(f'{one.value:.6g}', of.unit)}{told}"
         _mark(ax, [at / abs(at)], MARKS[place], "none", label)
     _entitle(ax, [f"{of.topology}: eigenvalues of a frame of {1e3 * found.frame_s:g} ms, packets on time"])
     return ax

@@ -13,6 +13,7 @@ A PDF is printed by Chromium, where there is one.
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
@@ -39,7 +40,7 @@ from apc.present.pictures import svg_text
 from apc.present.region_picture import region_picture
 from apc.present.simulation import played_picture
 from apc.regions.region import Region
-from apc.report.contents import Cell, Report, SceneReport, Table
+from apc.reports.contents import Cell, Report, SceneReport, Table
 from apc.simulation.trajectory import Trajectory
 from apc.suffixes import check_suffix
 from apc.vary.locus import Locus
@@ -148,7 +149,7 @@ def report_page(found: Report) -> str:
         cells = [_section(one, key, draw, len(found.scenes) > 1) for one in found.scenes]
         parts += _row(key, title, cells)
     parts += _row("made", "What made it", [_made(one, found) for one in found.scenes])
-    parts += [f'</main><script type="application/json" id="apc-report">{kept}</script></body></html>\n']
+    parts += [f'</main><script type="application/json" id="apc-report">{kept}</script></body></html>']
     return "\n".join(parts)
 
 
@@ -212,9 +213,9 @@ def _table(table: Table) -> str:
 
 
 def _cell(cell: Cell, column: str) -> str:
-    if isinstance(cell, int | float):
+    if isinstance(cell, int | float) and not math.isnan(cell):
         return f'<td class="number">{f"± {cell:.0e}" if column == "error" else f"{cell + 0:.9g}"}</td>'
-    return f"<td>{'–' if cell is None else escape(cell)}</td>"
+    return f"<td>{escape(cell) if isinstance(cell, str) else '–'}</td>"
 
 
 def _made(one: SceneReport, found: Report) -> str:

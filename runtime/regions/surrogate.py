@@ -94,8 +94,26 @@ class DirectFamily:
         values = np.concatenate([self.rectangle.values(points)] * 2)
         along = np.zeros_like(values)
         along[:count, 0], along[count:, 1] = self.rectangle.width
-        matrix, slope = self.evaluator.slopes(values, along)[system]
+        matrix, slope = (
+            _sized(one, self.sizes[system]) for one in self.evaluator.slopes(values, along)[system]
+        )
         return matrix[:count], slope.reshape(2, count, *slope.shape[1:])
+
+
+def _sized(matrices: Floats, size: int) -> Floats:
+    """Return matrices (k, n, n) as (k, size, size): zeros are put on or left off, which moves nothing.
+
+    All of a matrix is NaN where there is none, or one with more states than that.
+    """
+    n = matrices.shape[1]
+    if n == size:
+        return matrices
+    found = np.zeros((len(matrices), size, size))
+    both = min(n, size)
+    found[:, :both, :both] = matrices[:, :both, :both]
+    lost = matrices[:, both:].any(axis=(1, 2)) | matrices[:, :, both:].any(axis=(1, 2))
+    found[lost | ~np.isfinite(matrices).all(axis=(1, 2))] = np.nan
+    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -169,6 +169,8 @@ class PointEvaluator:
 
     def _bounded(self, value: Floats) -> list[tuple[Floats, Floats]]:
         """Return each system's matrix in relative coordinates with a bound on its error; NaN for none."""
+        if not np.isfinite(value).all():  # a search along a boundary that has lost it
+            return NOTHING
         try:
             systems = self.closed_at(value.tolist())
         except ApcError:

@@ -23,8 +23,8 @@ from apc.hands.feel import feel
 from apc.hands.passivity import passive_hands
 from apc.hands.populations import PopulationResponses
 from apc.optional import need
-from apc.present.pictures import write_figure
-from apc.present.region_picture import PANEL, STYLES
+from apc.present.pictures import COLOURS, write_figure
+from apc.present.region_picture import PANEL
 from apc.threads import single_threaded
 from tests.bench.judge import Judge, parser_of
 from tests.populations import different
@@ -179,7 +179,7 @@ def _picture(bearing: dict[str, dict[str, list[float]]], felt: dict[str, list[tu
     """Draw all three over the number of users."""
     figure = need("matplotlib.figure", "plot").Figure(figsize=(PANEL * 3, PANEL + 0.5), layout="constrained")
     first, *others = figure.subplots(1, 3)
-    for hands, (_, colour, _) in zip(HANDS, STYLES, strict=False):
+    for hands, colour in zip(HANDS, COLOURS, strict=False):
         first.plot(PEERS, bearing["average"][hands], "-o", color=colour, ms=4, label=f"{hands} hands")
         first.plot(PEERS, bearing["mesh"][hands], "--s", color=colour, ms=4, mfc="none")
         even = [value * (n - 1) for n, value in zip(PEERS, bearing["mesh"][hands], strict=True)]

@@ -25,8 +25,8 @@ from apc.frame.names import find
 from apc.frame.overrides import Override
 from apc.moments.network import Growth
 from apc.optional import need
-from apc.present.pictures import write_figure
-from apc.present.region_picture import PANEL, STYLES
+from apc.present.pictures import COLOURS, LINES, write_figure
+from apc.present.region_picture import PANEL
 from apc.threads import single_threaded
 from apc.vary.growth import growth_at
 from tests.bench.judge import Judge, parser_of
@@ -157,7 +157,7 @@ def main() -> None:
         for ax, peers in zip(axes, PEERS, strict=True):
             whole = largest(partial(growths(peers, LAWS[0]), 0.0), START)[0]
             print(f"\n{peers} users, {whole:.2f} with no packet lost")
-            for law, (line, colour, _) in zip(LAWS, STYLES, strict=True):
+            for law, line, colour in zip(LAWS, LINES, COLOURS, strict=False):
                 shares, found, left = curve(peers, law, whole)
                 exact = peers < ESTIMATED or law.burst is None
                 mesh = check(peers, law, shares, found, judge)

@@ -41,7 +41,7 @@ from apc.regions.region import region
 from apc.result import Result
 from apc.simulation.trajectory import simulate
 from apc.vary.critical import Critical, critical
-from apc.vary.growth import NOMINAL
+from apc.vary.growth import MEAN_SQUARE, NOMINAL
 from apc.vary.locus import root_locus
 from apc.vary.margins import coupler_parameters
 
@@ -50,6 +50,7 @@ Cell = str | float | int | None
 LIBRARIES = ("casadi", "numpy", "scipy", "sympy", "python-flint", "matplotlib")
 MOVED = ("parameter", "unit", "value", "by a whole of it", "eigenvalue")
 MOST_MODES, MOST_SIGNALS, MOST_PLAYED = 12, 40, 60  # rows of a table; peers that are played
+JITTER = "jitter"
 FURTHER = 3  # times the present value a region reaches where the scene says no range
 SECONDS = Fraction(1)  # that a scene is played, where it doesn't say how long
 PUSH = "0.1 m/s"  # with which a device starts in a scene that is at rest
@@ -301,19 +302,20 @@ def _criticals(system: CompiledSystem, call: str, key: str, axes: Sequence[str])
     """Return where the verdict changes along what `apc compare` looks at."""
     rows: list[tuple[Cell, ...]] = []
     told, commands, drawn = [], [], []
-    for axis, chosen in choose(system, ()).items():
-        if axis not in axes:
-            continue
-        if not chosen.name:
-            told.append(f"{axis}: {chosen.why}")
+    asked = [(axis, one.name, one.why) for axis, one in choose(system, ()).items() if axis in axes]
+    channels = [link.channel for link in system.links if link.channel is not None and LOSS in axes]
+    asked += [(JITTER, one.jitter, "") for one in channels if one.jitter is not None]
+    for axis, name, why in asked:
+        if not name:
+            told.append(f"{axis}: {why}")
             continue
         try:
-            found = critical(system, chosen.name)
+            found = critical(system, name)
         except ApcError as error:
             told.append(f"{axis}: {_why(error)}")
             continue
         plotted = f" --plot {axis}.svg" if axis == STIFFNESS else ""
-        commands.append(f"apc critical {chosen.name} {call}{plotted}")
+        commands.append(f"apc critical {name} {call}{plotted}")
         rows += [
             (found.parameter, found.unit, one.value, one.error, one.stable_side, one.frequency_hz)
             for one in found.crossings
@@ -354,7 +356,11 @@ def _region(system: CompiledSystem, call: str) -> Section:
     columns = ("curve", "mode", "from [Hz]", "to [Hz]", "error", "points")
     tables += [Table("Its boundary", columns, tuple(rows))] if rows else []
     command = f"apc region {call}{''.join(words)} --out region.svg"
-    return Section("region", command, tuple(found.left_out), tuple(tables), (found,))
+    told = list(found.left_out)
+    if unreliable:
+        lossy = command.replace(f"--in {NOMINAL}", f"--in {MEAN_SQUARE}")
+        told.append(f"Stable here means with every packet on time. As they are lost and late: {lossy}")
+    return Section("region", command, tuple(told), tuple(tables), (found,))
 
 
 def _unit(system: CompiledSystem, name: str) -> str:
