@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, prepare
+from apc.analysis.analysis import Prepared, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
@@ -101,13 +101,26 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
         As `analysis.lifted_groups`.
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        free = varied(system)
-        family = evaluator(system, free, prepared=prepared or prepare(system))
+        free, prepared = varied(system), prepared or prepare(system)
         here = np.array([parameter_of(system, one).value for one in free])
+        family = evaluator(system, free, prepared=prepare_at_start(system, prepared) or prepared)
+        if not isinstance(family, PointEvaluator):
+            moved = moved_systems(family, here)
+            if _is_known(moved):
+                return _differentiate(system, free, moved)
+            family = evaluator(system, free, prepared=prepared)  # equations have edges that points step over
         moved = (
             _by_points(family, here) if isinstance(family, PointEvaluator) else moved_systems(family, here)
         )
         return _differentiate(system, free, moved)
+
+
+def _is_known(listed: Sequence[Moved]) -> bool:
+    """Say whether all matrices and their derivatives could be had."""
+    return all(
+        np.isfinite(one.matrix).all() and all(np.isfinite(way.slopes.matrices).all() for way in one.through)
+        for one in listed
+    )
 
 
 def varied(system: CompiledSystem) -> list[Free]:
