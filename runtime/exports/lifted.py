@@ -412,7 +412,7 @@ def _cut_open(
     site: LinearSite, schedule: Schedule, listed: Sequence[tuple[int, int]]
 ) -> tuple[LinearSite, Schedule, tuple[Port, ...], tuple[int, ...]]:
     """Let forces come from outside at each tick, what the tick computes of them being remembered beside."""
-    ticks, carried = list(site.ticks), list(schedule.carried)
+    ticks, carried, clocks = list(site.ticks), list(schedule.carried), list(site.kind.clocks)
     heard, n_x = len(schedule.heard), len(site.kind.states)
     rows: dict[int, list[int]] = {}
     ports: list[Port] = []
@@ -425,15 +425,26 @@ def _cut_open(
         if heard + count > MOST_PACKETS:
             what = f"{count:,} ticks a frame, each an input where it is cut, and {MOST_PACKETS} are the most"
             raise ApcError(Mistake("E951", Place("--cut"), what, hint="--cut LINK"))
-        outputs = len(tick.x)
-        blocks = [np.vstack([block, block[output]]) for block in (tick.x, tick.u, tick.m, tick.r)]
+        clock = clocks[partition]
+        outputs = len(clock.outputs)
+        variants = [
+            one.reshape(
+                len(one) // outputs, outputs, one.shape[1]
+            )  # a tick may have several, one below the other
+            for one in (tick.x, tick.u, tick.m, tick.r)
+        ]
+        blocks = [np.concatenate([one, one[:, output : output + 1]], axis=1) for one in variants]
         for block in blocks:
-            block[output] = 0
-        force = np.zeros((outputs + 1, 1), dtype=tick.r.dtype)
-        force[output] = 1
-        x, u, m, r = blocks
-        ticks[partition] = replace(tick, x=x, u=u, m=m, r=np.hstack([r, force]))
-        clock = site.kind.clocks[partition]
+            block[:, output] = 0
+        force = np.zeros((*blocks[0].shape[:2], 1), dtype=tick.r.dtype)
+        force[:, output] = 1
+        blocks[3] = np.concatenate([blocks[3], force], axis=2)
+        x, u, m, r = (one.reshape(len(one) * (outputs + 1), one.shape[2]) for one in blocks)
+        ticks[partition] = replace(tick, x=x, u=u, m=m, r=r)
+        beside = f"{clock.outputs[output]} computed"
+        clocks[partition] = replace(
+            clock, outputs=(*clock.outputs, beside), units=(*clock.units, clock.units[output])
+        )
         for index in range(count):
             when = float(at[partition][index] * schedule.quantum * 1000)
             ports.append(Port(f"{clock.outputs[output]} at {when:.6g} ms", clock.units[output]))
@@ -454,7 +465,8 @@ def _cut_open(
         heard=(*schedule.heard, *(_OUTSIDE,) * len(ports)),
         value_names=(*schedule.value_names, *(f"{port.name} computed" for port in ports)),
     )
-    return replace(site, ticks=tuple(ticks)), whole, tuple(ports), tuple(computed)
+    kind = replace(site.kind, clocks=tuple(clocks))
+    return replace(site, kind=kind, ticks=tuple(ticks)), whole, tuple(ports), tuple(computed)
 
 
 def _check_size(system: CompiledSystem, opened: Sequence[_Opened]) -> None:
