@@ -201,7 +201,7 @@ E963 runtime/exports: a peer is to be named, or the name is none
 E970 runtime/loop: there is no such peer
 E971 runtime/loop runtime/cli: a peer has no address, or it is none
 E972 runtime/loop: nobody told a peer when its scene begins
-E973 runtime/loop runtime/cli: a folder is no run, or can't be one
+E973 runtime/loop: a folder is no run, or can't be one
 E974 runtime/loop runtime/cli: a peer can't listen there, or its secret is none
 E975 runtime/loop: a scene has more peers than processes, or one of these was lost
 E976 runtime/loop: a device outside has no function, or that is at fault

@@ -30,6 +30,7 @@ NAMES = (
     "two-users-waves",
     "finger",
     "limited-motor",
+    "three-users-scheduled",
 )
 LATE = AVERAGE.replace("lan: {clock: network, delay: 8 ms}", "lan: {clock: network, delay: 3.5 ms}")
 PUSHED = AVERAGE + "hands:\n  hand: {type: ConstantForce, flange: device, force: 0 N}\n"

@@ -94,14 +94,20 @@ def with_cuts(
     rows: dict[int, list[int]] = {}
     for partition, output in cuts:
         tick, own, count = ticks[partition], clocks[partition], schedule.ticks[partition]
-        outputs = len(tick.x)
-        blocks = [np.vstack([block, block[output]]) for block in (tick.x, tick.u, tick.m, tick.r)]
+        outputs = len(own.outputs)
+        # A tick may have several variants of its rows, one below the other.
+        variants = [
+            one.reshape(len(one) // outputs, outputs, one.shape[1])
+            for one in (tick.x, tick.u, tick.m, tick.r)
+        ]
+        blocks = [np.concatenate([one, one[:, output : output + 1]], axis=1) for one in variants]
         for block in blocks:
-            block[output] = 0
-        outside = np.zeros((outputs + 1, 1), dtype=tick.r.dtype)
-        outside[output] = 1
-        x, u, m, r = blocks
-        ticks[partition] = replace(tick, x=x, u=u, m=m, r=np.hstack([r, outside]))
+            block[:, output] = 0
+        outside = np.zeros((*blocks[0].shape[:2], 1), dtype=tick.r.dtype)
+        outside[:, output] = 1
+        blocks[3] = np.concatenate([blocks[3], outside], axis=2)
+        x, u, m, r = (one.reshape(len(one) * (outputs + 1), one.shape[2]) for one in blocks)
+        ticks[partition] = replace(tick, x=x, u=u, m=m, r=r)
         clocks[partition] = replace(
             own,
             outputs=(*own.outputs, f"{own.outputs[output]} computed"),
