@@ -13,6 +13,7 @@ from __future__ import annotations
 import errno
 import hmac
 import logging
+import multiprocessing
 import secrets
 import signal
 from collections.abc import Awaitable, Callable
@@ -132,3 +133,5 @@ def run(server: BaseServer, link: str, *, browser: bool) -> None:
         pass
     finally:
         server.stop()
+        for worker in multiprocessing.active_children():  # of the tabs that are still open
+            worker.kill()
