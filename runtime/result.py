@@ -1,6 +1,6 @@
 """A result: data that other rooms compute with, and that a person can look at.
 
-Takes: nothing. Gives: `Result`.
+Takes: nothing. Gives: `Result`, `Look`.
 Guarantees: data know the name of what shows them and nothing of it: it is imported when it is asked for. In a
 notebook a result is its text and its picture, elsewhere a line.
 Does not: show anything itself (see `present`).
@@ -8,8 +8,23 @@ Does not: show anything itself (see `present`).
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from importlib import import_module
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypedDict
+
+from apc.optional import need
+
+
+class Look(TypedDict, total=False):
+    """How a picture looks: `size` (width, height) in inches, `labels`, `style`.
+
+    `labels` are other words for some that stand in it; `style` is a style sheet of matplotlib, several, or
+    its settings by name.
+    """
+
+    size: tuple[float, float]
+    labels: Mapping[str, str]
+    style: str | Sequence[str] | Mapping[str, Any]
 
 
 class Result:
@@ -46,6 +61,17 @@ class Result:
         """Return the result as plain data, ready for JSON."""
         document: dict[str, Any] = self._shown("document")
         return document
+
+    def _drawn(self, *arguments: Any, look: Look) -> Any:
+        """Return the picture, a matplotlib Figure or Axes, that looks as it is wanted to."""
+        written, labels = need("matplotlib.text", "plot").Text, look.get("labels", {})
+        with need("matplotlib.style", "plot").context(look.get("style", [])):
+            drawn = self._shown("picture", *arguments)
+        if "size" in look:
+            drawn.figure.set_size_inches(*look["size"])
+        for text in drawn.figure.findobj(written):
+            text.set_text(labels.get(text.get_text(), text.get_text()))
+        return drawn
 
     def _shown(self, form: str, *arguments: Any) -> Any:
         """Return the result in another form."""

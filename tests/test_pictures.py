@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import matplotlib.colors
+import matplotlib.figure
 import numpy as np
 import pytest
 
@@ -266,3 +268,19 @@ def test_pictures_beside_answers_are_refused_before_anything_is_computed(
         assert "E930" in capsys.readouterr().err
         assert run([*words, "--plot", "a.svg"]) == 0
         assert "a.svg is written" in capsys.readouterr().out
+
+
+def test_a_picture_has_the_size_words_and_style_that_are_asked_for() -> None:
+    found = apc.analyze(compiled(AVERAGE))
+    ax = found.plot()
+    word = ax.get_xlabel()
+    assert word
+    other = found.plot(size=(3.0, 2.0), labels={word: "Realteil"}, style={"axes.facecolor": "#123456"})
+    assert tuple(other.figure.get_size_inches()) == (3.0, 2.0)
+    assert other.get_xlabel() == "Realteil"
+    assert matplotlib.colors.to_hex(other.get_facecolor()) == "#123456"
+    assert ax.get_xlabel() == word
+    assert matplotlib.colors.to_hex(ax.get_facecolor()) != "#123456"
+    own = matplotlib.figure.Figure().subplots()
+    assert found.plot(own, labels={word: "Realteil"}) is own
+    assert own.get_xlabel() == "Realteil"

@@ -14,7 +14,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -47,7 +47,7 @@ from apc.frame.schedule import ORDER, Schedule
 from apc.frame.scheduling import build_schedules
 from apc.frame.start import at_start
 from apc.network.nominal import left_out
-from apc.result import Result
+from apc.result import Look, Result
 from apc.threads import single_threaded
 
 SETTLED = 0.02  # of where it began: a motion counts as settled
@@ -100,9 +100,9 @@ class Analysis(Result):
     translations: int = 0
     unfelt: tuple[str, ...] = ()
 
-    def plot(self, ax: Any = None) -> Any:
-        """Draw the eigenvalues over the unit circle into a matplotlib Axes, or a figure of its own's."""
-        return self._shown("picture", ax)
+    def plot(self, ax: Any = None, **look: Unpack[Look]) -> Any:
+        """Draw the eigenvalues over the unit circle into a matplotlib Axes, or a figure's, as `look` says."""
+        return self._drawn(ax, look=look)
 
     @property
     def settling_s(self) -> float | None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.comparison.choice import DELAY, LOSS, STIFFNESS, Choice, check_over, choose
@@ -24,7 +24,7 @@ from apc.frame.devices import find_device
 from apc.frame.parameters import resolve
 from apc.hands.feel import Feel, feel
 from apc.moments.network import NetworkVerdict, judge_network
-from apc.result import Result
+from apc.result import Look, Result
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare as prepare_to_play
 from apc.simulation.trajectory import Played, duration_of, play, provenance_of
@@ -113,9 +113,9 @@ class Comparison(Result):
         every = len(self.schemes)
         return tuple(f"{', '.join(on)}: {text}" if len(on) < every else text for text, on in said.items())
 
-    def plot(self) -> Any:
-        """Draw all schemes beside each other; return the matplotlib Figure."""
-        return self._shown("picture")
+    def plot(self, **look: Unpack[Look]) -> Any:
+        """Draw all schemes beside each other, as `look` says; return the matplotlib Figure."""
+        return self._drawn(look=look)
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return a table with a row a scheme, in SI."""

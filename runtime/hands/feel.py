@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from fractions import Fraction
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,7 @@ from apc.hands.asked import Port, check_frequencies, find_port, next_peer, ticks
 from apc.hands.norms import Peak, noise_variance, sampled_data_peak, tick_peak
 from apc.hands.viscosity import Viscosity, network_viscosity
 from apc.network.nominal import left_out
-from apc.result import Result
+from apc.result import Look, Result
 from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
@@ -143,7 +143,7 @@ class Feel(Result):
     left_out: tuple[str, ...]
     notes: tuple[str, ...]
 
-    def plot(self, ax: Any = None, *, kind: str = "bode") -> Any:
+    def plot(self, ax: Any = None, *, kind: str = "bode", **look: Unpack[Look]) -> Any:
         """Draw Bode's plot or Nyquist's; return the matplotlib Figure.
 
         Parameters
@@ -152,8 +152,10 @@ class Feel(Result):
             The matplotlib Axes to draw into, of Bode's plot the magnitudes alone.
         kind
             "bode" or "nyquist".
+        look
+            Its size, labels and style: see `result.Look`.
         """
-        return self._shown("picture", kind, ax)
+        return self._drawn(kind, ax, look=look)
 
 
 @part("feel")

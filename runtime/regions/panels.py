@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from apc.frame.parameters import resolve
 from apc.regions.axes import PLACE, parse_axes
 from apc.regions.overlay import Overlay, overlay_points, parse_overlay
 from apc.regions.region import CELLS, Floats, Region, region
-from apc.result import Result
+from apc.result import Look, Result
 from apc.sweeps.grid import with_last_unit
 from apc.vary.search import Told
 
@@ -66,9 +66,9 @@ class Panels(Result):
         regions = self.panels[0].regions
         return regions[0] if len(regions) == 1 else None
 
-    def plot(self) -> Any:
-        """Draw all panels; return the matplotlib Figure."""
-        return self._shown("picture")
+    def plot(self, **look: Unpack[Look]) -> Any:
+        """Draw all panels, as `look` says; return the matplotlib Figure."""
+        return self._drawn(look=look)
 
 
 def parse_panel(text: str) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ from apc.regions.eigenpairs import Deciding, Eigenvalues, Family, largest
 from apc.regions.peaks import Peaks
 from apc.regions.strips import BRANCHES, Striped, trace_strips
 from apc.regions.surrogate import DirectFamily, Rectangle, rectangle_of, resolve_family
-from apc.result import Result
+from apc.result import Look, Result
 from apc.threads import single_threaded
 from apc.vary.batch import BatchEvaluator, matrix_errors
 from apc.vary.evaluator import (
@@ -176,9 +176,9 @@ class Region(Result):
         table: pandas.DataFrame = self._shown("table")
         return table
 
-    def plot(self, ax: Any = None) -> Any:
-        """Draw the region into a matplotlib Axes, or a figure of its own; return the Axes."""
-        return self._shown("picture", ax)
+    def plot(self, ax: Any = None, **look: Unpack[Look]) -> Any:
+        """Draw the region into a matplotlib Axes, or a figure of its own, as `look` says; return the Axes."""
+        return self._drawn(ax, look=look)
 
     def contains(self, x: Any, y: Any) -> Any:
         """Say whether points are stable: by the curves or, nearer to them than their error, by eigenvalues.

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Any, Protocol
+from typing import Any, Protocol, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from apc.compiler.timings import part
 from apc.distribution import versions
 from apc.memory import refuse_beyond
 from apc.option_value import option_value
-from apc.result import Result
+from apc.result import Look, Result
 from apc.simulation.accuracy import ErrorEstimate, compare_with
 from apc.simulation.blocks import Block, blocks
 from apc.simulation.flow import Tolerance
@@ -94,15 +94,17 @@ class Trajectory(Played):
         """Return an xarray Dataset over `time`, a variable a signal with its unit as attribute."""
         return self._shown("dataset")
 
-    def plot(self, ax: Any = None) -> Any:
+    def plot(self, ax: Any = None, **look: Unpack[Look]) -> Any:
         """Draw a panel a quantity, or all signals into one matplotlib Axes; return the Figure.
 
         Parameters
         ----------
         ax
             Where to draw; signals of more than one unit need a figure of their own.
+        look
+            Its size, labels and style: see `result.Look`.
         """
-        return self._shown("picture", ax)
+        return self._drawn(ax, look=look)
 
 
 def provenance_of(simulation: Simulation) -> Provenance:
