@@ -136,7 +136,6 @@ HOUSE = (
         "apc",
         "api",
     ),
-    ("apc.explore", "sliders written motion sections desk figures page server"),
     (
         "apc.cli",
         """
