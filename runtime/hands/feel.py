@@ -144,7 +144,7 @@ class Feel(Result):
     notes: tuple[str, ...]
 
     def plot(self, ax: Any = None, *, kind: str = "bode", **look: Unpack[Look]) -> Any:
-        """Draw Bode's plot or Nyquist's; return the matplotlib Figure.
+        """Draw Bode's plot or Nyquist's, as `look` says (see `result.Look`); return the matplotlib Figure.
 
         Parameters
         ----------
@@ -152,8 +152,6 @@ class Feel(Result):
             The matplotlib Axes to draw into, of Bode's plot the magnitudes alone.
         kind
             "bode" or "nyquist".
-        look
-            Its size, labels and style: see `result.Look`.
         """
         return self._drawn(kind, ax, look=look)
 

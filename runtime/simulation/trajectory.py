@@ -95,14 +95,12 @@ class Trajectory(Played):
         return self._shown("dataset")
 
     def plot(self, ax: Any = None, **look: Unpack[Look]) -> Any:
-        """Draw a panel a quantity, or all signals into one matplotlib Axes; return the Figure.
+        """Draw a panel a quantity, or all signals into one Axes, as `look` says; return the matplotlib Figure.
 
         Parameters
         ----------
         ax
             Where to draw; signals of more than one unit need a figure of their own.
-        look
-            Its size, labels and style: see `result.Look`.
         """
         return self._drawn(ax, look=look)
 
