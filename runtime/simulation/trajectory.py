@@ -95,7 +95,7 @@ class Trajectory(Played):
         return self._shown("dataset")
 
     def plot(self, ax: Any = None, **look: Unpack[Look]) -> Any:
-        """Draw a panel a quantity, or all signals into one Axes, as `look` says; return the matplotlib Figure.
+        """Draw a panel a quantity, or all signals into one Axes, as `look` says; return the Figure.
 
         Parameters
         ----------
