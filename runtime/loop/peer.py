@@ -207,6 +207,7 @@ class Loop:
                 raise self._alone(patience)
         if now() > self.begins:  # who begins late, or again, comes in with the frame after the next
             self.first = (now() - self.begins) // self.frame_ns + 2
+            self.player.instant = self.first * self.frame_ns
 
     def _knock(self) -> None:
         """Ask all others whether they are there."""
@@ -444,11 +445,13 @@ class _OnePeer(Stepwise):
         if not self.loop.begins:
             return "joining"
         frame, frame_now = packet.count // link.slots, came // self.loop.frame_ns
-        if frame > frame_now + 1:
-            return "early"
         # Of the frames that are kept the oldest may be overwritten by one that is early.
-        if frame < frame_now - (self.population.hearing.ring - 3):
+        kept = self.population.hearing.ring - 3
+        if frame < frame_now - kept:
             return "late"
+        # A peer that is late itself may still have to hear those that a newer one would overwrite.
+        if frame > min(frame_now + 1, self.instant // self.loop.frame_ns + kept - 1):
+            return "early"
         return "heard before" if packet.count in link.counts.get(packet.sender, ()) else ""
 
 
