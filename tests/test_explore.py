@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import http.client
 import json
-import os
 import re
-import shutil
-import signal
 import socket
-import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager
 from fractions import Fraction
 from importlib.resources import files
 from pathlib import Path
@@ -28,6 +23,7 @@ from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.frame.names import Free
 from apc.frame.overrides import parse_override
+from tests.pages import CHROMIUM, MODEL, VERDICT, Tab, launched, served
 from tests.topologies import AVERAGE, SCENES
 
 pytest.importorskip("bokeh")
@@ -219,11 +215,14 @@ class Held:
         future.set_result(Told({"of": task.asked}))
 
 
+def at_once(call: Callable[[], None], seconds: float) -> None:
+    if not seconds:
+        call()
+
+
 def test_an_old_answer_never_takes_the_place_of_a_newer_one() -> None:
     held, shown = Held(), []
-    desk = Desk(
-        b"", ("a", "b"), lambda call: call(), lambda section, told: shown.append((section, told.found))
-    )
+    desk = Desk(b"", ("a", "b"), at_once, lambda section, told: shown.append((section, told.found)))
     desk.workers = Workers(held.submit, 1, lambda _: None)
     assert desk.ask(Task("b", (), 1)) and not desk.ask(Task("b", (), 1))
     for number in (2, 3, 4):  # while it computes, the newest waits in the place of those before it
@@ -237,6 +236,39 @@ def test_an_old_answer_never_takes_the_place_of_a_newer_one() -> None:
     desk.forget("b")
     held.finish(3)
     assert len(shown) == 3
+
+
+def test_what_comes_later_is_begun_when_the_first_desk_rests_or_has_been_busy_for_long(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now, timers = [100.0], []
+    monkeypatch.setattr("apc.explore.desk.time.monotonic", lambda: now[0])
+
+    def later(call: Callable[[], None], seconds: float) -> None:
+        timers.append((seconds, call)) if seconds else call()
+
+    workers = [Held(), Held()]
+    desks = [Desk(b"", (name,), later, lambda section, told: None) for name in "ab"]
+    for desk, held in zip(desks, workers, strict=True):
+        desk.workers = Workers(held.submit, 1, lambda _: None)
+    quick, slow = desks
+    quick.put_before(slow)
+    quick.ask(Task("a", (), 1))
+    slow.ask(Task("b", (), 2))
+    assert [len(one.asked) for one in workers] == [1, 0]
+    workers[0].finish(0)
+    assert [len(one.asked) for one in workers] == [1, 1]
+    workers[1].finish(0)
+    # A slider that is moved without a stop keeps the first desk busy; the other gets its turn all the same.
+    for number in range(3):
+        quick.ask(Task("a", (), 3 + number))
+        slow.ask(Task("b", (), 6 + number))
+    seconds, look = timers[-1]
+    look()
+    assert len(workers[1].asked) == 1
+    now[0] += seconds
+    look()
+    assert [task.asked for task, _ in workers[1].asked] == [2, 8]
 
 
 # The topology with other values.
@@ -299,30 +331,7 @@ def test_what_can_t_be_explored_is_told_before_a_page_is_served(
 
 # In a browser.
 
-CHROMIUM = next(
-    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))),
-    None,
-)
-MODEL = "Bokeh.documents[0].get_model_by_name"
 PAGE = files("apc.explore").joinpath("page.html").read_text(encoding="utf-8")
-READY = "document.documentElement.dataset.ready == 'yes'"
-VERDICT = f"{MODEL}('verdict').text"
-
-
-@contextmanager
-def served(path: Path, *words: str) -> Iterator[str]:
-    """Serve a scene and give its link; at the end Ctrl-C ends it, and it has nothing to complain of."""
-    command = [sys.executable, "-m", "apc", "explore", str(path), "--no-browser", *words]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout is not None
-        yield process.stdout.readline().strip()
-        process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=60)
-        assert (process.returncode, err) == (0, "ended\n")
-    finally:
-        process.kill()
-        process.wait()
 
 
 @pytest.fixture(scope="module")
@@ -337,45 +346,9 @@ def link(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 def browser() -> Iterator[Any]:
     if CHROMIUM is None:
         pytest.skip("no Chromium on this machine")
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    with playwright.sync_playwright() as started:
-        root = hasattr(os, "geteuid") and os.geteuid() == 0  # whom Chromium's sandbox does not serve
-        found = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"] if root else [])
+    pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with launched() as found:
         yield found
-        found.close()
-
-
-class Tab:
-    """A page in the browser, and what it complained of and asked for."""
-
-    def __init__(self, browser: Any, link: str) -> None:
-        self.page = browser.new_page(viewport={"width": 1280, "height": 900})
-        self.page.set_default_timeout(60_000)
-        self.errors: list[str] = []
-        self.hosts: set[str] = set()
-        self.page.on("console", lambda one: self.errors.append(one.text) if one.type == "error" else None)
-        self.page.on("pageerror", lambda one: self.errors.append(str(one)))
-        self.page.on("request", lambda one: self.hosts.add(urlsplit(one.url).netloc))
-        self.page.on("websocket", lambda one: self.hosts.add(urlsplit(one.url).netloc))
-        self.page.goto(link)
-        self.page.wait_for_function(READY)
-        self.page.wait_for_function(f"!{VERDICT}.includes('Computing')")
-
-    def press(self, label: str, key: str, times: int) -> str:
-        """Press a key on a slider; return what the slider says then."""
-        handle = self.page.get_by_role("slider", name=label, exact=True)
-        for _ in range(times):
-            handle.press(key)
-        return str(handle.get_attribute("aria-valuetext"))
-
-    def radius(self, expected: float) -> None:
-        """Wait until the verdict has a spectral radius."""
-        self.page.wait_for_function(f"{VERDICT}.includes('spectral radius {expected:.9g} ')")
-
-    def close(self, link: str) -> None:
-        assert self.errors == []
-        assert self.hosts == {urlsplit(link).netloc}
-        self.page.close()
 
 
 def area(tab: Tab) -> str:

@@ -24,6 +24,9 @@ from apc.processes import Workers, local_processes
 
 # Seconds after which work that is no longer wanted is ended: to start afresh takes about one.
 PATIENCE = 3.0
+# Seconds for which work is held back at most while the desk before it is busy: who moves a slider without a
+# stop sees what comes later some times a second.
+HELD = 0.3
 
 LOST = Mistake("E981", Place("explore"), "the process that computes ended without a word: too little memory?")
 
@@ -35,15 +38,22 @@ Deliver = Callable[[str, Told], None]
 class Desk:
     """One process with its waiting tasks, by section; `order` says which goes first.
 
-    All of it is called from the one thread that serves pages; `later` hands a call to that thread.
+    Whose last turn is longest ago goes before it, or a slider that is moved without a stop would have the
+    first section computed and no other. While the desk `before` is busy, nothing is begun here: its answers,
+    and the pictures made of them, have the machine for themselves. All of it is called from the one thread
+    that serves pages; `later` hands a call to that thread, after so many seconds.
     """
 
     model: bytes
     order: tuple[str, ...]
-    later: Callable[[Callable[[], None]], None]
+    later: Callable[[Callable[[], None], float], None]
     deliver: Deliver
+    before: Desk | None = None
+    behind: Desk | None = None
     last: dict[str, Task] = field(default_factory=dict)
     waiting: dict[str, tuple[int, Task]] = field(default_factory=dict)
+    held: float | None = None  # since when
+    begun: dict[str, int] = field(default_factory=dict)
     shown: dict[str, int] = field(default_factory=dict)
     numbers: itertools.count[int] = field(default_factory=itertools.count)
     busy: tuple[int, Task, float] | None = None
@@ -85,15 +95,26 @@ class Desk:
         self.stack.close()
 
     def _next(self) -> None:
-        if self.busy is not None or not self.waiting:
+        if self.busy is not None or not self.waiting or self._held():
             return
         if self.workers is None:
             self.workers = self.stack.enter_context(local_processes(compute, self.model, 1, LOST))
-        section = min(self.waiting, key=self.order.index)
+        section = min(self.waiting, key=lambda one: (self.begun.get(one, -1), self.order.index(one)))
         number, task = self.waiting.pop(section)
+        self.begun[section] = next(self.numbers)
         self.busy = (number, task, time.monotonic())
         future = self.workers.submit(task)
-        future.add_done_callback(lambda done: self.later(lambda: self._done(number, task, done)))
+        future.add_done_callback(lambda done: self.later(lambda: self._done(number, task, done), 0))
+
+    def _held(self) -> bool:
+        """Return whether others go first, and look again when they may have had long enough."""
+        now = time.monotonic()
+        if self.before is None or self.before.busy is None:
+            self.held = None
+        elif self.held is None:
+            self.held = now
+            self.later(self._next, 1.1 * HELD)  # a timer may come early
+        return self.held is not None and now - self.held < HELD
 
     def _done(self, number: int, task: Task, done: Future[Told]) -> None:
         if self.busy is None or self.busy[0] != number:
@@ -109,3 +130,9 @@ class Desk:
             self.shown[task.section] = number
             self.deliver(task.section, told)
         self._next()
+        if self.busy is None and self.behind is not None:
+            self.behind._next()
+
+    def put_before(self, other: Desk) -> None:
+        """Let what is asked here go before what is asked of another desk."""
+        self.behind, other.before = other, self

@@ -19,6 +19,7 @@ from bokeh.models import (
     CustomJS,
     CustomJSTickFormatter,
     Div,
+    FixedTicker,
     HoverTool,
     Range1d,
     Slider,
@@ -52,12 +53,13 @@ return time.length ? time[Math.min(Math.round(tick), time.length - 1)].toFixed(3
 """
 # Changed in place: what is shown at an instant is this tab's, and not sent anywhere.
 SHOWING = """
-const {time, x, y} = frames.data
+const {time, x, y} = frames.data // x and y by time, then by body, one row behind the other
 if (time.length) {
   const k = Math.min(Math.round(slider.value), time.length - 1)
-  for (let body = 0; body < x[k].length; body++) {
-    bodies.data.x[body] = x[k][body]
-    bodies.data.y[body] = y[k][body]
+  const count = x.length / time.length
+  for (let body = 0; body < count; body++) {
+    bodies.data.x[body] = x[k * count + body]
+    bodies.data.y[body] = y[k * count + body]
   }
   instant.data.x[0] = time[k]
   bodies.change.emit()
@@ -219,7 +221,8 @@ class RegionFigure:
 
     def mark(self, x: float, y: float) -> None:
         """Mark where the scene is."""
-        self.point.data = {"x": [x], "y": [y]}
+        if self.point.data != (data := {"x": [x], "y": [y]}):
+            self.point.data = data
 
 
 class RootsFigure:
@@ -299,6 +302,7 @@ class MotionFigure:
         self.stage = _plot(
             "stage", x_axis_label="position [mm]", x_range=Range1d(0, 1), y_range=Range1d(0, 1)
         )
+        self.rows = FixedTicker()
         self.stage.vbar("x", 0.0, "top", "bottom", source=self.walls, line_color="#404040", line_width=4)
         self.stage.circle(
             "x", "y", radius="radius", source=self.discs, fill_color="#d0d0d0", line_color="#404040"
@@ -394,7 +398,7 @@ class MotionFigure:
         self.discs.data = {
             name: [one[n] for one in motion.discs] for n, name in enumerate(("x", "y", "radius"))
         }
-        self.frames.data = {"time": motion.time, "x": list(x), "y": list(y)}
+        self.frames.data = {"time": motion.time, "x": x, "y": y}
         reach = max(sizes)
         fixed = [at for _, at in motion.walls]
         low, high = min([x.min() - reach, *fixed]), max([x.max() + reach, *fixed])
@@ -407,7 +411,9 @@ class MotionFigure:
             self.stage.yaxis.axis_label = "position [mm]"
         else:
             self.stage.y_range.update(start=len(peers) - 0.3, end=-0.5)
-            self.stage.yaxis.ticker = list(range(len(peers)))
+            if self.stage.yaxis[0].ticker is not self.rows:  # a document walks through all that is new to it
+                self.stage.yaxis.ticker = self.rows
+            self.rows.ticks = list(range(len(peers)))
             self.stage.yaxis.major_label_overrides = dict(enumerate(peers))
         slower = SECONDS / float(motion.time[-1])
         legend = "; ".join(f"{name} {word}" for name, word in zip(names, DASH_WORDS, strict=False))

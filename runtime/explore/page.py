@@ -49,6 +49,8 @@ from apc.vary.growth import MEAN_SQUARE, NOMINAL
 # whose points are analysed one by one takes many seconds, and comes last.
 QUICK, LATER = 0, 1
 DESKS = (("verdict", "region"), ("numbers", "roots", "motion", "feel", "margins", "network", "region"))
+# Seconds, a few frames of a browser, after which eigenvalues are drawn beside a region that is drawn already.
+FRAMES = 0.05
 # Arguments of the link: the sliders on the axes of the region. No name of a scene has a hyphen.
 X, Y = "x-axis", "y-axis"
 STRUCK, BEGINS = "the first peer's device is struck", "as the scene begins"
@@ -167,11 +169,13 @@ class Page:
         self.verdict, self.margins, self.network = Words("verdict"), Words("margins"), Words("network")
         self.region, self.roots = RegionFigure(), RootsFigure()
         self.motion, self.feel = MotionFigure(), FeelFigure()
+        self.modes: Mapping[str, Any] = {}  # of the newest verdict
         self.linear: bool | None = None  # not known before the first verdict
         self.moving, self.last = False, self.chosen[0] if self.chosen else 0
         self.link = ColumnDataSource({"query": [""]})
         self.link.js_on_change("data", CustomJS(args={"link": self.link}, code=LINKED))
         self.desks = [Desk(scene.model, order, self._later, self._deliver) for order in DESKS]
+        self.desks[QUICK].put_before(self.desks[LATER])
         self._lay_out()
         document.on_session_destroyed(lambda session_context: self._close())
         self._moved()
@@ -234,26 +238,19 @@ class Page:
             heading = Div(text=f"<h2 style='font-size:15px;margin:10px 0 0'>{kind.capitalize()}</h2>")
             own = [handle for handle, one in zip(self.handles, self.sliders, strict=True) if one.kind == kind]
             controls += [heading, *own]
-        region, roots, motion, feel = self.region, self.roots, self.motion, self.feel
-        roots_of_page: dict[str, Any] = {
-            "controls": _below(*controls, tags=[self.link, self.out]),
-            "verdict": self.verdict.model,
-            "margins": self.margins.model,
-            "region": _below(region.plot, region.words.model),
-            "roots": _below(roots.plot, roots.words.model, roots.way_words.model),
-            "motion": _below(
-                self.begins,
-                motion.stage,
-                row(motion.play, motion.time, sizing_mode="stretch_width"),
-                motion.plot,
-                motion.words.model,
-            ),
-            "feel": _below(feel.plot, feel.phase, feel.words.model),
-            "network": self.network.model,
-        }
-        for name, root in roots_of_page.items():
-            root.name = name
-            self.document.add_root(root)
+        motion, feel = self.motion, self.feel
+        played = row(motion.play, motion.time, sizing_mode="stretch_width")
+        # Words stand by themselves: in one layout with a figure, they have it drawn again when they change.
+        for part in (
+            _below("controls", *controls, tags=[self.link, self.out]),
+            self.region.plot,
+            self.roots.plot,
+            _below("motion", self.begins, motion.stage, played, motion.plot),
+            _below("feel", feel.plot, feel.phase),
+            *(one.model for one in (self.verdict, self.margins, self.region.words, self.network)),
+            *(one.model for one in (self.roots.words, self.roots.way_words, motion.words, feel.words)),
+        ):
+            self.document.add_root(part)
         self.document.js_on_event(
             "document_ready", CustomJS(args={"sliders": [*self.handles, self.motion.time]}, code=NAMED)
         )
@@ -412,9 +409,12 @@ class Page:
         ]
         return "".join(f"&{quote(name)}={quote(text, safe='')}" for name, text in pairs)
 
-    def _later(self, call: Any) -> None:
+    def _later(self, call: Any, seconds: float) -> None:
         """Call on the thread of the page; a page that is closed by then is told nothing more."""
-        self.document.add_next_tick_callback(call)
+        if seconds:
+            self.document.add_timeout_callback(call, round(1000 * seconds))
+        else:
+            self.document.add_next_tick_callback(call)
 
     def _deliver(self, section: str, told: Told) -> None:
         """Show what a section tells."""
@@ -425,11 +425,14 @@ class Page:
         match section:
             case "verdict" if found is not None:
                 self.verdict.verdict(found)
-                self.roots.show(found)
+                self.modes = found
+                if "region" not in self.desks[QUICK].waiting:
+                    self.roots.show(found)
             case "roots" if found is not None:
                 self.roots.way_of(found)
             case "region" if found is not None:
                 self.region.show(found)
+                self._later(lambda: self.roots.show(self.modes), FRAMES)
             case "motion" if found is not None:
                 self.motion.show(found["motion"])
             case "feel" if found is not None:
@@ -452,6 +455,6 @@ class Page:
         return (words | {"margins": self.margins, "network": self.network}).get(section, self.message)
 
 
-def _below(*models: Any, tags: Sequence[Any] = ()) -> Any:
+def _below(name: str, *models: Any, tags: Sequence[Any] = ()) -> Any:
     """Return models below each other, as wide as their place."""
-    return column(*models, sizing_mode="stretch_width", tags=list(tags))
+    return column(*models, name=name, sizing_mode="stretch_width", tags=list(tags))

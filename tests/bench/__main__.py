@@ -83,6 +83,7 @@ PARTS = (
     Part("region", "Regions", _own("region"), _own("region", "--quick")),
     Part("network", "Unreliable networks", _own("network"), _own("network", "--quick")),
     Part("hands", "Hands", _own("hands")),
+    Part("explore", "A slider of the page", _own("explore")),
     Part("map", "The paper's map", _own("map"), _own("map", "--points", "400")),
     Part("sweep", "Sweeps", _own("sweep"), _own("sweep", "--points", "5000", "--kills", "1"), timed=False),
 )
