@@ -24,9 +24,9 @@ from apc.processes import Workers, local_processes
 
 # Seconds after which work that is no longer wanted is ended: to start afresh takes about one.
 PATIENCE = 3.0
-# Seconds for which work is held back at most while the desk before it is busy: who moves a slider without a
-# stop sees what comes later some times a second.
-HELD = 0.3
+# Seconds for which each piece of work is held back at most while the desk before it is busy: who moves a
+# slider without a stop sees what comes later some times a second.
+HELD = 0.2
 
 LOST = Mistake("E981", Place("explore"), "the process that computes ended without a word: too little memory?")
 
@@ -101,7 +101,7 @@ class Desk:
             self.workers = self.stack.enter_context(local_processes(compute, self.model, 1, LOST))
         section = min(self.waiting, key=lambda one: (self.begun.get(one, -1), self.order.index(one)))
         number, task = self.waiting.pop(section)
-        self.begun[section] = next(self.numbers)
+        self.begun[section], self.held = next(self.numbers), None
         self.busy = (number, task, time.monotonic())
         future = self.workers.submit(task)
         future.add_done_callback(lambda done: self.later(lambda: self._done(number, task, done), 0))

@@ -169,7 +169,7 @@ class Page:
         self.verdict, self.margins, self.network = Words("verdict"), Words("margins"), Words("network")
         self.region, self.roots = RegionFigure(), RootsFigure()
         self.motion, self.feel = MotionFigure(), FeelFigure()
-        self.modes: Mapping[str, Any] = {}  # of the newest verdict
+        self.modes: Mapping[str, Any] | None = None  # of the newest verdict
         self.linear: bool | None = None  # not known before the first verdict
         self.moving, self.last = False, self.chosen[0] if self.chosen else 0
         self.link = ColumnDataSource({"query": [""]})
@@ -422,6 +422,8 @@ class Page:
         if section == "verdict" and self.linear is None:
             self.linear = found is not None and found["linear"]
             self._ask_region(tuple(overrides_of(self.sliders, self.places)))
+        if section == "region" and self.modes is not None:
+            self._later(lambda: self.roots.show(self.modes), FRAMES)
         match section:
             case "verdict" if found is not None:
                 self.verdict.verdict(found)
@@ -432,7 +434,6 @@ class Page:
                 self.roots.way_of(found)
             case "region" if found is not None:
                 self.region.show(found)
-                self._later(lambda: self.roots.show(self.modes), FRAMES)
             case "motion" if found is not None:
                 self.motion.show(found["motion"])
             case "feel" if found is not None:
