@@ -46,7 +46,10 @@ HOUSE = (
     ("apc.compiler.view", "schema catalogue diagram svg layers picture stages listing"),
     (
         "apc",
-        "threads memory finite_equations distribution suffixes optional option_value result tables processes",
+        """
+        threads memory later finite_equations distribution suffixes optional option_value result tables
+        processes
+        """,
     ),
     (
         "apc.frame",
@@ -63,7 +66,7 @@ HOUSE = (
         "apc.eigen",
         """
         graph_modes peer_group listening peers closing graph_loops modes
-        eigenpairs dominant rigid dissipation pseudospectrum relative enclosure balls winding bordered
+        eigenpairs dominant rigid dissipation pseudospectrum apart relative enclosure balls winding bordered
         roots certify ratios spectrum
         """,
     ),

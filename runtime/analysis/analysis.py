@@ -92,7 +92,7 @@ class Analysis(Result):
     spectral_radius: float
     spectral_radius_error: float
     rigid_modes: int
-    modes: tuple[Mode, ...]
+    modes: Sequence[Mode]
     linearized: bool
     notes: tuple[str, ...]
     proof: str = ""

@@ -1,7 +1,7 @@
 """The largest eigenvalue of each of many matrices, with a bound, by products of small matrices alone.
 
 Takes: matrices (k, n, n), and bounds on what each entry may be off by.
-Gives: `largest_pairs`; `Dominant`, `enclosed`; `all_within`, `misses_one`.
+Gives: `largest_pairs`; `Dominant`, `enclosed`; `all_within`, `misses_one`, `resolvents`.
 Guarantees: the bounds hold for every matrix within the errors, whatever their conditioning; rounding in the
 bounds themselves is charged. What is not shown is said to be open, never guessed.
 Does not: give the other eigenvalues (see `enclosure`), or decide where two are about as large.
@@ -229,7 +229,7 @@ def _enclosed(matrix: Floats, error: Floats, value: Complexes, right: Complexes,
     away = _norms(error) + charge * large + norm_x * size * inverse * wrong * norm_w
     away += inverse * (norm_x * rest_w + rest_x * norm_w * apart)
     others = size * (1 - APART)
-    within = _resolvent(remainder / others[:, None, None])
+    within = resolvents(remainder / others[:, None, None])
     slack = within * (away + 2 * UNIT * large) / others
     second = inverse * apart**2 * rest_x * rest_w * 2 * within / others
     radius = first + inverse * wrong * norm_w * rest_x + second
@@ -247,7 +247,7 @@ def all_within(matrix: Floats, error: Floats, radius: Floats) -> Truths:
     with np.errstate(all="ignore"):
         shrunk = matrix / radius[:, None, None]
         away = _norms(error) / radius + 2 * UNIT * _norms(shrunk)
-        return np.asarray(_resolvent(shrunk) * away < 0.5)
+        return np.asarray(resolvents(shrunk) * away < 0.5)
 
 
 def misses_one(matrix: Floats, error: Floats) -> Truths:
@@ -265,8 +265,13 @@ def misses_one(matrix: Floats, error: Floats) -> Truths:
         return np.asarray(wrong.sum(axis=2).max(axis=1, initial=0.0) < 0.5)
 
 
-def _resolvent(matrix: Floats) -> Floats:
+def resolvents(matrix: Floats) -> Floats:
     """Return bounds on ‖(z − N)⁻¹‖ for all |z| ≥ 1 (k,), infinite where there seems to be none.
+
+    Parameters
+    ----------
+    matrix
+        Real matrices (k, n, n).
 
     Notes
     -----

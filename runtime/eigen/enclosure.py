@@ -1,7 +1,7 @@
 """Eigenvalues of a matrix known up to an error, each with a bound.
 
 Takes: a square matrix and a bound on what each entry may be off by.
-Gives: `Enclosure`, `enclose_eigenvalues`, `discs`; `components`.
+Gives: `Enclosure`, `enclose_eigenvalues`, `enclose_all`, `discs`; `components`.
 Guarantees: the bounds hold for every matrix within the error, whatever their conditioning; rounding in the
 bounds themselves is charged. LAPACK's results are checked by their residuals, not believed.
 Does not: know where the matrix comes from, or what is rigid (see `spectrum`).
@@ -10,18 +10,22 @@ States that drive each other are a part. Ordered by parts, the matrix is block t
 each as often as it is one, are those of the parts' own blocks. Peers in a directed chain are a part each.
 Equal ones make one Jordan block of the whole, whose eigenvalues floats scatter far about; those of a part
 have nothing to do with the next part's.
+
+Parts of one size are enclosed at once where their eigenvalues stand apart (see `apart`), and one by one where
+that leaves the radius uncertain.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
-from apc.eigen.eigenpairs import Eigenpairs, eigenpairs
+from apc.eigen.apart import GROWN, SMALL, pairs_apart
+from apc.eigen.eigenpairs import LARGE, Eigenpairs, eigenpairs
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance, norms, pseudospectral_radius
 from apc.eigen.relative import independent_places
 from apc.frame.discretize import UNIT
@@ -31,30 +35,48 @@ Complexes = NDArray[np.complex128]
 Places = NDArray[np.intp]
 Matrix = NDArray[Any]  # float64 or complex128
 
-# Eigenvalues smaller than this decide nothing (e-folding in a fifth of a frame) and are often one defective
-# cluster at zero, the queues running empty; the first split between large and small is here.
-SMALL = 1e-2
-
 # A radius less certain than this, or than this part of it where it is above 1, is worth more work: other
 # splits, this many; fewer of a matrix of more states, where each takes a second.
 WIDE = 1e-9
 SPLITS_TRIED, FEWER_SPLITS, MANY_STATES = 8, 2, 300
-
-# How much larger what drives a block of several may become where one beside it is scaled, see `_alone`.
-GROWN = 1024.0
 
 # Eigenvalues nearer to one another than this, relatively, are enclosed together: their own vectors are hardly
 # two.
 CLOSE = 1e-6
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Enclosure:
-    """Bounds on the spectral radius, and how far each estimate can be from a true eigenvalue."""
+    """Bounds on the spectral radius, and how far each estimate can be from a true eigenvalue.
+
+    `near` are such bounds as well, those on small eigenvalues wide; `telling` gives `errors`, which are made
+    each time they are asked for.
+    """
 
     low: float
     high: float
-    errors: Floats
+    near: Floats  # (n,)
+    telling: Callable[[], Floats]
+
+    @property
+    def errors(self) -> Floats:
+        """How far each estimate can be from a true eigenvalue (n,)."""
+        return self.telling()
+
+
+def _told(low: float, high: float, errors: Floats) -> Enclosure:
+    """Return bounds of which nothing is left to make."""
+    return Enclosure(low, high, errors, lambda: errors)
+
+
+@dataclass(frozen=True, slots=True)
+class _Parts:
+    """A matrix with its error, cut into parts: those of one state, and those of more."""
+
+    matrix: Matrix
+    error: Floats
+    alone: Places
+    several: tuple[Places, ...]
 
 
 def enclose_eigenvalues(
@@ -70,29 +92,88 @@ def enclose_eigenvalues(
         Whether the vectors must be those of the whole matrix. Else they are those of the part (see
         `components`) that the eigenvalue belongs to: the products of right and left ones are zero elsewhere.
     """
+    return enclose_all([(matrix, error, whole)])[0]
+
+
+def enclose_all(given: Sequence[tuple[Matrix, Floats, bool]]) -> list[tuple[Eigenpairs, Enclosure]]:
+    """Do the same for many matrices at once.
+
+    Parameters
+    ----------
+    given
+        Of each the matrix, its error, and whether vectors of the whole matrix are wanted.
+    """
+    cuts = [_cut(*one) for one in given]
+    blocks = [
+        (cut.matrix[np.ix_(part, part)], cut.error[np.ix_(part, part)])
+        for cut in cuts
+        for part in cut.several
+    ]
+    found = iter(_enclose_blocks(blocks))
+    return [_joined(cut, [next(found) for _ in cut.several]) for cut in cuts]
+
+
+def _cut(matrix: Matrix, error: Floats, whole: bool) -> _Parts:
     n = len(matrix)
     parts = [np.arange(n)] if whole or not n else components(~(np.abs(matrix) + error == 0))
-    values, errors = np.zeros(n, dtype=np.complex128), np.zeros(n)
-    right, left = np.zeros((n, n), dtype=np.complex128), np.zeros((n, n), dtype=np.complex128)
     alone = np.array([part[0] for part in parts if len(part) == 1], dtype=np.intp)
-    values[alone], errors[alone] = matrix[alone, alone], error[alone, alone]
+    return _Parts(matrix, error, alone, tuple(part for part in parts if len(part) > 1))
+
+
+def _joined(cut: _Parts, found: Sequence[tuple[Eigenpairs, Enclosure]]) -> tuple[Eigenpairs, Enclosure]:
+    """Return the eigenvalues of a matrix, given those of its parts of more than one state."""
+    n, alone = len(cut.matrix), cut.alone
+    values, near = np.zeros(n, dtype=np.complex128), np.zeros(n)
+    right, left = np.zeros((2, n, n), dtype=np.complex128)
+    values[alone], near[alone] = cut.matrix[alone, alone], cut.error[alone, alone]
     right[alone, alone] = left[alone, alone] = 1.0
-    size, near = np.abs(values[alone]), errors[alone]
-    low = max(0.0, float(((size - near) * (1 - 4 * UNIT)).max(initial=0.0)))
-    high = float(((size + near) * (1 + 4 * UNIT)).max(initial=0.0))
-    for part in parts:
-        if len(part) > 1:
-            block = np.ix_(part, part)
-            pairs, found = _enclose_part(matrix[block], error[block])
-            values[part], right[block], left[block] = pairs.values, pairs.right, pairs.left
-            errors[part] = found.errors
-            low, high = float(np.maximum(low, found.low)), float(np.maximum(high, found.high))  # NaN stays
+    size = np.abs(values[alone])
+    low = max(0.0, float(((size - near[alone]) * (1 - 4 * UNIT)).max(initial=0.0)))
+    high = float(((size + near[alone]) * (1 + 4 * UNIT)).max(initial=0.0))
+    for part, (pairs, bounds) in zip(cut.several, found, strict=True):
+        block = np.ix_(part, part)
+        values[part], right[block], left[block] = pairs.values, pairs.right, pairs.left
+        near[part] = bounds.near
+        low, high = float(np.maximum(low, bounds.low)), float(np.maximum(high, bounds.high))  # NaN stays
     order = np.lexsort((-values.imag, values.real, -np.abs(values)))
-    return Eigenpairs(values, right, left).at(order), Enclosure(low, high, errors[order])
+
+    def telling() -> Floats:
+        errors = near.copy()
+        for part, (_, bounds) in zip(cut.several, found, strict=True):
+            errors[part] = bounds.errors
+        return errors[order]
+
+    return Eigenpairs(values, right, left).at(order), Enclosure(low, high, near[order], telling)
 
 
-def _enclose_part(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]:
-    """Enclose the eigenvalues of a matrix whose states all drive each other.
+def _enclose_blocks(blocks: Sequence[tuple[Matrix, Floats]]) -> list[tuple[Eigenpairs, Enclosure]]:
+    """Enclose the eigenvalues of matrices whose states all drive each other, those of one size at once.
+
+    One large matrix has both its vectors from one triangular form, one of complex numbers has no pairs.
+    """
+    found: dict[int, tuple[Eigenpairs, Enclosure]] = {}
+    alike: dict[int, list[int]] = {}
+    for place, (matrix, error) in enumerate(blocks):
+        if len(matrix) > LARGE or np.iscomplexobj(matrix):
+            found[place] = _enclose_part(matrix, error)
+        else:
+            alike.setdefault(len(matrix), []).append(place)
+    for places in alike.values():
+        stacks = (np.stack(one) for one in zip(*(blocks[place] for place in places), strict=True))
+        pairs, told = pairs_apart(*stacks)
+        for row, (place, apart) in enumerate(zip(places, told, strict=True)):
+            own = Eigenpairs(pairs.values[row], pairs.right[row], pairs.left[row])
+            if apart is None or not apart.high - apart.low <= WIDE * max(apart.low, 1.0):
+                found[place] = _enclose_part(*blocks[place], own)
+            else:
+                found[place] = own, Enclosure(apart.low, apart.high, apart.near, apart.sharpened)
+    return [found[place] for place in range(len(blocks))]
+
+
+def _enclose_part(
+    matrix: Matrix, error: Floats, known: Eigenpairs | None = None
+) -> tuple[Eigenpairs, Enclosure]:
+    """Enclose the eigenvalues of a matrix whose states all drive each other; its pairs may be `known`.
 
     The eigenvalues are split by magnitude, large from small, see `_enclose`. A chain of packets or forces
     that hardly anybody answers is nearly a Jordan block at zero, scattered by rounding over a ring that may
@@ -101,7 +182,7 @@ def _enclose_part(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]
     """
     scale = balance(np.abs(matrix) + error)
     matrix, error = matrix / scale[:, None] * scale, error / scale[:, None] * scale
-    found = eigenpairs(matrix)
+    found = eigenpairs(matrix) if known is None else _in_units(known, scale)
     pairs = found.at(np.lexsort((-found.values.imag, found.values.real, -np.abs(found.values))))
     values, right, left = pairs.values, pairs.right, pairs.left
     sizes = np.abs(values)
@@ -114,7 +195,14 @@ def _enclose_part(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]
         low, high = max(one.low for one in tried), min(one.high for one in tried)
     # No estimate is farther from its eigenvalue than both are from zero.
     errors = np.minimum(np.min([one.errors for one in tried], axis=0), sizes + high)
-    return Eigenpairs(values, right * scale[:, None], left / scale), Enclosure(min(low, high), high, errors)
+    return Eigenpairs(values, right * scale[:, None], left / scale), _told(min(low, high), high, errors)
+
+
+def _in_units(pairs: Eigenpairs, scale: Floats) -> Eigenpairs:
+    """Return pairs over the states in other units, each vector of length 1."""
+    right, left = pairs.right / scale[:, None], pairs.left * scale
+    right = right / np.linalg.norm(right, axis=0)
+    return Eigenpairs(pairs.values, right, left / np.linalg.norm(left, axis=1, keepdims=True))
 
 
 def _splits(sizes: Floats, first: int) -> Iterator[int]:
@@ -149,7 +237,7 @@ def _enclose(
     basis = _basis(right, left, label, large)
     found = None if basis is None else _block_diagonal(matrix, error, basis, label, large)
     if found is None:
-        return Enclosure(0.0, np.inf, np.full(n, np.inf))
+        return _told(0.0, np.inf, np.full(n, np.inf))
     form, left_over = found
     sizes, totals = _totals(left_over, label, large)
     # A block of one is its own centre.
@@ -361,7 +449,7 @@ def discs(values: Complexes, centres: Complexes, radii: Floats) -> Enclosure:
     errors = np.where(label[:, None] == label[None, :], reach, 0.0).max(axis=1)
     inner = np.abs(centres) - radii
     low = max(0.0, *(float(inner[label == one].min()) for one in set(label.tolist())))
-    return Enclosure(low, float((np.abs(centres) + radii).max()), errors)
+    return _told(low, float((np.abs(centres) + radii).max()), errors)
 
 
 def components(driven: NDArray[np.bool_]) -> list[Places]:

@@ -70,6 +70,8 @@ def with_doubt(at: Relative) -> Relative:
 
 def relative_bounded(matrix: Matrix, error: Floats, at: Relative) -> tuple[Matrix, Floats]:
     """Return M_rr − W M_pr of matrices (…, n, n) known up to an error, and a bound on what that is off by."""
+    if not len(at.held):
+        return matrix, error
     found = relative(with_radius(matrix, error), with_doubt(at), RADII)
     return value_of(found), radius_of(found)
 

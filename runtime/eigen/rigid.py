@@ -1,7 +1,8 @@
 """The motions that nothing holds back, found in exact arithmetic.
 
 Takes: a `ClosedSystem`, or a `Loop` whose matrix was never built.
-Gives: `RigidModes`, `find_rigid_modes`, `rigid_modes_here`; `Standing`, `what_stands`; `stays_rigid`.
+Gives: `RigidModes`, `find_rigid_modes`, `rigid_modes_here`, `rigid_modes_before`; `Standing`, `what_stands`;
+`stays_rigid`.
 Guarantees: found from the equations with the parameters as exact rationals, never from an eigenvalue near 1;
 a stiffness of exactly zero frees what it held.
 Does not: find a motion that only repeats from frame to frame without standing still in between, or chains of
@@ -18,6 +19,7 @@ It makes a generalized eigenvector, a Jordan pair.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -33,7 +35,7 @@ from apc.eigen.closing import ClosedSystem, Coupling, Loop
 from apc.eigen.dominant import misses_one
 from apc.eigen.graph_modes import QUICK_PRIME
 from apc.eigen.peer_group import PeerGroup, states_of
-from apc.frame.schedule import Act, Propagate, Send, Tick, Value
+from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
 from apc.frame.site import LinearSite
 
 Floats = NDArray[np.float64]
@@ -44,11 +46,14 @@ LENGTHS = ("m", "rad")
 # What most entries of forms are: to multiply by it is worth sparing.
 ONE = Fraction(1)
 
+# Systems whose rigid modes are remembered as a guess.
+KEPT = 64
+
 # A linear form in the unknowns, sparse.
 Form = dict[int, Fraction]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class RigidModes:
     """The invariant subspace to remove before eigenvalues are computed.
 
@@ -85,6 +90,13 @@ def find_rigid_modes(system: ClosedSystem | Loop, *, with_drifts: bool = True) -
     """
     exact, numbering, still, vectors = _standing_motions(system)
     pairs = [state for _, state in _drifts(system, exact, numbering, still)] if still and with_drifts else []
+    return _rigid_modes(system, vectors, pairs)
+
+
+def _rigid_modes(
+    system: ClosedSystem | Loop, vectors: Sequence[Sequence[Fraction]], pairs: Sequence[Sequence[Fraction]]
+) -> RigidModes:
+    """Return exact directions, and the second vectors of Jordan pairs, as rigid modes."""
     n = len(system.names)
     return RigidModes(
         directions=exact_columns(vectors, n),
@@ -102,10 +114,67 @@ def rigid_modes_here(system: ClosedSystem) -> RigidModes:
 
     Where the matrix tells that 1 is none of its eigenvalues there are none, and none are looked for.
     """
+    return _found_here(system)[0]
+
+
+def _found_here(system: ClosedSystem) -> tuple[RigidModes, list[list[Fraction]]]:
+    """Return `rigid_modes_here` and the standing solutions that they are."""
     if misses_one(system.matrix[None], system.error[None])[0]:
         nothing = np.zeros((len(system.names), 0))
-        return RigidModes(nothing, nothing, (), ())
-    return find_rigid_modes(system, with_drifts=False)
+        return RigidModes(nothing, nothing, (), ()), []
+    _, _, still, vectors = _standing_motions(system)
+    return _rigid_modes(system, vectors, []), still
+
+
+def rigid_modes_before(system: ClosedSystem) -> RigidModes:
+    """Return rigid modes of such a system: as many as one of the same states had before, or all of them.
+
+    What was rigid there is seen to be so here, in exact rationals; what it leaves, an eigenvalue 1 that the
+    relative coordinates have, is left to be seen. So a system that is analysed again with other numbers is
+    spared the search.
+    """
+    known = _before(system.name, system.names)
+    if known and _still_stands(known[0], system):
+        return known[0].modes
+    modes, still = _found_here(system)
+    equations = tuple((group.exact, group.schedule) for group in system.sites)
+    known[:] = [_Before(modes, tuple(map(tuple, still)), equations, system.coupling)]
+    return modes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Before:
+    """The rigid modes of a system, the standing solutions that they are, and what they are solutions of."""
+
+    modes: RigidModes
+    still: tuple[tuple[Fraction, ...], ...]
+    equations: tuple[tuple[LinearSite, Schedule], ...]  # of each site
+    coupling: Coupling
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _before(name: str, names: tuple[str, ...]) -> list[_Before]:
+    """Return a place for the last of the systems of one name and of these states."""
+    return []
+
+
+def _still_stands(known: _Before, system: ClosedSystem) -> bool:
+    """Say whether what stood still in a system does so in another."""
+    same = len(known.equations) == len(system.sites) and all(
+        exact is group.exact and schedule is group.schedule
+        for (exact, schedule), group in zip(known.equations, system.sites, strict=True)
+    )
+    if not known.still or (same and known.coupling == system.coupling):
+        return True
+    numbering, exact = _Numbering(system.sites), [group.exact for group in system.sites]
+    if any(len(one) != numbering.size for one in known.still):
+        return False
+    forms = list(_standing(system, exact, numbering))
+    return all(
+        not any(_value(form, one) for form in forms)
+        and tuple(_standing_state(system, exact, numbering, one)) == state
+        for one, state in zip(known.still, known.modes.exact, strict=True)
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ Does not: close the loop (see `modes`).
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -20,17 +21,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
+from apc.eigen.apart import SMALL
 from apc.eigen.balls import unprovable
 from apc.eigen.certify import MOST_PROVED, prove
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.eigenpairs import Eigenpairs
-from apc.eigen.enclosure import SMALL, WIDE, components, discs, enclose_eigenvalues
+from apc.eigen.enclosure import WIDE, Enclosure, components, discs, enclose_all
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, independent_places, relative_bounded, relative_coordinates
-from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here
+from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_before, rigid_modes_here
 from apc.frame.course import turns
 from apc.frame.discretize import UNIT
 from apc.frame.schedule import Propagate
+from apc.later import Later
+from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -45,6 +49,9 @@ UNDECIDED = "undecided: |ρ−1| below the error bound"
 
 # A mode that shrinks to less than this in a frame is one that ends in finite time, computed in floats.
 DEADBEAT = 1e-12
+
+# Rigid modes whose relative coordinates are remembered.
+KEPT = 64
 
 # An angle that no eigenvalue kept as two floats has unless it is real: their unit roundoff.
 STRAIGHT = 2.0**-53
@@ -83,7 +90,7 @@ class Spectrum:
     say what could not be proved.
     """
 
-    modes: tuple[Mode, ...]
+    modes: Sequence[Mode]
     spectral_radius: float
     spectral_radius_error: float
     rigid_modes: int
@@ -110,12 +117,16 @@ def solve_spectrum(systems: Sequence[ClosedSystem], *, certify: bool = False) ->
     A drift leaves a second eigenvalue 1 behind when only the rigid direction is removed. So when every error
     disc keeps clear of 1 there is none, and the exact search for one is spared.
     """
-    solved = [_solve(system, rigid_modes_here(system)) for system in systems]
+    solved = _solve(systems, [rigid_modes_before(system) for system in systems])
+    for place, system in enumerate(systems):
+        free = solved[place].free
+        if not solved[place].clear_of_one and (more := rigid_modes_here(system)).exact != free.exact:
+            solved[place] = _solve([system], [more])[0]
     lowest = max((one.low for one in solved), default=0.0)
     notes: list[str] = []
     for place, system in enumerate(systems):
         one = solved[place]
-        drifting = bool(one.free.names) and not _clear_of_one(one)
+        drifting = bool(one.free.names) and not one.clear_of_one
         if not (certify or drifting or _is_open(one, lowest)):
             continue
         reason = unprovable(system)
@@ -127,20 +138,18 @@ def solve_spectrum(systems: Sequence[ClosedSystem], *, certify: bool = False) ->
         if certify or _is_open(one, lowest):
             notes.append(f"{system.name}: not proved, as {reason}")
         if drifting and (free := find_rigid_modes(system)).drifts:
-            solved[place] = _solve(system, free)
-    found = _modes(systems, solved)
-    found.sort(key=lambda mode: (-mode.magnitude, mode.shape, mode.eigenvalue.real, -mode.eigenvalue.imag))
+            solved[place] = _solve([system], [free])[0]
     low = max((one.low for one in solved), default=0.0)
     high = max((one.high for one in solved), default=0.0)
-    # A proof can know better than the vectors of floats.
-    radius = min(max(found[0].magnitude, low), high) if found else 0.0
+    largest = max((float(np.abs(one.pairs.values).max(initial=0.0)) for one in solved), default=0.0)
+    radius = min(max(largest, low), high)  # a proof can know better than the vectors of floats
     rigid = drifts = 0
     for system, one in zip(systems, solved, strict=True):
         rigid += system.multiplicity * one.free.directions.shape[1]
         drifts += system.multiplicity * one.free.drifts
     verdict, stable = judge([one.inside for one in solved], rigid, drifts)
     return Spectrum(
-        modes=tuple(found),
+        modes=Later(functools.partial(_modes, tuple(systems), tuple(solved))),
         spectral_radius=radius,
         spectral_radius_error=max(high - radius, radius - low, 0.0),
         rigid_modes=rigid,
@@ -152,7 +161,7 @@ def solve_spectrum(systems: Sequence[ClosedSystem], *, certify: bool = False) ->
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Solved:
     """One closed system: its eigenvalues, each with its error, and bounds on its spectral radius.
 
@@ -163,21 +172,21 @@ class _Solved:
     free: RigidModes
     at: Relative
     pairs: Eigenpairs  # of the relative coordinates
-    errors: Floats  # (k,)
+    bounds: Enclosure
     low: float
     high: float
     inside: bool | None
     bits: int
 
+    @property
+    def clear_of_one(self) -> bool:
+        """Whether no eigenvalue can be 1."""
+        return bool((np.abs(self.pairs.values - 1) > self.bounds.near).all())
+
 
 def _tied(system: ClosedSystem) -> int:
     """Return how many states drive each other at most."""
     return max((len(part) for part in components(~(np.abs(system.matrix) + system.error == 0))), default=0)
-
-
-def _clear_of_one(one: _Solved) -> bool:
-    """Say whether no eigenvalue can be 1."""
-    return bool((np.abs(one.pairs.values - 1) > one.errors).all())
 
 
 def _is_open(one: _Solved, lowest: float) -> bool:
@@ -204,7 +213,7 @@ def _proof_in_words(solved: Sequence[_Solved], drifts: int) -> str:
         return f"proved unstable with {max(unstable)} bits"
     if any(one.inside is None for one in solved):
         return f"undecided at {bits} bits"
-    if unstable or not all(one.bits for one in solved if len(one.errors)):
+    if unstable or not all(one.bits for one in solved if len(one.pairs.values)):
         return f"decided with {bits} bits where floats left it open"
     return f"proved {TO_DRIFT if drifts else 'stable'} with {bits} bits"
 
@@ -220,23 +229,31 @@ def judge(inside: Sequence[bool | None], rigid: int, drifts: int) -> tuple[str, 
     return (STABLE_TRANSLATING if rigid else STABLE), True
 
 
-def _solve(system: ClosedSystem, free: RigidModes) -> _Solved:
-    """Solve one system in floats."""
-    at = relative_coordinates(free.basis)
-    if not len(at.rest):
-        none = np.zeros((0, 0), dtype=np.complex128)
-        return _Solved(free, at, Eigenpairs(none.ravel(), none, none), np.zeros(0), 0.0, 0.0, True, 0)
-    reduced, reduced_error = relative_bounded(system.matrix, system.error, at)
-    pairs, found = enclose_eigenvalues(reduced, reduced_error, whole=len(at.held) > 0)
-    inside = False if found.low > 1 else True if found.high < 1 else None  # NaN decides nothing
-    return _Solved(free, at, pairs, found.errors, found.low, found.high, inside, 0)
+def _solve(systems: Sequence[ClosedSystem], free: Sequence[RigidModes]) -> list[_Solved]:
+    """Solve systems in floats, rigid modes taken out, all at once."""
+    listed = [_relative_to(one) for one in free]
+    given = [
+        (*relative_bounded(system.matrix, system.error, at), len(at.held) > 0)
+        for system, at in zip(systems, listed, strict=True)
+    ]
+    found = []
+    for one, at, (pairs, bounds) in zip(free, listed, enclose_all(given), strict=True):
+        inside = False if bounds.low > 1 else True if bounds.high < 1 else None  # NaN decides nothing
+        found.append(_Solved(one, at, pairs, bounds, bounds.low, bounds.high, inside, 0))
+    return found
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _relative_to(free: RigidModes) -> Relative:
+    """Return the coordinates relative to rigid modes; systems of other numbers mostly share theirs."""
+    return relative_coordinates(free.basis)
 
 
 def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
     """Solve one system in balls; what these leave open stays as floats found it."""
     proof = prove(system, estimate.free, independent_places(estimate.free.basis.T))
     if proof.free.drifts != estimate.free.drifts:
-        estimate = _solve(system, proof.free)
+        (estimate,) = _solve([system], [proof.free])
     inside, bits = proof.inside, proof.bits
     if inside is None and not estimate.free.names:
         # Weights known as floats only can cost balls more than floats: their bound counts these, too.
@@ -250,23 +267,33 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
         return replace(estimate, low=low, high=high, inside=inside, bits=bits)
     pairs = Eigenpairs(proof.values, proof.right, proof.left)
     at = relative_coordinates(proof.free.basis)
-    return _Solved(proof.free, at, pairs, found.errors, low, high, inside, bits)
+    return _Solved(proof.free, at, pairs, found, low, high, inside, bits)
 
 
-def _modes(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> list[Mode]:
-    """Describe the eigenvalues of all systems."""
+def _modes(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> tuple[Mode, ...]:
+    """Describe the eigenvalues of all systems, the largest first."""
+    with single_threaded(), np.errstate(all="ignore"):
+        return tuple(sorted(_described(systems, solved), key=_rank))
+
+
+def _rank(mode: Mode) -> tuple[float, str, float, float]:
+    return -mode.magnitude, mode.shape, mode.eigenvalue.real, -mode.eigenvalue.imag
+
+
+def _described(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> list[Mode]:
     vague: list[NDArray[np.bool_]] = []
     parts: list[tuple[ClosedSystem, Complexes, Complexes, Floats]] = []
-    described: list[Floats] = []
+    described: list[tuple[Floats, Floats]] = []
     for system, one in zip(systems, solved, strict=True):
         vectors, shares = whole_vectors(system, one.at, one.pairs)
-        described.append(shares)
+        errors = one.bounds.errors
+        described.append((shares, errors))
         magnitudes = np.abs(one.pairs.values)
-        gone = magnitudes <= np.maximum(DEADBEAT * len(system.names), np.minimum(one.errors, SMALL))
+        gone = magnitudes <= np.maximum(DEADBEAT * len(system.names), np.minimum(errors, SMALL))
         vague.append(gone)
         parts.append((system, one.pairs.values[~gone], vectors[:, ~gone], shares[:, ~gone]))
     modes = []
-    for system, one, shares, gone, known in zip(
+    for system, one, (shares, errors), gone, known in zip(
         systems, solved, described, vague, angles_in_frame(parts), strict=True
     ):
         # What ends in finite time has no frequency; but what is never computed anew can't end.
@@ -276,7 +303,7 @@ def _modes(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> list[M
             one.pairs.values.tolist(),
             angles.tolist(),
             gone.tolist(),
-            one.errors.tolist(),
+            errors.tolist(),
             shares.T.tolist(),
             strict=True,
         )

@@ -228,7 +228,7 @@ def answer_document(found: Answer) -> dict[str, Any]:
     return told
 
 
-def _mode_table(modes: tuple[Mode, ...]) -> str:
+def _mode_table(modes: Sequence[Mode]) -> str:
     # What can't be told from zero is counted only: its rounding differs from machine to machine.
     alive = [mode for mode in modes if _is_alive(mode)]
     rows = [mode for mode in alive if mode.eigenvalue.imag >= -mode.error]  # a conjugate pair is one row

@@ -16,6 +16,7 @@ from fractions import Fraction
 from typing import Any
 
 from apc.compiler.words import wrapped
+from apc.later import Later
 
 # What stable means by a criterion, where it is not that motions die out.
 MEANT = {
@@ -40,7 +41,7 @@ def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if isinstance(value, tuple | list):
+    if isinstance(value, tuple | list | Later):
         return [document(one) for one in value]
     if isinstance(value, complex):
         return document((value.real, value.imag))

@@ -1,0 +1,194 @@
+"""All eigenvalues of many matrices at once, each with a bound, where those that decide stand apart.
+
+Takes: matrices (k, n, n), and bounds on what each entry may be off by.
+Gives: `Apart`, `pairs_apart`.
+Guarantees: the bounds hold for every matrix within the errors, whatever their conditioning; rounding in the
+bounds themselves is charged. Where two eigenvalues are too near, or vectors too alike, nothing is said.
+Does not: enclose clusters, or look for a better split of large from small (see `enclosure`).
+
+One call of LAPACK for all right vectors, one for all left ones; all else are products of small matrices. The
+bounds are those of `enclosure` with every large eigenvalue a block of its own.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.frozen import dataclass
+from apc.eigen.dominant import resolvents
+from apc.eigen.eigenpairs import Eigenpairs, eigenpairs
+from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, pseudospectral_radius
+from apc.frame.discretize import UNIT
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+Matrix = NDArray[Any]  # float64 or complex128
+
+# Eigenvalues smaller than this decide nothing (e-folding in a fifth of a frame) and are often one defective
+# cluster at zero, the queues running empty; the first split between large and small is here.
+SMALL = 1e-2
+
+# How much larger what drives a block may become where one beside it is scaled.
+GROWN = 1024.0
+
+# What squares hide that leave the range of floats.
+TINY = 1e-150
+
+# Sweeps of balancing: the bounds hardly change with the scales, which only have to be of the right order.
+SWEEPS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Apart:
+    """Bounds on the eigenvalues of one matrix, the largest first, and on the largest magnitude.
+
+    Exactly one true eigenvalue is within `near` of each large one. All small ones are within `near` of each
+    of them, and `sharpened` gives closer bounds on all, which is most of the work.
+    """
+
+    low: float
+    high: float
+    near: Floats  # (n,)
+    sharpened: Callable[[], Floats]
+
+
+def pairs_apart(matrix: Floats, error: Floats) -> tuple[Eigenpairs, list[Apart | None]]:
+    """Return all eigenvalues of each matrix, the largest first, with their vectors, and bounds on them.
+
+    There are none where those that are not small don't stand apart, or all are small.
+
+    Parameters
+    ----------
+    matrix, error
+        Real matrices (k, n, n), and a bound on what each entry is off by.
+
+    Notes
+    -----
+    X = [X₁ X₂]: X₁ the right vectors of the large eigenvalues, X₂ annihilated by their left vectors, which
+    are those of unit length at right angles to X₁ less their part in X₁. X⁻¹(M + E)X = diag(Λ, T) + G as in
+    `enclosure`; what `_alone` says there of one disc beside others is said here of every large one.
+    """
+    scale = _alike(np.abs(matrix) + error)
+    units = scale[:, None] / scale[:, :, None]
+    matrix, error = matrix * units, error * units
+    with np.errstate(all="ignore"):
+        pairs = _in_order(eigenpairs(matrix))
+        bounds = _bounds(matrix, error, pairs)
+    return Eigenpairs(pairs.values, pairs.right * scale[:, :, None], pairs.left / scale[:, None]), bounds
+
+
+def _in_order(pairs: Eigenpairs) -> Eigenpairs:
+    """Return the pairs of each matrix in order, the largest first, of a conjugate pair the one above."""
+    values = pairs.values
+    order = np.lexsort((-values.imag, values.real, -np.abs(values)))
+    return Eigenpairs(
+        np.take_along_axis(values, order, axis=1),
+        np.take_along_axis(pairs.right, order[:, None], axis=2),
+        np.take_along_axis(pairs.left, order[:, :, None], axis=1),
+    )
+
+
+def _bounds(matrix: Floats, error: Floats, pairs: Eigenpairs) -> list[Apart | None]:
+    """Return the bounds on the eigenvalues of balanced matrices, see `pairs_apart`."""
+    k, n = matrix.shape[:2]
+    values, right, left = pairs.values, pairs.right, pairs.left
+    large = np.abs(values) >= SMALL
+    beside = ~large  # columns of X₂
+    basis = right
+    if beside.any():
+        # A pair spans the real and imaginary parts of its vector: a real basis of what is at right angles.
+        spanned = np.where(values.imag[:, None] < 0, right.imag, right.real)
+        straight = np.where(beside[:, None], np.linalg.qr(spanned)[0], 0.0)
+        along = left / np.einsum("kij,kji->ki", left, right)[:, :, None]
+        along[beside] = 0.0
+        straight = straight - (right @ (along @ straight)).real
+        basis = np.where(large[:, None], right, straight)
+    try:
+        inverse = np.linalg.inv(basis)
+    except np.linalg.LinAlgError:
+        return [None] * k
+    charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
+    moved = matrix @ basis
+    size, weight = np.abs(basis), np.abs(inverse)
+    form = inverse @ moved
+    own = np.einsum("kii->ki", form) * large
+    small = np.where(beside[:, :, None] & beside[:, None], form.real, 0.0)  # real, as what it is of is
+    blocks = small.astype(np.complex128)
+    np.einsum("kii->ki", blocks)[:] += own
+    doubt = np.abs(moved - basis @ blocks) + (error + charge * np.abs(matrix)) @ size
+    doubt += charge * (size @ np.abs(blocks))
+    # The computed inverse Y is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
+    wrong = np.abs(np.eye(n) - inverse @ basis).sum(axis=2)
+    wrong += charge * (weight @ size.sum(axis=2)[:, :, None])[:, :, 0]
+    defect = wrong.max(axis=1)
+    left_over = weight @ doubt * (1 + charge)
+    left_over += (wrong / (1 - defect)[:, None])[:, :, None] * left_over.max(axis=1, keepdims=True)
+
+    # ‖G_cb‖ for the large, one column b each, and all small ones together.
+    alone = np.where(large[:, None], left_over, 0.0)
+    squared = np.square(left_over)
+    across = np.sqrt(np.where(large[:, None], 0.0, squared).sum(axis=2)) + TINY
+    total = (alone.sum(axis=2) + across) * (1 + charge)
+    driving = np.sqrt((squared * beside[:, :, None]).sum(axis=1)) + TINY  # ‖G_cb‖ of them
+    within = np.sqrt((np.square(across) * beside).sum(axis=1))
+    off = (within + (driving * large).sum(axis=1)) * (1 + charge)
+    distance = np.abs(own)
+    clear = np.where(large, distance - total, np.inf).min(axis=1)
+    inner = clear / 2  # all small ones are shown to be within
+    known = (defect < 0.5) & large.any(axis=1) & (inner > 0)
+    if beside.any():
+        shrunk = small / inner[:, None, None]
+        away = (GROWN * off / inner + 2 * UNIT * np.sqrt(np.square(shrunk).sum(axis=(1, 2)))) * (1 + charge)
+        known &= resolvents(shrunk) * away < 0.5
+
+    gap = np.abs(own[:, :, None] - own[:, None]) * (1 - 8 * UNIT) - total[:, :, None] - total[:, None]
+    pair = large[:, :, None] & large[:, None] & ~np.eye(n, dtype=np.bool_)
+    gap = np.where(pair, gap, np.inf)
+    known &= (gap > 0).all(axis=(1, 2))
+    share = np.maximum((alone / gap).max(axis=1), 1 / (GROWN - 1)) * (1 + 8 * UNIT)
+    first = np.einsum("kii->ki", left_over)
+    less = (first + share * (total - first)) * (1 + 8 * UNIT)
+    radius = np.where(share < 1, np.minimum(less, total), total)
+    near = np.where(large, np.abs(values - own) + radius, np.abs(values) + inner[:, None]) * (1 + 8 * UNIT)
+    reach = np.where(large, distance + radius, -np.inf).max(axis=1) * (1 + 4 * UNIT)
+    least = np.where(large, distance - radius, -np.inf).max(axis=1) * (1 - 4 * UNIT)
+    answers: list[Apart | None] = [None] * k
+    for one in np.flatnonzero(known & np.isfinite(near).all(axis=1)).tolist():
+        places = np.flatnonzero(beside[one])
+        sharpened = functools.partial(
+            _sharpened, small[one][places[:, None], places], float(off[one]), values[one], near[one], places
+        )
+        answers[one] = Apart(float(least[one]), float(reach[one]), near[one], sharpened)
+    return answers
+
+
+def _sharpened(
+    block: Floats, off: float, values: Complexes, near: Floats, places: NDArray[np.intp]
+) -> Floats:
+    """Return the bounds (n,) with those on small eigenvalues as close as their pseudospectrum has them."""
+    found = near.copy()
+    if len(places):
+        radius = pseudospectral_radius(block, off)
+        found[places] = np.minimum(near[places], (np.abs(values[places]) + radius) * (1 + 8 * UNIT))
+    return found
+
+
+def _alike(size: Floats) -> Floats:
+    """Return d (k, n), powers of two, that make rows and columns of D⁻¹ |M| D about alike in norm.
+
+    As `pseudospectrum.balance`, of all states at once: each goes half-way, as those beside it go as well.
+    """
+    squared = np.square(size)
+    np.einsum("kii->ki", squared)[:] = 0.0
+    exponents = np.zeros(size.shape[:2])
+    for _ in range(SWEEPS):
+        column, row = squared.sum(axis=1), squared.sum(axis=2)
+        step = np.where((column > 0) & (row > 0), row / np.where(column > 0, column, 1.0), 1.0) ** 0.25
+        squared *= step[:, None] / step[:, :, None]
+        exponents += np.log2(step)
+    return np.asarray(np.exp2(np.round(np.where(np.isfinite(exponents), exponents, 0.0) / 2)))
