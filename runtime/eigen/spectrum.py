@@ -23,8 +23,8 @@ from apc.compiler.frozen import dataclass
 from apc.eigen.balls import unprovable
 from apc.eigen.certify import MOST_PROVED, prove
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.eigenpairs import Eigenpairs
-from apc.eigen.enclosure import SMALL, WIDE, components, discs, enclose_eigenvalues
+from apc.eigen.eigenpairs import Eigenpairs, components
+from apc.eigen.enclosure import SMALL, WIDE, discs, enclose_eigenvalues
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, independent_places, relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here

@@ -24,15 +24,17 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.words import counted
-from apc.eigen.closing import ClosedSystem, close_loop
+from apc.eigen.closing import ClosedSystem, Loop, close_loop
 from apc.eigen.eigenpairs import eigenvalues
-from apc.eigen.modes import split
+from apc.eigen.modes import arrange, split
+from apc.eigen.peer_group import PeerGroup
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.eigen.spectrum import DRIFTS, solve_spectrum
+from apc.frame.exchange import Exchange
 from apc.frame.names import Free, parameter_of
 from apc.vary.batch import BatchEvaluator, lifted_here
 from apc.vary.bends import bends
-from apc.vary.bracket import Bracket, ExactSystems, bracket, bracket_in_floats
+from apc.vary.bracket import Bracket, ExactLoop, bracket, bracket_in_floats
 from apc.vary.crossings import Course, Courses, Root, Scan, scan
 from apc.vary.delays import (
     INSIDE,
@@ -323,40 +325,38 @@ def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing | None:
             return None
         return _described(root, held, list(with_rigid(all_of_them(root.value))))
 
+    wiring = family.wirings[root.system]
+
     @functools.cache
-    def systems(value: float) -> list[tuple[ClosedSystem, RigidModes]]:
-        listed = zip(family.exact_at(point(value)), family.wirings, strict=True)
-        return [
-            (one, find_rigid_modes(one, with_drifts=False) if wiring.moving else wiring.rigid)
-            for one, wiring in listed
-        ]
+    def loop(value: float) -> tuple[ClosedSystem, RigidModes]:
+        (one,) = family.with_sites([wiring.system], point(value))
+        return one, find_rigid_modes(one, with_drifts=False) if wiring.moving else wiring.rigid
 
     def at(value: float) -> ClosedSystem:
-        return close_loop(lifted_here([systems(value)[root.system][0]])[0])
+        return close_loop(lifted_here([loop(value)[0]])[0])
 
-    return _bracketed(root, found, (low, high), systems, at, lambda value: family.closed_at(point(value)))
+    return _bracketed(root, found, (low, high), loop, at, lambda value: family.closed_at(point(value)))
 
 
 def _bracketed(
     root: Root,
     found: Scan,
     ends: tuple[float, float],
-    systems: ExactSystems,
+    loop: ExactLoop,
     at: Callable[[float], ClosedSystem],
     every: Callable[[float], Sequence[ClosedSystem]],
 ) -> Crossing | None:
     """Prove a crossing between two ends by balls or, where these don't tell, by the bounds of floats.
 
-    `systems` gives the systems of a value for balls, `at` the one that crosses as an analysis has it, and
-    `every` all of them.
+    `loop` gives what crosses at a value for balls, `at` as an analysis has it, and `every` all systems.
     """
     low, high = ends
-    held = bracket(root, systems, low=low, high=high)
+    held = bracket(root, loop, low=low, high=high)
     if held is None:
         held = bracket_in_floats(root, lambda value: [at(value)], low=low, high=high)
     if held is None and _alike(*map(every, _beside(root, found))):
         return None
-    return _described(root, held, [(at(root.value), systems(root.value)[root.system][1])])
+    return _described(root, held, [(at(root.value), loop(root.value)[1])])
 
 
 def _beside(root: Root, found: Scan) -> tuple[float, float]:
@@ -551,14 +551,22 @@ def _delay_crossing(
 ) -> Crossing | None:
     """Prove a crossing within a piece, whose systems are built anew for every value, as `proved_crossing`."""
 
+    assert piece.evaluator is not None, "nothing crosses where nothing depends on the delay"
+    wiring = piece.evaluator.wirings[root.system]
+
     @functools.cache
-    def systems(value: float) -> list[tuple[ClosedSystem, RigidModes]]:
-        moved = system_with_delay(system, free, Fraction(value))
-        listed = split(*lifted_groups(moved, prepared=prepared)).systems
-        return list(with_rigid(listed))
+    def here(value: float) -> tuple[tuple[PeerGroup, ...], Exchange]:
+        return lifted_groups(system_with_delay(system, free, Fraction(value)), prepared=prepared)
+
+    @functools.cache
+    def loop(value: float) -> tuple[Loop, RigidModes]:
+        one = arrange(*here(value)).loops[root.system]
+        if wiring.moving or one.names != wiring.system.names:  # as at the end of a piece
+            return one, find_rigid_modes(one, with_drifts=False)
+        return one, wiring.rigid
 
     return _bracketed(
-        *(root, found, (float(piece.low), float(piece.high)), systems),
-        lambda value: systems(value)[root.system][0],
-        lambda value: [one for one, _ in systems(value)],
+        *(root, found, (float(piece.low), float(piece.high)), loop),
+        lambda value: close_loop(loop(value)[0]),
+        lambda value: split(*here(value)).systems,
     )
