@@ -25,8 +25,8 @@ Complexes = NDArray[np.complex128]
 Places = NDArray[np.intp]
 Matrix = NDArray[Any]  # float64 or complex128
 
-# An inverse of the eigenvectors is used if its rows are left vectors to this; derivatives then have half their
-# digits.
+# An inverse of the eigenvectors is used if its rows are left vectors to this; derivatives have half their
+# digits then.
 SPOILT = 1e-8
 
 # A derivative of an eigenvalue of worse condition than this is mostly rounding.

@@ -177,7 +177,7 @@ class Line:
         if isinstance(family, PointEvaluator):
             return points, False
         maps = family if isinstance(family, BatchEvaluator) else family.family
-        found = bends(maps, self.base, self.column)
+        found = bends(maps, tuple(self.base.tolist()), self.column)
         return (points, False) if found is None else found.between(points, least)
 
     def scale(self) -> float:
