@@ -168,7 +168,7 @@ def closed_frame(
         end = layout.offsets[g] + len(group.z_names)
         columns.append(touched(g, range(layout.offsets[g], end)))
         start = unit[layout.offsets[g] : end, columns[g]]
-        courses[g] = follow(site, group.schedule, own, start, hearing(g), multiply=_multiply)
+        courses[g] = follow(site, group.schedule, own, start, hearing(g), numbers=BALLS)
     while courses:
         known = len(courses), len(sent)
         for g, course in tuple(courses.items()):
