@@ -61,7 +61,7 @@ def scene(folder: Path, shape: str) -> CompiledSystem:
 def bent(system: CompiledSystem, name: str) -> Bends:
     family = evaluator(system, [Free(name)], prepared=prepare(system))
     assert isinstance(family, BatchEvaluator)
-    found = bends(family, np.array([value_now(system, Free(name))]), 0)
+    found = bends(family, (value_now(system, Free(name)),), 0)
     assert found is not None
     return found
 

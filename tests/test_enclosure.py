@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apc.eigen.enclosure import components, enclose_eigenvalues
+from apc.eigen.eigenpairs import components
+from apc.eigen.enclosure import enclose_eigenvalues
 
 
 def _listed(driven: np.ndarray) -> list[list[int]]:

@@ -94,7 +94,7 @@ def frame_steps(
     return {duration: step(site.a, site.b, duration * schedule.quantum) for duration in sorted(durations)}
 
 
-def frame_balls(system: ClosedSystem) -> Balls:
+def frame_balls(system: ClosedSystem | Loop) -> Balls:
     """Return the closed matrix (n, n) of a system as balls at the present precision."""
     sites = site_balls(system)
     known: dict[tuple[int, int], Steps] = {}
@@ -107,7 +107,7 @@ def frame_balls(system: ClosedSystem) -> Balls:
     return closed_frame(system, sites, steps)
 
 
-def closed_frame(system: ClosedSystem, sites: Sequence[LinearSite], steps: Sequence[Steps]) -> Balls:
+def closed_frame(system: ClosedSystem | Loop, sites: Sequence[LinearSite], steps: Sequence[Steps]) -> Balls:
     """Follow all sites of a closed system through one frame, over its state.
 
     Parameters
@@ -122,9 +122,10 @@ def closed_frame(system: ClosedSystem, sites: Sequence[LinearSite], steps: Seque
     -------
     The closed matrix (n, n).
     """
-    n = len(system.names)
+    layout = system.layout
+    n = len(layout.names)
     unit = np.eye(n, dtype=np.int64).astype(object)
-    place_of = system.layout.places
+    place_of = layout.places
     rows_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in system.sites]
     weights = weight_balls(system)
     sent: dict[tuple[int, int], Balls] = {}
@@ -162,10 +163,10 @@ def closed_frame(system: ClosedSystem, sites: Sequence[LinearSite], steps: Seque
     matrix = np.zeros((n, n), dtype=object)
     courses, columns = {}, list[NDArray[np.intp]]()
     for g, (group, site, own) in enumerate(zip(system.sites, sites, steps, strict=True)):
-        end = system.offsets[g] + len(group.lifted.z_names)
-        columns.append(touched(g, range(system.offsets[g], end)))
-        start = unit[system.offsets[g] : end, columns[g]]
-        courses[g] = follow(site, group.schedule, own, start, hearing(g), multiply=_multiply)
+        end = layout.offsets[g] + len(group.z_names)
+        columns.append(touched(g, range(layout.offsets[g], end)))
+        start = unit[layout.offsets[g] : end, columns[g]]
+        courses[g] = follow(site, group.schedule, own, start, hearing(g), numbers=BALLS)
     while courses:
         known = len(courses), len(sent)
         for g, course in tuple(courses.items()):
@@ -175,10 +176,10 @@ def closed_frame(system: ClosedSystem, sites: Sequence[LinearSite], steps: Seque
                     sent[g, spoken[0]] = whole(g, spoken[1])
             except StopIteration as end_of_frame:
                 state = end_of_frame.value
-                matrix[system.offsets[g] : system.offsets[g] + len(state)] = whole(g, state)
+                matrix[layout.offsets[g] : layout.offsets[g] + len(state)] = whole(g, state)
                 del courses[g]
         assert (len(courses), len(sent)) != known, "a packet is heard before it is sent"
-    shift_packets(matrix, system.layout, lambda packet: sent[packet.site, packet.row])
+    shift_packets(matrix, layout, lambda packet: sent[packet.site, packet.row])
     return matrix
 
 

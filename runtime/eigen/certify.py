@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from apc.compiler.frozen import dataclass
 from apc.eigen.balls import Balls, frame_balls, precision, rational_ball, reduced_balls, square
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.enclosure import components, discs
+from apc.eigen.eigenpairs import components
+from apc.eigen.enclosure import discs
 from apc.eigen.relative import independent_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.eigen.roots import approach_roots, root_discs

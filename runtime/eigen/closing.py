@@ -61,9 +61,14 @@ class Loop:
         )
 
     @property
+    def layout(self) -> StateLayout:
+        """What the state holds, laid out anew each time."""
+        return lay_out_loop(self)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """The names of the state."""
-        return lay_out_loop(self).names
+        return self.layout.names
 
     @property
     def states(self) -> int:
@@ -123,7 +128,7 @@ def lay_out(z_names: Sequence[Sequence[str]], schedules: Sequence[Schedule]) -> 
 def lay_out_loop(loop: Loop | ClosedSystem) -> StateLayout:
     """Lay out the state of a loop; of several sites, each name says whose it is."""
     groups = loop.sites
-    layout = lay_out([group.lifted.z_names for group in groups], [group.schedule for group in groups])
+    layout = lay_out([group.z_names for group in groups], [group.schedule for group in groups])
     if len(groups) == 1:
         return layout
     sizes = np.diff([*layout.offsets, len(layout.names)])

@@ -1,7 +1,7 @@
 """Eigenvalues with their right and left vectors, of one matrix or of many, and what follows from both.
 
 Takes: matrices (…, n, n), their derivatives, or what they are off by.
-Gives: `Eigenpairs`, `eigenpairs`, `left_vectors`, `refined`; `eigenvalues`.
+Gives: `Eigenpairs`, `eigenpairs`, `left_vectors`, `refined`; `eigenvalues`; `components`.
 Guarantees: a derivative that `eigenvalues` gives and that would be mostly rounding comes as 0.
 Does not: bound the errors of eigenvalues (see `enclosure`).
 
@@ -11,6 +11,7 @@ dλ = w dM v / (w v).
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,11 @@ from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
+Places = NDArray[np.intp]
 Matrix = NDArray[Any]  # float64 or complex128
 
-# An inverse of the eigenvectors is used if it is one to this; derivatives then have half their digits.
+# An inverse of the eigenvectors is used if its rows are left vectors to this; derivatives have half their
+# digits then.
 SPOILT = 1e-8
 
 # A derivative of an eigenvalue of worse condition than this is mostly rounding.
@@ -34,6 +37,9 @@ SMALL = 0.05
 
 # A matrix of more states than this is worth the loading of SciPy.
 LARGE = 100
+
+# Graphs of matrices whose parts are kept: a search asks for the same again and again.
+KEPT = 64
 
 # How far from the predicted eigenvalue inverse iteration is shifted, so that the matrix it inverts stays
 # regular. Each step leaves a share of about SHIFT/gap of the other vectors.
@@ -104,23 +110,50 @@ def left_vectors(matrix: Matrix, values: Complexes) -> Complexes:
 def eigenvalues(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
     """Return the eigenvalues (k, n) of matrices (k, n, n) and their derivatives, fast.
 
-    A derivative that means nothing, of an eigenvalue near zero or one that is hardly simple, comes as 0.
+    States that drive each other have eigenvalues of their own. A derivative that means nothing, of an
+    eigenvalue near zero or one that is hardly simple, comes as 0.
     """
+    driven = (matrix != 0).any(axis=0) | (slope != 0).any(axis=0)
+    alike = _alike(driven.tobytes(), len(driven))
+    if len(alike) == 1 and len(alike[0]) == 1:
+        return _by_vectors(matrix, slope)
+    found = np.zeros((2, *matrix.shape[:2]), dtype=np.complex128)
+    for states in alike:
+        blocks = np.index_exp[:, states[:, :, None], states[:, None, :]]
+        found[:, :, states] = _by_vectors(matrix[blocks], slope[blocks])
+    return found[0], found[1]
+
+
+@lru_cache(maxsize=KEPT)
+def _alike(driven: bytes, n: int) -> tuple[Places, ...]:
+    """Return the parts of a matrix's graph (n, n), those of as many states together (m, s)."""
+    of_size: dict[int, list[Places]] = {}
+    for part in components(np.frombuffer(driven, dtype=np.bool_).reshape(n, n)):
+        of_size.setdefault(len(part), []).append(part)
+    return tuple(np.array(parts) for parts in of_size.values())
+
+
+def _by_vectors(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
+    """Return the eigenvalues (…, n) of matrices (…, n, n) and their derivatives, see `eigenvalues`."""
+    if matrix.shape[-1] == 1:
+        values, derivative = matrix[..., 0].astype(np.complex128), slope[..., 0]
+        return values, np.where(np.abs(values) < SMALL, 0.0, derivative)
     values, right = np.linalg.eig(matrix)
-    unit = np.eye(matrix.shape[1])
+    small = np.abs(values) < SMALL
     try:
         left = np.linalg.inv(right)
-        # A defective cluster spoils the inverse for all the others as well.
-        spoilt = ~(np.abs(left @ right - unit) <= SPOILT).all(axis=(1, 2))
+        # A defective cluster spoils the inverse, of the others hardly ever.
+        off = np.abs(left @ matrix - values[..., None] * left).max(axis=-1)
+        spoilt = ~(small | (off <= SPOILT * np.abs(left).max(axis=-1))).all(axis=-1)
     except np.linalg.LinAlgError:
-        left, spoilt = np.empty_like(right), np.ones(len(matrix), dtype=bool)
+        left, spoilt = np.empty_like(right), np.ones(matrix.shape[:-2], dtype=bool)
     if spoilt.any():
         left = left.astype(np.complex128)
         left[spoilt] = left_vectors(matrix[spoilt], values[spoilt])
     pairs = Eigenpairs(values, right, left)
     with np.errstate(all="ignore"):
         derivative = pairs.slopes(slope)
-        vague = ~(pairs.condition < WORST) | ~np.isfinite(derivative) | (np.abs(values) < SMALL)
+        vague = small | ~(pairs.condition < WORST) | ~np.isfinite(derivative)
     return values.astype(np.complex128), np.where(vague, 0.0, derivative)
 
 
@@ -134,3 +167,49 @@ def refined(matrix: Matrix, guess: Eigenpairs) -> Eigenpairs:
     v, w = v / np.abs(v).max(axis=-2, keepdims=True), w / np.abs(w).max(axis=-1, keepdims=True)
     pair = Eigenpairs(guess.values, v, w)
     return Eigenpairs(pair.slopes(matrix), v, w)
+
+
+def components(driven: NDArray[np.bool_]) -> list[Places]:
+    """Return the strongly connected components of a matrix's graph, by their first places.
+
+    Parameters
+    ----------
+    driven
+        Whether state i is driven by state j (n, n).
+
+    Returns
+    -------
+    The places of each part, in rising order.
+
+    Notes
+    -----
+    A state that drives nobody left, or that nobody left drives, is a part of its own: such go first, as
+    queues are full of them. Of the others, what a state reaches and what reaches it are its part.
+    """
+    links = driven.copy()
+    np.fill_diagonal(links, False)
+    left = np.ones(len(links), dtype=np.bool_)
+    found: list[Places] = []
+    while True:
+        alone = left & ~((links & left).any(axis=1) & (links.T & left).any(axis=1))
+        if not alone.any():
+            break
+        found += [np.array([place]) for place in np.flatnonzero(alone)]
+        left &= ~alone
+    while left.any():
+        start = int(np.argmax(left))
+        part = _reached(links, start, left) & _reached(links.T, start, left)
+        found.append(np.flatnonzero(part))
+        left &= ~part
+    return sorted(found, key=lambda part: int(part[0]))
+
+
+def _reached(links: NDArray[np.bool_], start: int, left: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which of the states left are reached from one, itself included."""
+    reached = np.zeros(len(links), dtype=np.bool_)
+    reached[start] = True
+    frontier = reached
+    while frontier.any():
+        frontier = links[frontier].any(axis=0) & left & ~reached
+        reached = reached | frontier
+    return reached

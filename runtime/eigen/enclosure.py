@@ -1,7 +1,7 @@
 """Eigenvalues of a matrix known up to an error, each with a bound.
 
 Takes: a square matrix and a bound on what each entry may be off by.
-Gives: `Enclosure`, `enclose_eigenvalues`, `enclose_all`, `discs`; `components`.
+Gives: `Enclosure`, `enclose_eigenvalues`, `enclose_all`, `discs`.
 Guarantees: the bounds hold for every matrix within the error, whatever their conditioning; rounding in the
 bounds themselves is charged. LAPACK's results are checked by their residuals, not believed.
 Does not: know where the matrix comes from, or what is rigid (see `spectrum`).
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
 from apc.eigen.apart import GROWN, SMALL, pairs_apart
-from apc.eigen.eigenpairs import LARGE, Eigenpairs, eigenpairs
+from apc.eigen.eigenpairs import LARGE, Eigenpairs, components, eigenpairs
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance, norms, pseudospectral_radius
 from apc.eigen.relative import independent_places
 from apc.frame.discretize import UNIT
@@ -450,49 +450,3 @@ def discs(values: Complexes, centres: Complexes, radii: Floats) -> Enclosure:
     inner = np.abs(centres) - radii
     low = max(0.0, *(float(inner[label == one].min()) for one in set(label.tolist())))
     return _told(low, float((np.abs(centres) + radii).max()), errors)
-
-
-def components(driven: NDArray[np.bool_]) -> list[Places]:
-    """Return the strongly connected components of a matrix's graph, by their first places.
-
-    Parameters
-    ----------
-    driven
-        Whether state i is driven by state j (n, n).
-
-    Returns
-    -------
-    The places of each part, in rising order.
-
-    Notes
-    -----
-    A state that drives nobody left, or that nobody left drives, is a part of its own: such go first, as
-    queues are full of them. Of the others, what a state reaches and what reaches it are its part.
-    """
-    links = driven.copy()
-    np.fill_diagonal(links, False)
-    left = np.ones(len(links), dtype=np.bool_)
-    found: list[Places] = []
-    while True:
-        alone = left & ~((links & left).any(axis=1) & (links.T & left).any(axis=1))
-        if not alone.any():
-            break
-        found += [np.array([place]) for place in np.flatnonzero(alone)]
-        left &= ~alone
-    while left.any():
-        start = int(np.argmax(left))
-        part = _reached(links, start, left) & _reached(links.T, start, left)
-        found.append(np.flatnonzero(part))
-        left &= ~part
-    return sorted(found, key=lambda part: int(part[0]))
-
-
-def _reached(links: NDArray[np.bool_], start: int, left: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which of the states left are reached from one, itself included."""
-    reached = np.zeros(len(links), dtype=np.bool_)
-    reached[start] = True
-    frontier = reached
-    while frontier.any():
-        frontier = links[frontier].any(axis=0) & left & ~reached
-        reached = reached | frontier
-    return reached

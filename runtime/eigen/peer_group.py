@@ -113,6 +113,11 @@ class PeerGroup:
         """The map of one frame."""
         return self.lifting()
 
+    @property
+    def z_names(self) -> tuple[str, ...]:
+        """The names of its part of the state: what moves, then what is remembered."""
+        return (*(state.name for state in self.site.kind.states), *self.schedule.value_names)
+
     def with_lifted(self, lifted: LiftedSite) -> PeerGroup:
         """Return the same peers with another map of one frame."""
         return replace(self, lifting=lambda: lifted)

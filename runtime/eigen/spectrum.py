@@ -25,8 +25,8 @@ from apc.eigen.apart import SMALL
 from apc.eigen.balls import unprovable
 from apc.eigen.certify import MOST_PROVED, prove
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.eigenpairs import Eigenpairs
-from apc.eigen.enclosure import WIDE, Enclosure, components, discs, enclose_all
+from apc.eigen.eigenpairs import Eigenpairs, components
+from apc.eigen.enclosure import WIDE, Enclosure, discs, enclose_all
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, independent_places, relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_before, rigid_modes_here

@@ -79,7 +79,7 @@ class Edge:
     timed: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class SiteJacobians:
     """The Jacobians of a kind as one CasADi function of (x, u, m, r, p, t); m and r of all clocks in a row.
 

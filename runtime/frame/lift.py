@@ -232,7 +232,7 @@ def compose(
         sent.update(playing.play(schedule.events, at, hear))
     else:
         sent.update(playing.play(schedule.events[: again.first], at, hear))
-        _play_again(playing, schedule, again, at, numbers)
+        _play_again(playing, schedule, again, at, numbers, None)
         sent.update(playing.play(schedule.events[again.end :], at, hear))
     z = playing.end(schedule, at)
     s = _over(z[..., :0, :], [sent[row] for row in range(len(schedule.sent))])
@@ -240,9 +240,25 @@ def compose(
 
 
 def _play_again(
-    playing: _Playing, schedule: Schedule, again: Repeats, at: _Moment, numbers: Arithmetic
+    playing: _Playing,
+    schedule: Schedule,
+    again: Repeats,
+    at: _Moment,
+    numbers: Arithmetic,
+    received: Matrix | None,
 ) -> None:
     """Play events that come again and again: once, over what they need, and that as often as they come.
+
+    Parameters
+    ----------
+    playing, schedule, again
+        The site, what happens in its frame, and what of that comes again.
+    at
+        The instant before, which becomes that after.
+    numbers
+        What all is of.
+    received
+        What is heard (n_r, columns); without it, the last columns, one a packet.
 
     Notes
     -----
@@ -295,8 +311,11 @@ def _play_again(
     assert whole is not None
     y = _over(at.moving[..., :n_x, :], [row_of(at, value, 0) for value in needed])
     found = numbers.multiply(whole[..., :n], y)
-    heard = found.shape[-1] - n_r  # the last columns are what is heard
-    found[..., heard:] = numbers.add(found[..., heard:], whole[..., n:])
+    if received is None:
+        heard = found.shape[-1] - n_r
+        found[..., heard:] = numbers.add(found[..., heard:], whole[..., n:])
+    else:
+        found = numbers.add(found, numbers.multiply(whole[..., n:], received))
     at.moving[..., :n_x, :] = found[..., :n_x, :]
     for place, value in enumerate(again.entering, n_x):
         if value.partition == HELD:
@@ -312,7 +331,7 @@ def follow(
     start: Matrix,
     hear: Callable[[int], Matrix | None],
     *,
-    multiply: Callable[[Matrix, Matrix], Matrix] = np.matmul,
+    numbers: Arithmetic = FLOATS,
     watch: Callable[[int, Matrix], None] | None = None,
 ) -> Generator[tuple[int, Matrix], None, Matrix]:
     """Follow a site, or many, through one frame, event by event, over numbers of any kind.
@@ -331,11 +350,11 @@ def follow(
         The state z (n_z, columns) at the start of the frame.
     hear
         Gives the row (columns,) of an entry of r, or None while it isn't sent yet: it is asked again.
-    multiply
-        The product of a site's matrix and rows.
+    numbers
+        What all is of.
     watch
         Is shown each step before it is made: its duration in quanta, and the continuous states above what the
-        holds put out (n_x + n_u, columns).
+        holds put out (n_x + n_u, columns). Without it, what comes again and again is played once.
 
     Yields
     ------
@@ -345,9 +364,21 @@ def follow(
     -------
     z⁺ (n_z, columns).
     """
-    playing = _Playing.of(site, steps, start.dtype, multiply, watch)
+    playing = _Playing.of(site, steps, start.dtype, numbers.multiply, watch)
     at = playing.begin(schedule, start)
-    yield from playing.play(schedule.events, at, hear)
+    again = schedule.repeats if watch is None else None
+    if again is None:
+        yield from playing.play(schedule.events, at, hear)
+        return playing.end(schedule, at)
+    yield from playing.play(schedule.events[: again.first], at, hear)
+    received = np.zeros((len(schedule.heard), start.shape[-1]), dtype=start.dtype)
+    body = schedule.events[again.first : again.first + again.length]
+    for row in {row for event in body if isinstance(event, Tick) for own in event.heard for row in own}:
+        while (packet := hear(row)) is None:
+            yield -1, at.nothing
+        received[row] = packet
+    _play_again(playing, schedule, again, at, numbers, received)
+    yield from playing.play(schedule.events[again.end :], at, hear)
     return playing.end(schedule, at)
 
 

@@ -1,14 +1,15 @@
 """The matrices of one site for its parameters, or of many sites at once.
 
 Takes: a kind's `SiteJacobians`, a parameter vector or many, what the site hears at the start.
-Gives: `linearize`, `linearize_exact`, `linearize_rows`; `site_of_row`, `sites_of_rows`, `site_of_entries`.
+Gives: `linearize`, `linearize_exact`, `linearize_rows`, `of_rows`; `site_of_row`, `sites_of_rows`,
+`site_of_entries`.
 Guarantees: a site that is not affine is linearized at its start values.
 Does not: decide when anything happens (see `scheduling`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import field
 from fractions import Fraction
 from functools import lru_cache
@@ -156,19 +157,36 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
     count, function = len(parameters), site.function
     rows = np.zeros((count, function.numel_out(0)))
     places = function.sparsity_out(0).row()
-    if not (count and places):
-        return rows
-    found = np.empty((count, len(places)))
-    # Evaluated where the numbers stand: CasADi's own matrices are copied entry by entry.
-    buffer, evaluate = function.map(count).buffer()
-    given = [np.zeros(max(1, count * function.numel_in(place))) for place in range(function.n_in())]
-    given[4] = np.array(parameters, dtype=np.float64, order="C").ravel()
-    for place, numbers in enumerate(given):
-        buffer.set_arg(place, numbers.data)
-    buffer.set_res(0, found.reshape(-1).data)
-    evaluate()
+    (found,) = of_rows(function, {4: parameters})
     rows[:, places] = found + 0.0  # −0 and 0 are one number
     return rows
+
+
+def of_rows(function: Any, given: Mapping[int, NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+    """Return a CasADi function's outputs at many rows of its arguments, each (k, entries that are stored).
+
+    Parameters
+    ----------
+    function
+        The function, of dense arguments.
+    given
+        Arguments (k, size) by their places; the others are zero.
+    """
+    count = len(next(iter(given.values())))
+    found = [np.empty((count, function.nnz_out(place))) for place in range(function.n_out())]
+    if not any(one.size for one in found):
+        return found
+    # Evaluated where the numbers stand: CasADi's own matrices are copied entry by entry.
+    buffer, evaluate = function.map(count).buffer()
+    numbers = [np.zeros(max(1, count * function.numel_in(place))) for place in range(function.n_in())]
+    for place, rows in given.items():
+        numbers[place] = np.array(rows, dtype=np.float64, order="C").ravel()
+    for place, one in enumerate(numbers):
+        buffer.set_arg(place, one.data)
+    for place, one in enumerate(found):
+        buffer.set_res(place, one.reshape(-1).data)
+    evaluate()
+    return found
 
 
 def sites_of_rows(site: SiteJacobians, rows: NDArray[np.float64]) -> LinearSite:

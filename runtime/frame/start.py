@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from functools import lru_cache
 from typing import Any
 
 import casadi
@@ -20,6 +21,9 @@ from apc.compiler.compiled import PEERS
 from apc.compiler.frozen import dataclass
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians
+
+# Kinds that are kept as they start.
+KEPT = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +64,7 @@ def start_sends(
     return sent
 
 
+@lru_cache(maxsize=KEPT)
 def at_start(site: SiteJacobians) -> SiteJacobians | None:
     """Return a kind's Jacobians where it starts, which follow from its parameters alone.
 

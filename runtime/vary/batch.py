@@ -34,7 +34,7 @@ from apc.frame.discretize import UNIT, Step, exponential_rows, exponential_value
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import FrameMap, LiftedSite, compose, composed_bounded, lift
-from apc.frame.linearize import linearize_exact, linearize_rows, site_of_row, sites_of_rows
+from apc.frame.linearize import linearize_exact, linearize_rows, of_rows, site_of_row, sites_of_rows
 from apc.frame.names import Free, value_now
 from apc.frame.parameters import free_rows
 from apc.frame.radius import RADII, radius_of, value_of
@@ -302,8 +302,7 @@ class BatchEvaluator:
         """Return the coefficients (k, …) of many sites; those of a complex step with their derivative."""
         if not np.iscomplexobj(vectors):
             return linearize_rows(built, vectors)
-        both = self.tangents[built.kind.name](vectors.real.T, vectors.imag.T / STEP)
-        value, slope = (np.asarray(one, dtype=np.float64).reshape(-1, len(vectors)).T for one in both)
+        value, slope = of_rows(self.tangents[built.kind.name], {0: vectors.real, 1: vectors.imag / STEP})
         return value + (STEP * 1j) * slope
 
 

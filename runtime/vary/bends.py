@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import casadi
@@ -46,6 +47,10 @@ TERMS, BITS = 5, 64
 _STEPS = frozenset(
     ["lt", "le", "eq", "ne", "not", "if_else_zero", "fabs", "sign", "floor", "ceil", "fmin", "fmax"]
 )
+
+
+# Lines whose coefficients are kept for the next question.
+KEPT = 64
 
 
 class _OpenError(Exception):
@@ -124,13 +129,14 @@ class Bends:
         return bool(np.all(np.array(off) <= STRAIGHT * size))
 
 
-def bends(family: BatchEvaluator, base: Floats, column: int) -> Bends | None:
+@lru_cache(maxsize=KEPT)
+def bends(family: BatchEvaluator, base: tuple[float, ...], column: int) -> Bends | None:
     """Return the coefficients that bend as one of the free parameters varies, the others at `base` (m,).
 
     None where the equations hold a loop that Newton's method solves, or a value that has no expression.
     """
     value = casadi.SX.sym("value")
-    free = {one: value if place == column else float(base[place]) for place, one in enumerate(family.free)}
+    free = {one: value if place == column else base[place] for place, one in enumerate(family.free)}
     functions: dict[object, Any] = {}
     for group in family.groups:
         built = group.jacobians
@@ -142,7 +148,7 @@ def bends(family: BatchEvaluator, base: Floats, column: int) -> Bends | None:
         if key not in functions:
             functions[key] = _bending(built.function, value, casadi.vertcat(*vector))
     found = tuple(one for one in functions.values() if one is not None)
-    return Bends(found, float(base[column]))
+    return Bends(found, base[column])
 
 
 def _bending(function: Any, value: Any, vector: Any) -> Any:

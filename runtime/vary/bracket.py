@@ -18,7 +18,7 @@ import numpy as np
 from apc.compiler.frozen import dataclass
 from apc.eigen.balls import frame_balls, precision, reduced_balls, square, unprovable
 from apc.eigen.certify import MOST_PROVED, schur_cohn
-from apc.eigen.closing import ClosedSystem
+from apc.eigen.closing import ClosedSystem, Loop
 from apc.eigen.relative import independent_places
 from apc.eigen.rigid import RigidModes
 from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE, solve_spectrum
@@ -37,8 +37,8 @@ WIDER, TRIES = 16.0, 8
 PRECISIONS = (128, 256, 512, 1024)
 BITS_A_STATE = 6
 
-# The closed systems at a value, with the rigid modes of each.
-ExactSystems = Callable[[float], Sequence[tuple[ClosedSystem, RigidModes]]]
+# The loop that crosses at a value, with its rigid modes.
+ExactLoop = Callable[[float], tuple[ClosedSystem | Loop, RigidModes]]
 
 # The closed systems at a value, as an analysis has them, one of which crosses.
 FloatSystems = Callable[[float], Sequence[ClosedSystem]]
@@ -63,19 +63,19 @@ class Bracket:
     proof: str
 
 
-def bracket(root: Root, systems: ExactSystems, *, low: float, high: float) -> Bracket | None:
+def bracket(root: Root, loop: ExactLoop, *, low: float, high: float) -> Bracket | None:
     """Prove a root of floats by ball arithmetic, or None where balls can't be had or don't tell.
 
     Parameters
     ----------
     root
         The crossing.
-    systems
-        The closed systems at a value.
+    loop
+        The loop that crosses, at a value.
     low, high
         No bracket reaches beyond these.
     """
-    system = systems(root.value)[root.system][0]
+    system, _ = loop(root.value)
     if unprovable(system) or len(system.names) > MOST_PROVED:
         return None
     likely = BITS_A_STATE * len(system.names)
@@ -84,7 +84,7 @@ def bracket(root: Root, systems: ExactSystems, *, low: float, high: float) -> Br
     @functools.cache
     def above(value: float) -> bool | None:
         nonlocal most_bits
-        inside, most_bits = _inside(*systems(value)[root.system], most_bits)
+        inside, most_bits = _inside(*loop(value), most_bits)
         return None if inside is None else inside == root.rising
 
     held = hold(root, above, low, high)
@@ -154,7 +154,7 @@ def hold(root: Root, above: Above, low: float, high: float, half: float = 0.0) -
     return value, max(right - value, value - left)
 
 
-def _inside(system: ClosedSystem, free: RigidModes, least: int) -> tuple[bool | None, int]:
+def _inside(system: ClosedSystem | Loop, free: RigidModes, least: int) -> tuple[bool | None, int]:
     """Say whether all eigenvalues but the rigid ones are proved inside the circle, or one outside.
 
     With `least` bits or more: what one end of a bracket took, the other takes, too.

@@ -137,6 +137,8 @@ def _stacked(one: Complexes, other: Complexes) -> Complexes:
     A scene that is linearized at its start may have more free motions there at one value than at another.
     """
     wide = max(one.shape[1], other.shape[1])
+    if one.shape[1] == other.shape[1]:
+        return np.concatenate([one, other])
     return np.concatenate([np.pad(rows, ((0, 0), (0, wide - rows.shape[1]))) for rows in (one, other)])
 
 

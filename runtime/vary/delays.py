@@ -13,12 +13,12 @@ changes within a piece at all, as a packet is read at ticks only: see `lags`.)
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from fractions import Fraction
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
 from apc.frame.schedule import Act, Propagate, Schedule
 from apc.vary.batch import BatchEvaluator, batch_evaluator
+from apc.vary.evaluator import Asked
 
 # Pieces of one search: each is some schedules and matrices, a hundredth of a second and more.
 MOST_PIECES = 10_000
@@ -45,8 +46,8 @@ INSIDE = Fraction(28_571, 104_729)
 STEP = Fraction(1, 1009)
 
 
-# Delays of which it is kept where events coincide: a search asks again and again.
-KEPT = 16
+# Delays of which it is kept where events coincide: a search asks again and again; pieces of each that are.
+KEPT, KEPT_PIECES = 16, 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,11 +111,20 @@ def delay_pieces(
     following = borders(system, free, place=place)
     if high is not None:
         _count(free, low, high, following, place)
-    slopes, follows = timing_slopes(system, free), reaches_parameters(system, free)
+    piece = _pieces(Asked.of(system, [free], prepared))
     while high is None or low < high:
         end = following(low)
-        yield _piece(system, free, low, end, prepared, slopes, follows=follows)
+        yield piece(low, end)
         low = end
+
+
+@lru_cache(maxsize=KEPT)
+def _pieces(of: Asked) -> Callable[[Fraction, Fraction], Piece]:
+    """Return what builds the piece between two values, and keeps it for the next question."""
+    (free,) = of.free
+    slopes, follows = timing_slopes(of.system, free), reaches_parameters(of.system, free)
+    build = partial(_piece, of.system, free, prepared=of.prepared, slopes=slopes, follows=follows)
+    return lru_cache(maxsize=KEPT_PIECES)(build)
 
 
 def pace(
@@ -164,7 +174,7 @@ def _count(
     raise ApcError(Mistake("E846", place, what, hint=f"a range up to {float(at):.6g}"))
 
 
-@functools.lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=KEPT)
 def borders(system: CompiledSystem, free: Free, *, place: Place) -> Callable[[Fraction], Fraction]:
     """Return what gives the next value at which events coincide that don't at the values before it.
 
@@ -225,7 +235,7 @@ def borders(system: CompiledSystem, free: Free, *, place: Place) -> Callable[[Fr
     return following
 
 
-@functools.lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=KEPT)
 def timing_slopes(system: CompiledSystem, free: Free) -> Mapping[str, Fraction]:
     """Return how fast each timing follows a parameter or timing, by its name."""
     now = delay_now(system, free)
@@ -251,9 +261,9 @@ def _piece(
     free: Free,
     low: Fraction,
     high: Fraction,
+    *,
     prepared: Prepared,
     slopes: Mapping[str, Fraction],
-    *,
     follows: bool,
 ) -> Piece:
     """Build the evaluator of one piece from its schedules at a value inside."""

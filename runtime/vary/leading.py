@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from apc.compiler.frozen import dataclass
 from apc.eigen.apart import SMALL
 from apc.eigen.dominant import all_within, enclosed, largest_pairs, misses_one
-from apc.eigen.enclosure import components
+from apc.eigen.eigenpairs import components
 from apc.eigen.pseudospectrum import balance
 from apc.eigen.relative import relative_bounded
 from apc.eigen.spectrum import LEAST_SHARE, STRAIGHT

@@ -19,20 +19,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, analyze, lifted_groups
+from apc.analysis.analysis import Analysis, Prepared, analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.words import counted
-from apc.eigen.closing import ClosedSystem, close_loop
+from apc.eigen.closing import ClosedSystem, Loop, close_loop
+from apc.eigen.dominant import all_within
 from apc.eigen.eigenpairs import eigenvalues
-from apc.eigen.modes import split
-from apc.eigen.rigid import RigidModes, find_rigid_modes
+from apc.eigen.modes import arrange, split
+from apc.eigen.peer_group import PeerGroup
+from apc.eigen.pseudospectrum import balance
+from apc.eigen.relative import relative_bounded, relative_coordinates
+from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here
 from apc.eigen.spectrum import DRIFTS, solve_spectrum
+from apc.frame.exchange import Exchange
 from apc.frame.names import Free, parameter_of
 from apc.vary.batch import BatchEvaluator, lifted_here
 from apc.vary.bends import bends
-from apc.vary.bracket import Bracket, ExactSystems, bracket, bracket_in_floats
+from apc.vary.bracket import Bracket, ExactLoop, bracket, bracket_in_floats
 from apc.vary.crossings import Course, Courses, Root, Scan, scan
 from apc.vary.delays import (
     INSIDE,
@@ -172,7 +177,7 @@ class Line:
         if isinstance(family, PointEvaluator):
             return points, False
         maps = family if isinstance(family, BatchEvaluator) else family.family
-        found = bends(maps, self.base, self.column)
+        found = bends(maps, tuple(self.base.tolist()), self.column)
         return (points, False) if found is None else found.between(points, least)
 
     def scale(self) -> float:
@@ -323,40 +328,38 @@ def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing | None:
             return None
         return _described(root, held, list(with_rigid(all_of_them(root.value))))
 
+    wiring = family.wirings[root.system]
+
     @functools.cache
-    def systems(value: float) -> list[tuple[ClosedSystem, RigidModes]]:
-        listed = zip(family.exact_at(point(value)), family.wirings, strict=True)
-        return [
-            (one, find_rigid_modes(one, with_drifts=False) if wiring.moving else wiring.rigid)
-            for one, wiring in listed
-        ]
+    def loop(value: float) -> tuple[ClosedSystem, RigidModes]:
+        (one,) = family.with_sites([wiring.system], point(value))
+        return one, find_rigid_modes(one, with_drifts=False) if wiring.moving else wiring.rigid
 
     def at(value: float) -> ClosedSystem:
-        return close_loop(lifted_here([systems(value)[root.system][0]])[0])
+        return close_loop(lifted_here([loop(value)[0]])[0])
 
-    return _bracketed(root, found, (low, high), systems, at, lambda value: family.closed_at(point(value)))
+    return _bracketed(root, found, (low, high), loop, at, lambda value: family.closed_at(point(value)))
 
 
 def _bracketed(
     root: Root,
     found: Scan,
     ends: tuple[float, float],
-    systems: ExactSystems,
+    loop: ExactLoop,
     at: Callable[[float], ClosedSystem],
     every: Callable[[float], Sequence[ClosedSystem]],
 ) -> Crossing | None:
     """Prove a crossing between two ends by balls or, where these don't tell, by the bounds of floats.
 
-    `systems` gives the systems of a value for balls, `at` the one that crosses as an analysis has it, and
-    `every` all of them.
+    `loop` gives what crosses at a value for balls, `at` as an analysis has it, and `every` all systems.
     """
     low, high = ends
-    held = bracket(root, systems, low=low, high=high)
+    held = bracket(root, loop, low=low, high=high)
     if held is None:
         held = bracket_in_floats(root, lambda value: [at(value)], low=low, high=high)
     if held is None and _alike(*map(every, _beside(root, found))):
         return None
-    return _described(root, held, [(at(root.value), systems(root.value)[root.system][1])])
+    return _described(root, held, [(at(root.value), loop(root.value)[1])])
 
 
 def _beside(root: Root, found: Scan) -> tuple[float, float]:
@@ -445,7 +448,7 @@ def search_delay(
         if stable and stable[-1] != first:
             side, way = (piece, 1) if stable[-1] or before is None else (before, -1)
             grows = system_with_delay(system, free, piece.low + way * BESIDE * (side.high - side.low))
-            edges.append(_jump(piece.low, grows, prepared, stable_below=stable[-1]))
+            edges.append(_jump(piece.low, analyze(grows, prepared=prepared), stable_below=stable[-1]))
         if not stable or stable[-1] != first:
             stable.append(first)
         for root in found.roots:
@@ -474,18 +477,17 @@ def _late_search(
     edges: list[Crossing] = []
     stable = [True] if from_stable else [bool(one.stable) for one in known[:1]]
     whole, before = len(known) == len(late), None
+
+    def inside(some: LateStretch) -> CompiledSystem:
+        return system_with_delay(system, free, some.low + INSIDE * (some.high - some.low))
+
     for one in known:
         if one.stable != stable[-1]:
-            pair = [one] if before is None else [before, one]
-            inside = [
-                system_with_delay(system, free, some.low + INSIDE * (some.high - some.low)) for some in pair
-            ]
-            whole &= all(
-                analyze(scene, prepared=prepared).stable == some.stable
-                for scene, some in zip(inside, pair, strict=True)
-            )
-            grows = inside[-1 if stable[-1] else 0]
-            edges.append(_jump(one.low, grows, prepared, stable_below=stable[-1]))
+            grows, settles = (one, before) if stable[-1] else (before, one)
+            assert grows is not None, "the first stretch is on the side that the search begins on"
+            there = analyze(inside(grows), prepared=prepared)
+            whole &= there.stable is False and (settles is None or _settles(inside(settles), prepared))
+            edges.append(_jump(one.low, there, stable_below=stable[-1]))
             stable.append(bool(one.stable))
             if from_stable:
                 break
@@ -520,6 +522,8 @@ def _piece_scan(piece: Piece, low: float, high: float, prepared: Prepared) -> tu
     """Scan one piece, its ends as limits from within; say whether the equations are known all over it."""
     family = piece.evaluator
     if family is None:
+        if _settles(piece.inside, prepared):
+            return Scan(np.array([low]), np.array([True]), (), whole=True), True
         found = analyze(piece.inside, prepared=prepared)
         if found.stable is None or found.verdict == DRIFTS:
             return Scan(np.empty(0), np.empty(0, dtype=bool), (), whole=found.verdict == DRIFTS), True
@@ -534,13 +538,25 @@ def _piece_scan(piece: Piece, low: float, high: float, prepared: Prepared) -> tu
     return scan(course, points, least=high - low), known
 
 
-def _jump(at: Fraction, grows: CompiledSystem, prepared: Prepared, *, stable_below: bool) -> Crossing:
-    """Describe a change of side where events coincide, exactly; `grows` is the scene on the unstable side."""
+def _settles(system: CompiledSystem, prepared: Prepared) -> bool:
+    """Say whether a scene is proved stable: by bounds of all eigenvalues at once, else by an analysis."""
+    for one in split(*lifted_groups(system, prepared=prepared)).systems:
+        at = relative_coordinates(rigid_modes_here(one).basis)
+        matrix, error = relative_bounded(one.matrix, one.error, at)
+        scale = balance(np.abs(matrix) + error)
+        alike = scale / scale[:, None]
+        if not all_within((matrix * alike)[None], (error * alike)[None], np.ones(1))[0]:
+            return bool(analyze(system, prepared=prepared).stable)
+    return True
+
+
+def _jump(at: Fraction, grows: Analysis, *, stable_below: bool) -> Crossing:
+    """Describe a change of side where events coincide, exactly; `grows` is of the unstable side."""
     return Crossing(
         value=float(at),
         error=0.0,
         stable_side="below" if stable_below else "above",
-        frequency_hz=analyze(grows, prepared=prepared).modes[0].frequency_hz,
+        frequency_hz=grows.modes[0].frequency_hz,
         kind="jump",
         proof="events coincide there",
     )
@@ -551,14 +567,22 @@ def _delay_crossing(
 ) -> Crossing | None:
     """Prove a crossing within a piece, whose systems are built anew for every value, as `proved_crossing`."""
 
+    assert piece.evaluator is not None, "nothing crosses where nothing depends on the delay"
+    wiring = piece.evaluator.wirings[root.system]
+
     @functools.cache
-    def systems(value: float) -> list[tuple[ClosedSystem, RigidModes]]:
-        moved = system_with_delay(system, free, Fraction(value))
-        listed = split(*lifted_groups(moved, prepared=prepared)).systems
-        return list(with_rigid(listed))
+    def here(value: float) -> tuple[tuple[PeerGroup, ...], Exchange]:
+        return lifted_groups(system_with_delay(system, free, Fraction(value)), prepared=prepared)
+
+    @functools.cache
+    def loop(value: float) -> tuple[Loop, RigidModes]:
+        one = arrange(*here(value)).loops[root.system]
+        if wiring.moving or one.names != wiring.system.names:  # as at the end of a piece
+            return one, find_rigid_modes(one, with_drifts=False)
+        return one, wiring.rigid
 
     return _bracketed(
-        *(root, found, (float(piece.low), float(piece.high)), systems),
-        lambda value: systems(value)[root.system][0],
-        lambda value: [one for one, _ in systems(value)],
+        *(root, found, (float(piece.low), float(piece.high)), loop),
+        lambda value: close_loop(loop(value)[0]),
+        lambda value: split(*here(value)).systems,
     )
