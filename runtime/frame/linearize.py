@@ -25,7 +25,7 @@ from apc.frame.parameters import exact_numbers
 from apc.frame.site import LinearSite, assemble, cut, matrices_of, with_own_parts
 from apc.frame.start import Listening, start_arguments
 
-# Exact sites that are kept.
+# Exact sites that are kept, and functions of many sites.
 KEPT = 64
 
 
@@ -160,7 +160,7 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
         return rows
     found = np.empty((count, len(places)))
     # Evaluated where the numbers stand: CasADi's own matrices are copied entry by entry.
-    buffer, evaluate = function.map(count).buffer()
+    buffer, evaluate = _of_many(function, count).buffer()
     given = [np.zeros(max(1, count * function.numel_in(place))) for place in range(function.n_in())]
     given[4] = np.array(parameters, dtype=np.float64, order="C").ravel()
     for place, numbers in enumerate(given):
@@ -169,6 +169,12 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
     evaluate()
     rows[:, places] = found + 0.0  # −0 and 0 are one number
     return rows
+
+
+@lru_cache(maxsize=KEPT)
+def _of_many(function: Any, count: int) -> Any:
+    """Return a CasADi function of so many arguments side by side: to make it takes longer than to call it."""
+    return function.map(count)
 
 
 def sites_of_rows(site: SiteJacobians, rows: NDArray[np.float64]) -> LinearSite:
