@@ -291,8 +291,7 @@ def close(
     z = [slice(offset, offset + one.p.shape[-1]) for one, offset in zip(maps, layout.offsets, strict=True)]
     sent = np.zeros((*many, starts[-1], columns), dtype=number)
     for one, heard, own, place in zip(maps, feedback, rows, z, strict=True):
-        sent[..., own, place] = one.s
-        sent[..., own, :] = numbers.add(sent[..., own, :], numbers.multiply(one.d, heard.before))
+        _put(sent[..., own, :], place, one.s, one.d, heard.before, numbers)
     at_once = any(heard.now.any() for heard in feedback)
     if at_once:
         within = np.zeros((*many, starts[-1], starts[-1]), dtype=number)
@@ -304,10 +303,15 @@ def close(
     for one, heard, place in zip(maps, feedback, z, strict=True):
         r = numbers.add(numbers.multiply(heard.now, sent), heard.before) if at_once else heard.before
         received.append(r)
-        matrix[..., place, place] = one.p
-        matrix[..., place, :] = numbers.add(matrix[..., place, :], numbers.multiply(one.q, r))
+        _put(matrix[..., place, :], place, one.p, one.q, r, numbers)
     shift_packets(matrix, layout, lambda packet: sent[..., starts[packet.site] + packet.row, :], numbers)
     return Closed(matrix, tuple(received), sent)
+
+
+def _put(rows: Matrix, z: slice, own: Matrix, of_heard: Matrix, heard: Matrix, numbers: Arithmetic) -> None:
+    """Write what a site makes of its own z, and of what it hears, into its rows over the state."""
+    rows[...] = numbers.multiply(of_heard, heard)
+    rows[..., z] = own if numbers.vanishes(heard[..., z]) else numbers.add(rows[..., z], own)
 
 
 def _sent_in_turn(within: Matrix, alone: Matrix, numbers: Arithmetic) -> Matrix:

@@ -41,9 +41,9 @@ Complexes = NDArray[np.complex128]
 Truths = NDArray[np.bool_]
 Matrix = NDArray[Any]
 
-# M is squared so many times: what is smaller than the largest by an eighth is then gone to rounding; where it
-# is not gone, so many times more, which leaves nothing of what is smaller by 0.1 %.
-SQUARINGS, MORE = 8, 8
+# M is squared so many times: what is smaller than the largest by 2 % is then gone to rounding; where it is
+# not gone, so many times more, which leaves nothing of what is smaller by 0.1 %.
+SQUARINGS, MORE = 11, 5
 
 # After so many squarings the largest entry is brought to 1: none has left the range of floats by then.
 EVERY = 3
@@ -72,12 +72,13 @@ class Dominant:
     """The largest eigenvalue of each of k matrices, of a conjugate pair the one above; NaN where it is open.
 
     `error` bounds |value − truth|: exactly one eigenvalue is that near. It and its conjugate are the only
-    ones of a magnitude of `others` or more.
+    ones of a magnitude of `others` or more, and where it is `alone`, of 1 or more.
     """
 
     value: Complexes  # (k,)
     error: Floats  # (k,)
     others: Floats  # (k,)
+    alone: Truths  # (k,)
 
 
 def largest_pairs(matrix: Floats) -> tuple[Complexes, Complexes, Complexes]:
@@ -195,51 +196,66 @@ def enclosed(matrix: Floats, error: Floats, value: Complexes, right: Complexes, 
 def _enclosed(matrix: Floats, error: Floats, value: Complexes, right: Complexes, left: Complexes) -> Dominant:
     n = matrix.shape[-1]
     charge = (n + 6) * UNIT  # of real matrices, and what is done to an entry besides
-    a, b = value.real[:, None, None], value.imag[:, None, None]
     paired = value.imag != 0
     size = np.abs(value) * (1 + 4 * UNIT)
-    x = np.stack([right.real, right.imag], axis=2)
-    w = np.stack([left.real, -left.imag], axis=1) * np.where(paired, 2.0, 1.0)[:, None, None]
-    x[~paired, :, 1], w[~paired, 1] = 0.0, 0.0
-    turned_x = a * x + b * x[:, :, ::-1] * [-1.0, 1.0]  # X Λ, Λ = [a b; −b a]
-    turned_w = a * w + b * w[:, ::-1] * [[1.0], [-1.0]]  # Λ W
-    moved, held = matrix @ x, w @ matrix
+    twice = np.where(paired, 2.0, 1.0)[:, None, None]
+    x, turned_x = (_columns(one, paired) for one in (right, value[:, None] * right))  # X, X Λ
+    w, turned_w = (_rows(one, paired) * twice for one in (left, value[:, None] * left))  # W, Λ W
+    off_x, off_w = matrix @ x - turned_x, w @ matrix - turned_w
 
-    # |R| and |S| for every matrix within the error; K − 1; and |R v| of the complex vector v.
-    size_x, size_w, size_m = np.abs(x), np.abs(w), charge * np.abs(matrix)
-    doubt = error + size_m
-    turned = charge * (np.abs(a) + np.abs(b))
-    off_x = np.abs(moved - turned_x) + doubt @ size_x + turned * (size_x + size_x[:, :, ::-1])
-    off_w = np.abs(held - turned_w) + size_w @ doubt + turned * (size_w + size_w[:, ::-1])
+    # ‖R‖ and ‖S‖ for every matrix within the error, and ‖K − 1‖.
     own = w @ x
     own[:, 0, 0] -= 1.0
     own[:, 1, 1] -= paired
-    wrong = _norms(np.abs(own) + charge * (size_w @ size_x))
-    sizes_v = np.abs(right)[:, :, None]
-    # What the error of M does to v is |E| |v|; the roundings of both its parts add up.
-    rounded = size_m @ size_x + turned * (size_x + size_x[:, :, ::-1])
-    off_v = (np.abs(moved - turned_x) + rounded).sum(axis=2) + (error @ sizes_v)[:, :, 0]
+    norm_x, norm_w, norm_m, norm_e = map(_norms, (x, w, matrix, error))
+    doubt = norm_e + charge * (norm_m + 3 * size)
+    rest_x, rest_w = _norms(off_x) + doubt * norm_x, _norms(off_w) + doubt * norm_w
+    wrong = _norms(own) + charge * norm_w * norm_x
+
+    # |R v| of the complex vector v. What the error of M does to v is |E| |v|; the roundings of both its parts
+    # add up.
+    parts = np.abs(x).sum(axis=2)
+    rounded = (np.abs(matrix) @ parts[:, :, None])[:, :, 0] + 3 * size[:, None] * parts
+    off_v = np.abs(off_x).sum(axis=2) + charge * rounded + (error @ np.abs(right)[:, :, None])[:, :, 0]
     first = (np.abs(left) * off_v).sum(axis=1) * (1 + charge)
 
-    norm_x, norm_w, rest_x, rest_w = map(_norms, (x, w, off_x, off_w))
     inverse = 1 / (1 - wrong)  # ‖K⁻¹‖
     apart = 1 + norm_x * inverse * norm_w  # ‖1 − Π‖
     remainder = matrix - turned_x @ w
-    large = _norms(matrix) + 2 * norm_x * size * norm_w
-    away = _norms(error) + charge * large + norm_x * size * inverse * wrong * norm_w
-    away += inverse * (norm_x * rest_w + rest_x * norm_w * apart)
+    large = norm_m + 2 * norm_x * size * norm_w
+    away = norm_e + charge * large + norm_x * size * inverse * wrong * norm_w
+    away += inverse * (norm_x * rest_w + rest_x * norm_w * apart) + 2 * UNIT * large
+    # Of what grows it is asked first whether nothing else does.
     others = size * (1 - APART)
-    within = resolvents(remainder / others[:, None, None])
-    slack = within * (away + 2 * UNIT * large) / others
-    second = inverse * apart**2 * rest_x * rest_w * 2 * within / others
+    beyond = np.minimum(others, 1.0)
+    within = resolvents(remainder / beyond[:, None, None])
+    more = np.flatnonzero(~(within * away < 0.5 * beyond) & (others > 1))
+    if len(more):
+        beyond[more] = others[more]
+        within[more] = resolvents(remainder[more] / others[more, None, None])
+    second = inverse * apart**2 * rest_x * rest_w * 2 * within / beyond
     radius = first + inverse * wrong * norm_w * rest_x + second
     mixed = radius  # |w R v̄| has the bound of |w R v|
     radius = radius + np.where(paired, 2 * mixed * mixed / np.abs(value.imag), 0.0)
     radius *= 1 + 64 * charge
-    known = (wrong < 0.1) & (slack < 0.5) & (radius < APART / 2 * size)
+    known = (wrong < 0.1) & (within * away < 0.5 * beyond) & (radius < APART / 2 * size)
     known &= ~paired | (mixed < np.abs(value.imag) / 4)
     nothing = np.where(known, 0.0, np.nan)
-    return Dominant(value + nothing, radius + nothing, others + nothing)
+    return Dominant(value + nothing, radius + nothing, others + nothing, known & (beyond <= 1))
+
+
+def _columns(vectors: Complexes, paired: Truths) -> Floats:
+    """Return the real and imaginary parts of vectors (k, n) as columns (k, n, 2), of real ones only those."""
+    found = np.ascontiguousarray(vectors).view(np.float64).reshape(*vectors.shape, 2).copy()
+    found[~paired, :, 1] = 0.0
+    return found
+
+
+def _rows(vectors: Complexes, paired: Truths) -> Floats:
+    """Return the real parts of vectors (k, n) and the imaginary ones with a minus, as rows (k, 2, n)."""
+    found = np.stack([vectors.real, -vectors.imag], axis=1)
+    found[~paired, 1] = 0.0
+    return found
 
 
 def all_within(matrix: Floats, error: Floats, radius: Floats) -> Truths:

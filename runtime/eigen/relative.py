@@ -48,11 +48,18 @@ class Relative:
 
 
 def relative(matrix: Matrix, at: Relative, numbers: Arithmetic = FLOATS) -> Matrix:
-    """Return M_rr − W M_pr of matrices (…, n, n) of some kind of number."""
-    within = matrix[..., at.rest[:, None], at.rest]
+    """Return M_rr − W M_pr of matrices (…, n, n) of some kind of number; M itself where nothing is held."""
     if not len(at.held):
-        return within
-    return numbers.subtract(within, numbers.multiply(at.weights, matrix[..., at.held[:, None], at.rest]))
+        return matrix
+    moving = matrix[..., _run(at.rest)]
+    held = numbers.multiply(at.weights, moving[..., _run(at.held), :])
+    return numbers.subtract(moving[..., _run(at.rest), :], held)
+
+
+def _run(places: Places) -> Places | slice:
+    """Return places as a slice where they follow one another: of these nothing is copied."""
+    first, count = int(places[0]) if len(places) else 0, len(places)
+    return slice(first, first + count) if (places == np.arange(first, first + count)).all() else places
 
 
 def relative_rows(matrix: Matrix, at: Relative, numbers: Arithmetic = FLOATS) -> Matrix:

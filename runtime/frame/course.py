@@ -173,7 +173,12 @@ def turns_of_many(
 
 
 def _some_of(places: Integers, matrix: Floats) -> Floats:
-    return matrix if len(matrix) == 1 else matrix[places]
+    """Return matrices (k, n, m) of some sites, each entry's numbers of all of them side by side."""
+    return (
+        matrix
+        if len(matrix) == 1
+        else np.ascontiguousarray(matrix[places].transpose(1, 2, 0)).transpose(2, 0, 1)
+    )
 
 
 def _courses(
@@ -184,30 +189,51 @@ def _courses(
     heard: Complexes,
     states: Integers,
 ) -> Complexes:
-    """Return the state followed of each site at so many points of each step, and the end (points, k)."""
+    """Return the state followed of each site at so many points of each step, and the end (points, k).
+
+    A row is of all sites, their real parts and then the imaginary ones: one product serves all sites of a
+    common matrix, and of others one of numbers side by side.
+    """
     n_x, n_u = site.b.shape[-2:]
     a, b = site.a, site.b
-    below = np.eye(n_x + n_u)[n_x:]
+    every, below = np.arange(len(states)), np.eye(n_x + n_u)[n_x:]
+    own, which = np.unique(states, return_inverse=True) if len(a) == len(b) == 1 else (states, every)
     steps, fine = {}, {}
     for duration, number in points.items():
         step = exponential_values(a, b, float(duration * schedule.quantum) / number)
         power = np.concatenate([step, np.broadcast_to(below, (len(step), *below.shape))], axis=1)
-        fine[duration], power = _followed(power, states, number)
+        fine[duration], power = _followed(power, own, number)
         steps[duration] = power[:, :n_x]
-    halves = [np.stack([one.real, one.imag], axis=-1) for one in (start, heard)]
     parts: list[NDArray[Any]] = []
 
-    def watch(duration: int, moving: NDArray[Any]) -> None:
-        parts.append(fine[duration] @ moving)
+    def rows_of(numbers: Complexes) -> Floats:
+        return np.concatenate([numbers.real.T, numbers.imag.T], axis=1)
 
-    course = follow(site, schedule, steps, halves[0], lambda row: halves[1][:, row], watch=watch)
+    def multiply(matrix: Floats, rows: Floats) -> Floats:
+        if len(matrix) == 1:
+            return np.asarray(matrix[0] @ rows)
+        halves = rows.reshape(len(rows), 2, -1)
+        return np.einsum("khn,nck->hck", matrix, halves).reshape(-1, rows.shape[-1])
+
+    def watch(duration: int, moving: NDArray[Any]) -> None:
+        rows = fine[duration]
+        if len(own) < len(every):
+            seen = (rows.reshape(-1, rows.shape[-1]) @ moving).reshape(*rows.shape[:2], 2, -1)
+            parts.append(seen[0] if len(own) == 1 else seen[which, :, :, every].transpose(1, 2, 0))
+        else:
+            parts.append(np.einsum("kpn,nck->pck", rows, moving.reshape(len(moving), 2, -1)))
+
+    listened = rows_of(heard)
+    course = follow(
+        site, schedule, steps, rows_of(start), lambda row: listened[row], multiply=multiply, watch=watch
+    )
     while True:
         try:
             next(course)
         except StopIteration as end:
-            last = np.take_along_axis(end.value, states[:, None, None], axis=1)
-            path = np.concatenate([*parts, last], axis=1)
-            return np.ascontiguousarray((path[..., 0] + 1j * path[..., 1]).T)
+            last = end.value.reshape(len(end.value), 2, -1)[states, :, every].T[None]
+            path = np.concatenate([*parts, last])
+            return np.asarray(path[:, 0] + 1j * path[:, 1])
 
 
 def _power_of_two(least: float, doubled: int) -> int:
@@ -310,15 +336,21 @@ def turned_along(course: Floats | Complexes) -> tuple[Floats, Floats]:
     0 has no angle.
     """
     size = np.abs(course)
-    moving = size > FADED * np.maximum.accumulate(size, axis=0)
-    # Where a course is 0, to rounding, it has the direction it came from, or leaves by.
-    place = np.maximum.accumulate(np.where(moving, np.arange(len(course))[:, None], -1), axis=0)
-    place = np.where(place < 0, np.argmax(moving, axis=0), place)
-    columns = np.arange(course.shape[1])
-    phases = course[place, columns] / size[place, columns]  # courses can grow or shrink out of floats' range
-    angles = np.angle(phases[1:] / phases[:-1])
+    phases = course / size  # courses can grow or shrink out of floats' range
+    spoilt = np.flatnonzero(~(size.min(axis=0) > FADED * size.max(axis=0)))
+    if len(spoilt):
+        phases[:, spoilt] = _directions(phases[:, spoilt], size[:, spoilt])
+    angles = np.angle(phases[1:] * phases[:-1].conj())
     angles = np.where(angles <= HALF_TURN_BACK, angles + 2 * np.pi, angles)
     return angles.sum(axis=0), np.abs(angles).max(axis=0, initial=0.0)
+
+
+def _directions(phases: NDArray[Any], size: Floats) -> NDArray[Any]:
+    """Return the directions of courses (points, k): where one is 0, to rounding, its last, or its first."""
+    moving = size > FADED * np.maximum.accumulate(size, axis=0)
+    place = np.maximum.accumulate(np.where(moving, np.arange(len(size))[:, None], -1), axis=0)
+    place = np.where(place < 0, np.argmax(moving, axis=0), place)
+    return np.take_along_axis(phases, place, axis=0)
 
 
 def _of_eigenvalue(turned: Floats, values: Complexes) -> Floats:

@@ -17,6 +17,7 @@ sent.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -347,7 +348,7 @@ def follow(
     steps
         [F G] (n_x, n_x + n_u) by duration in quanta.
     start
-        The state z (n_z, columns) at the start of the frame.
+        The state z (n_z, columns) at the start of the frame, of as many sites as rows are to be kept of.
     hear
         Gives the row (columns,) of an entry of r, or None while it isn't sent yet: it is asked again.
     numbers
@@ -364,19 +365,19 @@ def follow(
     -------
     z⁺ (n_z, columns).
     """
-    playing = _Playing.of(site, steps, start.dtype, numbers.multiply, watch)
+    playing = replace(_Playing.of(site, steps, start.dtype, numbers.multiply, watch), many=start.shape[:-2])
     at = playing.begin(schedule, start)
     again = schedule.repeats if watch is None else None
     if again is None:
         yield from playing.play(schedule.events, at, hear)
         return playing.end(schedule, at)
     yield from playing.play(schedule.events[: again.first], at, hear)
-    received = np.zeros((len(schedule.heard), start.shape[-1]), dtype=start.dtype)
+    received = np.zeros((*start.shape[:-2], len(schedule.heard), start.shape[-1]), dtype=start.dtype)
     body = schedule.events[again.first : again.first + again.length]
     for row in {row for event in body if isinstance(event, Tick) for own in event.heard for row in own}:
         while (packet := hear(row)) is None:
             yield -1, at.nothing
-        received[row] = packet
+        received[..., row, :] = packet
     _play_again(playing, schedule, again, at, numbers, received)
     yield from playing.play(schedule.events[again.end :], at, hear)
     return playing.end(schedule, at)
@@ -417,8 +418,8 @@ class _Playing:
         multiply: Callable[[Matrix, Matrix], Matrix],
         watch: Callable[[int, Matrix], None] | None = None,
     ) -> _Playing:
-        sends = [np.concatenate([send.x, send.u], axis=-1) for send in site.sends]
-        ticks = [np.concatenate([tick.x, tick.u, tick.m, tick.r], axis=-1) for tick in site.ticks]
+        sends = [_beside(send.x, send.u) for send in site.sends]
+        ticks = [_beside(tick.x, tick.u, tick.m, tick.r) for tick in site.ticks]
         parts = (site.a, *steps.values(), *sends, *ticks)
         many = np.broadcast_shapes(*(one.shape[:-2] for one in parts))
         return cls(
@@ -479,6 +480,11 @@ class _Playing:
                     computed = self.multiply(slopes, _over(moving, [*before, *received]))
                     for output in range(computed.shape[-2]):
                         value[Value(partition, output, index)] = computed[..., output, :]
+
+
+def _beside(*blocks: Matrix) -> Matrix:
+    """Return blocks side by side; one without columns would spoil the order in memory that they share."""
+    return np.concatenate([one for one in blocks if one.shape[-1]] or blocks[:1], axis=-1)
 
 
 def _over(block: Matrix, rows: Sequence[Matrix]) -> Matrix:

@@ -26,7 +26,7 @@ from apc.frame.parameters import exact_numbers
 from apc.frame.site import LinearSite, assemble, cut, matrices_of, with_own_parts
 from apc.frame.start import Listening, start_arguments
 
-# Exact sites that are kept.
+# Exact sites that are kept, and functions of many sites.
 KEPT = 64
 
 
@@ -162,6 +162,12 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
     return rows
 
 
+@lru_cache(maxsize=KEPT)
+def _of_many(function: Any, count: int) -> Any:
+    """Return a CasADi function of so many arguments side by side: to make it takes longer than to call it."""
+    return function.map(count)
+
+
 def of_rows(function: Any, given: Mapping[int, NDArray[np.float64]]) -> list[NDArray[np.float64]]:
     """Return a CasADi function's outputs at many rows of its arguments, each (k, entries that are stored).
 
@@ -177,7 +183,7 @@ def of_rows(function: Any, given: Mapping[int, NDArray[np.float64]]) -> list[NDA
     if not any(one.size for one in found):
         return found
     # Evaluated where the numbers stand: CasADi's own matrices are copied entry by entry.
-    buffer, evaluate = function.map(count).buffer()
+    buffer, evaluate = _of_many(function, count).buffer()
     numbers = [np.zeros(max(1, count * function.numel_in(place))) for place in range(function.n_in())]
     for place, rows in given.items():
         numbers[place] = np.array(rows, dtype=np.float64, order="C").ravel()

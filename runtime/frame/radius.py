@@ -87,14 +87,13 @@ def _multiply(left: Matrix, right: Matrix) -> Matrix:
     # Each radius is as much larger as adding it up may have rounded it down. Of many matrices writing and
     # fetching their numbers takes longer than computing them: nothing is written twice.
     size = np.abs(b)
-    weight = (1 + 2 * charge) * off_b
-    weight += charge * size
+    weight = charge * size
+    weight += off_b
     off = np.matmul(np.abs(a), weight, out=radius_of(found))
     if off_a.any():
         size += off_b
-        size *= 1 + 2 * charge
         off += off_a @ size
-    off *= 1 + 2 * charge
+    off *= 1 + 5 * charge
     return found
 
 

@@ -27,7 +27,7 @@ from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Closed, ClosedSystem, Loop, close, close_loop
 from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup
-from apc.eigen.relative import Relative, relative_bounded
+from apc.eigen.relative import Relative, relative, relative_bounded, with_doubt
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.batch_lift import lift_rows
 from apc.frame.discretize import UNIT, Step, exponential_rows, exponential_values
@@ -120,7 +120,9 @@ class Bounded:
     sites: tuple[Lift, ...]
 
     def at(self, places: NDArray[np.intp]) -> Bounded:
-        """Return some of the points."""
+        """Return some of the points, places in rising order."""
+        if len(places) == len(self.matrix):  # all of them
+            return self
 
         def some(matrix: Matrices) -> Matrices:
             return matrix if matrix.ndim == 2 or len(matrix) == 1 else matrix[places]
@@ -244,11 +246,13 @@ class BatchEvaluator:
         found = []
         for wiring in self.wirings:
             closed = _closed_bounded(wiring, maps)
-            whole, error = value_of(closed.matrix), radius_of(closed.matrix)
+            whole = value_of(closed.matrix)
             at, sound = relative_at(wiring, whole)
-            matrix, off = relative_bounded(whole, error, at)
-            sound = sound & np.isfinite(off).all(axis=(1, 2))
-            matrix = np.where(sound[:, None, None], matrix, np.nan)
+            within = relative(closed.matrix, with_doubt(at), RADII)
+            matrix, off = value_of(within), radius_of(within)
+            sound = sound & np.isfinite(off.sum(axis=(1, 2)))
+            if not sound.all():
+                matrix = np.where(sound[:, None, None], matrix, np.nan)
             sites = tuple(lifts[site_key(group)] for group in wiring.system.sites)
             found.append(Bounded(matrix, off, whole, tuple(map(value_of, closed.heard)), sites))
         return tuple(found)

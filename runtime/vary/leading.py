@@ -102,28 +102,28 @@ def _leading(
 ) -> Leading:
     value = np.full(count, np.nan, dtype=np.complex128)
     error, angle = np.full((2, count), np.nan)
-    leads, others = np.full(count, -1), np.zeros(count)
+    leads, others, alone = np.full(count, -1), np.zeros(count), np.zeros(count, dtype=np.bool_)
     vectors: list[tuple[Places, Complexes, Complexes]] = []
     blocks = []
     bounds = np.zeros((len(parts), count))  # how large a part may be that is not yet shown to be less
     for number, part in enumerate(parts):
         one = systems[part.system]
+        scaling = part.scale / part.scale[:, None]
         matrix, off = (
-            np.broadcast_to(
-                _block(whole, part.states) / part.scale[:, None] * part.scale, (count, *part.scale.shape * 2)
-            )
+            np.broadcast_to(_block(whole, part.states) * scaling, (count, *scaling.shape))
             for whole in (one.matrix, one.error)
         )
         blocks.append((matrix, off))
         open_still = ~all_within(matrix, off, others) if number else np.ones(count, dtype=np.bool_)
         larger = np.flatnonzero(open_still)
-        guess, right, left = largest_pairs(matrix[larger])
-        found = enclosed(matrix[larger], off[larger], guess, right, left)
+        tried, doubt = _of(matrix, larger), _of(off, larger)
+        guess, right, left = largest_pairs(tried)
+        found = enclosed(tried, doubt, guess, right, left)
         bounds[number, larger] = np.abs(found.value) + found.error
         wins = ~(np.abs(found.value) <= np.abs(value[larger])) & ~np.isnan(found.value)
         ahead = larger[wins]
         value[ahead], error[ahead], others[ahead] = found.value[wins], found.error[wins], found.others[wins]
-        leads[ahead] = number
+        leads[ahead], alone[ahead] = number, found.alone[wins]
         vectors.append((ahead, right[wins] * part.scale, left[wins] / part.scale))
     radius = np.abs(value)
     # A mode that is over in a frame is another matter.
@@ -133,7 +133,8 @@ def _leading(
     for number, (matrix, off) in enumerate(blocks):
         again = np.flatnonzero(certain & (leads != number) & ~(bounds[number] < others))
         certain[again] = all_within(matrix[again], off[again], others[again])
-        grown = np.flatnonzero(certain & unstable)  # an eigenvalue of 1 may be another rigid motion
+        # An eigenvalue of 1 may be another rigid motion.
+        grown = np.flatnonzero(certain & unstable & ~(alone & (leads == number)))
         certain[grown] = misses_one(matrix[grown], off[grown])
     frame_s = evaluator.wirings[0].system.frame_s
     for number, (part, (ahead, right, left)) in enumerate(zip(parts, vectors, strict=True)):
@@ -150,6 +151,11 @@ def _leading(
         damping_ratio=-rate.real / np.abs(rate),
         certain=certain & ~np.isnan(angle),
     )
+
+
+def _of(matrix: Floats, places: Places) -> Floats:
+    """Return some of matrices (k, …), places in rising order."""
+    return matrix if len(places) == len(matrix) else matrix[places]
 
 
 def _block(matrix: Floats, states: Places) -> Floats:

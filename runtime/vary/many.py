@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field, fields
 from fractions import Fraction
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,7 +40,7 @@ from apc.network.nominal import left_out, refuse_channel_number
 from apc.result import Result
 from apc.threads import single_threaded
 from apc.vary.batch import BatchEvaluator, batch_evaluator
-from apc.vary.evaluator import generic, reaches_count, reaches_time
+from apc.vary.evaluator import Asked, generic, reaches_count, reaches_time
 from apc.vary.leading import Part, leading, parts_of
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ class _Family:
     bounds: tuple[tuple[int, Parameter], ...]  # the parameters that a varied one sets, by its column
     patterns: tuple[Truths, ...]  # which entries of each system's matrix may be other than 0
     parts: tuple[Part, ...]
-    resolved: dict[tuple[int, ...], Numbers | None] = field(default_factory=dict)
+    resolved: dict[tuple[Override, ...], Numbers | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,10 +152,11 @@ class ManyAnalyses:
                 return None
             while len(self.families) >= KEPT:
                 self.families.pop(next(iter(self.families)))
-            given = [
+            given = tuple(
                 self.varied[column].override(place) for column, place in zip(self.times, timing, strict=True)
-            ]
-            self.families[timing] = _family(self.system, self.varied, self.times, given, self.prepared)
+            )
+            asked = Asked.of(self.system, [one.free for one in self.varied], self.prepared)
+            self.families[timing] = _family(asked, self.times, given)
         return self.families[timing]
 
     def _alone(self, places: Integers, row: int, found: Rows) -> None:
@@ -308,16 +309,12 @@ def many_analyses(system: CompiledSystem, varied: Sequence[Varied]) -> ManyAnaly
     return ManyAnalyses(system, tuple(varied), prepare(system), times)
 
 
-def _family(
-    system: CompiledSystem,
-    varied: Sequence[Varied],
-    times: Sequence[int],
-    given: Sequence[Override],
-    prepared: Prepared,
-) -> _Family | None:
+@lru_cache(maxsize=KEPT)
+def _family(of: Asked, times: tuple[int, ...], given: tuple[Override, ...]) -> _Family | None:
     """Prepare the matrices for some times; None where an analysis of the scene is no matter of these."""
-    columns = tuple(column for column in range(len(varied)) if column not in times)
-    free = tuple(varied[column].free for column in columns)
+    system, prepared = of.system, of.prepared
+    columns = tuple(column for column in range(len(of.free)) if column not in times)
+    free = tuple(of.free[column] for column in columns)
     try:
         with finite_equations(system.origin.topology), np.errstate(all="ignore"):
             timed_system = apply(system, given)
@@ -421,7 +418,7 @@ def _vectors(
     for column, parameter in family.bounds:
         allowed &= _keeps_bounds(parameter, numbers[column])
     different, which = np.unique(places[:, list(family.reaching)], axis=0, return_inverse=True)
-    settled = [_resolved(family, varied, tuple(one)) for one in different.tolist()]
+    settled = [_resolved(family, varied, one) for one in different.tolist()]
     allowed &= np.array([one is not None for one in settled])[which.ravel()]
     plain = sorted(
         set(family.columns) - set(family.reaching), key=lambda column: varied[column].free.group or ""
@@ -445,19 +442,19 @@ def _vectors(
     return allowed, vectors
 
 
-def _resolved(family: _Family, varied: Sequence[Varied], places: tuple[int, ...]) -> Numbers | None:
+def _resolved(family: _Family, varied: Sequence[Varied], places: Sequence[int]) -> Numbers | None:
     """Return the scene's numbers with what others follow from at these places; None if these may not be."""
-    if places not in family.resolved:
+    given = tuple(
+        varied[column].override(place) for column, place in zip(family.reaching, places, strict=True)
+    )
+    if given not in family.resolved:
         if len(family.resolved) >= MOST_RESOLVED:
             family.resolved.clear()
-        given = [
-            varied[column].override(place) for column, place in zip(family.reaching, places, strict=True)
-        ]
         try:
-            family.resolved[places] = resolve(apply(family.system, given))
+            family.resolved[given] = resolve(apply(family.system, given))
         except ApcError:
-            family.resolved[places] = None
-    return family.resolved[places]
+            family.resolved[given] = None
+    return family.resolved[given]
 
 
 def _keeps_bounds(parameter: Parameter, values: Floats) -> Truths:

@@ -106,8 +106,9 @@ def reduced(wiring: Wiring, matrix: Matrices, count: int) -> Matrices:
     """Take the rigid motions out; NaN where the directions are not rigid."""
     at, sound = relative_at(wiring, matrix)
     within = relative(matrix, at)
-    within[~(sound & np.isfinite(within).all(axis=(1, 2)))] = np.nan
-    return np.broadcast_to(within, (count, *within.shape[1:])).copy() if len(within) < count else within
+    sound = sound & np.isfinite(within).all(axis=(1, 2))
+    found = np.where(sound[:, None, None], within, np.nan)
+    return np.broadcast_to(found, (count, *found.shape[1:])).copy() if len(found) < count else found
 
 
 def relative_at(wiring: Wiring, matrix: Matrices) -> tuple[Relative, NDArray[np.bool_]]:
