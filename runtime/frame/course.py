@@ -14,6 +14,7 @@ vector are real, each change of sign is half a turn.
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from apc.frame.discretize import exponential, exponential_values
 from apc.frame.lift import follow
+from apc.frame.radius import FLOATS
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.site import LinearSite, every_matrix
 
@@ -213,7 +215,7 @@ def _courses(
         if len(matrix) == 1:
             return np.asarray(matrix[0] @ rows)
         halves = rows.reshape(len(rows), 2, -1)
-        return np.einsum("khn,nck->hck", matrix, halves).reshape(-1, rows.shape[-1])
+        return np.asarray(np.einsum("khn,nck->hck", matrix, halves).reshape(-1, rows.shape[-1]))
 
     def watch(duration: int, moving: NDArray[Any]) -> None:
         rows = fine[duration]
@@ -224,8 +226,9 @@ def _courses(
             parts.append(np.einsum("kpn,nck->pck", rows, moving.reshape(len(moving), 2, -1)))
 
     listened = rows_of(heard)
+    numbers = replace(FLOATS, multiply=multiply)
     course = follow(
-        site, schedule, steps, rows_of(start), lambda row: listened[row], multiply=multiply, watch=watch
+        site, schedule, steps, rows_of(start), lambda row: listened[row], numbers=numbers, watch=watch
     )
     while True:
         try:
