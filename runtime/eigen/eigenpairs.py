@@ -94,9 +94,12 @@ def left_vectors(matrix: Matrix, values: Complexes) -> Complexes:
     nearest = np.argmin(distances, axis=-1)
     claimed = (np.diff(np.sort(nearest, axis=-1), axis=-1) == 0).any(axis=-1)
     for one in map(tuple, np.argwhere(claimed).tolist()):  # each goes to one only, as they come
-        for place, line in enumerate(distances[one]):
-            nearest[one][place] = np.argmin(line)
-            distances[one][:, nearest[one][place]] = np.inf
+        own, apart = nearest[one], distances[one]
+        several = np.bincount(own, minlength=len(own))[own] > 1
+        apart[:, own[~several]] = np.inf
+        for place in np.flatnonzero(several).tolist():
+            own[place] = np.argmin(apart[place])
+            apart[:, own[place]] = np.inf
     rows = np.take_along_axis(vectors.swapaxes(-1, -2), nearest[..., None], axis=-2)
     return np.asarray(rows.astype(np.complex128))
 

@@ -26,7 +26,7 @@ from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize
-from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
+from apc.frame.radius import FLOATS, RADII, Arithmetic, common_shape, radius_of, value_of, with_radius
 from apc.frame.schedule import HELD, Act, Event, Propagate, Repeats, Schedule, Send, Tick, Value, shifted
 from apc.frame.site import LinearSite, every_matrix
 
@@ -389,7 +389,7 @@ class _Playing:
         sends = [np.concatenate([send.x, send.u], axis=-1) for send in site.sends]
         ticks = [np.concatenate([tick.x, tick.u, tick.m, tick.r], axis=-1) for tick in site.ticks]
         parts = (site.a, *steps.values(), *sends, *ticks)
-        many = np.broadcast_shapes(*(one.shape[:-2] for one in parts))
+        many = common_shape(*(one.shape[:-2] for one in parts))
         return cls(
             *(site.kind, sends, ticks, steps, site.b.shape[-1], many),
             *(np.result_type(number, *parts), multiply, watch),
@@ -412,7 +412,7 @@ class _Playing:
 
     def at_rest(self, x: Matrix) -> _Moment:
         """Return an instant at which nothing acts and nothing was computed, from states (n_x, columns)."""
-        many = np.broadcast_shapes(self.many, x.shape[:-2])
+        many = common_shape(self.many, x.shape[:-2])
         moving = np.zeros((*many, self.states + self.holds, x.shape[-1]), dtype=self.number)
         moving[..., : self.states, :] = x
         return _Moment(moving, {}, np.zeros((*x.shape[:-2], x.shape[-1]), dtype=x.dtype))
