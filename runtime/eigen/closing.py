@@ -208,7 +208,8 @@ def _wired(loop: Loop | ClosedSystem) -> tuple[StateLayout, Sequence[Feedback]]:
     the weights, both of which are known by identity and kept.
     """
     z_names = [group.lifted.z_names for group in loop.sites]
-    if loop.doubts or loop.states > FEW_STATES:
+    states = sum(map(len, z_names)) + sum(sum(group.schedule.depths) for group in loop.sites)
+    if loop.doubts or states > FEW_STATES:
         layout = lay_out_loop(loop)
         return layout, feedback_of(loop, layout)
     named = (
