@@ -321,7 +321,8 @@ def close(
     sent = np.zeros((*many, starts[-1], columns), dtype=number)
     for one, heard, own, place in zip(maps, feedback, rows, z, strict=True):
         sent[..., own, place] = one.s
-        sent[..., own, :] = numbers.add(sent[..., own, :], numbers.multiply(one.d, heard.before))
+        if not numbers.vanishes(one.d):
+            sent[..., own, :] = numbers.add(sent[..., own, :], numbers.multiply(one.d, heard.before))
     at_once = any(heard.now.any() for heard in feedback)
     if at_once:
         within = np.zeros((*many, starts[-1], starts[-1]), dtype=number)

@@ -17,6 +17,7 @@ that leaves the radius uncertain.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -39,6 +40,9 @@ Matrix = NDArray[Any]  # float64 or complex128
 # splits, this many; fewer of a matrix of more states, where each takes a second.
 WIDE = 1e-9
 SPLITS_TRIED, FEWER_SPLITS, MANY_STATES = 8, 2, 300
+
+# Graphs whose components are remembered, and of how many states.
+KEPT, FEW_STATES = 128, 64
 
 # Eigenvalues nearer to one another than this, relatively, are enclosed together: their own vectors are hardly
 # two.
@@ -105,7 +109,7 @@ def enclose_all(given: Sequence[tuple[Matrix, Floats, bool]]) -> list[tuple[Eige
     """
     cuts = [_cut(*one) for one in given]
     blocks = [
-        (cut.matrix[np.ix_(part, part)], cut.error[np.ix_(part, part)])
+        (cut.matrix[part[:, None], part], cut.error[part[:, None], part])
         for cut in cuts
         for part in cut.several
     ]
@@ -131,7 +135,7 @@ def _joined(cut: _Parts, found: Sequence[tuple[Eigenpairs, Enclosure]]) -> tuple
     low = max(0.0, float(((size - near[alone]) * (1 - 4 * UNIT)).max(initial=0.0)))
     high = float(((size + near[alone]) * (1 + 4 * UNIT)).max(initial=0.0))
     for part, (pairs, bounds) in zip(cut.several, found, strict=True):
-        block = np.ix_(part, part)
+        block = part[:, None], part
         values[part], right[block], left[block] = pairs.values, pairs.right, pairs.left
         near[part] = bounds.near
         low, high = float(np.maximum(low, bounds.low)), float(np.maximum(high, bounds.high))  # NaN stays
@@ -469,6 +473,21 @@ def components(driven: NDArray[np.bool_]) -> list[Places]:
     A state that drives nobody left, or that nobody left drives, is a part of its own: such go first, as
     queues are full of them. Of the others, what a state reaches and what reaches it are its part.
     """
+    n = len(driven)
+    if n > FEW_STATES:
+        return _components(driven)
+    return [np.array(part) for part in _known_components(n, driven.tobytes())]
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _known_components(n: int, driven: bytes) -> tuple[tuple[int, ...], ...]:
+    """Return the components of a small graph, row by row: whatever the numbers, it mostly stays."""
+    found = _components(np.frombuffer(driven, dtype=np.bool_).reshape(n, n))
+    return tuple(tuple(part.tolist()) for part in found)
+
+
+def _components(driven: NDArray[np.bool_]) -> list[Places]:
+    """Return `components`, found."""
     links = driven.copy()
     np.fill_diagonal(links, False)
     left = np.ones(len(links), dtype=np.bool_)

@@ -107,6 +107,10 @@ def _finite_slopes(
     ApcError
         E808 a value of the site, or a slope of one, that is not finite.
     """
+    if site.parameters_suffice:
+        flat = linearize_rows(site, np.asarray(parameters, dtype=np.float64)[None])[0]
+        _refuse_infinite(site, flat)
+        return flat
     x, u, m, r, p, t = start_arguments(site, [float(value) for value in parameters], float, listening)
     kind = site.kind
     if not site.affine:  # else the start is anywhere
@@ -120,6 +124,13 @@ def _finite_slopes(
         for form, rows, column in values:
             _check_finite([form.format(row) for row in rows], np.asarray(column).ravel(), "", kind.name)
     flat = np.asarray(site.function(x, u, m, r, p, t), dtype=np.float64).ravel()
+    _refuse_infinite(site, flat)
+    return flat
+
+
+def _refuse_infinite(site: SiteJacobians, flat: NDArray[np.float64]) -> None:
+    """Refuse a slope that is not finite, by name."""
+    kind = site.kind
     if not np.isfinite(flat).all():
         matrices = iter(cut(flat, site.shapes))
         rates = [f"der({state.name})" for state in kind.states]
@@ -131,7 +142,6 @@ def _finite_slopes(
         for names, count in blocks:
             for _ in range(count):
                 _check_finite(names, next(matrices).sum(axis=1), "the slope of ", kind.name)
-    return flat
 
 
 def _check_finite(rows: Sequence[str], values: NDArray[np.float64], what: str, where: str) -> None:
@@ -154,14 +164,14 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
     """
     assert site.parameters_suffice, "the start matters"
     count, function = len(parameters), site.function
-    rows = np.zeros((count, function.numel_out(0)))
-    places = function.sparsity_out(0).row()
-    if not (count and places):
+    sizes, width, places = _layout(function)
+    rows = np.zeros((count, width))
+    if not (count and len(places)):
         return rows
     found = np.empty((count, len(places)))
     # Evaluated where the numbers stand: CasADi's own matrices are copied entry by entry.
     buffer, evaluate = function.map(count).buffer()
-    given = [np.zeros(max(1, count * function.numel_in(place))) for place in range(function.n_in())]
+    given = [np.zeros(max(1, count * size)) for size in sizes]
     given[4] = np.array(parameters, dtype=np.float64, order="C").ravel()
     for place, numbers in enumerate(given):
         buffer.set_arg(place, numbers.data)
@@ -169,6 +179,13 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
     evaluate()
     rows[:, places] = found + 0.0  # −0 and 0 are one number
     return rows
+
+
+@lru_cache(maxsize=KEPT)
+def _layout(function: Any) -> tuple[tuple[int, ...], int, NDArray[np.int64]]:
+    """Return how long a function's arguments and its output are, and where that is not zero."""
+    sizes = tuple(function.numel_in(place) for place in range(function.n_in()))
+    return sizes, function.numel_out(0), np.array(function.sparsity_out(0).row(), dtype=np.int64)
 
 
 def sites_of_rows(site: SiteJacobians, rows: NDArray[np.float64]) -> LinearSite:
