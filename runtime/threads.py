@@ -34,7 +34,7 @@ def single_threaded() -> Iterator[None]:
         yield
         return
     with ExitStack() as limits:
-        limits.enter_context(_pools(len(sys.modules)).limit(limits=1))
+        _limit(limits)
         _entered.append(limits)
         try:
             yield
@@ -47,8 +47,17 @@ def load_pool(module: str) -> Any:
     new = module not in sys.modules
     found = importlib.import_module(module)
     if new and _entered:  # the outermost keeps the limit until all have left
-        _entered[0].enter_context(_pools(len(sys.modules)).limit(limits=1))
+        _limit(_entered[0])
     return found
+
+
+def _limit(limits: ExitStack) -> None:
+    """Give every pool one thread until the limits are left; the controller's own way takes far longer."""
+    for pool in _pools(len(sys.modules)).lib_controllers:
+        threads = pool.get_num_threads()
+        if threads != 1:
+            limits.callback(pool.set_num_threads, threads)
+            pool.set_num_threads(1)
 
 
 _entered: list[ExitStack] = []  # what `single_threaded` is in now, outermost first

@@ -84,13 +84,10 @@ def pairs_apart(matrix: Floats, error: Floats) -> tuple[Eigenpairs, list[Apart |
 
 def _in_order(pairs: Eigenpairs) -> Eigenpairs:
     """Return the pairs of each matrix in order, the largest first, of a conjugate pair the one above."""
-    values = pairs.values
+    values, one = pairs.values, np.arange(len(pairs.values))[:, None]
     order = np.lexsort((-values.imag, values.real, -np.abs(values)))
-    return Eigenpairs(
-        np.take_along_axis(values, order, axis=1),
-        np.take_along_axis(pairs.right, order[:, None], axis=2),
-        np.take_along_axis(pairs.left, order[:, :, None], axis=1),
-    )
+    right = pairs.right.swapaxes(1, 2)[one, order].swapaxes(1, 2)
+    return Eigenpairs(values[one, order], right, pairs.left[one, order])
 
 
 def _bounds(matrix: Floats, error: Floats, pairs: Eigenpairs) -> list[Apart | None]:

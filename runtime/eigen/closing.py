@@ -13,7 +13,8 @@ Does not: know where the weights come from (see `modes`, `graph_loops`); compute
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import functools
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import field, replace
 from fractions import Fraction
 from typing import Any
@@ -26,11 +27,14 @@ from apc.eigen.graph_modes import Surd
 from apc.eigen.peer_group import PeerGroup, states_of
 from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap
-from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of
+from apc.frame.radius import FLOATS, RADII, Arithmetic, common_shape, radius_of, value_of
 from apc.frame.schedule import Schedule, Way
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]  # float64 or complex128; of balls where it says so
+
+# Loops whose layout and weights are remembered, and of how many states.
+KEPT, FEW_STATES = 64, 200
 
 # What site g hears of site h on a way: the weight on h's packet.
 Coupling = Mapping[Way, tuple[tuple[Fraction, ...], ...]]
@@ -180,8 +184,8 @@ class ClosedSystem:
 def close_loop(loop: Loop | ClosedSystem) -> ClosedSystem:
     """Let K sites hear each other: r_g = Σ_h W_gh s_h, each packet as old as its receiver finds it."""
     lifted = [group.lifted for group in loop.sites]
-    layout = lay_out_loop(loop)
-    closed = close([site.bounded for site in lifted], feedback_of(loop, layout), layout, numbers=RADII)
+    layout, feedback = _wired(loop)
+    closed = close([site.bounded for site in lifted], feedback, layout, numbers=RADII)
     return ClosedSystem(
         name=loop.name,
         multiplicity=loop.multiplicity,
@@ -200,6 +204,36 @@ def close_loop(loop: Loop | ClosedSystem) -> ClosedSystem:
         doubts=loop.doubts,
         surds=loop.surds,
     )
+
+
+def _wired(loop: Loop | ClosedSystem) -> tuple[StateLayout, Sequence[Feedback]]:
+    """Return the layout of a loop's state and what each site hears of it: the same whatever its numbers.
+
+    That of few states is remembered, by all that it follows from: the names of the states, the schedules and
+    the weights, both of which are known by identity and kept.
+    """
+    z_names = [group.lifted.z_names for group in loop.sites]
+    states = sum(map(len, z_names)) + sum(sum(group.schedule.depths) for group in loop.sites)
+    if loop.doubts or states > FEW_STATES:
+        layout = lay_out_loop(loop)
+        return layout, feedback_of(loop, layout)
+    named = (
+        (group.name, names, id(group.schedule)) for group, names in zip(loop.sites, z_names, strict=True)
+    )
+    known = _known_wiring((id(loop.coupling), *named))
+    if not known:
+        layout = lay_out_loop(loop)
+        feedback = feedback_of(loop, layout)
+        for one in feedback:
+            one.now.flags.writeable = one.before.flags.writeable = False
+        known.append((layout, feedback, (loop.coupling, [group.schedule for group in loop.sites])))
+    return known[0][:2]
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _known_wiring(key: tuple[Hashable, ...]) -> list[tuple[StateLayout, Sequence[Feedback], Any]]:
+    """Return a place for a loop's layout and feedback, and for what the key knows by identity."""
+    return []
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,14 +318,17 @@ def close(
     """
     n, columns = len(layout.names), feedback[0].before.shape[-1]
     parts = [block for one in maps for block in one.blocks] + [one.before for one in feedback]
-    many = np.broadcast_shapes(*(block.shape[:-2] for block in parts))
+    many = common_shape(*(block.shape[:-2] for block in parts))
     number = np.result_type(*parts)
     starts = np.cumsum([0] + [one.s.shape[-2] for one in maps])
     rows = [slice(start, start + one.s.shape[-2]) for one, start in zip(maps, starts, strict=False)]
     z = [slice(offset, offset + one.p.shape[-1]) for one, offset in zip(maps, layout.offsets, strict=True)]
     sent = np.zeros((*many, starts[-1], columns), dtype=number)
     for one, heard, own, place in zip(maps, feedback, rows, z, strict=True):
-        _put(sent[..., own, :], place, one.s, one.d, heard.before, numbers)
+        if numbers.vanishes(one.d):
+            sent[..., own, place] = one.s
+        else:
+            _put(sent[..., own, :], place, one.s, one.d, heard.before, numbers)
     at_once = any(heard.now.any() for heard in feedback)
     if at_once:
         within = np.zeros((*many, starts[-1], starts[-1]), dtype=number)

@@ -38,8 +38,9 @@ SMALL = 0.05
 # A matrix of more states than this is worth the loading of SciPy.
 LARGE = 100
 
-# Graphs of matrices whose parts are kept: a search asks for the same again and again.
-KEPT = 64
+# Graphs of matrices whose parts are kept, and states of the largest one: a search asks for the same again and
+# again.
+KEPT, FEW_STATES = 128, 64
 
 # How far from the predicted eigenvalue inverse iteration is shifted, so that the matrix it inverts stays
 # regular. Each step leaves a share of about SHIFT/gap of the other vectors.
@@ -100,9 +101,12 @@ def left_vectors(matrix: Matrix, values: Complexes) -> Complexes:
     nearest = np.argmin(distances, axis=-1)
     claimed = (np.diff(np.sort(nearest, axis=-1), axis=-1) == 0).any(axis=-1)
     for one in map(tuple, np.argwhere(claimed).tolist()):  # each goes to one only, as they come
-        for place, line in enumerate(distances[one]):
-            nearest[one][place] = np.argmin(line)
-            distances[one][:, nearest[one][place]] = np.inf
+        own, apart = nearest[one], distances[one]
+        several = np.bincount(own, minlength=len(own))[own] > 1
+        apart[:, own[~several]] = np.inf
+        for place in np.flatnonzero(several).tolist():
+            own[place] = np.argmin(apart[place])
+            apart[:, own[place]] = np.inf
     rows = np.take_along_axis(vectors.swapaxes(-1, -2), nearest[..., None], axis=-2)
     return np.asarray(rows.astype(np.complex128))
 
@@ -186,6 +190,21 @@ def components(driven: NDArray[np.bool_]) -> list[Places]:
     A state that drives nobody left, or that nobody left drives, is a part of its own: such go first, as
     queues are full of them. Of the others, what a state reaches and what reaches it are its part.
     """
+    n = len(driven)
+    if n > FEW_STATES:
+        return _components(driven)
+    return [np.array(part) for part in _known_components(n, driven.tobytes())]
+
+
+@lru_cache(maxsize=KEPT)
+def _known_components(n: int, driven: bytes) -> tuple[tuple[int, ...], ...]:
+    """Return the components of a small graph, row by row: whatever the numbers, it mostly stays."""
+    found = _components(np.frombuffer(driven, dtype=np.bool_).reshape(n, n))
+    return tuple(tuple(part.tolist()) for part in found)
+
+
+def _components(driven: NDArray[np.bool_]) -> list[Places]:
+    """Return `components`, found."""
     links = driven.copy()
     np.fill_diagonal(links, False)
     left = np.ones(len(links), dtype=np.bool_)

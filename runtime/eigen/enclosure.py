@@ -105,7 +105,7 @@ def enclose_all(given: Sequence[tuple[Matrix, Floats, bool]]) -> list[tuple[Eige
     """
     cuts = [_cut(*one) for one in given]
     blocks = [
-        (cut.matrix[np.ix_(part, part)], cut.error[np.ix_(part, part)])
+        (cut.matrix[part[:, None], part], cut.error[part[:, None], part])
         for cut in cuts
         for part in cut.several
     ]
@@ -131,7 +131,7 @@ def _joined(cut: _Parts, found: Sequence[tuple[Eigenpairs, Enclosure]]) -> tuple
     low = max(0.0, float(((size - near[alone]) * (1 - 4 * UNIT)).max(initial=0.0)))
     high = float(((size + near[alone]) * (1 + 4 * UNIT)).max(initial=0.0))
     for part, (pairs, bounds) in zip(cut.several, found, strict=True):
-        block = np.ix_(part, part)
+        block = part[:, None], part
         values[part], right[block], left[block] = pairs.values, pairs.right, pairs.left
         near[part] = bounds.near
         low, high = float(np.maximum(low, bounds.low)), float(np.maximum(high, bounds.high))  # NaN stays

@@ -25,9 +25,11 @@ and all else at rest, each of them hearing w_own âˆ’ w_other times itself, n_c â
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import functools
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
@@ -39,6 +41,9 @@ from apc.eigen.graph_modes import graph_modes
 from apc.eigen.peer_group import MOST_STATES, PeerGroup, group_name, states_of, too_large, used_ways
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.schedule import Way
+
+# Structures whose loops are remembered.
+KEPT = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,12 +150,43 @@ def complete_loops(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loo
     exchange
         The links, all of them complete.
     """
+    key = (id(exchange), *(_structure(group) for group in groups))
+    known = _known_loops(key)
+    if not known:
+        held = exchange, [(group.schedule, group.jacobians.kind) for group in groups]
+        known.append((_complete_wiring(groups, exchange), held))
+    return tuple(
+        Loop(name, many, tuple(groups[place] for place in places), coupling)
+        for name, many, places, coupling in known[0][0]
+    )
+
+
+# Loops but for their sites' numbers: name, multiplicity, which of the groups are sites, weights.
+_Wiring = tuple[tuple[str, int, tuple[int, ...], Coupling], ...]
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _known_loops(key: tuple[Hashable, ...]) -> list[tuple[_Wiring, Any]]:
+    """Return a place for the loops of groups of this structure, and for what the key knows by identity."""
+    return []
+
+
+def _structure(group: PeerGroup) -> tuple[Hashable, ...]:
+    """Return all of a group that its loops' weights follow from; its schedule and its kind by identity."""
+    gains = tuple(group.gains.items())
+    known = id(group.schedule), id(group.jacobians.kind)
+    return group.name, group.count, group.role, group.place, int(group.peers[0]), gains, *known
+
+
+def _complete_wiring(groups: Sequence[PeerGroup], exchange: Exchange) -> _Wiring:
+    """Return the loops of `complete_loops`, but for their sites."""
     peers = sum(group.count for group in groups)
     degrees = complete_degrees(groups, exchange)
     weights = couple(
         groups, exchange, lambda way, g, h: Fraction(groups[h].count - (1 if g == h else 0)), degrees
     )
-    loops = [Loop("single" if peers == 1 else "common", 1, tuple(groups), weights)]
+    everyone = tuple(range(len(groups)))
+    loops = [("single" if peers == 1 else "common", 1, everyone, weights)]
     if all(group.count < 2 for group in groups):
         return tuple(loops)
     apart = couple(groups, exchange, lambda way, g, h: Fraction(-1 if g == h else 0), degrees)
@@ -159,7 +195,7 @@ def complete_loops(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loo
             continue
         own = {key: ((rows[place][place],),) for key, rows in apart.items()}
         name = "difference" if len(groups) == 1 else f"difference {group.name}"
-        loops.append(Loop(name, group.count - 1, (group,), own))
+        loops.append((name, group.count - 1, (place,), own))
     return tuple(loops)
 
 

@@ -107,6 +107,8 @@ def pseudospectral_radius(matrix: Matrix, error: float) -> float:
         return 0.0
     if n == 1:
         return float((abs(matrix[0, 0]) + error) * (1 + 4 * UNIT))
+    if n == 2:
+        return _radius_of_two(matrix, error)
     largest = float(norms(matrix)) * (1 + UNIT) + error  # no eigenvalue is larger than the norm
     if not 0 < largest < np.inf:
         return largest
@@ -122,7 +124,23 @@ def pseudospectral_radius(matrix: Matrix, error: float) -> float:
     # Bounds far apart first, then those between the least that serves and the next, which does not.
     coarse = nearest + steps[::STRIDE]
     place = STRIDE * int((coarse > least(coarse)).sum())
-    return min(least(nearest + steps[place : place + STRIDE]), least(np.array([1.0])), largest)
+    return min(least(np.append(nearest + steps[place : place + STRIDE], 1.0)), largest)
+
+
+def _radius_of_two(matrix: Matrix, error: float) -> float:
+    """Return the same of two states, in closed form.
+
+    Notes
+    -----
+    For |z| = r, ‖(z − M)⁻¹‖ ≤ ‖z − M‖ / |det(z − M)| ≤ (√2 r + ‖M‖) / (r² − |tr M| r − |det M|), with norms
+    of Frobenius: less than 1/ε beyond the positive root of r² − (|tr M| + √2 ε) r − (|det M| + ε ‖M‖).
+    """
+    (a, b), (c, d) = matrix.tolist()
+    trace, size = abs(a + d), math.hypot(*map(abs, (a, b, c, d)))
+    # What rounds by less than the smallest float is charged as well.
+    determinant = abs(a * d - b * c) + 8 * UNIT * (abs(a * d) + abs(b * c)) + float(np.finfo(np.float64).tiny)
+    linear = trace + 4 * UNIT * (abs(a) + abs(d)) + math.sqrt(2) * error
+    return (linear + math.sqrt(linear * linear + 4 * (determinant + error * size))) / 2 * (1 + 16 * UNIT)
 
 
 def _outside(

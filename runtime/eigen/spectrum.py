@@ -354,12 +354,13 @@ def whole_vectors(
     """
     matrix = system.matrix
     held, rest, weights, count = at.held, at.rest, at.weights, len(at.held)
-    # Back to the whole state: x_p follows from (λ − M_pp − M_pr W) x_p = M_pr y.
-    corner = matrix[np.ix_(held, held)] + matrix[np.ix_(held, rest)] @ weights
     vectors, covectors = np.zeros((2, len(system.names), len(pairs.values)), dtype=np.complex128)
     vectors[rest], covectors[rest] = pairs.right, pairs.left.T
     if count:
-        driven = matrix[np.ix_(held, rest)] @ pairs.right
+        # Back to the whole state: x_p follows from (λ − M_pp − M_pr W) x_p = M_pr y.
+        across = matrix[held[:, None], rest]
+        corner = matrix[held[:, None], held] + across @ weights
+        driven = across @ pairs.right
         shifted = (pairs.values * (1 + aside))[:, None, None] * np.eye(count) - corner
         vectors[held] = np.einsum("kij,jk->ik", np.linalg.pinv(shifted, rcond=count * 2 * UNIT), driven)
         vectors[rest] += weights @ vectors[held]

@@ -87,19 +87,21 @@ def turns(
         The eigenvalues (k,).
     """
     found = np.full(len(values), np.nan)
-    swing = float(np.abs(np.linalg.eigvals(site.a).imag).max(initial=0.0)) / (2 * np.pi)
+    swing = _swing(site.a.tobytes(), len(site.a)) if site.a.size <= FEW_ENTRIES else _fastest(site.a)
     mirrored = _mirrored(start, heard, states, values)
     real = (values.imag == 0) & ~start.imag.any(axis=0) & ~heard.imag.any(axis=0)
     left = np.flatnonzero(~mirrored)
     durations = [event.duration for event in schedule.events if isinstance(event, Propagate)]
     for doubled in range(1, DOUBLINGS + 1):
+        if not len(left):
+            break
         points = {
             duration: _power_of_two(A_TURN * swing * float(duration * schedule.quantum), doubled)
             for duration in set(durations)
         }
         most = sum(points[duration] for duration in durations)
         height = max(sum(site.b.shape), 1)
-        if not most * height <= MOST or not len(left):
+        if not most * height <= MOST:
             break
         # Rows of powers are held for every mode, of each length of step one; the course for every point.
         chunk = MOST // max(sum(points.values()) * height, most)
@@ -121,6 +123,17 @@ def turns(
         left = left[~seen[left]]
     found[mirrored] = -found[np.flatnonzero(mirrored) - 1]
     return found
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _swing(entries: bytes, n_x: int) -> float:
+    """Return `_fastest` of few entries, row by row; what only couplers change is remembered."""
+    return _fastest(np.frombuffer(entries).reshape(n_x, n_x))
+
+
+def _fastest(a: Floats) -> float:
+    """Return how often a second what swings fastest between events does so, of one site or of many."""
+    return float(np.abs(np.linalg.eigvals(a).imag).max(initial=0.0)) / (2 * np.pi)
 
 
 def _mirrored(start: Complexes, heard: Complexes, states: Integers, values: Complexes) -> NDArray[np.bool_]:
@@ -153,7 +166,7 @@ def turns_of_many(
         Which continuous state is followed (k,), and the eigenvalues (k,).
     """
     found = np.full(len(values), np.nan)
-    swing = float(np.abs(np.linalg.eigvals(site.a).imag).max(initial=0.0)) / (2 * np.pi)
+    swing = _fastest(site.a)
     durations = {event.duration for event in schedule.events if isinstance(event, Propagate)}
     left = np.arange(len(values))
     for doubled in (0, 1):

@@ -8,6 +8,7 @@ Does not: know what is sent, or when (see `scheduling`), or a graph's eigenvalue
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 
@@ -20,6 +21,9 @@ from apc.compiler.frozen import dataclass
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+
+# Exchanges that are remembered.
+KEPT = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,21 +90,33 @@ def build_exchange(system: CompiledSystem, timings: Mapping[str, Fraction]) -> E
     timings
         Seconds by the name of the timing.
     """
-    names = tuple(group.name for group in system.groups)
+    groups = tuple((group.name, group.count) for group in system.groups)
+    return _exchange(system.origin.topology, groups, system.links, tuple(timings.items()))
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _exchange(
+    scene: str,
+    groups: tuple[tuple[str, int], ...],
+    links: tuple[Link, ...],
+    times: tuple[tuple[str, Fraction], ...],
+) -> Exchange:
+    """Return what `build_exchange` does: of scenes that differ in other numbers only, the same object."""
+    names, timings = tuple(name for name, _ in groups), dict(times)
     place = {name: index for index, name in enumerate(names)}
     late = {}
-    for link in system.links:
+    for link in links:
         of_value = {timings[link.delay]: link.delay}
         for pair in link.delays:
             timing = of_value.setdefault(timings[pair.delay], pair.delay)
             if timing != link.delay:
                 late[link.name, place[pair.sender], place[pair.receiver]] = timing
     return Exchange(
-        scene=system.origin.topology,
+        scene=scene,
         groups=names,
-        starts=np.cumsum([0] + [group.count for group in system.groups], dtype=np.int64),
-        links={link.name: link for link in system.links},
-        usual={link.name: link.delay for link in system.links},
+        starts=np.cumsum([0] + [count for _, count in groups], dtype=np.int64),
+        links={link.name: link for link in links},
+        usual={link.name: link.delay for link in links},
         late=late,
     )
 

@@ -27,9 +27,9 @@ from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize
-from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
+from apc.frame.radius import FLOATS, RADII, Arithmetic, common_shape, radius_of, value_of, with_radius
 from apc.frame.schedule import HELD, Act, Event, Propagate, Repeats, Schedule, Send, Tick, Value, shifted
-from apc.frame.site import LinearSite, every_matrix
+from apc.frame.site import LinearSite, assemble, matrices_of
 
 Matrix = NDArray[Any]
 
@@ -181,8 +181,16 @@ def composed_bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, S
 
 def with_roundings(site: LinearSite) -> LinearSite:
     """Return a site's matrices with their radii, those of what CasADi rounds."""
-    charge = COEFFICIENT_ROUNDINGS * UNIT
-    return every_matrix(site, lambda matrix: with_radius(matrix, charge * np.abs(matrix)))
+    matrices = matrices_of(site)
+    many = common_shape(*(matrix.shape[:-2] for matrix in matrices))
+    flat = np.concatenate([matrix.reshape(*many, -1) for matrix in matrices], axis=-1)
+    both = np.stack([flat, COEFFICIENT_ROUNDINGS * UNIT * np.abs(flat)], axis=-2)
+    bounded, start = [], 0
+    for matrix in matrices:
+        end = start + matrix.shape[-2] * matrix.shape[-1]
+        bounded.append(both[..., start:end].reshape(*many, 2, *matrix.shape[-2:]))
+        start = end
+    return assemble(site.kind, site.affine, bounded, [tick.channels for tick in site.ticks])
 
 
 def roundings_of(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> float:
@@ -421,7 +429,7 @@ class _Playing:
         sends = [_beside(send.x, send.u) for send in site.sends]
         ticks = [_beside(tick.x, tick.u, tick.m, tick.r) for tick in site.ticks]
         parts = (site.a, *steps.values(), *sends, *ticks)
-        many = np.broadcast_shapes(*(one.shape[:-2] for one in parts))
+        many = common_shape(*(one.shape[:-2] for one in parts))
         return cls(
             *(site.kind, sends, ticks, steps, site.b.shape[-1], many),
             *(np.result_type(number, *parts), multiply, watch),
@@ -444,7 +452,7 @@ class _Playing:
 
     def at_rest(self, x: Matrix) -> _Moment:
         """Return an instant at which nothing acts and nothing was computed, from states (n_x, columns)."""
-        many = np.broadcast_shapes(self.many, x.shape[:-2])
+        many = common_shape(self.many, x.shape[:-2])
         moving = np.zeros((*many, self.states + self.holds, x.shape[-1]), dtype=self.number)
         moving[..., : self.states, :] = x
         return _Moment(moving, {}, np.zeros((*x.shape[:-2], x.shape[-1]), dtype=x.dtype))

@@ -108,6 +108,10 @@ def _finite_slopes(
     ApcError
         E808 a value of the site, or a slope of one, that is not finite.
     """
+    if site.parameters_suffice:
+        flat = linearize_rows(site, np.asarray(parameters, dtype=np.float64)[None])[0]
+        _refuse_infinite(site, flat)
+        return flat
     x, u, m, r, p, t = start_arguments(site, [float(value) for value in parameters], float, listening)
     kind = site.kind
     if not site.affine:  # else the start is anywhere
@@ -121,6 +125,13 @@ def _finite_slopes(
         for form, rows, column in values:
             _check_finite([form.format(row) for row in rows], np.asarray(column).ravel(), "", kind.name)
     flat = np.asarray(site.function(x, u, m, r, p, t), dtype=np.float64).ravel()
+    _refuse_infinite(site, flat)
+    return flat
+
+
+def _refuse_infinite(site: SiteJacobians, flat: NDArray[np.float64]) -> None:
+    """Refuse a slope that is not finite, by name."""
+    kind = site.kind
     if not np.isfinite(flat).all():
         matrices = iter(cut(flat, site.shapes))
         rates = [f"der({state.name})" for state in kind.states]
@@ -132,7 +143,6 @@ def _finite_slopes(
         for names, count in blocks:
             for _ in range(count):
                 _check_finite(names, next(matrices).sum(axis=1), "the slope of ", kind.name)
-    return flat
 
 
 def _check_finite(rows: Sequence[str], values: NDArray[np.float64], what: str, where: str) -> None:
@@ -155,8 +165,8 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
     """
     assert site.parameters_suffice, "the start matters"
     count, function = len(parameters), site.function
-    rows = np.zeros((count, function.numel_out(0)))
-    places = function.sparsity_out(0).row()
+    width, places = _output(function)
+    rows = np.zeros((count, width))
     (found,) = of_rows(function, {4: parameters})
     rows[:, places] = found + 0.0  # −0 and 0 are one number
     return rows
@@ -166,6 +176,19 @@ def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDAr
 def _of_many(function: Any, count: int) -> Any:
     """Return a CasADi function of so many arguments side by side: to make it takes longer than to call it."""
     return function.map(count)
+
+
+@lru_cache(maxsize=KEPT)
+def _layout(function: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return how long a function's arguments are, and how many entries of its outputs are stored."""
+    sizes = tuple(function.numel_in(place) for place in range(function.n_in()))
+    return sizes, tuple(function.nnz_out(place) for place in range(function.n_out()))
+
+
+@lru_cache(maxsize=KEPT)
+def _output(function: Any) -> tuple[int, NDArray[np.int64]]:
+    """Return how long a function's first output is, and where it is not zero."""
+    return function.numel_out(0), np.array(function.sparsity_out(0).row(), dtype=np.int64)
 
 
 def of_rows(function: Any, given: Mapping[int, NDArray[np.float64]]) -> list[NDArray[np.float64]]:
@@ -179,12 +202,13 @@ def of_rows(function: Any, given: Mapping[int, NDArray[np.float64]]) -> list[NDA
         Arguments (k, size) by their places; the others are zero.
     """
     count = len(next(iter(given.values())))
-    found = [np.empty((count, function.nnz_out(place))) for place in range(function.n_out())]
+    sizes, stored = _layout(function)
+    found = [np.empty((count, one)) for one in stored]
     if not any(one.size for one in found):
         return found
     # Evaluated where the numbers stand: CasADi's own matrices are copied entry by entry.
     buffer, evaluate = _of_many(function, count).buffer()
-    numbers = [np.zeros(max(1, count * function.numel_in(place))) for place in range(function.n_in())]
+    numbers = [np.zeros(max(1, count * size)) for size in sizes]
     for place, rows in given.items():
         numbers[place] = np.array(rows, dtype=np.float64, order="C").ravel()
     for place, one in enumerate(numbers):

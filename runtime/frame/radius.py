@@ -1,7 +1,8 @@
 """What the kernel computes with: floats, or floats that carry their radius.
 
 Takes: matrices of real floats, and bounds on what their entries are off by.
-Gives: `Arithmetic`, `FLOATS`, `RADII`; `with_radius`, `rounded`, `value_of`, `radius_of`; `solve`.
+Gives: `Arithmetic`, `FLOATS`, `RADII`; `with_radius`, `rounded`, `value_of`, `radius_of`; `solve`;
+`common_shape`.
 Guarantees: a sum or product in `RADII` holds that of all matrices within the radii of its operands, its own
 rounding and that of the radius included.
 Does not: carry rational numbers or balls of many digits (see `balls`); charge what underflows, less
@@ -51,9 +52,14 @@ class Arithmetic:
     vanishes: Callable[[Matrix], bool] = lambda matrix: not matrix.any()
 
 
+def common_shape(*shapes: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the shape of arrays of these shapes together, mostly that of all of them."""
+    return shapes[0] if shapes.count(shapes[0]) == len(shapes) else np.broadcast_shapes(*shapes)
+
+
 def with_radius(value: Matrix, radius: Matrix) -> Matrix:
     """Return matrices (…, n, m) with their radii (…, 2, n, m)."""
-    shape = np.broadcast_shapes(value.shape, radius.shape)
+    shape = common_shape(value.shape, radius.shape)
     found = np.empty((*shape[:-2], 2, *shape[-2:]), dtype=value.dtype)
     found[..., 0, :, :], found[..., 1, :, :] = value, radius
     return found
@@ -81,7 +87,7 @@ def _multiply(left: Matrix, right: Matrix) -> Matrix:
     if terms > FEW:  # a term is none where its factor is exactly 0
         terms = int(np.count_nonzero(left.any(axis=-3), axis=-1).max(initial=0))
     charge = (terms + 2) * UNIT / (1 - (terms + 2) * UNIT)
-    many = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    many = common_shape(a.shape[:-2], b.shape[:-2])
     found = np.empty((*many, 2, a.shape[-2], b.shape[-1]), dtype=np.float64)
     np.matmul(a, b, out=value_of(found))
     # Each radius is as much larger as adding it up may have rounded it down. Of many matrices writing and
