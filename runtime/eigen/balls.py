@@ -107,9 +107,7 @@ def frame_balls(system: ClosedSystem | Loop) -> Balls:
     return closed_frame(system, sites, steps)
 
 
-def closed_frame(
-    system: ClosedSystem | Loop, sites: Sequence[LinearSite], steps: Sequence[Steps]
-) -> Balls:
+def closed_frame(system: ClosedSystem | Loop, sites: Sequence[LinearSite], steps: Sequence[Steps]) -> Balls:
     """Follow all sites of a closed system through one frame, over its state.
 
     Parameters

@@ -137,7 +137,7 @@ def _by_vectors(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
     """Return the eigenvalues (…, n) of matrices (…, n, n) and their derivatives, see `eigenvalues`."""
     if matrix.shape[-1] == 1:
         values, derivative = matrix[..., 0].astype(np.complex128), slope[..., 0]
-        return values, np.where(np.abs(values) < SMALL, 0.0, derivative)
+        return values, np.where((np.abs(values) < SMALL) | ~np.isfinite(derivative), 0.0, derivative)
     values, right = np.linalg.eig(matrix)
     small = np.abs(values) < SMALL
     try:
