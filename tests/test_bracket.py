@@ -38,8 +38,9 @@ def test_a_delays_crossing_is_held_in_floats_as_well(monkeypatch: pytest.MonkeyP
 
 
 def test_a_defective_cluster_is_held_where_its_eigenvalue_alone_crosses() -> None:
-    """Four equal peers in a chain have one eigenvector, and floats would scatter their eigenvalue by a part
-    in 10⁴: each peer is a part of its own, whose eigenvalue is its own, too.
+    """Four equal peers in a chain have one eigenvector; floats scatter their eigenvalue by a part in 10⁴.
+
+    Each of them is a part of its own, which has it once.
     """
     text = (ROOT / "tests" / "hard" / "defective.yaml").read_text(encoding="utf-8")
     chain = critical(compiled(text), PATH).crossings[0]

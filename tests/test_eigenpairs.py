@@ -63,3 +63,22 @@ def test_slopes_of_eigenvalues_survive_a_defective_cluster() -> None:
     assert values[0, upper] == pytest.approx(0.6 + 0.8j)
     assert rates[0, upper] == pytest.approx(1.0)
     assert np.isfinite(rates).all()
+
+
+def test_states_that_drive_each_other_have_eigenvalues_of_their_own() -> None:
+    """Two equal parts one behind the other, a queue that runs empty, and a state alone that has no rate."""
+    matrix, slope = np.zeros((2, 12, 12)), np.zeros((2, 12, 12))
+    for part in (slice(0, 4), slice(4, 8)):
+        matrix[:, part, part], slope[:, part, part] = (
+            MATRIX,
+            BASIS @ np.diag([3.0, 2, 1, 1]) @ np.linalg.inv(BASIS),
+        )
+    matrix[:, 4:8, :4] = 100.0  # makes one Jordan block of each pair of equal ones
+    matrix[:, [8, 9, 10], [0, 8, 9]] = 1.0
+    matrix[:, 11, 11], slope[:, 11, 11] = 0.9, np.nan
+    values, rates = eigenvalues(matrix, slope)
+    for found, own in zip(values, rates, strict=True):
+        for value, rate, times in ((0.5, 3, 2), (-0.25, 2, 2), (0.3 + 0.4j, 1, 2), (0.0, 0, 3), (0.9, 0, 1)):
+            near = np.abs(found - value) < 1e-12
+            assert near.sum() == times
+            np.testing.assert_allclose(own[near], rate, atol=1e-11)

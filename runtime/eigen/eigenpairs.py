@@ -140,8 +140,9 @@ def _alike(driven: bytes, n: int) -> tuple[Places, ...]:
 def _by_vectors(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
     """Return the eigenvalues (…, n) of matrices (…, n, n) and their derivatives, see `eigenvalues`."""
     if matrix.shape[-1] == 1:
-        values, derivative = matrix[..., 0].astype(np.complex128), slope[..., 0]
-        return values, np.where(np.abs(values) < SMALL, 0.0, derivative)
+        alone, rate = (one[..., 0].astype(np.complex128) for one in (matrix, slope))
+        return alone, np.where((np.abs(alone) < SMALL) | ~np.isfinite(rate), 0.0, rate)
+    left: Matrix
     values, right = np.linalg.eig(matrix)
     small = np.abs(values) < SMALL
     try:

@@ -258,7 +258,8 @@ class BatchEvaluator:
         return tuple(found)
 
     def _lift_bounded(self, group: PeerGroup, vectors: Floats) -> Lift:
-        site, steps, lost = self._placed(group, linearize_rows(group.jacobians, vectors))
+        rows = linearize_rows(group.jacobians, vectors)
+        site, steps, lost = self._placed(group, sites_of_rows(group.jacobians, rows))
         steps = steps or self.steps(site, np.zeros((1, 1)), exponential_rows)
         with np.errstate(all="ignore"):
             frame = composed_bounded(site, group.schedule, steps)
@@ -266,7 +267,12 @@ class BatchEvaluator:
         return Lift(site, steps, frame)
 
     def _lift(self, group: PeerGroup, values: Matrices) -> FrameMap:
-        site, fixed, lost = self._placed(group, self.rows(group.jacobians, self.vectors(group, values)))
+        if self.tangents:
+            rows = self.rows(group.jacobians, self.vectors(group, values))
+            own = sites_of_rows(group.jacobians, rows)
+        else:
+            own = every_matrix(group.site, lambda block: np.array(block[None]))
+        site, fixed, lost = self._placed(group, own)
         steps = {quanta: step.matrix for quanta, step in fixed.items()}
         steps = steps or self.steps(site, values, exponential_values)
         with np.errstate(all="ignore"):
@@ -275,10 +281,9 @@ class BatchEvaluator:
         return frame
 
     def _placed(
-        self, group: PeerGroup, rows: Matrices
+        self, group: PeerGroup, site: LinearSite
     ) -> tuple[LinearSite, Mapping[int, Step], NDArray[np.bool_]]:
         """Return a group's sites, their exponentials if nothing free reaches these, and which have none."""
-        site = sites_of_rows(group.jacobians, rows)
         beyond = is_beyond(site.a, site.b)
         if site_key(group) in self.fixed:
             return replace(site, a=site.a[:1], b=site.b[:1]), self.fixed[site_key(group)], beyond

@@ -49,8 +49,8 @@ _STEPS = frozenset(
 )
 
 
-# Lines whose coefficients are kept for the next question.
-KEPT = 64
+# Lines whose coefficients are kept for the next question, and numbers that stand in them.
+KEPT, KEPT_CONSTANTS = 64, 1024
 
 
 class _OpenError(Exception):
@@ -121,7 +121,7 @@ class Bends:
                 )[0]
             ]
             # The fourth coefficient is f⁗/24.
-            off = [float(abs(_series(one)[TERMS - 1]).upper()) * (high - low) ** 4 / 16 for one in listed]
+            off = [float(abs(_term(one, TERMS - 1)).upper()) * (high - low) ** 4 / 16 for one in listed]
         except (_OpenError, ValueError, ZeroDivisionError, OverflowError):
             return False
         finally:
@@ -172,21 +172,22 @@ def _bending(function: Any, value: Any, vector: Any) -> Any:
 # ---- Taylor series with balls for coefficients, as numbers ----
 
 
+@lru_cache(maxsize=KEPT_CONSTANTS)
 def _constant(value: float) -> Any:
     return flint.arb_series([flint.arb(value)], prec=TERMS)
 
 
-def _series(value: Any) -> Any:
-    """Return a series, of a plain number as well; refuse one that is not known at all."""
-    found = value if isinstance(value, flint.arb_series) else _constant(value)
-    if not all(found[place].is_finite() for place in range(TERMS)):
+def _term(value: Any, place: int) -> Any:
+    """Return a coefficient of a series, of a plain number as well; refuse one that is not known at all."""
+    found = (value if isinstance(value, flint.arb_series) else _constant(value))[place]
+    if not found.is_finite():
         raise _OpenError
     return found
 
 
 def _sign(value: Any) -> int:
     """Return the sign of a series' value in all of the cell."""
-    ball = _series(value)[0]
+    ball = _term(value, 0)
     if ball == 0:
         return 0
     if ball > 0 or ball < 0:
@@ -195,15 +196,15 @@ def _sign(value: Any) -> int:
 
 
 def _floor(value: Any) -> Any:
-    whole = _series(value)[0].floor()
+    whole = _term(value, 0).floor()
     if not whole.is_exact():
         raise _OpenError
     return _constant(float(whole))
 
 
 def _power(base: Any, exponent: Any) -> Any:
-    ball = _series(exponent)[0]
-    fixed = ball.is_exact() and all(_series(exponent)[place] == 0 for place in range(1, TERMS))
+    ball = _term(exponent, 0)
+    fixed = ball.is_exact() and all(_term(exponent, place) == 0 for place in range(1, TERMS))
     if fixed and ball.is_integer():
         whole = int(float(ball))
         return base**whole if whole >= 0 else 1 / base**-whole
@@ -239,7 +240,7 @@ _RULES: dict[str, Callable[..., Any]] = {
 def _transcendental(name: str, *values: Any) -> Any:
     if name == "atan2":
         return _angle(*values)
-    value = _series(values[0])
+    value = values[0] if isinstance(values[0], flint.arb_series) else _constant(values[0])
     match name:
         case "tanh":
             return _tanh(value)
@@ -251,7 +252,7 @@ def _transcendental(name: str, *values: Any) -> Any:
 
 def _angle(y: Any, x: Any) -> Any:
     """Return atan2(y, x), whose jump at y = 0 > x is not decided."""
-    if _series(x)[0] > 0:
+    if _term(x, 0) > 0:
         return (y / x).atan()
     return -(x / y).atan() + flint.arb.pi() / 2 * _sign(y)
 

@@ -1,8 +1,8 @@
 """The evaluator of a system's matrices over some of its parameters, whatever kind of scene it is.
 
 Takes: a `CompiledSystem` and the parameters that vary.
-Gives: `evaluator`, `evaluator_of_many`, `PointEvaluator`; `Asked`; `free_parameters`, `reaches_time`,
-`reaches_count`, `overrides_at`.
+Gives: `evaluator`, `evaluator_of_many`, `PointEvaluator`; `Asked`; `long_loops`, `mostly_packets`;
+`free_parameters`, `reaches_time`, `reaches_count`, `overrides_at`.
 Guarantees: peers that are alike at some values only are kept apart.
 Does not: vary times (see `delays`).
 """
@@ -22,7 +22,7 @@ from apc.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.compiler.compiled import CompiledSystem, Group, Parameter, group_count
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
-from apc.eigen.closing import ClosedSystem
+from apc.eigen.closing import ClosedSystem, Loop
 from apc.eigen.modes import arrange, split
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import relative_bounded, relative_coordinates
@@ -283,6 +283,11 @@ def _evaluator(of: Asked) -> BatchEvaluator | PointEvaluator:
     return batch_evaluator(of.system, of.free, *of.lifted_anywhere())
 
 
+def mostly_packets(loop: Loop) -> bool:
+    """Say whether leaving a loop's packets out of its state is quicker: they are many, and most of it."""
+    return len(loop.packets) > max(MANY_PACKETS, loop.states / 2)
+
+
 def long_loops(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) -> LoopEvaluator | None:
     """Return the loops of a system without their packets, None unless these are many, and most of the state.
 
@@ -298,7 +303,7 @@ def long_loops(system: CompiledSystem, free: Sequence[Free], prepared: Prepared)
         return None
     groups, exchange = asked.lifted_anywhere()
     loops = arrange(groups, exchange).loops
-    if not any(len(loop.packets) > max(MANY_PACKETS, loop.states / 2) for loop in loops):
+    if not any(map(mostly_packets, loops)):
         return None
     from apc.vary.loops import loop_evaluator  # most scenes have none, and need not load it
 

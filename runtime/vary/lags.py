@@ -17,6 +17,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,7 @@ from apc.frame.parameters import resolve
 from apc.frame.schedule import Schedule, Selected, tick_by_tick
 from apc.frame.scheduling import build_schedules, newest
 from apc.vary.delays import INSIDE, reaches_parameters, system_with_delay, timing_slopes
+from apc.vary.evaluator import Asked
 from apc.vary.plane import count_beyond
 
 Floats = NDArray[np.float64]
@@ -47,6 +49,9 @@ _Packet = tuple[int, int]
 
 # Delays that are looked at together: the oldest packet of any at most so many times as old as that of each.
 OCTAVE = 2
+
+# Ranges of delays whose loops are kept for the next question.
+KEPT = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,13 +142,27 @@ def late_stretches(
     following
         From `delays.borders`.
     """
-    slopes = timing_slopes(system, free)
-    if not _only_late(system, free, prepared, {name for name, slope in slopes.items() if slope}):
+    moving = {name for name, slope in timing_slopes(system, free).items() if slope}
+    if not _only_late(system, free, prepared, moving):
         return None
     borders = [low]
     while borders[-1] < high:
         borders.append(following(borders[-1]))
-    pieces = list(itertools.pairwise(borders))
+    pieces = tuple(itertools.pairwise(borders))
+    found = np.zeros(len(pieces))
+    for sheet in _sheets(Asked.of(system, [free], prepared), pieces):
+        found += _beyond(sheet)
+    if np.isnan(found).all():  # a drift, say, which keeps two eigenvalues at 1
+        return None
+    stable = [None if np.isnan(count) else count == 0 for count in found.tolist()]
+    return [LateStretch(*piece, one) for piece, one in zip(pieces, stable, strict=True)]
+
+
+@lru_cache(maxsize=KEPT)
+def _sheets(of: Asked, pieces: tuple[tuple[Fraction, Fraction], ...]) -> tuple[_LateSheet, ...]:
+    """Return each loop of a scene at a delay within each piece, and keep them for the next question."""
+    system, prepared, (free,) = of.system, of.prepared, of.free
+    slopes = timing_slopes(system, free)
     values = [start + INSIDE * (end - start) for start, end in pieces]
     inside = system_with_delay(system, free, values[0])
     timings = resolve(inside).timings
@@ -158,17 +177,14 @@ def late_stretches(
     apart = {id(one): tick_by_tick(one) for one in schedules}
     by_tick = replace(prepared, schedules=tuple(apart[id(one)] for one in schedules), timings=timings)
     selected = {id(apart[id(one)]): one.selected for one in schedules}
-    found = np.zeros(len(pieces))
+    found = []
     for loop in arrange(*lifted_groups(inside, prepared=by_tick)).loops:
         rows = [
             [None if row.gap else packets[row] for row in selected[id(group.schedule)]]
             for group in loop.sites
         ]
-        found += _beyond(loop, rows, len(pieces))
-    if np.isnan(found).all():  # a drift, say, which keeps two eigenvalues at 1
-        return None
-    stable = [None if np.isnan(count) else count == 0 for count in found.tolist()]
-    return [LateStretch(*piece, one) for piece, one in zip(pieces, stable, strict=True)]
+        found.append(_sheet(loop, rows, len(pieces)))
+    return tuple(found)
 
 
 def _only_late(system: CompiledSystem, free: Free, prepared: Prepared, moving: set[str]) -> bool:
@@ -218,8 +234,8 @@ def _packets(
     return found
 
 
-def _beyond(loop: Loop, rows: Sequence[Sequence[Sequence[_Packet] | None]], count: int) -> Floats:
-    """Return how many eigenvalues of a loop are beyond the circle at each delay (k,).
+def _sheet(loop: Loop, rows: Sequence[Sequence[Sequence[_Packet] | None]], count: int) -> _LateSheet:
+    """Return a loop at all delays.
 
     Parameters
     ----------
@@ -261,12 +277,17 @@ def _beyond(loop: Loop, rows: Sequence[Sequence[Sequence[_Packet] | None]], coun
     loops = bordered(maps, weights)
     rigid = find_rigid_modes(without_packets(loop), with_drifts=False).directions.shape[1]
     ages = np.array([one + [0] * (most - len(one)) for one in lags])
-    oldest, found = ages.max(axis=1), np.zeros(count)
-    left = np.ones(count, dtype=bool)
+    return _LateSheet(loops, np.array(alike), ages, rigid, int(ages.max()))
+
+
+def _beyond(sheet: _LateSheet) -> Floats:
+    """Return how many eigenvalues of a loop are beyond the circle at each of its delays (k,)."""
+    oldest = sheet.lags.max(axis=1)
+    found, left = np.zeros(len(oldest)), np.ones(len(oldest), dtype=bool)
     while left.any():
         longest = int(oldest[left].max())
         some = left & (oldest * OCTAVE >= longest)
-        sheet = _LateSheet(loops, np.array(alike), ages, rigid, longest)
-        found[some] = count_beyond(sheet, np.flatnonzero(some).astype(np.float64))
+        within = replace(sheet, longest=longest)
+        found[some] = count_beyond(within, np.flatnonzero(some).astype(np.float64))
         left &= ~some
     return found

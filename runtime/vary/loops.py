@@ -1,7 +1,7 @@
 """Loops with long delays over values of some parameters: their sites' frames, without a packet.
 
 Takes: a `CompiledSystem` and what varies.
-Gives: `LoopEvaluator`, `loop_evaluator`, `LoopSheet`.
+Gives: `LoopEvaluator`, `loop_evaluator`, `LoopSheet`; `proved_in_loop`.
 Guarantees: nothing here grows with the length of a delay.
 Does not: build a matrix of a whole system (see `batch`).
 """
@@ -99,12 +99,25 @@ class LoopEvaluator:
             No bracket reaches beyond these.
         """
         loops = functools.cache(lambda value: self.loop_at(point(value), root.system))
-        held = bracket_of_loop(root, loops, self.rigid[root.system], low=low, high=high)
-        return held, frequency_of(loops(root.value), root.eigenvalue)
+        return proved_in_loop(root, loops, self.rigid[root.system], low=low, high=high)
 
     def loop_at(self, value: Sequence[float], place: int) -> Loop:
         """Return a loop at one point (m,), its sites lifted with bounds on their errors."""
         return lifted_here(self.family.with_sites([self.loops[place]], value))[0]
+
+
+def proved_in_loop(
+    root: Root, loops: Callable[[float], Loop], rigid: int, *, low: float, high: float
+) -> tuple[Bracket | None, float]:
+    """Return a bracket of a root of a loop, if one is found, and the frequency there in Hz.
+
+    Parameters
+    ----------
+    root, loops, rigid, low, high
+        As for `counting.bracket_of_loop`.
+    """
+    held = bracket_of_loop(root, loops, rigid, low=low, high=high)
+    return held, frequency_of(loops(root.value), root.eigenvalue)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -48,7 +48,7 @@ from apc.vary.delays import (
     pace,
     system_with_delay,
 )
-from apc.vary.evaluator import PointEvaluator, evaluator_of_many, long_loops
+from apc.vary.evaluator import PointEvaluator, evaluator_of_many, long_loops, mostly_packets
 from apc.vary.lags import LateStretch, late_stretches
 from apc.vary.marginal import marginal_motion, with_rigid
 
@@ -581,8 +581,15 @@ def _delay_crossing(
             return one, find_rigid_modes(one, with_drifts=False)
         return one, wiring.rigid
 
+    ends = float(piece.low), float(piece.high)
+    here_loop, rigid = loop(root.value)
+    if mostly_packets(here_loop):
+        from apc.vary.loops import proved_in_loop  # few scenes have packets so late
+
+        count = rigid.directions.shape[1]
+        return _told(root, *proved_in_loop(root, lambda v: loop(v)[0], count, low=ends[0], high=ends[1]))
     return _bracketed(
-        *(root, found, (float(piece.low), float(piece.high)), loop),
+        *(root, found, ends, loop),
         lambda value: close_loop(loop(value)[0]),
         lambda value: split(*here(value)).systems,
     )
