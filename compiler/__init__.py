@@ -7,8 +7,8 @@ weights                     exact sums of the decimals by which peers weigh one 
 source                      nodes, yaml_faults, compose: YAML to nodes; reading: typed values out of nodes
 language                    expression, lexer, grammar: text to trees; evaluation: trees to formulas and
                             values
-                            dimensions, unit_grammar, unit_names, units, unit_text, unit_check; vectors
-                            values, tables, recordings: numbers of a scene, and in CSV files;
+                            dimensions, si_forms, unit_grammar, unit_names, units, unit_text, unit_check
+                            vectors; values, tables, recordings: numbers of a scene, and in CSV files
                             probes: of what ping and irtt wrote
 components                  component, parts, declarations, component_check, definitions, library
 scene                       named_numbers, timebase, instances, sections, channels, graphs, links, groups,

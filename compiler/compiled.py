@@ -18,7 +18,6 @@ Every function of a kind takes some of these vectors, in this order:
 from __future__ import annotations
 
 from fractions import Fraction
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -387,6 +386,8 @@ class CompiledSystem:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows."""
+        from html import escape  # nothing else needs its list of characters
+
         return f"<pre>{escape(str(self))}</pre>"
 
     def __str__(self) -> str:

@@ -60,7 +60,7 @@ from apc.compiler.compiled import (
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, write_file
 from apc.compiler.formula import EXACT
-from apc.compiler.language.unit_text import is_si
+from apc.compiler.language.si_forms import is_si
 from apc.compiler.plain import PlainFunction, plain, read_function
 from apc.compiler.seal import seal
 from apc.compiler.timings import part

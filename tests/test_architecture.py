@@ -24,7 +24,7 @@ HOUSE = (
     (
         "apc.compiler.language",
         """
-        expression lexer grammar evaluation dimensions unit_grammar unit_names units unit_text
+        expression lexer grammar evaluation dimensions si_forms unit_grammar unit_names units unit_text
         unit_check vectors values tables probes recordings
         """,
     ),
@@ -143,7 +143,7 @@ HOUSE = (
         "apc.cli",
         """
         options progress region simulate sweep compare critical feel export explore bench analyze network play
-        library report commands
+        library report compile show commands
         """,
     ),
     ("apc", "__main__"),

@@ -10,11 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apc.compiler.errors import ApcError, Place
-from apc.compiler.language import unit_names
+from apc.compiler.language import unit_names, units
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.unit_text import format_dimension, format_si
 from apc.compiler.language.units import NO_UNIT, parse_quantity, parse_unit, quantity
 from apc.compiler.language.values import is_quantity
+from apc.compiler.pipeline import run_stages
+from tests.topologies import ROOT
 
 HERE = Place("a.yaml", 1, 1)
 LENGTH, TIME = Dimension((("m", 1),)), Dimension((("s", 1),))
@@ -213,6 +215,16 @@ def test_pint_is_imported_only_when_a_rare_unit_is_read() -> None:
         " parse_quantity('1 inch', Place('x', 1, 1)); assert 'pint' in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_no_scene_that_comes_with_the_program_has_a_rare_unit(monkeypatch: pytest.MonkeyPatch) -> None:
+    def rare() -> None:
+        raise AssertionError("pint is asked")
+
+    monkeypatch.setattr(unit_names, "_registry", rare)
+    units._unit.cache_clear()
+    for path in sorted((ROOT / "models" / "scenes").glob("*.yaml")):
+        run_stages(path, until="flat")
 
 
 @pytest.mark.parametrize("name", sorted(unit_names._OF_HAPTICS))

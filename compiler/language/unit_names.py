@@ -14,7 +14,7 @@ from functools import lru_cache
 from typing import Any
 
 from apc.compiler.errors import nearest
-from apc.compiler.language.dimensions import Dimension, product
+from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension, product
 from apc.compiler.language.unit_grammar import Factor, FaultError
 from apc.compiler.words import cut
 
@@ -103,13 +103,19 @@ def _of_haptics() -> dict[str, Factor]:
         "g": ((("kg", 1),), Fraction(1, 1000)),
         "N": (newton, Fraction(1)),
         "Hz": ((("s", -1),), Fraction(1)),
+        "J": ((("kg", 1), ("m", 2), ("s", -2)), Fraction(1)),
+        "W": ((("kg", 1), ("m", 2), ("s", -3)), Fraction(1)),
+        "A": ((("A", 1),), Fraction(1)),
+        "V": ((("A", -1), ("kg", 1), ("m", 2), ("s", -3)), Fraction(1)),
+        "rad": ((), Fraction(1)),
     }
     prefixes = {"": Fraction(1), "m": Fraction(1, 1000), "k": Fraction(1000), "u": Fraction(1, 10**6)}
-    return {
+    prefixed = {
         prefix + name: (factor * scale, Dimension(exponents))
         for name, (exponents, scale) in units.items()
         for prefix, factor in prefixes.items()
     }
+    return {"%": (Fraction(1, 100), DIMENSIONLESS), **prefixed}
 
 
 _OF_HAPTICS = _of_haptics()

@@ -1,7 +1,7 @@
 """What commands have in common: FILE, the options `--set` and `--json`, and how a result is printed.
 
 Takes: a result.
-Gives: `Command`, `Group`; `file_argument`, `file_option`, `set_option`, `in_option`, `hands_option`,
+Gives: `Command`; `file_argument`, `file_option`, `set_option`, `in_option`, `hands_option`,
 `json_option`, `check_plot`, `criterion_with`, `WholeNumber`; `print_result`, `tell`, `beside`.
 Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal.
 Does not: know any command.
@@ -94,12 +94,6 @@ class Command(click.Command):
                 return super().invoke(ctx)
             finally:
                 ctx.call_on_close(lambda: tell(timings_text({"start": started, **taken}), err=True))
-
-
-class Group(click.Group):
-    """Commands each of which is a `Command`."""
-
-    command_class = Command
 
 
 class WholeNumber(click.IntRange):

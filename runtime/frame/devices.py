@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import PEERS, CompiledSystem, Kind, Parameter, Ports, Receive
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.frozen import dataclass
-from apc.compiler.language.vectors import whole_and_index
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.overrides import apply, parse_override
@@ -121,7 +120,7 @@ def find_device(
             for at in range(len(slopes))
             if slopes[at] and change[at]
         }
-        if whole_and_index(state.name)[1]:
+        if state.name.endswith("]"):
             own = state.name  # one axis of several
         if len(set(inverses.values())) == 1:
             (mass, at), inverse = next(iter(inverses.items()))

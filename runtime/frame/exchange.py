@@ -71,8 +71,8 @@ class Exchange:
             return [h for h, does in enumerate(sending) if does and counts[h] > (1 if h == receiver else 0)]
         pairs, _ = self.arcs(link)
         group_of = np.searchsorted(self.starts, pairs, side="right") - 1
-        found = np.unique(group_of[group_of[:, 1] == receiver, 0]).tolist()
-        return [h for h in found if sending[h]]
+        heard = np.bincount(group_of[group_of[:, 1] == receiver, 0], minlength=len(sending))
+        return [h for h, does in enumerate(sending) if does and heard[h]]
 
     def peer_name(self, peer: int) -> str:
         """Return `left[2]`, for a peer's number."""

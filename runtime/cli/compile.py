@@ -1,0 +1,94 @@
+"""The commands `apc check` and `apc compile`.
+
+Takes: words of a command line. Gives: text on stdout, a compiled model beside its topology.
+Guarantees: nothing is written where there is a mistake.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from apc.cli.options import Command, file_argument, tell
+from apc.cli.progress import at_work
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.timings import recording
+from apc.compiler.words import counted
+from apc.threads import start_single_threaded
+
+STAGES = ("source", "scene", "flat", "clocked", "sorted", "compiled")
+
+
+@click.command("check", cls=Command)
+@file_argument
+def check_command(file: str | None) -> None:
+    """Report every mistake in a topology or component; write nothing.
+
+    Exit code 0 if there is none, 1 otherwise.
+    """
+    start_single_threaded()
+    from apc.analysis.selfcheck import check_frame
+    from apc.compiler.pipeline import check_definition, compile_topology
+    from apc.inputs import find_input
+
+    path = Path(file) if file else find_input(compiled_too=False)
+    if found := check_definition(path):
+        tell(f"{path}: no mistakes. {found}.")
+        return
+    system = compile_topology(path)
+    check_frame(system)
+    tell(f"{path}: no mistakes. {system.name}, {counted(system.peers, 'peer')}.")
+
+
+@click.command("compile", cls=Command)
+@file_argument
+@click.option(
+    "--until",
+    type=click.Choice(STAGES),
+    default="compiled",
+    metavar="STAGE",
+    help=f"Stop after a stage, print what it made and write nothing. One of {', '.join(STAGES[:-1])}.",
+)
+@click.option("--force", is_flag=True, help="Compile even if nothing has changed since it was compiled.")
+def compile_command(file: str | None, until: str, force: bool) -> None:
+    """Turn a topology into equations: NAME.yaml to NAME.apc beside it.
+
+    Prints what the scene needed: states, delays and packets kept for a peer,
+    and how large the systems are that decide its stability. Compiles nothing
+    if the topology, every file it names and apc itself are as they were, and
+    no --timings are asked for.
+    """
+    start_single_threaded()
+    from apc.inputs import check_model_name, compiled_already, find_input
+
+    path = Path(file) if file else find_input(compiled_too=False)
+    if until != "compiled":
+        from apc.compiler.pipeline import run_stages
+        from apc.compiler.view.stages import describe
+
+        tell(describe(run_stages(path, until=until)))  # type: ignore[arg-type] # click checked the word
+        return
+    if path.suffix == ".apc":
+        raise ApcError(Mistake("E614", Place(str(path)), "is compiled already", hint=f"apc analyze {path}"))
+    if not (force or recording()) and compiled_already(path):
+        tell(f"{path} → {path.with_suffix('.apc')}: unchanged, not compiled again (--force does)")
+        return
+    check_model_name(path)
+    with at_work("compiling"):
+        _compile(path)
+
+
+def _compile(path: Path) -> None:
+    """Compile, check, save and report."""
+    from apc.analysis.needs import needs
+    from apc.analysis.selfcheck import check_frame
+    from apc.compiler.pipeline import compile_topology
+    from apc.compiler.store import save
+    from apc.present.analysis import compile_text
+
+    system = compile_topology(path)
+    difference = check_frame(system)
+    save(system, target := path.with_suffix(".apc"), sealed=True)
+    tell(compile_text(system, needs(system), target, difference))

@@ -1,0 +1,106 @@
+"""The commands `apc show` and `apc schema`.
+
+Takes: words of a command line. Gives: text on stdout, or a file of it or of its picture.
+Guarantees: the format of a file is that of its suffix.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from apc.cli.options import Command, beside, file_argument, file_option, tell
+from apc.compiler.files import write_text
+from apc.present.forms import json_text
+from apc.suffixes import check_suffix
+
+FORMATS = {".txt": "text", ".json": "json", ".dot": "dot", ".gv": "dot", ".svg": "svg"}
+FORMATS |= {".png": "picture", ".pdf": "picture"}
+
+
+@click.command("show", cls=Command)
+@file_argument
+@click.option(
+    "--format",
+    "format_",
+    type=click.Choice(["text", "json", "dot", "svg"]),
+    help="text: graph, equations, schedule. json: the same as one document. dot: the graph for Graphviz. "
+    "svg: the graph as a picture. Taken from --out if not given, else text.",
+)
+@click.option(
+    "--parameters",
+    is_flag=True,
+    help="List what may be set instead: names, values, units, limits; as text or json.",
+)
+@file_option("--out", "Write to this file: .txt .json .dot .svg, or as a picture .png .pdf.")
+def show_command(file: str | None, format_: str | None, parameters: bool, out: Path | None) -> None:
+    """Show what a scene is made of: its graph, equations and schedule.
+
+    The graph has the parts of one peer and how they are joined, and the
+    peers and the links between them. The schedule says what ticks when, how
+    long what it computes is held, and which packets are on their way.
+    """
+    from apc.api import show as shown
+    from apc.inputs import check_topology_outputs, find_input
+
+    wanted = format_ or "text"
+    formats = {name: of for name, of in FORMATS.items() if not parameters or of in ("text", "json")}
+    if out is not None and (out.suffix or not format_):
+        known = [suffix for suffix in formats if format_ in (None, formats[suffix])]
+        wanted = formats[check_suffix(out, known, "--out")]
+    if parameters:
+        _show_parameters(file, wanted, out)
+        return
+    path = Path(file) if file else find_input(compiled_too=False)
+    check_topology_outputs(path, {"--out": out})
+    if wanted == "picture":
+        from apc.present.graph import save_graph
+
+        assert out is not None
+        save_graph(path, out)
+        tell(f"{out} is written", err=beside(out))
+        return
+    _print_or_write(shown(path, format=wanted), out)  # type: ignore[arg-type] # click checked the word
+
+
+def _show_parameters(file: str | None, wanted: str, out: Path | None) -> None:
+    """List what may be set of a scene."""
+    from apc.frame.settable import parameters
+    from apc.inputs import open_scene
+
+    if wanted not in ("text", "json"):
+        raise click.UsageError("--parameters is a table: --format text or json")
+    found = parameters(open_scene(file, (), {"--out": out}))
+    _print_or_write(json_text(found.to_dict()) if wanted == "json" else str(found), out)
+
+
+@click.command("schema", cls=Command)
+@file_option("--out", "Write to this file instead of the terminal.")
+def schema_command(out: Path | None) -> None:
+    """Print the JSON Schema of topologies, for editors.
+
+    An editor that knows YAML schemas completes and checks a topology whose
+    first line is, with the schema beside it as topology.schema.json,
+
+    \b
+        # yaml-language-server: $schema=topology.schema.json
+
+    `apc new` writes that line where the schema is.
+    """
+    from apc.api import schema as generated
+
+    if out is not None:
+        check_suffix(out, (".json",), "--out")
+    _print_or_write(json.dumps(generated(), ensure_ascii=False, indent=1), out)
+
+
+def _print_or_write(text: str, out: Path | None) -> None:
+    if out is None:
+        tell(text)
+        return
+
+    write_text(out, text)
+    tell(f"{out} is written", err=beside(out))
