@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, TypeAlias
 
 import casadi
@@ -39,6 +40,8 @@ MOST_FACTORS = 100  # of a power that is written as a product
 _SOMEWHERE_NONE = ("exp", "log", "tan", "asin", "acos", "sinh", "cosh", "atan2")
 HARMLESS = 0.5
 _EXTREMES = {"min": casadi.fmin, "max": casadi.fmax}  # of two values each
+# Python's + and * come to the same by way of much that finds out what their operands are.
+_PLUS, _TIMES = partial(casadi.SX.binary, casadi.OP_ADD), partial(casadi.SX.binary, casadi.OP_MUL)
 _CASADI: dict[str, Callable[..., Any]] = {
     "abs": casadi.fabs,
     "sign": casadi.sign,
@@ -196,7 +199,7 @@ class Writer:
         if isinstance(expression, Number):
             return casadi.SX(float(expression.value))
         if isinstance(expression, Sum):
-            return _fold([self._scaled(*one, taken) for one in terms_of(expression)], operator.add)
+            return _fold([self._scaled(*one, taken) for one in terms_of(expression)], _PLUS)
         if isinstance(expression, Product):
             return self._scaled(expression, 1, taken)
         assert isinstance(expression, Function)
@@ -232,15 +235,15 @@ class Writer:
         """Return a number times a term, dividing by what has a negative power: a*(1/b) rounds twice."""
         if not isinstance(term, Product):
             value = self._build(term, taken)
-            return value if factor == 1 else float(factor) * value
+            return value if factor == 1 else _TIMES(casadi.SX(float(factor)), value)
         coefficient = factor * term.coefficient
         above = [casadi.SX(float(coefficient))] if coefficient != 1 else []
         above += [self._power(base, size, taken) for base, size in term.powers if size > 0]
         below = [self._power(base, -size, taken) for base, size in term.powers if size < 0]
-        product = _fold(above, operator.mul) if above else casadi.SX(1)
+        product = _fold(above, _TIMES) if above else casadi.SX(1)
         if not below:
             return product
-        divisor = _fold(below, operator.mul)
+        divisor = _fold(below, _TIMES)
         moving = any(base.free_symbols for base, size in term.powers if size < 0)
         return product / (casadi.if_else(taken, divisor, 1) if taken is not None and moving else divisor)
 
@@ -252,7 +255,7 @@ class Writer:
         if exponent == HALF:
             return casadi.sqrt(value)
         if exponent.denominator == 1 and exponent <= MOST_FACTORS:
-            return _fold([value] * int(exponent), operator.mul)
+            return _fold([value] * int(exponent), _TIMES)
         return value ** float(exponent)
 
 

@@ -60,6 +60,9 @@ SMALL, TERMS = 2.0**-16, 24
 # A product of balls by itself, and one of many within a product of matrices, in nanoseconds.
 SINGLE, WITHIN = 200, 3
 
+# Rows multiplied together: few, so that what they share is most of the columns they take.
+TOGETHER = 16
+
 # The entries of a matrix of balls that are not zero, row by row, each with its column.
 Rows = list[list[tuple[int, Any]]]
 
@@ -178,7 +181,7 @@ def _stepped(site: _Stepped, schedule: Schedule, z: Floats, r: Floats) -> list[A
             case Act(hold, one):
                 u[hold] = value.get(one, zero)
             case Send(partition, rows):
-                everything = _sums(site.sends[partition], [*x, *u])
+                everything = site.sends[partition].times([*x, *u])
                 for channel, row in rows:
                     sent[row] = everything[channel]
             case Tick(partition, index, rows_heard):
@@ -186,7 +189,7 @@ def _stepped(site: _Stepped, schedule: Schedule, z: Floats, r: Floats) -> list[A
                 m = [value.get(Value(partition, o, index - 1), zero) for o in memories]
                 received = [sum((heard[row] for row in rows), zero) for rows in rows_heard]
                 own = event.rows(len(site.kind.clocks[partition].outputs))
-                outputs = _sums(site.ticks[partition][own], [*x, *u, *m, *received])
+                outputs = site.ticks[partition].times([*x, *u, *m, *received])[own]
                 value |= {Value(partition, o, index): number for o, number in enumerate(outputs)}
     after = [
         value[Value(one.partition, one.output, one.index + schedule.ticks[one.partition])]
@@ -224,7 +227,7 @@ class _Stepped:
         """Return x after `duration` seconds: dx/dt = A x + c, c = B u constant."""
         import flint
 
-        constant = _sums(self.rates, [flint.arb(0)] * len(x) + u)
+        constant = self.rates.times([flint.arb(0)] * len(x) + u)
         after = list(x)
         for joined in self.parts:
             states = joined.states
@@ -241,22 +244,22 @@ class _Part:
     as much as A has entries, as often as A T is large.
     """
 
-    def __init__(self, states: list[int], rates: Rows, lengths: Sequence[Fraction]) -> None:
+    def __init__(self, states: list[int], rates: _Sparse, lengths: Sequence[Fraction]) -> None:
         place = {state: i for i, state in enumerate(states)}
         self.states = states
-        self.rows: Rows = [[(place[j], one) for j, one in rates[i] if j in place] for i in states]
+        self.matrix = _Sparse([[(place[j], one) for j, one in rates.rows[i] if j in place] for i in states])
         self.steps: dict[Fraction, tuple[Any, Any]] = {}
         self.units, self.norm, n = np.ones(len(states)), np.inf, len(states)
         if n <= FEW_TOGETHER:
             return
         dense = np.zeros((n, n))
-        for i, row in enumerate(self.rows):
+        for i, row in enumerate(self.matrix.rows):
             dense[i, [j for j, _ in row]] = [float(one) for _, one in row]
         balance = load_pool("scipy.linalg").matrix_balance
         balanced, (units, _) = balance(dense, permute=False, separate=True)
         norm = float(np.abs(balanced).sum(axis=1).max()) * (1 + n * UNIT)
         turns = sum(max(1.0, norm * float(length)) for length in lengths)
-        if turns * sum(map(len, self.rows)) * SINGLE < len(set(lengths)) * n**3 * WITHIN:
+        if turns * sum(map(len, self.matrix.rows)) * SINGLE < len(set(lengths)) * n**3 * WITHIN:
             self.units, self.norm = units, norm
 
     def moved(self, x: list[Any], constant: list[Any], duration: Fraction) -> list[Any]:
@@ -272,7 +275,7 @@ class _Part:
         if duration not in self.steps:
             n = len(x)
             dense = flint.arb_mat(n, n)
-            for i, row in enumerate(self.rows):
+            for i, row in enumerate(self.matrix.rows):
                 for j, one in row:
                     dense[i, j] = one
             self.steps[duration] = _step(dense, seconds)
@@ -283,12 +286,12 @@ class _Part:
         """Sum x + T (A x + c) + T²/2 A (A x + c) + …, ‖A T‖ ≤ 1: the rest is below twice the last term."""
         import flint
 
-        term = [(one + other) * seconds for one, other in zip(_sums(self.rows, x), constant, strict=True)]
+        term = [(one + other) * seconds for one, other in zip(self.matrix.times(x), constant, strict=True)]
         last = TERMS * flint.ctx.prec // PRECISIONS[0]
         for power in range(2, last + 2):
             x = [one + other for one, other in zip(x, term, strict=True)]
             share = seconds / power
-            term = [one * share for one in _sums(self.rows, term)]
+            term = [one * share for one in self.matrix.times(term)]
         left = max(
             (float(abs(one).upper()) / unit for one, unit in zip(term, self.units.tolist(), strict=True)),
             default=0.0,
@@ -335,7 +338,7 @@ def _probes(columns: int) -> Iterator[NDArray[np.int64]]:
             yield probe
 
 
-def _agreed(function: Any, slopes: Sequence[NDArray[Any]], p: list[Fraction]) -> Rows:
+def _agreed(function: Any, slopes: Sequence[NDArray[Any]], p: list[Fraction]) -> _Sparse:
     """Return the slopes of an affine function as balls; they must be what it multiplies its inputs by."""
     import flint
 
@@ -361,7 +364,7 @@ def _agreed(function: Any, slopes: Sequence[NDArray[Any]], p: list[Fraction]) ->
             assert abs(after - before - expected) <= rounding * many * size, (
                 f"the slopes of {function.name()} are not what it multiplies its inputs by"
             )
-    return [[(column, flint.arb(one)) for column, one in row] for row in filled]
+    return _Sparse([[(column, flint.arb(one)) for column, one in row] for row in filled])
 
 
 def _rational(value: Fraction | float) -> Any:
@@ -371,12 +374,30 @@ def _rational(value: Fraction | float) -> Any:
     return flint.fmpq(*value.as_integer_ratio())
 
 
-def _sums(rows: Rows, vector: list[Any]) -> list[Any]:
-    """Return the products of a matrix's rows and a vector."""
-    import flint
+class _Sparse:
+    """A matrix of balls by what is not zero of it: some rows at a time, over the columns these take."""
 
-    zero = flint.arb(0)
-    return [sum((one * vector[column] for column, one in row), zero) for row in rows]
+    def __init__(self, rows: Rows) -> None:
+        import flint
+
+        self.rows, self.blocks = rows, []
+        for first in range(0, len(rows), TOGETHER):
+            some = rows[first : first + TOGETHER]
+            columns = sorted({column for row in some for column, _ in row})
+            place = {column: number for number, column in enumerate(columns)}
+            block = flint.arb_mat(len(some), len(columns))
+            for number, row in enumerate(some):
+                for column, one in row:
+                    block[number, place[column]] = one
+            self.blocks.append((block, columns))
+
+    def times(self, vector: list[Any]) -> list[Any]:
+        """Return the product with a vector."""
+        return [
+            one
+            for block, columns in self.blocks
+            for one in _times(block, [vector[column] for column in columns])
+        ]
 
 
 def _times(matrix: Any, vector: list[Any]) -> list[Any]:

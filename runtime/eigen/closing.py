@@ -268,7 +268,8 @@ class Closed:
 def bounded_weight(weight: Fraction, doubt: float) -> tuple[float, float]:
     """Return a weight as a float and what that may be off by: its doubt, and its rounding if it has any."""
     known = float(weight)
-    return known, doubt + (UNIT * abs(known) if known != weight else 0.0)
+    is_exact = known.as_integer_ratio() == weight.as_integer_ratio()  # a Fraction compares far slower
+    return known, doubt if is_exact else doubt + UNIT * abs(known)
 
 
 def feedback_of(loop: Loop | ClosedSystem, layout: StateLayout) -> list[Feedback]:
@@ -282,7 +283,7 @@ def feedback_of(loop: Loop | ClosedSystem, layout: StateLayout) -> list[Feedback
         for line, one in enumerate(group.schedule.heard):
             doubt = loop.doubts.get(one.way, 0.0)
             for h, weight in enumerate(loop.coupling[one.way][g]):
-                if weight == 0 and doubt == 0:
+                if not (weight or doubt):
                     continue
                 row = row_of[h][one.sent]
                 if one.lag == 0:

@@ -308,10 +308,15 @@ def _whole(step: Matrix) -> Matrix:
 
 def _phi(times: Callable[[Matrix], Matrix], x: Matrix, last: int) -> Matrix:
     """Return φ₁(X) = I + X/2! + X²/3! + … up to a power, from X and what multiplies by it."""
-    unit = np.eye(x.shape[-1])
-    found = unit + x / (last + 1)
-    for term in range(last - 1, 0, -1):
-        found = unit + times(found) / (term + 1)
+    diagonal = np.arange(x.shape[-1])
+    found = x / (last + 1)
+    for term in range(last - 1, -1, -1):
+        found[..., diagonal, diagonal] += (
+            1  # in place: a sum with a matrix of mostly zeros takes as long as a product
+        )
+        if term:
+            found = times(found)
+            found /= term + 1
     return np.asarray(found)
 
 

@@ -32,9 +32,9 @@ from apc.frame.site import LinearSite, Matrix, assemble, with_own_parts
 # Kinds whose Jacobians are remembered.
 KEPT = 64
 
-_BINARY = (casadi.OP_LT, casadi.OP_LE, casadi.OP_EQ, casadi.OP_NE, casadi.OP_FMIN, casadi.OP_FMAX)
-_UNARY = (casadi.OP_FABS, casadi.OP_SIGN)
-_STEPS = (casadi.OP_FLOOR, casadi.OP_CEIL)
+_BINARY = {casadi.OP_LT, casadi.OP_LE, casadi.OP_EQ, casadi.OP_NE, casadi.OP_FMIN, casadi.OP_FMAX}
+_UNARY = {casadi.OP_FABS, casadi.OP_SIGN}
+_STEPS = {casadi.OP_FLOOR, casadi.OP_CEIL}
 
 
 def guards_of(expression: Any, moving: Any) -> list[Any]:
@@ -51,16 +51,18 @@ def guards_of(expression: Any, moving: Any) -> list[Any]:
     work = [expression[i] for i in range(expression.numel())]
     while work:
         node = work.pop()
-        if node.element_hash() in seen:
+        known = node.element_hash()
+        if known in seen:
             continue
-        seen.add(node.element_hash())
+        seen.add(known)
         parts = [node.dep(i) for i in range(node.n_dep())]
         work += parts
-        if any(node.is_op(code) for code in _BINARY):
+        code = node.op()
+        if code in _BINARY:
             found.append(parts[0] - parts[1])
-        elif any(node.is_op(code) for code in _UNARY):
+        elif code in _UNARY:
             found.append(parts[0])
-        elif any(node.is_op(code) for code in _STEPS):
+        elif code in _STEPS:
             # Changes sign at each whole number, and again half-way, where nothing is split in vain.
             found.append(casadi.sin(np.pi * parts[0]))
     return [one for one in found if casadi.depends_on(one, moving)]

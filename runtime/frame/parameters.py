@@ -176,8 +176,9 @@ def _different_rows(system: CompiledSystem, group: Group) -> tuple[Floats, NDArr
         # A view of one zero: a million equal peers take no memory.
         return common, np.broadcast_to(np.int64(0), (group.count,))
     table = np.stack(list(varying.values()), axis=1) + 0.0  # −0 and 0 are one number
-    known: dict[bytes, int] = {}
-    rows = np.array([known.setdefault(row.tobytes(), len(known)) for row in table], dtype=np.int64)
+    keys = table.view(np.dtype((np.void, table.strides[0]))).ravel().tolist()
+    known = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+    rows = np.array([known[key] for key in keys], dtype=np.int64)
     first = np.zeros(len(known), dtype=np.int64)
     first[rows[::-1]] = np.arange(len(rows))[::-1]
     parameters = np.repeat(common, len(known), axis=0)

@@ -303,13 +303,20 @@ def _block_series(
     first = height * np.linalg.norm(size, axis=1)[:, None, :]
     for term in range(SERIES):
         left = height * np.linalg.norm(size, axis=1)[:, None, :] * (block * radius**-term)[:, None, None]
-        if np.all(left <= CUT * UNIT * first):
+        more = ~(left <= CUT * UNIT * first).all(axis=(1, 2))
+        if not more.any():
             break
-        value = row @ column
-        off = row_size @ doubt + row_doubt @ (size + doubt) + charge * (row_size @ size) + np.abs(value.imag)
+        if 2 * np.count_nonzero(more) < len(more):  # go on with the few sites that die out slowly
+            terms[2, 0] += np.tensordot(counts[~more], left[~more], 1)
+            counts, block, height, first, left = (one[more] for one in (counts, block, height, first, left))
+            row, row_size, row_doubt = row[more], row_size[more], row_doubt[more]
+            column, size, doubt = column[more], size[more], doubt[more]
+            small, weight = small[more], weight[more]
+        value, rounded = row @ column, doubt + charge * size
+        off = row_size @ rounded + row_doubt @ (size + doubt) + np.abs(value.imag)
         for kind, part in enumerate((value.real, np.abs(value), off)):
-            terms[kind, term + 1] = np.tensordot(counts, part, 1)
-        column, doubt = small @ column, weight @ (doubt + charge * size)
+            terms[kind, term + 1] += np.tensordot(counts, part, 1)
+        column, doubt = small @ column, weight @ rounded
         size = np.abs(column)
     terms[2, 0] += np.tensordot(counts, left, 1)
     return terms
