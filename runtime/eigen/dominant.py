@@ -41,8 +41,8 @@ Complexes = NDArray[np.complex128]
 Truths = NDArray[np.bool_]
 Matrix = NDArray[Any]
 
-# M is squared so many times: what is smaller than the largest by 2 % is then gone to rounding; where it is not
-# gone, so many times more, which leaves nothing of what is smaller by 0.1 %.
+# M is squared so many times: what is smaller than the largest by 2 % is then gone to rounding; where it is
+# not gone, so many times more, which leaves nothing of what is smaller by 0.1 %.
 SQUARINGS, MORE = 11, 5
 
 # After so many squarings the largest entry is brought to 1: none has left the range of floats by then.
@@ -245,7 +245,7 @@ def _enclosed(matrix: Floats, error: Floats, value: Complexes, right: Complexes,
 
 
 def _columns(vectors: Complexes, paired: Truths) -> Floats:
-    """Return the real and the imaginary parts of vectors (k, n) as columns (k, n, 2), of real ones only those."""
+    """Return the real and imaginary parts of vectors (k, n) as columns (k, n, 2), of real ones those."""
     found = np.ascontiguousarray(vectors).view(np.float64).reshape(*vectors.shape, 2).copy()
     found[~paired, :, 1] = 0.0
     return found

@@ -174,7 +174,11 @@ def turns_of_many(
 
 def _some_of(places: Integers, matrix: Floats) -> Floats:
     """Return matrices (k, n, m) of some sites, each entry's numbers of all of them side by side."""
-    return matrix if len(matrix) == 1 else np.ascontiguousarray(matrix[places].transpose(1, 2, 0)).transpose(2, 0, 1)
+    return (
+        matrix
+        if len(matrix) == 1
+        else np.ascontiguousarray(matrix[places].transpose(1, 2, 0)).transpose(2, 0, 1)
+    )
 
 
 def _courses(
@@ -193,7 +197,8 @@ def _courses(
     n_x, n_u = site.b.shape[-2:]
     a, b = site.a, site.b
     every, below = np.arange(len(states)), np.eye(n_x + n_u)[n_x:]
-    own, which = np.unique(states, return_inverse=True) if len(a) == len(b) == 1 else (states, every)
+    alike = len(a) == len(b) == 1
+    own, which = np.unique(states, return_inverse=True) if alike else (states, every)
     steps, fine = {}, {}
     for duration, number in points.items():
         step = exponential_values(a, b, float(duration * schedule.quantum) / number)
@@ -209,18 +214,20 @@ def _courses(
         if len(matrix) == 1:
             return np.asarray(matrix[0] @ rows)
         halves = rows.reshape(len(rows), 2, -1)
-        return np.einsum("khn,nck->hck", matrix, halves).reshape(-1, rows.shape[-1])
+        return np.asarray(np.einsum("khn,nck->hck", matrix, halves).reshape(-1, rows.shape[-1]))
 
     def watch(duration: int, moving: NDArray[Any]) -> None:
         rows = fine[duration]
-        if len(own) < len(every):
+        if alike:
             seen = (rows.reshape(-1, rows.shape[-1]) @ moving).reshape(*rows.shape[:2], 2, -1)
             parts.append(seen[0] if len(own) == 1 else seen[which, :, :, every].transpose(1, 2, 0))
         else:
             parts.append(np.einsum("kpn,nck->pck", rows, moving.reshape(len(moving), 2, -1)))
 
     listened = rows_of(heard)
-    course = follow(site, schedule, steps, rows_of(start), lambda row: listened[row], multiply=multiply, watch=watch)
+    course = follow(
+        site, schedule, steps, rows_of(start), lambda row: listened[row], multiply=multiply, watch=watch
+    )
     while True:
         try:
             next(course)
@@ -340,7 +347,7 @@ def turned_along(course: Floats | Complexes) -> tuple[Floats, Floats]:
 
 
 def _directions(phases: NDArray[Any], size: Floats) -> NDArray[Any]:
-    """Return the directions of courses (points, k): where one is 0, to rounding, that it came from, or leaves by."""
+    """Return directions of courses (points, k): where one is 0, to rounding, it came so or leaves so."""
     moving = size > FADED * np.maximum.accumulate(size, axis=0)
     place = np.maximum.accumulate(np.where(moving, np.arange(len(size))[:, None], -1), axis=0)
     place = np.where(place < 0, np.argmax(moving, axis=0), place)

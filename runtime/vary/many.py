@@ -392,8 +392,8 @@ def _decided(
     known = leading(family.evaluator, family.parts, [one.at(some) for one in systems], len(some))
     into, some = known.certain, some[known.certain]
     place, radius = rows[some], known.radius[into]
-    stands = judge([True], family.rigid, family.drifts)[0]
-    found.verdict[place] = np.where(radius > 1, UNSTABLE, stands)
+    found.verdict[place] = judge([True], family.rigid, family.drifts)[0]
+    found.verdict[place[radius > 1]] = UNSTABLE
     found.spectral_radius[place], found.spectral_radius_error[place] = radius, known.error[into]
     found.rigid_modes[place] = family.rigid
     found.frequency_hz[place], found.damping_ratio[place] = (
