@@ -276,9 +276,8 @@ def misses_one(matrix: Floats, error: Floats) -> Truths:
             inverse = np.linalg.inv(away)
         except np.linalg.LinAlgError:
             return np.zeros(len(matrix), dtype=np.bool_)
-        doubt = error + (n + 3) * UNIT * (unit + np.abs(matrix))
-        wrong = np.abs(unit - inverse @ away) + np.abs(inverse) @ doubt
-        return np.asarray(wrong.sum(axis=2).max(axis=1, initial=0.0) < 0.5)
+        doubt = _norms(error) + (n + 4) * UNIT * (n + _norms(matrix))
+        return np.asarray(_norms(unit - inverse @ away) + _norms(inverse) * doubt < 0.5)
 
 
 def _resolvent(matrix: Floats) -> Floats:
