@@ -81,7 +81,9 @@ def _multiply(left: Matrix, right: Matrix) -> Matrix:
     if terms > FEW:  # a term is none where its factor is exactly 0
         terms = int(np.count_nonzero(left.any(axis=-3), axis=-1).max(initial=0))
     charge = (terms + 2) * UNIT / (1 - (terms + 2) * UNIT)
-    many = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    many = a.shape[:-2]
+    if many != b.shape[:-2]:  # to ask of equal ones takes longer than to add them
+        many = np.broadcast_shapes(many, b.shape[:-2])
     found = np.empty((*many, 2, a.shape[-2], b.shape[-1]), dtype=np.float64)
     np.matmul(a, b, out=value_of(found))
     # Each radius is as much larger as adding it up may have rounded it down. Of many matrices writing and
