@@ -152,7 +152,7 @@ def _left_by(power: Floats, matrix: Floats) -> tuple[Complexes, Complexes, Compl
 
 
 def _cross(matrix: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the column (k, n) and row (k, n) of each matrix's largest entry, the row over it; and that (k,)."""
+    """Return the column (k, n), and over it the row (k, n), of each matrix's largest entry; and that (k,)."""
     k, n = len(matrix), matrix.shape[-1]
     row, column = np.divmod(np.abs(matrix).reshape(k, n * n).argmax(axis=1), n)
     every = np.arange(k)
