@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from apc.analysis.analysis import Analysis
 from apc.compiler.errors import ApcError
 from apc.processes import model_bytes
 from apc.sweeps import store as sweep_store
+from apc.sweeps import sweep as sweep_module
 from apc.sweeps.sweep import Sweep, sweep
 from apc.sweeps.work import Work, compute_part
 from tests.sweeping import CHEAP, alive, children, parts, start, start_waiting, wait_for_parts
@@ -102,6 +104,34 @@ def test_a_point_at_fault_says_why_and_the_sweep_goes_on(tmp_path: Path) -> None
     assert found.column("message").tolist() == ["", "", message, ""]
     assert target.read_text(encoding="utf-8").splitlines()[3] == f'0.0015,0.001,error: E625,,,,,,"{message}"'
     assert f"at 1 of them: {message}" in str(found)
+
+
+def test_what_stands_in_a_file_is_read_from_there_and_not_held(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    held = small(jobs=1)
+    for suffix in ("csv", "parquet"):
+        found = small(out=tmp_path / f"r.{suffix}", jobs=1)
+        assert found.held is None and (found.verdicts, str(found)[-200:]) == (held.verdicts, str(held)[-200:])
+        for heading, one, other in zip(held.headings, found.columns, held.columns, strict=True):
+            assert one.dtype == other.dtype
+            np.testing.assert_array_equal(one, other)
+            np.testing.assert_array_equal(found.column(heading), other)
+
+
+def test_the_rows_of_many_parts_make_whole_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, target = tmp_path / "whole.csv", tmp_path / "blocks.csv"
+    small(out=whole, jobs=1)
+    monkeypatch.setattr(sweep_module, "BLOCK", 50)  # parts have 64 points, the last one fewer
+    blocks = []
+    write = sweep_module.write_table
+
+    def watched(path: Path, listed: Any, given: Any, about: Any) -> None:
+        write(path, listed, (blocks.append(len(one[0])) or one for one in given), about)
+
+    monkeypatch.setattr(sweep_module, "write_table", watched)
+    small(out=target, jobs=1)
+    assert blocks == [50, 50, 50, 50]
+    assert target.read_bytes() == whole.read_bytes()
 
 
 def test_parquet_and_dataframe_hold_the_same_rows(tmp_path: Path) -> None:
