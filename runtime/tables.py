@@ -1,8 +1,8 @@
 """Tables of named columns as files, written as their rows come: CSV or Parquet, by the suffix.
 
 Takes: columns, and rows block by block.
-Gives: `Column`, `Row`, `Writer` and `WRITERS` of the formats; `check_table_path`, `write_table`, `blocks_of`,
-`keep_room`.
+Gives: `Column`, `Row`, `Writer` and `WRITERS` of the formats; `check_table_path`, `write_table`,
+`read_table`, `blocks_of`, `keep_room`.
 Guarantees: a block is in the file whole or not at all; before a block is written, room is kept on the disk
 for it and for the file's end, so that on a full disk the blocks before it can still be finished. The same
 rows give the same bytes; numbers keep every digit; an empty cell is empty, never NaN; at most a block of rows
@@ -271,6 +271,29 @@ def write_table(
             writer.close()
 
     write_file(path, write)
+
+
+def read_table(path: Path, columns: Sequence[Column]) -> tuple[NDArray[Any], ...]:
+    """Return columns of a table that `write_table` wrote, as floats, NaN where nothing is, or as objects."""
+    if path.suffix == ".parquet":
+        parquet = need("pyarrow.parquet", "data")
+        table = parquet.read_table(path, columns=[one.heading for one in columns])
+        cells = [table.column(one.heading).to_pylist() for one in columns]
+    else:
+        with path.open(encoding="utf-8", newline="") as file:
+            lines = csv.reader(file)
+            heading = next(lines)
+            places = [heading.index(one.heading) for one in columns]
+            rows = [[row[place] for place in places] for row in lines]
+        read = {"number": float, "count": int, "text": str}
+        cells = [
+            [read[one.kind](cell) if cell or one.kind == "text" else None for cell in own]
+            for one, own in zip(columns, zip(*rows, strict=True), strict=True)
+        ]
+    return tuple(
+        np.array(own, dtype=np.float64 if one.kind == "number" else object)
+        for one, own in zip(columns, cells, strict=True)
+    )
 
 
 def blocks_of(rows: Iterable[Row]) -> Iterator[list[tuple[Cell, ...]]]:

@@ -77,6 +77,10 @@ def test_the_truth_of_every_matrix_within_the_error_is_within_the_bound(
         assert float(off.mid()) <= found.error[k] + CERTAIN
         pair = 1 if abs(float(largest.imag.mid())) > CERTAIN else 0
         assert all(float(abs(one).mid()) < found.others[k] for one in rest[pair:])
+        assert not found.alone[k] or all(float(abs(one).mid()) < 1 for one in rest[pair:])
+    # A second one that grows is never overlooked, and where there is none it mostly shows.
+    assert not found.alone.any() or sum(abs(value) >= 1 for value in values) <= 1
+    assert found.alone.any() or alike > 0 or values[1] == 1.0 or not told.any()
 
 
 @pytest.mark.parametrize("values", SPECTRA, ids=range(len(SPECTRA)))

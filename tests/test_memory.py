@@ -38,7 +38,7 @@ SHORT = "simulate scene.yaml --duration 16ms"
         (
             AVERAGE,
             "sweep scene.yaml --out a.csv --over coordination.stiffness=0N/m:900N/m:1000",
-            "E883 1,000 points of 8 columns take about 128 kB",
+            "E883 1,000 points of 8 columns take about 256 kB",
         ),
     ],
 )

@@ -26,8 +26,11 @@ def test_the_series_has_the_eigenvalues_of_the_frame_everywhere() -> None:
     family, direct = both()
     points = np.random.default_rng(5).random((200, 2))
     for series, frame in zip(family.matrices(points), direct.matrices(points), strict=True):
-        found, truth = (np.sort_complex(np.linalg.eigvals(one)) for one in (series, frame))
-        assert np.abs(np.sort(np.abs(found)) - np.sort(np.abs(truth))).max() < 1e-12
+        found, truth = (np.sort(np.abs(np.linalg.eigvals(one))) for one in (series, frame))
+        queued = truth.shape[1] - found.shape[1]  # of a packet that nobody hears, as nothing damps here
+        assert queued == 1
+        assert np.abs(found - truth[:, queued:]).max() < 1e-12
+        assert truth[:, :queued].max() < 1e-12
 
 
 def test_its_slopes_are_those_of_its_sum() -> None:

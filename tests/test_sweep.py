@@ -12,7 +12,9 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 import apc
@@ -21,6 +23,7 @@ from apc.analysis.analysis import Analysis
 from apc.compiler.errors import ApcError
 from apc.processes import model_bytes
 from apc.sweeps import store as sweep_store
+from apc.sweeps import sweep as sweep_module
 from apc.sweeps.sweep import Sweep, sweep
 from apc.sweeps.work import Work, compute_part
 from tests.sweeping import CHEAP, alive, children, parts, start, start_waiting, wait_for_parts
@@ -76,7 +79,10 @@ def test_a_part_does_not_depend_on_the_parts_computed_before() -> None:
     work = Work(model_bytes(MODEL), "analyze", small(jobs=1).grid, 20)
     forward = [compute_part(work, part) for part in range(work.parts)]
     backward = [compute_part(work, part) for part in reversed(range(work.parts))]
-    assert forward == backward[::-1]
+    for one, other in zip(forward, reversed(backward), strict=True):
+        assert (one.part, one.versions) == (other.part, other.versions)
+        for cells, again in zip(one.cells, other.cells, strict=True):
+            np.testing.assert_array_equal(cells, again)
 
 
 def test_a_sweep_becomes_a_pandas_table() -> None:
@@ -98,6 +104,34 @@ def test_a_point_at_fault_says_why_and_the_sweep_goes_on(tmp_path: Path) -> None
     assert found.column("message").tolist() == ["", "", message, ""]
     assert target.read_text(encoding="utf-8").splitlines()[3] == f'0.0015,0.001,error: E625,,,,,,"{message}"'
     assert f"at 1 of them: {message}" in str(found)
+
+
+def test_what_stands_in_a_file_is_read_from_there_and_not_held(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    held = small(jobs=1)
+    for suffix in ("csv", "parquet"):
+        found = small(out=tmp_path / f"r.{suffix}", jobs=1)
+        assert found.held is None and (found.verdicts, str(found)[-200:]) == (held.verdicts, str(held)[-200:])
+        for heading, one, other in zip(held.headings, found.columns, held.columns, strict=True):
+            assert one.dtype == other.dtype
+            np.testing.assert_array_equal(one, other)
+            np.testing.assert_array_equal(found.column(heading), other)
+
+
+def test_the_rows_of_many_parts_make_whole_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, target = tmp_path / "whole.csv", tmp_path / "blocks.csv"
+    small(out=whole, jobs=1)
+    monkeypatch.setattr(sweep_module, "BLOCK", 50)  # parts have 64 points, the last one fewer
+    blocks = []
+    write = sweep_module.write_table
+
+    def watched(path: Path, listed: Any, given: Any, about: Any) -> None:
+        write(path, listed, (blocks.append(len(one[0])) or one for one in given), about)
+
+    monkeypatch.setattr(sweep_module, "write_table", watched)
+    small(out=target, jobs=1)
+    assert blocks == [50, 50, 50, 50]
+    assert target.read_bytes() == whole.read_bytes()
 
 
 def test_parquet_and_dataframe_hold_the_same_rows(tmp_path: Path) -> None:
@@ -123,7 +157,7 @@ def test_damaged_parts_are_computed_again_and_named(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         small(out=target, jobs=1, progress=stop)
     assert len(parts(target)) == 2
-    (tmp_path / "r.csv.parts" / "part-1.json").write_bytes(b"not mine")
+    (tmp_path / "r.csv.parts" / "part-1.npz").write_bytes(b"not mine")
     found = small(out=target, jobs=1)
     assert found.notes == ("part 1 was damaged and is computed again", "64 points were there already")
     assert target.read_bytes() == whole.read_bytes()

@@ -11,7 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apc.tables import BLOCK, Column, Csv, Writer, blocks_of, check_table_path, keep_room, write_table
+from apc.tables import (
+    BLOCK,
+    Column,
+    Csv,
+    Writer,
+    blocks_of,
+    check_table_path,
+    keep_room,
+    read_table,
+    write_table,
+)
 from tests.topologies import told
 
 COLUMNS = (Column("x", "m"), Column("verdict", kind="text"), Column("modes", kind="count"))
@@ -49,6 +59,20 @@ def test_columns_as_arrays_are_the_same_file_as_their_cells(tmp_path: Path, suff
     write_table(paths[0], COLUMNS, blocks_of(ROWS), {})
     write_table(paths[1], COLUMNS, [[numbers, texts, counts]], {})
     assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_columns_come_back_as_they_were_written(tmp_path: Path, suffix: str) -> None:
+    pytest.importorskip("pyarrow")
+    path = tmp_path / f"t.{suffix}"
+    write_table(path, COLUMNS, blocks_of(ROWS), {})
+    counts, numbers = read_table(path, [COLUMNS[2], COLUMNS[0]])  # some of them, in any order
+    (texts,) = read_table(path, COLUMNS[1:2])
+    assert counts.tolist() == [row[2] for row in ROWS]
+    np.testing.assert_array_equal(numbers, [math.nan if row[0] is None else row[0] for row in ROWS])
+    assert [text or None for text in texts.tolist()] == [
+        row[1] for row in ROWS
+    ]  # CSV has no texts that are none
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])

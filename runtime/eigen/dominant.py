@@ -45,7 +45,7 @@ Matrix = NDArray[Any]
 # not gone, so many times more, which leaves nothing of what is smaller by 0.1 %.
 SQUARINGS, MORE = 11, 5
 
-# After so many squarings the largest entry is brought to 1: none has left the range of floats by then.
+# After so many squarings the norm is brought to 1: no entry has left the range of floats by then.
 EVERY = 3
 
 # A power of a matrix with one largest eigenvalue is of rank 1 up to this.
@@ -92,7 +92,7 @@ def largest_pairs(matrix: Floats) -> tuple[Complexes, Complexes, Complexes]:
         Real matrices (k, n, n), their states scaled alike (see `pseudospectrum.balance`).
     """
     with np.errstate(all="ignore"):
-        power = _squared(matrix / _peaks(matrix), SQUARINGS)
+        power = _squared(_shrunk(matrix), SQUARINGS)
         value, right, left = _left_by(power, matrix)
         moved = (matrix @ right[:, :, None])[:, :, 0] - value[:, None] * right
         again = np.flatnonzero(~(np.abs(moved).max(axis=1, initial=0.0) <= SETTLED * np.abs(value)))
@@ -120,12 +120,17 @@ def _largest_of_all(matrix: Floats) -> tuple[Complexes, Complexes, Complexes]:
 
 
 def _squared(power: Floats, times: int) -> Floats:
-    """Square matrices (k, n, n) so many times, and bring their largest entries to 1."""
+    """Square matrices (k, n, n) so many times, and bring their norms to 1."""
     for time in range(times):
         power = power @ power
         if time % EVERY == EVERY - 1 or time == times - 1:
-            power /= _peaks(power)
+            power = _shrunk(power)
     return power
+
+
+def _shrunk(matrix: Floats) -> Floats:
+    """Return matrices (k, n, n) over their norms."""
+    return matrix / _norms(matrix)[:, None, None]
 
 
 def _left_by(power: Floats, matrix: Floats) -> tuple[Complexes, Complexes, Complexes]:
@@ -134,7 +139,7 @@ def _left_by(power: Floats, matrix: Floats) -> tuple[Complexes, Complexes, Compl
     one = _cross(power)
     rest = power - one[0][:, :, None] * one[1][:, None]
     two = _cross(rest)
-    alone = ~(np.abs(rest).max(axis=(1, 2)) > ALONE)
+    alone = ~(np.abs(two[2]) > ALONE)
     right, left = np.stack([one[0], two[0]], axis=2), np.stack([one[1], two[1]], axis=1)
     form, pairing = left @ (matrix @ right), left @ right
     form[alone, 1], form[alone, 0, 1] = 0.0, 0.0
@@ -146,17 +151,13 @@ def _left_by(power: Floats, matrix: Floats) -> tuple[Complexes, Complexes, Compl
     return value, v, w / (w * v).sum(axis=1, keepdims=True)
 
 
-def _peaks(matrix: Floats) -> Floats:
-    """Return the largest magnitude of each matrix (k, 1, 1)."""
-    return np.asarray(np.maximum(matrix.max(axis=(1, 2)), -matrix.min(axis=(1, 2))))[:, None, None]
-
-
-def _cross(matrix: Floats) -> tuple[Floats, Floats]:
-    """Return the column (k, n) and the row (k, n) of each matrix's largest entry, the row over that entry."""
+def _cross(matrix: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the column (k, n), and over it the row (k, n), of each matrix's largest entry; and that (k,)."""
     k, n = len(matrix), matrix.shape[-1]
     row, column = np.divmod(np.abs(matrix).reshape(k, n * n).argmax(axis=1), n)
     every = np.arange(k)
-    return matrix[every, :, column], matrix[every, row] / matrix[every, row, column][:, None]
+    peak = matrix[every, row, column]
+    return matrix[every, :, column], matrix[every, row] / peak[:, None], peak
 
 
 def _solved(matrix: Floats, right: Matrix) -> Matrix:
@@ -276,9 +277,8 @@ def misses_one(matrix: Floats, error: Floats) -> Truths:
             inverse = np.linalg.inv(away)
         except np.linalg.LinAlgError:
             return np.zeros(len(matrix), dtype=np.bool_)
-        doubt = error + (n + 3) * UNIT * (unit + np.abs(matrix))
-        wrong = np.abs(unit - inverse @ away) + np.abs(inverse) @ doubt
-        return np.asarray(wrong.sum(axis=2).max(axis=1, initial=0.0) < 0.5)
+        doubt = _norms(error) + (n + 4) * UNIT * (n + _norms(matrix))
+        return np.asarray(_norms(unit - inverse @ away) + _norms(inverse) * doubt < 0.5)
 
 
 def resolvents(matrix: Floats) -> Floats:

@@ -212,7 +212,8 @@ def _courses(
     n_x, n_u = site.b.shape[-2:]
     a, b = site.a, site.b
     every, below = np.arange(len(states)), np.eye(n_x + n_u)[n_x:]
-    own, which = np.unique(states, return_inverse=True) if len(a) == len(b) == 1 else (states, every)
+    alike = len(a) == len(b) == 1
+    own, which = np.unique(states, return_inverse=True) if alike else (states, every)
     steps, fine = {}, {}
     for duration, number in points.items():
         step = exponential_values(a, b, float(duration * schedule.quantum) / number)
@@ -232,7 +233,7 @@ def _courses(
 
     def watch(duration: int, moving: NDArray[Any]) -> None:
         rows = fine[duration]
-        if len(own) < len(every):
+        if alike:
             seen = (rows.reshape(-1, rows.shape[-1]) @ moving).reshape(*rows.shape[:2], 2, -1)
             parts.append(seen[0] if len(own) == 1 else seen[which, :, :, every].transpose(1, 2, 0))
         else:

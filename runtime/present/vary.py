@@ -191,7 +191,8 @@ def analyses_text(found: Analyses) -> str:
         lines += note(text)
     for name, values in zip(found.parameters, found.values, strict=True):
         lines.append(f"  {name}: {values.min():g} … {values.max():g}")
-    return "\n".join([*lines, *_verdict_lines(found.verdict.ravel(), found.message.ravel())])
+    counts = (Counter(one.ravel().tolist()) for one in (found.verdict, found.message))
+    return "\n".join([*lines, *_verdict_lines(*counts)])
 
 
 def analyses_document(found: Analyses) -> dict[str, Any]:
@@ -219,13 +220,12 @@ def _analyses_columns(found: Analyses) -> dict[str, NDArray[Any]]:
     return {heading: column.ravel() for heading, column in every.items()}
 
 
-def _verdict_lines(verdicts: NDArray[Any], messages: NDArray[Any]) -> list[str]:
+def _verdict_lines(verdicts: Counter[str], messages: Counter[str]) -> list[str]:
     """Return how many points have each verdict, and what most of those at fault say."""
-    counts = sorted(Counter(verdicts.tolist()).items(), key=lambda item: (-item[1], item[0]))
+    counts = sorted(verdicts.items(), key=lambda item: (-item[1], item[0]))
     lines = [f"  {count:>10,} × {verdict}" for verdict, count in counts]
-    said = Counter(cell for cell in messages.tolist() if cell)
-    if said:
-        text, count = said.most_common(1)[0]
+    said = Counter({text: count for text, count in messages.items() if text})
+    for text, count in said.most_common(1):
         lines += note(f"at {count:,} of them: {text}")
     return lines
 
@@ -241,7 +241,7 @@ def sweep_text(found: Sweep) -> str:
         lines.append(
             f"  {axis.free.label}: {with_unit(ends, axis.unit)}, {counted(len(axis.values), 'value')}"
         )
-    lines += _verdict_lines(found.column("verdict"), found.column("message"))
+    lines += _verdict_lines(found.counts, found.messages)
     return "\n".join([*lines, *(f"  note: {one}" for one in found.notes)])
 
 

@@ -21,6 +21,7 @@ from numpy.polynomial.chebyshev import chebder, chebvander
 from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
+from apc.eigen.enclosure import components
 from apc.eigen.pseudospectrum import balance
 from apc.frame.discretize import UNIT
 from apc.frame.names import Range
@@ -173,6 +174,8 @@ def resolve_family(evaluator: Evaluator, rectangle: Rectangle, errors: Errors) -
         series = [
             one * (scale[None, :] / scale[:, None]).ravel() for one, scale in zip(series, scales, strict=True)
         ]
+        doubts = [one * scale / scale[:, None] for one, scale in zip(wrong, scales, strict=True)]
+        series, doubts = _without_queues(series, doubts)
         largest = [float(np.abs(one).max(initial=0.0)) for one in series]
         x_done, y_done = (
             all(
@@ -187,11 +190,8 @@ def resolve_family(evaluator: Evaluator, rectangle: Rectangle, errors: Errors) -
             return ChebyshevFamily(
                 terms=terms,
                 coefficients=coefficients,
-                sizes=tuple(one.shape[1] for one in sampled),
-                errors=tuple(
-                    one * scale / scale[:, None] + left_out * most
-                    for one, scale, most in zip(wrong, scales, largest, strict=True)
-                ),
+                sizes=tuple(map(len, doubts)),
+                errors=tuple(one + left_out * most for one, most in zip(doubts, largest, strict=True)),
             )
         counts = (counts[0] * (1 if x_done else 2), counts[1] * (1 if y_done else 2))
     sampled = evaluator.matrices(corners[:1])
@@ -217,6 +217,21 @@ def _sample(
         by_y = (x @ values).reshape(counts[0], counts[1], -1)
         series.append(y @ by_y)
     return sampled, series
+
+
+def _without_queues(series: list[Floats], errors: list[Floats]) -> tuple[list[Floats], list[Floats]]:
+    """Return each system's series (n_x, n_y, n²) and errors (n, n) over states that drive one another.
+
+    All others, as packets that are only passed on, have the eigenvalue 0 wherever the entries are.
+    """
+    kept, doubts = [], []
+    for one, error in zip(series, errors, strict=True):
+        size = np.abs(one).max(axis=(0, 1)).reshape(error.shape) + error
+        parts = [states for states in components(size != 0) if size[np.ix_(states, states)].any()]
+        places = np.sort(np.concatenate(parts)) if parts else np.arange(len(size))
+        kept.append(one[:, :, (places[:, None] * len(size) + places).ravel()])
+        doubts.append(error[np.ix_(places, places)])
+    return kept, doubts
 
 
 def _with_slopes(series: list[Floats], dropped: list[float]) -> tuple[NDArray[np.int64], tuple[Floats, ...]]:

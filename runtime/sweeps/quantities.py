@@ -10,6 +10,7 @@ Does not: choose points, or hold results.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,20 +31,23 @@ PLACE = Place("sweep")
 # How the name of a quantity begins that is by another criterion than the nominal one.
 BEGINNINGS = {MEAN_SQUARE: "in mean square: ", PASSIVE: "with passive hands: "}
 
+Cells = tuple[NDArray[Any], ...]
+
 VERDICT = Column("verdict", "", "text")
 MESSAGE = Column("message", "", "text")
 
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A result of every point: `rows` gives the rows of some points of a grid, cells in order of `columns`.
+    """A result of every point: `cells` gives those of some points of a grid, an array for each of `columns`.
 
-    The first column is the verdict, the last a message, empty but where a point is at fault. `quick` says
-    that a point takes next to no time, so that many make a part of the work.
+    Of numbers and counts it is one of floats, NaN where a point has none; of texts one of objects. The first
+    column is the verdict, the last a message, empty but where a point is at fault. `quick` says that a point
+    takes next to no time, so that many make a part of the work.
     """
 
     columns: tuple[Column, ...]
-    rows: Callable[[Grid, Sequence[int]], list[Row]]
+    cells: Callable[[Grid, Sequence[int]], Cells]
     quick: bool = False
 
 
@@ -100,7 +104,7 @@ def _analyze(system: CompiledSystem, argument: str) -> Quantity:
     )
     made: list[tuple[Grid, ManyAnalyses]] = []
 
-    def rows(grid: Grid, points: Sequence[int]) -> list[Row]:
+    def cells(grid: Grid, points: Sequence[int]) -> Cells:
         if not made or made[0][0] is not grid:
             varied = [
                 Varied(axis.free, np.array([float(value) for value in axis.values]), exact)
@@ -109,23 +113,19 @@ def _analyze(system: CompiledSystem, argument: str) -> Quantity:
             ]
             made[:] = [(grid, many_analyses(system, varied))]
         found = made[0][1].at(grid.places(points))
-        cells = [
-            found.verdict.tolist(),
+        return (
+            found.verdict,
             *map(_finite, (found.spectral_radius, found.spectral_radius_error)),
-            [None if count < 0 else count for count in found.rigid_modes.tolist()],
+            np.where(found.rigid_modes < 0, np.nan, found.rigid_modes),
             *map(_finite, (found.frequency_hz, found.damping_ratio)),
-            found.message.tolist(),
-        ]
-        return list(zip(*cells, strict=True))
+            found.message,
+        )
 
-    return Quantity(columns, rows, by_matrices(system))
+    return Quantity(columns, cells, by_matrices(system))
 
 
-def _finite(numbers: NDArray[np.float64]) -> list[float | None]:
-    cells = numbers.astype(object)
-    cells[~np.isfinite(numbers)] = None
-    found: list[float | None] = cells.tolist()
-    return found
+def _finite(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.where(np.isfinite(numbers), numbers, np.nan)
 
 
 def _growth(system: CompiledSystem, argument: str) -> Quantity:
@@ -188,19 +188,22 @@ def _critical_by(criterion: str) -> Callable[[CompiledSystem, str], Quantity]:
 
 def _one_by_one(
     system: CompiledSystem, columns: tuple[Column, ...], evaluate: Callable[[CompiledSystem], Row]
-) -> Callable[[Grid, Sequence[int]], list[Row]]:
+) -> Callable[[Grid, Sequence[int]], Cells]:
     """Return what evaluates some points of a grid, each by itself."""
 
-    def rows(grid: Grid, points: Sequence[int]) -> list[Row]:
-        found = []
+    def cells(grid: Grid, points: Sequence[int]) -> Cells:
+        rows = []
         for point in points:
             try:
-                found.append(evaluate(apply(system, grid.overrides(point))))
+                rows.append(evaluate(apply(system, grid.overrides(point))))
             except ApcError as error:
-                found.append(faulty(columns, error))
-        return found
+                rows.append(faulty(columns, error))
+        kinds = [object if one.kind == "text" else np.float64 for one in columns]  # None is NaN
+        return tuple(
+            np.array(own, dtype=kind) for own, kind in zip(zip(*rows, strict=True), kinds, strict=True)
+        )
 
-    return rows
+    return cells
 
 
 def _critical(system: CompiledSystem, argument: str, criterion: str = "nominal") -> Quantity:

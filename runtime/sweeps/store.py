@@ -1,6 +1,6 @@
 """The finished parts of a sweep on disk, so that nothing is computed twice.
 
-Takes: the target of a sweep, a description of the sweep, rows as they come.
+Takes: the target of a sweep, a description of the sweep, cells as they come.
 Gives: `Parts`, `open_parts`, `remove_parts`.
 Guarantees: a part is there whole or not at all, whatever moment the process is killed at; a damaged part, or
 one of another sweep, counts as not there; one process at a time works on a target; no folder is touched that
@@ -11,12 +11,13 @@ Beside `results.csv` stands the folder `results.csv.parts`:
 
     manifest.json   that `apc sweep` made the folder, and for which sweep: model, axes, versions
     lock            held by the process at work, freed by the system when it ends, however it ends
-    part-7.json     the SHA-256 of the rest of the file, a line; the rows of part 7, with the sweep's digest
+    part-7.npz      the SHA-256 of the rest of the file, a line; the cells of part 7, with the sweep's digest
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import re
@@ -27,18 +28,21 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, read_file, unwritable, write_file
 from apc.compiler.frozen import dataclass
-from apc.tables import Row
+from apc.sweeps.quantities import Cells
 
 SUFFIX = ".parts"
 _MANIFEST = "manifest.json"
 _LOCK = "lock"
 _MARK = {"made by": "apc sweep"}  # in the manifest
 _LARGEST = 1 << 30  # bytes of a manifest, which holds the values of all axes, or of a part
-_OWN = re.compile(rf"({_LOCK}|part-[0-9]+\.json)\Z")
-_HALF = re.compile(rf"\.({re.escape(_MANIFEST)}|part-[0-9]+\.json)\.\w+\Z")  # what a killed process had begun
+_OWN = re.compile(rf"({_LOCK}|part-[0-9]+\.npz)\Z")
+_HALF = re.compile(rf"\.({re.escape(_MANIFEST)}|part-[0-9]+\.npz)\.\w+\Z")  # what a killed process had begun
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,33 +52,60 @@ class Parts:
     folder: Path
     sweep: str
 
-    def write(self, part: int, rows: tuple[Row, ...]) -> None:
-        """Keep the rows of a part. Raises ApcError E601 if they can't be written."""
-        document = {"sweep": self.sweep, "part": part, "rows": rows}
-        body = json.dumps(document, allow_nan=False).encode()
+    def write(self, part: int, cells: Cells) -> None:
+        """Keep the cells of a part. Raises ApcError E601 if they can't be written."""
+        body = _packed(cells, self.sweep, part)
         digest = hashlib.sha256(body).hexdigest().encode()
         write_file(self._path(part), lambda path: _fill(path, digest + b"\n" + body))
 
-    def read(self, part: int) -> tuple[Row, ...] | None:
-        """Return the rows of a part, or None if it is damaged, another sweep's or isn't there."""
+    def read(self, part: int) -> Cells | None:
+        """Return the cells of a part, or None if it is damaged, another sweep's or isn't there."""
         try:
             digest, _, body = read_file(self._path(part), _LARGEST).partition(b"\n")
         except RefusedError:
             return None
         if hashlib.sha256(body).hexdigest().encode() != digest:
             return None
-        document = json.loads(body)
-        if (document.get("sweep"), document["part"]) != (self.sweep, part):
+        found = np.load(io.BytesIO(body))
+        if (str(found["sweep"]), int(found["part"])) != (self.sweep, part):
             return None
-        return tuple(tuple(row) for row in document["rows"])
+        return _unpacked(found)
 
     def there(self) -> set[int]:
         """Return the numbers of the parts that have a file, damaged or not."""
-        names = (path.stem.removeprefix("part-") for path in self.folder.glob("part-*.json"))
+        names = (path.stem.removeprefix("part-") for path in self.folder.glob("part-*.npz"))
         return {int(name) for name in names if name.isdecimal()}
 
     def _path(self, part: int) -> Path:
-        return self.folder / f"part-{part}.json"
+        return self.folder / f"part-{part}.npz"
+
+
+def _packed(cells: Cells, sweep: str, part: int) -> bytes:
+    """Return columns as the bytes of an NPZ file: each text once, and of a cell its place, −1 of none."""
+    texts = {None: -1}
+    codes = [
+        [texts.setdefault(cell, len(texts) - 1) for cell in column.tolist()]
+        for column in cells
+        if column.dtype == object
+    ]
+    file = io.BytesIO()
+    np.savez(
+        file,
+        is_text=np.array([column.dtype == object for column in cells]),
+        numbers=np.array([column for column in cells if column.dtype != object]),
+        codes=np.array(codes, dtype=np.int32),
+        texts=np.array([text for text in texts if text is not None], dtype=np.str_),
+        sweep=np.array(sweep),
+        part=np.array(part),
+    )
+    return file.getvalue()
+
+
+def _unpacked(found: Mapping[str, NDArray[Any]]) -> Cells:
+    """Return the columns of `_packed`."""
+    numbers, codes = iter(found["numbers"]), iter(found["codes"])
+    texts = np.array([*found["texts"].tolist(), None], dtype=object)
+    return tuple(texts[next(codes)] if text else next(numbers) for text in found["is_text"].tolist())
 
 
 @contextmanager
@@ -105,7 +136,7 @@ def open_parts(target: Path, description: Mapping[str, Any]) -> Iterator[Parts]:
                 path.unlink(missing_ok=True)
         yield Parts(folder, hashlib.sha256(whole.encode()).hexdigest())
     finally:
-        if not any(folder.glob("part-*.json")) and _is_current(lock, folder / _LOCK):
+        if not any(folder.glob("part-*.npz")) and _is_current(lock, folder / _LOCK):
             _remove(folder)  # nothing came of it
         lock.close()
 

@@ -31,10 +31,10 @@ from apc.network.nominal import left_out, refuse_channel_number
 from apc.processes import Patience, Workers, cores, local_processes, model_bytes, results, this_process
 from apc.result import Result
 from apc.sweeps.grid import Grid, build_grid, check_size, parse_axis
-from apc.sweeps.quantities import BEGINNINGS, VERDICT, by_criterion, find_quantity
+from apc.sweeps.quantities import BEGINNINGS, Cells, by_criterion, find_quantity
 from apc.sweeps.store import Parts, open_parts, remove_parts
 from apc.sweeps.work import Computed, Work, compute_part, program_versions
-from apc.tables import BLOCK, Cell, Column, Row, check_table_path, write_table
+from apc.tables import BLOCK, Column, check_table_path, read_table, write_table
 from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE, criterion_of, refuse_time
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ PLACE = Place("sweep")
 
 # Points of a part: a third of a second of analyses, which is what a kill can cost; more where points are
 # quick, as long as there are parts for all who compute; and no more files in a folder than one likes to list.
-PART_POINTS, QUICK_POINTS = 64, 2048
+PART_POINTS, QUICK_POINTS = 64, 8192
 SHARES = 32
 MOST_PARTS = 10_000
 
@@ -63,8 +63,10 @@ LOST = Mistake(
 class Sweep(Result):
     """The rows of a sweep, by columns: swept parameters first, in SI, then results.
 
-    A column of numbers is a float64 array (n,), NaN where a point has no number; others are object arrays.
-    `made_of` says what made it: model, axes, versions. `notes` tell what was out of the ordinary.
+    `columns` and `column` give them: of numbers a float64 array (n,), NaN where a point has no number; of
+    others object arrays. What stands in the file `out` is read from there, and not held. `counts` and
+    `messages` say how many points have which verdict and message. `made_of` says what made it: model, axes,
+    versions. `notes` tell what was out of the ordinary.
     """
 
     shown_by = "vary:sweep"
@@ -72,8 +74,10 @@ class Sweep(Result):
     topology: str
     of: str
     grid: Grid
-    headings: tuple[str, ...]
-    columns: tuple[NDArray[Any], ...]
+    listed: tuple[Column, ...]
+    held: Cells | None
+    counts: Counter[str]
+    messages: Counter[str]
     out: Path | None
     made_of: Mapping[str, Any]
     notes: tuple[str, ...]
@@ -83,15 +87,31 @@ class Sweep(Result):
         """The number of rows."""
         return self.grid.points
 
+    @property
+    def headings(self) -> tuple[str, ...]:
+        """The headings of the columns, such as `verdict` or `contact.stiffness [N/m]`."""
+        return tuple(one.heading for one in self.listed)
+
+    @property
+    def columns(self) -> Cells:
+        """The columns, in the order of `headings`."""
+        if self.held is not None:
+            return self.held
+        assert self.out is not None, "what is in no file is held"
+        return read_table(self.out, self.listed)
+
     def column(self, heading: str) -> NDArray[Any]:
-        """Return the column of a heading, such as `verdict` or `contact.stiffness [N/m]`."""
-        return self.columns[self.headings.index(heading)]
+        """Return the column of a heading."""
+        place = self.headings.index(heading)
+        if self.held is not None:
+            return self.held[place]
+        assert self.out is not None, "what is in no file is held"
+        return read_table(self.out, self.listed[place : place + 1])[0]
 
     @property
     def verdicts(self) -> tuple[tuple[str, int], ...]:
         """Each verdict and how many points have it, the most frequent first."""
-        counts = Counter(self.column(VERDICT.heading).tolist())
-        return tuple(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
+        return tuple(sorted(self.counts.items(), key=lambda item: (-item[1], item[0])))
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return the sweep as a pandas table, with the headings as its columns."""
@@ -99,7 +119,9 @@ class Sweep(Result):
         return table
 
 
-NUMBER, CELL = 16, 150  # bytes of a cell in a column; and where no file keeps the rows
+# Bytes of a cell at hand, of a number as of a word that many rows share: its part's, the whole's, and what
+# these are put together from.
+CELL = 32
 
 
 @part("points")
@@ -167,27 +189,27 @@ def sweep(
         raise ApcError(Mistake("E889", PLACE, "the number of processes", "1 or more", str(jobs)))
     width = len(grid.axes) + len(quantity.columns)
     what = f"{grid.points:,} points of {width} columns"
-    needed = grid.points * width * (NUMBER if out else CELL)
-    refuse_beyond(needed, "E883", PLACE, what, "fewer values" if out else "fewer values, or out=FILE.parquet")
+    filed = _in_a_file(out)
+    needed = (min(grid.points, 2 * BLOCK) if filed else grid.points) * width * CELL
+    refuse_beyond(
+        needed, "E883", PLACE, what, "fewer values" if filed else "fewer values, or out=FILE.parquet"
+    )
     work = Work(model_bytes(system), work_of, grid, part_points(grid.points, quick=quantity.quick))
     made_of = _description(system, work)
     with _kept(out, made_of) as kept:
         whose = Whose(jobs or cores(), cluster, patience or Patience())
         notes = _compute_missing(work, kept, whose, progress)
         listed = (*(Column(axis.heading) for axis in grid.axes), *quantity.columns)
-        kinds = [one.kind for one in listed]
-        columns: tuple[NDArray[Any], ...] = tuple(
-            np.empty(grid.points, dtype=np.float64 if kind == "number" else object) for kind in kinds
-        )
-        _collect(work, kept, kinds, columns)
+        counts = Counter[str](), Counter[str]()
+        blocks, held = _blocks(work, kept, [one.kind for one in listed], counts), None
+        if isinstance(kept, _Memory):
+            held = tuple(np.concatenate(own) for own in zip(*blocks, strict=True))
+            blocks = ([column[at : at + BLOCK] for column in held] for at in range(0, grid.points, BLOCK))
         if out is not None:
-            starts = range(0, grid.points, BLOCK)
-            blocks = ([column[at : at + BLOCK] for column in columns] for at in starts)
             write_table(out, listed, blocks, made_of)
-            if isinstance(kept, Parts):
-                remove_parts(out)
-    headings = tuple(one.heading for one in listed)
-    return Sweep(system.name, of, grid, headings, columns, out, made_of, notes)
+        if out is not None and isinstance(kept, Parts):
+            remove_parts(out)
+    return Sweep(system.name, of, grid, listed, held, *counts, out, made_of, notes)
 
 
 def part_points(points: int, *, quick: bool) -> int:
@@ -242,24 +264,29 @@ class _Memory:
     """Parts that are nowhere but here, as `store.Parts` are on disk."""
 
     def __init__(self) -> None:
-        self._rows: dict[int, tuple[Row, ...]] = {}
+        self._cells: dict[int, Cells] = {}
 
-    def write(self, part: int, rows: tuple[Row, ...]) -> None:
-        self._rows[part] = rows
+    def write(self, part: int, cells: Cells) -> None:
+        self._cells[part] = cells
 
-    def read(self, part: int) -> tuple[Row, ...] | None:
-        return self._rows.get(part)
+    def read(self, part: int) -> Cells | None:
+        return self._cells.get(part)
 
     def there(self) -> set[int]:
-        return set(self._rows)
+        return set(self._cells)
 
 
 _Kept = Parts | _Memory
 
 
+def _in_a_file(out: Path | None) -> bool:
+    """Say whether rows stand in a file that can be read again."""
+    return out is not None and not is_special(out)
+
+
 @contextmanager
 def _kept(out: Path | None, made_of: Mapping[str, Any]) -> Iterator[_Kept]:
-    if out is None or is_special(out):
+    if out is None or not _in_a_file(out):
         yield _Memory()
         return
     with open_parts(out, made_of) as parts:
@@ -292,8 +319,8 @@ def _compute_missing(work: Work, kept: _Kept, whose: Whose, progress: Progress |
         for computed in results(workers, missing, whose.patience, PLACE):
             if computed.versions != program_versions():
                 raise ApcError(_other_versions(computed, whose.cluster))
-            kept.write(computed.part, computed.rows)
-            done += len(computed.rows)
+            kept.write(computed.part, computed.cells)
+            done += len(work.points_of(computed.part))
             if progress:
                 progress(done, work.grid.points)
     return tuple(notes)
@@ -317,19 +344,34 @@ def _other_versions(computed: Computed, cluster: str | None) -> Mistake:
     return Mistake("E888", Place(cluster or "sweep"), what)
 
 
-def _collect(work: Work, kept: _Kept, kinds: Sequence[str], columns: Sequence[NDArray[Any]]) -> None:
-    """Fill in the columns: the values of the axes, then the results."""
+def _blocks(
+    work: Work, kept: _Kept, kinds: Sequence[str], counts: tuple[Counter[str], Counter[str]]
+) -> Iterator[list[NDArray[Any]]]:
+    """Yield the rows as blocks of columns, the values of the axes first; count the verdicts and messages."""
     values = [np.array([float(value) for value in axis.values]) for axis in work.grid.axes]
-    words: dict[Cell, Cell] = {}  # a verdict that stands in a million rows is held once
+    waiting: list[list[NDArray[Any]]] = []
+    rows = 0
     for number in range(work.parts):
-        computed = kept.read(number)
-        assert computed is not None, f"part {number} was written and is gone"
-        points = work.points_of(number)
-        places = work.grid.places(points)
-        listed: list[Any] = [own[places[:, axis]] for axis, own in enumerate(values)]
-        listed += list(zip(*computed, strict=True))
-        for column, cells, kind in zip(columns, listed, kinds, strict=True):
-            if kind == "number":  # None is NaN
-                column[points.start : points.stop] = np.array(cells, dtype=np.float64)
-            else:
-                column[points.start : points.stop] = [words.setdefault(cell, cell) for cell in cells]
+        cells = kept.read(number)
+        assert cells is not None, f"part {number} was written and is gone"
+        places = work.grid.places(work.points_of(number))
+        columns = [own[places[:, axis]] for axis, own in enumerate(values)] + list(cells)
+        counts[0].update(cells[0].tolist())
+        counts[1].update(cells[-1].tolist())
+        waiting.append(
+            [_counts(one) if kind == "count" else one for one, kind in zip(columns, kinds, strict=True)]
+        )
+        rows += len(places)
+        while rows >= BLOCK or (rows and number == work.parts - 1):
+            whole = [np.concatenate(own) for own in zip(*waiting, strict=True)]
+            yield [one[:BLOCK] for one in whole]
+            rows = max(rows - BLOCK, 0)
+            waiting = [[one[BLOCK:] for one in whole]]
+
+
+def _counts(numbers: NDArray[np.float64]) -> NDArray[Any]:
+    """Return whole numbers as integers, None where there is none."""
+    nothing = np.isnan(numbers)
+    cells = np.where(nothing, 0.0, numbers).astype(np.int64).astype(object)
+    cells[nothing] = None
+    return cells

@@ -19,8 +19,7 @@ from apc.compiler.frozen import dataclass
 from apc.distribution import versions
 from apc.processes import model_of_bytes
 from apc.sweeps.grid import Grid
-from apc.sweeps.quantities import Quantity, find_quantity
-from apc.tables import Row
+from apc.sweeps.quantities import Cells, Quantity, find_quantity
 from apc.threads import single_threaded
 
 # What makes the numbers: with another version of one of them, the last digits may be others.
@@ -52,20 +51,20 @@ class Work:
         return range(first, min(first + self.part_points, self.grid.points))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Computed:
-    """The rows of a part, and the versions of what computed them."""
+    """The cells of a part (see `quantities.Quantity`), and the versions of what computed them."""
 
     part: int
-    rows: tuple[Row, ...]
+    cells: Cells
     versions: tuple[tuple[str, str], ...]
 
 
 def compute_part(work: Work, part: int) -> Computed:
     """Compute one part of a sweep. A point that can't be computed becomes a row that says why."""
     with _ONE_AT_A_TIME, single_threaded():
-        rows = _opened(work.model, work.of).rows(work.grid, work.points_of(part))
-    return Computed(part, tuple(rows), program_versions())
+        cells = _opened(work.model, work.of).cells(work.grid, work.points_of(part))
+    return Computed(part, cells, program_versions())
 
 
 @cache

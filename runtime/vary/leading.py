@@ -69,8 +69,7 @@ def parts_of(evaluator: BatchEvaluator) -> tuple[tuple[Part, ...], tuple[Truths,
         matrix, error = relative_bounded(wiring.system.matrix, wiring.system.error, wiring.relative)
         size = np.abs(matrix) + error
         patterns.append(size != 0)
-        whole = [np.arange(len(size))] if wiring.rigid.names else components(size != 0)
-        for states in whole:
+        for states in components(size != 0):
             block = size[np.ix_(states, states)]
             if block.any():
                 parts.append(Part(place, states, balance(block)))

@@ -41,8 +41,8 @@ def plain(model: Path, over: dict[str, str], count: int) -> float:
     grid = build_grid([parse_axis(system, name, text) for name, text in over.items()])
     quantity = find_quantity(system, "analyze")
     with single_threaded():
-        quantity.rows(grid, range(count))
-        return timed(lambda: quantity.rows(grid, range(count)))[0] / count
+        quantity.cells(grid, range(count))
+        return timed(lambda: quantity.cells(grid, range(count)))[0] / count
 
 
 def finish(folder: Path, words: list[str]) -> tuple[str, float]:
