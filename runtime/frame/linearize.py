@@ -213,8 +213,8 @@ def of_rows(function: Any, given: Mapping[int, NDArray[np.float64]]) -> list[NDA
         numbers[place] = np.array(rows, dtype=np.float64, order="C").ravel()
     for place, one in enumerate(numbers):
         buffer.set_arg(place, one.data)
-    for place, one in enumerate(found):
-        buffer.set_res(place, one.reshape(-1).data)
+    for place, rows in enumerate(found):
+        buffer.set_res(place, rows.reshape(-1).data)
     evaluate()
     return found
 

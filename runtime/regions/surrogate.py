@@ -21,7 +21,7 @@ from numpy.polynomial.chebyshev import chebder, chebvander
 from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
-from apc.eigen.enclosure import components
+from apc.eigen.eigenpairs import components
 from apc.eigen.pseudospectrum import balance
 from apc.frame.discretize import UNIT
 from apc.frame.names import Range
