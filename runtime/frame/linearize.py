@@ -108,9 +108,9 @@ def _finite_slopes(
         E808 a value of the site, or a slope of one, that is not finite.
     """
     if site.parameters_suffice:
-        (row,) = linearize_rows(site, np.asarray(parameters, dtype=np.float64)[None])
-        _refuse_infinite(site, row)
-        return row
+        one = linearize_rows(site, np.asarray(parameters, dtype=np.float64)[None])
+        _refuse_infinite(site, one[0])
+        return one.ravel()
     x, u, m, r, p, t = start_arguments(site, [float(value) for value in parameters], float, listening)
     kind = site.kind
     if not site.affine:  # else the start is anywhere
