@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
-from apc.eigen.apart import GROWN, SMALL, pairs_apart
+from apc.eigen.apart import GROWN, SMALL, Apart, pairs_apart
 from apc.eigen.eigenpairs import LARGE, Eigenpairs, components, eigenpairs
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance, norms, pseudospectral_radius
 from apc.eigen.relative import independent_places
@@ -39,6 +39,9 @@ Matrix = NDArray[Any]  # float64 or complex128
 # splits, this many; fewer of a matrix of more states, where each takes a second.
 WIDE = 1e-9
 SPLITS_TRIED, FEWER_SPLITS, MANY_STATES = 8, 2, 300
+
+# What the quick way leaves wider, relative to a radius of 1 or more, is looked at again.
+SHARP = 2e-12
 
 # Eigenvalues nearer to one another than this, relatively, are enclosed together: their own vectors are hardly
 # two.
@@ -164,16 +167,23 @@ def _enclose_blocks(blocks: Sequence[tuple[Matrix, Floats]]) -> list[tuple[Eigen
         for row, (place, apart) in enumerate(zip(places, told, strict=True)):
             own = Eigenpairs(pairs.values[row], pairs.right[row], pairs.left[row])
             if apart is None or not apart.high - apart.low <= WIDE * max(apart.low, 1.0):
-                found[place] = _enclose_part(*blocks[place], own)
+                found[place] = _enclose_part(*blocks[place])
             else:
-                found[place] = own, Enclosure(apart.low, apart.high, apart.near, apart.sharpened)
+                found[place] = own, _sharper(*blocks[place], apart)
     return [found[place] for place in range(len(blocks))]
 
 
-def _enclose_part(
-    matrix: Matrix, error: Floats, known: Eigenpairs | None = None
-) -> tuple[Eigenpairs, Enclosure]:
-    """Enclose the eigenvalues of a matrix whose states all drive each other; its pairs may be `known`.
+def _sharper(matrix: Matrix, error: Floats, apart: Apart) -> Enclosure:
+    """Return bounds on eigenvalues that stand apart, on the radius by more work where these say little."""
+    low, high = apart.low, apart.high
+    if high - low > SHARP * max(low, 1.0):
+        _, other = _enclose_part(matrix, error)
+        low, high = max(low, other.low), min(high, other.high)
+    return Enclosure(low, high, apart.near, apart.sharpened)
+
+
+def _enclose_part(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]:
+    """Enclose the eigenvalues of a matrix whose states all drive each other.
 
     The eigenvalues are split by magnitude, large from small, see `_enclose`. A chain of packets or forces
     that hardly anybody answers is nearly a Jordan block at zero, scattered by rounding over a ring that may
@@ -182,7 +192,7 @@ def _enclose_part(
     """
     scale = balance(np.abs(matrix) + error)
     matrix, error = matrix / scale[:, None] * scale, error / scale[:, None] * scale
-    found = eigenpairs(matrix) if known is None else _in_units(known, scale)
+    found = eigenpairs(matrix)
     pairs = found.at(np.lexsort((-found.values.imag, found.values.real, -np.abs(found.values))))
     values, right, left = pairs.values, pairs.right, pairs.left
     sizes = np.abs(values)
@@ -196,13 +206,6 @@ def _enclose_part(
     # No estimate is farther from its eigenvalue than both are from zero.
     errors = np.minimum(np.min([one.errors for one in tried], axis=0), sizes + high)
     return Eigenpairs(values, right * scale[:, None], left / scale), _told(min(low, high), high, errors)
-
-
-def _in_units(pairs: Eigenpairs, scale: Floats) -> Eigenpairs:
-    """Return pairs over the states in other units, each vector of length 1."""
-    right, left = pairs.right / scale[:, None], pairs.left * scale
-    right = right / np.linalg.norm(right, axis=0)
-    return Eigenpairs(pairs.values, right, left / np.linalg.norm(left, axis=1, keepdims=True))
 
 
 def _splits(sizes: Floats, first: int) -> Iterator[int]:

@@ -137,10 +137,12 @@ def _radius_of_two(matrix: Matrix, error: float) -> float:
     """
     (a, b), (c, d) = matrix.tolist()
     trace, size = abs(a + d), math.hypot(*map(abs, (a, b, c, d)))
-    # What rounds by less than the smallest float is charged as well.
-    determinant = abs(a * d - b * c) + 8 * UNIT * (abs(a * d) + abs(b * c)) + float(np.finfo(np.float64).tiny)
+    determinant = abs(a * d - b * c) + 8 * UNIT * (abs(a * d) + abs(b * c))
+    if (a and d) or (b and c):  # what vanishes of a product is less than the smallest float
+        determinant += float(np.finfo(np.float64).tiny)
     linear = trace + 4 * UNIT * (abs(a) + abs(d)) + math.sqrt(2) * error
-    return (linear + math.sqrt(linear * linear + 4 * (determinant + error * size))) / 2 * (1 + 16 * UNIT)
+    root = math.sqrt(linear * linear + 4 * (determinant + error * size))
+    return float((linear + root) / 2 * (1 + 16 * UNIT))
 
 
 def _outside(

@@ -169,9 +169,8 @@ def _still_stands(known: _Before, system: ClosedSystem) -> bool:
     numbering, exact = _Numbering(system.sites), [group.exact for group in system.sites]
     if any(len(one) != numbering.size for one in known.still):
         return False
-    forms = list(_standing(system, exact, numbering))
     return all(
-        not any(_value(form, one) for form in forms)
+        not any(any(form.values()) for form in _standing(system, exact, _Numbering(system.sites, one)))
         and tuple(_standing_state(system, exact, numbering, one)) == state
         for one, state in zip(known.still, known.modes.exact, strict=True)
     )
@@ -310,9 +309,13 @@ def _standing_solutions(
 
 
 class _Numbering:
-    """Numbers the unknowns of the standing solution: every site's states, then its clocks' outputs."""
+    """Numbers the unknowns of the standing solution: every site's states, then its clocks' outputs.
 
-    def __init__(self, sites: Sequence[PeerGroup]) -> None:
+    With `values` of them (size,), each is that multiple of a single unknown.
+    """
+
+    def __init__(self, sites: Sequence[PeerGroup], values: Sequence[Fraction] | None = None) -> None:
+        self.values = values
         self.states: list[int] = []
         self.outputs: list[list[int]] = []
         self.size = 0
@@ -325,6 +328,13 @@ class _Numbering:
                 starts.append(self.size)
                 self.size += len(partition.outputs)
             self.outputs.append(starts)
+
+    def form(self, unknown: int) -> Form:
+        """Return an unknown as a form."""
+        if self.values is None:
+            return {unknown: ONE}
+        value = self.values[unknown]
+        return {0: value} if value else {}
 
 
 def _add(form: Form, weight: Any, other: Mapping[int, Fraction]) -> None:
@@ -352,7 +362,7 @@ def _standing(system: ClosedSystem | Loop, exact: Sequence[LinearSite], number: 
         for row_a, row_b in zip(site.a, site.b, strict=True):
             yield _combine([*zip(row_a, x, strict=True), *zip(row_b, u, strict=True)])
         for p, (tick, partition) in enumerate(zip(site.ticks, site.kind.clocks, strict=True)):
-            y = [{number.outputs[g][p] + o: ONE} for o in range(len(partition.outputs))]
+            y = [number.form(number.outputs[g][p] + o) for o in range(len(partition.outputs))]
             m = [y[o] for o in partition.memories]
             schedule = system.sites[g].schedule
             r = [
@@ -372,10 +382,8 @@ def _standing(system: ClosedSystem | Loop, exact: Sequence[LinearSite], number: 
 def _standing_inputs(site: LinearSite, number: _Numbering, g: int) -> tuple[list[Form], list[Form]]:
     """Return x and u of a site as forms in the unknowns of the standing solution."""
     partition_of = {partition.clock: p for p, partition in enumerate(site.kind.clocks)}
-    x: list[Form] = [{number.states[g] + i: ONE} for i in range(len(site.kind.states))]
-    u: list[Form] = [
-        {number.outputs[g][partition_of[hold.clock]] + hold.output: ONE} for hold in site.kind.holds
-    ]
+    x = [number.form(number.states[g] + i) for i in range(len(site.kind.states))]
+    u = [number.form(number.outputs[g][partition_of[hold.clock]] + hold.output) for hold in site.kind.holds]
     return x, u
 
 

@@ -53,6 +53,9 @@ DEADBEAT = 1e-12
 # Rigid modes whose relative coordinates are remembered.
 KEPT = 64
 
+# A proof serves for all that is told where it knows the radius to this many times the bound of floats.
+AS_SHARP = 4.0
+
 # An angle that no eigenvalue kept as two floats has unless it is real: their unit roundoff.
 STRAIGHT = 2.0**-53
 
@@ -262,7 +265,8 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
         return replace(estimate, inside=inside, bits=bits)
     found = discs(proof.values, proof.values, proof.radii)
     low, high = max(estimate.low, found.low), min(estimate.high, found.high)
-    known = not found.high - found.low > estimate.high - estimate.low
+    # A radius that floats know as well: the other eigenvalues a proof knows far better.
+    known = not found.high - found.low > AS_SHARP * (estimate.high - estimate.low)
     if not known or proof.right is None or proof.left is None:
         return replace(estimate, low=low, high=high, inside=inside, bits=bits)
     pairs = Eigenpairs(proof.values, proof.right, proof.left)

@@ -182,7 +182,11 @@ def composed_bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, S
 def with_roundings(site: LinearSite) -> LinearSite:
     """Return a site's matrices with their radii, those of what CasADi rounds."""
     matrices = matrices_of(site)
-    many = common_shape(*(matrix.shape[:-2] for matrix in matrices))
+    channels = [tick.channels for tick in site.ticks]
+    many, *others = {matrix.shape[:-2] for matrix in matrices}
+    if others:  # what many sites share is one matrix, and stays one
+        bounded = [with_radius(one, COEFFICIENT_ROUNDINGS * UNIT * np.abs(one)) for one in matrices]
+        return assemble(site.kind, site.affine, bounded, channels)
     flat = np.concatenate([matrix.reshape(*many, -1) for matrix in matrices], axis=-1)
     both = np.stack([flat, COEFFICIENT_ROUNDINGS * UNIT * np.abs(flat)], axis=-2)
     bounded, start = [], 0
@@ -190,7 +194,7 @@ def with_roundings(site: LinearSite) -> LinearSite:
         end = start + matrix.shape[-2] * matrix.shape[-1]
         bounded.append(both[..., start:end].reshape(*many, 2, *matrix.shape[-2:]))
         start = end
-    return assemble(site.kind, site.affine, bounded, [tick.channels for tick in site.ticks])
+    return assemble(site.kind, site.affine, bounded, channels)
 
 
 def roundings_of(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> float:

@@ -109,9 +109,9 @@ def _finite_slopes(
         E808 a value of the site, or a slope of one, that is not finite.
     """
     if site.parameters_suffice:
-        flat = linearize_rows(site, np.asarray(parameters, dtype=np.float64)[None])[0]
-        _refuse_infinite(site, flat)
-        return flat
+        one = linearize_rows(site, np.asarray(parameters, dtype=np.float64)[None])
+        _refuse_infinite(site, one[0])
+        return one.ravel()
     x, u, m, r, p, t = start_arguments(site, [float(value) for value in parameters], float, listening)
     kind = site.kind
     if not site.affine:  # else the start is anywhere
