@@ -360,7 +360,12 @@ class FirstLost:
 
 
 def first_lost(
-    system: CompiledSystem, free: Free, samples: Sequence[float], prepared: Prepared, place: Place
+    system: CompiledSystem,
+    free: Free,
+    samples: Sequence[float],
+    prepared: Prepared,
+    place: Place,
+    here: Growth,
 ) -> FirstLost:
     """Look at values of a parameter, from a stable one on, until second moments grow.
 
@@ -369,11 +374,13 @@ def first_lost(
     system, free
         The compiled scene and what varies.
     samples
-        Where to look, the first a stable value.
+        Where to look, the first the present value, a stable one.
     prepared, place
         As for `search_growth`.
+    here
+        What second moments grow by as the scene is.
     """
-    looking, why, reached = _Looking(system, free, prepared, place, {}), "", samples[0]
+    looking, why, reached = _Looking(system, free, prepared, place, {samples[0]: here}), "", samples[0]
     for one, other in itertools.pairwise(samples):
         try:
             grows = looking.at(one).radius < 1 <= looking.at(other).radius

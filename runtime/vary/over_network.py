@@ -79,7 +79,7 @@ def network_margins(system: CompiledSystem, prepared: Prepared, nominal: Margins
         notes, open_sides, looked = [], [], 0
         beyond: dict[str, list[str]] = {}
         for one in free:
-            found = first_lost(system, one, _samples(system, one, scales), prepared, PLACE)
+            found = first_lost(system, one, _samples(system, one, scales), prepared, PLACE, here)
             looked += found.looked
             if not found.enters:
                 continue
