@@ -25,7 +25,8 @@ from tests.bench.judge import Judge, parser_of
 
 RUNS = 7
 SCENE, STAR = "three-users-average", "client-server"
-TARGETS = {"help": 0.1, "compile": 0.4, "compile star": 0.4, "unchanged": 0.15, "analyze": 0.25}  # seconds of a processor
+# Seconds of a processor.
+TARGETS = {"help": 0.1, "compile": 0.4, "compile star": 0.4, "unchanged": 0.15, "analyze": 0.25}
 COMMANDS = (
     ("import apc", ("-c", "import apc")),
     ("help", ("-m", "apc", "--help")),
