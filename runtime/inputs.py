@@ -67,9 +67,7 @@ def find_input(*, compiled_too: bool) -> Path:
 
 
 def _is_topology(path: Path) -> bool:
-    from apc.compiler.source.source import (
-        MAX_BYTES,  # with a YAML parser, which a compiled model does without
-    )
+    from apc.compiler.source.nodes import MAX_BYTES
 
     try:
         return _TOPOLOGY.search(read_file(path, MAX_BYTES)) is not None

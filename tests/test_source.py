@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apc.compiler.errors import ApcError, Place, place_in
-from apc.compiler.source.nodes import Mapping, Node, Scalar, Sequence
-from apc.compiler.source.source import MAX_BYTES, parse_source, read_source
+from apc.compiler.source.nodes import MAX_BYTES, Mapping, Node, Scalar, Sequence
+from apc.compiler.source.source import parse_source, read_source
 
 
 def root(text: str | bytes) -> Node:

@@ -15,9 +15,9 @@ from apc.compiler.components.component import Component, Connector
 from apc.compiler.components.definitions import read_component, read_connector
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, files_below, read_file, same_file
-from apc.compiler.source.nodes import Mapping, Scalar
+from apc.compiler.source.nodes import MAX_BYTES, Mapping, Scalar
 from apc.compiler.source.reading import brief
-from apc.compiler.source.source import MAX_BYTES, Source, read_source
+from apc.compiler.source.source import Source, read_source
 
 LONGEST_CHAIN = 50  # of components that are read for one another, each by several calls of Python's stack
 

@@ -1,6 +1,6 @@
 """What a YAML text is made of: nodes that know where they stand, and the lines they stand in.
 
-Takes: nothing (data types). Gives: `Scalar`, `Sequence`, `Mapping`, their union `Node`; `Lines`.
+Takes: nothing (data types). Gives: `Scalar`, `Sequence`, `Mapping`, their union `Node`; `Lines`, `MAX_BYTES`.
 Guarantees: plain frozen data; every place on a line shares the line's string.
 Does not: read YAML (see `compose`), or know what any key means.
 """
@@ -12,6 +12,8 @@ from typing import Any
 
 from apc.compiler.errors import Place
 from apc.compiler.frozen import dataclass
+
+MAX_BYTES = 1 << 20  # 1 MiB; the largest scene we know of is a hundredth of it
 
 
 @dataclass(frozen=True, slots=True)

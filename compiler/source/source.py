@@ -16,9 +16,7 @@ from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.files import RefusedError, read_file
 from apc.compiler.frozen import dataclass
 from apc.compiler.source.compose import compose
-from apc.compiler.source.nodes import Lines, Node
-
-MAX_BYTES = 1 << 20  # 1 MiB; the largest scene we know of is a hundredth of it
+from apc.compiler.source.nodes import MAX_BYTES, Lines, Node
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, read_file
 from apc.compiler.frozen import dataclass
 from apc.compiler.pipeline import compile_topology
-from apc.compiler.source.source import MAX_BYTES
+from apc.compiler.source.nodes import MAX_BYTES
 from apc.result import Result
 from apc.threads import single_threaded
 

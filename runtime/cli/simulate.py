@@ -196,12 +196,15 @@ def _play_many(system: CompiledSystem, how: Settings, runs: int, jobs: int, *, a
 
 def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bool) -> None:
     """Play a scene once, keep what is wanted of it, and print what it amounts to."""
-    from apc.present.animation import SUFFIXES, save_animation
     from apc.simulation.accuracy import compare_with
     from apc.simulation.simulation import prepare
     from apc.simulation.trajectory import Keeper, Played, provenance_of, trajectory_of
 
-    moving = kept.out if kept.out is not None and kept.out.suffix.lower() in SUFFIXES else None
+    moving = None
+    if kept.out is not None:
+        from apc.present.animation import SUFFIXES, save_animation
+
+        moving = kept.out if kept.out.suffix.lower() in SUFFIXES else None
     if moving is not None and kept.signals:
         raise click.UsageError(f"--signals chooses rows: a {moving.suffix} shows all that moves")
     simulation = prepare(system, how, signals=kept.signals)

@@ -212,7 +212,7 @@ def fill(points: Floats, tangents: Floats, errors: Floats, allowed: Floats) -> t
     starts = np.concatenate([[0], np.cumsum(pieces)])
     all_points, all_tangents = np.empty((starts[-1] + 1, 2)), np.empty((starts[-1] + 1, 2))
     all_points[starts], all_tangents[starts] = points, tangents
-    for count in np.unique(pieces[pieces > 1]).tolist():
+    for count in sorted(set(pieces[pieces > 1].tolist())):
         chosen = np.flatnonzero(pieces == count)
         rows = starts[chosen][:, None] + np.arange(1, count)
         if count <= FIRST_PIECES:

@@ -49,7 +49,11 @@ class Provenance:
     seed: int
     parameters: tuple[tuple[str, float, str], ...]
     timings: tuple[tuple[str, str], ...]
-    versions: tuple[tuple[str, str], ...]
+
+    @property
+    def versions(self) -> tuple[tuple[str, str], ...]:
+        """The program and what it computes with: looked up when a result is written, not for each run."""
+        return versions("casadi", "numpy")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -117,7 +121,6 @@ def provenance_of(simulation: Simulation) -> Provenance:
         seed=simulation.seed,
         parameters=parameters_of(system),
         timings=tuple((one.name, str(one.value)) for one in system.timings),
-        versions=versions("casadi", "numpy"),
     )
 
 

@@ -24,15 +24,19 @@ from tests.bench.growing import SCENES, equations, flat, kinds, lossy, plain, ro
 from tests.bench.judge import Judge, parser_of
 
 RUNS = 7
-SCENE = "three-users-average"
-TARGETS = {"help": 0.1, "compile": 0.4, "unchanged": 0.15, "analyze": 0.25}  # seconds of a processor
+SCENE, STAR = "three-users-average", "client-server"
+# Seconds of a processor.
+TARGETS = {"help": 0.1, "compile": 0.4, "compile star": 0.4, "unchanged": 0.15, "analyze": 0.25}
 COMMANDS = (
     ("import apc", ("-c", "import apc")),
     ("help", ("-m", "apc", "--help")),
     ("compile", ("-m", "apc", "compile", "--force", f"{SCENE}.yaml")),
+    ("compile star", ("-m", "apc", "compile", "--force", f"{STAR}.yaml")),
     ("unchanged", ("-m", "apc", "compile", f"{SCENE}.yaml")),
     ("analyze", ("-m", "apc", "analyze", f"{SCENE}.apc")),
     ("simulate", ("-m", "apc", "simulate", "--duration", "1 s", f"{SCENE}.apc")),
+    ("feel", ("-m", "apc", "feel", f"{SCENE}.apc")),
+    ("region", ("-m", "apc", "region", f"{SCENE}.apc")),
 )
 # What grows, over two decades where the largest is analysed: how many of it, and the seconds of a processor
 # that `compile` and `analyze` of the largest may take beyond those of the smallest.
@@ -189,7 +193,8 @@ def main() -> None:
     judge = Judge(given.strict)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        shutil.copy(SCENES / f"{SCENE}.yaml", folder)
+        for scene in (SCENE, STAR):
+            shutil.copy(SCENES / f"{scene}.yaml", folder)
         print(f"{'process':<12} {'median':>9} {'spread':>9} {'processor':>10} {'memory':>9}   target")
         for title, words in COMMANDS:
             measured = [once(words, folder) for _ in range(given.runs + 1)][1:]
