@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 
+import flint
 import numpy as np
 import pytest
 
@@ -15,7 +16,7 @@ from apc.frame.names import Free
 from apc.threads import single_threaded
 from apc.vary.critical import critical
 from apc.vary.delays import borders, system_with_delay
-from apc.vary.lags import LateStretch, late_stretches
+from apc.vary.lags import LateStretch, _of_powers, late_stretches
 from tests.topologies import AVERAGE, MESH, compiled, replaced
 
 PHASED = replaced(AVERAGE, ("network: 8 ms", "network: {period: 4 ms, phase: 1 ms}"))
@@ -58,3 +59,31 @@ def test_a_search_of_two_seconds_ends_where_a_short_one_does() -> None:
     assert long.crossings == short.crossings and long.whole and long.looked == 2000
     (edge,) = long.crossings
     assert edge.kind == "jump" and edge.stable_side == "below"
+
+
+@pytest.mark.parametrize("kind", ["any", "of very different size", "nilpotent"])
+def test_a_determinant_is_the_same_polynomial_at_every_age(kind: str) -> None:
+    random = np.random.default_rng(5)
+    matrices, turned = random.normal(size=(2, 4, 3, 3)) + 1j * random.normal(size=(2, 4, 3, 3))
+    if kind == "of very different size":
+        matrices *= np.array([1e9, 1.0, 1e-6])
+    if kind == "nilpotent":
+        matrices, turned = np.tril(matrices, -1), np.tril(turned, -1)
+    points, ages = np.exp(1j * random.uniform(0, np.pi, 4)), np.array([[0], [7], [250]])
+    value, turning = _of_powers(matrices, turned, points, ages)
+    # Of the largest value on the circle a few roundings are lost, of its slope as many times the steepest.
+    with flint.ctx.workprec(200):
+        one = flint.acb_mat(3, 3, [int(i == j) for i in range(3) for j in range(3)])
+        for place, point in enumerate(points):
+            whole, slope = (
+                flint.acb_mat(3, 3, [flint.acb(entry.real, entry.imag) for entry in each[place].ravel()])
+                for each in (matrices, turned)
+            )
+            for row, (age,) in enumerate(ages.tolist()):
+                power = 1 / flint.acb(point.real, point.imag) ** age
+                here = one + whole * power
+                change = here.inv() * (slope * power - whole * (power * flint.acb(0, age)))
+                determinant = here.det()
+                assert abs(np.exp(value[row, place]) / complex(determinant) - 1) < 1e-12
+                exact = complex(sum((change[i, i] for i in range(3)), flint.acb(0)))
+                assert abs(turning[row, place] - exact) < 1e-10 * max(abs(exact), 1.0)

@@ -90,8 +90,11 @@ class _LateSheet:
     def over(self, values: Floats, points: Complexes) -> Logarithm:
         """Return the logarithm of F (k, z) at all values (k,) and points (z,).
 
-        M = A + Σ_l ζ^(−l) [0 B_l], A the matrix of all delays while nobody hears anything: det M is
-        det A det(1 + Σ_l ζ^(−l) K_l), K_l the rows of A⁻¹ B_l over what is sent.
+        Notes
+        -----
+        M = A + Σ_l ζ^(−m−l) [0 B_l], m the age of the youngest packets and A the matrix while nobody hears
+        anything: det M is det A det(1 + ζ^(−m) G), G the rows of A⁻¹ Σ_l ζ^(−l) B_l over what is sent, which
+        is a polynomial of p = ζ^(−m), the same for all delays that are alike but for m.
         """
         n_z = self.loops.states
         matrix = np.repeat(self.loops.fixed[:1].astype(np.complex128), len(points), axis=0)
@@ -104,21 +107,57 @@ class _LateSheet:
         slope = turn[:, 0, 0] * inverse[:, place, place].sum(axis=1) - self.rigid * 1j / (points - 1)
         sent = inverse[:, n_z:]
         turned = -turn * (sent[:, :, :n_z] @ inverse[:, :n_z])
-        number, unit = values.astype(np.intp), np.eye(sent.shape[1])
+        number = values.astype(np.intp)
+        ages = self.lags[number]
+        older = np.maximum(ages - ages[:, :1], 0)  # a layer that a delay does not have is empty, of age 0
+        alike, which = np.unique(np.column_stack([self.alike[number], older]), axis=0, return_inverse=True)
         value, turning = np.zeros((2, len(values), len(points)), np.complex128)
-        for which in sorted(set(self.alike[number].tolist())):
-            heard = self.loops.heard[:, which, None]
-            back, back_turned = sent @ heard, turned @ heard
-            for row in np.flatnonzero(self.alike[number] == which).tolist():
-                lags = self.lags[number[row], :, None]
-                power = points**-lags
-                whole = unit + np.einsum("lz,lzij->zij", power, back)
-                moved = np.einsum("lz,lzij->zij", power, back_turned)
-                moved -= np.einsum("lz,lzij->zij", 1j * lags * power, back)
-                sign, size = np.linalg.slogdet(whole)
-                value[row] = base + size + 1j * np.angle(sign)
-                turning[row] = slope + np.trace(np.linalg.solve(whole, moved), axis1=1, axis2=2)
+        for group, (kind, *lags) in enumerate(alike.tolist()):
+            rows, back = np.flatnonzero(which.ravel() == group), self.loops.heard[:, kind]
+            power = points[:, None] ** -np.array(lags)
+            heard, moved = (np.tensordot(one, back, 1) for one in (power, -1j * power * lags))
+            with np.errstate(divide="ignore", invalid="ignore"):  # a zero on the circle
+                logarithm_, along = _of_powers(
+                    sent @ heard, turned @ heard + sent @ moved, points, ages[rows, :1]
+                )
+            value[rows], turning[rows] = base + logarithm_, slope + along
         return Logarithm(value, turning, np.zeros_like(value))
+
+
+def _of_powers(
+    matrices: Complexes, turned: Complexes, points: Complexes, ages: Integers
+) -> tuple[Complexes, Complexes]:
+    """Return the logarithm (k, z) of det(1 + ζ^(−m) G), and its derivative along the circle.
+
+    Parameters
+    ----------
+    matrices, turned
+        G (z, s, s), and its derivative over ζ's angle.
+    points, ages
+        ζ (z,) on the unit circle, and m (k, 1).
+
+    Notes
+    -----
+    A polynomial of degree s of p = ζ^(−m), known by its values at s + 1 roots of unity: as |p| = 1, none of
+    its coefficients loses by that more than a rounding of its largest value.
+    """
+    size = matrices.shape[-1]
+    nodes = np.exp(2j * np.pi * np.arange(size + 1) / (size + 1))
+    sizes, values, slopes = np.zeros((3, size + 1, len(points)), np.complex128)
+    for place, node in enumerate(nodes):
+        whole = np.eye(size) + node * matrices
+        values[place], sizes[place] = np.linalg.slogdet(whole)
+        slopes[place] = np.trace(np.linalg.solve(whole, node * turned), axis1=1, axis2=2)
+    largest = sizes.real.max(axis=0)
+    values *= np.exp(sizes.real - largest)
+    terms, turning = (np.fft.fft(one, axis=0) / (size + 1) for one in (values, values * slopes))
+    power = points**-ages
+    total, along, moved = np.zeros((3, *power.shape), np.complex128)
+    for degree in range(size, -1, -1):
+        total = total * power + terms[degree]
+        along = along * power + degree * terms[degree]
+        moved = moved * power + turning[degree]
+    return largest + np.log(total), (moved - 1j * ages * along) / total
 
 
 def late_stretches(
