@@ -324,6 +324,7 @@ FREE = {
 }
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize("cut", ["", "link", "coupler"])
 @pytest.mark.parametrize("name", FREE)
 def test_with_a_number_free_it_is_at_each_value_what_it_is_with_that_set(name: str, cut: str) -> None:
