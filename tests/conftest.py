@@ -8,7 +8,8 @@ as many values of each parameter as they can, and all of them with `pytest --who
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -58,3 +59,20 @@ def users_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         # Processes that tests start keep what Python compiled, as where apc is installed.
         patch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
         yield
+
+
+@pytest.fixture
+def refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., str]:
+    """Return what gives a scene's text to `apc export` with words that it refuses, and what it says then."""
+    from apc.__main__ import run
+
+    def export(text: str, *words: str) -> str:
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
+        assert run(["export", *words]) == 1
+        assert [path.name for path in tmp_path.iterdir()] == ["scene.yaml"]
+        return capsys.readouterr().err
+
+    return export

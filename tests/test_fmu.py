@@ -6,6 +6,7 @@ import ctypes
 import subprocess
 import xml.etree.ElementTree as xml
 import zipfile
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -271,17 +272,9 @@ def test_another_program_is_not_given_another_scene(fmpy: Any, tmp_path: Path) -
     ],
 )
 def test_what_cannot_be_is_told_and_nothing_is_written(
-    words: list[str],
-    message: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    words: list[str], message: str, refused: Callable[..., str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "scene.yaml").write_text(BENT, encoding="utf-8")
-    assert run(["export", "--out", *words]) == 1
-    assert message in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["scene.yaml"]
+    assert message in refused(BENT, "--out", *words)
 
 
 def test_where_all_peers_are_alike_one_serves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
