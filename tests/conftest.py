@@ -1,11 +1,15 @@
 """What holds for all tests: none of them depends on time, so a busy machine changes no outcome.
 
 None depends on another either, or on what the user keeps: they run in several processes at once.
+
+A test marked `few(count)` has more cases than its claim needs each time: so many of them run, chosen to show
+as many values of each parameter as they can, and all of them with `pytest --whole`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -13,6 +17,36 @@ from hypothesis import HealthCheck, settings
 # How long an example takes, or the making of one, says nothing of whether a claim is true.
 settings.register_profile("apc", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("apc")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--whole", action="store_true", help="run every case of the tests marked few, too")
+
+
+@pytest.hookimpl(trylast=True)  # of what is selected otherwise
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--whole"):
+        return
+    marked: dict[str, tuple[int, list[pytest.Function]]] = {}
+    for item in items:
+        if isinstance(item, pytest.Function) and (mark := item.get_closest_marker("few")):
+            marked.setdefault(item.nodeid.partition("[")[0], (mark.args[0], []))[1].append(item)
+    left_out = {item for count, cases in marked.values() for item in {*cases} - {*few(cases, count)}}
+    config.hook.pytest_deselected(items=[item for item in items if item in left_out])
+    items[:] = [item for item in items if item not in left_out]
+
+
+def few(cases: list[pytest.Function], count: int) -> list[pytest.Function]:
+    """Return so many cases, each the first of those that show most values not shown yet."""
+    values = {case: {(name, repr(value)) for name, value in case.callspec.params.items()} for case in cases}
+    kept: list[pytest.Function] = []
+    rest, shown = [*cases], set[tuple[str, str]]()
+    while rest and len(kept) < count:
+        best = max(rest, key=lambda case: len(values[case] - shown))
+        rest.remove(best)
+        kept.append(best)
+        shown |= values[best]
+    return kept
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -25,3 +59,20 @@ def users_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         # Processes that tests start keep what Python compiled, as where apc is installed.
         patch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
         yield
+
+
+@pytest.fixture
+def refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., str]:
+    """Return what gives a scene's text to `apc export` with words that it refuses, and what it says then."""
+    from apc.__main__ import run
+
+    def export(text: str, *words: str) -> str:
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
+        assert run(["export", *words]) == 1
+        assert [path.name for path in tmp_path.iterdir()] == ["scene.yaml"]
+        return capsys.readouterr().err
+
+    return export

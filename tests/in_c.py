@@ -14,7 +14,10 @@ import numpy as np
 import pytest
 
 import apc
-from apc.exports.c_text import CPeer, c_peer, driver, header, source
+from apc.exports.c_driver import driver
+from apc.exports.c_header import header
+from apc.exports.c_names import CPeer, c_peer
+from apc.exports.c_text import source
 from apc.exports.peer import Peer, peer_of
 from apc.network.timetable import Timetable, luck_of
 from apc.simulation.settings import DEFAULT, parse_method

@@ -80,7 +80,12 @@ class Tab:
         """Wait until the verdict has a spectral radius."""
         self.page.wait_for_function(f"{VERDICT}.includes('spectral radius {expected:.9g} ')")
 
-    def close(self, link: str) -> None:
+    def check(self, link: str) -> None:
+        """Check that nothing went wrong so far, and nobody else was asked for anything."""
         assert self.errors == []
         assert self.hosts == {urlsplit(link).netloc}
+
+    def close(self, link: str) -> None:
+        """Check it, and close it."""
+        self.check(link)
         self.page.close()

@@ -53,7 +53,8 @@ def test_an_exact_scene_is_off_by_roundings_and_the_estimate_is_no_less() -> Non
     assert error_text(found.error).startswith("none but rounding; about ")
 
 
-@pytest.mark.parametrize("method", ["rk4:1ms", "rk4:0.3ms", "semi-implicit:0.1ms", "cvodes:1e-7"])
+@pytest.mark.few(3)
+@pytest.mark.parametrize("method", ["rk4:1ms", "semi-implicit:0.1ms", "cvodes:1e-7", "rk4:0.3ms"])
 def test_the_estimate_of_a_linear_scene_is_its_distance_from_the_exact_motion(method: str) -> None:
     system = compiled(replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: [9 mm, 0 mm, 0 mm]}}")))
     duration = Fraction(1, 4)

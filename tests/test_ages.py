@@ -127,6 +127,7 @@ def positions(system: CompiledSystem, *, jit: bool = False) -> Any:
     return np.array([run[one.name] for one in run.signals]).T
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize("late", [0, 3, 10])
 @pytest.mark.parametrize("force", LAWS)
 def test_a_simulation_is_the_law_played(force: str, late: int, tmp_path: Path) -> None:
@@ -146,6 +147,7 @@ def test_a_simulation_is_the_law_played(force: str, late: int, tmp_path: Path) -
     assert found == pytest.approx(expected, abs=SAME)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("force", LAWS)
 def test_machine_code_does_the_same(force: str, tmp_path: Path) -> None:
     system = scene(force, "3 ms", tmp_path)
@@ -161,6 +163,7 @@ BEFORE = {
 }
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("late", [0, 1, 3, 10])
 @pytest.mark.parametrize("force", BEFORE)
 def test_what_was_heard_before_is_its_law(force: str, late: int, tmp_path: Path) -> None:

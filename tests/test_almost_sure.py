@@ -52,6 +52,7 @@ def test_intervals_hold_the_exponent_of_one_number_95_times_in_a_hundred(law: st
     assert 88 <= inside <= 100
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("peers", "stiffness", "known", "half"),
     REFERENCE,

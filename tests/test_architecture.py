@@ -121,7 +121,10 @@ HOUSE = (
     ),
     (
         "apc.exports",
-        "words lifted free files expressions modelica peer c_text chance_text scene_text fmu code export",
+        """
+        words lifted free files expressions modelica peer c_names c_header c_text c_driver chance_text
+        scene_text fmu code export
+        """,
     ),
     ("apc.benchmark", "timing truth bench hard scale"),
     ("apc", "inputs"),

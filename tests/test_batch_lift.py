@@ -87,6 +87,7 @@ def _true_frame(population: Population, vector: Any) -> FrameMap:
     return compose(site, population.schedule, steps)
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("hopeless", [0.0, np.inf], ids=["estimate", "bound"])
 @pytest.mark.parametrize(
     ("grams", "seed", "values"),

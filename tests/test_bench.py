@@ -26,6 +26,7 @@ from apc.benchmark.scale import scale, with_count
 from apc.benchmark.truth import MOST_STATES
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.present.bench import bench_picture, save_bench
+from apc.simulation.settings import EXACT, Method
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 
 
@@ -116,6 +117,13 @@ equations:
 """
 
 
+@pytest.fixture
+def played_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave all other methods of simulation out: they say nothing of how a scene is set in motion."""
+    monkeypatch.setattr("apc.benchmark.bench._methods", lambda _: [Method(EXACT)])
+
+
+@pytest.mark.usefixtures("played_exactly")
 def test_a_push_between_two_ticks_is_no_rest() -> None:
     assert "nothing moves" in bench_simulation(compiled(PUSHED), Fraction(1, 50), rounds=1).notes[0]
     pushed = bench_simulation(compiled(PUSHED + BETWEEN), Fraction(1, 50), rounds=1)
@@ -125,6 +133,7 @@ def test_a_push_between_two_ticks_is_no_rest() -> None:
     assert pushed.chosen.error < 1e-12
 
 
+@pytest.mark.usefixtures("played_exactly")
 def test_what_rests_is_moved_by_its_own_scale_in_its_own_unit(tmp_path: Path) -> None:
     wheel = "{type: Rotor, inertia: 1 kg*m^2, drag: 1 N*m*s, radius: 5 mm}"
     turning = replaced(PUSHED, ("{mass: 0.25 kg, damping: 2 N*s/m}", wheel))
@@ -134,7 +143,8 @@ def test_what_rests_is_moved_by_its_own_scale_in_its_own_unit(tmp_path: Path) ->
     )
     wide = replaced(PUSHED, ("{count: 1}", "{count: 2, set: {device.x: [20 mm, 30 mm]}}"))
     still = compiled(replaced(wide, ("9 N/m", "0 N/m")))
-    assert "device.x of its first peer starts 0.03 m" in bench_simulation(still, Fraction(1, 50)).notes[0]
+    [note] = bench_simulation(still, Fraction(1, 50), rounds=1).notes
+    assert "device.x of its first peer starts 0.03 m" in note
 
 
 def test_the_function_of_its_name_does_what_the_command_does() -> None:

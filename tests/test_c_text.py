@@ -10,7 +10,7 @@ import pytest
 
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.exports.c_text import c_peer, identifier, in_order, number
+from apc.exports.c_names import c_peer, identifier, in_order, number
 from apc.exports.peer import peer_of
 from apc.simulation.settings import DEFAULT, parse_method
 from apc.simulation.simulation import plan_of
@@ -42,12 +42,12 @@ AGED = replaced(
 EXACT = {"ring": RING, "pairs": PAIRS}
 ROUNDED = {
     "moved": MOVED,
-    "paper": PAPER,
     "mixed clocks": MIXED,
-    "a delay inside a tick": INSIDE,
-    "late and lost, zero": LOSSY,
     "late and lost, hold": LOSSY_HOLD,
     "packets that say how old they are": AGED,
+    "paper": PAPER,
+    "a delay inside a tick": INSIDE,
+    "late and lost, zero": LOSSY,
 }
 
 
@@ -56,12 +56,14 @@ def test_not_a_bit_of_its_forces_is_different(name: str, tmp_path: Path) -> None
     assert worst(differences(compiled(EXACT[name]), tmp_path, duration="0.4 s")) == 0.0
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", ROUNDED)
 def test_its_forces_are_those_of_simulate_to_the_last_bits(name: str, tmp_path: Path) -> None:
     """A rounding of a sum over the others is all that differs, and what loops make of it in 0.4 s."""
     assert worst(differences(compiled(ROUNDED[name]), tmp_path, duration="0.4 s")) < 2e-13
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "scene",
     ["planar-users", "two-users-waves", "two-users-passivity", "client-server"],

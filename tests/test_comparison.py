@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import casadi
@@ -33,8 +34,13 @@ TWO_SPRINGS = replaced(
 )
 
 
+@cache
+def compared(*texts: str) -> Comparison:
+    return compare([compiled(text) for text in texts])
+
+
 def both() -> Comparison:
-    return compare([compiled(AVERAGE), compiled(MESH)])
+    return compared(AVERAGE, MESH)
 
 
 # ---- the numbers ----
@@ -43,7 +49,7 @@ def both() -> Comparison:
 def test_each_number_is_that_of_its_own_command() -> None:
     for text in (AVERAGE, SHAKING, LOSSY):
         system = compiled(text)
-        (found,) = compare([system]).schemes
+        (found,) = compared(text).schemes
         assert found.analysis == apc.analyze(system)
         assert found.network == apc.judge_network(system)
         assert found.stiffness == apc.critical(system, "coordination.stiffness")
@@ -59,7 +65,7 @@ def test_each_number_is_that_of_its_own_command() -> None:
 
 def test_the_verdict_is_of_the_network_as_it_is_or_nominal_as_asked() -> None:
     system = compiled(LOSSY)
-    assert compare([system]).schemes[0].verdict == "stable in mean square"
+    assert compared(LOSSY).schemes[0].verdict == "stable in mean square"
     (nominal,) = compare([system], criterion="nominal").schemes
     assert (nominal.verdict, nominal.network) == ("stable up to a common translation", None)
     assert nominal.delay == apc.critical(system, "lan.delay", criterion="nominal")
@@ -282,7 +288,7 @@ def test_a_name_that_serves_no_scene_is_refused(over: str, message: str) -> None
 
 
 def test_a_cell_that_cant_be_had_says_why() -> None:
-    found = compare([compiled(SHAKING), compiled(LOSSY), compiled(ONE_MASS)])
+    found = compared(SHAKING, LOSSY, ONE_MASS)
     missing = [dict(one.missing) for one in found.schemes]
     assert [sorted(one) for one in missing] == [
         ["feel", "loss"],
@@ -302,7 +308,7 @@ def test_the_line_that_a_missing_loss_asks_for_gives_it() -> None:
 
 
 def test_no_dash_stands_without_its_footnote() -> None:
-    found = str(compare([compiled(SHAKING), compiled(LOSSY), compiled(ONE_MASS)]))
+    found = str(compared(SHAKING, LOSSY, ONE_MASS))
     rows = [line.split() for line in found.splitlines()]
     dashed = [row for row in rows if len(row) > 1 and row[0].isdigit() and row[1] == "–"]
     assert len(dashed) == 7
@@ -311,7 +317,7 @@ def test_no_dash_stands_without_its_footnote() -> None:
 
 def test_schemes_that_differ_in_more_than_their_coupling_are_told_of() -> None:
     longer = replaced(AVERAGE, ("network: 8 ms", "network: 10 ms"), ("count: 3", "count: 4"))
-    assert compare([compiled(AVERAGE), compiled(MESH)]).notes == ()
+    assert both().notes == ()
     assert compare([compiled(AVERAGE), compiled(longer), compiled(LOSSY)]).notes == (
         "they have different numbers of peers: 3, 4",
         "their frames differ, and with them what a spectral radius is of: 8 ms, 10 ms",

@@ -361,6 +361,7 @@ def test_a_long_delay_has_the_crossing_of_all_peers_by_hand(frames: int) -> None
     assert largest(found.value - aside) < 1 < largest(found.value + aside)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("frames", [100, 300])
 def test_a_long_delay_has_the_crossing_of_a_frequency_sweep_by_hand(frames: int) -> None:
     """det(ζ − P − w ζ^(−d) Q S) goes once less around 0 for every eigenvalue beyond the circle."""
@@ -434,6 +435,7 @@ def test_a_stiffness_that_vanishes_is_no_crossing(b: str) -> None:
 DELAYS = ("contact.delay", "coordination.delay", "lan.delay")
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", DELAYS)
 @pytest.mark.parametrize("times", [("0.13 ms", "1 ms", "8 ms"), ("1.37 ms", "0.61 ms", "7.19 ms")])
 def test_a_scan_of_a_delay_goes_beyond_the_present_value(name: str, times: tuple[str, str, str]) -> None:

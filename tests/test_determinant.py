@@ -67,6 +67,7 @@ def _agree(found: Spectrum | Analysis, whole: Analysis) -> None:
             assert share == pytest.approx(shares[name.split("user.")[-1]], abs=1e-8)
 
 
+@pytest.mark.few(10)
 @pytest.mark.parametrize("values", VARIED)
 @pytest.mark.parametrize("peers", [2, 5, 12])
 def test_different_peers_have_the_spectral_radius_of_their_whole_matrix(
@@ -202,6 +203,7 @@ def _site_in_50_digits(values: dict[str, float]) -> tuple[Any, Any, Any]:
     return p, q, s
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "values", [{"kt": 5.0, "kc": 500.0}, {"kt": 20.0, "bt": 0.2, "kc": 1000.0, "bc": 1.0}]
 )

@@ -103,6 +103,7 @@ def in_balls(
     return step
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("stiffness", "damping", "milliseconds"), [(1000, 1, 1), (1000, 0, 1), (20, 3, 1), (1000, 4, 1)]
 )

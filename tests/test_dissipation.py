@@ -57,9 +57,11 @@ def test_a_loop_of_one_state_has_its_least_real_part_where_its_closed_form_says(
     assert angle == pytest.approx(0.0)
 
 
-def test_the_least_real_part_is_that_of_a_dense_grid_and_proved_up_to_there_only() -> None:
+@pytest.mark.few(1)
+@pytest.mark.parametrize("draws", [15, 60])
+def test_the_least_real_part_is_that_of_a_dense_grid_and_proved_up_to_there_only(draws: int) -> None:
     generator = np.random.default_rng(4)
-    for _ in range(60):
+    for _ in range(draws):
         n, m = int(generator.integers(1, 7)), int(generator.integers(1, 4))
         system, weight = loop(generator, n, m), symmetric(generator, m)
         least, angle = least_real(*system, weight)

@@ -72,6 +72,7 @@ SIDE = 13  # more runs than are added up at once, and no multiple of it
 ALONE = (2, 9, 14)
 
 
+@pytest.mark.few(5)
 @pytest.mark.skipif(compiler() is None, reason="there is no C compiler")
 @pytest.mark.parametrize(("peers", "more"), [*((3, more) for more in ("", *ODD)), (7, ""), (7, ODD[-1])])
 def test_runs_side_by_side_are_to_the_bit_those_played_alone(peers: int, more: str) -> None:
@@ -84,6 +85,7 @@ def test_runs_side_by_side_are_to_the_bit_those_played_alone(peers: int, more: s
         np.testing.assert_array_equal(together[:, :, number - 2], rows_of_runs(system, 1, number)[:, :, 0])
 
 
+@pytest.mark.few(5)
 @pytest.mark.skipif(compiler() is None, reason="there is no C compiler")
 @pytest.mark.parametrize("name", FORCES)
 @pytest.mark.parametrize("link", ["delay: 8 ms", "delay: 8 ms, jitter: 9 ms, loss: 20 %, on_loss: zero"])

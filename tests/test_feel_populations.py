@@ -73,6 +73,7 @@ def test_peer_by_peer_it_is_what_one_system_of_all_says(
     assert (bool(one.hinf), bool(one.h2), bool(other.hinf), bool(other.h2)) == (True, True, False, False)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("at", "between"),
     [("left[1]", "left[3]"), ("left[3]", "right[2]"), ("right[1]", "left[2]"), ("left[2]", "left[2]")],

@@ -59,6 +59,7 @@ def test_taking_the_rigid_motion_out_leaves_all_other_eigenvalues(graph: Any) ->
     assert np.abs(one - 1).min() > 1e-6
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("operator", ["mean", "sum"])
 @pytest.mark.parametrize("graph", ["ring", "star"])
 @pytest.mark.parametrize("values", [{}, {"kc": 2500.0}, {"kt": 3000.0}])

@@ -30,6 +30,7 @@ def heard(law: ChannelLaw, ticks: int, *, newest: bool = True) -> list[int]:
     return [int(one) for one in listener(law, newest=newest).hear(np.arange(ticks)).packets[:, 0]]
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("law", [BURSTS, JITTER, recorded(9, 3, math.inf, 20, 1)])
 @pytest.mark.parametrize("newest", [True, False])
 def test_it_does_not_matter_how_time_is_cut(law: ChannelLaw, newest: bool) -> None:

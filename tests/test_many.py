@@ -84,19 +84,22 @@ EVERY_SCENE = sorted(
 )
 
 
+@pytest.mark.few(len(EVERY_SCENE))
 @pytest.mark.parametrize("path", EVERY_SCENE, ids=lambda path: path.stem)
-def test_every_point_is_as_an_analysis_of_its_own_says(path: Path) -> None:
+@pytest.mark.parametrize("points", [2, 6])
+def test_every_point_is_as_an_analysis_of_its_own_says(path: Path, points: int) -> None:
     system = scene(path)
     names = free_parameters(system)[:3]
     random = np.random.default_rng(len(path.stem))
     base = np.array([[next(p.value for p in system.parameters if p.name == name.name)] for name in names])
-    drawn = np.where(base, base, 1.0) * random.uniform(0.5, 1.7, (len(names), 6))
+    drawn = np.where(base, base, 1.0) * random.uniform(0.5, 1.7, (len(names), points))
     drawn[:, 0] = base[:, 0]
     found = analyze_many(system, {name.label: row for name, row in zip(names, drawn, strict=True)})
     for point in range(drawn.shape[1]):
         alone(system, found, names, point)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("damping", [0.0, 2.0])
 @pytest.mark.parametrize("mesh", [False, True])
 def test_the_truth_in_sixty_digits_is_within_every_bound(

@@ -138,6 +138,7 @@ def burst(loss: float, packets: int) -> str:
     return f", loss: {{p: {loss * r / (1 - loss)!r}, r: {r!r}}}"
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize(("peers", "kind", "stiffness", "hold", "zero", "digits"), INDEPENDENT)
 def test_independent_losses_meet_the_references(
     peers: int, kind: str, stiffness: float, hold: float, zero: float, digits: float
@@ -147,6 +148,7 @@ def test_independent_losses_meet_the_references(
         assert math.isclose(radius(system), expected, abs_tol=max(digits, 1e-12))
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize(("peers", "mass", "loss", "on_loss", "stiffness"), CRITICAL)
 def test_where_a_reference_is_critical_the_radius_is_1(
     peers: int, mass: float, loss: float, on_loss: str, stiffness: float
@@ -166,6 +168,7 @@ def test_where_a_reference_is_critical_the_radius_is_1(
     assert found.error < 1e-7
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize(("stiffness", "loss", "packets", "hold", "zero"), PAIR)
 def test_bursts_of_two_peers_meet_the_references(
     stiffness: float, loss: float, packets: int, hold: float, zero: float

@@ -80,6 +80,7 @@ def worst(system: apc.CompiledSystem, seconds: float, method: str | None = None)
     return max(apart)
 
 
+@pytest.mark.few(4)
 @needs_rumoca
 @pytest.mark.parametrize("times", TIMES)
 def test_rumoca_plays_the_papers_scene_at_any_times_as_simulate_does(times: str) -> None:

@@ -65,6 +65,7 @@ def least_real_part(
     return least
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(("count", "stiffness"), [(2, 100.0), (3, 400.0), (3, 2200.0), (3, 2500.0)])
 @pytest.mark.parametrize("lag", [0.0, 1.0, 64.0, 1000.0])
 def test_all_peers_at_once_take_out_as_little_energy_as_the_least_of_their_modes(

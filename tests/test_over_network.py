@@ -75,6 +75,7 @@ def test_what_grows_in_mean_square_is_told_almost_surely_too(folder: Path) -> No
     assert folder.exists()
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("more", "value"),
     [
@@ -204,6 +205,7 @@ def test_a_jitter_longer_than_the_delay_arrives_at_once_at_the_earliest() -> Non
     assert len(set(radii)) == len(radii)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("more", "stiffness", "proof"),
     [

@@ -162,6 +162,7 @@ def check(system: CompiledSystem, expected: NDArray[np.float64], seed: int = 0) 
     np.testing.assert_allclose(found.values, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
+@pytest.mark.few(6)
 @pytest.mark.parametrize("name", FORCES)
 @pytest.mark.parametrize("delay", [0, 3, 8, 21])
 def test_each_pair_is_what_looking_at_every_packet_gives(tmp_path: Path, name: str, delay: int) -> None:
@@ -189,6 +190,7 @@ GRAPHS: dict[str, Ways] = {
 }
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("name", FORCES)
 @pytest.mark.parametrize("graph", GRAPHS)
 def test_only_those_who_hear_each_other_are_looked_at(tmp_path: Path, name: str, graph: str) -> None:
@@ -199,6 +201,7 @@ def test_only_those_who_hear_each_other_are_looked_at(tmp_path: Path, name: str,
     )
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("name", FORCES)
 @pytest.mark.parametrize(
     ("more", "graph"),

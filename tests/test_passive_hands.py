@@ -253,8 +253,10 @@ def test_a_device_touched_at_every_moment_is_refused_by_name() -> None:
         passive_hands(compiled(text))
 
 
-def test_no_passive_hand_shakes_what_is_called_passive() -> None:
-    found = exceptions(0, 15, 20)
+@pytest.mark.few(1)
+@pytest.mark.parametrize("draws", [8, 15])
+def test_no_passive_hand_shakes_what_is_called_passive(draws: int) -> None:
+    found = exceptions(0, draws, 20)
     assert not found.wrong
     assert not found.undecided
     assert 2 <= found.passive <= found.scenes - 2  # or the draws would say nothing
@@ -287,6 +289,7 @@ def test_the_boundary_for_passive_hands_is_where_an_independent_program_finds_no
             assert min(truth.least(one) for one in np.linspace(1e-3, np.pi, 60)) > -2e-7
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("count", "limit"), [(2, 233.1357), (3, 458.242), (5, 895.643)])
 def test_a_critical_stiffness_is_bounded_to_nine_digits(count: int, limit: float) -> None:
     found = critical(compiled(users(count, 200)), "coordination.stiffness", criterion="passive")

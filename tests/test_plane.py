@@ -76,12 +76,9 @@ def test_a_fast_pole_is_held_between_two_values(delay: int) -> None:
     pole = 1 + 0.5 / (delay + 1)
     points = np.geomspace(1e-3, 10.0, 60) * (pole - 1)
     found = cross([Pull(delay, pole)], points, 1e-3)
-    brute = [
-        float(np.abs(np.roots([1.0, -pole, *np.zeros(delay - 1), p])).max()) < 1
-        for p in np.geomspace(points[0], points[-1], 4000)
-    ]
+    grid = np.geomspace(points[0], points[-1], 1000)
+    brute = [float(np.abs(np.roots([1.0, -pole, *np.zeros(delay - 1), p])).max()) < 1 for p in grid]
     changes = np.flatnonzero(np.diff(brute))
-    grid = np.geomspace(points[0], points[-1], 4000)
     assert [one.rising for one in found.roots] == [bool(brute[place]) for place in changes]
     for root, place in zip(found.roots, changes, strict=True):
         assert grid[place] <= root.value <= grid[place + 1]

@@ -12,6 +12,7 @@ from tests.bench.random_scenes import check, run
 from tests.sites import paper
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("seed", [11, 14])
 def test_no_bound_fails_and_no_verdict_is_wrong(seed: int) -> None:
     tally = run(8, seed=seed, draws=4)

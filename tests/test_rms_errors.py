@@ -91,6 +91,7 @@ def test_with_no_loss_the_error_is_that_of_an_ideal_network(
     assert metres(found) == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     ("count", "stiffness", "loss"), [(2, 900, 0.1), (2, 500, 0.4), (3, 500, 0.1), (3, 900, 0.4)]
 )

@@ -99,6 +99,7 @@ def effective(late: list[float], tick: int, *, newest: bool) -> tuple[int, bool]
     return number, gap > number
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("operator", ["mean", "sum"])
 @pytest.mark.parametrize("more", ODD)
 def test_a_played_scene_is_what_looking_at_every_packet_gives(operator: str, more: str) -> None:
@@ -124,6 +125,7 @@ def test_a_played_scene_is_what_looking_at_every_packet_gives(operator: str, mor
 # ---- perfect channels are reliable links ----
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("delay", ["0 ms", "1/3 ms", "8 ms", "20 ms"])
 @pytest.mark.parametrize("more", ["loss: 0 %", "jitter: 0 ms, reorder: all", "loss: 0 %, on_loss: zero"])
 def test_a_perfect_channel_plays_as_a_reliable_link(delay: str, more: str) -> None:

@@ -141,6 +141,7 @@ def limit_of(scene: Drawn) -> float:
     return low
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("number", range(12))
 def test_what_is_said_to_settle_does_from_any_start_and_what_loads_an_unstable_contact_does_not(
     number: int,

@@ -54,6 +54,7 @@ def test_the_papers_experiment_is_what_stepping_it_by_hand_gives(
     assert np.abs(users(found, 3) - expected).max() < tolerance
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize(
     ("comp", "comm"),
     [

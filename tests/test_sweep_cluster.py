@@ -124,7 +124,11 @@ def test_a_cluster_without_workers_is_told(monkeypatch: pytest.MonkeyPatch) -> N
         ]
 
 
-def test_a_cluster_lost_on_the_way_keeps_what_is_finished(tmp_path: Path) -> None:
+def test_a_cluster_lost_on_the_way_keeps_what_is_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # So long a client looks for a scheduler that it has lost, if that goes before it says so.
+    monkeypatch.setattr(sweep_cluster, "PATIENCE_S", 60)
     target = tmp_path / "r.csv"
     lost = distributed.LocalCluster(n_workers=1, processes=True, dashboard_address=":0")
 

@@ -327,15 +327,15 @@ def test_the_scene_they_slip_in_is_right(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_scenes_of_vectors_compile_or_are_told_what_is_wrong(tmp_path: Path) -> None:
-    """Here a hundred; thousands are `python -m tests.fuzz --inputs 10000 --sort vectors`."""
-    command = [sys.executable, "-m", "tests.fuzz", "--inputs", "100", "--sort", "vectors", "--seed", "7"]
+    """Here forty; thousands are `python -m tests.fuzz --inputs 10000 --sort vectors`."""
+    command = [sys.executable, "-m", "tests.fuzz", "--inputs", "40", "--sort", "vectors", "--seed", "7"]
     ran = subprocess.run(
         [*command, "--out", str(tmp_path / "failures")], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert ran.returncode == 0, ran.stdout + ran.stderr
     outcomes = {sort: int(count) for count, sort in re.findall(r"(\d+)  vectors: (\w+)", ran.stdout)}
-    assert outcomes["compiled"] > 20
-    assert sum(outcomes.values()) == 100
+    assert outcomes["compiled"] > 8
+    assert sum(outcomes.values()) == 40
 
 
 def test_a_name_whose_size_contradicts_itself_is_told_of(tmp_path: Path) -> None:

@@ -141,6 +141,7 @@ def test_who_shakes_anyhow_is_shaken_by_no_loss_at_all() -> None:
     assert found.growth == pytest.approx(math.sqrt(1.0005576554441589), abs=1e-10)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("peers", "stiffness", "damping", "coupler", "operator"),
     [

@@ -2,7 +2,8 @@
 
 Takes: a result.
 Gives: `Command`; `file_argument`, `file_option`, `set_option`, `in_option`, `hands_option`,
-`json_option`, `check_plot`, `criterion_with`, `WholeNumber`; `print_result`, `tell`, `beside`.
+`duration_option`, `seed_option`, `json_option`, `check_plot`, `criterion_with`, `WholeNumber`;
+`print_result`, `tell`, `beside`.
 Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal.
 Does not: know any command.
 """
@@ -50,12 +51,27 @@ hands_option = click.option(
     "stable with all hands that give back no more energy than they got. Or a hand of the library, such as "
     "StylusArmForward.",
 )
+duration_option = click.option(
+    "--duration",
+    metavar='"TIME"',
+    help='How long, such as "2 s"; that of the scene\'s experiment if not given.',
+)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
 
 
 def file_option(name: str, told: str, *, required: bool = False) -> Callable[[Function], Function]:
     """Return an option that names a file to write; `told` is its help."""
     return click.option(name, type=click.Path(path_type=Path), metavar="FILE", help=told, required=required)
+
+
+def seed_option(packets: str) -> Callable[[Function], Function]:
+    """Return the option `--seed` of what happens by chance to `packets`, such as "that get lost"."""
+    return click.option(
+        "--seed",
+        type=WholeNumber(0, 2**63 - 1),
+        metavar="NUMBER",
+        help=f"Of packets {packets}; the experiment's if not given.",
+    )
 
 
 def check_plot(plot: Path | None) -> None:

@@ -14,12 +14,13 @@ import click
 
 from apc.cli.options import (
     Command,
-    WholeNumber,
+    duration_option,
     file_argument,
     file_option,
     json_option,
     note_aside,
     print_result,
+    seed_option,
     set_option,
     tell,
 )
@@ -30,7 +31,7 @@ from apc.threads import start_single_threaded
 
 @click.command("play", cls=Command)
 @file_argument
-@click.option("--duration", metavar='"TIME"', help="How long; that of the scene's experiment if not given.")
+@duration_option
 @set_option
 @click.option(
     "--peer", metavar="PEER", help="Play this peer alone, such as left[1]; all of them if not given."
@@ -44,12 +45,7 @@ from apc.threads import start_single_threaded
     is_flag=True,
     help="Hold back and lose packets at the sender, as the scene's links say, beside what the network does.",
 )
-@click.option(
-    "--seed",
-    type=WholeNumber(0, 2**63 - 1),
-    metavar="NUMBER",
-    help="Of packets that --emulate loses; the experiment's if not given.",
-)
+@seed_option("that --emulate loses")
 @click.option(
     "--device",
     type=click.Path(path_type=Path),

@@ -18,11 +18,13 @@ from apc.cli.options import (
     Command,
     WholeNumber,
     beside,
+    duration_option,
     file_argument,
     file_option,
     json_option,
     note_aside,
     print_result,
+    seed_option,
     set_option,
     tell,
 )
@@ -42,11 +44,7 @@ if TYPE_CHECKING:
 
 @click.command("simulate", cls=Command)
 @file_argument
-@click.option(
-    "--duration",
-    metavar='"TIME"',
-    help='How long, such as "2 s"; that of the scene\'s experiment if not given.',
-)
+@duration_option
 @set_option
 @click.option(
     "--signals",
@@ -59,12 +57,7 @@ if TYPE_CHECKING:
 @file_option("--still", "Draw how it begins, the peers' bodies side by side: .png, .svg or .pdf.")
 @json_option
 @click.option("--no-jit", is_flag=True, help="Don't compile to machine code.")
-@click.option(
-    "--seed",
-    type=WholeNumber(0, 2**63 - 1),
-    metavar="NUMBER",
-    help="Of packets that get lost or come late; the experiment's if not given.",
-)
+@seed_option("that get lost or come late")
 @click.option(
     "--runs",
     type=WholeNumber(1, 10_000_000),

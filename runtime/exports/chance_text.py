@@ -16,7 +16,7 @@ from collections.abc import Iterable
 from fractions import Fraction
 
 from apc.compiler.frozen import dataclass
-from apc.exports.c_text import CLOSE, OPEN, number
+from apc.exports.c_names import CLOSE, OPEN, number
 from apc.exports.peer import group_of, lines_of
 from apc.network.channel import luck_key
 from apc.network.timetable import Luck, luck_of

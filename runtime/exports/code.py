@@ -16,7 +16,10 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.files import write_texts
 from apc.compiler.frozen import dataclass
-from apc.exports.c_text import CPeer, c_peer, driver, header, source
+from apc.exports.c_driver import driver
+from apc.exports.c_header import header
+from apc.exports.c_names import CPeer, c_peer
+from apc.exports.c_text import source
 from apc.exports.fmu import Unit, unit_of
 from apc.exports.peer import peer_of, refused, sites_of
 from apc.exports.scene_text import c_scene, one_peer

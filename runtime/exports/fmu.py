@@ -24,7 +24,8 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import write_file
 from apc.compiler.frozen import dataclass
 from apc.distribution import program_version
-from apc.exports.c_text import header, source
+from apc.exports.c_header import header
+from apc.exports.c_text import source
 from apc.exports.scene_text import CScene, scene_source
 from apc.result import Result
 from apc.simulation.native import compiler

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 
 from apc.compiler.frozen import dataclass
-from apc.exports.c_text import CLOSE, OPEN, CPeer, c_peer, identifier, in_order, number
+from apc.exports.c_names import CLOSE, OPEN, CPeer, c_peer, identifier, in_order, number
 from apc.exports.chance_text import Chance, chance_begin, chance_of, chance_source, chance_types
 from apc.exports.peer import MOST_HEARD, Line, first_packet, group_of, lines_of, peer_of, refused, sites_of
 from apc.simulation.machine import luck_text

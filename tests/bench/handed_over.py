@@ -15,7 +15,7 @@ from pathlib import Path
 from time import process_time
 
 import apc
-from apc.exports.c_text import c_peer
+from apc.exports.c_names import c_peer
 from apc.exports.code import scene_unit
 from apc.exports.fmu import write_fmu
 from apc.exports.peer import peer_of
