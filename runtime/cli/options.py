@@ -2,8 +2,8 @@
 
 Takes: a result.
 Gives: `Command`, `Group`; `file_argument`, `file_option`, `set_option`, `in_option`, `hands_option`,
-`duration_option`, `seed_option`, `json_option`, `check_plot`, `criterion_with`, `WholeNumber`; `print_result`,
-`tell`, `beside`.
+`duration_option`, `seed_option`, `json_option`, `check_plot`, `criterion_with`, `WholeNumber`;
+`print_result`, `tell`, `beside`.
 Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal.
 Does not: know any command.
 """
