@@ -88,7 +88,8 @@ def test_other_questions_say_in_their_second_line_what_is_left_out(
     assert scene
 
 
-@pytest.mark.parametrize("method", ["auto", "paper"])
+@pytest.mark.few(1)
+@pytest.mark.parametrize("method", ["paper", "auto"])
 def test_an_analysis_answers_for_the_network_first_and_says_what_the_rest_leaves_out(
     scene: str, method: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
