@@ -26,8 +26,8 @@ Places = NDArray[np.intp]
 Matrix = NDArray[Any]  # float64 or complex128
 
 # An inverse of the eigenvectors is used if its rows are left vectors to this; derivatives have half their
-# digits then.
-SPOILT = 1e-8
+# digits then, even where another eigenvalue is as near as 0.01.
+SPOILT = 1e-10
 
 # A derivative of an eigenvalue of worse condition than this is mostly rounding.
 WORST = 1e10

@@ -27,8 +27,9 @@ from apc.vary.crossings import Root
 # Half the width asked of a bracket, relative to the value: half of 1e-12, rounding set aside.
 HALF = 4e-13
 
-# The first bracket tried is this much narrower: a root of floats is mostly better than asked.
-FIRST = 1 / 4
+# The first bracket tried is this much narrower, as a root of floats is mostly better than asked. What was
+# wider is halved until it is hardly wider than that.
+FIRST, HARDLY = 1 / 4, 1.5
 
 # Each bracket that fails is followed by one so much wider, so many times.
 WIDER, TRIES = 16.0, 8
@@ -144,7 +145,7 @@ def hold(root: Root, above: Above, low: float, high: float, half: float = 0.0) -
         half *= WIDER
     else:
         return None
-    while right - left > 2 * HALF * _size(root):
+    while right - left > HARDLY * 2 * FIRST * HALF * _size(root):
         middle = (left + right) / 2
         side = above(middle)
         if side is None or middle in (left, right):
