@@ -22,9 +22,9 @@ BETWEEN_COLLECTIONS = 100_000
 
 def main() -> None:
     """Run the command line and exit."""
+    gc.set_threshold(BETWEEN_COLLECTIONS)
     from apc.memory import hold_to_memory
 
-    gc.set_threshold(BETWEEN_COLLECTIONS)
     hold_to_memory()
     code = run(sys.argv[1:])
     gc.freeze()  # the process ends, and its memory with it: Python would search all of it for garbage first

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
+from apc import cli
+from apc.cli.options import Command
 from apc.threads import POOLS, single_threaded, start_single_threaded
 from tests.topologies import ROOT
 
@@ -110,3 +112,8 @@ def test_what_brings_a_pool_is_loaded_where_it_is_limited() -> None:
     for path in (ROOT / "runtime").rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         assert not re.search(r"import scipy\.(sparse\.)?linalg|from scipy\.(sparse\.)?linalg", text), path
+
+
+def test_every_command_asks_for_one_thread_before_it_loads_anything() -> None:
+    for name in cli.__all__:
+        assert type(getattr(cli, name)) is Command, name

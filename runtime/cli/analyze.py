@@ -28,7 +28,6 @@ from apc.cli.options import (
 )
 from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.threads import start_single_threaded
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
@@ -99,7 +98,6 @@ def analyze_command(
     never pull, which of them make it unstable, and whether they may open and
     close at will.
     """
-    start_single_threaded()
     from apc.answer import answer
     from apc.frame.devices import HANDS, PASSIVE, published
     from apc.inputs import open_scene

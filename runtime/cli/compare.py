@@ -28,7 +28,6 @@ from apc.cli.options import (
 )
 from apc.cli.progress import status_line
 from apc.compiler.errors import ApcError
-from apc.threads import start_single_threaded
 
 
 @click.command("compare", cls=Command)
@@ -80,7 +79,6 @@ def compare_command(
         apc compare average.yaml mesh.yaml --set "lan.delay=16 ms" \\
                     --out schemes.svg
     """
-    start_single_threaded()
     if len(files) == 1 and Path(files[0]).is_dir():
         _compare_run(Path(files[0]), as_json=as_json)
         return

@@ -16,7 +16,6 @@ from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import recording
 from apc.compiler.words import counted
-from apc.threads import start_single_threaded
 
 STAGES = ("source", "scene", "flat", "clocked", "sorted", "compiled")
 
@@ -28,7 +27,6 @@ def check_command(file: str | None) -> None:
 
     Exit code 0 if there is none, 1 otherwise.
     """
-    start_single_threaded()
     from apc.analysis.selfcheck import check_frame
     from apc.compiler.pipeline import check_definition, compile_topology
     from apc.inputs import find_input
@@ -60,7 +58,6 @@ def compile_command(file: str | None, until: str, force: bool) -> None:
     if the topology, every file it names and apc itself are as they were, and
     no --timings are asked for.
     """
-    start_single_threaded()
     from apc.inputs import check_model_name, compiled_already, find_input
 
     path = Path(file) if file else find_input(compiled_too=False)

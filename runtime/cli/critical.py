@@ -30,7 +30,6 @@ from apc.cli.options import (
 )
 from apc.cli.progress import status_line
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.threads import start_single_threaded
 
 # What the name of a scene ends in.
 SCENES = (".yaml", ".yml", ".apc")
@@ -65,7 +64,6 @@ def critical_command(
     that is printed; each is proved where it can be, and on which side of it
     the scene is stable. FILE is a topology or a compiled model.
     """
-    start_single_threaded()
     from apc.inputs import open_scene
     from apc.vary.critical import critical
 

@@ -19,7 +19,6 @@ from apc.cli.options import (
     set_option,
     tell,
 )
-from apc.threads import start_single_threaded
 
 
 @click.command("explore", cls=Command)
@@ -48,7 +47,6 @@ def explore_command(file: str | None, settings: tuple[str, ...], port: int, no_b
     \b
         apc explore three-users.yaml --set "lan.delay=16 ms" --no-browser
     """
-    start_single_threaded()
     from apc.inputs import find_input, open_scene
     from apc.optional import need
 

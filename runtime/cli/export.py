@@ -23,7 +23,6 @@ from apc.cli.options import (
     set_option,
     tell,
 )
-from apc.threads import start_single_threaded
 
 
 @click.command("export", cls=Command)
@@ -96,7 +95,6 @@ def export_command(
         apc export --peer "left[1]" --out left.c
         apc export --out scene.fmu
     """
-    start_single_threaded()
     from apc.exports.export import Asked, export, format_of
     from apc.inputs import open_scene
 

@@ -24,7 +24,6 @@ from apc.cli.options import (
     set_option,
     tell,
 )
-from apc.threads import start_single_threaded
 
 # The options that --frequencies takes the place of, by parameter.
 _SPANNED = {"low": "--from", "high": "--to", "points": "--points"}
@@ -87,7 +86,6 @@ def feel_command(
         apc feel --at "user[1].device" --frequencies "1 Hz, 5 Hz"
         apc feel --from "0.1 Hz" --to "60 Hz" --out bode.svg
     """
-    start_single_threaded()
     from apc.hands.asked import read_frequencies
     from apc.hands.feel import feel
     from apc.inputs import open_scene

@@ -13,7 +13,6 @@ import click
 
 from apc.cli.options import Command, beside, file_option, json_option, print_result, tell
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.threads import start_single_threaded
 
 
 @click.command("network", cls=Command)
@@ -35,7 +34,6 @@ def network_command(recording: str, interval: str | None, out: Path | None, as_j
         irtt client -i 8ms -d 60s -o lan.json HOST
         apc network lan.json
     """
-    start_single_threaded()
     from apc.compiler.files import check_target, write_text
     from apc.network.recorded import describe
     from apc.option_value import option_value

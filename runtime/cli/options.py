@@ -23,6 +23,7 @@ from apc.compiler.files import is_stdout
 from apc.compiler.timings import part, record
 from apc.present.forms import json_text
 from apc.result import Result
+from apc.threads import start_single_threaded
 
 Function = TypeVar("Function", bound=Callable[..., None])
 
@@ -101,7 +102,8 @@ class Command(click.Command):
         self.params.append(click.Option(["--timings"], is_flag=True, help=told))
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command, its parts measured if that is asked for."""
+        """Run the command with one thread of each library, its parts measured if that is asked for."""
+        start_single_threaded()
         if not ctx.params.pop("timings"):
             return super().invoke(ctx)
         started = time.process_time()

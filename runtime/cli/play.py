@@ -26,7 +26,6 @@ from apc.cli.options import (
 )
 from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.threads import start_single_threaded
 
 
 @click.command("play", cls=Command)
@@ -91,7 +90,6 @@ def play_command(
     Hosts that play together keep their clocks by NTP or PTP: how far apart
     they are when the peers meet is taken off, what they drift is not.
     """
-    start_single_threaded()
     from apc.inputs import open_scene
     from apc.loop.device import device_function
     from apc.loop.run import check_folder, read_run, write_run

@@ -30,7 +30,6 @@ from apc.cli.options import (
 )
 from apc.cli.progress import status_line
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.threads import start_single_threaded
 
 
 @click.command("region", cls=Command)
@@ -99,7 +98,6 @@ def region_command(
                    --compare mesh.yaml --vary "lan.delay=0,8 ms" \\
                    --out regions.svg
     """
-    start_single_threaded()
     from apc.inputs import open_scene
     from apc.present.pictures import check_result_path
     from apc.present.region import write_panels

@@ -17,7 +17,6 @@ import click
 from apc.cli.options import Command, file_option, set_option, tell
 from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.threads import start_single_threaded
 
 if TYPE_CHECKING:
     from apc.reports.contents import Report
@@ -48,7 +47,6 @@ def report_command(
         apc report average.yaml mesh.yaml --out report.html
         apc report --check report.html
     """
-    start_single_threaded()
     if (out is None) == (check is None):
         raise click.UsageError("--out FILE writes a report, --check REPORT reads one: one of them")
     if check is not None:
