@@ -101,7 +101,7 @@ class _LateSheet:
         place = np.arange(n_z)
         matrix[:, place, place] += points[:, None]
         sign, size = np.linalg.slogdet(matrix)
-        inverse = np.linalg.inv(matrix)
+        inverse = np.asarray(np.linalg.inv(matrix), np.complex128)
         turn = 1j * points[:, None, None]
         base = size + 1j * np.angle(sign) - self.rigid * np.log(1 - 1 / points)
         slope = turn[:, 0, 0] * inverse[:, place, place].sum(axis=1) - self.rigid * 1j / (points - 1)
@@ -116,11 +116,10 @@ class _LateSheet:
             rows, back = np.flatnonzero(which.ravel() == group), self.loops.heard[:, kind]
             power = points[:, None] ** -np.array(lags)
             heard, moved = (np.tensordot(one, back, 1) for one in (power, -1j * power * lags))
+            gains, gains_turned = sent @ heard, turned @ heard + sent @ moved
             with np.errstate(divide="ignore", invalid="ignore"):  # a zero on the circle
-                logarithm_, along = _of_powers(
-                    sent @ heard, turned @ heard + sent @ moved, points, ages[rows, :1]
-                )
-            value[rows], turning[rows] = base + logarithm_, slope + along
+                found = _of_powers(gains, gains_turned, points, ages[rows, :1])
+            value[rows], turning[rows] = base + found[0], slope + found[1]
         return Logarithm(value, turning, np.zeros_like(value))
 
 
