@@ -106,7 +106,7 @@ class Rows:
 
 
 @dataclass(frozen=True, slots=True)
-class Reaching:
+class _Reaching:
     """Varied numbers, by their columns, from which others follow: the names of these and their own.
 
     No other number of a scene follows from both these and what varies besides.
@@ -123,7 +123,7 @@ class _Family:
     system: CompiledSystem
     evaluator: BatchEvaluator
     columns: tuple[int, ...]  # which of the varied each free parameter is
-    reaching: tuple[Reaching, ...]
+    reaching: tuple[_Reaching, ...]
     rigid: int
     drifts: int
     bounds: tuple[tuple[int, Parameter], ...]  # the parameters that a varied one sets, by its column
@@ -367,19 +367,19 @@ def _family(of: Asked, times: tuple[int, ...], given: tuple[Override, ...]) -> _
     )
 
 
-def _reaching(system: CompiledSystem, columns: Sequence[int], free: Sequence[Free]) -> tuple[Reaching, ...]:
+def _reaching(system: CompiledSystem, columns: Sequence[int], free: Sequence[Free]) -> tuple[_Reaching, ...]:
     """Return the varied numbers from which any others follow, those together of which the same does."""
     scopes = [scope_of(system), *(scope_of(system, group.values) for group in system.groups)]
-    found: list[Reaching] = []
+    found: list[_Reaching] = []
     for column, one in zip(columns, free, strict=True):
         reached = [scope.follow({one.name: None}, lambda *_: None, lambda _: None) for scope in scopes]
-        mine = Reaching((column,), frozenset[str]().union(*reached))
+        mine = _Reaching((column,), frozenset[str]().union(*reached))
         if len(mine.names) > 1:
             shared = [other for other in found if other.names & mine.names]
             every = [*shared, mine]
             found = [other for other in found if other not in shared]
             found.append(
-                Reaching(
+                _Reaching(
                     tuple(column for other in every for column in other.columns),
                     frozenset[str]().union(*(other.names for other in every)),
                 )
@@ -481,7 +481,7 @@ def _vectors(
 
 
 def _resolved(
-    family: _Family, varied: Sequence[Varied], some: Reaching, places: Sequence[int]
+    family: _Family, varied: Sequence[Varied], some: _Reaching, places: Sequence[int]
 ) -> Numbers | None:
     """Return the scene's numbers with what others follow from at these places; None if these may not be."""
     given = tuple(varied[column].override(place) for column, place in zip(some.columns, places, strict=True))
