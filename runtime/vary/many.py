@@ -56,8 +56,8 @@ PLACE = Place("analyze_many")
 FAULT = "error: "
 
 # Points whose matrices are made together, and their entries: what they are made of then stays in the cache of
-# a processor. Twice as many are given back to the system and fetched anew each time.
-TOGETHER, ENTRIES = 1024, 40 * 2**10
+# a processor, and is not given back to the system and fetched anew each time.
+TOGETHER, ENTRIES = 1024, 56 * 2**10
 
 # An evaluator takes as long to prepare as one analysis: for fewer points it isn't.
 FEWEST = 3
