@@ -175,6 +175,29 @@ def test_what_follows_from_a_value_follows_and_keeps_its_bounds(counted: Counted
         alone(system, found, names, point)
 
 
+@pytest.mark.parametrize(("damping", "worked_out"), [("kt*lead", 12), ("(kc + kt)*lead", 36)])
+def test_what_follows_from_two_values_apart_is_worked_out_once_for_each(
+    damping: str, worked_out: int, counted: Counted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = compiled(
+        replaced(
+            AVERAGE,
+            ("peers:\n", "parameters: {kc: 1000 N/m, kt: 500 N/m, lead: 0.1 ms}\npeers:\n"),
+            ("stiffness: 1000 N/m", "stiffness: kc"),
+            ("stiffness: 500 N/m", f"stiffness: kt, damping: {damping}"),
+        )
+    )
+    resolved: list[object] = []
+    resolve = many.resolve
+    kc, kt = (one.ravel() for one in np.meshgrid(np.linspace(300, 1800, 6), np.linspace(100, 900, 6)))
+    analyze_many(system, {"kc": kc[:3] / 7, "kt": kt[:3] / 7})  # what the scene's points share is made ready
+    monkeypatch.setattr(many, "resolve", lambda given: resolved.append(given) or resolve(given))
+    found = analyze_many(system, {"kc": kc, "kt": kt})
+    assert (counted.points, len(resolved)) == (0, worked_out)
+    for point in (0, 7, 20, 35):
+        alone(system, found, [Free("kc"), Free("kt")], point)
+
+
 GROUPS = replaced(
     AVERAGE,
     (

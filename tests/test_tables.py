@@ -70,9 +70,8 @@ def test_columns_come_back_as_they_were_written(tmp_path: Path, suffix: str) -> 
     (texts,) = read_table(path, COLUMNS[1:2])
     assert counts.tolist() == [row[2] for row in ROWS]
     np.testing.assert_array_equal(numbers, [math.nan if row[0] is None else row[0] for row in ROWS])
-    assert [text or None for text in texts.tolist()] == [
-        row[1] for row in ROWS
-    ]  # CSV has no texts that are none
+    # CSV has no texts that are none.
+    assert [text or None for text in texts.tolist()] == [row[1] for row in ROWS]
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])

@@ -278,7 +278,8 @@ def misses_one(matrix: Floats, error: Floats) -> Truths:
         except np.linalg.LinAlgError:
             return np.zeros(len(matrix), dtype=np.bool_)
         doubt = _norms(error) + (n + 4) * UNIT * (n + _norms(matrix))
-        return np.asarray(_norms(unit - inverse @ away) + _norms(inverse) * doubt < 0.5)
+        wrong = np.asarray(unit - inverse @ away, dtype=np.float64)
+        return np.asarray(_norms(wrong) + _norms(np.asarray(inverse)) * doubt < 0.5)
 
 
 def resolvents(matrix: Floats) -> Floats:

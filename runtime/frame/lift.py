@@ -360,7 +360,7 @@ def follow(
     steps
         [F G] (n_x, n_x + n_u) by duration in quanta.
     start
-        The state z (n_z, columns) at the start of the frame, of as many sites as rows are to be kept of.
+        The state z (n_z, columns) at the start of the frame. Rows have a leading axis where it has one.
     hear
         Gives the row (columns,) of an entry of r, or None while it isn't sent yet: it is asked again.
     numbers

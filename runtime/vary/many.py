@@ -56,8 +56,8 @@ PLACE = Place("analyze_many")
 FAULT = "error: "
 
 # Points whose matrices are made together, and their entries: what they are made of then stays in the cache of
-# a processor. Twice as many are given back to the system and fetched anew each time.
-TOGETHER, ENTRIES = 1024, 40 * 2**10
+# a processor, and is not given back to the system and fetched anew each time.
+TOGETHER, ENTRIES = 1024, 56 * 2**10
 
 # An evaluator takes as long to prepare as one analysis: for fewer points it isn't.
 FEWEST = 3
@@ -105,6 +105,17 @@ class Rows:
         return cls(verdict, radius, error, np.full(count, -1), frequency, damping, message)
 
 
+@dataclass(frozen=True, slots=True)
+class _Reaching:
+    """Varied numbers, by their columns, from which others follow: the names of these and their own.
+
+    No other number of a scene follows from both these and what varies besides.
+    """
+
+    columns: tuple[int, ...]
+    names: frozenset[str]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Family:
     """What all points of the same times share; `rigid` and `drifts` are those of the whole."""
@@ -112,7 +123,7 @@ class _Family:
     system: CompiledSystem
     evaluator: BatchEvaluator
     columns: tuple[int, ...]  # which of the varied each free parameter is
-    reaching: tuple[int, ...]  # those of them from which other numbers follow
+    reaching: tuple[_Reaching, ...]
     rigid: int
     drifts: int
     bounds: tuple[tuple[int, Parameter], ...]  # the parameters that a varied one sets, by its column
@@ -347,9 +358,7 @@ def _family(of: Asked, times: tuple[int, ...], given: tuple[Override, ...]) -> _
         system=timed_system,
         evaluator=evaluator,
         columns=columns,
-        reaching=tuple(
-            column for column, one in zip(columns, free, strict=True) if _is_followed(timed_system, one)
-        ),
+        reaching=_reaching(timed_system, columns, free),
         rigid=rigid,
         drifts=drifts,
         bounds=tuple((names[one.name], one) for one in every if one.name in names),
@@ -358,10 +367,24 @@ def _family(of: Asked, times: tuple[int, ...], given: tuple[Override, ...]) -> _
     )
 
 
-def _is_followed(system: CompiledSystem, free: Free) -> bool:
-    """Say whether any number follows from a parameter by a formula."""
+def _reaching(system: CompiledSystem, columns: Sequence[int], free: Sequence[Free]) -> tuple[_Reaching, ...]:
+    """Return the varied numbers from which any others follow, those together of which the same does."""
     scopes = [scope_of(system), *(scope_of(system, group.values) for group in system.groups)]
-    return any(free.name in formula.names for scope in scopes for formula in scope.formulas.values())
+    found: list[_Reaching] = []
+    for column, one in zip(columns, free, strict=True):
+        reached = [scope.follow({one.name: None}, lambda *_: None, lambda _: None) for scope in scopes]
+        mine = _Reaching((column,), frozenset[str]().union(*reached))
+        if len(mine.names) > 1:
+            shared = [other for other in found if other.names & mine.names]
+            every = [*shared, mine]
+            found = [other for other in found if other not in shared]
+            found.append(
+                _Reaching(
+                    tuple(column for other in every for column in other.columns),
+                    frozenset[str]().union(*(other.names for other in every)),
+                )
+            )
+    return tuple(found)
 
 
 def _filled(
@@ -413,42 +436,55 @@ def _vectors(
     """Return which points may be, and what gives each group's parameters there (k, n_p), or (1, n_p).
 
     A number that follows from others is worked out as for an analysis, in rationals, once for all points that
-    agree in what it follows from.
+    agree in what it follows from: over a grid of two such, once for each value of either.
     """
     numbers = {column: varied[column].numbers[places[:, column]] for column in family.columns}
     allowed = np.ones(len(places), dtype=np.bool_)
     for column, parameter in family.bounds:
         allowed &= _keeps_bounds(parameter, numbers[column])
-    different, which = np.unique(places[:, list(family.reaching)], axis=0, return_inverse=True)
-    settled = [_resolved(family, varied, one) for one in different.tolist()]
-    allowed &= np.array([one is not None for one in settled])[which.ravel()]
+    settled = []
+    for some in family.reaching:
+        different, which = np.unique(places[:, list(some.columns)], axis=0, return_inverse=True)
+        there = [_resolved(family, varied, some, one) for one in different.tolist()]
+        settled.append((some.names, there, which.ravel()))
+        allowed &= np.array([one is not None for one in there])[which.ravel()]
     plain = sorted(
-        set(family.columns) - set(family.reaching), key=lambda column: varied[column].free.group or ""
+        set(family.columns).difference(*(some.columns for some in family.reaching)),
+        key=lambda column: varied[column].free.group or "",
     )
 
     def vectors(group: PeerGroup) -> Floats:
         place, peer = family.evaluator.first_peer(group)
-        found = group.parameters[None]
-        if family.reaching:
-            found = np.array(
-                [found[0] if one is None else one.parameters[place][one.rows[place][peer]] for one in settled]
-            )[which.ravel()]
         names, own = group.jacobians.kind.parameters, family.system.groups[place].name
+        found = group.parameters[None]
+
+        def put(where: list[int], values: Floats) -> None:
+            nonlocal found
+            if where:
+                found = np.array(np.broadcast_to(found, (len(places), len(names))))
+                found[:, where] = values
+
+        for reached, there, which in settled:
+            rows = [
+                group.parameters if one is None else one.parameters[place][one.rows[place][peer]]
+                for one in there
+            ]
+            where = [column for column, name in enumerate(names) if name in reached]
+            put(where, np.array(rows)[:, where][which])
         for column in plain:  # a group's own value after that of everybody
             free = varied[column].free
             if free.name in names and free.group in (None, own):
-                found = np.array(np.broadcast_to(found, (len(places), len(names))))
-                found[:, names.index(free.name)] = numbers[column]
+                put([names.index(free.name)], numbers[column][:, None])
         return found
 
     return allowed, vectors
 
 
-def _resolved(family: _Family, varied: Sequence[Varied], places: Sequence[int]) -> Numbers | None:
+def _resolved(
+    family: _Family, varied: Sequence[Varied], some: _Reaching, places: Sequence[int]
+) -> Numbers | None:
     """Return the scene's numbers with what others follow from at these places; None if these may not be."""
-    given = tuple(
-        varied[column].override(place) for column, place in zip(family.reaching, places, strict=True)
-    )
+    given = tuple(varied[column].override(place) for column, place in zip(some.columns, places, strict=True))
     if given not in family.resolved:
         if len(family.resolved) >= MOST_RESOLVED:
             family.resolved.clear()
