@@ -244,6 +244,23 @@ def test_bodies_are_where_the_run_has_them_and_never_out_of_sight() -> None:
     }
 
 
+@pytest.mark.usefixtures("short")
+def test_every_frame_shows_what_stands_and_what_moved(tmp_path: Path) -> None:
+    image = pytest.importorskip("PIL.Image")
+    system = compiled(replaced(AVERAGE, ("device: {", "device: {v: 2 m/s, ")))
+    out = tmp_path / "run.gif"
+    animation.save_animation(system, apc.simulate(system, duration="1 s", jit=False), out)
+    with image.open(out) as run:
+        frames = []
+        for number in (0, run.n_frames - 1):
+            run.seek(number)
+            frames.append(np.asarray(run.convert("L"), dtype=float))
+    assert run.n_frames == 5
+    dark = [one < 100 for one in frames]
+    assert min(one.sum() for one in dark) > 0.9 * max(one.sum() for one in dark)  # axes, ticks and names
+    assert (dark[0] != dark[1]).any() and (dark[0] & dark[1]).sum() > 0.5 * dark[0].sum()
+
+
 def test_without_ffmpeg_it_says_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

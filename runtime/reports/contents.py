@@ -43,7 +43,7 @@ from apc.simulation.trajectory import simulate
 from apc.vary.critical import Critical, critical
 from apc.vary.growth import MEAN_SQUARE, NOMINAL
 from apc.vary.locus import root_locus
-from apc.vary.margins import coupler_parameters
+from apc.vary.margins import STIFFNESSES, coupler_parameters
 
 Cell = str | float | int | None
 
@@ -336,7 +336,7 @@ def _said(found: Critical) -> str:
 def _region(system: CompiledSystem, call: str) -> Section:
     asked: list[str | None] = [None, None]
     if len(system.region) < 2:
-        stiff = [one for one in coupler_parameters(system) if _unit(system, one.name) == "N/m"]
+        stiff = [one for one in coupler_parameters(system) if _unit(system, one.name) in STIFFNESSES]
         if len(stiff) < 2:
             why = "the scene has fewer than two stiffnesses, and says no studies: region:"
             return Section("region", "", refused=why)
