@@ -13,6 +13,7 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.comparison.comparison import compare
+from apc.compiler.errors import ApcError
 from apc.present import animation
 from apc.present.comparison_picture import comparison_picture
 from apc.present.eigenvalues import eigenvalues_picture, locus_picture
@@ -197,6 +198,21 @@ def test_a_root_locus_passes_the_circle_where_stability_changes() -> None:
     assert np.abs(locus.now).max() == pytest.approx(apc.analyze(system).spectral_radius)
     texts = [one.get_text() for one in locus_picture(locus).get_legend().get_texts()]
     assert texts == ["now, 500 N/m", "changes at 1096.41 N/m, 20.29 Hz"]
+
+
+def test_a_critical_value_draws_its_root_locus(tmp_path: Path) -> None:
+    found = apc.critical(compiled(AVERAGE), "coordination.stiffness")
+    ax = pytest.importorskip("matplotlib.figure").Figure().subplots()
+    assert found.plot(ax) is ax
+    apart = ax.collections[0].get_offsets()
+    locus = root_locus(found.system, found)
+    assert np.array_equal(apart[:, 0], np.concatenate(locus.eigenvalues).real)
+    drawn = found.plot(size=(4, 3), labels={"real part": "Re"})
+    assert drawn.get_xlabel() == "Re" and tuple(drawn.figure.get_size_inches()) == (4, 3)
+    assert "system" not in found.to_dict() and "<img" not in found._repr_mimebundle_()["text/html"]
+    passive = apc.critical(compiled(AVERAGE), "coordination.stiffness", criterion="passive")
+    with pytest.raises(ApcError, match="E930 what every passive hand can draw has no eigenvalues"):
+        passive.plot()
 
 
 def test_text_in_an_svg_is_text(tmp_path: Path) -> None:
