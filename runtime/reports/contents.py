@@ -251,7 +251,8 @@ def _verdict(system: CompiledSystem, call: str) -> Section:
     ]
     columns = ("magnitude", "error", "times", "frequency [Hz]", "shape", "moves most")
     of = found.network or found
-    told += [text for text in (of.margins.note, of.sensitivities.note) if text]
+    notes = (("Margins", of.margins.note), ("What moves the radius", of.sensitivities.note))
+    told += [f"{what}: {note}" for what, note in notes if note]
     grow = [
         (one.parameter, one.unit, one.present, one.value, one.error, one.note or None)
         for one in of.margins.rows
