@@ -186,9 +186,13 @@ def test_a_report_is_computed_anew_from_itself_alone(
     text = Path("r.html").read_text(encoding="utf-8")
     kept = kept_report(Path("r.html"))
     old = kept["scenes"][0]["sections"][1]["tables"][0]["rows"][1][1]
-    Path("r.html").write_text(text.replace(f"{old!r},", f"{old + 0.001!r},"), encoding="utf-8")
+    version = f'"apc": "{apc.__version__}"'
+    assert version in text
+    text = text.replace(f"{old!r},", f"{old + 0.001!r},").replace(version, '"apc": "0.0.1"')
+    Path("r.html").write_text(text, encoding="utf-8")
     assert run(["report", "--check", "r.html"]) == 1
     said = capsys.readouterr().err
+    assert f"note: apc was 0.0.1, and is {apc.__version__} here" in said
     assert "E991 Verdict, modes and margins: Verdict: value of spectral radius a frame is 0.9" in said
 
 
