@@ -7,12 +7,13 @@ Does not: print.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from apc.vary.margins import Margins
     from apc.vary.sensitivity import Sensitivities
 
+_Scene = CompiledSystem | str | Path
 Format = Literal["text", "json", "dot", "svg"]
 Criterion = Literal["mean-square", "nominal", "passive"]
 
@@ -227,7 +229,7 @@ def critical(
 
 
 def compare(
-    models: Sequence[CompiledSystem | str | Path],
+    models: _Scene | Sequence[_Scene],
     *,
     set: Mapping[str, str] | None = None,
     over: Sequence[str] = (),
@@ -239,7 +241,7 @@ def compare(
     Parameters
     ----------
     models
-        Several of what `analyze` takes.
+        What `analyze` takes, mostly several.
     set
         As for `analyze`, of all of them.
     over
@@ -262,7 +264,8 @@ def compare(
     """
     from apc.comparison import comparison
 
-    return comparison.compare([_model(one, set) for one in models], over=over, criterion=criterion, at=at)
+    listed = _several(models, "compare")
+    return comparison.compare([_model(one, set) for one in listed], over=over, criterion=criterion, at=at)
 
 
 def passive_hands(
@@ -591,6 +594,28 @@ def sweep(
     return points.sweep(system, over, of=of, criterion=criterion, out=path, jobs=jobs, cluster=cluster)
 
 
+def _several(scenes: _Scene | Iterable[_Scene], function: str) -> list[_Scene]:
+    """Return the scenes that a function is given, of which one needs no list; refuse none."""
+    if isinstance(scenes, CompiledSystem | str | Path):
+        return [scenes]
+    if listed := list(scenes):
+        return listed
+    hint = f'apc.{function}(["average.yaml", "mesh.yaml"])'
+    raise ApcError(Mistake("E610", Place(function), "no scene is given", hint=hint))
+
+
+def _path(scene: _Scene, function: str) -> Path:
+    """Return the path of a topology; refuse a compiled model, which no longer has its text."""
+    from apc.inputs import refuse_model
+
+    if isinstance(scene, CompiledSystem):
+        path = Path(scene.origin.topology).with_suffix(".apc")
+    else:
+        path = Path(scene)
+    refuse_model(path, function)
+    return path
+
+
 def _model(model: CompiledSystem | str | Path, set: Mapping[str, str] | None) -> CompiledSystem:
     """Return a compiled model, with the parameters set."""
     if not isinstance(model, CompiledSystem):
@@ -781,13 +806,12 @@ def report(
     ApcError
         The input is at fault, or the page can't be written.
     """
-    from apc.inputs import check_topology_outputs, refuse_model
+    from apc.inputs import check_topology_outputs
     from apc.present.report import check_report_path, save_report
     from apc.reports import contents
 
-    paths = [Path(one) for one in ([files] if isinstance(files, str | Path) else files)]
+    paths = [_path(one, "report") for one in _several(files, "report")]
     for path in paths:
-        refuse_model(path, "report")
         if out is not None:
             check_topology_outputs(path, {"out=": Path(out)})
     if out is not None:
@@ -815,11 +839,9 @@ def show(path: str | Path, *, format: Format = "text") -> str:
         The file is at fault, or is a compiled model, which no longer has the equations as written.
     """
     from apc.compiler.view import listing
-    from apc.inputs import refuse_model
     from apc.present.forms import json_text
 
-    path = Path(path)
-    refuse_model(path, "show")
+    path = _path(path, "show")
     match format:
         case "text":
             return listing.show_text(path)

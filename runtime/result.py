@@ -36,6 +36,7 @@ class Result:
 
     __slots__ = ()
     shown_by: ClassVar[str]
+    pictured: ClassVar[bool] = True  # in a notebook, where it has a picture
 
     def __init_subclass__(cls) -> None:
         """Give every result the short repr, which `dataclass` leaves to a class that has one."""

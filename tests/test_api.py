@@ -109,3 +109,23 @@ def test_a_faulty_file_raises_all_its_mistakes(tmp_path: Path) -> None:
     with pytest.raises(apc.ApcError) as caught:
         apc.compile(path)
     assert [mistake.code for mistake in caught.value.mistakes] == ["E201", "E201"]
+
+
+def test_a_list_of_no_scenes_is_refused_and_one_scene_needs_no_list(model: apc.CompiledSystem) -> None:
+    assert told(apc.compare, []) == [
+        'compare: E610 no scene is given. Write: apc.compare(["average.yaml", "mesh.yaml"])'
+    ]
+    assert told(apc.report, []) == [
+        'report: E610 no scene is given. Write: apc.report(["average.yaml", "mesh.yaml"])'
+    ]
+    for one in (model, PATH, str(PATH)):
+        assert [scheme.topology for scheme in apc.compare(one).schemes] == ["three-users-average"]
+    assert told(apc.prove_box, model, {}) == [
+        "box: E830 no parameter is left open. Write: contact.stiffness=±1%"
+    ]
+
+
+def test_what_tells_of_texts_refuses_a_compiled_model(model: apc.CompiledSystem) -> None:
+    for function, given in ((apc.report, model), (apc.report, [model]), (apc.show, model)):
+        [mistake] = told(function, given)
+        assert mistake.startswith("three-users-average.apc: E615 is a compiled model")

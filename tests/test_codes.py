@@ -92,7 +92,7 @@ E602 compiler: a compiled model can't be read
 E603 compiler: a compiled model is of another format version
 E604 compiler: a compiled model is damaged
 E605 runtime: a compiled model is older than its texts
-E610 runtime: a folder has no scene
+E610 runtime: a folder, or a list, has no scene
 E611 runtime: a folder has several scenes
 E612 runtime/cli: a new scene's name is none
 E613 runtime/cli: a new scene's file exists

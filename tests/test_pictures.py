@@ -13,6 +13,7 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.comparison.comparison import compare
+from apc.compiler.errors import ApcError
 from apc.present import animation
 from apc.present.comparison_picture import comparison_picture
 from apc.present.eigenvalues import eigenvalues_picture, locus_picture
@@ -199,6 +200,21 @@ def test_a_root_locus_passes_the_circle_where_stability_changes() -> None:
     assert texts == ["now, 500 N/m", "changes at 1096.41 N/m, 20.29 Hz"]
 
 
+def test_a_critical_value_draws_its_root_locus(tmp_path: Path) -> None:
+    found = apc.critical(compiled(AVERAGE), "coordination.stiffness")
+    ax = pytest.importorskip("matplotlib.figure").Figure().subplots()
+    assert found.plot(ax) is ax
+    apart = ax.collections[0].get_offsets()
+    locus = root_locus(found.system, found)
+    assert np.array_equal(apart[:, 0], np.concatenate(locus.eigenvalues).real)
+    drawn = found.plot(size=(4, 3), labels={"real part": "Re"})
+    assert drawn.get_xlabel() == "Re" and tuple(drawn.figure.get_size_inches()) == (4, 3)
+    assert "system" not in found.to_dict() and "<img" not in found._repr_mimebundle_()["text/html"]
+    passive = apc.critical(compiled(AVERAGE), "coordination.stiffness", criterion="passive")
+    with pytest.raises(ApcError, match="E930 what every passive hand can draw has no eigenvalues"):
+        passive.plot()
+
+
 def test_text_in_an_svg_is_text(tmp_path: Path) -> None:
     write_figure(eigenvalues_picture(apc.analyze(compiled(AVERAGE))).figure, tmp_path / "e.svg")
     text = (tmp_path / "e.svg").read_text(encoding="utf-8")
@@ -242,6 +258,23 @@ def test_bodies_are_where_the_run_has_them_and_never_out_of_sight() -> None:
     assert {one.states[0] for one in actors} == {
         f"user[{n}].{x}" for n in (1, 2, 3) for x in ("device.x", "cube.x")
     }
+
+
+@pytest.mark.usefixtures("short")
+def test_every_frame_shows_what_stands_and_what_moved(tmp_path: Path) -> None:
+    image = pytest.importorskip("PIL.Image")
+    system = compiled(replaced(AVERAGE, ("device: {", "device: {v: 2 m/s, ")))
+    out = tmp_path / "run.gif"
+    animation.save_animation(system, apc.simulate(system, duration="1 s", jit=False), out)
+    with image.open(out) as run:
+        frames = []
+        for number in (0, run.n_frames - 1):
+            run.seek(number)
+            frames.append(np.asarray(run.convert("L"), dtype=float))
+    assert run.n_frames == 5
+    dark = [one < 100 for one in frames]
+    assert min(one.sum() for one in dark) > 0.9 * max(one.sum() for one in dark)  # axes, ticks and names
+    assert (dark[0] != dark[1]).any() and (dark[0] & dark[1]).sum() > 0.5 * dark[0].sum()
 
 
 def test_without_ffmpeg_it_says_what_to_do(

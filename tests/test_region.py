@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,12 +13,15 @@ import pytest
 import apc
 from apc.analysis.analysis import analyze
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.overrides import Override, apply
+from apc.regions import region as regions
 from apc.regions.axes import parse_axes
 from apc.regions.boundary import relative_to
 from apc.regions.curves import between
 from apc.regions.region import Region, region
+from apc.vary.batch import BatchEvaluator
+from apc.vary.evaluator import PointEvaluator
 from tests.paper_limit import limit
 from tests.reference import CONTACT_LIMITS, LIMITS
 from tests.topologies import AVERAGE, MESH, ROOT, compiled, replaced
@@ -178,6 +182,32 @@ def test_a_scene_linearized_at_its_start_has_a_region_too() -> None:
     for x, y in random.uniform([100, 100], [6000, 4000], (8, 2)).tolist():
         overrides = [Override(axis.free, Fraction(v)) for axis, v in ((found.x, x), (found.y, y))]
         assert found.contains(x, y) == analyze(apply(system, overrides)).stable
+
+
+def test_where_a_scene_starts_its_region_is_followed_with_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    surveyed = regions._surveyed
+
+    def survey(source: Any, *rest: Any) -> Any:
+        asked.append(type(source))
+        return surveyed(source, *rest)
+
+    monkeypatch.setattr(regions, "_surveyed", survey)
+    text = (ROOT / "models" / "scenes" / "experiment-average.yaml").read_text(encoding="utf-8")
+    system = compiled(text.partition("\n")[2])
+    spans = ("contact.stiffness=100 N/m:6000 N/m", "coordination.stiffness=100 N/m:4000 N/m")
+    assert region(system, parse_axes(system, *spans), cells=6).curves
+    assert asked == [BatchEvaluator]
+    # Beyond 30 mm a device begins apart from the cube: another motion is free there, and points tell of it.
+    apart = ("contact.half_width=25 mm:35 mm", "contact.stiffness=1000 N/m:1001 N/m")
+    monkeypatch.setattr(regions, "_surveyed", lambda source, *rest: asked.append(type(source)) or _lost())
+    with pytest.raises(ApcError, match="E905"):
+        region(system, parse_axes(system, *apart))
+    assert asked[1:] == [BatchEvaluator, PointEvaluator]
+
+
+def _lost() -> None:
+    raise ApcError(Mistake("E905", Place("region"), "some motion keeps its size"))
 
 
 def test_the_document_is_the_contract(paper: Region) -> None:

@@ -186,9 +186,13 @@ def test_a_report_is_computed_anew_from_itself_alone(
     text = Path("r.html").read_text(encoding="utf-8")
     kept = kept_report(Path("r.html"))
     old = kept["scenes"][0]["sections"][1]["tables"][0]["rows"][1][1]
-    Path("r.html").write_text(text.replace(f"{old!r},", f"{old + 0.001!r},"), encoding="utf-8")
+    version = f'"apc": "{apc.__version__}"'
+    assert version in text
+    text = text.replace(f"{old!r},", f"{old + 0.001!r},").replace(version, '"apc": "0.0.1"')
+    Path("r.html").write_text(text, encoding="utf-8")
     assert run(["report", "--check", "r.html"]) == 1
     said = capsys.readouterr().err
+    assert f"note: apc was 0.0.1, and is {apc.__version__} here" in said
     assert "E991 Verdict, modes and margins: Verdict: value of spectral radius a frame is 0.9" in said
 
 
@@ -273,6 +277,28 @@ def test_what_cannot_be_written_or_read_is_refused_before_anything_is_computed(
     assert run(["report", "scene.apc", "--out", "r.html"]) == 1
     assert "E615" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not any(map(shutil.which, pages.BROWSERS)), reason="there is no Chromium")
+def test_on_paper_what_is_told_stays_with_its_figure(tmp_path: Path) -> None:
+    """Each h2 and the figure below it, though sentences stand between them, begin on one page."""
+    pytest.importorskip("playwright.sync_api")
+    from playwright.sync_api import sync_playwright
+
+    page = (
+        f"<style>{pages._STYLE} @page {{ size: 400px 400px; margin: 0; }} svg {{ height: 300px; }}</style>"
+        '<p style="height: 310px">Above</p><section><div class="scenes"><div>'
+        "<h2>Over time</h2><p>It settles.</p><p>Twice.</p><figure><svg></svg></figure></div></div></section>"
+    )
+    out = tmp_path / "r.pdf"
+    with sync_playwright() as play:
+        path = next(one for name in pages.BROWSERS if (one := shutil.which(name)))
+        browser = play.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        shown = browser.new_page()
+        shown.set_content(page)
+        out.write_bytes(shown.pdf(prefer_css_page_size=True))
+        browser.close()
+    assert len(re.findall(rb"/Type\s*/Page\b", out.read_bytes())) == 2
 
 
 @pytest.mark.skipif(not any(map(shutil.which, pages.BROWSERS)), reason="there is no Chromium")

@@ -160,6 +160,8 @@ def open_box(system: CompiledSystem, ranges: Sequence[Range]) -> Box:
     ApcError
         E896 a number of an unreliable link; those of `open_sites`.
     """
+    if not ranges:
+        raise ApcError(Mistake("E830", _PLACE, "no parameter is left open", hint="contact.stiffness=±1%"))
     for one in ranges:
         refuse_channel_number(system, one.free, _PLACE)
     prepared = prepare(system)

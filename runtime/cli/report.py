@@ -85,11 +85,14 @@ def _check(path: Path) -> None:
             again = report([scene_again(one, Path(folder))], one["settings"])
         place = Place(f"{path}: {one['name']}")
         mistakes += [Mistake("E991", place, what) for what in _differs(one, again)]
-        now = dict(again.scenes[0].origin)
-        notes += [name for name, digest in one["origin"] if now.get(name) != digest]
-        notes += [name for name, version in again.versions if kept["versions"].get(name) != version]
-    for name in dict.fromkeys(notes):
-        tell(f"note: {name} is another one than the report was made with", err=True)
+        made = dict(again.scenes[0].origin)
+        changed = [name for name, digest in one["origin"] if made.get(name) != digest]
+        notes += [f"{name} is another one than the report was made with" for name in changed]
+        was = dict(kept["versions"])
+        other = [(name, now) for name, now in again.versions if was.get(name) != now]
+        notes += [f"{name} was {was.get(name, 'not there')}, and is {now} here" for name, now in other]
+    for text in dict.fromkeys(notes):
+        tell(f"note: {text}", err=True)
     if mistakes:
         raise ApcError(mistakes)
     tell(f"{path}: every number is the same, computed anew")

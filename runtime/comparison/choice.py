@@ -17,11 +17,9 @@ from apc.compiler.frozen import dataclass
 from apc.frame.names import Free, find, named_times, unit_of
 from apc.frame.parameters import scope_of
 from apc.network.nominal import channel_numbers
+from apc.vary.margins import STIFFNESSES
 
 STIFFNESS, DELAY, LOSS = "stiffness", "delay", "loss"
-
-# Units of a stiffness, as components write them.
-UNITS = ("N/m", "kg/s^2")
 
 _PLACE = Place("--over")
 
@@ -95,7 +93,7 @@ def _axis(system: CompiledSystem, free: Free) -> str:
     if free.name in channel_numbers(system):
         return LOSS
     unit = unit_of(system, free.name)
-    if unit in UNITS:
+    if unit in STIFFNESSES:
         return STIFFNESS
     if unit == "s":
         return DELAY
@@ -119,8 +117,8 @@ def _found(system: CompiledSystem, axis: str) -> list[str]:
         if send.link in heard
         for channel in send.channels
     }
-    stiff = [one.name for one in system.parameters if one.unit in UNITS]
-    return _roots(system, [name for name in stiff if name.rpartition(".")[0] in hearing], UNITS)
+    stiff = [one.name for one in system.parameters if one.unit in STIFFNESSES]
+    return _roots(system, [name for name in stiff if name.rpartition(".")[0] in hearing], STIFFNESSES)
 
 
 def _roots(system: CompiledSystem, names: Iterable[str], units: Sequence[str]) -> list[str]:

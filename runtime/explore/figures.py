@@ -81,6 +81,7 @@ FOCUS = """
     :host { font: 13px/1.4 system-ui, sans-serif; color: #1a1a1a; }
     .noUi-handle:focus-visible, button:focus-visible, select:focus-visible
       { outline: 3px solid #0072B2; outline-offset: 1px; }
+    .bk-btn { padding: 6px 2px; } /* three of them stand side by side in a narrow window */
     .noUi-target { border-color: #767676; margin: 0 8px; }
     .noUi-handle { border-color: #595959; }
     """

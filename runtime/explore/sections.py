@@ -88,7 +88,7 @@ def compute(model: bytes, task: Task) -> Told:
         changed = apply(system, task.overrides)
         return Told(SECTIONS[task.section](changed, prepared, task.asked))
     except ApcError as error:
-        return Told(None, "\n".join(one.sentence for one in error.mistakes))
+        return Told(None, "\n".join(one.reason for one in error.mistakes))  # whose hints are for the terminal
     except Exception as error:  # the other sections go on
         return Told(None, f"This is a bug of apc, not of your scene: {type(error).__name__}: {error}")
 
@@ -214,8 +214,8 @@ def _network(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, A
     if not links:
         name = system.links[0].name if system.links else "lan"
         what = "no link here loses packets or delays them by chance: there is nothing to look for"
-        hint = f"links: {{{name}: {{…, loss: 1 %, jitter: 1 ms}}}}"
-        raise ApcError(Mistake("E984", Place(system.name), what, hint=hint))
+        write = f"To look, write in the topology: links: {{{name}: {{…, loss: 1 %, jitter: 1 ms}}}}"
+        raise ApcError(Mistake("E984", Place(system.name), f"{what}. {write}"))
     verdict = judge_network(system, prepared)
     texts = ["Here packets are always on time." if verdict is None else str(verdict)]
     for link in links:
@@ -230,7 +230,7 @@ def _critical(system: CompiledSystem, name: str) -> str:
     try:
         return str(critical(system, name, criterion=MEAN_SQUARE))
     except ApcError as error:
-        return f"{name}: {error.mistakes[0].sentence}"
+        return f"{name}: {error.mistakes[0].reason}"
 
 
 def _numbers(

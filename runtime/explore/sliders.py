@@ -22,6 +22,7 @@ from apc.compiler.words import with_unit
 from apc.frame.names import Free, Range, named_times, parameter_of, unit_of
 from apc.frame.overrides import Override, parse_override
 from apc.vary.evaluator import free_parameters
+from apc.vary.margins import STIFFNESSES, coupler_parameters
 
 # How many values a slider has at most: one a pixel of its length, no more can be told apart by hand.
 STEPS = 200
@@ -70,7 +71,8 @@ def sliders_of(system: CompiledSystem) -> tuple[Slider, ...]:
     Parameters
     ----------
     system
-        The compiled scene, with the numbers that the sliders begin with.
+        The compiled scene, with the numbers that the sliders begin with. What it studies comes first, then
+        its couplers' stiffnesses and dampings: the first two are the axes of the region.
     """
     starts = {state.start for kind in system.kinds for state in kind.states}
     starts |= {name for kind in system.kinds for clock in kind.clocks for name in clock.starts}
@@ -87,7 +89,10 @@ def sliders_of(system: CompiledSystem) -> tuple[Slider, ...]:
         else:
             values = _even(one.number, *_within(span, one.number), low, high)
         found.append(_slider(system, free, PARAMETERS, one.about, values, one.number, span))
-    found.sort(key=lambda one: one.label not in studied)
+    couplers = coupler_parameters(system)
+    couplers.sort(key=lambda one: unit_of(system, one.name) not in STIFFNESSES)
+    listed = [*studied, *(one.label for one in couplers)]
+    found.sort(key=lambda one: listed.index(one.label) if one.label in listed else len(listed))
     return (*found, *_times(system, studied), *_people(system))
 
 

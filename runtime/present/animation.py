@@ -78,26 +78,45 @@ def save_animation(system: CompiledSystem, found: Trajectory, path: Path) -> Non
         ax.set_title(ax.get_title().partition(": at the start")[0].replace(system.name, ""), fontsize=9)
     speed = (end - start) / seconds
     told = "" if abs(speed - 1) < 1e-3 else f", {speed:.2g} × as fast as it is"
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # or every frame is laid out anew
+    pixels = [2 * round(side * DPI / 2) for side in figure.get_size_inches()]  # ffmpeg wants even ones
+    figure.set_size_inches(*(side / DPI for side in pixels))
+    shapes = [actor.shape for actor in actors if actor.shape is not None]
+    _paint_what_stands(figure, [title, *shapes, *(actor.dot for actor in actors)])
 
-    def show(row: int) -> list[Any]:
-        title.set_text(f"{system.name}: {found.time[row]:.3f} s{told}")
-        for actor, track in zip(actors, tracks, strict=True):
-            actor.move(track[row])
-        return []
-
-    drawn = moving.FuncAnimation(figure, show, frames=rows.tolist(), init_func=list, cache_frame_data=False)
+    writer = moving.writers["ffmpeg" if path.suffix.lower() == ".mp4" else "pillow"](fps=RATE)
 
     def write(temporary: Path) -> None:
         named = temporary.with_name(f"{temporary.name}{path.suffix.lower()}")  # writers go by the suffix
         try:
-            drawn.save(named, writer="ffmpeg" if named.suffix == ".mp4" else "pillow", fps=RATE, dpi=DPI)
+            with writer.saving(figure, named, DPI):
+                for row in rows.tolist():
+                    title.set_text(f"{system.name}: {found.time[row]:.3f} s{told}")
+                    for actor, track in zip(actors, tracks, strict=True):
+                        actor.move(track[row])
+                    writer.grab_frame()
             named.replace(temporary)
         finally:
             named.unlink(missing_ok=True)
 
     write_file(path, write)
+
+
+def _paint_what_stands(figure: Any, moving: Sequence[Any]) -> None:
+    """Make one image of all that does not move, behind what does: else every frame draws its axes anew."""
+    agg = need("matplotlib.backends.backend_agg", "plot")
+    figure.set_dpi(DPI)
+    figure.draw_without_rendering()  # which lays it out, with room for all
+    figure.set_layout_engine("none")
+    for one in moving:
+        one.set_visible(False)
+    canvas = agg.FigureCanvasAgg(figure)
+    canvas.draw()
+    painted = np.array(canvas.buffer_rgba())
+    for one in [*figure.legends, *(child for ax in figure.axes for child in ax.get_children())]:
+        one.set_visible(False)
+    for one in moving:
+        one.set_visible(True)
+    figure.figimage(painted, zorder=-1)
 
 
 def _keep_in_sight(actors: Sequence[Actor], tracks: Sequence[NDArray[np.float64]]) -> None:

@@ -58,8 +58,8 @@ def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
 
 @functools.cache
 def _names(kind: Any) -> tuple[str, ...]:
-    """Return the names of a dataclass's fields: there are as many modes as states."""
-    return tuple(one.name for one in fields(kind))
+    """Return the names of a dataclass's fields that are shown: there are as many modes as states."""
+    return tuple(one.name for one in fields(kind) if one.repr)
 
 
 def json_text(found: Any, *, indent: int | None = 2) -> str:

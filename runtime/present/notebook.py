@@ -18,7 +18,7 @@ from apc.present.pictures import svg_text
 def html_of(found: Any) -> str:
     """Return a result as HTML; a picture is an image of its own, so that no name in it meets another's."""
     text = f"<pre>{escape(str(found))}</pre>"
-    if not hasattr(found, "plot"):
+    if not (found.pictured and hasattr(found, "plot")):
         return text
     try:
         drawn = svg_text(found.plot().figure)

@@ -83,7 +83,9 @@ th, td { text-align: left; padding: .15rem .7rem .15rem 0; border-bottom: 1px so
 pre { background: var(--tint); padding: .6rem; overflow-x: auto; font-size: .8rem; line-height: 1.4; }
 code { background: var(--tint); padding: .1rem .3rem; overflow-wrap: anywhere; }
 @media print { body { padding: 0; max-width: none; font-size: 11px; } figure, tr { break-inside: avoid; }
-  h2, h3 { break-after: avoid; } pre { white-space: pre-wrap; } nav { display: none; } }
+  h2, h3, thead, p:has(+ p, + figure, + h3) { break-after: avoid; } .scenes { display: block; }
+  .scroll:not(:has(tr:nth-child(12))) { break-inside: avoid; } /* short tables stay whole */
+  pre { white-space: pre-wrap; } nav { display: none; } }
 """
 
 

@@ -2,7 +2,7 @@
 
 Takes: results of `vary` and `sweeps`. Gives: their texts, documents and tables.
 Guarantees: a number is shown to the digits that its error leaves known.
-Does not: compute.
+Does not: compute, but for the root locus that a picture of a critical value is.
 """
 
 from __future__ import annotations
@@ -106,6 +106,14 @@ def _count_lines(found: Critical) -> list[str]:
         *lines,
         *wrapped(f"{looked}change among them; a change and back between two could hide", "  ", "  "),
     ]
+
+
+def critical_picture(found: Critical, ax: Any) -> Any:
+    """Draw where the eigenvalues go; return the matplotlib Axes."""
+    from apc.present.eigenvalues import locus_picture
+    from apc.vary.locus import root_locus
+
+    return locus_picture(root_locus(found.system, found), ax)
 
 
 def critical_document(found: Critical) -> dict[str, Any]:

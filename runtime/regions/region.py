@@ -275,8 +275,16 @@ def region(
         if isinstance(source, GrowthEvaluator):
             times = []
         found: Striped | None = None
-        start = prepare_at_start(system, prepared) if len(times) == 1 else None
-        if start is not None:
+        plain = not times and isinstance(source, PointEvaluator)
+        start = prepare_at_start(system, prepared) if plain or len(times) == 1 else None
+        if start is not None and plain:
+            at_once = evaluator_of_many(system, free, PLACE, prepared=start)
+            try:
+                found = _surveyed(at_once, rectangle, False, cells, tolerance, told)
+                source = at_once
+            except ApcError:  # other motions are free where it starts elsewhere: point by point they are told
+                found = None
+        elif start is not None:
             found = trace_strips(system, axes, times[0], start, cells=cells, tolerance=tolerance, told=told)
         # Of one point at a time what hands can draw is known as the damping needed, which jumps.
         by_point = meant == PASSIVE and isinstance(source, GrowthEvaluator)

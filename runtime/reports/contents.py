@@ -43,7 +43,7 @@ from apc.simulation.trajectory import simulate
 from apc.vary.critical import Critical, critical
 from apc.vary.growth import MEAN_SQUARE, NOMINAL
 from apc.vary.locus import root_locus
-from apc.vary.margins import coupler_parameters
+from apc.vary.margins import STIFFNESSES, coupler_parameters
 
 Cell = str | float | int | None
 
@@ -251,7 +251,8 @@ def _verdict(system: CompiledSystem, call: str) -> Section:
     ]
     columns = ("magnitude", "error", "times", "frequency [Hz]", "shape", "moves most")
     of = found.network or found
-    told += [text for text in (of.margins.note, of.sensitivities.note) if text]
+    notes = (("Margins", of.margins.note), ("What moves the radius", of.sensitivities.note))
+    told += [f"{what}: {note}" for what, note in notes if note]
     grow = [
         (one.parameter, one.unit, one.present, one.value, one.error, one.note or None)
         for one in of.margins.rows
@@ -336,7 +337,7 @@ def _said(found: Critical) -> str:
 def _region(system: CompiledSystem, call: str) -> Section:
     asked: list[str | None] = [None, None]
     if len(system.region) < 2:
-        stiff = [one for one in coupler_parameters(system) if _unit(system, one.name) == "N/m"]
+        stiff = [one for one in coupler_parameters(system) if _unit(system, one.name) in STIFFNESSES]
         if len(stiff) < 2:
             why = "the scene has fewer than two stiffnesses, and says no studies: region:"
             return Section("region", "", refused=why)

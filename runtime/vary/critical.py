@@ -11,7 +11,9 @@ Does not: prove that there are no others, or find two nearer to each other than 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import field
 from fractions import Fraction
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -25,7 +27,7 @@ from apc.finite_equations import finite_equations
 from apc.frame.names import Free, find, parameter_of, unit_of, values_by_group
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.option_value import option_value
-from apc.result import Result
+from apc.result import Look, Result
 from apc.threads import single_threaded
 from apc.vary.counts import search_counts
 from apc.vary.crossings import CELL
@@ -60,10 +62,11 @@ class Critical(Result):
     is then the number on its stable side.
     `left_out` says what of the scene the answer does not look at. `groups` are the groups' present values
     (None where their peers differ) of a parameter that is set for all groups though they have not all the
-    same.
+    same. `system` is the scene.
     """
 
     shown_by = "vary:critical"
+    pictured = False  # which takes a hundred analyses
 
     topology: str
     parameter: str
@@ -80,11 +83,25 @@ class Critical(Result):
     looked: int
     enters: bool
     verdict: str
+    system: CompiledSystem = field(compare=False, repr=False)
     left_out: tuple[str, ...] = ()
     criterion: str = NOMINAL
     groups: tuple[tuple[str, float | None], ...] = ()
     stretches: int = 0
     counted: bool = False
+
+    def plot(self, ax: Any = None, **look: Unpack[Look]) -> Any:
+        """Draw where the eigenvalues go (root locus), as `look` says; return the matplotlib Axes.
+
+        Raises
+        ------
+        ApcError
+            E930 stable was meant with every passive hand; E875 matplotlib is not installed.
+        """
+        if self.criterion == PASSIVE:
+            what = "what every passive hand can draw has no eigenvalues: there is no root locus of it"
+            raise ApcError(Mistake("E930", Place(self.topology), what))
+        return self._drawn(ax, look=look)
 
 
 @part("critical")
@@ -176,6 +193,7 @@ def critical(
         looked=found.looked,
         enters=found.enters,
         verdict=verdict,
+        system=system,
         left_out=left_out(system, linear=linear, network=chosen_criterion != MEAN_SQUARE),
         criterion=chosen_criterion,
         groups=values_by_group(system, free),

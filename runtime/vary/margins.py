@@ -1,7 +1,7 @@
 """How much each coupler's stiffness and damping, and each delay, may grow before the boundary.
 
 Takes: a `CompiledSystem`.
-Gives: `Margin`, `Margins`, `margins`; `coupler_parameters`.
+Gives: `Margin`, `Margins`, `margins`; `coupler_parameters`; `STIFFNESSES`.
 Guarantees: a margin is the next crossing above the present value, with its error; none is said together with
 how far was looked.
 Does not: look below the present value (see `critical`), or vary two at once (see `box`).
@@ -43,7 +43,8 @@ from apc.vary.search import (
 Floats = NDArray[np.float64]
 
 # Units of a stiffness and of a damping, as components write them.
-UNITS = ("N/m", "kg/s^2", "N*s/m", "kg/s")
+STIFFNESSES = ("N/m", "kg/s^2")
+UNITS = (*STIFFNESSES, "N*s/m", "kg/s")
 
 # How many times the present value is looked at (or the change that would move an eigenvalue by 1).
 GROWTH = 1e3

@@ -86,6 +86,8 @@ def told_by_constants(wiring: Wiring, there: RigidModes) -> Wiring:
         Those of another point.
     """
     basis = wiring.rigid.basis
+    if len(there.names) != len(wiring.rigid.names):  # other motions are free there: none of these follows
+        return wiring
     same = [
         all(one == other for one, other in zip(*pair, strict=True))
         for pair in zip(zip(*wiring.rigid.exact, strict=True), zip(*there.exact, strict=True), strict=True)
