@@ -28,7 +28,7 @@ from apc.compiler.frozen import dataclass
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize
 from apc.frame.radius import FLOATS, RADII, Arithmetic, common_shape, radius_of, value_of, with_radius
 from apc.frame.schedule import HELD, Act, Event, Propagate, Repeats, Schedule, Send, Tick, Value, shifted
-from apc.frame.site import LinearSite, assemble, matrices_of
+from apc.frame.site import LinearSite, every_matrix
 
 Matrix = NDArray[Any]
 
@@ -180,16 +180,8 @@ def composed_bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, S
 
 def with_roundings(site: LinearSite) -> LinearSite:
     """Return a site's matrices with their radii, those of what CasADi rounds."""
-    matrices = matrices_of(site)
-    many = common_shape(*(matrix.shape[:-2] for matrix in matrices))
-    flat = np.concatenate([matrix.reshape(*many, -1) for matrix in matrices], axis=-1)
-    both = np.stack([flat, COEFFICIENT_ROUNDINGS * UNIT * np.abs(flat)], axis=-2)
-    bounded, start = [], 0
-    for matrix in matrices:
-        end = start + matrix.shape[-2] * matrix.shape[-1]
-        bounded.append(both[..., start:end].reshape(*many, 2, *matrix.shape[-2:]))
-        start = end
-    return assemble(site.kind, site.affine, bounded, [tick.channels for tick in site.ticks])
+    charge = COEFFICIENT_ROUNDINGS * UNIT
+    return every_matrix(site, lambda matrix: with_radius(matrix, charge * np.abs(matrix)))
 
 
 def roundings_of(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> float:
