@@ -29,7 +29,7 @@ from apc.compiler.frozen import dataclass
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize
 from apc.frame.radius import FLOATS, RADII, Arithmetic, common_shape, radius_of, value_of, with_radius
 from apc.frame.schedule import HELD, Act, Event, Propagate, Repeats, Schedule, Send, Tick, Value, shifted
-from apc.frame.site import LinearSite, assemble, matrices_of
+from apc.frame.site import LinearSite, every_matrix
 
 Matrix = NDArray[Any]
 
@@ -181,20 +181,8 @@ def composed_bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, S
 
 def with_roundings(site: LinearSite) -> LinearSite:
     """Return a site's matrices with their radii, those of what CasADi rounds."""
-    matrices = matrices_of(site)
-    channels = [tick.channels for tick in site.ticks]
-    many, *others = {matrix.shape[:-2] for matrix in matrices}
-    if others:  # what many sites share is one matrix, and stays one
-        bounded = [with_radius(one, COEFFICIENT_ROUNDINGS * UNIT * np.abs(one)) for one in matrices]
-        return assemble(site.kind, site.affine, bounded, channels)
-    flat = np.concatenate([matrix.reshape(*many, -1) for matrix in matrices], axis=-1)
-    both = np.stack([flat, COEFFICIENT_ROUNDINGS * UNIT * np.abs(flat)], axis=-2)
-    bounded, start = [], 0
-    for matrix in matrices:
-        end = start + matrix.shape[-2] * matrix.shape[-1]
-        bounded.append(both[..., start:end].reshape(*many, 2, *matrix.shape[-2:]))
-        start = end
-    return assemble(site.kind, site.affine, bounded, channels)
+    charge = COEFFICIENT_ROUNDINGS * UNIT
+    return every_matrix(site, lambda matrix: with_radius(matrix, charge * np.abs(matrix)))
 
 
 def roundings_of(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> float:
