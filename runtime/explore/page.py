@@ -42,7 +42,7 @@ from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
 from apc.present.forms import json_text
 from apc.processes import model_bytes
-from apc.vary.evaluator import reaches_count, reaches_time
+from apc.vary.evaluator import reaches_count, reaches_start, reaches_time
 from apc.vary.growth import MEAN_SQUARE, NOMINAL
 
 # Who computes what, first things first: what is redrawn while a slider moves waits for nothing else. A region
@@ -170,7 +170,9 @@ class Page:
         self.region, self.roots = RegionFigure(), RootsFigure()
         self.motion, self.feel = MotionFigure(), FeelFigure()
         self.modes: Mapping[str, Any] | None = None  # of the newest verdict
-        self.linear: bool | None = None  # not known before the first verdict
+        # Whether the scene is linear, and many points are analysed at once: what the first verdict says.
+        self.linear: bool | None = None
+        self.at_once = False
         self.moving, self.last = False, self.chosen[0] if self.chosen else 0
         self.link = ColumnDataSource({"query": [""]})
         self.link.js_on_change("data", CustomJS(args={"link": self.link}, code=LINKED))
@@ -377,7 +379,9 @@ class Page:
         x, y, criterion = asked
         if criterion == MEAN_SQUARE:
             return "it looks at packets as they are lost and late"
-        if not self.linear:
+        if not self.at_once or (
+            not self.linear and any(reaches_start(self.system, one.free) for one in (x, y))
+        ):
             return "the scene is not linear, and is linearized at its start for each point by itself"
         if any(reaches_time(self.system, one.free) for one in (x, y)):
             return "as a time varies, each point has a schedule of its own"
@@ -421,6 +425,7 @@ class Page:
         found = told.found
         if section == "verdict" and self.linear is None:
             self.linear = found is not None and found["linear"]
+            self.at_once = found is not None and found["at_once"]
             self._ask_region(tuple(overrides_of(self.sliders, self.places)))
         if section == "region" and self.modes is not None:
             self._later(lambda: self.roots.show(self.modes), FRAMES)

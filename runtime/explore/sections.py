@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
+from apc.analysis.analysis import Analysis, Prepared, analyze, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
@@ -100,6 +100,7 @@ def _verdict(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, A
         "verdict": found.verdict + (", linearized" if found.linearized else ""),
         "stable": found.stable,
         "linear": not found.linearized,
+        "at_once": not found.linearized or prepare_at_start(system, prepared) is not None,
         "radius": found.spectral_radius,
         "limits": _limits(found),
         "notes": found.left_out,

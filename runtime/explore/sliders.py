@@ -21,7 +21,7 @@ from apc.compiler.frozen import dataclass
 from apc.compiler.words import with_unit
 from apc.frame.names import Free, Range, named_times, parameter_of, unit_of
 from apc.frame.overrides import Override, parse_override
-from apc.vary.evaluator import free_parameters
+from apc.vary.evaluator import free_parameters, start_names
 from apc.vary.margins import STIFFNESSES, coupler_parameters
 
 # How many values a slider has at most: one a pixel of its length, no more can be told apart by hand.
@@ -74,8 +74,7 @@ def sliders_of(system: CompiledSystem) -> tuple[Slider, ...]:
         The compiled scene, with the numbers that the sliders begin with. What it studies comes first, then
         its couplers' stiffnesses and dampings: the first two are the axes of the region.
     """
-    starts = {state.start for kind in system.kinds for state in kind.states}
-    starts |= {name for kind in system.kinds for clock in kind.clocks for name in clock.starts}
+    starts = start_names(system)
     studied = {axis.parameter: (axis.low, axis.high) for axis in system.region}
     found = []
     for free in free_parameters(system):
