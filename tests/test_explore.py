@@ -420,6 +420,7 @@ def test_a_click_in_the_region_sets_both_sliders(tab: Tab, link: str) -> None:
     tab.page.wait_for_function(f"{MODEL}('region-words').text.includes('Stable in')")
     inner = tab.page.evaluate(
         f"""(() => {{
+          window.scrollTo(0, 0)
           const view = Bokeh.index.get_one({MODEL}('region-plot'))
           const box = view.canvas_view.el.getBoundingClientRect(), frame = view.frame.bbox
           return [box.x + frame.x + 0.8 * frame.width, box.y + frame.y + 0.4 * frame.height]

@@ -39,16 +39,16 @@ class Desk:
     """One process with its waiting tasks, by section; `order` says which goes first.
 
     Whose last turn is longest ago goes before it, or a slider that is moved without a stop would have the
-    first section computed and no other. While the desk `before` is busy, nothing is begun here: its answers,
-    and the pictures made of them, have the machine for themselves. All of it is called from the one thread
-    that serves pages; `later` hands a call to that thread, after so many seconds.
+    first section computed and no other. While one of the desks `before` is busy, nothing is begun here: their
+    answers, and the pictures made of them, have the machine for themselves. All of it is called from the one
+    thread that serves pages; `later` hands a call to that thread, after so many seconds.
     """
 
     model: bytes
     order: tuple[str, ...]
     later: Callable[[Callable[[], None], float], None]
     deliver: Deliver
-    before: Desk | None = None
+    before: list[Desk] = field(default_factory=list)
     behind: Desk | None = None
     last: dict[str, Task] = field(default_factory=dict)
     waiting: dict[str, tuple[int, Task]] = field(default_factory=dict)
@@ -109,7 +109,7 @@ class Desk:
     def _held(self) -> bool:
         """Return whether others go first, and look again when they may have had long enough."""
         now = time.monotonic()
-        if self.before is None or self.before.busy is None:
+        if all(desk.busy is None for desk in self.before):
             self.held = None
         elif self.held is None:
             self.held = now
@@ -135,4 +135,5 @@ class Desk:
 
     def put_before(self, other: Desk) -> None:
         """Let what is asked here go before what is asked of another desk."""
-        self.behind, other.before = other, self
+        self.behind = other
+        other.before.append(self)

@@ -47,8 +47,12 @@ from apc.vary.growth import MEAN_SQUARE, NOMINAL
 
 # Who computes what, first things first: what is redrawn while a slider moves waits for nothing else. A region
 # whose points are analysed one by one takes many seconds, and comes last.
-QUICK, LATER = 0, 1
-DESKS = (("verdict", "region"), ("numbers", "roots", "motion", "feel", "margins", "network", "region"))
+VERDICT, REGION, LATER = 0, 1, 2
+DESKS = (
+    ("verdict",),
+    ("region",),
+    ("numbers", "roots", "motion", "feel", "margins", "network", "region"),
+)
 # Seconds, a few frames of a browser, after which eigenvalues are drawn beside a region that is drawn already.
 FRAMES = 0.05
 # Arguments of the link: the sliders on the axes of the region. No name of a scene has a hyphen.
@@ -177,7 +181,8 @@ class Page:
         self.link = ColumnDataSource({"query": [""]})
         self.link.js_on_change("data", CustomJS(args={"link": self.link}, code=LINKED))
         self.desks = [Desk(scene.model, order, self._later, self._deliver) for order in DESKS]
-        self.desks[QUICK].put_before(self.desks[LATER])
+        for first in (VERDICT, REGION):
+            self.desks[first].put_before(self.desks[LATER])
         self._lay_out()
         document.on_session_destroyed(lambda session_context: self._close())
         self._moved()
@@ -369,8 +374,8 @@ class Page:
         # What stands on an axis has all its values there.
         others = tuple(one for one in overrides if one.free not in (asked[0].free, asked[1].free))
         slow = self._slow(asked)
-        self.desks[QUICK if slow else LATER].forget("region")
-        if self.desks[LATER if slow else QUICK].ask(Task("region", others, asked)) and slow:
+        self.desks[REGION if slow else LATER].forget("region")
+        if self.desks[LATER if slow else REGION].ask(Task("region", others, asked)) and slow:
             self.region.clear(f"Computing, after all else: {slow}, which takes a while.")
         self.region.mark(*(float(self.sliders[one].values[self.places[one]]) for one in self.chosen))
 
@@ -433,7 +438,7 @@ class Page:
             case "verdict" if found is not None:
                 self.verdict.verdict(found)
                 self.modes = found
-                if "region" not in self.desks[QUICK].waiting:
+                if self.desks[REGION].busy is None:
                     self.roots.show(found)
             case "roots" if found is not None:
                 self.roots.way_of(found)
