@@ -10,13 +10,14 @@ import pytest
 
 from apc.analysis.analysis import lifted_groups, prepare
 from apc.compiler.errors import Place
+from apc.eigen.bordered import Bordered
 from apc.eigen.modes import split
 from apc.eigen.spectrum import solve_spectrum
 from apc.frame.names import Free
 from apc.threads import single_threaded
 from apc.vary.critical import critical
 from apc.vary.delays import borders, system_with_delay
-from apc.vary.lags import LateStretch, _of_powers, late_stretches
+from apc.vary.lags import LateStretch, _LateSheet, _of_powers, late_stretches
 from tests.topologies import AVERAGE, MESH, compiled, replaced
 
 PHASED = replaced(AVERAGE, ("network: 8 ms", "network: {period: 4 ms, phase: 1 ms}"))
@@ -88,3 +89,20 @@ def test_a_determinant_is_the_same_polynomial_at_every_age(kind: str) -> None:
                 assert abs(np.exp(value[row, place]) / complex(determinant) - 1) < 1e-12
                 exact = complex(sum((change[i, i] for i in range(3)), flint.acb(0)))
                 assert abs(turning[row, place] - exact) < 1e-10 * max(abs(exact), 1.0)
+
+
+def test_a_determinant_far_below_its_largest_value_keeps_its_digits() -> None:
+    # Six equal loops z⁺ = a z + b z of m frames ago: F = (ζ − a − b ζ^(−m))⁶, at ζ ≈ 1 next to nothing.
+    many, a, b = 6, 0.5, 0.499999
+    unit, nothing = np.eye(many), np.zeros((many, many))
+    fixed = np.block([[-a * unit, nothing], [-unit, unit]])[None]
+    heard = np.vstack([-b * unit, nothing])[None, None]
+    ages = np.array([[1], [40]])
+    loops = Bordered(fixed, heard, many)
+    sheet = _LateSheet(loops, np.zeros(2, dtype=np.intp), ages, 0, 40)
+    points = np.exp(1j * np.array([1e-7, 1e-3, 1.0]))
+    found = sheet.over(np.arange(2.0), points)
+    one = points - a - b * points**-ages
+    assert np.abs(np.exp(found.value - many * np.log(one)) - 1).max() < 1e-6
+    slope = many * 1j * (points + ages * b * points**-ages) / one
+    assert (np.abs(found.turning / slope - 1) < 1e-6).all()

@@ -118,7 +118,7 @@ def eigenvalues(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
     eigenvalue near zero or one that is hardly simple, comes as 0.
     """
     driven = (matrix != 0).any(axis=0) | (slope != 0).any(axis=0)
-    alike = _alike(driven.tobytes(), len(driven))
+    alike = _alike(driven)
     if len(alike) == 1 and len(alike[0]) == 1:
         return _by_vectors(matrix, slope)
     found = np.zeros((2, *matrix.shape[:2]), dtype=np.complex128)
@@ -128,11 +128,10 @@ def eigenvalues(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
     return found[0], found[1]
 
 
-@lru_cache(maxsize=KEPT)
-def _alike(driven: bytes, n: int) -> tuple[Places, ...]:
+def _alike(driven: NDArray[np.bool_]) -> tuple[Places, ...]:
     """Return the parts of a matrix's graph (n, n), those of as many states together (m, s)."""
     of_size: dict[int, list[Places]] = {}
-    for part in components(np.frombuffer(driven, dtype=np.bool_).reshape(n, n)):
+    for part in components(driven):
         of_size.setdefault(len(part), []).append(part)
     return tuple(np.array(parts) for parts in of_size.values())
 

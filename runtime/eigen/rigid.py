@@ -134,8 +134,9 @@ def rigid_modes_before(system: ClosedSystem) -> RigidModes:
     spared the search.
     """
     known = _before(system.name, system.names)
-    if known and _still_stands(known[0], system):
-        return known[0].modes
+    last = known[0] if known else None  # looked up once: another thread may write there
+    if last is not None and _still_stands(last, system):
+        return last.modes
     modes, still = _found_here(system)
     equations = tuple((group.exact, group.schedule) for group in system.sites)
     known[:] = [_Before(modes, tuple(map(tuple, still)), equations, system.coupling)]

@@ -311,9 +311,8 @@ def _phi(times: Callable[[Matrix], Matrix], x: Matrix, last: int) -> Matrix:
     diagonal = np.arange(x.shape[-1])
     found = x / (last + 1)
     for term in range(last - 1, -1, -1):
-        found[..., diagonal, diagonal] += (
-            1  # in place: a sum with a matrix of mostly zeros takes as long as a product
-        )
+        # In place: a sum with a matrix of mostly zeros takes as long as a product.
+        found[..., diagonal, diagonal] += 1
         if term:
             found = times(found)
             found /= term + 1

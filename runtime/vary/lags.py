@@ -50,6 +50,10 @@ _Packet = tuple[int, int]
 # Delays that are looked at together: the oldest packet of any at most so many times as old as that of each.
 OCTAVE = 2
 
+# What a determinant is at least, relative to its largest value at other ages, to be taken from the polynomial
+# of these: half its digits are right then.
+CLEAR = 1e-8
+
 # Ranges of delays whose loops are kept for the next question.
 KEPT = 16
 
@@ -120,6 +124,10 @@ class _LateSheet:
             with np.errstate(divide="ignore", invalid="ignore"):  # a zero on the circle
                 found = _of_powers(gains, gains_turned, points, ages[rows, :1])
             value[rows], turning[rows] = base + found[0], slope + found[1]
+        vague = np.nonzero(np.isnan(value))
+        if len(vague[0]):
+            again = self.at(values, vague[0], points[vague[1]])
+            value[vague], turning[vague] = again.value, again.turning
         return Logarithm(value, turning, np.zeros_like(value))
 
 
@@ -127,6 +135,8 @@ def _of_powers(
     matrices: Complexes, turned: Complexes, points: Complexes, ages: Integers
 ) -> tuple[Complexes, Complexes]:
     """Return the logarithm (k, z) of det(1 + ζ^(−m) G), and its derivative along the circle.
+
+    Both are NaN where that is far smaller than at some other p of the circle, and its digits are lost.
 
     Parameters
     ----------
@@ -137,8 +147,8 @@ def _of_powers(
 
     Notes
     -----
-    A polynomial of degree s of p = ζ^(−m), known by its values at s + 1 roots of unity: as |p| = 1, none of
-    its coefficients loses by that more than a rounding of its largest value.
+    A polynomial of degree s of p = ζ^(−m), known by its values at s + 1 roots of unity: as |p| = 1, its
+    coefficients and their sum are off by some roundings of its largest value.
     """
     size = matrices.shape[-1]
     nodes = np.exp(2j * np.pi * np.arange(size + 1) / (size + 1))
@@ -156,6 +166,7 @@ def _of_powers(
         total = total * power + terms[degree]
         along = along * power + degree * terms[degree]
         moved = moved * power + turning[degree]
+    total[~(np.abs(total) > CLEAR)] = np.nan
     return largest + np.log(total), (moved - 1j * ages * along) / total
 
 
