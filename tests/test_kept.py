@@ -8,20 +8,23 @@ import apc
 from apc.analysis.analysis import Analysis, prepare
 from apc.answer import judge
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen import closing, enclosure, modes, peers, rigid, spectrum
+from apc.eigen import closing, eigenpairs, modes, peers, rigid, spectrum
 from apc.frame import course, exchange, linearize
 from tests.topologies import AVERAGE, compiled, replaced
 
 KEEPING = (
     exchange._exchange,
     linearize._layout,
+    linearize._output,
+    linearize._of_many,
     course._swing,
     peers._known_group,
     modes._known_loops,
     closing._known_wiring,
     rigid._before,
     spectrum._relative_to,
-    enclosure._known_components,
+    eigenpairs._known_components,
+    eigenpairs._alike,
 )
 
 # Each changes one thing that what is kept hangs on: a number, a time, how many, who hears whom, a law.

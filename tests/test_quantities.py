@@ -6,7 +6,7 @@ import pytest
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.sweeps.grid import build_grid, parse_axis
-from apc.sweeps.quantities import QUANTITIES, faulty, find_quantity
+from apc.sweeps.quantities import QUANTITIES, Cells, faulty, find_quantity
 from apc.sweeps.sweep import sweep
 from tests.sweeping import CHEAP
 from tests.topologies import compiled, told
@@ -21,15 +21,20 @@ def test_every_quantity_has_verdict_first_and_message_last(text: str) -> None:
     quantity = find_quantity(MODEL, text)
     names = [column.name for column in quantity.columns]
     assert (names[0], names[-1]) == ("verdict", "message")
-    (row,) = quantity.rows(GRID, [0])
-    assert len(row) == len(names)
+    assert [len(column) for column in quantity.cells(GRID, [0])] == [1] * len(names)
 
 
 def test_a_row_does_not_depend_on_the_rows_before() -> None:
     quantity = find_quantity(MODEL, "analyze")
-    first, slower = quantity.rows(GRID, [0])[0], quantity.rows(GRID, [1])[0]
-    assert slower != first
-    assert quantity.rows(GRID, [0])[0] == first == find_quantity(MODEL, "analyze").rows(GRID, [0])[0]
+    first, slower = quantity.cells(GRID, [0]), quantity.cells(GRID, [1])
+    assert not same(slower, first)
+    assert same(quantity.cells(GRID, [0]), first)
+    assert same(find_quantity(MODEL, "analyze").cells(GRID, [0]), first)
+
+
+def same(left: Cells, right: Cells) -> bool:
+    """Say whether cells are equal, what isn't a number too."""
+    return repr([column.tolist() for column in left]) == repr([column.tolist() for column in right])
 
 
 def test_the_critical_stiffness_of_a_wall_is_swept_over_its_delay() -> None:

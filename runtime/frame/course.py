@@ -353,7 +353,8 @@ def turned_along(course: Floats | Complexes) -> tuple[Floats, Floats]:
     0 has no angle.
     """
     size = np.abs(course)
-    phases = course / size  # courses can grow or shrink out of floats' range
+    with np.errstate(invalid="ignore"):
+        phases = course / size  # courses can grow or shrink out of floats' range
     spoilt = np.flatnonzero(~(size.min(axis=0) > FADED * size.max(axis=0)))
     if len(spoilt):
         phases[:, spoilt] = _directions(phases[:, spoilt], size[:, spoilt])
