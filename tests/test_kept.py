@@ -24,7 +24,6 @@ KEEPING = (
     rigid._before,
     spectrum._relative_to,
     eigenpairs._known_components,
-    eigenpairs._alike,
 )
 
 # Each changes one thing that what is kept hangs on: a number, a time, how many, who hears whom, a law.
