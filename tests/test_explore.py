@@ -29,7 +29,7 @@ from tests.topologies import AVERAGE, SCENES
 pytest.importorskip("bokeh")
 
 from apc.explore import figures, sections
-from apc.explore.desk import Desk
+from apc.explore.desk import DRAWN, Desk
 from apc.explore.motion import STRUCK, motion_of
 from apc.explore.sections import Task, Told, compute
 from apc.explore.sliders import Slider, axes_of, overrides_of, place_of, set_to, sliders_of, with_value
@@ -268,6 +268,9 @@ def test_what_comes_later_is_begun_when_the_first_desk_rests_or_has_been_busy_fo
     slow.ask(Task("b", (), 2))
     assert [len(one.asked) for one in workers] == [1, 0]
     workers[0].finish(0)
+    seconds, look = timers[-1]
+    assert seconds == DRAWN
+    look()
     assert [len(one.asked) for one in workers] == [1, 1]
     workers[1].finish(0)
     # A slider that is moved without a stop keeps the first desk busy; the other gets its turn all the same.

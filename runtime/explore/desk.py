@@ -27,6 +27,8 @@ PATIENCE = 3.0
 # Seconds for which each piece of work is held back at most while the desk before it is busy: who moves a
 # slider without a stop sees what comes later some times a second.
 HELD = 0.2
+# Seconds that a browser has for drawing an answer before there is more to do.
+DRAWN = 0.05
 
 LOST = Mistake("E981", Place("explore"), "the process that computes ended without a word: too little memory?")
 
@@ -131,7 +133,7 @@ class Desk:
             self.deliver(task.section, told)
         self._next()
         if self.busy is None and self.behind is not None:
-            self.behind._next()
+            self.later(self.behind._next, DRAWN)
 
     def put_before(self, other: Desk) -> None:
         """Let what is asked here go before what is asked of another desk."""
