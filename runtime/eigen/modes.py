@@ -42,8 +42,8 @@ from apc.eigen.peer_group import MOST_STATES, PeerGroup, group_name, states_of, 
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.schedule import Way
 
-# Structures whose loops are remembered.
-KEPT = 64
+# Structures whose loops are remembered, and of how many groups: their weights grow with its square.
+KEPT, FEW_GROUPS = 64, 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,19 +150,25 @@ def complete_loops(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loo
     exchange
         The links, all of them complete.
     """
-    key = (id(exchange), *(_structure(group) for group in groups))
-    known = _known_loops(key)
-    if not known:
-        held = exchange, [(group.schedule, group.jacobians.kind) for group in groups]
-        known.append((_complete_wiring(groups, exchange), held))
     return tuple(
         Loop(name, many, tuple(groups[place] for place in places), coupling)
-        for name, many, places, coupling in known[0][0]
+        for name, many, places, coupling in _wiring_of(groups, exchange)
     )
 
 
 # Loops but for their sites' numbers: name, multiplicity, which of the groups are sites, weights.
 _Wiring = tuple[tuple[str, int, tuple[int, ...], Coupling], ...]
+
+
+def _wiring_of(groups: Sequence[PeerGroup], exchange: Exchange) -> _Wiring:
+    """Return `_complete_wiring`; that of few groups is remembered."""
+    if len(groups) > FEW_GROUPS:
+        return _complete_wiring(groups, exchange)
+    known = _known_loops((id(exchange), *(_structure(group) for group in groups)))
+    if not known:
+        held = exchange, [(group.schedule, group.jacobians.kind) for group in groups]
+        known.append((_complete_wiring(groups, exchange), held))
+    return known[0][0]
 
 
 @functools.lru_cache(maxsize=KEPT)

@@ -28,6 +28,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.multiples import common_divisor
 from apc.compiler.words import time_left
+from apc.eigen.peer_group import states_of
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
@@ -46,8 +47,9 @@ INSIDE = Fraction(28_571, 104_729)
 STEP = Fraction(1, 1009)
 
 
-# Delays of which it is kept where events coincide: a search asks again and again; pieces of each that are.
-KEPT, KEPT_PIECES = 16, 16
+# Delays of which it is kept where events coincide: a search asks again and again; pieces of each that are,
+# and of how many states at most: a piece of these takes half a megabyte.
+KEPT, KEPT_PIECES, FEW_STATES = 16, 16, 120
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,11 +122,13 @@ def delay_pieces(
 
 @lru_cache(maxsize=KEPT)
 def _pieces(of: Asked) -> Callable[[Fraction, Fraction], Piece]:
-    """Return what builds the piece between two values, and keeps it for the next question."""
+    """Return what builds the piece between two values, and of few states keeps it for the next question."""
     (free,) = of.free
     slopes, follows = timing_slopes(of.system, free), reaches_parameters(of.system, free)
     build = partial(_piece, of.system, free, prepared=of.prepared, slopes=slopes, follows=follows)
-    return lru_cache(maxsize=KEPT_PIECES)(build)
+    used = zip(of.prepared.schedules, of.system.groups, strict=True)
+    states = sum(states_of(schedule, of.prepared.jacobians[group.kind]) for schedule, group in used)
+    return lru_cache(maxsize=KEPT_PIECES)(build) if states <= FEW_STATES else build
 
 
 def pace(
