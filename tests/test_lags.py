@@ -63,7 +63,7 @@ def test_a_search_of_two_seconds_ends_where_a_short_one_does() -> None:
     assert edge.kind == "jump" and edge.stable_side == "below"
 
 
-@pytest.mark.parametrize("kind", ["any", "of very different size", "nilpotent"])
+@pytest.mark.parametrize("kind", ["any", "of very different size", "nilpotent", "of size one"])
 def test_a_determinant_is_the_same_polynomial_at_every_age(kind: str) -> None:
     random = np.random.default_rng(5)
     matrices, turned = random.normal(size=(2, 4, 3, 3)) + 1j * random.normal(size=(2, 4, 3, 3))
@@ -71,6 +71,8 @@ def test_a_determinant_is_the_same_polynomial_at_every_age(kind: str) -> None:
         matrices *= np.array([1e9, 1.0, 1e-6])
     if kind == "nilpotent":
         matrices, turned = np.tril(matrices, -1), np.tril(turned, -1)
+    if kind == "of size one":  # 1 ± G is no matrix with an inverse
+        matrices[:] = np.diag([1.0, -1.0, 0.5])
     points, ages = np.exp(1j * random.uniform(0, np.pi, 4)), np.array([[0], [7], [250]])
     value, turning = _of_powers(matrices, turned, points, ages)
     # Of the largest value on the circle a few roundings are lost, of its slope as many times the steepest.

@@ -46,8 +46,8 @@ LENGTHS = ("m", "rad")
 # What most entries of forms are: to multiply by it is worth sparing.
 ONE = Fraction(1)
 
-# Systems whose rigid modes are remembered as a guess.
-KEPT = 64
+# Systems whose rigid modes are remembered as a guess, and how many states they have at most.
+KEPT, FEW_STATES = 64, 200
 
 # A linear form in the unknowns, sparse.
 Form = dict[int, Fraction]
@@ -133,6 +133,8 @@ def rigid_modes_before(system: ClosedSystem) -> RigidModes:
     relative coordinates have, is left to be seen. So a system that is analysed again with other numbers is
     spared the search.
     """
+    if len(system.names) > FEW_STATES:
+        return _found_here(system)[0]
     known = _before(system.name, system.names)
     last = known[0] if known else None  # looked up once: another thread may write there
     if last is not None and _still_stands(last, system):

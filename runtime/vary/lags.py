@@ -54,8 +54,8 @@ OCTAVE = 2
 # of these: half its digits are right then.
 CLEAR = 1e-8
 
-# Ranges of delays whose loops are kept for the next question.
-KEPT = 16
+# Ranges of delays whose loops are kept for the next question: each may be tens of megabytes.
+KEPT = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +151,9 @@ def _of_powers(
     coefficients and their sum are off by some roundings of its largest value.
     """
     size = matrices.shape[-1]
-    nodes = np.exp(2j * np.pi * np.arange(size + 1) / (size + 1))
+    # Turned, so that real eigenvalues of G of size 1 make no matrix singular.
+    turn = np.exp(1j / (size + 1))
+    nodes = turn * np.exp(2j * np.pi * np.arange(size + 1) / (size + 1))
     sizes, values, slopes = np.zeros((3, size + 1, len(points)), np.complex128)
     for place, node in enumerate(nodes):
         whole = np.eye(size) + node * matrices
@@ -159,7 +161,8 @@ def _of_powers(
         slopes[place] = np.trace(np.linalg.solve(whole, node * turned), axis1=1, axis2=2)
     largest = sizes.real.max(axis=0)
     values *= np.exp(sizes.real - largest)
-    terms, turning = (np.fft.fft(one, axis=0) / (size + 1) for one in (values, values * slopes))
+    back = turn ** -np.arange(size + 1)[:, None] / (size + 1)
+    terms, turning = (back * np.fft.fft(one, axis=0) for one in (values, values * slopes))
     power = points**-ages
     total, along, moved = np.zeros((3, *power.shape), np.complex128)
     for degree in range(size, -1, -1):

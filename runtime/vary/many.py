@@ -65,8 +65,9 @@ FEWEST = 3
 # Sets of numbers kept that others follow from.
 MOST_RESOLVED = 4096
 
-# Evaluators kept for the next points of the same times, and states of a system that is worth one.
-KEPT, MOST_STATES = 64, 120
+# Evaluators kept for the next points of the same times, those of them kept for the next call, and states of a
+# system that is worth one.
+KEPT, KEPT_ON, MOST_STATES = 64, 8, 120
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -321,7 +322,7 @@ def many_analyses(system: CompiledSystem, varied: Sequence[Varied]) -> ManyAnaly
     return ManyAnalyses(system, tuple(varied), prepare(system), times)
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=KEPT_ON)
 def _family(of: Asked, times: tuple[int, ...], given: tuple[Override, ...]) -> _Family | None:
     """Prepare the matrices for some times; None where an analysis of the scene is no matter of these."""
     system, prepared = of.system, of.prepared
