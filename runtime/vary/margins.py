@@ -53,8 +53,8 @@ GROWTH = 1e3
 # a tick, and up to so many times its present value; over more pieces than the most it takes too long.
 PIECES, FURTHER, MOST_PIECES = 4, 1.5, 64
 
-# Larger systems than this are left alone: hundreds of eigenproblems of theirs take more than some seconds.
-MOST_STATES = 120
+# Larger systems than this are left alone: hundreds of eigenproblems of theirs take more than a second.
+MOST_STATES = 60
 
 
 @dataclass(frozen=True, slots=True)
