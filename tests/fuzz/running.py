@@ -31,6 +31,7 @@ import apc
 from apc.compiler import frozen, pipeline
 from apc.compiler.components.library import Library
 from apc.compiler.errors import ApcError, Mistake
+from apc.compiler.language import unit_names
 from apc.compiler.pipeline import run_stages
 from tests.fuzz import models
 from tests.fuzz.inputs import MODELS, PLAYED, SENTINEL, TOPOLOGY, Input, make_input
@@ -147,6 +148,7 @@ def _warm_up() -> None:
     )
     for module in loaded:
         importlib.import_module(module)
+    unit_names._scaled("furlong")  # one of the rare units, which pint knows
     for scene in ("three-users-average", "finger", "users-table"):
         run_stages(MODELS / "scenes" / f"{scene}.yaml", until="compiled")
     before = Path.cwd()
