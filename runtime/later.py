@@ -2,7 +2,7 @@
 
 Takes: what makes it. Gives: `Later`.
 Guarantees: made once, whoever looks; equal to what it holds, and copied or sent to another process as that.
-Does not: keep what it was made from.
+Does not: keep what it was made from, once it is made; until then `make` keeps it.
 """
 
 from __future__ import annotations

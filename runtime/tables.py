@@ -287,8 +287,8 @@ def read_table(path: Path, columns: Sequence[Column]) -> tuple[NDArray[Any], ...
             rows = [[row[place] for place in places] for row in lines]
         read = {"number": float, "count": int, "text": str}
         cells = [
-            [read[one.kind](cell) if cell or one.kind == "text" else None for cell in own]
-            for one, own in zip(columns, zip(*rows, strict=True), strict=True)
+            [read[one.kind](row[place]) if row[place] or one.kind == "text" else None for row in rows]
+            for place, one in enumerate(columns)
         ]
     return tuple(
         np.array(own, dtype=np.float64 if one.kind == "number" else object)

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import ast
+import builtins
+import collections.abc
+import dataclasses
 import functools
 import importlib
+import inspect
 import re
 import subprocess
 import sys
+import typing
 import zipfile
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.topologies import AVERAGE, ROOT
@@ -302,6 +309,36 @@ def test_classes_are_cheap_to_make() -> None:
     for name, path in modules().items():
         own = re.search(r"^from dataclasses import .*\bdataclass\b", path.read_text(encoding="utf-8"), re.M)
         assert not own, f"{name}: dataclass comes from apc.compiler.frozen"
+
+
+class Known(dict[str, Any]):
+    """The names of a module; what it imports for the type checker alone is anything."""
+
+    def __missing__(self, name: str) -> type:
+        if name in vars(builtins):
+            raise KeyError(name)
+        return object
+
+
+def test_what_holds_arrays_is_not_compared_by_them() -> None:
+    """Two arrays compare entry by entry, and have no truth: such an object is equal to itself alone."""
+
+    def arrays(kind: object) -> bool:
+        if typing.get_origin(kind) is collections.abc.Callable:
+            return False
+        return typing.get_origin(kind) is np.ndarray or any(map(arrays, typing.get_args(kind)))
+
+    looked, wrong = 0, []
+    for name in modules():
+        module = importlib.import_module(name)
+        for one in vars(module).values():
+            if inspect.isclass(one) and one.__module__ == name and "__dataclass_fields__" in vars(one):
+                kinds = {str(field.type) for field in dataclasses.fields(one)} - {"itertools.count[int]"}
+                if any(arrays(eval(kind, {}, Known(vars(module)))) for kind in kinds):
+                    looked += 1
+                    wrong += [f"{name}.{one.__name__}"] if one.__eq__ is not object.__eq__ else []
+    assert looked > 100
+    assert not wrong
 
 
 def test_importing_the_package_costs_nothing(tmp_path: Path) -> None:

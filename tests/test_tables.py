@@ -75,6 +75,14 @@ def test_columns_come_back_as_they_were_written(tmp_path: Path, suffix: str) -> 
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_a_table_without_rows_comes_back_with_none(tmp_path: Path, suffix: str) -> None:
+    pytest.importorskip("pyarrow")
+    path = tmp_path / f"t.{suffix}"
+    write_table(path, COLUMNS, [], {})
+    assert [len(one) for one in read_table(path, COLUMNS)] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
 def test_the_same_rows_give_the_same_bytes_over_many_blocks(tmp_path: Path, suffix: str) -> None:
     pytest.importorskip("pyarrow")
     rows = [(math.sqrt(i), "word", i) for i in range(BLOCK + 10)]

@@ -31,7 +31,7 @@ LATEST_DELAY = 1e9  # seconds: a longer one is no packet's, and its square would
 LOST = "lost"  # a packet that never arrived, in a trace; so is a cell with nothing in it
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class TimeTable:
     """A quantity over time: `times` (n,) in seconds, rising; `numbers` (n,) in SI.
 

@@ -85,7 +85,7 @@ class NamedFiles:
         return found
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Column:
     """A column: name and unit of its heading, its numbers in SI (rows,)."""
 

@@ -67,7 +67,7 @@ class GroupBody:
     counted: Value | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Settings:
     """What a group sets: numbers, words (options and clocks), and numbers that differ from peer to peer."""
 

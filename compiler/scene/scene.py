@@ -53,7 +53,7 @@ KEYS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class SceneGroup:
     """`count` peers.
 

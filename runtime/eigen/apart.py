@@ -46,7 +46,7 @@ TINY = 1e-150
 SWEEPS = 8
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Apart:
     """Bounds on the eigenvalues of one matrix, the largest first, and on the largest magnitude.
 

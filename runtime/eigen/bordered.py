@@ -54,7 +54,7 @@ GOLDEN = (5**0.5 - 1) / 2
 TOGETHER = 1 << 17
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Wires:
     """How what all sites send comes back to them: r = Σ_l W_l ζ^(−l) s.
 
@@ -140,7 +140,7 @@ def side_by_side(maps: Sequence[FrameMap]) -> FrameMap:
     return FrameMap(*(diagonal(blocks) for blocks in zip(*(one.blocks for one in maps), strict=True)))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Bordered:
     """M(ζ) = ζ E + C + Σ_l ζ^(−l) C_l of many loops, E the unit matrix over z alone.
 
@@ -175,7 +175,7 @@ def bordered(maps: FrameMap, weights: Floats, unit: float = 1.0) -> Bordered:
     return Bordered(fixed, -(back @ weights), n_z)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Logarithm:
     """log F (z,) at points, its derivative over the angle and that over what varies in the maps."""
 

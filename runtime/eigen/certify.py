@@ -68,7 +68,7 @@ GOLDEN = (5**0.5 - 1) / 2
 SETTLED = 2.0**-40
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Proof:
     """What was proved of one closed system.
 
@@ -130,7 +130,7 @@ def prove(system: ClosedSystem, free: RigidModes, held: Places) -> Proof:
     return best
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Part:
     """States that drive each other: their `places` among n, their `block` in balls, its polynomial.
 

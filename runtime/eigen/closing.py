@@ -142,7 +142,7 @@ def lay_out_loop(loop: Loop | ClosedSystem) -> StateLayout:
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class ClosedSystem:
     """One autonomous system: state⁺ = `matrix` · state, once a frame.
 
@@ -236,7 +236,7 @@ def _known_wiring(key: tuple[Hashable, ...]) -> list[tuple[StateLayout, Sequence
     return []
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Feedback:
     """What a site hears, r = `now` s + `before` x, in floats or with their radii.
 
@@ -253,7 +253,7 @@ class Feedback:
         return Feedback(value_of(self.now), value_of(self.before))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Closed:
     """A closed loop over its state and what comes from outside: what it becomes, is heard and is sent.
 

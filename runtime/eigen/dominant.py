@@ -67,7 +67,7 @@ TRIED = 20
 HIDDEN = 1e-150
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Dominant:
     """The largest eigenvalue of each of k matrices, of a conjugate pair the one above; NaN where it is open.
 

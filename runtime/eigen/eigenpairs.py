@@ -51,7 +51,7 @@ SHIFT = 1e-7
 STEPS = 3
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Eigenpairs:
     """Eigenvalues with their right vectors as columns and their left ones as rows."""
 

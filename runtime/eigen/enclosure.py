@@ -72,7 +72,7 @@ def _told(low: float, high: float, errors: Floats) -> Enclosure:
     return Enclosure(low, high, errors, lambda: errors)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Parts:
     """A matrix with its error, cut into parts: those of one state, and those of more."""
 

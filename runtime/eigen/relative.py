@@ -33,7 +33,7 @@ Matrix = NDArray[Any]  # float64 or complex128; of balls where it says so
 MOST_PIVOTED = 64
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Relative:
     """The coordinates x_r − W x_p: `held` are the places p, `rest` all others, `weights` is W.
 

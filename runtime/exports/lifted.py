@@ -121,7 +121,7 @@ class StateSpace(Result):
         return self._shown("control")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Numbers:
     """What a frame is made of in a kind of number.
 

@@ -274,7 +274,9 @@ def _finest(site: LinearSite, schedule: Schedule, points: dict[int, int]) -> dic
 @functools.lru_cache(maxsize=KEPT)
 def _known_step(entries: bytes, n_x: int, seconds: float) -> Floats:
     """Return `_square_step` of few entries, row by row; what only couplers change is remembered."""
-    return _square_step(np.frombuffer(entries).reshape(n_x, -1), seconds)
+    step = _square_step(np.frombuffer(entries).reshape(n_x, -1), seconds)
+    step.setflags(write=False)
+    return step
 
 
 def _square_step(generator: Floats, seconds: float) -> Floats:

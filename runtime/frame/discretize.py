@@ -79,7 +79,7 @@ TOO_LARGE = (
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Step:
     """[F G] of one duration (n_x, n_x + n_u), or of many sites (k, …); real or complex.
 

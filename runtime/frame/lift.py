@@ -37,7 +37,7 @@ Matrix = NDArray[Any]
 MOST_PACKETS = 1000
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class FrameMap:
     """The map of one frame, z⁺ = P z + Q r and s = S z + D r; of many with a leading axis (k)."""
 
@@ -62,7 +62,7 @@ class FrameMap:
         return np.maximum([p, s], [q, d])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class BoundedMap(FrameMap):
     """A map and what it may be off by, entry by entry."""
 
@@ -80,7 +80,7 @@ class BoundedMap(FrameMap):
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class LiftedSite(BoundedMap):
     """The one-frame map of a site, or of many of one kind.
 

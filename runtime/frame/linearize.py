@@ -188,7 +188,9 @@ def _layout(function: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
 @lru_cache(maxsize=KEPT)
 def _output(function: Any) -> tuple[int, NDArray[np.int64]]:
     """Return how long a function's first output is, and where it is not zero."""
-    return function.numel_out(0), np.array(function.sparsity_out(0).row(), dtype=np.int64)
+    stored = np.array(function.sparsity_out(0).row(), dtype=np.int64)
+    stored.setflags(write=False)
+    return function.numel_out(0), stored
 
 
 def of_rows(function: Any, given: Mapping[int, NDArray[np.float64]]) -> list[NDArray[np.float64]]:

@@ -34,7 +34,7 @@ INPUTS, READINGS = "what comes in", "what is read"
 OUTSIDE = Heard(Way("", "", ""), Sent("", "", 0), 0)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Ports:
     """Where in z the ways in and out are: `drawn` (instants, inputs) and `read` (instants, readings).
 

@@ -28,7 +28,7 @@ from apc.compiler.frozen import dataclass
 Matrix = NDArray[Any]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class LinearTick:
     """What a clock partition computes: rows are its outputs; columns states, holds, memories, receives.
 
@@ -43,7 +43,7 @@ class LinearTick:
     channels: tuple[tuple[int, ...], ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class LinearSend:
     """What a site sends over a link: rows are the channels; columns states and holds."""
 
@@ -52,7 +52,7 @@ class LinearSend:
     u: Matrix  # (n_c, n_u)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class LinearSite:
     """The matrices of one site, in floats, exact rationals, or truth values (a structural pattern).
 

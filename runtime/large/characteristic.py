@@ -36,7 +36,7 @@ Complexes = NDArray[np.complex128]
 STEPS, LONGEST, ARRIVED, NEAR, FARTHEST = 40, 0.1, 1e-15, 1e-6, 1e6
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Characteristic:
     """f(ζ) = det(I − T W); `weights` (l, n_r, n_s) are W_l, `lags` the l.
 
@@ -60,7 +60,7 @@ def weights_at(function: Characteristic, points: Complexes) -> Complexes:
     return np.asarray(np.einsum("zl,lrs->zrs", powers, function.weights))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Matrices:
     """I − T W at ζ + h: `value` + h · `slope`, but for what `doubt` bounds in the disc (z, n, n).
 

@@ -71,7 +71,7 @@ def heard_weights(listed: Sequence[Population], exchange: Exchange) -> list[Floa
     return weights
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Places:
     """Where in s and r of the whole each population's rows are; how it weighs its own packets and others'."""
 

@@ -300,7 +300,7 @@ def _own_mode(population: Population, places: Places, zero: Zero, site: tuple[in
     return mode_of(zero.value, zero.error, turned, shares, f"{population.name} by itself", zero.multiplicity)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Motion:
     """Sites in a mode: their states z (k, n), what weighs these, w (k, n), and what they hear, r (k, n_r).
 

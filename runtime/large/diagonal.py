@@ -23,7 +23,7 @@ Complexes = NDArray[np.complex128]
 SQUARINGS, SETTLED = 6, 0.1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Diagonal:
     """X⁻¹ (M + E) X = diag(p_1, …, p_L, T₂) + Δ of k matrices, |Δ| ≤ `change`.
 

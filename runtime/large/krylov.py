@@ -82,7 +82,7 @@ OUTSIDE, FARTHEST = 20.0, 1e-9
 DRIFTING = 1e-6
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Pair:
     """An eigenvalue with its right and left vector and an estimate of its error."""
 

@@ -122,7 +122,7 @@ GRAPH_ROUNDINGS = 32
 MOST_SOLVED, TOGETHER = 64, 4096
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Extremes:
     """The places of the graph eigenvalues that decide, and a bound for the radii of all others.
 

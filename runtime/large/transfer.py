@@ -45,7 +45,7 @@ FINE = 1e-9
 CHUNK = 1024
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Transfer:
     """Sites of one structure by their poles, k sites of at most K poles beyond `inner`.
 
@@ -173,7 +173,7 @@ def _chunks(places: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
         yield places[start : start + CHUNK]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Parts:
     """A chunk of sites of equally many poles; the fields as in `Transfer`, each site counted once.
 
@@ -329,7 +329,7 @@ CLOSE = 300.0
 ANSWERS = 65_536
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Response:
     """T(ζ + h) = `value` + h · `slope`, but for what `doubt` bounds in the disc (z, n_s, n_r)."""
 

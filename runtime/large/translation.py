@@ -76,7 +76,7 @@ def count_translations(listed: Sequence[Population], exchange: Exchange) -> int 
     return total
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class FreeMotions:
     """What nothing holds back, for each population over the state of one of its peers: z, then its packets.
 

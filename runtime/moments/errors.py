@@ -73,7 +73,7 @@ class _Class:
     got: Peer
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Spread:
     """Second moments (2, n, n) of all classes' means, or of peers of class `apart` less the mean of these.
 

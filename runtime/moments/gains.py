@@ -71,7 +71,7 @@ def too_much(entries: int, states: int) -> str:
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Luck:
     """The luck of equal channels, on `route` from each of `senders` peers of class `sender` to each of some.
 
@@ -239,7 +239,7 @@ def gain_of(of: Moments) -> Gain:
     return at
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Form:
     """The moments E[l rᵀ] + E[r lᵀ] of forms of states times `by`, each unit of luck by itself, and `own`."""
 
@@ -255,7 +255,7 @@ class _Form:
         return numbers.add(scaled(found, self.by, numbers), self.own)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Answers:
     """How far packets are from what is heard, `miss`, and what luck that is to channels.
 
@@ -266,7 +266,7 @@ class _Answers:
     heard: tuple[tuple[Any, NDArray[np.intp], Matrix, _Form | None], ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Driven:
     """A part driven by the luck of a channel: states by `matrix` and, for each unit, `driven` (b, n, n)."""
 

@@ -62,7 +62,7 @@ class Ear:
     row: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class HeldLoop:
     """F (2, n, n), G (2, n, ears), S and E (2, ears that have a sender, n) in relative coordinates.
 

@@ -65,7 +65,7 @@ class Listened:
     weights: Mapping[Way, Fraction]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Channel:
     """What the luck of a channel does to a loop.
 
@@ -82,7 +82,7 @@ class Channel:
     own: tuple[Matrix, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class MeanLoop:
     """A loop of means in relative coordinates: its `matrix` (2, n, n) with its radius.
 
@@ -98,7 +98,7 @@ class MeanLoop:
     misses: Mapping[tuple[int, Route, int], Matrix]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Followed:
     """One number a channel remembers, through a frame: over [kept values, packets sent] and over its luck.
 
@@ -226,7 +226,7 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered]) -> Site:
     return Site(FrameMap(p, q, s, d), (*group.lifted.z_names, *names), values, misses, sent)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Apart:
     """What a channel's memory is apart from its mean, over [δ, ξ].
 

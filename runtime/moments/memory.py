@@ -44,7 +44,7 @@ LATELY = 64
 ROUNDED = 4e-16
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Memory:
     """The values that ticks hear: of this frame, and of those to come, `old` and `chances` by value.
 

@@ -172,7 +172,7 @@ def frames(
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Patterns:
     """The frame of each pattern of lost packets, over relative coordinates, and the law of each channel.
 

@@ -97,7 +97,7 @@ class LossesInARow:
     note: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class HeldPart:
     """A mode of a scene: `heard` where all channels lose the same packets, `off` for what comes on top.
 

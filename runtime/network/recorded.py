@@ -71,7 +71,7 @@ class Law:
     distance: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class NetworkRecording(Result):
     """What a recording amounts to; times in seconds.
 

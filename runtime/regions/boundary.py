@@ -63,7 +63,7 @@ RESOLUTION = 2.0**-24
 LEAST_COORDINATE = 1e-3
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Arc:
     """A piece of the boundary along which one mode decides, stable side on the left.
 

@@ -47,7 +47,7 @@ _INNER = np.array([0.125, 0.375, 0.625, 0.875])
 HALVINGS = 4
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Crossing:
     """A stretch of a cell's edge that the boundary crosses: from a stable to an unstable point (2,) each."""
 

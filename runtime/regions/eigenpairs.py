@@ -73,7 +73,7 @@ class Deciding(Protocol):
         """Return by how much the numbers (k,) may be off."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
     """One eigenvalue a point, the one that decides there.
 

@@ -49,7 +49,7 @@ DROPPED = 4 * UNIT
 LAST = 2
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Rectangle:
     """Two ranges in SI: `low` and `width` (2,)."""
 

@@ -82,7 +82,7 @@ class Root:
     slope: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Scan:
     """What was found: `points` (k,), whether it is `stable` (k,) at each, and the `roots` in order.
 
@@ -95,7 +95,7 @@ class Scan:
     whole: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Samples:
     """Points of lines, both in order, with each system's eigenvalues (k, n) and slopes (k, n)."""
 

@@ -99,7 +99,7 @@ def over_all(sheet: Sheet, values: Floats, points: Complexes) -> Logarithm:
     return Logarithm(*(one.reshape(shape) for one in (found.value, found.turning, found.moving)))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Cells:
     """Cells of the plane: between two angles and two values; corner by corner (k, 4) what F is there.
 
@@ -151,7 +151,7 @@ class _Cells:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Zeros:
     """Where F is 0, as Newton's method found it from each of some cells; NaN where it didn't arrive.
 
@@ -246,7 +246,7 @@ def _on_circle(angles: Floats) -> Complexes:
     return np.asarray(np.exp(1j * angles))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Grid:
     """F at values (k,) and angles (a,); `rows` (k,) says which of all values these are."""
 
