@@ -60,8 +60,9 @@ NEAR, FAR = 1e-14, 1e-4
 # After so many values at which nothing changes, second moments don't depend on a parameter.
 STILL = 4
 
-# The first width at which bounds are asked for; steps towards a crossing.
-FIRST, STEPS = 1e-12, 60
+# The first width at which bounds are asked for; how many times wider the next is where they say nothing of
+# that, where they do beyond what they want, and at most; steps towards a crossing.
+FIRST, WIDER, BEYOND, WIDEST, STEPS = 1e-12, 4.0, 1.5, 64.0, 60
 
 
 def criterion_of(system: CompiledSystem, asked: str | None, place: Place, varied: Sequence[Free] = ()) -> str:
@@ -339,9 +340,19 @@ class _Looking:
                 proof = BOUNDED[self.criterion] if all(one.proved for one in sides) else ITERATED
                 proof = proof if all(one.exact for one in sides) else TAGGED
                 return Crossing(value, width, "below" if below else "above", math.nan, "crossing", proof)
-            width *= 4
+            width *= _wider(sides)
         side = "below" if stable_below else "above"
         return Crossing(value, width, side, math.nan, "crossing", ESTIMATED)
+
+
+def _wider(sides: Sequence[Growth]) -> float:
+    """Return how many times farther off bounds will decide, as what grows changes evenly so near a crossing."""
+    wanted = [
+        ((one.high if one.radius < 1 else one.low) - one.radius) / (1 - one.radius)
+        for one in sides
+        if one.stable is None and one.radius != 1
+    ]
+    return min(max([WIDER] if not wanted else [BEYOND, *(BEYOND * one for one in wanted)]), WIDEST)
 
 
 @dataclass(frozen=True, slots=True)
