@@ -346,7 +346,7 @@ class _Looking:
 
 
 def _wider(sides: Sequence[Growth]) -> float:
-    """Return how many times farther off bounds will decide, as what grows changes evenly so near a crossing."""
+    """Return how many times farther off bounds decide, as what grows changes evenly near a crossing."""
     wanted = [
         ((one.high if one.radius < 1 else one.low) - one.radius) / (1 - one.radius)
         for one in sides
