@@ -13,12 +13,8 @@ result) → cli. Each imports only what comes before it: a result names what sho
 is asked for.
 """
 
+import functools
 from typing import Any
-
-import lazy_loader
-
-# Looked up when first used, so that `import apc` costs nothing and each command imports what it needs.
-_lookup, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
@@ -26,4 +22,18 @@ def __getattr__(name: str) -> Any:
         from apc.distribution import program_version
 
         return program_version()
-    return _lookup(name)
+    lookup, _, public = _attached()
+    return public if name == "__all__" else lookup(name)
+
+
+def __dir__() -> list[str]:
+    _, public, _ = _attached()
+    return list(public())
+
+
+@functools.cache
+def _attached() -> Any:
+    """Look the public names up when one is first used: a command uses none, and imports what it needs."""
+    import lazy_loader
+
+    return lazy_loader.attach_stub(__name__, __file__)

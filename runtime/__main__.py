@@ -5,11 +5,14 @@
 
 from __future__ import annotations
 
+import atexit
 import errno
 import gc
 import io
 import os
 import sys
+import threading
+from contextlib import suppress
 
 # Every file a command reads or writes has its own message; these can only come from the terminal or a pipe.
 OUTPUT_ERRORS = (errno.ENOSPC, errno.EIO, errno.EDQUOT, errno.EFBIG)
@@ -26,9 +29,21 @@ def main() -> None:
     from apc.memory import hold_to_memory
 
     hold_to_memory()
-    code = run(sys.argv[1:])
-    gc.freeze()  # the process ends, and its memory with it: Python would search all of it for garbage first
-    sys.exit(code)
+    _end(run(sys.argv[1:]))
+
+
+def _end(code: int) -> None:
+    """End the process as it stands: its memory ends with it, and Python would take all apart before.
+
+    Whoever is still at work is waited for, and whoever measures is told, as ever.
+    """
+    if threading.active_count() > 1 or sys.getprofile() or sys.gettrace():
+        sys.exit(code)
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError, AttributeError):  # closed, or not writable, as `run` said
+            stream.flush()
+    os._exit(code)
 
 
 def run(arguments: list[str]) -> int:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import decimal
 import functools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from fractions import Fraction
 
@@ -451,7 +451,7 @@ def _repeats(
 ) -> Repeats | None:
     """Return the longest row of events that come again and again, as of a clock's ticks between packets."""
     counted = [*_counted(events, len(ticks))]
-    first, length, count = _longest_run([_moved(*one) for one in zip(events, counted, strict=False)])
+    first, length, count = _longest_run([_form(*one) for one in zip(events, counted, strict=False)])
     work = sum(isinstance(event, Tick | Propagate) for event in events[first : first + length])
     if (count - 1) * work < WORTH * (count.bit_length() + count.bit_count() - 1):
         return None
@@ -486,6 +486,18 @@ def _counted(events: Sequence[Event], clocks: int) -> Iterator[tuple[int, ...]]:
     yield tuple(counts)
 
 
+def _form(event: Event, by: Sequence[int]) -> Hashable:
+    """Return what is the same of events that do the same a few ticks apart; None of what never is."""
+    match event:
+        case Tick(partition, index, heard, variant):
+            return "tick", partition, index - by[partition], heard, variant
+        case Act(hold, value):
+            return "act", hold, value.partition, value.output, value.index - by[value.partition]
+        case Propagate(duration):
+            return duration
+    return None  # what is sent is another packet each time
+
+
 def _moved(event: Event, by: Sequence[int]) -> Event:
     """Return an event with its ticks counted from later ones."""
     match event:
@@ -500,13 +512,13 @@ def _earlier(value: Value, by: Sequence[int]) -> Value:
     return Value(value.partition, value.output, value.index - by[value.partition])
 
 
-def _longest_run(forms: Sequence[Event]) -> tuple[int, int, int]:
-    """Return the first place, length and number of times of what repeats most in a sequence."""
-    numbers: dict[Event, int] = {}
+def _longest_run(forms: Sequence[Hashable]) -> tuple[int, int, int]:
+    """Return the first place, length and number of times of what repeats most; None never does."""
+    numbers: dict[Hashable, int] = {}
     codes = np.array(
         [
-            -place - 1 if isinstance(form, Send) else numbers.setdefault(form, len(numbers))
-            for place, form in enumerate(forms)  # what is sent is another packet each time
+            -place - 1 if form is None else numbers.setdefault(form, len(numbers))
+            for place, form in enumerate(forms)
         ]
     )
     best, found = 0, (0, 1, 1)
