@@ -63,7 +63,7 @@ HOUSE = (
         "apc.frame",
         """
         exact names parameters settable overrides
-        discretize radius exchange
+        discretize radius taylor exchange
         site jacobians start devices linearize
         schedule liveness hyperperiod ages scheduling
         lift ports batch_lift course residues
@@ -88,7 +88,7 @@ HOUSE = (
     (
         "apc.analysis",
         """
-        methods switches pushes plan selfcheck analysis needs box box_proof openloop paper conventions
+        methods switches pushes plan selfcheck analysis needs box cells box_proof openloop paper conventions
         contact_modes opened alternating multipliers switching describing
         """,
     ),

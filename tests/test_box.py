@@ -114,6 +114,15 @@ def test_a_group_of_its_own_is_opened_alone_even_if_it_is_alike_in_the_middle() 
     assert unstable.stable is False
 
 
+def test_groups_of_the_same_numbers_are_opened_over_the_same_range() -> None:
+    """They are alike on the diagonal of the box, and nowhere else."""
+    system = grouped(
+        paper(), ("left", 2, {"contact.stiffness": 1000.0}), ("right", 1, {"contact.stiffness": 1000.0})
+    )
+    found = _proof(system, "left.contact.stiffness=±5%", "right.contact.stiffness=±5%")
+    assert (found.stable, len(found.ranges)) == (True, 2)
+
+
 def test_peers_that_differ_in_other_things_are_proved_together() -> None:
     system = columned(paper(), device__mass=[0.1, 0.2, 0.15])
     assert _proof(system, "contact.stiffness=±1%").stable is True

@@ -40,7 +40,8 @@ from apc.network.nominal import refuse_channel_number
 _PLACE = Place("box")
 
 # Where in the box the peers are sorted into groups: a place that no two given values share, so that peers are
-# alike there only if they are alike all over the box. Three, in case one of them is met by chance.
+# alike there only if they are alike all over the box: of each range another power of it, as two groups may
+# have the same ranges. Three, in case one of them is met by chance.
 GENERIC = (Fraction(6180339887, 10**10), Fraction(4142135623, 10**10), Fraction(7320508075, 10**10))
 
 
@@ -218,7 +219,10 @@ def open_sites(
     field = Ratios.of(len(ranges))
     opened = [_opened(system, group, ranges, field) for group in system.groups]
     for share in GENERIC:
-        point = [Override(one.free, one.low + share * (one.high - one.low)) for one in ranges]
+        point = [
+            Override(one.free, one.low + share**place * (one.high - one.low))
+            for place, one in enumerate(ranges, 1)
+        ]
         at = apply(system, point)
         groups, exchange = lifted(at)
         members = [_members(group, exchange.starts) for group in groups]

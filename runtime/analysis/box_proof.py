@@ -1,22 +1,21 @@
 """Proof that a scene is stable for every value of some parameters in a box.
 
 Takes: a `CompiledSystem` and ranges.
-Gives: `BoxProof`, `prove_box`; `Cell`, `search_box`, `middle`, `site_at`, `range_ball`, `ball_radii`;
+Gives: `BoxProof`, `prove_box`; `search_box`, `middle`; `site_at`, `range_ball`, `ball_radii`;
 `BITS`, `UNDECIDED`.
 Guarantees: stable means proved for every point of the box, unstable proved at the point that is named.
 Does not: find the boundary (see the share that is left open).
 
-About the middle c of a cell of the box, M(p) = M(c) + Σ_k S_k (p_k − c_k), each S_k a slope somewhere in the
-cell: balls hold all of them. With a P from the equation of Stein and Lyapunov at the middle, P = RᵀR, a norm
-‖R M R⁻¹‖ < 1 proves all eigenvalues inside the circle. A norm is convex: it is largest at a corner of the
-cell. A cell where that fails is halved.
+The box is halved until a norm proves each of its cells, all cells of a size at once, in floats with their
+radii (`cells`). Where these don't even prove a cell's middle stable, balls are asked: is it unstable, or is
+the cell stable after all? There M(p) = M(c) + Σ_k S_k (p_k − c_k), each S_k a slope somewhere in the cell,
+which balls hold all of; the norm is the same.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from functools import partial
 from typing import Any
@@ -26,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.box import Box, open_box
+from apc.analysis.cells import Cell, OpenSystem, change_of_basis, look, open_system
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
@@ -44,10 +44,10 @@ from apc.eigen.balls import (
 )
 from apc.eigen.certify import schur_cohn
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.pseudospectrum import balance
+from apc.eigen.dominant import misses_one
 from apc.eigen.ratios import Ratio
-from apc.eigen.relative import independent_places
-from apc.eigen.rigid import RigidModes, find_rigid_modes, stays_rigid, what_stands
+from apc.eigen.relative import independent_places, relative_bounded, relative_coordinates
+from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here, stays_rigid, what_stands
 from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE
 from apc.frame.discretize import UNIT
 from apc.frame.names import Range
@@ -56,22 +56,18 @@ from apc.result import Result
 from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
-Cell = tuple[tuple[Fraction, Fraction], ...]
-
 UNDECIDED = "undecided"
 
 # Bits of the proof: those that 1,000 ticks lose, and twice those of a float.
 BITS = 256
 
-# Cells tried for each closed system, at some ten milliseconds each.
+# Work for each closed system, in cells looked at in balls, at some ten milliseconds each; a cell in floats is
+# this part of one.
 MOST_CELLS = 500
+LIGHT = 1 / 40
 
-# Where between the spectral radius (0) and 1 the decay lies that the norm is made for; the nearer to 1, the
-# better conditioned the norm, the nearer to 0, the more of it is left for the cell. Measured: flat about 1/2.
-DECAY = 0.5
-
-# Doublings of the sum P = Σ Aᵀᵏ Aᵏ: enough for an A that decays by 1e-9 a step.
-DOUBLINGS = 40
+# Cells looked at in floats together: their matrices then stay in the cache of a processor.
+TOGETHER = 128
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,14 +90,20 @@ class BoxProof(Result):
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Question:
-    """One closed system over the box: its sites over the open parameters, its rigid motions and where."""
+@dataclass(frozen=True, slots=True)
+class Looked:
+    """What came out for a cell: nothing where it is proved, or else how much each parameter matters in it.
 
-    system: ClosedSystem
-    sites: tuple[LinearSite, ...]
-    vectors: tuple[tuple[Fraction, ...], ...]
-    held: NDArray[np.intp]
+    `unstable` says that it is so, proved, at the cell's middle; `work` is what it took, in cells in balls.
+    """
+
+    reach: Floats | None
+    unstable: bool = False
+    work: float = 1.0
+
+
+# Looks at cells, one after the other; nobody asks on after one that is unstable.
+Look = Callable[[Sequence[Cell]], Iterator[Looked]]
 
 
 @part("box")
@@ -126,24 +128,26 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
 
 def _prove_box(name: str, box: Box) -> BoxProof:
     whole: Cell = tuple((one.low, one.high) for one in box.ranges)
-    questions: list[_Question] = []
+    questions: list[OpenSystem] = []
     notes: list[str] = []
     translations = 0
     for system, sites in zip(box.systems, box.sites, strict=True):
-        free = find_rigid_modes(system)
-        translations += what_stands(system, with_drifts=False).translations
-        if free.drifts or not stays_rigid(system, sites):
+        free = _rigid_modes(system)
+        translations += what_stands(system, with_drifts=False).translations if free.names else 0
+        if free.drifts or (free.names and not stays_rigid(system, sites)):
             what = "drifts" if free.drifts else "moves freely in a direction that changes with the parameters"
             notes.append(f"{system.name} {what}: nothing can be proved for a whole box")
             continue
-        questions.append(_question(system, sites, free))
-    corners = [middle(whole), *itertools.product(*whole)]
-    for question, point in itertools.product(questions, corners):
-        if _is_unstable(question, point):
-            return _answer(name, box, UNSTABLE, False, 1, 1.0, point)
+        questions.append(open_system(system, sites, free))
+    points = [middle(whole), *itertools.product(*whole)]
+    for question in questions:
+        stable = look(question, [_only(point) for point in points]).proved
+        for point, known in zip(points, stable.tolist(), strict=True):
+            if not known and _is_unstable(question, point):
+                return _answer(name, box, UNSTABLE, False, 1, 1.0, point)
     cells, left, where = 0, 1.0 if notes else 0.0, tuple[Fraction, ...]()
     for question in questions:
-        found = _halved(whole, partial(_reach_out, question), partial(_is_unstable, question))
+        found = _halved(whole, partial(_looked, question))
         cells += found.cells
         if found.unstable:
             return _answer(name, box, UNSTABLE, False, cells, 1.0, found.point)
@@ -152,6 +156,13 @@ def _prove_box(name: str, box: Box) -> BoxProof:
     if left:
         return _answer(name, box, UNDECIDED, None, cells, left, where, notes)
     return _answer(name, box, STABLE_TRANSLATING if translations else STABLE, True, cells, 0.0, ())
+
+
+def _rigid_modes(system: ClosedSystem) -> RigidModes:
+    """Return the rigid modes of a system; drifts are not looked for where its matrix tells of none."""
+    free = rigid_modes_here(system)
+    left = relative_bounded(system.matrix, system.error, relative_coordinates(free.basis))
+    return free if misses_one(*(one[None] for one in left))[0] else find_rigid_modes(system)
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,10 +187,6 @@ def _answer(
 ) -> BoxProof:
     where = tuple(float(value) for value in point)
     return BoxProof(name, box.ranges, verdict, stable, cells, left, where, tuple(notes))
-
-
-def _question(system: ClosedSystem, sites: tuple[LinearSite, ...], free: RigidModes) -> _Question:
-    return _Question(system, sites, free.exact, independent_places(free.basis.T))
 
 
 def search_box(
@@ -213,7 +220,7 @@ def search_box(
     for point in (middle(whole), *itertools.product(*whole)):
         if is_unstable(point):
             return answer(unstable, 1, 1.0, point)
-    found = _halved(whole, reach_out, is_unstable)
+    found = _halved(whole, partial(_one_by_one, reach_out, is_unstable))
     if found.unstable:
         return answer(unstable, found.cells, 1.0, found.point)
     if found.open_share:
@@ -221,29 +228,36 @@ def search_box(
     return answer(stable, found.cells, 0.0, ())
 
 
-def _halved(
-    whole: Cell,
+def _one_by_one(
     reach_out: Callable[[Cell], Floats | None],
     is_unstable: Callable[[tuple[Fraction, ...]], bool],
-) -> _Halved:
-    """Prove cell after cell, the largest first; all as in `search_box`."""
-    waiting = deque([whole])
-    looked = 0
-    while waiting and looked < MOST_CELLS:
-        cell = waiting.popleft()
-        looked += 1
+    cells: Sequence[Cell],
+) -> Iterator[Looked]:
+    """Look at cells one by one, see `search_box`."""
+    for cell in cells:
         reach = reach_out(cell)
-        if reach is None:
-            continue
-        inner = middle(cell)
-        if is_unstable(inner):
-            return _Halved(looked, 1.0, True, inner)
-        widest = int(np.argmax(reach))
-        low, high = cell[widest]
-        for half in ((low, inner[widest]), (inner[widest], high)):
-            waiting.append((*cell[:widest], half, *cell[widest + 1 :]))
-    share = float(sum((_volume(cell) for cell in waiting), Fraction(0)) / _volume(whole))
-    return _Halved(looked, share, False, middle(waiting[0]) if waiting else ())
+        yield Looked(reach, reach is not None and is_unstable(middle(cell)))
+
+
+def _halved(whole: Cell, looks: Look) -> _Halved:
+    """Prove cells, the larger before the smaller; all as in `search_box`."""
+    level, looked, work = [whole], 0, 0.0
+    while level and work < MOST_CELLS:
+        halves, done = list[Cell](), 0
+        for cell, one in zip(level, looks(level), strict=False):
+            looked, done, work = looked + 1, done + 1, work + one.work
+            if one.unstable:
+                return _Halved(looked, 1.0, True, middle(cell))
+            if one.reach is not None:
+                widest = int(np.argmax(one.reach))
+                low, high = cell[widest]
+                for half in ((low, (low + high) / 2), ((low + high) / 2, high)):
+                    halves.append((*cell[:widest], half, *cell[widest + 1 :]))
+            if work >= MOST_CELLS:
+                break
+        level = level[done:] + halves
+    share = float(sum((_volume(cell) for cell in level), Fraction(0)) / _volume(whole))
+    return _Halved(looked, share, False, middle(level[0]) if level else ())
 
 
 def middle(cell: Cell) -> tuple[Fraction, ...]:
@@ -258,13 +272,36 @@ def _volume(cell: Cell) -> Fraction:
     return volume
 
 
-def _is_unstable(question: _Question, point: Sequence[Fraction]) -> bool:
+def _only(point: Sequence[Fraction]) -> Cell:
+    """Return the cell that is one point."""
+    return tuple((value, value) for value in point)
+
+
+def _looked(question: OpenSystem, cells: Sequence[Cell]) -> Iterator[Looked]:
+    """Look at cells in floats, many at a time; in balls where these don't prove even the middle stable."""
+    for start in range(0, len(cells), TOGETHER):
+        some = cells[start : start + TOGETHER]
+        found = look(question, some)
+        inside = found.inside.copy()
+        left = np.flatnonzero(~inside)
+        if len(left):
+            inside[left] = look(question, [_only(middle(some[place])) for place in left.tolist()]).proved
+        for cell, proved, sound, reach in zip(some, found.proved, inside, found.reach, strict=True):
+            if proved or sound:
+                yield Looked(None if proved else reach, work=LIGHT)
+            elif _is_unstable(question, middle(cell)):
+                yield Looked(reach, unstable=True)
+            else:
+                yield Looked(_reach_out(question, cell))
+
+
+def _is_unstable(question: OpenSystem, point: Sequence[Fraction]) -> bool:
     """Say whether an eigenvalue is proved outside the circle at a point of the box."""
     exact = [rational_ball(value) for value in point]
     return schur_cohn(square(_matrix(question, exact, None)).charpoly().coeffs()) is False
 
 
-def _matrix(question: _Question, point: Sequence[Any], by: int | None) -> Balls:
+def _matrix(question: OpenSystem, point: Sequence[Any], by: int | None) -> Balls:
     """Return the matrix in relative coordinates at a point of balls, or its slope by a parameter there."""
     sites = [site_at(site, point, by) for site in question.sites]
     steps = [
@@ -274,7 +311,7 @@ def _matrix(question: _Question, point: Sequence[Any], by: int | None) -> Balls:
     matrix = closed_frame(question.system, sites, steps)
     if by is not None:
         matrix = mapped(slope_of, matrix)
-    return reduced_balls(matrix, question.vectors, question.held)
+    return reduced_balls(matrix, question.rigid.exact, independent_places(question.rigid.basis.T))
 
 
 def site_at(site: LinearSite, point: Sequence[Any], by: int | None) -> LinearSite:
@@ -291,7 +328,7 @@ def site_at(site: LinearSite, point: Sequence[Any], by: int | None) -> LinearSit
     return entrywise(site, at)
 
 
-def _reach_out(question: _Question, cell: Cell) -> Floats | None:
+def _reach_out(question: OpenSystem, cell: Cell) -> Floats | None:
     """Return None when a cell is proved, or else how much each parameter moves the matrix in it."""
     balls = [range_ball(low, high) for low, high in cell]
     centre = square(_matrix(question, [rational_ball(value) for value in middle(cell)], None))
@@ -300,8 +337,8 @@ def _reach_out(question: _Question, cell: Cell) -> Floats | None:
     n = centre.nrows()
     if n == 0:
         return None
-    change = _change_of_basis(_floats(centre))
-    if change is None:
+    [change] = change_of_basis(_floats(centre)[None])
+    if not np.isfinite(change).all():
         return np.array([float(high - low) for low, high in cell])
     basis = flint.arb_mat(n, n, [flint.arb(value) for value in change.ravel().tolist()])
     inverse = basis.inv()
@@ -340,34 +377,6 @@ def ball_radii(balls: Balls) -> Floats:
 def _floats(matrix: Any) -> Floats:
     n = matrix.nrows()
     return np.array([float(entry.mid()) for entry in matrix.entries()], dtype=np.float64).reshape(n, n)
-
-
-def _change_of_basis(matrix: Floats) -> Floats | None:
-    """Return R with ‖R M R⁻¹‖₂ < 1, or None where rounding finds none.
-
-    With the decay γ between the spectral radius and 1, P = Σ_k (Mᵀ/γ)ᵏ (M/γ)ᵏ solves MᵀPM = γ² (P − I), so
-    that ‖R M R⁻¹‖ ≤ γ for P = RᵀR.
-    """
-    n = len(matrix)
-    scale = balance(np.abs(matrix) + np.finfo(np.float64).tiny)
-    balanced = matrix / scale[:, None] * scale
-    if not np.isfinite(balanced).all():
-        return None
-    radius = float(np.abs(np.linalg.eigvals(balanced)).max())
-    if not radius < 1:
-        return None
-    power = balanced / (radius + DECAY * (1 - radius))
-    total = np.eye(n)
-    for _ in range(DOUBLINGS):
-        total = total + power.T @ total @ power
-        power = power @ power
-        if not np.abs(power).max() > np.finfo(np.float64).tiny:
-            break
-    try:
-        root = np.linalg.cholesky((total + total.T) / 2).T
-    except np.linalg.LinAlgError:
-        return None
-    return np.asarray(root / scale)
 
 
 def _frobenius(matrix: Any) -> Any:

@@ -26,13 +26,13 @@ from apc.analysis.box import open_sites
 from apc.analysis.box_proof import (
     BITS,
     BoxProof,
-    Cell,
     ball_radii,
     middle,
     range_ball,
     search_box,
     site_at,
 )
+from apc.analysis.cells import Cell
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass

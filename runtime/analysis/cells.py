@@ -1,0 +1,375 @@
+"""A closed system over many cells of some parameters at once, and which of them a norm proves stable.
+
+Takes: a `ClosedSystem`, its sites over `Fraction` and `Ratio`, its rigid motions; cells.
+Gives: `OpenSystem`, `open_system`; `Cell`; `Looked`, `look`; `change_of_basis`.
+Guarantees: a cell that is said to be stable is proved so, at every point of it; rounding is charged.
+Does not: divide cells, or decide what floats leave open (see `box_proof`).
+
+Entries of the sites are floats with their slopes over the cell and a radius for all else (`frame.taylor`);
+so are the frames composed of them and the loop closed of these, M(p) = M(c) + Σ_k S_k ε_k + E for |ε_k| ≤ 1.
+With a P from the equation of Stein and Lyapunov at the middle, P = RᵀR, a norm ‖R M R⁻¹‖ < 1 proves all
+eigenvalues inside the circle. A norm is convex: it is largest at a corner of the cell.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.frozen import dataclass
+from apc.eigen.closing import ClosedSystem, Feedback, bounded_weight, close, feedback_of
+from apc.eigen.pseudospectrum import balance
+from apc.eigen.ratios import Ratio
+from apc.eigen.relative import Relative, relative, relative_coordinates, with_doubt
+from apc.eigen.rigid import RigidModes
+from apc.frame.discretize import UNIT, discretize
+from apc.frame.lift import FrameMap, compose, step_durations
+from apc.frame.radius import Arithmetic, radius_of, value_of, with_radius
+from apc.frame.schedule import Schedule
+from apc.frame.site import LinearSite, every_matrix
+from apc.frame.taylor import reciprocal, step_over, taylor, within
+
+Floats = NDArray[np.float64]
+Truths = NDArray[np.bool_]
+Matrix = NDArray[Any]
+Cell = tuple[tuple[Fraction, Fraction], ...]
+
+# Where between the spectral radius (0) and 1 the decay lies that the norm is made for; the nearer to 1, the
+# better conditioned the norm, the nearer to 0, the more of it is left for the cell. Measured: flat about 1/2.
+DECAY = 0.5
+
+# Doublings of the sum P = Σ Aᵀᵏ Aᵏ: enough for an A that decays by 1e-9 a step.
+DOUBLINGS = 40
+
+
+# A polynomial over the parameters: exponents, and a coefficient with its radius.
+Polynomial = Sequence[tuple[tuple[int, ...], tuple[float, float]]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Written:
+    """A matrix over the parameters: numbers with their radii (2, n, m), and what quotient an entry is."""
+
+    still: Floats
+    moving: Mapping[tuple[int, ...], int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OpenSystem:
+    """One closed system over a box: its sites over the open parameters, its rigid motions, who hears whom.
+
+    `written` are its sites in floats, `quotients` the numerators and denominators in these, none where this
+    is 1; `steps` are [F G] by duration in quanta of the sites whose A and B stay.
+    """
+
+    system: ClosedSystem
+    sites: tuple[LinearSite, ...]
+    rigid: RigidModes
+    feedback: tuple[Feedback, ...]
+    relative: Relative
+    written: tuple[LinearSite, ...]
+    steps: tuple[Mapping[int, Matrix], ...]
+    quotients: tuple[tuple[Polynomial, Polynomial | None], ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Looked:
+    """What is known of k cells: which are proved, or only their middles, and how much each parameter matters.
+
+    Of points nothing matters: m is 0. Where there is no norm it is NaN.
+    """
+
+    proved: Truths  # (k,)
+    inside: Truths  # (k,)
+    reach: Floats  # (k, m)
+
+
+def open_system(system: ClosedSystem, sites: Sequence[LinearSite], rigid: RigidModes) -> OpenSystem:
+    """Make a closed system ready to be looked at over cells.
+
+    Parameters
+    ----------
+    system
+        The system, at some point of the box.
+    sites
+        Its sites' matrices, over `Fraction` and `Ratio`.
+    rigid
+        Its rigid motions, which are so all over the box.
+    """
+    known: dict[str, int] = {}
+    quotients: list[tuple[Polynomial, Polynomial | None]] = []
+
+    def place_of(ratio: Ratio) -> int:
+        text = f"{ratio.top}/{ratio.bottom}"
+        if text not in known:
+            known[text] = len(quotients)
+            quotients.append(_quotient(ratio))
+        return known[text]
+
+    def written(entries: Matrix) -> Matrix:
+        still, moving = np.zeros((2, *entries.shape)), {}
+        for place, entry in np.ndenumerate(entries):
+            if isinstance(entry, Ratio):
+                moving[place] = place_of(entry)
+            elif entry:
+                still[(slice(2), *place)] = _bounded(Fraction(entry))
+        return np.array(_Written(still, moving), dtype=object)
+
+    alike = {id(site): every_matrix(site, written) for site in sites}
+    return OpenSystem(
+        system=system,
+        sites=tuple(sites),
+        rigid=rigid,
+        feedback=tuple(feedback_of(system, system.layout)),
+        relative=with_doubt(relative_coordinates(rigid.basis)),
+        written=tuple(alike[id(site)] for site in sites),
+        steps=tuple(_steps(site, group.schedule) for site, group in zip(sites, system.sites, strict=True)),
+        quotients=tuple(quotients),
+    )
+
+
+def look(asked: OpenSystem, cells: Sequence[Cell]) -> Looked:
+    """Say which cells are proved stable.
+
+    Parameters
+    ----------
+    asked
+        The system.
+    cells
+        Of all its parameters, k of them; points, where low and high are the same.
+    """
+    matrix = _matrices(asked, cells)
+    k, count, n = len(cells), matrix.shape[1] - 2, matrix.shape[-1]
+    proved, inside = np.full((2, k), not n)
+    reach = np.zeros((k, count))
+    if not n:
+        return Looked(proved, inside, reach)
+    value, off, slopes = value_of(matrix), radius_of(matrix), matrix[:, 2:]
+    basis = change_of_basis(value)
+    known = np.isfinite(basis).all(axis=(1, 2)) & np.isfinite(matrix).all(axis=(1, 2, 3))
+    reach[~known] = np.nan
+    if known.any():
+        found = _contracted(basis[known], value[known], off[known], slopes[known])
+        proved[known], inside[known], reach[known] = found.proved, found.inside, found.reach
+    return Looked(proved, inside, reach)
+
+
+def _contracted(basis: Floats, value: Floats, off: Floats, slopes: Floats) -> Looked:
+    """Say whether ‖R M R⁻¹‖ < 1 all over each cell, and by how much each parameter moves it.
+
+    Notes
+    -----
+    With Y about R⁻¹, ‖R M R⁻¹‖ ≤ ‖R M Y‖ / (1 − ‖1 − R Y‖). What the radii, and rounding, leave of R M Y is
+    less in norm than |R| E |Y|.
+    """
+    k, count, n = slopes.shape[:3]
+    charge = (n + 4) * UNIT
+    try:
+        inverse = np.linalg.inv(basis)
+    except np.linalg.LinAlgError:
+        nothing = np.zeros(k, dtype=np.bool_)
+        return Looked(nothing, nothing, np.full((k, count), np.nan))
+    size, weight = np.abs(basis), np.abs(inverse)
+    wrong = norms(np.eye(n) - basis @ inverse) + charge * (norms(size @ weight) + np.sqrt(n))
+    moved = basis @ value @ inverse
+    turned = basis[:, None] @ slopes @ inverse[:, None]
+    spread = np.abs(value) + np.abs(slopes).sum(axis=1)
+    loose = norms(size @ (off + 3 * charge * spread) @ weight)
+    loose += (count + 1) * UNIT * (norms(moved) + norms(turned).sum(axis=1))
+    limit = (1 - wrong - loose) * (1 - 8 * charge) - 8 * charge
+    inside = limit > 0
+    inside[inside] = _norm_below(moved[inside], limit[inside])
+    proved = inside.copy()
+    for signs in itertools.product((1.0, -1.0), repeat=count) if count else ():
+        some = np.flatnonzero(proved)
+        if not len(some):
+            break
+        corner = moved[some]
+        for by, sign in enumerate(signs):
+            corner = corner + sign * turned[some, by]
+        proved[some] = _norm_below(corner, limit[some])
+    return Looked(proved, inside, norms(turned))
+
+
+def norms(matrix: Floats) -> Floats:
+    """Return upper bounds on the 2-norms of matrices (…, n, m), those of Frobenius."""
+    entries = matrix.shape[-2] * matrix.shape[-1]
+    total = np.square(matrix).sum(axis=(-2, -1))
+    return np.asarray(np.sqrt(total) * (1 + (entries + 4) * UNIT) + np.finfo(np.float64).tiny ** 0.5)
+
+
+def _norm_below(matrix: Floats, limit: Floats) -> Truths:
+    """Say whether the 2-norms of matrices N (k, n, n) are proved to be below limits (k,), all below 1.
+
+    Notes
+    -----
+    limit²·I − NᵀN is positive definite if the decomposition of Cholesky in floats runs through of what is
+    less than it by more than that rounds, γ_{n+1} tr / (1 − γ_{n+1}) (Rump, Verification of positive
+    definiteness, 2006), and by what N ᵀN rounds.
+    """
+    n = matrix.shape[-1]
+    rounded = (n + 2) * UNIT * (np.square(matrix).sum(axis=(1, 2)) + n) * 2
+    left = -(matrix.swapaxes(1, 2) @ matrix)
+    np.einsum("kii->ki", left)[:] += (np.square(limit) * (1 - 4 * UNIT) - rounded)[:, None]
+    below = np.ones(len(matrix), dtype=np.bool_)
+    for column in range(n):
+        pivot = left[:, column, column]
+        below &= pivot > 0
+        under = left[:, column + 1 :, column] / np.sqrt(np.where(below, pivot, 1.0))[:, None]
+        left[:, column + 1 :, column + 1 :] -= under[:, :, None] * under[:, None]
+    return below
+
+
+def change_of_basis(matrix: Floats) -> Floats:
+    """Return R (k, n, n) with ‖R M R⁻¹‖₂ < 1 of matrices (k, n, n), NaN where rounding finds none.
+
+    Notes
+    -----
+    With the decay γ between the spectral radius and 1, P = Σ_k (Mᵀ/γ)ᵏ (M/γ)ᵏ solves MᵀPM = γ² (P − I), so
+    that ‖R M R⁻¹‖ ≤ γ for P = RᵀR.
+    """
+    n = matrix.shape[-1]
+    found = np.full(matrix.shape, np.nan)
+    some = np.flatnonzero(np.isfinite(matrix).all(axis=(1, 2)))
+    if not len(some):
+        return found
+    # Cells of one box are alike enough for the units of one.
+    scale = balance(np.abs(matrix[some]).max(axis=0) + np.finfo(np.float64).tiny)
+    balanced = matrix[some] / scale[:, None] * scale
+    radius = np.abs(np.linalg.eigvals(balanced)).max(axis=1)
+    some, balanced, radius = (one[radius < 1] for one in (some, balanced, radius))
+    if not len(some):
+        return found
+    power_of = balanced / (radius + DECAY * (1 - radius))[:, None, None]
+    total = np.broadcast_to(np.eye(n), balanced.shape)
+    for _ in range(DOUBLINGS):
+        total = total + power_of.swapaxes(1, 2) @ total @ power_of
+        power_of = power_of @ power_of
+        if not np.abs(power_of).max() > np.finfo(np.float64).tiny:
+            break
+    found[some] = _roots((total + total.swapaxes(1, 2)) / 2) / scale
+    return found
+
+
+def _roots(matrix: Floats) -> Floats:
+    """Return R (k, n, n) of matrices RᵀR, NaN where there is none."""
+    try:
+        return np.asarray(np.linalg.cholesky(matrix)).swapaxes(1, 2)
+    except np.linalg.LinAlgError:
+        if len(matrix) == 1:
+            return np.full(matrix.shape, np.nan)
+        return np.concatenate([_roots(one[None]) for one in matrix])
+
+
+def _matrices(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:
+    """Return the matrices in relative coordinates over cells (k, 2 + m, n, n), or of points (k, 2, n, n)."""
+    wide = any(low != high for low, high in cells[0])
+    parameters = _parameters(cells, wide=wide)
+    count = len(parameters) if wide else 0
+    numbers = taylor(count)
+    values = [_value(one, parameters, numbers) for one in asked.quotients]
+
+    def over(written: Matrix) -> Matrix:
+        one: _Written = written.item()
+        found = np.empty((len(cells), 2 + count, *one.still.shape[1:]))
+        found[:] = within(one.still, count)
+        for (row, column), place in one.moving.items():
+            found[..., row, column] = values[place][..., 0, 0]
+        return found
+
+    known: dict[tuple[int, int], FrameMap] = {}
+    maps = []
+    for site, steps, group in zip(asked.written, asked.steps, asked.system.sites, strict=True):
+        key = id(site), id(group.schedule)
+        if key not in known:
+            here = every_matrix(site, over)
+            durations = {one: float(one * group.schedule.quantum) for one in step_durations(group.schedule)}
+            own = {
+                duration: within(steps[duration], count) if steps else step_over(here.a, here.b, seconds)
+                for duration, seconds in durations.items()
+            }
+            known[key] = compose(here, group.schedule, own, numbers=numbers)
+        maps.append(known[key])
+    heard = [Feedback(within(one.now, count), within(one.before, count)) for one in asked.feedback]
+    closed = close(maps, heard, asked.system.layout, numbers=numbers).matrix
+    at = replace(asked.relative, weights=within(asked.relative.weights, count))
+    found = relative(closed, at, numbers)
+    return np.broadcast_to(found, (len(cells), *found.shape[-3:]))
+
+
+def _parameters(cells: Sequence[Cell], *, wide: bool) -> list[Matrix]:
+    """Return the parameters over cells (k, 2 + m, 1, 1) each, m being 0 of points."""
+    count = len(cells[0])
+    found = []
+    for place in range(count):
+        number = np.zeros((len(cells), 2 + (count if wide else 0), 1, 1))
+        number[:, 0, 0, 0] = [float((cell[place][0] + cell[place][1]) / 2) for cell in cells]
+        if wide:
+            number[:, 2 + place, 0, 0] = [float((cell[place][1] - cell[place][0]) / 2) for cell in cells]
+        radius_of(number)[...] = UNIT * np.abs(number).sum(axis=1) * (1 + 8 * UNIT)
+        found.append(number)
+    return found
+
+
+def _bounded(number: Fraction) -> tuple[float, float]:
+    """Return a rational as a float with its radius, infinite of one that is too large for a float."""
+    try:
+        return bounded_weight(number, 0.0)
+    except OverflowError:
+        return np.inf, np.inf
+
+
+def _quotient(ratio: Ratio) -> tuple[Polynomial, Polynomial | None]:
+    """Return a quotient as numerator and denominator, none where it is 1."""
+    over = _fraction(ratio.bottom.leading_coefficient())
+    top, bottom = (
+        [(tuple(map(int, powers)), _bounded(_fraction(one) / over)) for powers, one in part.to_dict().items()]
+        for part in (ratio.top, ratio.bottom)
+    )
+    return top, None if ratio.bottom.is_constant() else bottom
+
+
+def _fraction(number: Any) -> Fraction:
+    return Fraction(int(number.p), int(number.q))
+
+
+def _value(
+    quotient: tuple[Polynomial, Polynomial | None], parameters: Sequence[Matrix], numbers: Arithmetic
+) -> Matrix:
+    """Return a quotient over cells (k, 2 + m, 1, 1)."""
+    top = _polynomial(quotient[0], parameters, numbers)
+    if quotient[1] is None:
+        return top
+    return numbers.multiply(top, reciprocal(_polynomial(quotient[1], parameters, numbers)))
+
+
+def _polynomial(terms: Polynomial, parameters: Sequence[Matrix], numbers: Arithmetic) -> Matrix:
+    total = None
+    for powers, (coefficient, off) in terms:
+        term = numbers.exact(np.array([[coefficient]]))
+        radius_of(term)[...] = off
+        for number, power in zip(parameters, powers, strict=True):
+            for _ in range(power):
+                one = coefficient == 1 and not off and term.ndim == 3
+                term = number if one else numbers.multiply(term, number)
+        total = term if total is None else numbers.add(total, term)
+    assert total is not None, "a quotient that is zero"
+    return total
+
+
+def _steps(site: LinearSite, schedule: Schedule) -> Mapping[int, Matrix]:
+    """Return [F G] with its radii by duration in quanta, as an analysis has it; none if A or B moves."""
+    if any(isinstance(entry, Ratio) for block in (site.a, site.b) for entry in block.ravel()):
+        return {}
+    durations = step_durations(schedule)
+    steps = discretize(site.a, site.b, [duration * schedule.quantum for duration in durations])
+    return {
+        duration: with_radius(step.matrix, step.roundings * UNIT * step.size)[None]
+        for duration, step in zip(durations, steps, strict=True)
+    }

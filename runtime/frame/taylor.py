@@ -1,0 +1,163 @@
+"""What the kernel computes with over many cells at once: floats with slopes, and a radius for all the rest.
+
+Takes: values of matrices at the middle of a cell of parameters, and how they change towards its sides.
+Gives: `taylor`; `within`, `reciprocal`, `step_over`.
+Guarantees: a sum, product, quotient or exponential holds that of all numbers its operands hold, at every
+point of the cell; rounding is charged. What can't be bounded is infinite or NaN.
+Does not: follow what is of the second order (it goes into the radius); charge what underflows, less than
+1e-307 a product.
+
+A matrix over a cell of m parameters has a third axis from the end, (…, 2 + m, n, n'): its value v at the
+middle, a radius r, and its change s_k from the middle to the upper side of parameter k; it holds
+v + Σ_k s_k ε_k + ρ for every ε_k in [−1, 1] and |ρ| ≤ r: a Taylor model of the first order (Makino and Berz,
+Taylor models and other validated functional inclusion methods, 2003). Value and radius stand where
+`frame.radius` has them, and without parameters it is what that has.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.frame.discretize import LEFT_OUT, TERMS, UNIT
+from apc.frame.radius import FEW, Arithmetic, common_shape, radius_of, value_of
+
+Matrix = NDArray[Any]
+
+# Series of φ₁ are taken of matrices of at most this norm, see `discretize`; more squarings than so many are
+# of no use to anybody.
+SHORT, MOST_SQUARINGS = 0.5, 64
+
+
+@lru_cache(maxsize=16)
+def taylor(parameters: int) -> Arithmetic:
+    """Return how matrices over cells of so many parameters are multiplied, added, subtracted and written."""
+
+    def exact(value: Matrix) -> Matrix:
+        return np.stack([value, *[np.zeros_like(value)] * (1 + parameters)], axis=-min(value.ndim + 1, 3))
+
+    return Arithmetic(_multiply, _add, _subtract, exact)
+
+
+def within(matrix: Matrix, parameters: int) -> Matrix:
+    """Return matrices with their radii (…, 2, n, m) over cells of parameters that they don't follow."""
+    still = np.zeros((*matrix.shape[:-3], parameters, *matrix.shape[-2:]))
+    return np.concatenate([matrix, still], axis=-3)
+
+
+def _slopes(matrix: Matrix) -> Matrix:
+    return matrix[..., 2:, :, :]
+
+
+def _spread(matrix: Matrix) -> Matrix:
+    """Return how far entries (…, n, m) change within a cell, to first order."""
+    return np.asarray(np.abs(_slopes(matrix)).sum(axis=-3))
+
+
+def _multiply(left: Matrix, right: Matrix) -> Matrix:
+    """Return the product of matrices over cells.
+
+    Notes
+    -----
+    (a + α)(b + β) = a b + (a β + α b) + α β, the last in the radius, as is what a sum of products rounds
+    (see `radius`).
+    """
+    a, b, off_a, off_b = value_of(left), value_of(right), radius_of(left), radius_of(right)
+    terms = a.shape[-1]
+    if terms > FEW:  # a term is none where its factor is exactly 0
+        terms = int(np.count_nonzero(left.any(axis=-3), axis=-1).max(initial=0))
+    charge = (terms + left.shape[-3] + 2) * UNIT
+    many = common_shape(a.shape[:-2], b.shape[:-2])
+    found = np.empty((*many, left.shape[-3], a.shape[-2], b.shape[-1]))
+    np.matmul(a, b, out=value_of(found))
+    first = np.matmul(a[..., None, :, :], _slopes(right), out=_slopes(found))
+    size_b, spread_b, size_a = np.abs(b), _spread(right), np.abs(a)
+    off = np.matmul(size_a, off_b + charge * (size_b + spread_b), out=radius_of(found))
+    moving = _slopes(left)
+    if moving.any() or off_a.any():
+        first += moving @ b[..., None, :, :]
+        spread_a = _spread(left)
+        off += (off_a + charge * spread_a) @ size_b
+        off += (off_a + spread_a) @ (off_b + spread_b)
+    off *= 1 + 8 * charge
+    return found
+
+
+def _add(left: Matrix, right: Matrix) -> Matrix:
+    return _rounded(left + right)
+
+
+def _subtract(left: Matrix, right: Matrix) -> Matrix:
+    found = left - right
+    np.add(radius_of(left), radius_of(right), out=radius_of(found))
+    return _rounded(found)
+
+
+def _rounded(found: Matrix) -> Matrix:
+    """Return a sum of which each entry was rounded once, with that in its radius."""
+    off = radius_of(found)
+    off += UNIT * (np.abs(value_of(found)) + _spread(found))
+    off *= 1 + (found.shape[-3] + 4) * UNIT
+    return found
+
+
+def reciprocal(number: Matrix) -> Matrix:
+    """Return 1/x of numbers (…, 2 + m, 1, 1) over cells; infinite or NaN where one may be 0.
+
+    Notes
+    -----
+    1/x = 1/v − (x − v)/v² + (x − v)²/(v² x).
+    """
+    value, spread = np.abs(value_of(number)), _spread(number) + radius_of(number)
+    found = number / -np.square(value_of(number))[..., None, :, :]
+    value_of(found)[...] = 1 / value_of(number)
+    apart = value - spread * (1 + 8 * UNIT)
+    off = radius_of(number) + spread * np.where(apart > 0, spread / apart, np.inf)
+    off = off / np.square(value) + 8 * UNIT * (1 / value + _spread(found))
+    radius_of(found)[...] = off * (1 + 64 * UNIT)
+    return found
+
+
+def step_over(a: Matrix, b: Matrix, seconds: float) -> Matrix:
+    """Return [F G] (…, 2 + m, n_x, n_x + n_u) over cells, x(t + T) = F x(t) + G u.
+
+    Parameters
+    ----------
+    a, b
+        A (…, 2 + m, n_x, n_x) and B (…, 2 + m, n_x, n_u) over the cells.
+    seconds
+        T, a float that is off by one rounding.
+
+    Notes
+    -----
+    By scaling and squaring, as `discretize.exponential_rows`.
+    """
+    numbers = taylor(a.shape[-3] - 2)
+    n_x, n_u = a.shape[-1], b.shape[-1]
+    size = (np.abs(value_of(a)) + radius_of(a) + _spread(a)).sum(axis=-2).max(initial=0.0) * seconds
+    if not size < SHORT * 2.0**MOST_SQUARINGS:
+        return np.full((*a.shape[:-1], n_x + n_u), np.nan)
+    squarings = max(0, int(np.ceil(np.log2(max(size, SHORT) / SHORT) + 1e-9)))
+    x, g = (_scaled(one, seconds * 2.0**-squarings) for one in (a, b))
+    unit = numbers.exact(np.eye(n_x))
+    phi = unit
+    for term in range(TERMS, 0, -1):
+        phi = numbers.add(unit, _scaled(numbers.multiply(x, phi), 1 / (term + 1)))
+    radius_of(phi)[...] += LEFT_OUT
+    step = np.concatenate([numbers.add(numbers.multiply(x, phi), unit), numbers.multiply(phi, g)], axis=-1)
+    below = numbers.exact(np.eye(n_x + n_u)[n_x:])
+    below = np.broadcast_to(below, (*step.shape[:-2], *below.shape[-2:]))
+    for _ in range(squarings):
+        step = numbers.multiply(step, np.concatenate([step, below], axis=-2))
+    return step
+
+
+def _scaled(matrix: Matrix, factor: float) -> Matrix:
+    """Return matrices over cells times a number that is off by one rounding."""
+    found = matrix * factor
+    radius_of(found)[...] += 2 * UNIT * (np.abs(value_of(found)) + _spread(found))
+    radius_of(found)[...] *= 1 + (found.shape[-3] + 4) * UNIT
+    return found
