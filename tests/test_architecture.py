@@ -74,8 +74,8 @@ HOUSE = (
         "apc.eigen",
         """
         graph_modes peer_group listening peers closing graph_loops modes
-        eigenpairs dominant rigid dissipation pseudospectrum apart relative enclosure balls winding bordered
-        roots certify ratios spectrum
+        eigenpairs dominant ratios rigid dissipation pseudospectrum apart relative enclosure balls winding
+        bordered roots certify spectrum
         """,
     ),
     (

@@ -27,10 +27,8 @@ from apc.compiler.plain import RULES
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup, Runs
-from apc.eigen.ratios import NotRational, Ratio, Ratios
-from apc.frame.exact import evaluate_exact
+from apc.eigen.ratios import NotRational, Ratio, Ratios, open_site
 from apc.frame.exchange import Exchange
-from apc.frame.linearize import site_of_entries
 from apc.frame.names import Free, Range, find
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import exact_numbers, scope_of
@@ -313,15 +311,8 @@ def _open_vector(group: PeerGroup, opened: Mapping[str, Ratio]) -> list[Any]:
 
 def _open_site(group: PeerGroup, vector: Sequence[Any], system: CompiledSystem) -> LinearSite:
     """Return a site's matrices over the open parameters."""
-    built = group.jacobians
-    zeros = [[Fraction(0)] * built.function.numel_in(argument) for argument in range(4)]
-
-    def refuse(name: str, *_: Any) -> Any:
-        raise NotRational(f"hold {name}(), which is no quotient of polynomials")
-
     try:
-        flat = evaluate_exact(built.function, [*zeros, list(vector), [Fraction(0)]], rounded=refuse)[0]
+        return open_site(group.jacobians, vector)
     except NotRational as reason:
         what = f"the equations of {group.name} {reason}"
         raise ApcError(Mistake("E832", Place(system.origin.topology), what)) from None
-    return site_of_entries(built, flat, Fraction(0))

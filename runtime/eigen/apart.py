@@ -1,13 +1,13 @@
 """All eigenvalues of many matrices at once, each with a bound, where those that decide stand apart.
 
 Takes: matrices (k, n, n), and bounds on what each entry may be off by.
-Gives: `Apart`, `pairs_apart`.
+Gives: `Apart`, `pairs_apart`, `pairs_by_discs`.
 Guarantees: the bounds hold for every matrix within the errors, whatever their conditioning; rounding in the
 bounds themselves is charged. Where two eigenvalues are too near, or vectors too alike, nothing is said.
 Does not: enclose clusters, or look for a better split of large from small (see `enclosure`).
 
-One call of LAPACK for all right vectors, one for all left ones; all else are products of small matrices. The
-bounds are those of `enclosure` with every large eigenvalue a block of its own.
+One call of LAPACK for all right vectors, and for `pairs_apart` one for all left ones; all else are products of
+small matrices. Its bounds are those of `enclosure` with every large eigenvalue a block of its own.
 """
 
 from __future__ import annotations
@@ -42,6 +42,16 @@ GROWN = 1024.0
 # What squares hide that leave the range of floats.
 TINY = 1e-150
 
+# Roundings of a column beside its n terms. Of a real matrix times vectors both parts are sums of n terms, and
+# what is taken from it is a product of two complex numbers, or such a sum.
+EXTRA = 4
+
+# Eigenvalues of a worse condition than this have vectors too alike for their discs, |w| |v| where w v = 1.
+ALIKE = 1e4
+
+# A bound this small needs no closer look: a few roundings of what lies on the circle.
+LEAST = 2.0**-50
+
 # Sweeps of balancing: after twice as many the bounds are hardly less.
 SWEEPS = 8
 
@@ -58,6 +68,94 @@ class Apart:
     high: float
     near: Floats  # (n,)
     sharpened: Callable[[], Floats]
+
+
+def pairs_by_discs(
+    matrix: Floats, error: Floats, beside: NDArray[np.bool_]
+) -> tuple[Eigenpairs, list[Apart | None]]:
+    """Return all eigenvalues of each matrix, in order, and the bounds that their vectors alone give.
+
+    There are none where large ones don't stand apart, where the vectors are too alike, or where a closer look
+    may know twice as much.
+
+    Parameters
+    ----------
+    matrix, error
+        As of `pairs_apart`.
+    beside
+        The states (k, n) that drive no other and are driven by none.
+
+    Notes
+    -----
+    X⁻¹(M + E)X = Λ + G with all right vectors X: Gershgorin's discs, and as in `pairs_apart` what is scaled
+    where one stands alone. Small ones whose discs touch are each somewhere in these. It asks for nothing but
+    one solve: eigenvalues at zero by structure, which `pairs_apart` takes for a block, mostly have vectors of
+    their own, and a bound hundreds of times as close.
+    """
+    k, n = matrix.shape[:2]
+    with np.errstate(all="ignore"):
+        values, right = (one.astype(np.complex128) for one in np.linalg.eig(matrix))
+        order = np.lexsort((-values.imag, values.real, -np.abs(values)))
+        every = np.arange(k)[:, None]
+        values = values[every, order]
+        right = right.swapaxes(1, 2)[every, order].swapaxes(1, 2)
+        try:
+            left = np.linalg.inv(right)
+        except np.linalg.LinAlgError:
+            return Eigenpairs(values, right, right), [None] * k
+        return Eigenpairs(values, right, left), _discs(matrix, error, beside, Eigenpairs(values, right, left))
+
+
+def _discs(matrix: Floats, error: Floats, beside: NDArray[np.bool_], pairs: Eigenpairs) -> list[Apart | None]:
+    """Return the bounds of `pairs_by_discs`."""
+    n = matrix.shape[-1]
+    values, right, left = pairs.values, pairs.right, pairs.left
+    charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
+    size, weight, magnitudes = np.abs(right), np.abs(left), np.abs(values)
+    residual = matrix @ right - right * values[:, None]
+    doubt = (error + (n + EXTRA) * UNIT * np.abs(matrix)) @ size
+    doubt += size * (EXTRA * UNIT * magnitudes)[:, None]
+    doubt += charge * np.abs(residual)
+    # The computed inverse Y is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
+    product = weight @ size
+    wrong = (np.abs(np.eye(n) - left @ right) + charge * product).sum(axis=2)
+    defect = wrong.max(axis=1)
+    over = weight @ doubt
+    attainable = _diagonal(over).copy()  # whatever the vectors
+    over += np.abs(left @ residual)
+    over *= 1 + charge
+    over += (wrong / (1 - defect)[:, None])[:, :, None] * over.max(axis=1, keepdims=True)
+    total, first = over.sum(axis=2) * (1 + charge), _diagonal(over)
+    gap = np.abs(values[:, :, None] - values[:, None]) * (1 - 8 * UNIT) - total[:, :, None] - total[:, None]
+    _diagonal(gap)[...] = np.inf
+    known = (defect < 0.5) & (_diagonal(product).max(axis=1) < ALIKE)
+    if beside.any():
+        # The eigenvalue of such a state is its own entry, and no other's disc has to do with it.
+        itself = (size > 0) & beside[:, :, None]
+        known &= (itself.sum(axis=(1, 2)) == beside.sum(axis=1)) & (itself.any(axis=2) == beside).all(axis=1)
+        lone = itself.any(axis=1)
+        off = np.abs(values - (_diagonal(matrix)[:, None] @ itself)[:, 0])
+        total = np.where(lone, off + (_diagonal(error)[:, None] @ itself)[:, 0], total)
+        attainable = np.where(lone, total, attainable)
+        gap[lone[:, :, None] | lone[:, None]] = np.inf
+        over[lone[:, :, None] | lone[:, None]] = 0.0
+        first = total * lone + first
+    alone = gap.min(axis=1) > 0
+    share = (over / gap).max(axis=1) * (1 + 8 * UNIT)
+    radius = np.where(alone & (share < 1), (first + share * (total - first)) * (1 + 8 * UNIT), total)
+    outer = (magnitudes + radius) * (1 + 4 * UNIT)
+    # Those that touch are small; each is in one of their discs.
+    reach = np.where(alone, 0.0, outer).max(axis=1, keepdims=True)
+    near = np.where(alone, radius, magnitudes + reach) * (1 + 4 * UNIT)
+    least = np.where(alone, magnitudes - radius, 0.0).max(axis=1) * (1 - 4 * UNIT)
+    sharp = (near <= 2 * attainable) | (near < LEAST)
+    known &= (sharp & (alone | (magnitudes < SMALL))).all(axis=1)
+    high = outer.max(axis=1)
+    answers: list[Apart | None] = [None] * len(matrix)
+    for one in np.flatnonzero(known & np.isfinite(high)).tolist():
+        told = near[one]
+        answers[one] = Apart(max(0.0, float(least[one])), float(high[one]), told, lambda told=told: told)
+    return answers
 
 
 def pairs_apart(matrix: Floats, error: Floats) -> tuple[Eigenpairs, list[Apart | None]]:
@@ -83,6 +181,11 @@ def pairs_apart(matrix: Floats, error: Floats) -> tuple[Eigenpairs, list[Apart |
         pairs = _in_order(eigenpairs(matrix))
         bounds = _bounds(matrix, error, pairs)
     return Eigenpairs(pairs.values, pairs.right * scale[:, :, None], pairs.left / scale[:, None]), bounds
+
+
+def _diagonal(stack: Matrix) -> Matrix:
+    """Return the diagonals (k, n) of matrices (k, n, n) that stand one behind the other, to be written to."""
+    return stack.reshape(len(stack), -1)[:, :: stack.shape[-1] + 1]
 
 
 def _in_order(pairs: Eigenpairs) -> Eigenpairs:
@@ -113,6 +216,7 @@ def _bounds(matrix: Floats, error: Floats, pairs: Eigenpairs) -> list[Apart | No
     except np.linalg.LinAlgError:
         return [None] * k
     charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
+    rounded = (n + EXTRA) * UNIT  # see `EXTRA`
     moved = matrix @ basis
     size, weight = np.abs(basis), np.abs(inverse)
     form = inverse @ moved
@@ -120,8 +224,8 @@ def _bounds(matrix: Floats, error: Floats, pairs: Eigenpairs) -> list[Apart | No
     small = np.where(beside[:, :, None] & beside[:, None], form.real, 0.0)  # real, as what it is of is
     blocks = small.astype(np.complex128)
     np.einsum("kii->ki", blocks)[:] += own
-    doubt = np.abs(moved - basis @ blocks) + (error + charge * np.abs(matrix)) @ size
-    doubt += charge * (size @ np.abs(blocks))
+    doubt = np.abs(moved - basis @ blocks) + (error + rounded * np.abs(matrix)) @ size
+    doubt += rounded * (size @ np.abs(blocks))
     # The computed inverse Y is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
     wrong = np.abs(np.eye(n) - inverse @ basis).sum(axis=2)
     wrong += charge * (weight @ size.sum(axis=2)[:, :, None])[:, :, 0]
@@ -184,12 +288,12 @@ def _alike(size: Floats) -> Floats:
     As `pseudospectrum.balance`, of all states at once: each goes half-way, as those beside it go as well.
     """
     squared = np.square(size)
-    np.einsum("kii->ki", squared)[:] = 0.0
-    free = (squared.sum(axis=1) > 0) & (squared.sum(axis=2) > 0)
-    scale = np.ones(size.shape[:2])  # squared
+    _diagonal(squared)[...] = 0.0
+    turned = squared.swapaxes(1, 2)
+    scale = np.ones((*size.shape[:2], 1))  # squared
+    free = (squared @ scale > 0) & (turned @ scale > 0)
     for _ in range(SWEEPS):
-        step = np.where(free, np.sqrt(np.sqrt(squared.sum(axis=2) / squared.sum(axis=1))), 1.0)
-        squared *= step[:, None] / step[:, :, None]
-        scale *= step
-    exponents = np.log2(scale) / 2
+        step = (squared @ scale) / (turned @ (1 / scale))  # rows by columns, times the scale squared
+        scale *= np.where(free, np.sqrt(np.sqrt(step) / scale), 1.0)
+    exponents = np.log2(scale[:, :, 0]) / 2
     return np.asarray(np.exp2(np.round(np.where(np.isfinite(exponents), exponents, 0.0))))

@@ -1,7 +1,7 @@
 """Eigenvalues with their right and left vectors, of one matrix or of many, and what follows from both.
 
 Takes: matrices (…, n, n), their derivatives, or what they are off by.
-Gives: `Eigenpairs`, `eigenpairs`, `left_vectors`, `refined`; `eigenvalues`; `components`.
+Gives: `Eigenpairs`, `eigenpairs`, `left_vectors`, `pairs_to`, `refined`; `eigenvalues`; `components`.
 Guarantees: a derivative that `eigenvalues` gives and that would be mostly rounding comes as 0.
 Does not: bound the errors of eigenvalues (see `enclosure`).
 
@@ -41,6 +41,9 @@ LARGE = 100
 # Graphs of matrices whose parts are kept, and states of the largest one: a search asks for the same again and
 # again.
 KEPT, FEW_STATES = 128, 64
+
+# An eigenvalue that is found twice, from either side, is the same to this, relatively.
+SAME = 1e-9
 
 # How far from the predicted eigenvalue inverse iteration is shifted, so that the matrix it inverts stays
 # regular. Each step leaves a share of about SHIFT/gap of the other vectors.
@@ -97,6 +100,26 @@ def eigenpairs(matrix: Matrix) -> Eigenpairs:
 def left_vectors(matrix: Matrix, values: Complexes) -> Complexes:
     """Return left vectors (…, n, n) as rows: those of Mᵀ, each to its nearest of the values (…, n)."""
     found, vectors = np.linalg.eig(matrix.swapaxes(-1, -2))
+    nearest = _nearest(values, found)
+    rows = np.take_along_axis(vectors.swapaxes(-1, -2), nearest[..., None], axis=-2)
+    return np.asarray(rows.astype(np.complex128))
+
+
+def pairs_to(matrix: Matrix, values: Complexes) -> Eigenpairs:
+    """Return the eigenvalues (n,) with the vectors of a matrix (n, n), each those of the nearest it has."""
+    found = eigenpairs(matrix)
+    own = found.at(_nearest(values, found.values))
+    return Eigenpairs(values, own.right, own.left)
+
+
+def _nearest(values: Complexes, found: Complexes) -> NDArray[np.intp]:
+    """Return which of the eigenvalues found (…, n) each of some values (…, n) is, each another."""
+    order, ranked = (np.argsort(-np.abs(one), axis=-1, kind="stable") for one in (values, found))
+    nearest = np.empty_like(order)
+    np.put_along_axis(nearest, order, ranked, axis=-1)
+    apart = np.abs(np.take_along_axis(found, nearest, axis=-1) - values)
+    if (apart <= SAME * np.abs(values)).all():
+        return nearest  # in order of magnitude, as mostly
     distances = np.abs(values[..., :, None] - found[..., None, :])
     nearest = np.argmin(distances, axis=-1)
     claimed = (np.diff(np.sort(nearest, axis=-1), axis=-1) == 0).any(axis=-1)
@@ -107,8 +130,7 @@ def left_vectors(matrix: Matrix, values: Complexes) -> Complexes:
         for place in np.flatnonzero(several).tolist():
             own[place] = np.argmin(apart[place])
             apart[:, own[place]] = np.inf
-    rows = np.take_along_axis(vectors.swapaxes(-1, -2), nearest[..., None], axis=-2)
-    return np.asarray(rows.astype(np.complex128))
+    return np.asarray(nearest)
 
 
 def eigenvalues(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
-from apc.eigen.apart import GROWN, SMALL, Apart, pairs_apart
+from apc.eigen.apart import GROWN, SMALL, Apart, pairs_apart, pairs_by_discs
 from apc.eigen.eigenpairs import LARGE, Eigenpairs, components, eigenpairs
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance, norms, pseudospectral_radius
 from apc.eigen.relative import independent_places
@@ -82,20 +82,20 @@ class _Parts:
     several: tuple[Places, ...]
 
 
-def enclose_eigenvalues(
-    matrix: Matrix, error: Floats, *, whole: bool = False
-) -> tuple[Eigenpairs, Enclosure]:
+def enclose_eigenvalues(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]:
     """Compute all eigenvalues, the largest first, with their vectors, and enclose them.
 
     Parameters
     ----------
     matrix, error
         The matrix (n, n), and a bound on what each entry is off by.
-    whole
-        Whether the vectors must be those of the whole matrix. Else they are those of the part (see
-        `components`) that the eigenvalue belongs to: the products of right and left ones are zero elsewhere.
+
+    Returns
+    -------
+    The vectors are those of the part that the eigenvalue belongs to: where matrices have several, the products
+    of right and left ones are zero elsewhere.
     """
-    return enclose_all([(matrix, error, whole)])[0]
+    return enclose_all([(matrix, error, False)])[0]
 
 
 def enclose_all(given: Sequence[tuple[Matrix, Floats, bool]]) -> list[tuple[Eigenpairs, Enclosure]]:
@@ -104,23 +104,65 @@ def enclose_all(given: Sequence[tuple[Matrix, Floats, bool]]) -> list[tuple[Eige
     Parameters
     ----------
     given
-        Of each the matrix, its error, and whether vectors of the whole matrix are wanted.
+        Of each the matrix, its error, and whether it is not to be cut where discs tell too little.
     """
-    cuts = [_cut(*one) for one in given]
+    cuts = [_cut(matrix, error) for matrix, error, _ in given]
+    found = _enclose_by_discs(cuts)
+    for place, (matrix, error, whole) in enumerate(given):
+        if whole and found[place] is None:
+            cuts[place] = _Parts(matrix, error, np.zeros(0, dtype=np.intp), (np.arange(len(matrix)),))
     blocks = [
         (cut.matrix[part[:, None], part], cut.error[part[:, None], part])
-        for cut in cuts
+        for cut, quick in zip(cuts, found, strict=True)
+        if quick is None
         for part in cut.several
     ]
-    found = iter(_enclose_blocks(blocks))
-    return [_joined(cut, [next(found) for _ in cut.several]) for cut in cuts]
+    rest = iter(_enclose_blocks(blocks))
+    return [
+        _joined(cut, [next(rest) for _ in cut.several]) if quick is None else quick
+        for cut, quick in zip(cuts, found, strict=True)
+    ]
 
 
-def _cut(matrix: Matrix, error: Floats, whole: bool) -> _Parts:
-    n = len(matrix)
-    parts = [np.arange(n)] if whole or not n else components(~(np.abs(matrix) + error == 0))
+def _cut(matrix: Matrix, error: Floats) -> _Parts:
+    parts = components(~(np.abs(matrix) + error == 0)) if len(matrix) else []
     alone = np.array([part[0] for part in parts if len(part) == 1], dtype=np.intp)
     return _Parts(matrix, error, alone, tuple(part for part in parts if len(part) > 1))
+
+
+def _enclose_by_discs(cuts: Sequence[_Parts]) -> list[tuple[Eigenpairs, Enclosure] | None]:
+    """Enclose the eigenvalues of matrices of one part, and some states beside it, where discs tell enough."""
+    found: list[tuple[Eigenpairs, Enclosure] | None] = [None] * len(cuts)
+    alike: dict[int, list[int]] = {}
+    for place, cut in enumerate(cuts):
+        n = len(cut.matrix)
+        if len(cut.several) == 1 and len(cut.alone) < n / 2 and n <= LARGE and np.isrealobj(cut.matrix):
+            alike.setdefault(n, []).append(place)
+    for n, places in alike.items():
+        alone = np.zeros((len(places), n), dtype=np.bool_)
+        matrix, error = (np.stack([part(cuts[place]) for place in places]) for part in (_matrix, _error))
+        for row, place in enumerate(places):
+            beside = cuts[place].alone
+            if len(beside):
+                alone[row, beside] = True
+                for one in (matrix, error):
+                    kept = one[row, beside, beside]
+                    one[row, beside] = one[row, :, beside] = 0.0
+                    one[row, beside, beside] = kept
+        pairs, told = pairs_by_discs(matrix, error, alone)
+        for row, (place, apart) in enumerate(zip(places, told, strict=True)):
+            if apart is not None and apart.high - apart.low <= SHARP * max(apart.low, 1.0):
+                own = Eigenpairs(pairs.values[row], pairs.right[row], pairs.left[row])
+                found[place] = own, Enclosure(apart.low, apart.high, apart.near, apart.sharpened)
+    return found
+
+
+def _matrix(cut: _Parts) -> Floats:
+    return cut.matrix
+
+
+def _error(cut: _Parts) -> Floats:
+    return cut.error
 
 
 def _joined(cut: _Parts, found: Sequence[tuple[Eigenpairs, Enclosure]]) -> tuple[Eigenpairs, Enclosure]:

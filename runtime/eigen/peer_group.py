@@ -24,7 +24,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.lift import LiftedSite, check_packets, lift
+from apc.frame.lift import LiftedSite, check_packets, lift, steps_alone
 from apc.frame.linearize import linearize_exact
 from apc.frame.schedule import Schedule, Way
 from apc.frame.site import LinearSite, rational_floats
@@ -89,9 +89,9 @@ class PeerGroup:
     """`count` peers that move alike; `parameters` is the vector (n_p,) of the first of them.
 
     `peers` are their numbers in the scene, from 0; `role` is the scene's group where it has delays of its own
-    (see `Exchange.role`); `place` is what `gains` calls the group. `exact` holds the site's matrices in
-    rationals; where they can't be had, its floats taken at their word. `lifting` gives `lifted`, which is
-    made when it is asked for.
+    (see `Exchange.role`); `place` is what `gains` calls the group. `exacting` gives `exact`, the site's
+    matrices in rationals, where they can't be had its floats taken at their word, and `lifting` gives
+    `lifted`: both are made when they are asked for.
     """
 
     name: str
@@ -99,7 +99,7 @@ class PeerGroup:
     parameters: Floats
     jacobians: SiteJacobians
     site: LinearSite
-    exact: LinearSite
+    exacting: Callable[[], LinearSite]
     schedule: Schedule
     lifting: Callable[[], LiftedSite]
     peers: Peers
@@ -107,6 +107,11 @@ class PeerGroup:
     place: int
     listening: Listening | None
     gains: Gains
+
+    @property
+    def exact(self) -> LinearSite:
+        """The site's matrices in rationals."""
+        return self.exacting()
 
     @property
     def lifted(self) -> LiftedSite:
@@ -151,7 +156,7 @@ class PeerGroup:
             self,
             jacobians=replace(self.jacobians, kind=site.kind),
             site=site,
-            exact=exact,
+            exacting=lambda: exact,
             schedule=schedule,
             lifting=functools.cache(lambda: lifted or lift(site, schedule, exact=exact)),
         )
@@ -186,17 +191,26 @@ def build_group(
     """
     check_packets(schedule)
     peers = joined([shifted(peers, int(exchange.starts[group])) for group, peers in parts])
-    # The functions of a nonlinear loop can't be walked one by one.
-    exact = linearize_exact(built, vector, listening) if built.walkable else None
+
+    @functools.cache
+    def exacting() -> LinearSite:
+        # The functions of a nonlinear loop can't be walked one by one.
+        return linearize_exact(built, vector, listening) if built.walkable else rational_floats(site)
+
+    def lifting() -> LiftedSite:
+        if built.parameters_suffice:
+            return lift(site, schedule, steps=steps_alone(built, vector, schedule))
+        return lift(site, schedule, exact=exacting() if built.walkable else None)
+
     return PeerGroup(
         name=group_name(parts, exchange),
         count=len(peers),
         parameters=vector,
         jacobians=built,
         site=site,
-        exact=rational_floats(site) if exact is None else exact,
+        exacting=exacting,
         schedule=schedule,
-        lifting=functools.cache(lambda: lift(site, schedule, exact=exact)),
+        lifting=functools.cache(lifting),
         peers=peers,
         role=exchange.role(parts[0][0]),
         place=place,

@@ -1,6 +1,6 @@
 """Quotients of polynomials in a few parameters, as numbers.
 
-Takes: parameters that are left open. Gives: `Ratio`, `Ratios`, `NotRational`.
+Takes: parameters that are left open. Gives: `Ratio`, `Ratios`, `NotRational`; `open_site`.
 Guarantees: exact; two quotients are equal when they are as functions.
 Does not: compare what depends on the parameters, or take a root of it.
 """
@@ -14,6 +14,10 @@ from typing import Any
 import flint
 
 from apc.compiler.frozen import dataclass
+from apc.frame.exact import evaluate_exact
+from apc.frame.jacobians import SiteJacobians
+from apc.frame.linearize import site_of_entries
+from apc.frame.site import LinearSite
 
 # Terms a numerator or denominator may have: products of many parameters grow without end.
 MOST_TERMS = 2000
@@ -157,6 +161,23 @@ class Ratio:
     def at(self, point: Sequence[Any]) -> Any:
         """Return the value at parameters that are balls, as a ball."""
         return _value(self.top, point) / _value(self.bottom, point)
+
+
+def open_site(built: SiteJacobians, vector: Sequence[Any]) -> LinearSite:
+    """Return the matrices of a site that follow from its parameters (n_p,), some of them open.
+
+    Raises
+    ------
+    NotRational
+        They are no quotients of polynomials in these.
+    """
+    zeros = [[Fraction(0)] * built.function.numel_in(argument) for argument in range(4)]
+
+    def refuse(name: str, *_: Any) -> Any:
+        raise NotRational(f"hold {name}(), which is no quotient of polynomials")
+
+    flat = evaluate_exact(built.function, [*zeros, list(vector), [Fraction(0)]], rounded=refuse)[0]
+    return site_of_entries(built, flat, Fraction(0))
 
 
 def _value(polynomial: Any, point: Sequence[Any]) -> Any:

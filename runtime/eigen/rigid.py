@@ -20,7 +20,7 @@ It makes a generalized eigenvector, a Jordan pair.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from operator import mul
@@ -35,6 +35,8 @@ from apc.eigen.closing import ClosedSystem, Coupling, Loop
 from apc.eigen.dominant import misses_one
 from apc.eigen.graph_modes import QUICK_PRIME
 from apc.eigen.peer_group import PeerGroup, states_of
+from apc.eigen.ratios import NotRational, Ratios, open_site
+from apc.frame.jacobians import SiteJacobians
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick, Value
 from apc.frame.site import LinearSite
 
@@ -48,6 +50,9 @@ ONE = Fraction(1)
 
 # Systems whose rigid modes are remembered as a guess, and how many states they have at most.
 KEPT, FEW_STATES = 64, 200
+
+# Up to so many parameters it is seen whether rigid modes are such for all values of them.
+FEW_OPEN = 40
 
 # A linear form in the unknowns, sparse.
 Form = dict[int, Fraction]
@@ -140,19 +145,23 @@ def rigid_modes_before(system: ClosedSystem) -> RigidModes:
     if last is not None and _still_stands(last, system):
         return last.modes
     modes, still = _found_here(system)
-    equations = tuple((group.exact, group.schedule) for group in system.sites)
-    known[:] = [_Before(modes, tuple(map(tuple, still)), equations, system.coupling)]
+    equations = tuple((group.exacting, group.jacobians, group.schedule) for group in system.sites)
+    known[:] = [_Before(modes, tuple(map(tuple, still)), equations, system.coupling, [])]
     return modes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Before:
-    """The rigid modes of a system, the standing solutions that they are, and what they are solutions of."""
+    """The rigid modes of a system, the standing solutions that they are, and what they are solutions of.
+
+    `always` says, once that was asked, whether they are solutions whatever the sites' parameters.
+    """
 
     modes: RigidModes
     still: tuple[tuple[Fraction, ...], ...]
-    equations: tuple[tuple[LinearSite, Schedule], ...]  # of each site
+    equations: tuple[tuple[Callable[[], LinearSite], SiteJacobians, Schedule], ...]  # of each site
     coupling: Coupling
+    always: list[bool]
 
 
 @functools.lru_cache(maxsize=KEPT)
@@ -163,12 +172,19 @@ def _before(name: str, names: tuple[str, ...]) -> list[_Before]:
 
 def _still_stands(known: _Before, system: ClosedSystem) -> bool:
     """Say whether what stood still in a system does so in another."""
-    same = len(known.equations) == len(system.sites) and all(
-        exact is group.exact and schedule is group.schedule
-        for (exact, schedule), group in zip(known.equations, system.sites, strict=True)
-    )
-    if not known.still or (same and known.coupling == system.coupling):
+    if not known.still:
         return True
+    alike = len(known.equations) == len(system.sites) and all(
+        site is group.jacobians and schedule is group.schedule
+        for (_, site, schedule), group in zip(known.equations, system.sites, strict=True)
+    )
+    if alike and (known.coupling is system.coupling or known.coupling == system.coupling):
+        if all(one[0] is group.exacting for one, group in zip(known.equations, system.sites, strict=True)):
+            return True
+        if not known.always:
+            known.always.append(_always_stands(known, system))
+        if known.always[0]:
+            return True
     numbering, exact = _Numbering(system.sites), [group.exact for group in system.sites]
     if any(len(one) != numbering.size for one in known.still):
         return False
@@ -177,6 +193,31 @@ def _still_stands(known: _Before, system: ClosedSystem) -> bool:
         and tuple(_standing_state(system, exact, numbering, one)) == state
         for one, state in zip(known.still, known.modes.exact, strict=True)
     )
+
+
+def _always_stands(known: _Before, system: ClosedSystem) -> bool:
+    """Say whether what stands still does so for all parameters, as far as quotients of polynomials tell."""
+    needed = [_parameters_of(site) for _, site, _ in known.equations]
+    starts = np.cumsum([0, *map(len, needed)]).tolist()
+    if starts[-1] > FEW_OPEN or not all(site.parameters_suffice for _, site, _ in known.equations):
+        return False
+    field = Ratios.of(starts[-1])
+    sites = []
+    try:
+        for (_, site, _), places, start in zip(known.equations, needed, starts, strict=False):
+            numbers: list[Any] = [Fraction(0)] * site.function.numel_in(4)
+            for place, opened in enumerate(places, start):
+                numbers[opened] = field.parameter(place)
+            sites.append(open_site(site, numbers))
+        return stays_rigid(system, sites, solutions=tuple(zip(known.still, known.modes.exact, strict=True)))
+    except (NotRational, ArithmeticError, ValueError):
+        return False
+
+
+def _parameters_of(site: SiteJacobians) -> list[int]:
+    """Return the places of the parameters that any entry of a site's matrices follows from, by structure."""
+    columns = site.function.jac_sparsity(0, 4).get_triplet()[1]
+    return sorted(set(columns))
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,7 +296,11 @@ def _beyond(
 
 
 def stays_rigid(
-    system: ClosedSystem | Loop, others: Sequence[LinearSite], *, coupling: Coupling | None = None
+    system: ClosedSystem | Loop,
+    others: Sequence[LinearSite],
+    *,
+    coupling: Coupling | None = None,
+    solutions: Sequence[tuple[Sequence[Fraction], Sequence[Fraction]]] | None = None,
 ) -> bool:
     """Say whether the directions of a system's rigid modes are rigid with other matrices of its sites, too.
 
@@ -267,11 +312,14 @@ def stays_rigid(
         Matrices of each site, over rationals or quotients of polynomials: then for all values of these.
     coupling
         What the sites hear of each other then, where that is another, too.
+    solutions
+        The standing solutions that the rigid modes are, each with its state, where they are known.
     """
     other = system if coupling is None else replace(system, coupling=coupling)
     numbering = _Numbering(system.sites)
-    exact = [group.exact for group in system.sites]
-    solutions = _standing_solutions(system, exact, numbering)
+    if solutions is None:
+        exact = [group.exact for group in system.sites]
+        solutions = _standing_solutions(system, exact, numbering)
     # Of the matrices alone, once for all, by the unknowns in them: of many parts a solution moves few.
     forms: dict[int, list[Form]] = {}
     for form in _standing(other, others, numbering) if solutions else ():

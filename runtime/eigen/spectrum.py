@@ -25,7 +25,7 @@ from apc.eigen.apart import SMALL
 from apc.eigen.balls import unprovable
 from apc.eigen.certify import MOST_PROVED, prove
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.eigenpairs import Eigenpairs, components
+from apc.eigen.eigenpairs import Eigenpairs, components, pairs_to
 from apc.eigen.enclosure import WIDE, Enclosure, discs, enclose_all
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, independent_places, relative_bounded, relative_coordinates
@@ -174,12 +174,20 @@ class _Solved:
 
     free: RigidModes
     at: Relative
-    pairs: Eigenpairs  # of the relative coordinates
+    matrix: Floats | None  # of the relative coordinates; None where `pairs` are all there is to know of it
+    pairs: Eigenpairs  # of these, or of each part of them by itself
     bounds: Enclosure
     low: float
     high: float
     inside: bool | None
     bits: int
+
+    @property
+    def whole(self) -> Eigenpairs:
+        """The vectors that the whole state follows from: where some is held, those of all that is left."""
+        if self.matrix is None or not len(self.at.held) or len(components(self.matrix != 0)) == 1:
+            return self.pairs
+        return pairs_to(self.matrix, self.pairs.values)
 
     @property
     def clear_of_one(self) -> bool:
@@ -240,9 +248,9 @@ def _solve(systems: Sequence[ClosedSystem], free: Sequence[RigidModes]) -> list[
         for system, at in zip(systems, listed, strict=True)
     ]
     found = []
-    for one, at, (pairs, bounds) in zip(free, listed, enclose_all(given), strict=True):
+    for one, at, (matrix, _, _), (pairs, bounds) in zip(free, listed, given, enclose_all(given), strict=True):
         inside = False if bounds.low > 1 else True if bounds.high < 1 else None  # NaN decides nothing
-        found.append(_Solved(one, at, pairs, bounds, bounds.low, bounds.high, inside, 0))
+        found.append(_Solved(one, at, matrix, pairs, bounds, bounds.low, bounds.high, inside, 0))
     return found
 
 
@@ -271,7 +279,7 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
         return replace(estimate, low=low, high=high, inside=inside, bits=bits)
     pairs = Eigenpairs(proof.values, proof.right, proof.left)
     at = relative_coordinates(proof.free.basis)
-    return _Solved(proof.free, at, pairs, found, low, high, inside, bits)
+    return _Solved(proof.free, at, None, pairs, found, low, high, inside, bits)
 
 
 def _modes(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> tuple[Mode, ...]:
@@ -289,7 +297,7 @@ def _described(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> li
     parts: list[tuple[ClosedSystem, Complexes, Complexes, Floats]] = []
     described: list[tuple[Floats, Floats]] = []
     for system, one in zip(systems, solved, strict=True):
-        vectors, shares = whole_vectors(system, one.at, one.pairs)
+        vectors, shares = whole_vectors(system, one.at, one.whole)
         errors = one.bounds.errors
         described.append((shares, errors))
         magnitudes = np.abs(one.pairs.values)

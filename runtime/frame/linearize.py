@@ -241,7 +241,8 @@ def site_of_entries(site: SiteJacobians, found: Sequence[Any], zero: Any) -> Lin
 
 
 def site_of_row(site: SiteJacobians, row: NDArray[np.float64]) -> LinearSite:
-    """Return the site of one row of `linearize_rows`."""
+    """Return the site of one row of `linearize_rows`. Raises ApcError E808 where a slope is not finite."""
+    _refuse_infinite(site, row)
     return assemble(site.kind, site.affine, cut(row, site.shapes), _channels_of(site))
 
 

@@ -213,7 +213,7 @@ class BatchEvaluator:
 
         def at_point(group: PeerGroup) -> PeerGroup:
             vector, exact = moved[site_key(group)]
-            return replace(group, parameters=vector, exact=exact)
+            return replace(group, parameters=vector, exacting=lambda: exact)
 
         return tuple(replace(system, sites=tuple(map(at_point, system.sites))) for system in systems)
 
