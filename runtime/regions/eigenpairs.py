@@ -24,6 +24,9 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 Integers = NDArray[np.int64]
 
+# Magnitudes alike to this, relatively, are one: rounding tells them apart.
+ALIKE = 1e-11
+
 # What is smaller decides nothing, and its logarithm must be finite.
 LEAST_MAGNITUDE = 1e-3
 
@@ -139,7 +142,8 @@ class Eigenvalues:
         matrices = self.family.matrices(points)
         values = [np.linalg.eigvals(one) for one in matrices]
         best = np.stack([np.abs(one).max(axis=1) for one in values], axis=1)
-        system = np.argmax(best, axis=1)
+        # Of systems that share an eigenvalue, one all along: rounding would have them take turns.
+        system = np.argmax(best >= (1 - ALIKE) * best.max(axis=1, keepdims=True), axis=1)
         k, widest = len(points), max(self.family.sizes)
         value = np.zeros(k, np.complex128)
         start = np.zeros((k, widest), np.complex128)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
 from apc.frame.discretize import UNIT
-from apc.regions.eigenpairs import Family, Pairs, by_system
+from apc.regions.eigenpairs import ALIKE, Family, Pairs, by_system
 
 Floats = NDArray[np.float64]
 # Complex, as they come out of numpy, which forgets of how many digits.
@@ -48,9 +48,6 @@ TWINS = 1e-13
 
 # A peak this high decides: whether another is higher makes no difference.
 BEYOND = 1.05
-
-# Heights alike to this, relatively, are one: rounding tells them apart.
-ALIKE = 1e-11
 
 # Gains are told up to this: a resonance that doesn't die out has none.
 MOST_GAIN = 1e2

@@ -282,8 +282,10 @@ def region(
             try:
                 found = _surveyed(at_once, rectangle, False, cells, tolerance, told)
                 source = at_once
-            except ApcError:  # other motions are free where it starts elsewhere: point by point they are told
-                found = None
+            except ApcError as error:
+                if error.mistakes[0].code != "E905":
+                    raise
+                # Other motions are free where it starts elsewhere: point by point they are told.
         elif start is not None:
             found = trace_strips(system, axes, times[0], start, cells=cells, tolerance=tolerance, told=told)
         # Of one point at a time what hands can draw is known as the damping needed, which jumps.
