@@ -90,7 +90,7 @@ class BoxProof(Result):
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Looked:
     """What came out for a cell: nothing where it is proved, or else how much each parameter matters in it.
 
