@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 import apc
+from apc.analysis import analysis
 from apc.analysis.analysis import Analysis, prepare
 from apc.answer import judge
 from apc.compiler.compiled import CompiledSystem
@@ -28,6 +29,7 @@ KEEPING = (
     closing._known_wiring,
     rigid._before,
     spectrum._relative_to,
+    analysis._known_spectrum,
     eigenpairs._known_components,
     delays._pieces,
     delays.borders,

@@ -93,8 +93,8 @@ def pairs_by_discs(blocks: Sequence[tuple[Floats, Floats]]) -> list[tuple[Eigenp
     one solve: eigenvalues at zero by structure, which `pairs_apart` takes for a block, mostly have vectors of
     their own, and a bound hundreds of times as close.
 
-    Matrices are filled up with entries on the diagonal that are larger than any eigenvalue, always to the same
-    size: no bit of an answer hangs on what is solved beside it.
+    Matrices are filled up with entries on the diagonal that are larger than any eigenvalue, always to the
+    same size: no bit of an answer hangs on what is solved beside it.
     """
     sizes = [len(matrix) for matrix, _ in blocks]
     n = padded(sizes[0])
