@@ -5,11 +5,12 @@ from __future__ import annotations
 import pytest
 
 import apc
+from apc.analysis import analysis
 from apc.analysis.analysis import Analysis, prepare
 from apc.answer import judge
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen import closing, eigenpairs, modes, peers, rigid, spectrum
-from apc.frame import course, exchange, linearize
+from apc.frame import course, exchange, lift, linearize
 from apc.vary import bends, delays, evaluator, lags, many
 from apc.vary.margins import Margins, margins
 from tests.topologies import AVERAGE, compiled, replaced
@@ -19,12 +20,16 @@ KEEPING = (
     linearize._layout,
     linearize._output,
     linearize._of_many,
+    lift._known_steps,
+    lift._moving_parameters,
     course._swing,
+    course._known_rows,
     peers._known_group,
     modes._known_loops,
     closing._known_wiring,
     rigid._before,
     spectrum._relative_to,
+    analysis._known_spectrum,
     eigenpairs._known_components,
     delays._pieces,
     delays.borders,

@@ -1,19 +1,19 @@
 """All eigenvalues of many matrices at once, each with a bound, where those that decide stand apart.
 
 Takes: matrices (k, n, n), and bounds on what each entry may be off by.
-Gives: `Apart`, `pairs_apart`, `pairs_by_discs`.
+Gives: `Apart`, `pairs_apart`; `pairs_by_discs`, `padded`.
 Guarantees: the bounds hold for every matrix within the errors, whatever their conditioning; rounding in the
 bounds themselves is charged. Where two eigenvalues are too near, or vectors too alike, nothing is said.
 Does not: enclose clusters, or look for a better split of large from small (see `enclosure`).
 
-One call of LAPACK for all right vectors, and for `pairs_apart` one for all left ones; all else are products of
-small matrices. Its bounds are those of `enclosure` with every large eigenvalue a block of its own.
+One call of LAPACK for all right vectors, and for `pairs_apart` one for all left ones; all else are products
+of small matrices. Its bounds are those of `enclosure` with every large eigenvalue a block of its own.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -70,9 +70,12 @@ class Apart:
     sharpened: Callable[[], Floats]
 
 
-def pairs_by_discs(
-    matrix: Floats, error: Floats, beside: NDArray[np.bool_]
-) -> tuple[Eigenpairs, list[Apart | None]]:
+def padded(size: int) -> int:
+    """Return the size to which matrices are filled up, to be solved with others."""
+    return max(8, 4 * -(-size // 4))
+
+
+def pairs_by_discs(blocks: Sequence[tuple[Floats, Floats]]) -> list[tuple[Eigenpairs, Apart | None]]:
     """Return all eigenvalues of each matrix, in order, and the bounds that their vectors alone give.
 
     There are none where large ones don't stand apart, where the vectors are too alike, or where a closer look
@@ -80,10 +83,8 @@ def pairs_by_discs(
 
     Parameters
     ----------
-    matrix, error
-        As of `pairs_apart`.
-    beside
-        The states (k, n) that drive no other and are driven by none.
+    blocks
+        Real matrices (n, n) of one `padded` size, each with a bound on what its entries are off by.
 
     Notes
     -----
@@ -91,28 +92,47 @@ def pairs_by_discs(
     where one stands alone. Small ones whose discs touch are each somewhere in these. It asks for nothing but
     one solve: eigenvalues at zero by structure, which `pairs_apart` takes for a block, mostly have vectors of
     their own, and a bound hundreds of times as close.
+
+    Matrices are filled up with entries on the diagonal that are larger than any eigenvalue, always to the
+    same size: no bit of an answer hangs on what is solved beside it.
     """
-    k, n = matrix.shape[:2]
+    sizes = [len(matrix) for matrix, _ in blocks]
+    n = padded(sizes[0])
+    matrix, error = np.zeros((2, len(blocks), n, n))
+    for row, ((own, off), size) in enumerate(zip(blocks, sizes, strict=True)):
+        matrix[row, :size, :size], error[row, :size, :size] = own, off
+        if size < n:
+            beyond = 2.0 * size * float(np.abs(own).max())
+            matrix[row, range(size, n), range(size, n)] = beyond * np.arange(1, n - size + 1)
     with np.errstate(all="ignore"):
-        values, right = (one.astype(np.complex128) for one in np.linalg.eig(matrix))
+        values, right = np.linalg.eig(matrix)
         order = np.lexsort((-values.imag, values.real, -np.abs(values)))
-        every = np.arange(k)[:, None]
-        values = values[every, order]
-        right = right.swapaxes(1, 2)[every, order].swapaxes(1, 2)
+        every = np.arange(len(blocks))[:, None]
+        values = values[every, order].astype(np.complex128)
+        right = right.swapaxes(1, 2)[every, order].swapaxes(1, 2).astype(np.complex128)
         try:
             left = np.linalg.inv(right)
         except np.linalg.LinAlgError:
-            return Eigenpairs(values, right, right), [None] * k
-        return Eigenpairs(values, right, left), _discs(matrix, error, beside, Eigenpairs(values, right, left))
+            left, told = right, list[Apart | None]([None] * len(blocks))
+        else:
+            told = _discs(matrix, error, Eigenpairs(values, right, left), n - np.array(sizes))
+    return [
+        (
+            Eigenpairs(values[row, n - size :], right[row, :size, n - size :], left[row, n - size :, :size]),
+            apart,
+        )
+        for row, (size, apart) in enumerate(zip(sizes, told, strict=True))
+    ]
 
 
-def _discs(matrix: Floats, error: Floats, beside: NDArray[np.bool_], pairs: Eigenpairs) -> list[Apart | None]:
-    """Return the bounds of `pairs_by_discs`."""
+def _discs(matrix: Floats, error: Floats, pairs: Eigenpairs, others: NDArray[np.intp]) -> list[Apart | None]:
+    """Return the bounds of `pairs_by_discs`; the first so many eigenvalues of each are none of its own."""
     n = matrix.shape[-1]
     values, right, left = pairs.values, pairs.right, pairs.left
     charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
     size, weight, magnitudes = np.abs(right), np.abs(left), np.abs(values)
-    residual = matrix @ right - right * values[:, None]
+    residual = matrix @ right
+    residual -= right * values[:, None]
     doubt = (error + (n + EXTRA) * UNIT * np.abs(matrix)) @ size
     doubt += size * (EXTRA * UNIT * magnitudes)[:, None]
     doubt += charge * np.abs(residual)
@@ -126,36 +146,34 @@ def _discs(matrix: Floats, error: Floats, beside: NDArray[np.bool_], pairs: Eige
     over *= 1 + charge
     over += (wrong / (1 - defect)[:, None])[:, :, None] * over.max(axis=1, keepdims=True)
     total, first = over.sum(axis=2) * (1 + charge), _diagonal(over)
-    gap = np.abs(values[:, :, None] - values[:, None]) * (1 - 8 * UNIT) - total[:, :, None] - total[:, None]
+    gap = np.abs(values[:, :, None] - values[:, None]) * (1 - 8 * UNIT)
+    gap -= total[:, :, None]
+    gap -= total[:, None]
     _diagonal(gap)[...] = np.inf
-    known = (defect < 0.5) & (_diagonal(product).max(axis=1) < ALIKE)
-    if beside.any():
-        # The eigenvalue of such a state is its own entry, and no other's disc has to do with it.
-        itself = (size > 0) & beside[:, :, None]
-        known &= (itself.sum(axis=(1, 2)) == beside.sum(axis=1)) & (itself.any(axis=2) == beside).all(axis=1)
-        lone = itself.any(axis=1)
-        off = np.abs(values - (_diagonal(matrix)[:, None] @ itself)[:, 0])
-        total = np.where(lone, off + (_diagonal(error)[:, None] @ itself)[:, 0], total)
-        attainable = np.where(lone, total, attainable)
-        gap[lone[:, :, None] | lone[:, None]] = np.inf
-        over[lone[:, :, None] | lone[:, None]] = 0.0
-        first = total * lone + first
     alone = gap.min(axis=1) > 0
     share = (over / gap).max(axis=1) * (1 + 8 * UNIT)
     radius = np.where(alone & (share < 1), (first + share * (total - first)) * (1 + 8 * UNIT), total)
-    outer = (magnitudes + radius) * (1 + 4 * UNIT)
+    own = np.arange(n) >= others[:, None]
+    outer = (magnitudes + radius) * (1 + 4 * UNIT) * own
     # Those that touch are small; each is in one of their discs.
     reach = np.where(alone, 0.0, outer).max(axis=1, keepdims=True)
     near = np.where(alone, radius, magnitudes + reach) * (1 + 4 * UNIT)
-    least = np.where(alone, magnitudes - radius, 0.0).max(axis=1) * (1 - 4 * UNIT)
-    sharp = (near <= 2 * attainable) | (near < LEAST)
-    known &= (sharp & (alone | (magnitudes < SMALL))).all(axis=1)
+    least = np.where(alone & own, magnitudes - radius, 0.0).max(axis=1) * (1 - 4 * UNIT)
+    sharp = (near <= 2 * attainable) | (near < LEAST) | ~own
     high = outer.max(axis=1)
+    known = (defect < 0.5) & (_diagonal(product).max(axis=1) < ALIKE) & (high < np.inf)
+    known &= (sharp & (alone | (magnitudes < SMALL))).all(axis=1)
     answers: list[Apart | None] = [None] * len(matrix)
-    for one in np.flatnonzero(known & np.isfinite(high)).tolist():
-        told = near[one]
-        answers[one] = Apart(max(0.0, float(least[one])), float(high[one]), told, lambda told=told: told)
+    for one in np.flatnonzero(known).tolist():
+        told = near[one, others[one] :]
+        answers[one] = Apart(
+            max(0.0, float(least[one])), float(high[one]), told, functools.partial(_told, told)
+        )
     return answers
+
+
+def _told(near: Floats) -> Floats:
+    return near
 
 
 def pairs_apart(matrix: Floats, error: Floats) -> tuple[Eigenpairs, list[Apart | None]]:

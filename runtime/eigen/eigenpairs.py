@@ -42,8 +42,9 @@ LARGE = 100
 # again.
 KEPT, FEW_STATES = 128, 64
 
-# An eigenvalue that is found twice, from either side, is the same to this, relatively.
-SAME = 1e-9
+# An eigenvalue found twice, from either side, is the same to the first, relatively; below the second it ends
+# within the frame.
+SAME, NOTHING = 1e-9, 1e-12
 
 # How far from the predicted eigenvalue inverse iteration is shifted, so that the matrix it inverts stays
 # regular. Each step leaves a share of about SHIFT/gap of the other vectors.
@@ -118,7 +119,7 @@ def _nearest(values: Complexes, found: Complexes) -> NDArray[np.intp]:
     nearest = np.empty_like(order)
     np.put_along_axis(nearest, order, ranked, axis=-1)
     apart = np.abs(np.take_along_axis(found, nearest, axis=-1) - values)
-    if (apart <= SAME * np.abs(values)).all():
+    if (apart <= SAME * np.abs(values) + NOTHING).all():
         return nearest  # in order of magnitude, as mostly
     distances = np.abs(values[..., :, None] - found[..., None, :])
     nearest = np.argmin(distances, axis=-1)

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
-from apc.eigen.apart import GROWN, SMALL, Apart, pairs_apart, pairs_by_discs
+from apc.eigen.apart import GROWN, SMALL, Apart, padded, pairs_apart, pairs_by_discs
 from apc.eigen.eigenpairs import LARGE, Eigenpairs, components, eigenpairs
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance, norms, pseudospectral_radius
 from apc.eigen.relative import independent_places
@@ -92,8 +92,8 @@ def enclose_eigenvalues(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Encl
 
     Returns
     -------
-    The vectors are those of the part that the eigenvalue belongs to: where matrices have several, the products
-    of right and left ones are zero elsewhere.
+    The vectors are those of the part that the eigenvalue belongs to: the products of right and left ones are
+    zero elsewhere.
     """
     return enclose_all([(matrix, error, False)])[0]
 
@@ -131,38 +131,29 @@ def _cut(matrix: Matrix, error: Floats) -> _Parts:
 
 
 def _enclose_by_discs(cuts: Sequence[_Parts]) -> list[tuple[Eigenpairs, Enclosure] | None]:
-    """Enclose the eigenvalues of matrices of one part, and some states beside it, where discs tell enough."""
+    """Enclose the eigenvalues of matrices of one part, and some states beside it, where discs tell enough.
+
+    Parts of about one size go at once.
+    """
     found: list[tuple[Eigenpairs, Enclosure] | None] = [None] * len(cuts)
     alike: dict[int, list[int]] = {}
     for place, cut in enumerate(cuts):
-        n = len(cut.matrix)
-        if len(cut.several) == 1 and len(cut.alone) < n / 2 and n <= LARGE and np.isrealobj(cut.matrix):
-            alike.setdefault(n, []).append(place)
-    for n, places in alike.items():
-        alone = np.zeros((len(places), n), dtype=np.bool_)
-        matrix, error = (np.stack([part(cuts[place]) for place in places]) for part in (_matrix, _error))
-        for row, place in enumerate(places):
-            beside = cuts[place].alone
-            if len(beside):
-                alone[row, beside] = True
-                for one in (matrix, error):
-                    kept = one[row, beside, beside]
-                    one[row, beside] = one[row, :, beside] = 0.0
-                    one[row, beside, beside] = kept
-        pairs, told = pairs_by_discs(matrix, error, alone)
-        for row, (place, apart) in enumerate(zip(places, told, strict=True)):
-            if apart is not None and apart.high - apart.low <= SHARP * max(apart.low, 1.0):
-                own = Eigenpairs(pairs.values[row], pairs.right[row], pairs.left[row])
-                found[place] = own, Enclosure(apart.low, apart.high, apart.near, apart.sharpened)
+        if len(cut.several) == 1 and len(cut.several[0]) <= LARGE and np.isrealobj(cut.matrix):
+            alike.setdefault(padded(len(cut.several[0])), []).append(place)
+    for places in alike.values():
+        blocks = [
+            (cut.matrix[part[:, None], part], cut.error[part[:, None], part])
+            if len(cut.alone)
+            else (cut.matrix, cut.error)
+            for cut in (cuts[place] for place in places)
+            for part in cut.several
+        ]
+        for place, (pairs, apart) in zip(places, pairs_by_discs(blocks), strict=True):
+            if apart is None or not apart.high - apart.low <= SHARP * max(apart.low, 1.0):
+                continue
+            told = pairs, Enclosure(apart.low, apart.high, apart.near, apart.sharpened)
+            found[place] = told if not len(cuts[place].alone) else _joined(cuts[place], [told])
     return found
-
-
-def _matrix(cut: _Parts) -> Floats:
-    return cut.matrix
-
-
-def _error(cut: _Parts) -> Floats:
-    return cut.error
 
 
 def _joined(cut: _Parts, found: Sequence[tuple[Eigenpairs, Enclosure]]) -> tuple[Eigenpairs, Enclosure]:

@@ -374,7 +374,7 @@ def whole_vectors(
         corner = matrix[held[:, None], held] + across @ weights
         driven = across @ pairs.right
         shifted = (pairs.values * (1 + aside))[:, None, None] * np.eye(count) - corner
-        vectors[held] = np.einsum("kij,jk->ik", np.linalg.pinv(shifted, rcond=count * 2 * UNIT), driven)
+        vectors[held] = _least(shifted, driven)
         vectors[rest] += weights @ vectors[held]
         covectors[held] = -(pairs.left @ weights).T
     shares = np.abs(vectors * covectors)
@@ -382,6 +382,15 @@ def whole_vectors(
     sizes = np.abs(vectors)
     shares = np.where(total > 0, shares, sizes)
     return vectors, shares / shares.sum(axis=0)
+
+
+def _least(matrix: Complexes, right: Complexes) -> Complexes:
+    """Return the least solutions (n, k) of M x = r, of matrices (k, n, n) and right sides (n, k)."""
+    if len(right) == 1:
+        alone = matrix[:, 0, 0]
+        return np.where(alone == 0, 0.0, right / alone)
+    inverse = np.linalg.pinv(matrix, rcond=len(right) * 2 * UNIT)
+    return np.asarray(np.einsum("kij,jk->ik", inverse, right))
 
 
 def oscillation(magnitude: float, angle: float, frame_s: float) -> tuple[float, float]:

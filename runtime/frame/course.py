@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.frame.discretize import exponential, exponential_values
-from apc.frame.lift import follow
+from apc.frame.lift import Seen, follow
 from apc.frame.radius import FLOATS
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.site import LinearSite, every_matrix
@@ -89,7 +89,9 @@ def turns(
     found = np.full(len(values), np.nan)
     swing = _swing(site.a.tobytes(), len(site.a)) if site.a.size <= FEW_ENTRIES else _fastest(site.a)
     mirrored = _mirrored(start, heard, states, values)
-    real = (values.imag == 0) & ~start.imag.any(axis=0) & ~heard.imag.any(axis=0)
+    real = values.imag == 0
+    if real.all() or len(real) > FEW:  # else they are followed with complex ones
+        real &= ~start.imag.any(axis=0) & ~heard.imag.any(axis=0)
     left = np.flatnonzero(~mirrored)
     durations = [event.duration for event in schedule.events if isinstance(event, Propagate)]
     for doubled in range(1, DOUBLINGS + 1):
@@ -106,14 +108,13 @@ def turns(
         # Rows of powers are held for every mode, of each length of step one; the course for every point.
         chunk = MOST // max(sum(points.values()) * height, most)
         seen = np.zeros(len(values), dtype=np.bool_)
-        steps = _finest(site, schedule, points)
         # A real course is half the work of a complex one.
         alike = [left] if len(left) <= FEW else [left[real[left]], left[~real[left]]]
         for some in (one[first : first + chunk] for one in alike for first in range(0, len(one), chunk)):
             given: list[NDArray[Any]] = [start[:, some], heard[:, some]]
             if real[some].all():
                 given = [block.real for block in given]
-            course = _course(site, schedule, steps, points, given[0], given[1], states[some])
+            course = _course(site, schedule, points, given[0], given[1], states[some])
             angle, widest = turned_along(course)
             agreed = widest < CLOSE
             if not agreed.all():
@@ -231,7 +232,8 @@ def _courses(
         halves = rows.reshape(len(rows), 2, -1)
         return np.asarray(np.einsum("khn,nck->hck", matrix, halves).reshape(-1, rows.shape[-1]))
 
-    def watch(duration: int, moving: NDArray[Any]) -> None:
+    def watch(seen_now: Seen) -> None:
+        ((duration, moving),) = seen_now
         rows = fine[duration]
         if alike:
             seen = (rows.reshape(-1, rows.shape[-1]) @ moving).reshape(*rows.shape[:2], 2, -1)
@@ -260,23 +262,42 @@ def _power_of_two(least: float, doubled: int) -> int:
     return int(2 ** (np.ceil(np.log2(max(least, FEWEST))) + doubled))
 
 
-def _finest(site: LinearSite, schedule: Schedule, points: dict[int, int]) -> dict[int, Floats]:
-    """Return the steps from one of so many points of each step to the next, square, of one site (1, n, n)."""
-    generator = np.hstack([site.a, site.b])
-    entries, n_x = generator.tobytes() if generator.size <= FEW_ENTRIES else b"", len(generator)
-    finest = {}
+def _fine(
+    site: LinearSite, schedule: Schedule, points: dict[int, int], states: Integers
+) -> dict[int, tuple[Floats, Floats]]:
+    """Return `_rows_of_step` for each duration, of one site at so many points; of few entries remembered."""
+    generator = np.concatenate([site.a, site.b], axis=1)
+    n_x, n = generator.shape
+    few = n * max(n, len(states) * max(points.values(), default=0)) <= FEW_ENTRIES
+    entries, followed = generator.tobytes(), states.astype(np.int64).tobytes()
+    fine = {}
     for duration, number in points.items():
         seconds = float(duration * schedule.quantum) / number
-        finest[duration] = _known_step(entries, n_x, seconds) if entries else _square_step(generator, seconds)
-    return finest
+        if few:  # what only couplers change leaves them as they are
+            fine[duration] = _known_rows(entries, n_x, seconds, followed, number)
+        else:
+            fine[duration] = _rows_of_step(generator, seconds, states, number)
+    return fine
 
 
 @functools.lru_cache(maxsize=KEPT)
-def _known_step(entries: bytes, n_x: int, seconds: float) -> Floats:
-    """Return `_square_step` of few entries, row by row; what only couplers change is remembered."""
-    step = _square_step(np.frombuffer(entries).reshape(n_x, -1), seconds)
-    step.setflags(write=False)
-    return step
+def _known_rows(
+    entries: bytes, n_x: int, seconds: float, states: bytes, number: int
+) -> tuple[Floats, Floats]:
+    """Return `_rows_of_step`, the numbers row by row."""
+    found = _rows_of_step(
+        np.frombuffer(entries).reshape(n_x, -1), seconds, np.frombuffer(states, np.int64), number
+    )
+    for one in found:
+        one.flags.writeable = False
+    return found
+
+
+def _rows_of_step(generator: Floats, seconds: float, states: Integers, number: int) -> tuple[Floats, Floats]:
+    """Return what the states followed are at each point (k, number, n), and [F G] (n_x, n) to the last."""
+    own, which = np.unique(states, return_inverse=True)
+    rows, power = _followed(_square_step(generator, seconds), own, number)
+    return rows[which], power[0, : len(generator)].copy()
 
 
 def _square_step(generator: Floats, seconds: float) -> Floats:
@@ -316,7 +337,6 @@ def _followed(power: Floats, states: Integers, number: int) -> tuple[Floats, Flo
 def _course(
     site: LinearSite,
     schedule: Schedule,
-    finest: dict[int, Floats],
     points: dict[int, int],
     start: Floats | Complexes,
     heard: Floats | Complexes,
@@ -324,21 +344,28 @@ def _course(
 ) -> Floats | Complexes:
     """Return the states followed at so many points of each step, and the end (points, k)."""
     width = 2 if np.iscomplexobj(start) else 1
-    n_x, own = len(site.a), np.unique(states, return_inverse=True)
-    fine = {duration: _followed(step, own[0], points[duration]) for duration, step in finest.items()}
-    steps = {duration: power[0, :n_x] for duration, (_, power) in fine.items()}
+    fine = _fine(site, schedule, points, states)
+    steps = {duration: step for duration, (_, step) in fine.items()}
     parts: list[Floats] = []
 
     def columns(block: Floats | Complexes) -> Floats:
         # A complex column is two real ones: a real matrix times these is half the work.
         return np.ascontiguousarray(block).view(np.float64)
 
-    def watch(duration: int, moving: NDArray[Any]) -> None:
-        rows = fine[duration][0][own[1]]
-        parts.append(rows @ moving.reshape(len(moving), -1, width).swapaxes(0, 1))
+    def watch(seen: Seen) -> None:
+        # Each mode's rows times its columns, of every time: (modes, times, points of all steps, width).
+        every = [
+            (fine[duration][0] if moving.ndim == 2 else fine[duration][0][:, None])
+            @ np.moveaxis(moving.reshape(*moving.shape[:-1], -1, width), -2, 0)
+            for duration, moving in seen
+        ]
+        path = np.concatenate(every, axis=-2) if len(every) > 1 else every[0]
+        parts.append(path.reshape(len(states), -1, width))
 
     listened = columns(heard)
-    course = follow(site, schedule, steps, columns(start), lambda row: listened[row], watch=watch)
+    course = follow(
+        site, schedule, steps, columns(start), lambda row: listened[row], watch=watch, at_once=True
+    )
     while True:
         try:
             next(course)

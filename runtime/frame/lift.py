@@ -37,6 +37,9 @@ from apc.frame.site import LinearSite, every_matrix
 
 Matrix = NDArray[Any]
 
+# Steps one after another, each with its duration in quanta and what moves as it begins.
+Seen = Sequence[tuple[int, Matrix]]
+
 # Packets that a peer sends or hears in a frame, each a row or column of the frame's map and of the loop's.
 MOST_PACKETS = 1000
 
@@ -302,6 +305,7 @@ def _play_again(
     at: _Moment,
     numbers: Arithmetic,
     received: Matrix | None,
+    watch: Callable[[Seen], None] | None = None,
 ) -> None:
     """Play events that come again and again: once, over what they need, and that as often as they come.
 
@@ -315,6 +319,8 @@ def _play_again(
         What all is of.
     received
         What is heard (n_r, columns); without it, the last columns, one a packet.
+    watch
+        As of `follow`, with `received`.
 
     Notes
     -----
@@ -347,7 +353,9 @@ def _play_again(
         else:
             once.value[named_at(value, 0)] = unit[..., place, :]
     body = schedule.events[again.first : again.first + again.length]
-    dict(playing.play(body, once, lambda row: unit[..., n + row, :]))
+    seen: list[tuple[int, Matrix]] = []
+    watching = playing if watch is None else replace(playing, watch=lambda one: seen.extend(_kept(one)))
+    dict(watching.play(body, once, lambda row: unit[..., n + row, :]))
     step = _over(once.moving[..., :n_x, :], [row_of(once, value, 1) for value in again.entering])
 
     def after(later: Matrix, earlier: Matrix) -> Matrix:
@@ -356,6 +364,10 @@ def _play_again(
         found[..., n_y:] = numbers.add(found[..., n_y:], later[..., n_y:])
         return found
 
+    y = _over(at.moving[..., :n_x, :], [row_of(at, value, 0) for value in needed])
+    if watch is not None and received is not None:
+        each = _each_time(step, y, received, again.count, numbers)
+        watch([(duration, numbers.multiply(moving, each)) for duration, moving in seen])
     whole, left = None, again.count
     while True:
         if left % 2:
@@ -365,7 +377,6 @@ def _play_again(
             break
         step = after(step, step)
     assert whole is not None
-    y = _over(at.moving[..., :n_x, :], [row_of(at, value, 0) for value in needed])
     found = numbers.multiply(whole[..., :n], y)
     if received is None:
         heard = found.shape[-1] - n_r
@@ -380,6 +391,34 @@ def _play_again(
             at.value[named_at(value, again.count)] = found[..., place, :]
 
 
+def _each_time(step: Matrix, y: Matrix, received: Matrix, count: int, numbers: Arithmetic) -> Matrix:
+    """Return what each of so many times needs, and all that is heard (count, n + n_r, columns).
+
+    Parameters
+    ----------
+    step
+        [T R] of one time (n_y, n + n_r).
+    y
+        What the first needs (n, columns).
+    received
+        All that is heard (n_r, columns).
+
+    Notes
+    -----
+    What the first few have, the next as many have after as many times: their map is squared each time.
+    """
+    each = np.concatenate([y, received])[None]
+    square = np.concatenate([step, np.eye(step.shape[1])[len(step) :]])
+    while len(each) < count:
+        each = np.concatenate([each, numbers.multiply(square, each[: count - len(each)])])
+        square = numbers.multiply(square, square)
+    return each
+
+
+def _kept(seen: Seen) -> Seen:
+    return [(duration, moving.copy()) for duration, moving in seen]
+
+
 def follow(
     site: LinearSite,
     schedule: Schedule,
@@ -388,7 +427,8 @@ def follow(
     hear: Callable[[int], Matrix | None],
     *,
     numbers: Arithmetic = FLOATS,
-    watch: Callable[[int, Matrix], None] | None = None,
+    watch: Callable[[Seen], None] | None = None,
+    at_once: bool = False,
 ) -> Generator[tuple[int, Matrix], None, Matrix]:
     """Follow a site, or many, through one frame, event by event, over numbers of any kind.
 
@@ -411,6 +451,9 @@ def follow(
     watch
         Is shown each step before it is made: its duration in quanta, and the continuous states above what the
         holds put out (n_x + n_u, columns). Without it, what comes again and again is played once.
+    at_once
+        Whether that is played once all the same, and shown step by step, each with what moves at every time
+        (times, n_x + n_u, columns); not of many.
 
     Yields
     ------
@@ -422,7 +465,7 @@ def follow(
     """
     playing = replace(_Playing.of(site, steps, start.dtype, numbers.multiply, watch), many=start.shape[:-2])
     at = playing.begin(schedule, start)
-    again = schedule.repeats if watch is None else None
+    again = schedule.repeats if watch is None or at_once else None
     if again is None:
         yield from playing.play(schedule.events, at, hear)
         return playing.end(schedule, at)
@@ -433,7 +476,7 @@ def follow(
         while (packet := hear(row)) is None:
             yield -1, at.nothing
         received[..., row, :] = packet
-    _play_again(playing, schedule, again, at, numbers, received)
+    _play_again(playing, schedule, again, at, numbers, received, watch)
     yield from playing.play(schedule.events[again.end :], at, hear)
     return playing.end(schedule, at)
 
@@ -462,7 +505,7 @@ class _Playing:
     many: tuple[int, ...]  # of how many sites
     number: Any
     multiply: Callable[[Matrix, Matrix], Matrix]
-    watch: Callable[[int, Matrix], None] | None
+    watch: Callable[[Seen], None] | None
 
     @classmethod
     def of(
@@ -471,7 +514,7 @@ class _Playing:
         steps: Mapping[int, Matrix],
         number: Any,
         multiply: Callable[[Matrix, Matrix], Matrix],
-        watch: Callable[[int, Matrix], None] | None = None,
+        watch: Callable[[Seen], None] | None = None,
     ) -> _Playing:
         sends = [_beside(send.x, send.u) for send in site.sends]
         ticks = [_beside(tick.x, tick.u, tick.m, tick.r) for tick in site.ticks]
@@ -518,7 +561,7 @@ class _Playing:
             match event:
                 case Propagate(duration):
                     if self.watch is not None:
-                        self.watch(duration, moving)
+                        self.watch([(duration, moving)])
                     moving[..., :n_x, :] = self.multiply(self.steps[duration][..., :n_x, :], moving)
                 case Act(hold, one):
                     moving[..., n_x + hold, :] = value.get(one, at.nothing)

@@ -89,7 +89,7 @@ def forced(system: CompiledSystem, told: Hearing, first: Fraction = Fraction(0))
                 group,
                 jacobians=found.jacobians,
                 site=found.site,
-                exact=found.exact,
+                exacting=found.exacting,
                 schedule=found.schedule,
                 lifting=found.lifting,
             )
