@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.regions.cells import INSIDE_RIM
-from apc.regions.eigenpairs import Deciding, Pairs, join
+from apc.regions.eigenpairs import Deciding, Pairs
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
