@@ -185,7 +185,7 @@ def test_a_scene_linearized_at_its_start_has_a_region_too() -> None:
 
 
 def test_systems_that_share_an_eigenvalue_have_one_boundary_as_right_as_any() -> None:
-    """The common motion and the difference of two peers decide together, and rounding who of them is larger."""
+    """One motion of all and one of some have the same eigenvalue; rounding tells which of them is larger."""
     text = (ROOT / "models" / "scenes" / "experiment-average.yaml").read_text(encoding="utf-8")
     system = apc.set_parameters(compiled(text), {"contact.half_width": "40 mm"})
     spans = ("contact.stiffness=100 N/m:5000 N/m", "coordination.stiffness=100 N/m:5000 N/m")
