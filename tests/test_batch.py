@@ -16,7 +16,7 @@ from apc.eigen.relative import relative
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.frame.schedule import ORDER
-from apc.vary.batch import BatchEvaluator, matrix_errors
+from apc.vary.batch import BatchEvaluator
 from apc.vary.evaluator import evaluator, reaches_time
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
@@ -95,7 +95,7 @@ def test_error_bounds_hold_the_true_matrices() -> None:
     family = evaluator(system, [Free(name) for name in NAMES])
     assert isinstance(family, BatchEvaluator)
     values = points(system, NAMES)
-    bounds = matrix_errors(family, values)
+    bounds = family.errors(values)
     found = family.matrices(values)
     for k, row in enumerate(values):
         for place, wiring in enumerate(family.wirings):

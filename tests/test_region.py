@@ -184,6 +184,20 @@ def test_a_scene_linearized_at_its_start_has_a_region_too() -> None:
         assert found.contains(x, y) == analyze(apply(system, overrides)).stable
 
 
+def test_systems_that_share_an_eigenvalue_have_one_boundary_as_right_as_any() -> None:
+    """One motion of all and one of some have the same eigenvalue; rounding tells which of them is larger."""
+    text = (ROOT / "models" / "scenes" / "experiment-average.yaml").read_text(encoding="utf-8")
+    system = apc.set_parameters(compiled(text), {"contact.half_width": "40 mm"})
+    spans = ("contact.stiffness=100 N/m:5000 N/m", "coordination.stiffness=100 N/m:5000 N/m")
+    found = region(system, parse_axes(system, *spans))
+    assert max(curve.error for curve in found.curves) <= regions.TOLERANCE
+    for curve in found.curves:
+        for x, y in curve.points[1::20].tolist():
+            overrides = [Override(axis.free, Fraction(v)) for axis, v in ((found.x, x), (found.y, y))]
+            one = analyze(apply(system, overrides))
+            assert abs(one.spectral_radius - 1) <= 1e-8  # a part in 10⁹ of a coordinate moves it by less
+
+
 def test_where_a_scene_starts_its_region_is_followed_with_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     surveyed = regions._surveyed

@@ -7,7 +7,7 @@ import pytest
 
 from apc.frame.names import Free
 from apc.regions.surrogate import ChebyshevFamily, DirectFamily, Rectangle, resolve_family
-from apc.vary.batch import matrix_errors
+from apc.vary.batch import BatchEvaluator
 from apc.vary.evaluator import PointEvaluator, evaluator
 from tests.topologies import AVERAGE, compiled
 
@@ -17,7 +17,8 @@ FREE = (Free("contact.stiffness"), Free("coordination.stiffness"))
 
 def both() -> tuple[ChebyshevFamily, DirectFamily]:
     source = evaluator(compiled(AVERAGE), FREE)
-    family = resolve_family(source, RECTANGLE, lambda values: matrix_errors(source, values))
+    assert isinstance(source, BatchEvaluator)
+    family = resolve_family(source, RECTANGLE, source.errors)
     assert isinstance(family, ChebyshevFamily)
     return family, DirectFamily(source, RECTANGLE, family.sizes, family.errors)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.regions.cells import INSIDE_RIM
-from apc.regions.eigenpairs import Deciding, Pairs, join
+from apc.regions.eigenpairs import Deciding, Pairs
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -149,8 +149,8 @@ def polish(
     along
         Directions to stay on (k, 2); left out, each point moves down its gradient.
     """
-    found, parts = np.full(points.shape, np.nan), [guess.at(slice(0))]
-    rest, order = np.arange(len(points)), np.arange(0)
+    found, rest = np.full(points.shape, np.nan), np.arange(len(points))
+    whole = guess
     for _ in range(MOST_STEPS):
         guess = deciding.follow(points, guess)
         way = guess.gradient if along is None else along
@@ -160,12 +160,13 @@ def polish(
         points, guess = points + step, moved(guess, step)
         done = size <= SHORT
         found[rest[done]] = points[done]
-        ended = done | ~(size <= 1)
-        if not ended.any():
-            continue
-        order, parts = np.concatenate([order, rest[ended]]), [*parts, guess.at(ended)]
-        rest, points, guess = rest[~ended], points[~ended], guess.at(~ended)
-        along = along if along is None else along[~ended]
-        if not len(rest):
+        if len(rest) == len(found):
+            whole = guess
+        else:
+            _put(whole, rest, guess)
+        left = ~done & (size <= 1)
+        if not left.any():
             break
-    return found, join([*parts, guess]).at(np.argsort(np.concatenate([order, rest])))
+        rest, points, guess = rest[left], points[left], guess.at(left)
+        along = along if along is None else along[left]
+    return found, whole

@@ -135,7 +135,7 @@ def through_four(
     a, b
         The ends (k, 2) of the interval looked at.
     share
-        How far along the chord, 0 to 1: (m,), the same for all.
+        How far along the chord, 0 to 1: (k, m), or (m,) if the same for all.
 
     Returns
     -------
@@ -160,7 +160,8 @@ def through_four(
     gaps = u[:, :, None] - u[:, None, :] + np.eye(4)
     weight = 1 / gaps.prod(axis=2)  # of Lagrange's polynomials
     centre = (1 / gaps).sum(axis=2) - 1
-    at = np.asarray(share)[None, :, None] - u[:, None, :]  # (k, m, 4)
+    share = np.atleast_2d(share)[..., None]
+    at = share - u[:, None, :]  # (k, m, 4)
     one, two, three = (at[..., places] for places in _OTHERS)
     others = one * two * three
     sums = one * two + one * three + two * three  # of l_j' what `others` is of l_j
@@ -172,9 +173,7 @@ def through_four(
         v[:, None] * (tilt * square_slope - 2 * centre[:, None] * square)
         + slope[:, None] * (square + at * square_slope)
     ).sum(axis=2)
-    place = a[:, None] + length[:, None, None] * (
-        np.asarray(share)[None, :, None] * along[:, None] + value[..., None] * across[:, None]
-    )
+    place = a[:, None] + length[:, None, None] * (share * along[:, None] + value[..., None] * across[:, None])
     direction = along[:, None] + rate[..., None] * across[:, None]
     return place, direction / np.linalg.norm(direction, axis=2, keepdims=True)
 

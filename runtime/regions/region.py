@@ -11,7 +11,6 @@ Does not: draw, or write files (see `present`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
@@ -37,7 +36,7 @@ from apc.regions.strips import BRANCHES, Striped, trace_strips
 from apc.regions.surrogate import DirectFamily, Rectangle, rectangle_of, resolve_family
 from apc.result import Look, Result
 from apc.threads import single_threaded
-from apc.vary.batch import BatchEvaluator, matrix_errors
+from apc.vary.batch import BatchEvaluator
 from apc.vary.evaluator import (
     PointEvaluator,
     evaluator_of_many,
@@ -381,8 +380,6 @@ def _surveyed(
 
 def _family(source: Source, rectangle: Rectangle, *, timed: bool) -> Family:
     """Return the closed systems over the unit square."""
-    if isinstance(source, BatchEvaluator):
-        return resolve_family(source, rectangle, partial(matrix_errors, source))
     if isinstance(source, GrowthEvaluator | PortEvaluator):  # a series would take more points than it saves
         errors = tuple(one[0] for one in source.errors(rectangle.values(np.array([[0.5, 0.5]]))))
         return DirectFamily(source, rectangle, tuple(len(one) for one in errors), errors)

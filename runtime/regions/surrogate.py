@@ -15,6 +15,7 @@ loses a digit at most (Trefethen, Approximation Theory and Approximation Practic
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebder, chebvander
@@ -242,15 +243,20 @@ def _with_slopes(series: list[Floats], dropped: list[float]) -> tuple[NDArray[np
     found = []
     for one, least in zip(series, dropped, strict=True):
         kept = np.where(np.abs(one).max(axis=2, keepdims=True, initial=0.0) > least, one, 0.0)
-        every = np.zeros((3, *one.shape))
-        every[0], every[1, :-1], every[2, :, :-1] = (
-            kept,
-            *(chebder(kept, scl=2, axis=axis) for axis in (0, 1)),
-        )
-        found.append(every)
-    terms = np.argwhere(sum((one != 0).any(axis=(0, 3)) for one in found))
-    picked = (one[:, terms[:, 0], terms[:, 1]].swapaxes(0, 1).reshape(len(terms), -1) for one in found)
+        x, y = map(_derivative, kept.shape[:2])
+        over_x = (x @ kept.reshape(len(x), -1)).reshape(kept.shape)
+        found.append(np.stack([kept, over_x, y @ kept], axis=2))
+    terms = np.argwhere(sum((one != 0).any(axis=(2, 3)) for one in found))
+    picked = (one[terms[:, 0], terms[:, 1]].reshape(len(terms), -1) for one in found)
     return terms, tuple(picked)
+
+
+@lru_cache(maxsize=8)
+def _derivative(count: int) -> Floats:
+    """Return what turns so many coefficients into those of the derivative over the unit interval."""
+    found: Floats = np.vstack([chebder(np.eye(count), scl=2), np.zeros((1, count))])
+    found.flags.writeable = False  # it is kept
+    return found
 
 
 def _to_coefficients(nodes: Floats) -> Floats:

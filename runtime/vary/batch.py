@@ -1,8 +1,8 @@
 """The frame matrices of a system for many values of its parameters at once, with their derivatives.
 
 Takes: groups of peers whose sites are affine, the exchange between them, and the parameters that vary.
-Gives: `MatrixSource`, `Evaluator`; `BatchEvaluator`, `batch_evaluator`, `matrix_errors`; `lifted_here`,
-`relative_here`, `inverse_size`, `is_beyond`.
+Gives: `MatrixSource`, `Evaluator`; `BatchEvaluator`, `batch_evaluator`; `lifted_here`, `relative_here`,
+`inverse_size`, `is_beyond`.
 Guarantees: what is built once serves every value; rigid motions are taken out by their exact directions; a
 derivative is exact to rounding. A point whose matrices are not finite, or that has other rigid motions than
 its neighbours, comes out as NaN, never as a wrong number.
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Protocol, TypeVar
 
 import casadi
@@ -27,9 +28,8 @@ from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Closed, ClosedSystem, Loop, close, close_loop
 from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup
-from apc.eigen.relative import Relative, relative, relative_bounded, with_doubt
+from apc.eigen.relative import Relative, relative, with_doubt
 from apc.eigen.rigid import find_rigid_modes
-from apc.frame.batch_lift import lift_rows
 from apc.frame.discretize import UNIT, Step, exponential_rows, exponential_values
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
@@ -169,6 +169,11 @@ class BatchEvaluator:
         """Return each system's reduced frame matrices (k, n, n) at values (k, m)."""
         lifted = self.lifted(values)
         return tuple(reduced(wiring, closed_loop(wiring, lifted), len(values)) for wiring in self.wirings)
+
+    def errors(self, values: Floats) -> tuple[Floats, ...]:
+        """Return bounds (k, n, n) on the errors of the matrices at values (k, m), entry by entry."""
+        found = self.bounded(partial(self.vectors, values=values))
+        return tuple(np.broadcast_to(one.error, (len(values), *one.error.shape[1:])) for one in found)
 
     def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
         """Return each system's matrices (k, n, n) and their derivatives along directions (k, m)."""
@@ -404,31 +409,6 @@ def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Step
         if not (np.iscomplexobj(site.a) and (site.a.imag.any() or site.b.imag.any())):
             found[site_key(group)] = evaluator.steps(site, point, exponential_rows)
     return found
-
-
-def matrix_errors(evaluator: BatchEvaluator, values: Floats) -> tuple[Floats, ...]:
-    """Return bounds (k, n, n) on the rounding errors of each system's reduced matrices, entry by entry.
-
-    Parameters
-    ----------
-    evaluator
-        The evaluator; no time varies in it.
-    values
-        The points (k, m).
-
-    """
-    assert not evaluator.timed, "the errors of a step belong to its time"
-    bounded: dict[tuple[int, int], FrameMap] = {}
-    for group in evaluator.groups:
-        rows = linearize_rows(group.jacobians, evaluator.vectors(group, values))
-        bounded[site_key(group)] = lift_rows(group.jacobians, group.schedule, rows).bounded
-    found = []
-    for wiring in evaluator.wirings:
-        closed = _closed_bounded(wiring, bounded).matrix
-        matrix, error = value_of(closed), radius_of(closed)
-        _, own = relative_bounded(matrix, error, relative_here(wiring, matrix, error))
-        found.append(np.broadcast_to(own, (len(values), *own.shape[1:])))
-    return tuple(found)
 
 
 def _closed_bounded(wiring: Wiring, maps: Mapping[tuple[int, int], FrameMap]) -> Closed:
