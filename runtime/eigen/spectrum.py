@@ -185,14 +185,47 @@ class _Solved:
     @property
     def whole(self) -> Eigenpairs:
         """The vectors that the whole state follows from: where some is held, those of all that is left."""
-        if self.matrix is None or not len(self.at.held) or len(components(self.matrix != 0)) == 1:
+        if self.matrix is None or not len(self.at.held):
             return self.pairs
+        parts = components(self.matrix != 0)
+        several = [part for part in parts if len(part) > 1]
+        if len(parts) == 1:
+            return self.pairs
+        if len(several) == 1:
+            alone = np.array([part[0] for part in parts if len(part) == 1], dtype=np.intp)
+            if (found := _with_queues(self.matrix, self.pairs, several[0], alone)) is not None:
+                return found
         return pairs_to(self.matrix, self.pairs.values)
 
     @property
     def clear_of_one(self) -> bool:
         """Whether no eigenvalue can be 1."""
         return bool((np.abs(self.pairs.values - 1) > self.bounds.near).all())
+
+
+def _with_queues(matrix: Floats, pairs: Eigenpairs, part: Integers, alone: Integers) -> Eigenpairs | None:
+    """Return vectors of a whole matrix, given those of a part and of states that keep what it was.
+
+    None where these do more than that, or the vectors don't follow.
+    """
+    driven = matrix[alone[:, None], part]
+    if matrix[:, alone].any():
+        return None
+    own = pairs.right[alone].any(axis=0)
+    late, rest = np.flatnonzero(own), np.flatnonzero(~own)
+    right, left = pairs.right.copy(), pairs.left.copy()
+    try:
+        # λ x_a = M_ap x_p of the part's; w_p M_pp + w_a M_ap = 0 of theirs.
+        right[alone[:, None], rest] = driven @ right[part[:, None], rest] / pairs.values[rest]
+        late_left = left[late[:, None], alone] @ driven
+        left[late[:, None], part] = -np.linalg.solve(matrix[part[:, None], part].T, late_left.T).T
+    except np.linalg.LinAlgError:
+        return None
+    return (
+        Eigenpairs(pairs.values, right, left)
+        if np.isfinite(right).all() and np.isfinite(left).all()
+        else None
+    )
 
 
 def _tied(system: ClosedSystem) -> int:

@@ -115,10 +115,11 @@ def turns(
             if real[some].all():
                 given = [block.real for block in given]
             course = _course(site, schedule, points, given[0], given[1], states[some])
-            angle, widest = turned_along(course)
+            phases = _phases(course)
+            angle, widest = _turned(phases)
             agreed = widest < CLOSE
             if not agreed.all():
-                agreed |= np.abs(angle - turned_along(course[::2])[0]) < OFF  # half as finely
+                agreed |= np.abs(angle - _turned(phases[::2])[0]) < OFF  # half as finely
             found[some[agreed]] = _of_eigenvalue(angle[agreed], values[some[agreed]])
             seen[some[agreed]] = True
         left = left[~seen[left]]
@@ -141,7 +142,7 @@ def _mirrored(start: Complexes, heard: Complexes, states: Integers, values: Comp
     """Say which modes (k,) are the one before seen in a mirror: its conjugate."""
     found = np.zeros(len(values), dtype=np.bool_)
     found[1:] = (values[:-1].imag > 0) & (values[1:] == values[:-1].conj()) & (states[1:] == states[:-1])
-    for block in (start, heard):
+    for block in (start, heard) if found.any() else ():
         apart = np.abs(block[:, 1:] - block[:, :-1].conj()).max(axis=0, initial=0.0)
         found[1:] &= apart <= SAME * np.abs(block[:, 1:]).max(axis=0, initial=0.0)
     return found
@@ -381,14 +382,27 @@ def turned_along(course: Floats | Complexes) -> tuple[Floats, Floats]:
     A change of sign is half a turn forwards, whatever the sign of the zero beside it; a course that stays at
     0 has no angle.
     """
+    return _turned(_phases(course))
+
+
+def _phases(course: Floats | Complexes) -> NDArray[Any]:
+    """Return the directions of courses (points, k), of unit length; where one stays at 0, NaN."""
     size = np.abs(course)
     with np.errstate(invalid="ignore"):
         phases = course / size  # courses can grow or shrink out of floats' range
-    spoilt = np.flatnonzero(~(size.min(axis=0) > FADED * size.max(axis=0)))
-    if len(spoilt):
+    clear = size.min(axis=0) > FADED * size.max(axis=0)
+    if not clear.all():
+        spoilt = np.flatnonzero(~clear)
         phases[:, spoilt] = _directions(phases[:, spoilt], size[:, spoilt])
-    angles = np.angle(phases[1:] * phases[:-1].conj())
-    angles = np.where(angles <= HALF_TURN_BACK, angles + 2 * np.pi, angles)
+    return phases
+
+
+def _turned(phases: NDArray[Any]) -> tuple[Floats, Floats]:
+    """Return `turned_along` of directions (points, k)."""
+    turned = phases[1:] * phases[:-1].conj()
+    angles = np.arctan2(turned.imag, turned.real)
+    if (angles <= HALF_TURN_BACK).any():
+        angles = np.where(angles <= HALF_TURN_BACK, angles + 2 * np.pi, angles)
     return angles.sum(axis=0), np.abs(angles).max(axis=0, initial=0.0)
 
 
