@@ -160,18 +160,20 @@ def _joined(cut: _Parts, found: Sequence[tuple[Eigenpairs, Enclosure]]) -> tuple
     """Return the eigenvalues of a matrix, given those of its parts of more than one state."""
     n, alone = len(cut.matrix), cut.alone
     values, near = np.zeros(n, dtype=np.complex128), np.zeros(n)
-    right, left = np.zeros((2, n, n), dtype=np.complex128)
     values[alone], near[alone] = cut.matrix[alone, alone], cut.error[alone, alone]
-    right[alone, alone] = left[alone, alone] = 1.0
     size = np.abs(values[alone])
     low = max(0.0, float(((size - near[alone]) * (1 - 4 * UNIT)).max(initial=0.0)))
     high = float(((size + near[alone]) * (1 + 4 * UNIT)).max(initial=0.0))
     for part, (pairs, bounds) in zip(cut.several, found, strict=True):
-        block = part[:, None], part
-        values[part], right[block], left[block] = pairs.values, pairs.right, pairs.left
-        near[part] = bounds.near
+        values[part], near[part] = pairs.values, bounds.near
         low, high = float(np.maximum(low, bounds.low)), float(np.maximum(high, bounds.high))  # NaN stays
     order = np.lexsort((-values.imag, values.real, -np.abs(values)))
+    rank = np.empty_like(order)
+    rank[order] = np.arange(n)
+    right, left = np.zeros((2, n, n), dtype=np.complex128)
+    right[alone, rank[alone]] = left[rank[alone], alone] = 1.0
+    for part, (pairs, _) in zip(cut.several, found, strict=True):
+        right[part[:, None], rank[part]], left[rank[part][:, None], part] = pairs.right, pairs.left
 
     def telling() -> Floats:
         errors = near.copy()
@@ -179,7 +181,7 @@ def _joined(cut: _Parts, found: Sequence[tuple[Eigenpairs, Enclosure]]) -> tuple
             errors[part] = bounds.errors
         return errors[order]
 
-    return Eigenpairs(values, right, left).at(order), Enclosure(low, high, near[order], telling)
+    return Eigenpairs(values[order], right, left), Enclosure(low, high, near[order], telling)
 
 
 def _enclose_blocks(blocks: Sequence[tuple[Matrix, Floats]]) -> list[tuple[Eigenpairs, Enclosure]]:

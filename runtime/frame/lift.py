@@ -286,7 +286,7 @@ def compose(
         What these matrices are of.
     """
     n_z = len(site.kind.states) + len(schedule.carried)
-    unit = numbers.exact(np.eye(n_z + len(schedule.heard)))
+    unit = _unit(n_z + len(schedule.heard), numbers.exact)
     playing = _Playing.of(site, steps, unit.dtype, numbers.multiply)
     at = playing.begin(schedule, unit[..., :n_z, :])
     sent: dict[int, Matrix] = {}
@@ -304,6 +304,18 @@ def compose(
     z = playing.end(schedule, at)
     s = _over(z[..., :0, :], [sent[row] for row in range(len(schedule.sent))])
     return FrameMap(z[..., :n_z], z[..., n_z:], s[..., :n_z], s[..., n_z:])
+
+
+def _unit(size: int, exact: Callable[[Matrix], Matrix]) -> Matrix:
+    """Return the unit matrix of some kind of number; a small one is made once."""
+    return _known_unit(size, exact) if size <= FEW_STATES else exact(np.eye(size))
+
+
+@lru_cache(maxsize=KEPT)
+def _known_unit(size: int, exact: Callable[[Matrix], Matrix]) -> Matrix:
+    unit = exact(np.eye(size))
+    unit.flags.writeable = False
+    return unit
 
 
 def _play_again(
@@ -353,7 +365,7 @@ def _play_again(
         index = value.index + before[value.partition] + later * again.ticks[value.partition]
         return Value(value.partition, value.output, index)
 
-    unit = numbers.exact(np.eye(n + n_r))
+    unit = _unit(n + n_r, numbers.exact)
     once = playing.at_rest(unit[..., :n_x, :])
     for place, value in enumerate(needed, n_x):
         if value.partition == HELD:
@@ -376,27 +388,35 @@ def _play_again(
     if watch is not None and received is not None:
         each = _each_time(step, y, received, again.count, numbers)
         watch([(duration, numbers.multiply(moving, each)) for duration, moving in seen])
-    whole, left = None, again.count
-    while True:
-        if left % 2:
-            whole = step if whole is None else after(step, whole)
-        left //= 2
-        if not left:
-            break
-        step = after(step, step)
-    assert whole is not None
-    found = numbers.multiply(whole[..., :n], y)
-    if received is None:
-        heard = found.shape[-1] - n_r
-        found[..., heard:] = numbers.add(found[..., heard:], whole[..., n:])
+        found = numbers.multiply(step, each[-1])
     else:
-        found = numbers.add(found, numbers.multiply(whole[..., n:], received))
+        whole = _often(step, again.count, after)
+        found = numbers.multiply(whole[..., :n], y)
+        if received is None:
+            heard = found.shape[-1] - n_r
+            found[..., heard:] = numbers.add(found[..., heard:], whole[..., n:])
+        else:
+            found = numbers.add(found, numbers.multiply(whole[..., n:], received))
     at.moving[..., :n_x, :] = found[..., :n_x, :]
     for place, value in enumerate(again.entering, n_x):
         if value.partition == HELD:
             at.moving[..., n_x + value.output, :] = found[..., place, :]
         else:
             at.value[named_at(value, again.count)] = found[..., place, :]
+
+
+def _often(step: Matrix, count: int, after: Callable[[Matrix, Matrix], Matrix]) -> Matrix:
+    """Return the map of so many times, given that of one, and what makes one after another of two."""
+    whole = None
+    while True:
+        if count % 2:
+            whole = step if whole is None else after(step, whole)
+        count //= 2
+        if not count:
+            break
+        step = after(step, step)
+    assert whole is not None
+    return whole
 
 
 def _each_time(step: Matrix, y: Matrix, received: Matrix, count: int, numbers: Arithmetic) -> Matrix:
