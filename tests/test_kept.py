@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 import apc
-from apc.analysis import analysis
 from apc.analysis.analysis import Analysis, prepare
 from apc.answer import judge
 from apc.compiler.compiled import CompiledSystem
@@ -29,7 +28,7 @@ KEEPING = (
     closing._known_wiring,
     rigid._before,
     spectrum._relative_to,
-    analysis._known_spectrum,
+    lift._known_unit,
     eigenpairs._known_components,
     delays._pieces,
     delays.borders,

@@ -10,9 +10,8 @@ Does not: read files, or draw.
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from typing import Any, Unpack
@@ -52,9 +51,6 @@ from apc.result import Look, Result
 from apc.threads import single_threaded
 
 SETTLED = 0.02  # of where it began: a motion counts as settled
-
-# Spectra that are kept, and of how many states.
-KEPT, FEW_STATES = 16, 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,27 +299,7 @@ def _representatives(
 
 
 def _solve_closed(system: CompiledSystem, loops: Sequence[Loop], *, certify: bool) -> Spectrum:
-    """Solve loops by their matrices; what is asked again of a few states with the same numbers is kept."""
-    if sum(one.states for one in loops) > FEW_STATES or any(one.doubts for one in loops):
-        return _solve(system, loops, certify=certify)
-    known = _known_spectrum((certify, *(_identity(one) for one in loops)))
-    if not known:
-        known.append((_solve(system, loops, certify=certify), loops))  # which hold what the key knows
-    return known[0][0]
-
-
-def _identity(loop: Loop) -> tuple[Hashable, ...]:
-    """Return all of a loop that its spectrum follows from; its sites and its coupling by identity."""
-    return loop.name, loop.multiplicity, id(loop.coupling), *map(id, loop.sites)
-
-
-@functools.lru_cache(maxsize=KEPT)
-def _known_spectrum(key: tuple[Hashable, ...]) -> list[tuple[Spectrum, Sequence[Loop]]]:
-    """Return a place for the spectrum of these loops, and for what the key knows by identity."""
-    return []
-
-
-def _solve(system: CompiledSystem, loops: Sequence[Loop], *, certify: bool) -> Spectrum:
+    """Solve loops by their matrices."""
     closed = tuple(close_loop(loop) for loop in loops)
     if not all(np.isfinite(one.matrix).all() and np.isfinite(one.error).all() for one in closed):
         raise ApcError(Mistake("E806", Place(system.origin.topology), TOO_LARGE))

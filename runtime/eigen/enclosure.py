@@ -11,8 +11,8 @@ each as often as it is one, are those of the parts' own blocks. Peers in a direc
 Equal ones make one Jordan block of the whole, whose eigenvalues floats scatter far about; those of a part
 have nothing to do with the next part's.
 
-Parts of one size are enclosed at once where their eigenvalues stand apart (see `apart`), and one by one where
-that leaves the radius uncertain.
+What one solve tells of all comes first; where that says too little, parts of one size are enclosed at once if
+their eigenvalues stand apart (see `apart`), and one by one where that leaves the radius uncertain.
 """
 
 from __future__ import annotations
