@@ -220,6 +220,32 @@ def test_where_a_scene_starts_its_region_is_followed_with_slopes(monkeypatch: py
     assert asked[1:] == [BatchEvaluator, PointEvaluator]
 
 
+def test_where_a_scene_begins_apart_or_touching_both_are_followed_and_a_straight_line_parts_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A device begins 30 mm from the middle of the cube, and holds nothing of one that is narrower."""
+    alone = []
+    bounded = PointEvaluator._bounded
+    monkeypatch.setattr(
+        PointEvaluator, "_bounded", lambda self, value: alone.append(value) or bounded(self, value)
+    )
+    text = (ROOT / "models" / "scenes" / "experiment-average.yaml").read_text(encoding="utf-8")
+    system = compiled(text.partition("\n")[2])
+    spans = ("contact.half_width=25 mm:35 mm", "contact.stiffness=100 N/m:5000 N/m")
+    found = region(system, parse_axes(system, *spans), cells=6)
+    assert len(alone) <= 8  # the corners' errors; two sets of motions serve all other points
+    straight = [curve for curve in found.curves if not curve.smooth]
+    assert [len(found.curves), len(straight)] == [3, 1]
+    assert np.abs(straight[0].points[:, 0] - 0.03).max() <= 1e-12
+    assert max(curve.error for curve in found.curves if curve.smooth) <= regions.TOLERANCE
+    # Its ends are looked for in halves only: twelve times from a sixth of the range.
+    assert straight[0].distance <= 2.0**-12
+    random = np.random.default_rng(3)
+    for x, y in random.uniform([0.025, 100], [0.035, 5000], (12, 2)).tolist():
+        overrides = [Override(axis.free, Fraction(v)) for axis, v in ((found.x, x), (found.y, y))]
+        assert found.contains(x, y) == analyze(apply(system, overrides)).stable
+
+
 def _lost() -> None:
     raise ApcError(Mistake("E905", Place("region"), "some motion keeps its size"))
 

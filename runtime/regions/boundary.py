@@ -19,6 +19,7 @@ have log|λ_a| = log|λ_b| = 0.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -27,7 +28,16 @@ from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
 from apc.frame.discretize import UNIT
-from apc.regions.boundary_points import MOST_STEPS, SHORT, clear, cross, just_inside, moved, polish
+from apc.regions.boundary_points import (
+    MOST_STEPS,
+    MOST_TRIES,
+    SHORT,
+    clear,
+    cross,
+    just_inside,
+    moved,
+    polish,
+)
 from apc.regions.cells import Survey
 from apc.regions.curves import area_beside, between, fill, off_an_arc, stencils, through_four
 from apc.regions.eigenpairs import Deciding, Pairs, join
@@ -47,6 +57,9 @@ QUARTERS = np.array([0.25, 0.5, 0.75])
 # there, the polynomial through four some hundred times once it converges; little of that is counted on.
 GAIN_TWO = 8.0
 GAIN_FOUR = 10.0
+
+# A knot whose log|λ| is farther from 0 is at a jump: where other motions are free on either side.
+JUMP = 1e-6
 
 # Points nearer to each other than this are one.
 COINCIDENT = 1e-11
@@ -115,6 +128,11 @@ class _Knots:
         self.error = np.concatenate([self.error, np.zeros(len(key))])
         self.last = np.concatenate([self.last, np.zeros(len(key), dtype=bool)])
         return np.arange(before, len(self.key))
+
+    @property
+    def jumps(self) -> NDArray[np.bool_]:
+        """Say of each knot whether the boundary is there because the spectral radius jumps."""
+        return np.asarray(~(np.abs(self.pairs.growth) <= JUMP))
 
     def tangents(self, knots: Integers) -> Floats:
         """Return the unit tangents (k, 2) at some knots."""
@@ -196,11 +214,11 @@ def _divide(
     whether another eigenvalue has left the unit circle at the new middles.
     """
     same = _on_one_branch(knots, intervals)
-    lost = intervals[~same]
-    left = []
-    if len(lost):
-        cornered, lost = _corners(deciding, knots, lost)
-        left.append(cornered)
+    lost, left = intervals[~same], []
+    jumps = knots.jumps[lost].any(axis=1)
+    if not jumps.all():
+        cornered, others = _corners(deciding, knots, lost[~jumps])
+        left, lost = [cornered], np.concatenate([others, lost[jumps]])
     a, b = intervals[same].T
     if len(a):
         chord = knots.points[b] - knots.points[a]
@@ -223,7 +241,7 @@ def _divide(
         place, good = place.reshape(-1, 2)[beside], good.ravel()[beside]
         left += _halved(knots, halves, place, pairs.at(beside), good, tolerance, offset)
     if len(lost):
-        left.append(_search(deciding, knots, lost))
+        left.append(_search(deciding, knots, lost, tolerance, offset))
     return np.concatenate(left) if left else intervals[:0]
 
 
@@ -308,7 +326,9 @@ def _on_one_branch(knots: _Knots, intervals: Integers) -> NDArray[np.bool_]:
     moved = knots.pairs.value[b] - knots.pairs.value[a]
     # A complex pair may meet on the real axis: the slopes say nothing there, but the eigenvalue is near it.
     size = np.abs(moved) + np.abs(moves[0]) + np.abs(moves[1])
-    same: NDArray[np.bool_] = knots.pairs.system[a] == knots.pairs.system[b]
+    same: NDArray[np.bool_] = (knots.pairs.system[a] == knots.pairs.system[b]) & ~knots.jumps[intervals].any(
+        axis=1
+    )
     same &= np.abs(moved - (moves[0] + moves[1]) / 2) <= EXPLAINED * size + SHORT
     return same
 
@@ -366,10 +386,13 @@ def _corners(deciding: Deciding, knots: _Knots, intervals: Integers) -> tuple[In
     return beside, intervals[~good]
 
 
-def _search(deciding: Deciding, knots: _Knots, intervals: Integers) -> Integers:
+def _search(
+    deciding: Deciding, knots: _Knots, intervals: Integers, tolerance: float, offset: Floats
+) -> Integers:
     """Put a knot into intervals nothing is known about, where a line across their middle meets the boundary.
 
-    Returns the halves; an interval without such a crossing keeps the chord as its error.
+    Returns the halves that are not good enough yet; an interval without such a crossing keeps the chord as
+    its error. Along a jump the boundary is followed by straight lines: they are off by what the knot is.
     """
     a, b = intervals.T
     chord = knots.points[b] - knots.points[a]
@@ -386,8 +409,14 @@ def _search(deciding: Deciding, knots: _Knots, intervals: Integers) -> Integers:
     a, b = a[found], b[found]
     if not len(a):
         return intervals[:0]
-    place, pairs = cross(deciding, stable[found], unstable[found], ends[found])
+    tries = 1 if knots.jumps[np.stack([a, b])].any(axis=0).all() else MOST_TRIES
+    place, pairs = cross(deciding, stable[found], unstable[found], ends[found], tries=tries)
     new = knots.add(place, pairs, a, (knots.key[a] + knots.key[b]) / 2)
+    straight = knots.jumps[np.stack([a, new, b])].all(axis=0)
+    off = _norm(place - middle[found])
+    straight &= off <= FILLED / 2 * tolerance * relative_to(place, across[found], offset)
+    knots.error[a[straight]] = knots.error[new[straight]] = off[straight]
+    a, b, new = a[~straight], b[~straight], new[~straight]
     return np.concatenate([np.stack([a, new], axis=1), np.stack([new, b], axis=1)])
 
 
@@ -402,11 +431,18 @@ def _arcs(
         pieces = np.split(order, np.flatnonzero(knots.last[order]) + 1)
         if comes_back and len(pieces) > 1:  # the first crossing is no corner
             pieces = [np.concatenate([pieces[-1], pieces[0][1:]]), *pieces[1:-1]]
-        for piece in pieces:
+        for piece in itertools.chain.from_iterable(_between_jumps(knots, one) for one in pieces):
             kept = _without_copies(knots.points[piece])
             if len(kept) > 1:
                 arcs.append(_arc(deciding, knots, piece[kept], chain, tolerance, offset))
     return tuple(arcs)
+
+
+def _between_jumps(knots: _Knots, piece: Integers) -> list[Integers]:
+    """Return the parts of a curve that follow a mode, and those along jumps; each begins where one ends."""
+    jumps = knots.jumps[piece]
+    cuts = np.flatnonzero(np.diff(jumps[:-1] | jumps[1:])) + 1
+    return [piece[a : b + 1] for a, b in itertools.pairwise([0, *cuts.tolist(), len(piece) - 1])]
 
 
 def _without_copies(points: Floats) -> Integers:
@@ -422,6 +458,11 @@ def _arc(
     deciding: Deciding, knots: _Knots, piece: Integers, chain: int, tolerance: float, offset: Floats
 ) -> Arc:
     """Return some knots as an arc."""
+    jumps = knots.jumps[piece]
+    if jumps.any():
+        middle = piece[jumps][jumps.sum() // 2]
+        value = complex(knots.pairs.value[middle])
+        return _straight(knots.points[piece], knots.error[piece[:-1]], knots.points[middle], value, chain)
     pairs = knots.pairs.at(piece)
     system = int(pairs.system[0])
     steepness = np.linalg.norm(pairs.gradient, axis=1)
@@ -477,24 +518,28 @@ def trace_steps(
     for number, (chain, closed) in enumerate(zip(found.chains, found.closed, strict=True)):
         members = [*chain, chain[0]] if closed else list(chain)
         own = points[members]
-        chord = np.diff(own, axis=0)
-        length = np.linalg.norm(chord, axis=1)
-        direction = chord / np.maximum(length, RESOLUTION)[:, None]
         middle = members[len(members) // 2]  # its unstable side has the motion that grows
-        arcs.append(
-            Arc(
-                points=own,
-                tangents=np.concatenate([direction, direction[-1:]]),
-                errors=np.maximum(length, RESOLUTION),
-                knots=unstable[middle][None],
-                values=np.array([leading(unstable[middle])], np.complex128),
-                system=0,
-                rounding=RESOLUTION,
-                chain=number,
-                smooth=False,
-            )
-        )
+        value = leading(unstable[middle])
+        errors = np.maximum(_norm(np.diff(own, axis=0)), RESOLUTION)
+        arcs.append(_straight(own, errors, unstable[middle], value, number))
     return tuple(arcs)
+
+
+def _straight(points: Floats, errors: Floats, knot: Floats, value: complex, chain: int) -> Arc:
+    """Return an arc of straight lines through points (k, 2), with the eigenvalue beyond one of them."""
+    chord = np.diff(points, axis=0)
+    direction = chord / np.maximum(_norm(chord), RESOLUTION)[:, None]
+    return Arc(
+        points=points,
+        tangents=np.concatenate([direction, direction[-1:]]),
+        errors=errors,
+        knots=knot[None],
+        values=np.array([value], np.complex128),
+        system=0,
+        rounding=RESOLUTION,
+        chain=chain,
+        smooth=False,
+    )
 
 
 def stable_area(arcs: Sequence[Arc], found: Survey) -> tuple[float, float]:

@@ -26,14 +26,20 @@ SHORT = 1e-8
 # Newton's method either arrives within so many steps or is not near anything.
 MOST_STEPS = 8
 
-# A bracket is closed in on at most so many times, each time by half or more.
-MOST_BRACKETS = 50
+# A bracket is closed in on at most so many times, each time by half or more; the first few of them are tried
+# to be ended by Newton's method, which nothing leads to where the spectral radius jumps.
+MOST_BRACKETS, MOST_TRIES = 50, 8
+
+# A bracket this short, in unit coordinates, is one point.
+CLOSED = 1e-12
 
 # log|λ| of another eigenvalue at a point of the boundary above this means that the point isn't on it.
 OUTSIDE = 1e-9
 
 
-def cross(deciding: Deciding, stable: Floats, unstable: Floats, growth: Floats) -> tuple[Floats, Pairs]:
+def cross(
+    deciding: Deciding, stable: Floats, unstable: Floats, growth: Floats, *, tries: int = MOST_TRIES
+) -> tuple[Floats, Pairs]:
     """Return where the boundary lies on stretches from stable to unstable points, and who decides there.
 
     Parameters
@@ -44,12 +50,14 @@ def cross(deciding: Deciding, stable: Floats, unstable: Floats, growth: Floats) 
         The ends of the stretches (k, 2).
     growth
         The log of the spectral radius at both ends (k, 2).
+    tries
+        How often Newton's method is tried.
 
     Notes
     -----
     The eigenvalue that is largest at the unstable end is followed to where it enters the unit circle. If
     another one is still outside there, that point is the new unstable end; if Newton's method went nowhere,
-    the middle becomes an end.
+    the middle becomes an end. Where the radius jumps, the unstable end of the last bracket is what is found.
     """
     count = len(stable)
     low, high = np.zeros(count), np.ones(count)
@@ -58,31 +66,39 @@ def cross(deciding: Deciding, stable: Floats, unstable: Floats, growth: Floats) 
     pairs = deciding.leading(just_inside(unstable))
     guess = _quadratic_root(growth, (pairs.gradient * along).sum(axis=1))
     rest = np.arange(count)
-    for _ in range(MOST_BRACKETS):
-        start = stable[rest] + guess[rest, None] * along[rest]
-        place, found = polish(deciding, start, moved(pairs.at(rest), start - points[rest]), along[rest])
-        length = np.square(along[rest]).sum(axis=1)
-        reached = ((place - stable[rest]) * along[rest]).sum(axis=1) / length
-        arrived = np.isfinite(reached) & (reached >= low[rest]) & (reached <= high[rest])
+    for bracket in range(MOST_BRACKETS):
         middle = (low[rest] + high[rest]) / 2
-        looked_at = np.where(arrived, reached, middle)
+        looked_at, arrived = middle, np.zeros(len(rest), dtype=bool)
+        if bracket < tries:
+            start = stable[rest] + guess[rest, None] * along[rest]
+            place, found = polish(deciding, start, moved(pairs.at(rest), start - points[rest]), along[rest])
+            length = np.square(along[rest]).sum(axis=1)
+            reached = ((place - stable[rest]) * along[rest]).sum(axis=1) / length
+            arrived = np.isfinite(reached) & (reached >= low[rest]) & (reached <= high[rest])
+            looked_at = np.where(arrived, reached, middle)
         spots = stable[rest] + looked_at[:, None] * along[rest]
         top = deciding.log_magnitudes(deciding.family.matrices(just_inside(spots)), 1)[:, 0]
-        good = arrived & (top <= rounded_growth(spots, found.gradient))
+        good = arrived.copy()
+        good[arrived] = top[arrived] <= rounded_growth(spots[arrived], found.gradient[arrived])
         done = rest[good]
-        points[done] = place[good]
-        _put(pairs, done, found.at(good))
+        if len(done):
+            points[done] = place[good]
+            _put(pairs, done, found.at(good))
         out = ~good & (top > 0)
         low[rest[~good & ~out]] = looked_at[~good & ~out]
         high[rest[out]] = looked_at[out]
         again = rest[out]
-        if len(again):
+        if len(again) and bracket < tries - 1:
             points[again] = spots[out]
             _put(pairs, again, deciding.leading(just_inside(points[again])))
         rest = rest[~good]
-        if not len(rest):
-            break
         guess[rest] = (low[rest] + high[rest]) / 2
+        if (np.hypot(*along[rest].T) * (high - low)[rest] <= CLOSED).all():
+            break
+    if not len(rest):
+        return points, pairs
+    points[rest] = stable[rest] + high[rest, None] * along[rest]
+    _put(pairs, rest, deciding.leading(just_inside(points[rest])))
     return points, pairs
 
 

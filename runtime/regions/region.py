@@ -11,6 +11,7 @@ Does not: draw, or write files (see `present`).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
@@ -274,9 +275,9 @@ def region(
         if isinstance(source, GrowthEvaluator):
             times = []
         found: Striped | None = None
-        plain = not times and isinstance(source, PointEvaluator)
+        plain = source if not times and isinstance(source, PointEvaluator) else None
         start = prepare_at_start(system, prepared) if plain or len(times) == 1 else None
-        if start is not None and plain:
+        if start is not None and plain is not None:
             at_once = evaluator_of_many(system, free, PLACE, prepared=start)
             try:
                 found = _surveyed(at_once, rectangle, False, cells, tolerance, told)
@@ -284,7 +285,8 @@ def region(
             except ApcError as error:
                 if error.mistakes[0].code != "E905":
                     raise
-                # Other motions are free where it starts elsewhere: point by point they are told.
+                # Other motions are free where it starts elsewhere: they are told point by point.
+                source = replace(plain, start=start)
         elif start is not None:
             found = trace_strips(system, axes, times[0], start, cells=cells, tolerance=tolerance, told=told)
         # Of one point at a time what hands can draw is known as the damping needed, which jumps.

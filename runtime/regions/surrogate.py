@@ -195,8 +195,7 @@ def resolve_family(evaluator: Evaluator, rectangle: Rectangle, errors: Errors) -
                 errors=tuple(one + left_out * most for one, most in zip(doubts, largest, strict=True)),
             )
         counts = (counts[0] * (1 if x_done else 2), counts[1] * (1 if y_done else 2))
-    sampled = evaluator.matrices(corners[:1])
-    return DirectFamily(evaluator, rectangle, tuple(one.shape[1] for one in sampled), tuple(wrong))
+    return DirectFamily(evaluator, rectangle, tuple(map(len, wrong)), tuple(wrong))
 
 
 def _sample(

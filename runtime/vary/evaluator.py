@@ -33,11 +33,14 @@ from apc.frame.names import Free, is_named, parameter_of
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import free_rows, scope_of
 from apc.vary.batch import BatchEvaluator, batch_evaluator
+from apc.vary.wiring import wire
 
 if TYPE_CHECKING:
     from apc.vary.loops import LoopEvaluator
 
 Floats = NDArray[np.float64]
+Places = NDArray[np.intp]
+Truths = NDArray[np.bool_]
 
 # What each free parameter is moved by, relatively, where peers are told apart: no other number of a scene
 # agrees with such a value by accident. The next one is moved by a little more.
@@ -69,6 +72,9 @@ MANY_PACKETS = 24
 # Evaluators kept for the next question of the same parameters: another range of theirs, say.
 KEPT = 8
 
+# So many sets of motions that are free somewhere are told apart; points beyond go alone.
+MOST_ALIKE = 8
+
 # The blocks of a point that has no matrix.
 NOTHING = [(np.full((1, 1), np.nan), np.full((1, 1), np.nan))]
 
@@ -79,18 +85,26 @@ class PointEvaluator:
 
     All closed systems are blocks of one matrix, filled up with zeros where a point has fewer states than
     another. Derivatives are central differences, right to about 1e-10.
+
+    `start`, where there is one, is from `analysis.prepare_at_start`: points at which the same motions are
+    free are taken together then, by one of `alike`, with exact derivatives; the others go alone.
     """
 
     system: CompiledSystem
     free: tuple[Free, ...]
     prepared: Prepared
+    start: Prepared | None = None
+    alike: list[BatchEvaluator] = field(default_factory=list)
 
     def matrices(self, values: Floats) -> tuple[Floats, ...]:
         """Return the reduced frame matrices of all systems as blocks (k, n, n) at values (k, m).
 
         All of a matrix is NaN where there is none: below a parameter's minimum, say.
         """
-        return (_filled_up([self._blocks(value) for value in values]),)
+        which, listed = self._alike(values)
+        for row in np.flatnonzero(which < 0).tolist():
+            listed[row] = self._blocks(values[row])
+        return (_filled_up(listed),)
 
     def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
         """Return the matrices (k, n, n) and their derivatives along directions (k, m).
@@ -98,6 +112,20 @@ class PointEvaluator:
         At the end of what a parameter may be, or of where the same motions are free, the derivative is that
         of the parabola through two points further inside; NaN where there is none.
         """
+        which, _ = self._alike(values)
+        matrices: list[list[Floats]] = [[] for _ in values]
+        slopes: list[list[Floats]] = [[] for _ in values]
+        for place in range(-1, len(self.alike)):
+            rows = np.flatnonzero(which == place)
+            if len(rows):
+                those = self._differences if place < 0 else self.alike[place].slopes
+                for found, slope in those(values[rows], along[rows]):
+                    _put_in(matrices, rows, found)
+                    _put_in(slopes, rows, slope)
+        return ((_filled_up(matrices), _filled_up(slopes)),)
+
+    def _differences(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
+        """Return the matrices and derivatives of `slopes` of points that go alone."""
         scale = np.where(values == 0, 1.0, np.maximum(np.abs(values), 1e-6))  # 0 has none: its unit's
         step = DIFFERENCE * np.where(along != 0, scale, np.inf).min(axis=1) / np.abs(along).max(axis=1)
         moved = step[:, None] * along
@@ -163,6 +191,33 @@ class PointEvaluator:
             errors[place] = np.abs(near - far) / 3 + doubt + 8 * np.maximum(e.max(axis=0), error) / step
         return matrix, error, slopes, errors
 
+    def _alike(self, values: Floats) -> tuple[Places, list[list[Floats]]]:
+        """Return which of `alike` takes each point (k,), −1 where none does, and the matrices of each.
+
+        A point is taken where the motions left out are free and no other is: no eigenvalue is next to 1.
+        """
+        which = np.full(len(values), -1)
+        listed: list[list[Floats]] = [[] for _ in values]
+        if self.start is None:
+            return which, listed
+        still: Truths = np.asarray(np.isfinite(values).all(axis=1))
+        place = 0
+        while still.any() and place < MOST_ALIKE:
+            rows = np.flatnonzero(still)
+            if place == len(self.alike):
+                still[rows[0]] = False  # whatever comes of it, it is not tried again
+                try:
+                    self.alike.append(_around(self, values[rows[0]], self.start))
+                except ApcError:
+                    continue
+            blocks = self.alike[place].matrices(values[rows])
+            sure = np.all([_is_apart(one) for one in blocks], axis=0)
+            which[rows[sure]], still[rows[sure]] = place, False
+            for one in blocks:
+                _put_in(listed, rows[sure], one[sure])
+            place += 1
+        return which, listed
+
     def _blocks(self, value: Floats) -> list[Floats]:
         """Return each system's matrix in relative coordinates at a point (m,); NaN where there is none."""
         return [matrix for matrix, _ in self._bounded(value)]
@@ -185,6 +240,26 @@ class PointEvaluator:
                 reduced = _reduced(system, find_rigid_modes(system))
             found.append(reduced)
         return found
+
+
+def _put_in(listed: list[list[Floats]], rows: Places, blocks: Floats) -> None:
+    """Add the blocks (r, n, n) of some of the points to the lists of these."""
+    for row, matrix in zip(rows.tolist(), blocks, strict=True):
+        listed[row].append(matrix)
+
+
+def _around(source: PointEvaluator, value: Floats, start: Prepared) -> BatchEvaluator:
+    """Return what serves the points at which the same motions are free as at one (m,)."""
+    at = apply(source.system, overrides_at(source.system, source.free, value.tolist()))
+    found = batch_evaluator(at, source.free, *Asked.of(at, source.free, start).lifted_anywhere())
+    return replace(found, wirings=tuple(map(wire, found.closed)))  # none that serve other points, too
+
+
+def _is_apart(matrices: Floats) -> Truths:
+    """Say of each matrix (k, n, n) whether it is one, and no eigenvalue is next to 1."""
+    sure: Truths = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
+    values = np.linalg.eigvals(np.where(sure[:, None, None], matrices, 0.0))
+    return np.asarray(sure & (np.abs(values - 1).min(axis=1, initial=np.inf) >= DRIFT))
 
 
 def keeps_size(matrices: Sequence[Floats]) -> bool:
