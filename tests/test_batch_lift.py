@@ -11,7 +11,7 @@ import pytest
 
 from apc.frame import batch_lift
 from apc.frame.batch_lift import lift_rows
-from apc.frame.discretize import UNIT, discretize, exponential_rows
+from apc.frame.discretize import UNIT, discretize, exponential_rows, step_rows
 from apc.frame.jacobians import jacobians
 from apc.frame.lift import FrameMap, compose, lift
 from apc.frame.linearize import linearize, linearize_exact, linearize_rows, site_of_row
@@ -62,6 +62,25 @@ def test_exponentials_are_within_their_bound_of_ball_arithmetic(decay: float) ->
     off = step.roundings * UNIT * step.size[0]
     assert np.all(np.abs(step.matrix[0] - truth.matrix) <= off + UNIT * truth.size)
     assert np.all(off < 1e-10)
+
+
+def test_what_moves_by_itself_or_alike_in_all_sites_is_within_its_bound_of_ball_arithmetic() -> None:
+    """Sites of a mass of their own, an object that all have alike and that dies out fast, two held inputs.
+
+    The third site's mass hangs on the object, so that in no site they may be taken apart.
+    """
+    for coupled in (0.0, 3.0):
+        a, b = np.zeros((3, 4, 4)), np.zeros((3, 4, 2))
+        a[:, 0, 1] = a[:, 2, 3] = 1.0
+        a[:, 1, 1], a[:, 3, 3] = (-50.0, -70.0, -110.0), -8000.0
+        a[2, 1, 2] = coupled
+        b[:, 1, 0], b[:, 3, 0], b[:, 3, 1] = (-10.0, -9.0, -8.0), 1600.0, -1600.0
+        step = step_rows(a, b, 0.001)
+        for site in range(3):
+            [truth] = discretize(a[site], b[site], [Fraction(0.001)])
+            off = step.roundings * UNIT * step.size[site]
+            assert np.all(np.abs(step.matrix[site] - truth.matrix) <= off + UNIT * truth.size)
+            assert np.all(off < 1e-11 * np.maximum(1.0, np.abs(truth.matrix)))
 
 
 def _many_digits(matrix: Any) -> Any:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.discretize import UNIT, Step, exponential_rows
+from apc.frame.discretize import UNIT, Step, step_rows
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import (
     FrameMap,
@@ -81,12 +81,12 @@ def lift_sites(sites: LinearSite, schedule: Schedule) -> LiftedSite:
 
     Notes
     -----
-    As in `lift`, errors multiply along the composition of magnitudes; a step of `exponential_rows` counts
+    As in `lift`, errors multiply along the composition of magnitudes; a step of `step_rows` counts
     with the roundings it reports. Where stiffness and damping nearly cancel over many ticks that grows
     without measure, whatever the errors are: beyond `HOPELESS` they are estimated, see `_perturbed`.
     """
     steps = {
-        duration: exponential_rows(sites.a, sites.b, float(duration * schedule.quantum))
+        duration: step_rows(sites.a, sites.b, float(duration * schedule.quantum))
         for duration in step_durations(schedule)
     }
     frame, error = bounded(sites, schedule, steps)

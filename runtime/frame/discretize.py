@@ -1,7 +1,7 @@
 """What a linear system does in a while: the exact matrix exponential, inputs held.
 
 Takes: the matrices of dx/dt = A x + B u, exact, or of many sites at once in floats.
-Gives: `Step`, `discretize`, `moved_together`; in floats, `exponential`, `exponential_rows`,
+Gives: `Step`, `discretize`, `moved_together`; in floats, `exponential`, `exponential_rows`, `step_rows`,
 `exponential_values`; `step_balls`.
 Guarantees: every entry of `discretize` is right to the last digit but one, proved by ball arithmetic, whether
 a mode dies out in a nanosecond or never; where many states move together and it is off by no more than
@@ -220,6 +220,32 @@ def exponential(
     step = exponential_rows(a[None], b[None] / units[:, None], seconds, rounded=rounded)
     whole = units[:, None] / np.concatenate([units, np.ones(b.shape[1])])
     return Step(step.matrix[0], step.size[0], step.roundings), whole
+
+
+def step_rows(a: Floats, b: Floats, seconds: float) -> Step:
+    """Return `exponential_rows` of many sites, states that move together in any of them by themselves.
+
+    What all sites have in common, as copies of one object have, is exponentiated once; and how fast one
+    object's motion dies out does not make the series of another's longer.
+
+    Parameters
+    ----------
+    a, b
+        A (k, n_x, n_x) and B (k, n_x, n_u).
+    seconds
+        T.
+    """
+    sites, n_x, n_u = b.shape
+    matrix = np.zeros((sites, n_x, n_x + n_u))
+    size, roundings = np.full(matrix.shape, UNDERFLOW), 1.0
+    for states, inputs in _pieces(np.asarray(a.any(axis=0)), np.asarray(b.any(axis=0))):
+        own, pushed = a[:, states[:, None], states], b[:, states[:, None], inputs]
+        some = slice(1 if all((one == one[:1]).all() for one in (own, pushed)) else sites)
+        step = exponential_rows(own[some], pushed[some], seconds)
+        places = slice(None), states[:, None], np.concatenate([states, n_x + inputs])
+        matrix[places], size[places] = step.matrix, step.size
+        roundings = max(roundings, step.roundings)
+    return Step(matrix, size, roundings)
 
 
 def exponential_rows(

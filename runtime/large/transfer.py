@@ -34,9 +34,11 @@ Complexes = NDArray[np.complex128]
 # gains a bit a term, (inner/|ζ|)^k < 2^−k.
 INNER = 0.3
 
-# Terms of the block's power series: at twice `inner`, 2^−60 of the first is left. It is cut where what is
-# left is this share of a rounding.
-SERIES, CUT = 60, 2.0**-7
+# Terms of the block's power series: at twice `inner`, 2^−64 of the first is left. It is cut where what is
+# left is this share of a rounding. So many terms, two to this power, are had by one product: of matrices so
+# small, it takes no longer than one term.
+SERIES, CUT = 64, 2.0**-7
+DOUBLINGS = 2
 
 # What residues may be off by, relatively, before those that should be nothing count as larger.
 FINE = 1e-9
@@ -297,29 +299,59 @@ def _block_series(
         ends[2][:, :, large:],
         ends[3][:, large:],
     )
-    row_size, size, weight = np.abs(row), np.abs(column), np.abs(small)
-    terms = np.zeros((3, 1 + SERIES, row.shape[1], column.shape[2]))
+    lines, together = column.shape[2], 2**DOUBLINGS
+    terms = np.zeros((3, 1 + SERIES, row.shape[1], lines))
+    row_size = np.abs(row)
     height = np.linalg.norm(row_size, axis=2)[:, :, None]
-    first = height * np.linalg.norm(size, axis=1)[:, None, :]
-    for term in range(SERIES):
-        left = height * np.linalg.norm(size, axis=1)[:, None, :] * (block * radius**-term)[:, None, None]
+    first = height * np.linalg.norm(np.abs(column), axis=1)[:, None, :]
+    left = first * block[:, None, None]
+    column, doubt, power, power_doubt = _doubled(column, doubt, small, charge)
+    for term in range(0, SERIES, together):
         more = ~(left <= CUT * UNIT * first).all(axis=(1, 2))
         if not more.any():
             break
         if 2 * np.count_nonzero(more) < len(more):  # go on with the few sites that die out slowly
             terms[2, 0] += np.tensordot(counts[~more], left[~more], 1)
-            counts, block, height, first, left = (one[more] for one in (counts, block, height, first, left))
+            counts, block, height, first = (one[more] for one in (counts, block, height, first))
             row, row_size, row_doubt = row[more], row_size[more], row_doubt[more]
-            column, size, doubt = column[more], size[more], doubt[more]
-            small, weight = small[more], weight[more]
-        value, rounded = row @ column, doubt + charge * size
-        off = row_size @ rounded + row_doubt @ (size + doubt) + np.abs(value.imag)
-        for kind, part in enumerate((value.real, np.abs(value), off)):
-            terms[kind, term + 1] += np.tensordot(counts, part, 1)
-        column, doubt = small @ column, weight @ rounded
+            column, doubt = column[more], doubt[more]
+            power, power_doubt = power[more], power_doubt[more]
         size = np.abs(column)
+        value, rounded, most = row @ column, doubt + charge * size, size + doubt
+        off = row_size @ rounded + row_doubt @ most + np.abs(value.imag)
+        for kind, part in enumerate((value.real, np.abs(value), off)):
+            added = np.tensordot(counts, part, 1).reshape(-1, together, lines)
+            terms[kind, term + 1 : term + 1 + together] += added.swapaxes(0, 1)
+        column, doubt = power @ column, np.abs(power) @ rounded + power_doubt @ most
+        dying = np.linalg.norm(np.abs(column[:, :, :lines]), axis=1)[:, None, :]
+        left = height * dying * (block * radius ** -(term + together))[:, None, None]
     terms[2, 0] += np.tensordot(counts, left, 1)
     return terms
+
+
+def _doubled(
+    column: Complexes, doubt: Floats, small: Complexes, charge: float
+) -> tuple[Complexes, Floats, Complexes, Floats]:
+    """Return C, T C, T² C, … side by side, the next power of T, and what both may be off by.
+
+    Parameters
+    ----------
+    column, doubt
+        C (k, m, n_r), and what it may be off by.
+    small
+        T (k, m, m).
+    charge
+        What a product is off by, relative to that of the sizes.
+    """
+    power, power_doubt = small, np.zeros(small.shape)
+    for _ in range(DOUBLINGS):
+        size, weight = np.abs(column), np.abs(power)
+        more = weight @ (doubt + charge * size) + power_doubt @ (size + doubt)
+        column = np.concatenate([column, power @ column], axis=2)
+        doubt = np.concatenate([doubt, more], axis=2)
+        power_doubt = weight @ (power_doubt + charge * weight) + power_doubt @ (weight + power_doubt)
+        power = power @ power
+    return column, doubt, power, power_doubt
 
 
 # A pole nearer than the inverse of this is looked at by itself.

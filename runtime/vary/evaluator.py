@@ -454,10 +454,11 @@ def free_parameters(system: CompiledSystem) -> list[Free]:
     an expression, has no one value there and is left out.
     """
     listed = []
+    shaping = scope_of(system).needed(
+        [*(timing.name for timing in system.timings), *(group_count(group.name) for group in system.groups)]
+    )
     for one in system.parameters:
-        free = Free(one.name)
-        shapes = reaches_time(system, free) or reaches_count(system, free)
-        if one.formula is not None or not is_named(one.name) or shapes:
+        if one.formula is not None or not is_named(one.name) or one.name in shaping:
             continue
         several = {
             group.name: any(column.name == one.name for column in group.columns)
