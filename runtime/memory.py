@@ -12,6 +12,7 @@ What commands take beside the 60 to 120 MB of the program, at most and within a 
 | `analyze`: systems of n states | 500 n² at work, 200 n² kept of each | `analysis.plan` |
 | `analyze`: k unlike peers, a determinant of s rows and r heard | (200 k + 6,000) s r | `analysis.plan` |
 | `analyze`: k different peers of n states | 100 n² k | `large.populations` |
+| `feel`: n states together, frequencies in blocks | 30 MB, or 150 n² if that is more | `hands.response` |
 | `simulate`: numbers of a frame of all peers | 64 each | `simulation.simulation` |
 | `simulate` in Python, `--plot`: rows × signals | 16 each | `simulation.trajectory` |
 | `simulate --out`: a signal; a number of a block | 2,000 (Parquet 24,000); 150 | `present.recording` |

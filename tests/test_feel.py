@@ -162,6 +162,13 @@ def test_a_million_users_and_groups_are_as_right_as_all_peers_in_one() -> None:
     assert many.bound[0] < 1e-4
 
 
+def test_few_frequencies_at_once_are_answered_as_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    system = compiled(AVERAGE)
+    whole = repr(feel(system, [0.5, 5.0, 50.0]))  # some numbers of it are none, and equal nothing
+    monkeypatch.setattr("apc.hands.response.TOGETHER", 1)
+    assert repr(feel(system, [0.5, 5.0, 50.0])) == whole
+
+
 def test_multiples_of_the_frame_rate_are_as_their_neighbours() -> None:
     """The scene may rest anywhere: e^{sT} = 1 is a pole of its frames, and none of its responses."""
     system = compiled(AVERAGE)

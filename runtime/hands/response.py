@@ -46,6 +46,9 @@ Carried = tuple[Complex, Floats]
 # Less than any number of interest, in SI.
 LEAST = 1e-250
 
+# Entries of the matrices that are solved at once, each some hundred bytes at work.
+TOGETHER = 2**18
+
 # A series ends where its terms, of the largest |s τ|, are less than this.
 SERIES = 1e-18
 
@@ -445,9 +448,16 @@ def _steady(matrix: Matrix, at: Carried, driven: Carried) -> Carried:
     """
     real, radius = value_of(matrix), radius_of(matrix)
     unit = np.eye(len(real))
-    z, off = at
-    system = z[:, None, None] * unit - real
-    return solved(system, off[:, None, None] * unit + radius, driven)
+    block = max(1, TOGETHER // max(real.size, 1))
+
+    def some(first: int) -> Carried:
+        z, off, value, doubt = (one[first : first + block] for one in (*at, *driven))
+        system = z[:, None, None] * unit - real
+        return solved(system, off[:, None, None] * unit + radius, (value, doubt))
+
+    found = [some(first) for first in range(0, max(len(at[0]), 1), block)]
+    value, off = (np.concatenate([one[place] for one in found]) for place in range(2))
+    return value, off
 
 
 def solved(system: Complex, loose: Floats, driven: Carried) -> Carried:
