@@ -206,5 +206,5 @@ def _angles(
         start = vectors[own, offset : offset + len(group.lifted.z_names)]
         received = (here.heard[g] @ vectors[own, :, None])[:, :, 0]
         states = leads[own] - offset
-        found[own] = turns_of_many(here.sites[g].site, group.schedule, start, received, states, values[own])
+        found[own] = turns_of_many(here.sites[g], group.schedule, start, received, states, values[own])
     return found
