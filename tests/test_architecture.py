@@ -66,7 +66,7 @@ HOUSE = (
         discretize radius taylor exchange
         site jacobians start devices linearize
         schedule liveness hyperperiod ages scheduling
-        lift ports batch_lift course residues
+        lift nearby ports batch_lift course residues
         """,
     ),
     ("apc.network", "philox channel nominal timetable recorded"),

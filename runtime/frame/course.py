@@ -171,7 +171,7 @@ def turns_of_many(
     swing = _fastest(site.a)
     durations = {event.duration for event in schedule.events if isinstance(event, Propagate)}
     left = np.arange(len(values))
-    for doubled in (0, 1):
+    for doubled in (-1, 0, 1):  # half as finely first: nearly always that is close enough
         points = {
             duration: _power_of_two(A_TURN * swing * float(duration * schedule.quantum), doubled)
             for duration in durations
@@ -182,7 +182,7 @@ def turns_of_many(
         course = _courses(mine, schedule, points, start[left], heard[left], states[left])
         angle, widest = turned_along(course)
         agreed = widest < CLOSE
-        if doubled:
+        if doubled > 0:
             agreed |= np.abs(angle - turned_along(course[::2])[0]) < OFF
         found[left[agreed]] = _of_eigenvalue(angle[agreed], values[left[agreed]])
         left = left[~agreed]

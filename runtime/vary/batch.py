@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.frozen import dataclass
-from apc.eigen.closing import Closed, ClosedSystem, Loop, close, close_loop
+from apc.eigen.closing import Closed, ClosedSystem, Feedback, Loop, close, close_loop
 from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, relative, with_doubt
@@ -36,6 +36,7 @@ from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import FrameMap, LiftedSite, compose, composed_bounded, lift
 from apc.frame.linearize import linearize_exact, linearize_rows, of_rows, site_of_row, sites_of_rows
 from apc.frame.names import Free, value_now
+from apc.frame.nearby import NEARBY, alike, composed_nearby
 from apc.frame.parameters import free_rows
 from apc.frame.radius import RADII, radius_of, value_of
 from apc.frame.schedule import Propagate
@@ -53,6 +54,7 @@ from apc.vary.wiring import (
 
 Floats = NDArray[np.float64]
 Matrices = NDArray[Any]  # float64 or complex128
+Places = NDArray[np.intp]
 Wired = TypeVar("Wired", ClosedSystem, Loop)
 T = TypeVar("T")
 
@@ -97,15 +99,6 @@ class Evaluator(MatrixSource, Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lift:
-    """A group's sites at k points: their matrices, exponentials by quanta, and frames with their radii."""
-
-    site: LinearSite
-    steps: Mapping[int, Step]
-    frame: FrameMap
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Bounded:
     """A closed system at k points.
 
@@ -117,7 +110,7 @@ class Bounded:
     error: Floats  # (k, m, m)
     whole: Floats  # (k, n, n)
     heard: tuple[Floats, ...]  # (n_r, n) or (k, n_r, n), one a site
-    sites: tuple[Lift, ...]
+    sites: tuple[LinearSite, ...]
 
     def at(self, places: NDArray[np.intp]) -> Bounded:
         """Return some of the points, places in rising order."""
@@ -132,8 +125,20 @@ class Bounded:
             error=some(self.error),
             whole=some(self.whole),
             heard=tuple(map(some, self.heard)),
-            sites=tuple(replace(one, site=every_matrix(one.site, some)) for one in self.sites),
+            sites=tuple(every_matrix(one, some) for one in self.sites),
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lift:
+    """A group's sites at k points, and their frames: in floats, and with bounds, of groups of points or each.
+
+    Where each point has its own bound, `plain` is that as well.
+    """
+
+    site: LinearSite
+    plain: FrameMap
+    bounded: FrameMap
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -234,42 +239,63 @@ class BatchEvaluator:
                 found[site_key(group)] = self._lift(group, values)
         return found
 
-    def bounded(self, vectors: Callable[[PeerGroup], Floats]) -> tuple[Bounded, ...]:
+    def bounded(
+        self, vectors: Callable[[PeerGroup], Floats], starts: Places | None = None
+    ) -> tuple[Bounded, ...]:
         """Return each system at k points with bounds on all its errors; no time varies.
 
         Parameters
         ----------
         vectors
             Gives the parameters of a group at each point (k, n_p), or (1, n_p) where no value reaches it.
+        starts
+            Where the points of each of g groups start (g,) that are near each other and have one bound
+            (`frame.nearby`); without it, each point has its own.
         """
         assert not self.timed, "the errors of a step belong to its time"
-        lifts: dict[tuple[int, int], Lift] = {}
+        lifts: dict[tuple[int, int], _Lift] = {}
         for group in self.groups:
             if site_key(group) not in lifts:
-                lifts[site_key(group)] = self._lift_bounded(group, vectors(group))
-        maps = {key: one.frame for key, one in lifts.items()}
+                lifts[site_key(group)] = self._lift_bounded(group, vectors(group), starts)
+        bounds = {key: one.bounded for key, one in lifts.items()}
         found = []
         for wiring in self.wirings:
-            closed = _closed_bounded(wiring, maps)
-            whole = value_of(closed.matrix)
-            at, sound = relative_at(wiring, whole)
-            within = relative(closed.matrix, with_doubt(at), RADII)
-            matrix, off = value_of(within), radius_of(within)
-            sound = sound & np.isfinite(off.sum(axis=(1, 2)))
+            closed = _closed_bounded(wiring, bounds, starts)
+            if starts is None:
+                whole, heard = value_of(closed.matrix), tuple(map(value_of, closed.heard))
+                at, sound = relative_at(wiring, whole)
+                within = relative(closed.matrix, with_doubt(at), RADII)
+                matrix, error = value_of(within), radius_of(within)
+            else:
+                assert not wiring.moving, "directions that follow what varies are each point's own"
+                at = with_doubt(wiring.relative)
+                error = radius_of(relative(closed.matrix, replace(at, weights=alike(at.weights)), NEARBY))
+                maps = [lifts[site_key(group)].plain for group in wiring.system.sites]
+                plain = close(maps, [one.plain for one in wiring.feedback], wiring.system.layout)
+                whole, matrix, heard = plain.matrix, relative(plain.matrix, wiring.relative), plain.heard
+                _, sound = relative_at(wiring, whole)
+                if len(error) > 1:
+                    error = np.repeat(error, np.diff(starts, append=len(matrix)), axis=0)
+            sound = sound & np.isfinite(error.sum(axis=(1, 2)))
             if not sound.all():
                 matrix = np.where(sound[:, None, None], matrix, np.nan)
-            sites = tuple(lifts[site_key(group)] for group in wiring.system.sites)
-            found.append(Bounded(matrix, off, whole, tuple(map(value_of, closed.heard)), sites))
+            sites = tuple(lifts[site_key(group)].site for group in wiring.system.sites)
+            found.append(Bounded(matrix, error, whole, heard, sites))
         return tuple(found)
 
-    def _lift_bounded(self, group: PeerGroup, vectors: Floats) -> Lift:
+    def _lift_bounded(self, group: PeerGroup, vectors: Floats, starts: Places | None) -> _Lift:
         rows = linearize_rows(group.jacobians, vectors)
         site, steps, lost = self._placed(group, sites_of_rows(group.jacobians, rows))
         steps = steps or self.steps(site, np.zeros((1, 1)), exponential_rows)
         with np.errstate(all="ignore"):
-            frame = composed_bounded(site, group.schedule, steps)
-        _lose(frame, lost)
-        return Lift(site, steps, frame)
+            if starts is None:
+                frame = composed_bounded(site, group.schedule, steps)
+                plain = frame
+            else:
+                plain = compose(site, group.schedule, {one: step.matrix for one, step in steps.items()})
+                frame = composed_nearby(site, group.schedule, steps, starts)
+        _lose(plain, lost)
+        return _Lift(site, plain, frame)
 
     def _lift(self, group: PeerGroup, values: Matrices) -> FrameMap:
         if self.tangents:
@@ -411,11 +437,19 @@ def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Step
     return found
 
 
-def _closed_bounded(wiring: Wiring, maps: Mapping[tuple[int, int], FrameMap]) -> Closed:
-    """Return the closed matrices (k, 2, n, n) of a system with their radii, from such maps of its sites."""
+def _closed_bounded(
+    wiring: Wiring, maps: Mapping[tuple[int, int], FrameMap], starts: Places | None = None
+) -> Closed:
+    """Return the closed matrices (k, 2, n, n) of a system with their radii, from such maps of its sites.
+
+    With `starts`, those of groups of points (g, 3, n, n), see `frame.nearby`.
+    """
     system = wiring.system
     sites = [maps[site_key(group)] for group in system.sites]
-    return close(sites, wiring.feedback, system.layout, numbers=RADII)
+    if starts is None:
+        return close(sites, wiring.feedback, system.layout, numbers=RADII)
+    heard = [Feedback(alike(one.now), alike(one.before)) for one in wiring.feedback]
+    return close(sites, heard, system.layout, numbers=NEARBY)
 
 
 def inverse_size(matrices: Floats) -> Floats:

@@ -105,6 +105,7 @@ def _leading(
     vectors: list[tuple[Places, Complexes, Complexes]] = []
     blocks = []
     bounds = np.zeros((len(parts), count))  # how large a part may be that is not yet shown to be less
+    below = np.zeros((len(parts), count), dtype=np.bool_)  # and which are shown to be below 1
     for number, part in enumerate(parts):
         one = systems[part.system]
         scaling = part.scale / part.scale[:, None]
@@ -113,7 +114,13 @@ def _leading(
             for whole in (one.matrix, one.error)
         )
         blocks.append((matrix, off))
-        open_still = ~all_within(matrix, off, others) if number else np.ones(count, dtype=np.bool_)
+        open_still = np.ones(count, dtype=np.bool_)
+        if number:
+            # Where the whole grows it is asked first whether this does not: then 1 is no value of it either.
+            below[number] = all_within(matrix, off, np.minimum(others, 1.0))
+            open_still = ~below[number]
+            grown = np.flatnonzero(open_still & (others > 1))
+            open_still[grown] = ~all_within(matrix[grown], off[grown], others[grown])
         larger = np.flatnonzero(open_still)
         tried, doubt = _of(matrix, larger), _of(off, larger)
         guess, right, left = largest_pairs(tried)
@@ -133,7 +140,7 @@ def _leading(
         again = np.flatnonzero(certain & (leads != number) & ~(bounds[number] < others))
         certain[again] = all_within(matrix[again], off[again], others[again])
         # An eigenvalue of 1 may be another rigid motion.
-        grown = np.flatnonzero(certain & unstable & ~(alone & (leads == number)))
+        grown = np.flatnonzero(certain & unstable & ~below[number] & ~(alone & (leads == number)))
         certain[grown] = misses_one(matrix[grown], off[grown])
     frame_s = evaluator.wirings[0].system.frame_s
     for number, (part, (ahead, right, left)) in enumerate(zip(parts, vectors, strict=True)):
@@ -206,5 +213,5 @@ def _angles(
         start = vectors[own, offset : offset + len(group.lifted.z_names)]
         received = (here.heard[g] @ vectors[own, :, None])[:, :, 0]
         states = leads[own] - offset
-        found[own] = turns_of_many(here.sites[g].site, group.schedule, start, received, states, values[own])
+        found[own] = turns_of_many(here.sites[g], group.schedule, start, received, states, values[own])
     return found
