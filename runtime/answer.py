@@ -173,7 +173,7 @@ def _over_network(
     verdict = judge_network(system, prepared, certify=certify)
     if verdict is None:
         return None
-    if why := _too_large(system, prepared, found):
+    if why := _too_large(system, prepared, found) or _too_many_products(system):
         return NetworkAnswer(verdict, _not_told(0.0, why), Margins((), why))
     moved = network_sensitivities(system, prepared)
     return NetworkAnswer(verdict, moved, network_margins(system, prepared, nominal))
@@ -239,7 +239,7 @@ def sensitivities_of(system: CompiledSystem, prepared: Prepared, found: Analysis
     found
         Its analysis.
     """
-    if why := _too_large(system, prepared, found):
+    if why := _too_large(system, prepared, found) or _too_many_products(system):
         return _not_told(found.spectral_radius, why)
     try:
         told = sensitivities(system, prepared=prepared)
@@ -269,6 +269,11 @@ def _too_large(system: CompiledSystem, prepared: Prepared, found: Analysis) -> s
     packets = max(len(schedule.heard) for schedule in prepared.schedules)
     if packets > MOST_TICKS:
         return f"not looked for: {packets:,} packets heard in a frame take too long"
+    return ""
+
+
+def _too_many_products(system: CompiledSystem) -> str:
+    """Return why nothing is differentiated, "" unless many numbers meet many states."""
     free, states = len(varied(system)), max(len(kind.states) for kind in system.kinds)
     if free * states**3 > MOST_PRODUCTS:
         return f"not looked for: {free:,} numbers of {states:,} states take too long"

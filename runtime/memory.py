@@ -9,7 +9,7 @@ What commands take beside the 60 to 120 MB of the program, at most and within a 
 
 | what | bytes | told by |
 |---|---|---|
-| `analyze`: systems of n states | 500 n² at work, 200 n² kept of each | `analysis.plan` |
+| `analyze`: systems of n states, their margins | 500 n² at work, 200 n² kept of each | `analysis.plan` |
 | `analyze`: k unlike peers, a determinant of s rows and r heard | (200 k + 6,000) s r | `analysis.plan` |
 | `analyze`: k different peers of n states | 100 n² k | `large.populations` |
 | `feel`: n states together, frequencies in blocks | 30 MB, or 150 n² if that is more | `hands.response` |

@@ -104,7 +104,7 @@ HOUSE = (
         "apc.vary",
         """
         wiring batch slopes crossings plane bracket counting loops evaluator ports leading many bends marginal
-        delays lags search counts growth critical locus margins sensitivity over_network
+        delays lags search counts growth critical locus one_gain margins sensitivity over_network
         """,
     ),
     ("apc.sweeps", "grid quantities work store cluster sweep"),

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import re
 from fractions import Fraction
+from pathlib import Path
 
-from apc.analysis.analysis import analyze
+import pytest
+
+from apc.analysis.analysis import analyze, lifted_groups
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.pipeline import compile_topology
+from apc.eigen.modes import split
+from apc.eigen.spectrum import solve_spectrum
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
-from apc.vary.margins import margins
+from apc.vary.margins import Margin, margins
+from tests.bench.growing import row
 from tests.topologies import AVERAGE, compiled, replaced
 
 DEAD_RECKONING = """
@@ -111,3 +119,63 @@ def test_a_delay_beside_packets_that_are_late_by_many_frames_is_proved_without_t
     for side, stable in ((-1e-9, True), (1e-9, False)):
         value = Fraction(one.value * (1 + side))
         assert analyze(apply(system, [Override(Free("contact.delay"), value)])).stable is stable
+
+
+def _late(delay: str) -> str:
+    """Return two users in some haste: each frame is a tick, so that many packets are on their way."""
+    return replaced(
+        AVERAGE,
+        ("count: 3", "count: 2"),
+        ("network: 8 ms", "network: 1 ms"),
+        ("delay: 8 ms", f"delay: {delay}"),
+        ("stiffness: 500 N/m", "stiffness: 60 N/m"),
+    )
+
+
+def _holds(system: CompiledSystem, one: Margin) -> None:
+    """Check that bounds of floats decide otherwise on both sides of a margin, a few of its errors away."""
+    assert one.value is not None
+    assert one.error is not None
+    for side, stable in ((-1, True), (1, False)):
+        value = Fraction(one.value + side * max(10 * one.error, 1e-7 * one.value))
+        groups = lifted_groups(apply(system, [Override(Free(one.parameter), value)]))
+        assert solve_spectrum(split(*groups).systems, in_balls=False).stable is stable
+
+
+@pytest.mark.parametrize("delay", ["12 ms", "30 ms"])
+def test_two_users_some_frames_apart_have_margins(delay: str) -> None:
+    system = compiled(_late(delay))
+    found = margins(system)
+    assert found.note == ""
+    rows = {one.parameter: one for one in found.rows}
+    assert {"contact.stiffness", "coordination.stiffness", "contact.delay"} <= set(rows)
+    assert not any(one.note for one in rows.values())
+    for name in ("contact.stiffness", "coordination.stiffness", "contact.delay"):
+        _holds(system, rows[name])
+
+
+@pytest.mark.parametrize("masses", [30, 70, 160])
+def test_a_row_of_masses_has_margins_that_bounds_on_both_sides_confirm(masses: int, tmp_path: Path) -> None:
+    """Systems of 70, 150 and 330 states: looked at value by value, by response and bound, and estimated."""
+    (tmp_path / "scene.yaml").write_text(row(masses, tmp_path), encoding="utf-8")
+    system = compile_topology(tmp_path / "scene.yaml")
+    found = margins(system)
+    rows = {one.parameter: one for one in found.rows}
+    gains = ("contact.stiffness", "contact.damping", "coordination.stiffness", "coordination.damping")
+    for name in gains:
+        assert rows[name].estimated == (masses > 140)
+    for name in gains[::2]:
+        _holds(system, rows[name])
+    assert found.note == (f"estimated, as a bound takes long: {', '.join(gains)}" if masses > 140 else "")
+    assert bool(rows["lan.delay"].note) == (masses > 50)
+
+
+def test_what_is_no_gain_of_a_large_system_is_said_not_to_be_looked_for(tmp_path: Path) -> None:
+    text = row(70, tmp_path).replace(
+        "couplers:", "couplers:\n  seat: {type: SpringDamper, a: device, b: ground, stiffness: 3 N/m}"
+    )
+    (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
+    found = margins(compile_topology(tmp_path / "scene.yaml"))
+    one = next(one for one in found.rows if one.parameter == "seat.stiffness")
+    assert one.value is None
+    assert re.fullmatch(r"no gain at ticks, and 14\d states", one.note)

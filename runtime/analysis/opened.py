@@ -30,7 +30,7 @@ from apc.analysis.pushes import Push, push_of
 from apc.analysis.switches import bind, find_switches
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.frozen import dataclass
-from apc.eigen.closing import Feedback, Loop, StateLayout, close, close_loop, feedback_of, lay_out
+from apc.eigen.closing import Loop, StateLayout, close_loop, close_outside, lay_out
 from apc.eigen.modes import loops_at_right_angles
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.peers import peer_groups
@@ -218,7 +218,9 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
         return "with all contacts open, something drifts ever farther"
     names = [(*one.group.lifted.z_names, *(f"{part}[{tick}]" for part, tick in one.ticks)) for one in opened]
     layout = lay_out(names, [site.schedule for site in loop.sites])
-    closed = _closed(loop, opened, layout)
+    closed = close_outside(
+        loop, [one.map for one in opened], [len(one.ticks) for one in opened], layout, numbers=RADII
+    )
     outside = np.concatenate(
         [
             offset + one.states + np.arange(len(one.ticks))
@@ -265,21 +267,6 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
 def negated(matrix: Matrix) -> Matrix:
     """Return a matrix with its radii times −1."""
     return with_radius(-value_of(matrix), radius_of(matrix))
-
-
-def _closed(loop: Loop, opened: Sequence[Opened], layout: StateLayout) -> Matrix:
-    """Close a loop over its states, the y among them, and the forces from outside behind them."""
-    total, first = sum(len(one.ticks) for one in opened), 0
-    feedback = []
-    for one, plain in zip(opened, feedback_of(loop, layout), strict=True):
-        many, heard = len(one.ticks), plain.now.shape[1]
-        now = np.zeros((2, heard + many, plain.now.shape[2]))
-        before = np.zeros((2, heard + many, len(layout.names) + total))
-        now[:, :heard], before[:, :heard, : len(layout.names)] = plain.now, plain.before
-        before[0, heard:, len(layout.names) + first : len(layout.names) + first + many] = np.eye(many)
-        feedback.append(Feedback(now, before))
-        first += many
-    return close([one.map for one in opened], feedback, layout, numbers=RADII).matrix
 
 
 def _seen(

@@ -2,7 +2,8 @@
 
 Takes: groups of equal peers, and what each weighs the packets of each other by.
 Gives: `Loop`, `Coupling`, `without_packets`; `Packet`, `StateLayout`, `lay_out`; `ClosedSystem`,
-`close_loop`; `Feedback`, `bounded_weight`, `feedback_of`, `close`, `shift_packets`.
+`close_loop`; `Feedback`, `bounded_weight`, `feedback_of`, `close`, `close_outside`,
+`shift_packets`.
 Guarantees: the state holds, site by site, z and then the packets on their way, in order of row and age. The
 matrix of `close_loop` comes with a bound on its rounding error, entry by entry; `close` takes one system or
 many (k, …), real or complex.
@@ -344,6 +345,45 @@ def close(
         _put(matrix[..., place, :], place, one.p, one.q, r, numbers)
     shift_packets(matrix, layout, lambda packet: sent[..., starts[packet.site] + packet.row, :], numbers)
     return Closed(matrix, tuple(received), sent)
+
+
+def close_outside(
+    loop: Loop | ClosedSystem,
+    maps: Sequence[FrameMap],
+    ways: Sequence[int],
+    layout: StateLayout,
+    *,
+    numbers: Arithmetic = FLOATS,
+) -> Matrix:
+    """Close a loop into whose sites something comes from outside: over the state, and that behind it.
+
+    Parameters
+    ----------
+    loop
+        The loop.
+    maps
+        Those of its sites, what comes from outside the last that they hear.
+    ways
+        How much that is, of each site.
+    layout
+        The state's.
+    numbers
+        What the maps are of.
+    """
+    total, first = sum(ways), 0
+    feedback = []
+    for many, known in zip(ways, feedback_of(loop, layout), strict=True):
+        plain = known if numbers is RADII else known.plain
+        around = plain.now.shape[:-2]
+        now = np.zeros((*around, plain.now.shape[-2] + many, plain.now.shape[-1]))
+        before = np.zeros((*around, now.shape[-2], len(layout.names) + total))
+        heard = plain.now.shape[-2]
+        now[..., :heard, :], before[..., :heard, : len(layout.names)] = plain.now, plain.before
+        columns = len(layout.names) + first
+        before[..., heard:, columns : columns + many] = numbers.exact(np.eye(many))
+        feedback.append(Feedback(now, before))
+        first += many
+    return close(maps, feedback, layout, numbers=numbers).matrix
 
 
 def _put(rows: Matrix, z: slice, own: Matrix, of_heard: Matrix, heard: Matrix, numbers: Arithmetic) -> None:

@@ -104,7 +104,9 @@ class Spectrum:
     notes: tuple[str, ...]
 
 
-def solve_spectrum(systems: Sequence[ClosedSystem], *, certify: bool = False) -> Spectrum:
+def solve_spectrum(
+    systems: Sequence[ClosedSystem], *, certify: bool = False, in_balls: bool = True
+) -> Spectrum:
     """Compute the spectrum of a whole system given as independent closed systems.
 
     Parameters
@@ -114,6 +116,8 @@ def solve_spectrum(systems: Sequence[ClosedSystem], *, certify: bool = False) ->
     certify
         Prove the verdict of every closed system in ball arithmetic; else of those only that floats leave
         open.
+    in_balls
+        Whether these are worth their time; else they stay open.
 
     Notes
     -----
@@ -133,7 +137,9 @@ def solve_spectrum(systems: Sequence[ClosedSystem], *, certify: bool = False) ->
         if not (certify or drifting or _is_open(one, lowest)):
             continue
         reason = unprovable(system)
-        if not reason and (states := _tied(system)) > MOST_PROVED:
+        if not in_balls:
+            reason = "balls were not asked"
+        elif not reason and (states := _tied(system)) > MOST_PROVED:
             reason = f"it has {states} states, more than the {MOST_PROVED} that are proved"
         if not reason:
             solved[place] = _prove(system, one)

@@ -92,7 +92,9 @@ def bracket(root: Root, loop: ExactLoop, *, low: float, high: float) -> Bracket 
     return None if held is None else Bracket(*held, f"proved with {most_bits} bits")
 
 
-def bracket_in_floats(root: Root, systems: FloatSystems, *, low: float, high: float) -> Bracket | None:
+def bracket_in_floats(
+    root: Root, systems: FloatSystems, *, low: float, high: float, in_balls: bool = True
+) -> Bracket | None:
     """Hold a root between two values whose analyses differ, or None where their bounds don't tell.
 
     Parameters
@@ -103,15 +105,17 @@ def bracket_in_floats(root: Root, systems: FloatSystems, *, low: float, high: fl
         Those closed systems at a value of which one crosses, with bounds on their errors.
     low, high
         No bracket reaches beyond these.
+    in_balls
+        Whether balls are asked for a verdict that floats leave open.
     """
 
     @functools.cache
     def above(value: float) -> bool | None:
-        verdict = solve_spectrum(systems(value)).verdict
+        verdict = solve_spectrum(systems(value), in_balls=in_balls).verdict
         sides = {STABLE: True, STABLE_TRANSLATING: True, UNSTABLE: False}
         return (sides[verdict] == root.rising) if verdict in sides else None
 
-    error = solve_spectrum(systems(root.value)).spectral_radius_error
+    error = solve_spectrum(systems(root.value), in_balls=in_balls).spectral_radius_error
     if not np.isfinite(error):
         return None
     reach = FLOAT_REACH * error / abs(root.slope) if root.slope else SCATTER * _size(root)
@@ -137,7 +141,7 @@ def hold(root: Root, above: Above, low: float, high: float, half: float = 0.0) -
     half
         How far to either side of the root it starts at least.
     """
-    half = max(half, HALF * FIRST * _size(root))
+    half = least = max(half, HALF * FIRST * _size(root))
     for _ in range(TRIES):
         left, right = max(root.value - half, low), min(root.value + half, high)
         if above(left) is True and above(right) is False:
@@ -145,7 +149,7 @@ def hold(root: Root, above: Above, low: float, high: float, half: float = 0.0) -
         half *= WIDER
     else:
         return None
-    while right - left > HARDLY * 2 * FIRST * HALF * _size(root):
+    while right - left > HARDLY * 2 * least:
         middle = (left + right) / 2
         side = above(middle)
         if side is None or middle in (left, right):

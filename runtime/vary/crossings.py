@@ -1,7 +1,7 @@
 """Where the largest eigenvalue magnitude of a family of matrices crosses 1 as one number varies.
 
 Takes: a function that gives the matrices and their derivatives at many points of an interval, or of many.
-Gives: `Course`, `Courses`, `Root`, `Scan`, `scan`, `scan_lines`; `extremes`, `narrowest`.
+Gives: `Course`, `Courses`, `Root`, `Scan`, `scan`, `scan_lines`; `extremes`, `cubic`, `narrowest`.
 Guarantees: every cell between samples is divided until the eigenvalues and their derivatives at both ends
 speak against a crossing that the ends don't show, or down to the cell size; every change found is bracketed.
 Does not: prove anything (see `bracket`), or choose the interval.
@@ -377,7 +377,7 @@ def extremes(
     off = CAUTION * np.take_along_axis(miss, partner[:, :, None], axis=2)[:, :, 0]
     end, end_rise = (np.take_along_axis(one, partner, axis=1) for one in (end, end_rise))
     t = np.linspace(0.0, 1.0, PLACES)[:, None, None]
-    sizes = np.abs(_cubic(t, value, rise, end, end_rise))
+    sizes = np.abs(cubic(t, value, rise, end, end_rise))
     # Between two places the magnitude bends by an eighth of its second difference.
     off = off + np.abs(np.diff(sizes, 2, axis=0)).max(axis=0) / 8
     first, last = sizes[0], sizes[-1]
@@ -438,7 +438,7 @@ def _starts(samples: _Samples, cells: NDArray[np.intp]) -> Floats:
     partner = np.argmin(miss, axis=1)
     last, fall = values[end, partner], slopes[end, partner] * width
     t = np.linspace(0.0, 1.0, 8 * PLACES)[:, None]
-    sizes = np.abs(_cubic(t, value, rise, last, fall))
+    sizes = np.abs(cubic(t, value, rise, last, fall))
     inside = np.maximum(np.argmax(sizes < 1, axis=0), 1)
     before, after = sizes[inside - 1, line], sizes[inside, line]
     with np.errstate(all="ignore"):
@@ -448,8 +448,18 @@ def _starts(samples: _Samples, cells: NDArray[np.intp]) -> Floats:
     return found
 
 
-def _cubic(t: Floats, value: Complexes, rise: Complexes, end: Complexes, end_rise: Complexes) -> Complexes:
-    """Return the cubic through two values and slopes at shares t of the way."""
+def cubic(t: Floats, value: Complexes, rise: Complexes, end: Complexes, end_rise: Complexes) -> Complexes:
+    """Return the cubic through two values and slopes.
+
+    Parameters
+    ----------
+    t
+        Where: a share of the way.
+    value, rise
+        Where it begins, and its slope there times the whole way.
+    end, end_rise
+        The same of its end.
+    """
     found: Complexes = (1 + 2 * t) * (1 - t) ** 2 * value + t * (1 - t) ** 2 * rise
     return found + t * t * (3 - 2 * t) * end + t * t * (t - 1) * end_rise
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.eigenpairs import eigenpairs
+from apc.eigen.eigenpairs import LARGE, eigenpairs, pair_near
 from apc.eigen.relative import relative, relative_coordinates
 from apc.eigen.rigid import RigidModes, rigid_modes_here
 from apc.eigen.spectrum import angles_in_frame, whole_vectors
@@ -63,7 +63,7 @@ def marginal_motion(systems: Iterable[tuple[ClosedSystem, RigidModes]], eigenval
         reduced = relative(system.matrix, at)
         if not len(reduced):
             continue
-        pairs = eigenpairs(reduced)
+        pairs = eigenpairs(reduced) if len(reduced) <= LARGE else pair_near(reduced, eigenvalue)
         place = int(np.argmin(np.abs(pairs.values - eigenvalue)))
         off = float(np.abs(pairs.values[place] - eigenvalue))
         if best is not None and off >= best[0]:

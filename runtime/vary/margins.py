@@ -13,24 +13,38 @@ a delay by a hold or link that waits for it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, prepare, prepare_at_start
+from apc.analysis.analysis import Prepared, lifted_groups, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
+from apc.eigen.closing import close_loop
+from apc.eigen.eigenpairs import pair_near
+from apc.eigen.modes import arrange
+from apc.eigen.relative import relative_bounded
 from apc.eigen.spectrum import finite
 from apc.finite_equations import finite_equations
 from apc.frame.names import Free, named_times, parameter_of
 from apc.result import Result
 from apc.threads import single_threaded
-from apc.vary.batch import BatchEvaluator
-from apc.vary.crossings import scan_lines
+from apc.vary.batch import BatchEvaluator, lifted_here
+from apc.vary.crossings import Root, Scan, scan_lines
 from apc.vary.delays import delay_now
-from apc.vary.evaluator import PointEvaluator, evaluator, free_parameters, keeps_size, long_loops
+from apc.vary.evaluator import (
+    PointEvaluator,
+    evaluator,
+    free_parameters,
+    keeps_size,
+    long_loops,
+    mostly_packets,
+)
+from apc.vary.marginal import marginal_motion
 from apc.vary.search import (
+    ESTIMATE,
     Crossing,
     Line,
     courses_of,
@@ -39,6 +53,9 @@ from apc.vary.search import (
     reach,
     search_delay,
 )
+
+if TYPE_CHECKING:  # few scenes are so large
+    from apc.vary.one_gain import Gain, Response
 
 Floats = NDArray[np.float64]
 
@@ -53,8 +70,19 @@ GROWTH = 1e3
 # a tick, and up to so many times its present value; over more pieces than the most it takes too long.
 PIECES, FURTHER, MOST_PIECES = 4, 1.5, 64
 
-# Larger systems than this are left alone: hundreds of eigenproblems of theirs take more than a second.
-MOST_STATES = 60
+# The eigenvalues of larger systems are not looked at value by value: where a parameter is a gain, the loop's
+# response to it tells the first crossing (see `one_gain`). Balls of these take minutes, bounds of floats do.
+FEW_STATES = 60
+
+# Of a larger one nothing is looked at value by value: each takes a tenth of a second; and larger ones are
+# estimated, as a bound takes seconds.
+MOST_SCANNED, MOST_BOUNDED = 120, 300
+
+# How far beyond a crossing, relative to the way there, an analysis says whether it is one.
+BESIDE = 1e-3
+
+# An estimated error is so many times what those of a matrix make of it to first order.
+ESTIMATED = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +90,8 @@ class Margin:
     """How far a parameter may grow: to `value`, right to `error`, both in SI, `factor` times its present one.
 
     `value` and `error` are None when no boundary was found up to `scanned`; `factor` is None then, and for a
-    present value of 0. `note` says why it was not looked for, where it was not.
+    present value of 0. `note` says why it was not looked for, where it was not; `estimated` that the error is
+    an estimate and no bound.
     """
 
     parameter: str
@@ -75,6 +104,7 @@ class Margin:
     kind: str
     scanned: float
     note: str = ""
+    estimated: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,9 +136,10 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None) -> Marg
             return Margins((), found)
         if start is None:
             why = "how the scene moves hangs on what is heard at the start"
-            return Margins(tuple(found), f"delays were not varied: {why}")
+            told = [f"delays were not varied: {why}", *filter(None, [_estimated_in_words(found)])]
+            return Margins(tuple(found), "; ".join(told))
         delays = [_delay_margin(system, one, start) for one in _delays(system)]
-        return Margins((*found, *delays), "")
+        return Margins((*found, *delays), _estimated_in_words(found))
 
 
 def coupler_parameters(system: CompiledSystem) -> list[Free]:
@@ -140,8 +171,6 @@ def _parameter_margins(
     base = np.array([parameter_of(system, one).value for one in free])
     here = family.matrices(base[None])
     largest = max((one.shape[1] for one in here), default=0)
-    if largest > MOST_STATES:
-        return f"not looked for: {largest} states take too long (apc critical does)"
     if not all(np.isfinite(one).all() for one in here):
         return "not looked for: the present values have no frame matrix of their own"
     lines = [Line(family, base, column) for column in range(len(free))]
@@ -153,9 +182,90 @@ def _parameter_margins(
     found: list[Margin | None] = [None] * len(free)
     for which in dict.fromkeys(id(line.family) for line in lines):
         own = [place for place, line in enumerate(lines) if id(line.family) == which]
-        for place, one in zip(own, _along(system, [(free[i], lines[i]) for i in own]), strict=True):
+        ways = [(free[i], lines[i]) for i in own]
+        rows = _by_responses(system, ways) if largest > FEW_STATES else _along(system, ways)
+        for place, one in zip(own, rows, strict=True):
             found[place] = one
     return [one for one in found if one]
+
+
+def _by_responses(system: CompiledSystem, ways: Sequence[tuple[Free, Line]]) -> list[Margin | None]:
+    """Return the margins of parameters of one evaluator of large systems, None where nothing can grow."""
+    from apc.vary.one_gain import gains_of, response_of  # few scenes are so large
+
+    line = ways[0][1]
+    if not isinstance(line.family, BatchEvaluator):
+        return _in_matrices(system, ways)
+    matrices = [one[0] for one in line.family.matrices(line.base[None])]
+    responses = [response_of(one) for one in matrices]
+    found: list[Margin | None] = []
+    for free, line in ways:
+        assert isinstance(line.family, BatchEvaluator), "all are of one evaluator"
+        gains = gains_of(line.family, line.base, line.column)
+        known = [(gain, one) for gain, one in zip(gains or (), responses, strict=False) if one is not None]
+        if len(known) == len(matrices):
+            found.append(_gain_margin(system, free, line, known))
+        else:
+            found += _in_matrices(system, [(free, line)])
+    return found
+
+
+def _in_matrices(system: CompiledSystem, ways: Sequence[tuple[Free, Line]]) -> list[Margin | None]:
+    """Return the margins of parameters looked at value by value, or rows that say why they are not."""
+    line = ways[0][1]
+    states = max(len(one[0]) for one, _ in line.course(line.base[[line.column]]))
+    if states <= MOST_SCANNED:
+        return _along(system, ways)
+    why = f"no gain at ticks, and {states} states"
+    return [
+        _not_looked(free.label, parameter_of(system, free).unit, float(line.base[line.column]), why)
+        for free, line in ways
+    ]
+
+
+def _gain_margin(
+    system: CompiledSystem, free: Free, line: Line, gains: Sequence[tuple[Gain, Response]]
+) -> Margin | None:
+    """Return the margin of a parameter that acts as a gain, None where nothing can grow or depends on it."""
+    from apc.vary.one_gain import first_crossing
+
+    parameter, start = parameter_of(system, free), float(line.base[line.column])
+    fastest = max(float(np.abs(response.rates(gain)).max(initial=0.0)) for gain, response in gains)
+    if not fastest:
+        return None
+    scale = abs(start) or 1 / fastest
+    top = GROWTH * scale if parameter.maximum is None else min(GROWTH * scale, parameter.maximum)
+    if not top > start:
+        return None
+    root = first_crossing(gains, start, float(top))
+    if root is None:
+        return _margin(free.label, parameter.unit, start, None, float(top))
+    if len(gains[root.system][0].a) > MOST_BOUNDED:
+        crossing: Crossing | None = _estimated(root, line)
+    else:
+        beyond = root.value + BESIDE * (root.value - start)
+        sides = Scan(np.array([start, beyond]), np.array([True, False]), (root,), whole=True)
+        crossing = proved_crossing(root, line, sides, in_balls=False)
+    return _margin(free.label, parameter.unit, start, crossing, root.value)
+
+
+def _estimated(root: Root, line: Line) -> Crossing:
+    """Describe a crossing without a bound: by how much errors of the matrix move it, to first order."""
+    assert isinstance(line.family, BatchEvaluator), "what acts as a gain has equations"
+    wiring = line.family.wirings[root.system]
+    point = line.points(np.array([root.value]))[0].tolist()
+    closed = close_loop(lifted_here(line.family.with_sites([wiring.system], point))[0])
+    matrix, error = relative_bounded(closed.matrix, closed.error, wiring.relative)
+    pair = pair_near(matrix, root.eigenvalue)
+    doubt = ESTIMATED * float(pair.errors(error)[0]) + abs(abs(complex(pair.values[0])) - 1)
+    frequency = marginal_motion([(closed, wiring.rigid)], root.eigenvalue).frequency_hz
+    return Crossing(root.value, doubt / root.slope, "below", frequency, "crossing", ESTIMATE)
+
+
+def _estimated_in_words(rows: Sequence[Margin]) -> str:
+    """Return which margins have an estimated error."""
+    labels = [one.parameter for one in rows if one.estimated]
+    return f"estimated, as a bound takes long: {', '.join(labels)}" if labels else ""
 
 
 def _loop_margins(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) -> list[Margin] | str:
@@ -252,10 +362,18 @@ def _delay_margin(system: CompiledSystem, free: Free, prepared: Prepared) -> Mar
     end, count = delay_reach(system, free, now, pieces=PIECES, further=FURTHER)
     present = float(now)
     if count > MOST_PIECES:
-        note = f"{count} orders of events up to {float(end):.4g} s"
-        return Margin(free.name, "s", present, None, None, None, None, "", present, note)
-    found = search_delay(system, free, now, end, prepared, from_stable=True)
+        return _not_looked(free.name, "s", present, f"{count} orders of events up to {float(end):.4g} s")
+    loops = arrange(*lifted_groups(system, prepared=prepared)).loops
+    states = max((loop.states for loop in loops if not mostly_packets(loop)), default=0)
+    if states > MOST_SCANNED:
+        return _not_looked(free.name, "s", present, f"{states} states in each order of events")
+    few = states <= FEW_STATES
+    found = search_delay(system, free, now, end, prepared, from_stable=True, in_balls=few)
     return _margin(free.name, "s", present, found.edges[0] if found.edges else None, found.scanned[1])
+
+
+def _not_looked(name: str, unit: str, present: float, why: str) -> Margin:
+    return Margin(name, unit, present, None, None, None, None, "", present, why)
 
 
 def _margin(name: str, unit: str, present: float, crossing: Crossing | None, scanned: float) -> Margin:
@@ -272,4 +390,5 @@ def _margin(name: str, unit: str, present: float, crossing: Crossing | None, sca
         finite(crossing.frequency_hz),
         crossing.kind,
         scanned,
+        estimated=crossing.proof == ESTIMATE,
     )

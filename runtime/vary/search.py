@@ -85,6 +85,9 @@ PIECE_SAMPLES = 3
 # events that coincide there.
 BESIDE = Fraction(1, 10**6)
 
+# What is said of a crossing that no bound holds.
+ESTIMATE = "estimated in floats"
+
 _PLACE = Place("critical value")
 
 
@@ -305,8 +308,16 @@ def _search(
     return Search(tuple(edges), stable, scanned, found.whole, known, len(points), enters)
 
 
-def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing | None:
-    """Prove a crossing, if it can be proved, and describe it; None where both sides are proved alike."""
+def proved_crossing(root: Root, line: Line, found: Scan, *, in_balls: bool = True) -> Crossing | None:
+    """Prove a crossing, if it can be proved, and describe it; None where both sides are proved alike.
+
+    Parameters
+    ----------
+    root, line, found
+        The crossing, the line it is on, and the scan that found it.
+    in_balls
+        Whether balls are worth their time; else bounds of floats are.
+    """
     beside = low, high = _beside(root, found)
     if not root.slope:  # a defective cluster: its samples are scattered as well
         low, high = root.value - abs(root.value) / 2, root.value + abs(root.value) / 2
@@ -338,7 +349,9 @@ def proved_crossing(root: Root, line: Line, found: Scan) -> Crossing | None:
     def at(value: float) -> ClosedSystem:
         return close_loop(lifted_here([loop(value)[0]])[0])
 
-    return _bracketed(root, found, (low, high), loop, at, lambda value: family.closed_at(point(value)))
+    return _bracketed(
+        *(root, found, (low, high), loop, at, lambda value: family.closed_at(point(value))), in_balls=in_balls
+    )
 
 
 def _bracketed(
@@ -348,15 +361,17 @@ def _bracketed(
     loop: ExactLoop,
     at: Callable[[float], ClosedSystem],
     every: Callable[[float], Sequence[ClosedSystem]],
+    *,
+    in_balls: bool,
 ) -> Crossing | None:
     """Prove a crossing between two ends by balls or, where these don't tell, by the bounds of floats.
 
     `loop` gives what crosses at a value for balls, `at` as an analysis has it, and `every` all systems.
     """
     low, high = ends
-    held = bracket(root, loop, low=low, high=high)
+    held = bracket(root, loop, low=low, high=high) if in_balls else None
     if held is None:
-        held = bracket_in_floats(root, lambda value: [at(value)], low=low, high=high)
+        held = bracket_in_floats(root, lambda value: [at(value)], low=low, high=high, in_balls=in_balls)
     if held is None and _alike(*map(every, _beside(root, found))):
         return None
     return _described(root, held, [(at(root.value), loop(root.value)[1])])
@@ -385,7 +400,7 @@ def _told(root: Root, held: Bracket | None, frequency_hz: float) -> Crossing:
     """Return the crossing of a root; if no bracket holds it, with the error that floats are trusted with."""
     if held is None:
         error = FLOAT_ROUNDINGS / abs(root.slope) if root.slope else root.high - root.low
-        held = Bracket(root.value, max(error, abs(root.value) * FLOAT_ROUNDINGS), "estimated in floats")
+        held = Bracket(root.value, max(error, abs(root.value) * FLOAT_ROUNDINGS), ESTIMATE)
     return Crossing(
         value=held.value,
         error=held.error,
@@ -404,6 +419,7 @@ def search_delay(
     prepared: Prepared,
     *,
     from_stable: bool = False,
+    in_balls: bool = True,
     told: Told | None = None,
 ) -> Search:
     """Find the crossings of a delay: within pieces as of any parameter, and jumps between them.
@@ -420,6 +436,8 @@ def search_delay(
         From `analysis.prepare`.
     from_stable
         The scene is stable at `low`: where nothing above it is, that is a jump. The first crossing is enough.
+    in_balls
+        As for `proved_crossing`.
     told
         Is told how far the search is.
 
@@ -452,7 +470,7 @@ def search_delay(
         if not stable or stable[-1] != first:
             stable.append(first)
         for root in found.roots:
-            crossing = _delay_crossing(system, free, root, found, prepared, piece)
+            crossing = _delay_crossing(system, free, root, found, prepared, piece, in_balls=in_balls)
             if crossing:
                 edges.append(crossing)
                 stable.append(not stable[-1])
@@ -563,7 +581,14 @@ def _jump(at: Fraction, grows: Analysis, *, stable_below: bool) -> Crossing:
 
 
 def _delay_crossing(
-    system: CompiledSystem, free: Free, root: Root, found: Scan, prepared: Prepared, piece: Piece
+    system: CompiledSystem,
+    free: Free,
+    root: Root,
+    found: Scan,
+    prepared: Prepared,
+    piece: Piece,
+    *,
+    in_balls: bool,
 ) -> Crossing | None:
     """Prove a crossing within a piece, whose systems are built anew for every value, as `proved_crossing`."""
 
@@ -592,4 +617,5 @@ def _delay_crossing(
         *(root, found, ends, loop),
         lambda value: close_loop(loop(value)[0]),
         lambda value: split(*here(value)).systems,
+        in_balls=in_balls,
     )
