@@ -55,7 +55,7 @@ DOUBTFUL = 1e4
 FEWEST_INPUTS = 8
 
 # Steps of sites that are remembered, and of how many entries in all, A's and B's for each duration.
-KEPT, FEW_ENTRIES = 128, 4096
+KEPT, FEW_ENTRIES = 128, 1 << 14
 
 # Entries of a large matrix, as a share of all, up to which its products leave out the zeros.
 SPARSE = 1 / 16
