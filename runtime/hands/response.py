@@ -451,13 +451,12 @@ def _steady(matrix: Matrix, at: Carried, driven: Carried) -> Carried:
     block = max(1, TOGETHER // max(real.size, 1))
 
     def some(first: int) -> Carried:
-        z, off, value, doubt = (one[first : first + block] for one in (*at, *driven))
-        system = z[:, None, None] * unit - real
-        return solved(system, off[:, None, None] * unit + radius, (value, doubt))
+        own = slice(first, first + block)
+        system = at[0][own, None, None] * unit - real
+        return solved(system, at[1][own, None, None] * unit + radius, (driven[0][own], driven[1][own]))
 
     found = [some(first) for first in range(0, max(len(at[0]), 1), block)]
-    value, off = (np.concatenate([one[place] for one in found]) for place in range(2))
-    return value, off
+    return np.concatenate([value for value, _ in found]), np.concatenate([off for _, off in found])
 
 
 def solved(system: Complex, loose: Floats, driven: Carried) -> Carried:
