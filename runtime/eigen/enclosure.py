@@ -109,7 +109,7 @@ def enclose_all(given: Sequence[tuple[Matrix, Floats, bool]]) -> list[tuple[Eige
     cuts = [_cut(matrix, error) for matrix, error, _ in given]
     found = _enclose_by_discs(cuts)
     for place, (matrix, error, whole) in enumerate(given):
-        if whole and found[place] is None:
+        if whole and found[place] is None and len(matrix) > 1:
             cuts[place] = _Parts(matrix, error, np.zeros(0, dtype=np.intp), (np.arange(len(matrix)),))
     blocks = [
         (cut.matrix[part[:, None], part], cut.error[part[:, None], part])
