@@ -219,6 +219,8 @@ def _with_queues(matrix: Floats, pairs: Eigenpairs, part: Integers, alone: Integ
         return None
     own = pairs.right[alone].any(axis=0)
     late, rest = np.flatnonzero(own), np.flatnonzero(~own)
+    if len(late) != len(alone) or pairs.values[late].any() or not pairs.values[rest].all():
+        return None  # they are of more than their part already
     right, left = pairs.right.copy(), pairs.left.copy()
     try:
         # λ x_a = M_ap x_p of the part's; w_p M_pp + w_a M_ap = 0 of theirs.

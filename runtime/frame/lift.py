@@ -101,12 +101,6 @@ class LiftedSite(BoundedMap):
     continuous: int  # the first so many entries of z are continuous states
     frame_s: float
     estimated: bool = False
-    together: FrameMap | None = None  # the map with its errors as radii, where it came so
-
-    @property
-    def bounded(self) -> FrameMap:
-        """The map with its errors as radii."""
-        return self.mapped(with_radius, self.error) if self.together is None else self.together
 
 
 def lift(
@@ -135,8 +129,7 @@ def lift(
     exact = site if exact is None else exact
     found = steps or discretize(exact.a, exact.b, [duration * schedule.quantum for duration in durations])
     both = composed_bounded(site, schedule, dict(zip(durations, found, strict=True)))
-    lifted = named(site.kind, schedule, both.mapped(value_of), both.mapped(radius_of))
-    return replace(lifted, together=both)
+    return named(site.kind, schedule, both.mapped(value_of), both.mapped(radius_of))
 
 
 def steps_alone(site: SiteJacobians, parameters: NDArray[np.float64], schedule: Schedule) -> tuple[Step, ...]:

@@ -116,7 +116,7 @@ def rows_of(lifted: LiftedSite, count: int) -> LiftedSite:
 
 def _every_block(lifted: LiftedSite, change: Callable[[Floats], Floats]) -> LiftedSite:
     p, q, s, d = lifted.mapped(change).blocks
-    return replace(lifted, p=p, q=q, s=s, d=d, error=lifted.error.mapped(change), together=None)
+    return replace(lifted, p=p, q=q, s=s, d=d, error=lifted.error.mapped(change))
 
 
 def site_one(population: Population, row: int) -> LinearSite:
