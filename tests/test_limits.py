@@ -229,25 +229,26 @@ def test_parts_in_parts_are_counted_where_they_are_defined(
     assert any(message in one for one in told(compile_topology, scene))
 
 
-@pytest.mark.parametrize(
-    ("limit", "why"),
-    [
-        ("MOST_TICKS", "8 ticks in a frame take too long"),
-        ("MOST_PRODUCTS", "{} numbers of 4 states take too long"),
-    ],
-)
-def test_what_is_too_large_is_judged_and_not_varied(
-    monkeypatch: pytest.MonkeyPatch, limit: str, why: str
-) -> None:
+def test_what_is_too_large_is_judged_and_not_varied(monkeypatch: pytest.MonkeyPatch) -> None:
     model = compiled(AVERAGE)
-    monkeypatch.setattr(answering, limit, 7)
+    monkeypatch.setattr(answering, "MOST_TICKS", 7)
     monkeypatch.setattr(answering, "margins", lambda *_, **__: pytest.fail("margins are looked for"))
     monkeypatch.setattr(answering, "sensitivities", lambda *_, **__: pytest.fail("it is differentiated"))
     found = answer(model)
     assert found.analysis.stable
-    told_of = f"not looked for: {why.format(len(varied(model)))}"
+    told_of = "not looked for: 8 ticks in a frame take too long"
     assert found.margins.note == told_of
     assert found.sensitivities.note == f"what moves it most: {told_of}"
+
+
+def test_what_is_too_much_to_differentiate_has_margins_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = compiled(AVERAGE)
+    monkeypatch.setattr(answering, "MOST_PRODUCTS", 7)
+    monkeypatch.setattr(answering, "sensitivities", lambda *_, **__: pytest.fail("it is differentiated"))
+    found = answer(model)
+    told_of = f"not looked for: {len(varied(model))} numbers of 4 states take too long"
+    assert found.sensitivities.note == f"what moves it most: {told_of}"
+    assert found.margins.rows
 
 
 def test_what_stands_still_is_written_out_once_however_many_ways_there_are(

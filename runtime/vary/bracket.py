@@ -141,7 +141,7 @@ def hold(root: Root, above: Above, low: float, high: float, half: float = 0.0) -
     half
         How far to either side of the root it starts at least.
     """
-    half = least = max(half, HALF * FIRST * _size(root))
+    half = max(half, HALF * FIRST * _size(root))
     for _ in range(TRIES):
         left, right = max(root.value - half, low), min(root.value + half, high)
         if above(left) is True and above(right) is False:
@@ -149,7 +149,7 @@ def hold(root: Root, above: Above, low: float, high: float, half: float = 0.0) -
         half *= WIDER
     else:
         return None
-    while right - left > HARDLY * 2 * least:
+    while right - left > HARDLY * 2 * FIRST * HALF * _size(root):
         middle = (left + right) / 2
         side = above(middle)
         if side is None or middle in (left, right):
