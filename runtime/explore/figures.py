@@ -418,9 +418,10 @@ class MotionFigure:
             self.stage.yaxis.major_label_overrides = dict(enumerate(peers))
         slower = SECONDS / float(motion.time[-1])
         legend = "; ".join(f"{name} {word}" for name, word in zip(names, DASH_WORDS, strict=False))
+        pace = "as fast as it is" if slower == 1 else f"{slower:.2g} times slower"
         self.words.say(
             *motion.told,
-            f"A colour is a peer, a kind of line a body: {legend}. Played {slower:.2g} times slower.",
+            f"A colour is a peer, a kind of line a body: {legend}. Played {pace}.",
             *([f"{motion.others} more peers are not shown."] if motion.others else []),
         )
 
@@ -460,6 +461,7 @@ class FeelFigure:
             plot.line("frequency", column, source=self.source, line_color=BLUE, line_width=2)
             plot.add_tools(HoverTool(tooltips=[("Hz", "@frequency"), (column, f"@{column}")], mode="vline"))
         self.phase.yaxis.ticker = [-180, -90, 0, 90, 180]
+        self.plot.yaxis.minor_tick_line_color = None  # over less than a decade they lie on each other
         self.words = Words("feel-words")
 
     def show(self, found: Mapping[str, Any]) -> None:
