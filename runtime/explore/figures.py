@@ -418,7 +418,8 @@ class MotionFigure:
             self.stage.yaxis.major_label_overrides = dict(enumerate(peers))
         slower = SECONDS / float(motion.time[-1])
         legend = "; ".join(f"{name} {word}" for name, word in zip(names, DASH_WORDS, strict=False))
-        pace = "as fast as it is" if slower == 1 else f"{slower:.2g} times slower"
+        times = f"{max(slower, 1 / slower):.2g}"
+        pace = "as fast as it is" if times == "1" else f"{times} times {'slower' if slower > 1 else 'faster'}"
         self.words.say(
             *motion.told,
             f"A colour is a peer, a kind of line a body: {legend}. Played {pace}.",
