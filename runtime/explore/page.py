@@ -57,7 +57,7 @@ DESKS = (
 FRAMES = 0.05
 # Arguments of the link: the sliders on the axes of the region. No name of a scene has a hyphen.
 X, Y = "x-axis", "y-axis"
-STRUCK, BEGINS = "the first peer's device is struck", "as the scene begins"
+STRUCK, BEGINS = "the first peer is struck", "as the scene begins"
 SAME_AXES = "A region has two different parameters: choose another one for an axis."
 NO_AXES = "A region has two parameters, and this scene has fewer that are numbers of a range."
 LIVE, SLOW = "every packet is on time", "packets as they are lost and late (takes long)"

@@ -112,7 +112,7 @@ def _verdict(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, A
 
 
 def _named(mode: Mode) -> str:
-    at = "" if np.isnan(mode.frequency_hz) else f" at {in_hertz(mode.frequency_hz)}"
+    at = f" at {in_hertz(mode.frequency_hz)}" if mode.frequency_hz > 0 else ""
     return f"{mode.shape}{at}"
 
 

@@ -125,7 +125,7 @@ def run(server: BaseServer, link: str, *, browser: bool) -> None:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if browser:
         server.io_loop.add_callback(webbrowser.open, link)
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # even where Ctrl-C is ignored
     server.start()
     try:
         server.io_loop.start()

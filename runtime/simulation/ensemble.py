@@ -190,9 +190,8 @@ def play_many(
     refuse_beyond(RUN * runs, "E876", Place(system.origin.topology), f"{runs:,} runs", "fewer --runs")
     if not any(link.channel is not None for link in system.links):
         what = f"nothing in {system.name} is left to chance: every run would be the same"
-        raise ApcError(
-            Mistake("E894", Place(system.origin.topology), what, hint="links: {lan: {…, loss: 2 %}}")
-        )
+        hint = f"links: {{{system.links[0].name}: {{…, loss: 2 %}}}}" if system.links else "apc simulate"
+        raise ApcError(Mistake("E894", Place(system.origin.topology), what, hint=hint))
     seed = system.experiment.seed if settings.seed is None else settings.seed
     settings = replace(settings, seed=seed)
     parts = [range(first, min(first + PART, runs)) for first in range(0, runs, PART)]
