@@ -46,12 +46,8 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 Integers = NDArray[np.int64]
 
-# The intervals between the first points of a curve are halved until they are good enough or, relative to the
-# first, narrower than this. Each time makes the interpolant 16 times better.
-NARROWEST = 2.0**-11.5
-
-# Where in an interval points are put at once.
-QUARTERS = np.array([0.25, 0.5, 0.75])
+# Halvings of the intervals between the first points of a curve. Each makes the interpolant 16 times better.
+MOST_HALVINGS = 12
 
 # The middle of an interval, put in, makes the cubic through two points 16 times better than it was measured
 # there, the polynomial through four some hundred times once it converges; little of that is counted on.
@@ -174,15 +170,14 @@ def trace(deciding: Deciding, found: Survey, *, tolerance: float, offset: Floats
     knots = _Knots(points[taken], pairs.at(taken), np.array(chain), np.array(key, np.float64))
     first = np.flatnonzero(knots.chain[1:] == knots.chain[:-1])
     intervals = np.stack([first, first + 1], axis=1)
-    given_up, guarded = intervals[:0], True
-    while len(intervals := _apart(knots, intervals)):
-        deep = np.diff(knots.key[intervals], axis=1)[:, 0] < NARROWEST
-        given_up = np.concatenate([given_up, intervals[deep]])
-        if deep.all():
+    for halving in range(MOST_HALVINGS):
+        intervals = _apart(knots, intervals)
+        if not len(intervals):
             break
-        intervals = _divide(deciding, knots, intervals[~deep], tolerance, offset, guarded=guarded)
-        guarded = deciding.strays
-    for a, b in given_up.tolist():  # the chord is all that is known
+        intervals = _halve(
+            deciding, knots, intervals, tolerance, offset, guarded=not halving or deciding.strays
+        )
+    for a, b in intervals.tolist():  # given up: the chord is all that is known
         knots.error[a] = max(knots.error[a], float(np.linalg.norm(knots.points[b] - knots.points[a])))
     return _arcs(deciding, knots, found.closed, tolerance, offset)
 
@@ -205,13 +200,12 @@ def _tangents(gradient: Floats) -> Floats:
     return unit
 
 
-def _divide(
+def _halve(
     deciding: Deciding, knots: _Knots, intervals: Integers, tolerance: float, offset: Floats, *, guarded: bool
 ) -> Integers:
-    """Put three knots into every interval, or a corner; return the intervals that are not good enough yet.
+    """Put a knot into every interval, or a corner; return the intervals that are not good enough yet.
 
-    The middle makes the curve better, and the quarter points say how good it has become. `guarded` asks
-    whether another eigenvalue has left the unit circle at the new middles.
+    `guarded` asks whether another eigenvalue has left the unit circle at the new knots.
     """
     same = _on_one_branch(knots, intervals)
     lost, left = intervals[~same], []
@@ -222,85 +216,51 @@ def _divide(
     a, b = intervals[same].T
     if len(a):
         chord = knots.points[b] - knots.points[a]
-        expected, *_ = _expected(knots, a, b, np.tile(QUARTERS, (len(a), 1)))
-        place, pairs = polish(deciding, expected.reshape(-1, 2), _on_the_way(knots, a, b, chord))
-        place = place.reshape(-1, 3, 2)
-        good = _norm(place - expected) <= ASTRAY * _norm(chord)[:, None]
-        rows = np.arange(3 * len(a)).reshape(-1, 3)
+        length = _norm(chord)
+        expected, unseen, gain = _expected(knots, a, b)
+        place, pairs = polish(deciding, expected, _halfway(knots, a, b, chord))
+        off = _norm(place - expected)
+        good = off <= ASTRAY * length
         if guarded:
-            asked = slice(None) if deciding.strays else slice(1, 2)
-            chosen = rows[:, asked].ravel()
-            free = clear(deciding, place[:, asked].reshape(-1, 2), pairs.at(chosen))
-            good[:, asked] &= free.reshape(len(a), -1)
-        lost = np.concatenate([lost, np.stack([a, b], axis=1)[~good[:, 1]]])
-        some = good[:, 1]
-        a, b, rows = a[some], b[some], rows[some]
-        middle = knots.add(place[some, 1], pairs.at(rows[:, 1]), a, (knots.key[a] + knots.key[b]) / 2)
-        halves = np.stack([np.concatenate([a, middle]), np.concatenate([middle, b])], axis=1)
-        beside = np.concatenate([rows[:, 0], rows[:, 2]])
-        place, good = place.reshape(-1, 2)[beside], good.ravel()[beside]
-        left += _halved(knots, halves, place, pairs.at(beside), good, tolerance, offset)
+            good &= clear(deciding, place, pairs)
+        lost = np.concatenate([lost, np.stack([a[~good], b[~good]], axis=1)])
+        a, b, place, pairs = a[good], b[good], place[good], pairs.at(good)
+        off = off[good] / gain[good] + unseen[good]
+        middle = knots.add(place, pairs, a, (knots.key[a] + knots.key[b]) / 2)
+        knots.error[a] = knots.error[middle] = off
+        fine = off <= FILLED / 2 * tolerance * relative_to(place, pairs.gradient, offset)
+        left += [np.stack([a, middle], axis=1)[~fine], np.stack([middle, b], axis=1)[~fine]]
     if len(lost):
         left.append(_search(deciding, knots, lost, tolerance, offset))
     return np.concatenate(left) if left else intervals[:0]
 
 
-def _halved(
-    knots: _Knots,
-    intervals: Integers,
-    place: Floats,
-    pairs: Pairs,
-    good: NDArray[np.bool_],
-    tolerance: float,
-    offset: Floats,
-) -> list[Integers]:
-    """Put a point of the boundary into the middle of each interval, if it is a `good` one.
-
-    Returns the intervals that are not good enough yet; all others have their error.
-    """
-    a, b = intervals.T
-    chord = knots.points[b] - knots.points[a]
-    length = _norm(chord)
-    share = ((place - knots.points[a]) * chord).sum(axis=1) / length**2
-    expected, unseen, gain = _expected(knots, a, b, share[:, None])
-    off = _norm(place - expected[:, 0])
-    good = good & (off <= ASTRAY * length) & (np.abs(share - 0.5) <= ASTRAY)
-    good &= _on_one_branch(knots, intervals)
-    left = [intervals[~good]]
-    a, b, place, pairs = a[good], b[good], place[good], pairs.at(good)
-    off = (off / gain + unseen)[good]
-    middle = knots.add(place, pairs, a, (knots.key[a] + knots.key[b]) / 2)
-    knots.error[a] = knots.error[middle] = off
-    rough = off > FILLED / 2 * tolerance * relative_to(place, pairs.gradient, offset)
-    return [*left, np.stack([a, middle], axis=1)[rough], np.stack([middle, b], axis=1)[rough]]
-
-
-def _expected(knots: _Knots, a: Integers, b: Integers, shares: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return where points are expected that are at shares (k, m) of intervals' chords (k, m, 2), what their
-    misses do not show (k,), and how much better the middle makes the interpolant (k,).
+def _expected(knots: _Knots, a: Integers, b: Integers) -> tuple[Floats, Floats, Floats]:
+    """Return where the middles of intervals are expected (k, 2), what their misses do not show (k,), and how
+    much better the middle makes the interpolant (k,).
 
     By four knots of the same arc where there are as many, else by two.
     """
     points, tangents = knots.points, knots.tangents(np.arange(len(knots.key)))
+    plain = between(points[a], points[b], tangents[a], tangents[b], 0.5)
+    unseen = off_an_arc(tangents[a], tangents[b], _norm(points[b] - points[a]))
     order = np.lexsort((knots.key, knots.chain))
-    before, after = order[:-1], order[1:]
-    ends = knots.last[before] | (knots.chain[before] != knots.chain[after])
-    ends |= _norm(points[after] - points[before]) <= COINCIDENT
-    ends |= ~_on_one_branch(knots, np.stack([before, after], axis=1))
+    pairs = np.stack([order[:-1], order[1:]], axis=1)
+    ends = knots.last[order[:-1]] | (knots.chain[order[:-1]] != knots.chain[order[1:]])
+    ends |= _norm(points[order[1:]] - points[order[:-1]]) <= COINCIDENT
+    ends |= ~_on_one_branch(knots, pairs)
     first = stencils(np.concatenate([[0], np.cumsum(ends)]))
     place = np.empty(len(order), dtype=np.int64)
     place[order] = np.arange(len(order))
     first = first[place[a]]
     four = order[np.minimum(np.maximum(first, 0)[:, None] + np.arange(4), len(order) - 1)]
-    found, _ = through_four(points[four], tangents[four], points[a], points[b], shares)
-    use = (first >= 0) & np.isfinite(found).all(axis=(1, 2))
-    unseen = np.zeros(len(a))
-    if not use.all():
-        c, d = a[~use], b[~use]
-        ends_of = (points[c], points[d], tangents[c], tangents[d])
-        found[~use] = np.stack([between(*ends_of, share) for share in shares[~use].T], axis=1)
-        unseen[~use] = off_an_arc(tangents[c], tangents[d], _norm(points[d] - points[c])) / GAIN_TWO
-    return found, unseen, np.where(use, GAIN_FOUR, GAIN_TWO)
+    better, _ = through_four(points[four], tangents[four], points[a], points[b], np.array([0.5]))
+    use = (first >= 0) & np.isfinite(better[:, 0]).all(axis=1)
+    return (
+        np.where(use[:, None], better[:, 0], plain),
+        np.where(use, 0.0, unseen / GAIN_TWO),
+        np.where(use, GAIN_FOUR, GAIN_TWO),
+    )
 
 
 def _norm(vectors: Floats) -> Floats:
@@ -333,20 +293,11 @@ def _on_one_branch(knots: _Knots, intervals: Integers) -> NDArray[np.bool_]:
     return same
 
 
-def _on_the_way(knots: _Knots, a: Integers, b: Integers, chord: Floats) -> Pairs:
-    """Return guesses of the pairs at the quarters of intervals: the cubics through values and slopes.
-
-    The vectors are those of the nearer end.
-    """
+def _halfway(knots: _Knots, a: Integers, b: Integers, chord: Floats) -> Pairs:
+    """Return a guess of the pairs in the middle of intervals: the cubic through values and slopes."""
     start, end = knots.pairs.at(a), knots.pairs.at(b)
-    rise = end.value - start.value
-    bend = (start.slope * chord).sum(axis=1) - rise
-    back = rise - (end.slope * chord).sum(axis=1)
-    s = QUARTERS
-    cubic = s * (1 - s) * (bend[:, None] * (1 - s) + back[:, None] * s)
-    value = start.value[:, None] + s * rise[:, None] + cubic
-    nearer = np.stack([a, a, b], axis=1).ravel()
-    return replace(knots.pairs.at(nearer), value=value.ravel())
+    slopes = ((start.slope - end.slope) * chord).sum(axis=1)
+    return replace(start, value=(start.value + end.value) / 2 + slopes / 8)
 
 
 def _corners(deciding: Deciding, knots: _Knots, intervals: Integers) -> tuple[Integers, Integers]:
@@ -354,7 +305,7 @@ def _corners(deciding: Deciding, knots: _Knots, intervals: Integers) -> tuple[In
     a, b = intervals.T
     count = len(a)
     chord = knots.points[b] - knots.points[a]
-    length = np.linalg.norm(chord, axis=1)
+    length = _norm(chord)
     place = (knots.points[a] + knots.points[b]) / 2
     pairs = join([knots.pairs.at(a), knots.pairs.at(b)])
     before = np.concatenate([knots.points[a], knots.points[b]])
@@ -447,7 +398,7 @@ def _between_jumps(knots: _Knots, piece: Integers) -> list[Integers]:
 
 def _without_copies(points: Floats) -> Integers:
     """Return which points of a curve to keep so that no two that follow each other are one; both ends are."""
-    apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > COINCIDENT
+    apart = _norm(np.diff(points, axis=0)) > COINCIDENT
     kept = np.flatnonzero(np.concatenate([[True], apart]))
     if len(kept) > 1:
         kept[-1] = len(points) - 1
