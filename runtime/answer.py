@@ -113,6 +113,7 @@ def answer(
     certify: bool = False,
     box: Sequence[Range] = (),
     every_convention: bool = False,
+    every_margin: bool = False,
     with_buzz: bool = False,
 ) -> Answer:
     """Analyse a system and look at what stands beside the verdict.
@@ -129,6 +130,8 @@ def answer(
         Ranges of parameters over which to prove stability as well.
     every_convention
         Repeat the analysis under every order of coincident events, however long it takes.
+    every_margin
+        Look for the margins of large systems too, however long it takes.
     with_buzz
         Predict the buzz of one-sided contacts, and play the scene to lay it beside.
 
@@ -144,7 +147,7 @@ def answer(
     if compared.not_repeated and not every_convention:
         notes = (*notes, compared.not_repeated)
     moved = sensitivities_of(system, prepared, found)
-    nominal = _margins(system, prepared, found)
+    nominal = _margins(system, prepared, found, quick=not every_margin)
     buzz, no_buzz = _buzz(system, prepared, modes) if with_buzz else (None, "")
     return Answer(
         analysis=replace(found, notes=(*found.notes, *notes)),
@@ -280,12 +283,12 @@ def _too_many_products(system: CompiledSystem) -> str:
     return ""
 
 
-def _margins(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Margins:
+def _margins(system: CompiledSystem, prepared: Prepared, found: Analysis, *, quick: bool) -> Margins:
     """Return the margins, or only why they couldn't be had."""
     if why := _too_large(system, prepared, found):
         return Margins((), why)
     try:
-        return margins(system, prepared=prepared)
+        return margins(system, prepared=prepared, quick=quick)
     except ApcError as error:
         return Margins((), f"not looked for: {error.mistakes[0].what}")
 

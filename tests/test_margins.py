@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from apc.analysis.analysis import analyze, lifted_groups
+from apc.answer import answer
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
 from apc.eigen.modes import split
@@ -179,3 +180,16 @@ def test_what_is_no_gain_of_a_large_system_is_said_not_to_be_looked_for(tmp_path
     one = next(one for one in found.rows if one.parameter == "seat.stiffness")
     assert one.value is None
     assert re.fullmatch(r"no gain at ticks, and 14\d states", one.note)
+
+
+def test_in_passing_large_systems_have_no_margins_and_the_line_that_asks_for_them_is_told(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "scene.yaml").write_text(row(30, tmp_path), encoding="utf-8")
+    system = compile_topology(tmp_path / "scene.yaml")
+    passing = answer(system)
+    assert passing.margins.rows == ()
+    assert re.fullmatch(
+        r"not looked for in passing: \d\d states \(apc analyze --margins does\)", passing.margins.note
+    )
+    assert answer(system, every_margin=True).margins == margins(system)

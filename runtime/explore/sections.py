@@ -190,7 +190,7 @@ def _eigenvalues(system: CompiledSystem, prepared: Prepared, override: Override)
 
 
 def _margins(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, Any]:
-    return {"text": str(margins(system, prepared=prepared))}
+    return {"text": str(margins(system, prepared=prepared, quick=True))}
 
 
 def _motion(system: CompiledSystem, _: Prepared, struck: bool) -> dict[str, Any]:

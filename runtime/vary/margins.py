@@ -118,7 +118,7 @@ class Margins(Result):
 
 
 @part("margins")
-def margins(system: CompiledSystem, *, prepared: Prepared | None = None) -> Margins:
+def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: bool = False) -> Margins:
     """Find how much each stiffness, damping and delay may grow, all else as it is.
 
     Parameters
@@ -127,11 +127,13 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None) -> Marg
         The compiled scene. One that isn't stable has no margins.
     prepared
         From `analysis.prepare`, of this system with any numbers.
+    quick
+        Give up, and say so, where the matrices are so large that it would take seconds.
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         start = prepare_at_start(system, prepared)
-        found = _parameter_margins(system, coupler_parameters(system), start or prepared)
+        found = _parameter_margins(system, coupler_parameters(system), start or prepared, quick)
         if isinstance(found, str):
             return Margins((), found)
         if start is None:
@@ -162,7 +164,7 @@ def _delays(system: CompiledSystem) -> list[Free]:
 
 
 def _parameter_margins(
-    system: CompiledSystem, free: Sequence[Free], prepared: Prepared
+    system: CompiledSystem, free: Sequence[Free], prepared: Prepared, quick: bool
 ) -> list[Margin] | str:
     """Return the margins of the parameters that matter, or why there are none."""
     if long_loops(system, free, prepared):
@@ -171,6 +173,8 @@ def _parameter_margins(
     base = np.array([parameter_of(system, one).value for one in free])
     here = family.matrices(base[None])
     largest = max((one.shape[1] for one in here), default=0)
+    if quick and largest > FEW_STATES:
+        return f"not looked for in passing: {largest} states (apc analyze --margins does)"
     if not all(np.isfinite(one).all() for one in here):
         return "not looked for: the present values have no frame matrix of their own"
     lines = [Line(family, base, column) for column in range(len(free))]
