@@ -73,6 +73,7 @@ PIECES, FURTHER, MOST_PIECES = 4, 1.5, 64
 # The eigenvalues of larger systems are not looked at value by value: where a parameter is a gain, the loop's
 # response to it tells the first crossing (see `one_gain`). Balls of these take minutes, bounds of floats do.
 FEW_STATES = 60
+IN_PASSING = "not looked for in passing: {} states (apc analyze --margins does)"
 
 # Of a larger one nothing is looked at value by value: each takes a tenth of a second; and larger ones are
 # estimated, as a bound takes seconds.
@@ -130,6 +131,9 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
     quick
         Give up, and say so, where the matrices are so large that it would take seconds.
     """
+    states = max(len(kind.states) for kind in system.kinds)
+    if quick and states > FEW_STATES:  # as many in a loop, or nearly: no matrix is made to say so
+        return Margins((), IN_PASSING.format(states))
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         start = prepare_at_start(system, prepared)
@@ -174,7 +178,7 @@ def _parameter_margins(
     here = family.matrices(base[None])
     largest = max((one.shape[1] for one in here), default=0)
     if quick and largest > FEW_STATES:
-        return f"not looked for in passing: {largest} states (apc analyze --margins does)"
+        return IN_PASSING.format(largest)
     if not all(np.isfinite(one).all() for one in here):
         return "not looked for: the present values have no frame matrix of their own"
     lines = [Line(family, base, column) for column in range(len(free))]
