@@ -35,7 +35,7 @@ def served(path: Path, *words: str) -> Iterator[str]:
         yield process.stdout.readline().strip()
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=60)
-        assert (process.returncode, err) == (0, "ended\n")
+        assert (process.returncode, err) == (0, "ended\n"), f"it ended with {process.returncode}: {err}"
     finally:
         process.kill()
         process.wait()
