@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from apc.frame.names import parameter_of
+from apc.vary import one_gain
 from apc.vary.evaluator import evaluator
 from apc.vary.margins import coupler_parameters, margins
-from apc.vary.one_gain import Gain, first_crossing, gains_of, response_of
+from apc.vary.one_gain import Gain, NotTold, first_crossing, gains_of, response_of
 from tests.topologies import AVERAGE, MESH, compiled
 
 
@@ -79,3 +80,16 @@ def test_a_spring_that_acts_all_the_time_is_no_gain() -> None:
     free = [one for one in coupler_parameters(system) if one.name == "contact.stiffness"]
     family = evaluator(system, free)
     assert gains_of(family, np.array([1000.0]), 0) is None  # type: ignore[arg-type] # one of affine equations
+
+
+def test_where_angles_run_out_nothing_is_said_instead_of_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    shift = np.eye(5, k=-1)
+    shift[0, 0] = 1.0
+    into, out = np.zeros((5, 1)), np.zeros((1, 5))
+    into[0, 0], out[0, -1] = -1.0, 1.0
+    gain = Gain(shift + 0.01 * into @ out, into, out, np.zeros((1, 1)))
+    response = response_of(gain.a)
+    assert response is not None
+    monkeypatch.setattr(one_gain, "_real", lambda *given: np.zeros((len(given[4]), 2)))
+    with pytest.raises(NotTold):
+        first_crossing([(gain, response)], 0.01, 3.0)

@@ -199,11 +199,11 @@ def _parameter_margins(
 
 def _by_responses(system: CompiledSystem, ways: Sequence[tuple[Free, Line]]) -> list[Margin | None]:
     """Return the margins of parameters of one evaluator of large systems, None where nothing can grow."""
-    from apc.vary.one_gain import gains_of, response_of  # few scenes are so large
+    from apc.vary.one_gain import NotTold, gains_of, response_of  # few scenes are so large
 
     line = ways[0][1]
     if not isinstance(line.family, BatchEvaluator):
-        return _in_matrices(system, ways)
+        return _in_matrices(system, ways, "no gain at ticks")
     matrices = [one[0] for one in line.family.matrices(line.base[None])]
     responses = [response_of(one) for one in matrices]
     found: list[Margin | None] = []
@@ -212,19 +212,22 @@ def _by_responses(system: CompiledSystem, ways: Sequence[tuple[Free, Line]]) -> 
         gains = gains_of(line.family, line.base, line.column)
         known = [(gain, one) for gain, one in zip(gains or (), responses, strict=False) if one is not None]
         if len(known) == len(matrices):
-            found.append(_gain_margin(system, free, line, known))
+            try:
+                found.append(_gain_margin(system, free, line, known))
+            except NotTold:
+                found += _in_matrices(system, [(free, line)], "no first crossing told by the response")
         else:
-            found += _in_matrices(system, [(free, line)])
+            found += _in_matrices(system, [(free, line)], "no gain at ticks")
     return found
 
 
-def _in_matrices(system: CompiledSystem, ways: Sequence[tuple[Free, Line]]) -> list[Margin | None]:
+def _in_matrices(system: CompiledSystem, ways: Sequence[tuple[Free, Line]], why: str) -> list[Margin | None]:
     """Return the margins of parameters looked at value by value, or rows that say why they are not."""
     line = ways[0][1]
     states = max(len(one[0]) for one, _ in line.course(line.base[[line.column]]))
     if states <= MOST_SCANNED:
         return _along(system, ways)
-    why = f"no gain at ticks, and {states} states"
+    why = f"{why}, and {states} states"
     return [
         _not_looked(free.label, parameter_of(system, free).unit, float(line.base[line.column]), why)
         for free, line in ways

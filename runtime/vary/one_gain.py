@@ -1,7 +1,7 @@
 """Where an eigenvalue first crosses the unit circle as one gain grows, from the loop's response to it.
 
 Takes: a line along which one parameter varies, and the eigenvalues of the loops where it starts.
-Gives: `Gain`, `gains_of`; `Response`, `response_of`; `first_crossing`.
+Gives: `Gain`, `gains_of`; `Response`, `response_of`; `first_crossing`, `NotTold`.
 Guarantees: what is no gain is not taken for one: every coefficient is straight in the parameter, none of it
 in A or B. The work of a frequency doesn't know how many states there are, but for one sum over them.
 Does not: prove a crossing (see `bracket`), or that none comes before it: angles are looked at as closely as
@@ -57,11 +57,18 @@ FIRST = 1e-6
 # A cell is divided so often at most; angles looked at, of a gain at most.
 MOST_LEVELS, MOST_ANGLES = 40, 200_000
 
+# Angles nearer to each other than this are of one crossing.
+SAME = 1e-6
+
 # Numbers of a response that are worked on together.
 TOGETHER = 1 << 19
 
 # Steps of inverse iteration and of Newton's method at most; one so small, relatively, is the last.
 STEPS, SETTLED = 20, 1e-13
+
+
+class NotTold(Exception):
+    """Angles or steps ran out: whether, or where, an eigenvalue crosses first is not known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,14 +225,23 @@ def first_crossing(gains: Sequence[tuple[Gain, Response]], start: float, end: fl
         How the parameter acts in each loop, and the loop's response.
     start, end
         Its present value, and how far it is looked at.
+
+    Raises
+    ------
+    NotTold
+        It could not be found out.
     """
     best, found = end - start, None
     for place, (gain, response) in enumerate(gains):
         if not gain.b.any() or not gain.c.any():
             continue
         met = _least(gain, response, best)
-        settled = None if met is None else _settled(gain, *met)
-        if settled is not None and settled[0] <= best:
+        if met is None:
+            continue
+        settled = _settled(gain, *met)
+        if settled is None:
+            raise NotTold
+        if settled[0] <= best:
             best, eigenvalue, slope = settled
             found = Root(start + best, start, end, True, place, eigenvalue, slope)
     return found
@@ -263,10 +279,16 @@ def _least(gain: Gain, response: Response, most: float) -> tuple[float, float] |
                 best, found = change, at
         done = np.zeros(len(left), dtype=bool)
         done[alone[met[:, 0] > 0]] = True
-        cut = near & ~done & (right - left > SETTLED)
+        cut = near & ~done
         looked += int(cut.sum())
-        if not cut.any() or looked > MOST_ANGLES:
+        narrow = cut & (right - left <= SETTLED)
+        cut &= ~narrow
+        if found is not None:  # beside what was found, it is that
+            narrow &= np.abs(left - found) > SAME
+        if narrow.any() or looked > MOST_ANGLES:
             break
+        if not cut.any():
+            return None if found is None else (best, found)
         middle = (left[cut] + right[cut]) / 2
         value, slope = response.at(gain, middle)
         first, second = [one[cut] for one in ends[:2]], [one[cut] for one in ends[2:]]
@@ -274,7 +296,7 @@ def _least(gain: Gain, response: Response, most: float) -> tuple[float, float] |
             np.concatenate(pair) for pair in zip([*first, value, slope], [value, slope, *second], strict=True)
         ]
         left, right = np.concatenate([left[cut], middle]), np.concatenate([middle, right[cut]])
-    return None if found is None else (best, found)
+    raise NotTold
 
 
 def _crossed(
