@@ -6,6 +6,7 @@ import http.client
 import json
 import re
 import socket
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -498,6 +499,25 @@ def test_a_scene_may_name_its_numbers_as_the_link_does(browser: Any, tmp_path: P
         assert again.page.evaluate(f"{MODEL}('message').text") == ""
         tab.close(link)
         again.close(link)
+
+
+SERVED = """
+from tornado.httpclient import AsyncHTTPClient
+from apc.explore.server import bound, run
+
+async def opened():
+    await AsyncHTTPClient().fetch(link)
+    raise KeyboardInterrupt
+
+server, link = bound(lambda tab: tab.on_session_destroyed(lambda session_context: print("closed")), 0)
+server.io_loop.add_callback(opened)
+run(server, link, browser=False)
+"""
+
+
+def test_ctrl_c_closes_the_tabs_that_are_open() -> None:
+    ended = subprocess.run([sys.executable, "-c", SERVED], capture_output=True, text=True, check=False)
+    assert (ended.stdout, ended.stderr) == ("closed\n", "")
 
 
 def test_a_region_that_takes_long_keeps_nothing_waiting(browser: Any) -> None:

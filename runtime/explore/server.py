@@ -13,7 +13,6 @@ from __future__ import annotations
 import errno
 import hmac
 import logging
-import multiprocessing
 import secrets
 import signal
 from collections.abc import Awaitable, Callable
@@ -133,5 +132,7 @@ def run(server: BaseServer, link: str, *, browser: bool) -> None:
         pass
     finally:
         server.stop()
-        for worker in multiprocessing.active_children():  # of the tabs that are still open
-            worker.kill()
+        # Left to Python's end, what a tab computes with is taken apart in any order.
+        for session in server.get_sessions():
+            for close in session.document.session_destroyed_callbacks:
+                close(session.document.session_context)
