@@ -157,6 +157,15 @@ def test_sections_tell_what_the_api_tells(tmp_path: Path) -> None:
     assert np.array_equal(feel["magnitude"], np.abs(felt.impedance))
 
 
+def test_where_a_hand_may_hold_several_one_is_felt_and_the_others_are_named() -> None:
+    model = model_bytes(apc.compile(SCENES / "planar-users.yaml"))
+    names = ["user[1].device.x[1]", "user[1].device.x[2]"]
+    for asked, at in (("", names[0]), (names[1], names[1])):
+        found = compute(model, Task("feel", (), asked)).found
+        assert found is not None
+        assert (found["at"], found["names"]) == (at, names)
+
+
 @pytest.mark.parametrize("label", ["coordination.stiffness", "lan.delay", "user.count"])
 def test_the_roots_of_a_slider_are_the_eigenvalues_of_analyses(label: str, tmp_path: Path) -> None:
     system = compiled(AVERAGE, tmp_path)

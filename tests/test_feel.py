@@ -413,8 +413,23 @@ def test_in_a_plane_a_hand_is_along_an_axis_and_feels_what_it_feels_on_a_line() 
         assert found.transmitted_admittance == pytest.approx(line.transmitted_admittance, rel=1e-9)
         assert found.error_per_force == pytest.approx(line.error_per_force, abs=1e-12)
     told = "a hand may hold any of device.x[1], device.x[2] (user)"
-    hint = f"Write: --at with the part that is held, as {at}.x[1]"
+    hint = f'Write: --at "{at}.x[1]"'
     with pytest.raises(ApcError, match=re.escape(f"E931 {told}. {hint}")):
         feel(plane, [1.0], quick=True)
     with pytest.raises(ApcError, match=re.escape(f"E931 --hands: {told}.") + "$"):
         devices_of(plane)
+
+
+@pytest.mark.parametrize("name", ["planar-users", "god-object", "client-server"])
+def test_where_it_is_open_what_is_held_the_line_to_write_is_one_that_works(name: str) -> None:
+    scene = compile_topology(SCENES / f"{name}.yaml")
+    with pytest.raises(ApcError) as told:
+        feel(scene, [1.0], quick=True)
+    option, at = (told.value.mistakes[0].hint or "").split(" ", 1)
+    assert option == "--at" and feel(scene, [1.0], at=at.strip('"'), quick=True).at == at.strip('"')
+
+
+def test_where_no_part_can_be_held_alone_it_says_why_and_names_no_line() -> None:
+    told = "E931 left moves with masses that move otherwise, and a hand may hold any of them (user)."
+    with pytest.raises(ApcError, match=re.escape(told) + "$"):
+        feel(compile_topology(SCENES / "two-handed-tool.yaml"), [1.0])

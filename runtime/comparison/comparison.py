@@ -20,8 +20,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
-from apc.frame.devices import find_device
-from apc.frame.parameters import resolve
+from apc.hands.answers import held_names
 from apc.hands.feel import Feel, feel
 from apc.moments.network import NetworkVerdict, judge_network
 from apc.result import Look, Result
@@ -236,16 +235,9 @@ def _played(system: CompiledSystem, say: Told) -> Played:
 
 def _feel(system: CompiledSystem, prepared: Prepared, at: str) -> Feel:
     """Return what is felt, at the first device there is if it isn't said: a server has none."""
-    if at:
-        return feel(system, FREQUENCIES, at=at, quick=True, prepared=prepared)
-    unit_of, numbers = {one.name: one.unit for one in system.parameters}, resolve(system)
-    holding = [
-        group.name
-        for place, group in enumerate(system.groups)
-        if find_device(prepared.jacobians[group.kind], numbers.parameters[place][0], unit_of) is not None
-    ]
-    first = f"{holding[0]}[1]" if holding else ""
-    return feel(system, FREQUENCIES, at=first, quick=True, prepared=prepared)
+    names = held_names(system, prepared)
+    at = at or (names[0].partition(".")[0] if names else "")
+    return feel(system, FREQUENCIES, at=at, quick=True, prepared=prepared)
 
 
 def _passive(system: CompiledSystem, prepared: Prepared) -> PassiveHands:

@@ -45,6 +45,8 @@ CIRCLE = np.exp(1j * np.linspace(0, 2 * np.pi, 241))
 
 # How far below each other the bodies of a peer stand that move along a line, of the distance of two peers.
 STAGGER = 0.3
+# Height of a line of names, in pixels.
+LINE = 13
 # Seconds that a whole motion is played in.
 SECONDS = 10
 INSTANT = """
@@ -285,7 +287,7 @@ class MotionFigure:
         self.lines = ColumnDataSource(columns("xs", "ys", "colour", "dash", "name"))
         self.instant = ColumnDataSource({"x": [0.0]})
         self.frames = ColumnDataSource(columns("time", "x", "y"))
-        self.bodies = ColumnDataSource(columns("x", "y", "width", "height", "name", "colour"))
+        self.bodies = ColumnDataSource(columns("x", "y", "width", "height", "name", "above", "colour"))
         self.walls = ColumnDataSource(columns("x", "top", "bottom"))
         self.discs = ColumnDataSource(columns("x", "y", "radius"))
         self.plot = _plot(
@@ -324,7 +326,7 @@ class MotionFigure:
             "y",
             "name",
             source=self.bodies,
-            y_offset=-8,
+            y_offset="above",
             text_align="center",
             text_baseline="bottom",
             text_font_size="11px",
@@ -388,6 +390,8 @@ class MotionFigure:
             "width": [2 * one for one in sizes],
             "height": [2 * one if planar else 0.5 * (one > 0) for one in sizes],
             "name": labels if planar else [one.name for one in motion.bodies],
+            # In a plane bodies may stand on one place, where their names would lie on each other.
+            "above": [-8 - (LINE if planar else 0) * place for place in range(len(labels))],
             "colour": colours,
         }
         rows = [row for row, _ in motion.walls]

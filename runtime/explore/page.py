@@ -237,6 +237,8 @@ class Page:
         self.begins.on_change("value", lambda attr, old, new: self._moved())
         self.meant = Select(title="Stable, where", options=[LIVE, SLOW], value=LIVE, stylesheets=[FOCUS])
         self.meant.on_change("value", lambda attr, old, new: self._moved())
+        self.at = Select(title="The hand holds", visible=False, stylesheets=[FOCUS])
+        self.at.on_change("value", lambda attr, old, new: self._ask_feel())
         controls: list[Any] = [self.message.model, *self.selects]
         if any(link.channel is not None for link in self.system.links):
             controls.append(self.meant)
@@ -253,7 +255,7 @@ class Page:
             self.region.plot,
             self.roots.plot,
             _below("motion", self.begins, motion.stage, played, motion.plot),
-            _below("feel", feel.plot, feel.phase),
+            _below("feel", self.at, feel.plot, feel.phase),
             *(one.model for one in (self.verdict, self.margins, self.region.words, self.network)),
             *(one.model for one in (self.roots.words, self.roots.way_words, motion.words, feel.words)),
         ):
@@ -357,9 +359,14 @@ class Page:
             self._ask("roots", others, (moved.free, moved.values))
         self._ask_region(overrides)
         self._ask("motion", overrides, self.begins.value == STRUCK)
-        for section in ("feel", "margins", "network"):
+        self._ask_feel()
+        for section in ("margins", "network"):
             self._ask(section, overrides)
         self.link.data = {"query": [self._query()]}
+
+    def _ask_feel(self) -> None:
+        """Ask what is felt by the hand that was chosen."""
+        self._ask("feel", tuple(overrides_of(self.sliders, self.places)), self.at.value)
 
     def _ask_region(self, overrides: tuple[Override, ...]) -> None:
         """Ask for the region, if there are two axes: nobody waits for it where it takes long."""
@@ -448,6 +455,8 @@ class Page:
                 self.motion.show(found["motion"])
             case "feel" if found is not None:
                 self.feel.show(found)
+                if len(found["names"]) > 1:
+                    self.at.update(options=found["names"], value=found["at"], visible=True)
             case "numbers" if found is not None:
                 self._save_numbers(found)
             case "margins" | "network" if found is not None:

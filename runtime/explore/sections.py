@@ -28,6 +28,7 @@ from apc.explore.sliders import text_of
 from apc.finite_equations import finite_equations
 from apc.frame.names import Free, Range, unit_of
 from apc.frame.overrides import Override, apply
+from apc.hands.answers import held_names
 from apc.hands.asked import read_frequencies
 from apc.hands.feel import feel
 from apc.moments.network import judge_network
@@ -197,10 +198,13 @@ def _motion(system: CompiledSystem, _: Prepared, struck: bool) -> dict[str, Any]
     return {"motion": motion_of(system, struck=struck)}
 
 
-def _feel(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, Any]:
+def _feel(system: CompiledSystem, prepared: Prepared, at: str) -> dict[str, Any]:
+    """Return what is felt at a device, the first there is if it isn't said, and what else may be held."""
     frequencies = read_frequencies(system, None, LOWEST, None, FREQUENCIES)
-    found = feel(system, frequencies, quick=True, prepared=prepared)
+    names = held_names(system, prepared)
+    found = feel(system, frequencies, at=at or next(iter(names), ""), quick=True, prepared=prepared)
     return {
+        "names": names,
         "at": found.at,
         "frequency": found.frequency_hz,
         "magnitude": np.abs(found.impedance),

@@ -1,8 +1,8 @@
 """What a hand holds: a peer's device, found in its equations, and the peer with a hand on it.
 
 Takes: a kind's Jacobians and exact numbers; a `CompiledSystem`.
-Gives: `Device`, `find_device`, `devices_of`; `Push`, `find_push`; `HANDS`, `with_hands`, `clamped`, `held`;
-`refuse_hands`; `published`; `OWN_MASS`, `UNHELD`.
+Gives: `Device`, `find_device`, `find_devices`, `devices_of`; `Push`, `find_push`; `HANDS`, `with_hands`,
+`clamped`, `held`; `refuse_hands`; `published`; `OWN_MASS`, `UNHELD`.
 Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
 Does not: ask whether it is stable (see `passivity` for hands of every kind).
 
@@ -84,6 +84,38 @@ def find_device(
 
     Parameters
     ----------
+    site, parameters, unit_of, listening, part
+        As for `find_devices`.
+    """
+    kind = site.kind
+    if not _is_plain(site):
+        return f"{kind.name} has a nonlinear loop"
+    found = find_devices(site, parameters, unit_of, listening, part=part)
+    if not found:
+        return None
+    if len(found) > 1 and any(isinstance(one, Device) for one in found.values()):
+        return f"a hand may hold any of {', '.join(found)} ({kind.name})"
+    one = next(iter(found.values()))
+    return f"{one} ({kind.name})" if isinstance(one, str) else one
+
+
+def _is_plain(site: SiteJacobians) -> bool:
+    """Return whether a site's equations can be walked through: they have no nonlinear loop."""
+    return bool(site.walkable and site.kind.derivative.is_a("SXFunction"))
+
+
+def find_devices(
+    site: SiteJacobians,
+    parameters: NDArray[np.float64],
+    unit_of: Mapping[str, str],
+    listening: Listening | None = None,
+    *,
+    part: str = "",
+) -> dict[str, Device | str]:
+    """Return what a hand may hold, by name; or why that can't be held, in words.
+
+    Parameters
+    ----------
     site, parameters, unit_of, listening
         The kind, a vector (n_p,) of its parameters, their units, and what it hears at the start.
     part
@@ -93,8 +125,8 @@ def find_device(
     kind = site.kind
     owners = {_part(one.name) for one in kind.states}
     gripped = {own for own in owners for one in kind.held if own == one or own.startswith(f"{one}.")}
-    if not (site.walkable and kind.derivative.is_a("SXFunction")):
-        return f"{kind.name} has a nonlinear loop"
+    if not _is_plain(site):
+        return {}
     told_of = _told_of(site)
     masses = tuple(place for place, name in enumerate(kind.parameters) if unit_of.get(name) == "kg")
     x, u, _, _, p, t = start_arguments(site, exact_numbers(kind, parameters), Fraction, listening)
@@ -129,12 +161,7 @@ def find_device(
             found[own] = Device(own, place, velocity, inverse, symbolic)
         elif inverses:
             found[own] = f"{own} moves with masses that move otherwise, and a hand may hold any of them"
-    if not found:
-        return None
-    if len(found) > 1:
-        return f"a hand may hold any of {', '.join(found)} ({kind.name})"
-    (one,) = found.values()
-    return f"{one} ({kind.name})" if isinstance(one, str) else one
+    return found
 
 
 def _told_of(site: SiteJacobians) -> set[str]:

@@ -2,7 +2,7 @@
 
 Takes: a `CompiledSystem` with what `analysis.prepare` made of it, and two devices.
 Gives: `AbstractResponses`; `many_differ`; `Modes`, `open_modes`; `Responses`, `Weights`; `held_device`,
-`check_kicks`, `copy_of`, `nothing`.
+`held_names`, `check_kicks`, `copy_of`, `nothing`.
 Guarantees: an answer is exact for the sampled, held and sent signals of the scene, with a bound on its
 rounding.
 Does not: ask whether the scene is stable.
@@ -31,7 +31,7 @@ from apc.eigen.modes import arrange, dense_loop
 from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of, used_ways
 from apc.eigen.peers import more_differ
 from apc.eigen.rigid import find_rigid_modes
-from apc.frame.devices import OWN_MASS, Device, find_device
+from apc.frame.devices import OWN_MASS, Device, find_device, find_devices
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.parameters import resolve
@@ -106,7 +106,7 @@ def open_modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Po
                 continue
             along = port.peer in group.peers or whole_and_index(port.part)[1]
             named = one.part or (port.part if along else "")
-            held[one] = device = held_device(system, group, named, unit_of)
+            held[one] = device = held_device(system, prepared, group, named, unit_of)
         if device is None:
             found = find_device(group.jacobians, group.parameters, unit_of, group.listening)
             device = found if isinstance(found, Device) else None
@@ -138,7 +138,9 @@ def open_modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Po
     return Modes(loops, plain, apart, class_of, counts, held[port], held[other]), exchange
 
 
-def held_device(system: CompiledSystem, group: PeerGroup, part: str, unit_of: Mapping[str, str]) -> Device:
+def held_device(
+    system: CompiledSystem, prepared: Prepared, group: PeerGroup, part: str, unit_of: Mapping[str, str]
+) -> Device:
     """Return the device of a group that a hand holds, `part` of its peers or the only one; or refuse it.
 
     Raises
@@ -150,13 +152,23 @@ def held_device(system: CompiledSystem, group: PeerGroup, part: str, unit_of: Ma
     if isinstance(device, Device):
         return device
     what = device or f"{group.name} has no device"
-    moving = [state.name for state in group.jacobians.kind.states]
-    meant = next((n for n in moving if whole_and_index(n)[1] == 1 and n in what), "")
-    if not meant and any(n.startswith("device.") for n in moving) and part != "device":
-        meant = "device"
-    hint = f"--at with the part that is held, as {group.name}[1].{meant}" if meant else ""
-    hint = hint if device else OWN_MASS
+    names = held_names(system, prepared)
+    own = [name for name in names if name.startswith(f"{group.name}[")]
+    hint = f'--at "{(own or names)[0]}"' if names else "" if device else OWN_MASS
     raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
+
+
+def held_names(system: CompiledSystem, prepared: Prepared) -> list[str]:
+    """Return what hands may hold, of the first peer of each group: `left[1].device`."""
+    unit_of, numbers = {one.name: one.unit for one in system.parameters}, resolve(system)
+    return [
+        f"{group.name}[1].{part}"
+        for place, group in enumerate(system.groups)
+        for part, found in find_devices(
+            prepared.jacobians[group.kind], numbers.parameters[place][0], unit_of
+        ).items()
+        if isinstance(found, Device)
+    ]
 
 
 def check_kicks(system: CompiledSystem, group: PeerGroup) -> None:

@@ -73,8 +73,8 @@ class PopulationResponses(AbstractResponses):
         groups = [self._peer(one) for one in (port, other)]
         along = self.at_port == self.at_other or whole_and_index(port.part)[1]
         named = other.part or (port.part if along else "")
-        self.other = held_device(system, groups[1], named, unit_of)
-        self.device = held_device(system, groups[0], port.part, unit_of)
+        self.other = held_device(system, prepared, groups[1], named, unit_of)
+        self.device = held_device(system, prepared, groups[0], port.part, unit_of)
         for group in groups:
             check_kicks(system, group)
         self.pushed = self._alone(self.at_port, groups[0], self.device)
