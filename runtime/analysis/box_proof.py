@@ -1,8 +1,8 @@
 """Proof that a scene is stable for every value of some parameters in a box.
 
 Takes: a `CompiledSystem` and ranges.
-Gives: `BoxProof`, `prove_box`; `search_box`, `middle`; `site_at`, `range_ball`, `ball_radii`;
-`BITS`, `UNDECIDED`.
+Gives: `BoxProof`, `prove_box`; `search_box`, `Look`, `Looked`, `one_by_one`, `middle`;
+`site_at`, `range_ball`, `ball_radii`; `BITS`, `TOGETHER`, `UNDECIDED`.
 Guarantees: stable means proved for every point of the box, unstable proved at the point that is named.
 Does not: find the boundary (see the share that is left open).
 
@@ -192,7 +192,7 @@ def _answer(
 def search_box(
     name: str,
     ranges: Sequence[Range],
-    reach_out: Callable[[Cell], Floats | None],
+    looks: Look,
     is_unstable: Callable[[tuple[Fraction, ...]], bool],
     *,
     stable: str,
@@ -204,8 +204,8 @@ def search_box(
     ----------
     name, ranges
         The scene's, and the parameters left open.
-    reach_out
-        Returns None when a cell is proved, or else how much each parameter matters in it.
+    looks
+        Looks at cells.
     is_unstable
         Whether it is proved unstable at a point.
     stable, unstable
@@ -220,7 +220,7 @@ def search_box(
     for point in (middle(whole), *itertools.product(*whole)):
         if is_unstable(point):
             return answer(unstable, 1, 1.0, point)
-    found = _halved(whole, partial(_one_by_one, reach_out, is_unstable))
+    found = _halved(whole, looks)
     if found.unstable:
         return answer(unstable, found.cells, 1.0, found.point)
     if found.open_share:
@@ -228,12 +228,22 @@ def search_box(
     return answer(stable, found.cells, 0.0, ())
 
 
-def _one_by_one(
+def one_by_one(
     reach_out: Callable[[Cell], Floats | None],
     is_unstable: Callable[[tuple[Fraction, ...]], bool],
     cells: Sequence[Cell],
 ) -> Iterator[Looked]:
-    """Look at cells one by one, see `search_box`."""
+    """Look at cells one by one, for `search_box`.
+
+    Parameters
+    ----------
+    reach_out
+        Returns None when a cell is proved, or else how much each parameter matters in it.
+    is_unstable
+        As for `search_box`.
+    cells
+        Which.
+    """
     for cell in cells:
         reach = reach_out(cell)
         yield Looked(reach, reach is not None and is_unstable(middle(cell)))
@@ -303,12 +313,12 @@ def _is_unstable(question: OpenSystem, point: Sequence[Fraction]) -> bool:
 
 def _matrix(question: OpenSystem, point: Sequence[Any], by: int | None) -> Balls:
     """Return the matrix in relative coordinates at a point of balls, or its slope by a parameter there."""
-    sites = [site_at(site, point, by) for site in question.sites]
+    sites = [site_at(site, point, by) for site in question.loop.sites]
     steps = [
         frame_steps(site, group.schedule, step_duals)
-        for site, group in zip(sites, question.system.sites, strict=True)
+        for site, group in zip(sites, question.loop.system.sites, strict=True)
     ]
-    matrix = closed_frame(question.system, sites, steps)
+    matrix = closed_frame(question.loop.system, sites, steps)
     if by is not None:
         matrix = mapped(slope_of, matrix)
     return reduced_balls(matrix, question.rigid.exact, independent_places(question.rigid.basis.T))

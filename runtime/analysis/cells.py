@@ -1,7 +1,8 @@
 """A closed system over many cells of some parameters at once, and which of them a norm proves stable.
 
 Takes: a `ClosedSystem`, its sites over `Fraction` and `Ratio`, its rigid motions; cells.
-Gives: `OpenSystem`, `open_system`; `Cell`; `Looked`, `look`; `change_of_basis`.
+Gives: `OpenLoop`, `open_loop`, `closed_over`; `OpenSystem`, `open_system`; `Cell`; `Looked`, `look`;
+`change_of_basis`.
 Guarantees: a cell that is said to be stable is proved so, at every point of it; rounding is charged.
 Does not: divide cells, or decide what floats leave open (see `box_proof`).
 
@@ -61,21 +62,30 @@ class _Written:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OpenSystem:
-    """One closed system over a box: its sites over the open parameters, its rigid motions, who hears whom.
+class OpenLoop:
+    """One closed system over a box: its sites over the open parameters, who hears whom.
 
-    `written` are its sites in floats, `quotients` the numerators and denominators in these, none where this
-    is 1; `steps` are [F G] by duration in quanta of the sites whose A and B stay.
+    `written` are its sites in floats, `beside` another matrix that is wanted, `quotients` the numerators and
+    denominators in these, none where this is 1; `steps` are [F G] by duration in quanta of the sites whose A
+    and B stay.
     """
 
     system: ClosedSystem
     sites: tuple[LinearSite, ...]
-    rigid: RigidModes
     feedback: tuple[Feedback, ...]
-    relative: Relative
     written: tuple[LinearSite, ...]
+    beside: Matrix
     steps: tuple[Mapping[int, Matrix], ...]
     quotients: tuple[tuple[Polynomial, Polynomial | None], ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OpenSystem:
+    """A closed system over a box, and its rigid motions, which are so all over it."""
+
+    loop: OpenLoop
+    rigid: RigidModes
+    relative: Relative
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,12 +105,25 @@ def open_system(system: ClosedSystem, sites: Sequence[LinearSite], rigid: RigidM
 
     Parameters
     ----------
+    system, sites
+        As for `open_loop`.
+    rigid
+        Its rigid motions, which are so all over the box.
+    """
+    return OpenSystem(open_loop(system, sites), rigid, with_doubt(relative_coordinates(rigid.basis)))
+
+
+def open_loop(system: ClosedSystem, sites: Sequence[LinearSite], beside: Matrix | None = None) -> OpenLoop:
+    """Make a closed system ready to be closed over cells.
+
+    Parameters
+    ----------
     system
         The system, at some point of the box.
     sites
         Its sites' matrices, over `Fraction` and `Ratio`.
-    rigid
-        Its rigid motions, which are so all over the box.
+    beside
+        Another matrix over these that is wanted.
     """
     known: dict[str, int] = {}
     quotients: list[tuple[Polynomial, Polynomial | None]] = []
@@ -122,13 +145,13 @@ def open_system(system: ClosedSystem, sites: Sequence[LinearSite], rigid: RigidM
         return np.array(_Written(still, moving), dtype=object)
 
     alike = {id(site): every_matrix(site, written) for site in sites}
-    return OpenSystem(
+    wanted = written(np.zeros((0, 0)) if beside is None else beside)
+    return OpenLoop(
         system=system,
         sites=tuple(sites),
-        rigid=rigid,
         feedback=tuple(feedback_of(system, system.layout)),
-        relative=with_doubt(relative_coordinates(rigid.basis)),
         written=tuple(alike[id(site)] for site in sites),
+        beside=wanted,
         steps=tuple(_steps(site, group.schedule) for site, group in zip(sites, system.sites, strict=True)),
         quotients=tuple(quotients),
     )
@@ -269,6 +292,22 @@ def _roots(matrix: Floats) -> Floats:
 
 def _matrices(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:
     """Return the matrices in relative coordinates over cells (k, 2 + m, n, n), or of points (k, 2, n, n)."""
+    closed, _ = closed_over(asked.loop, cells)
+    count = closed.shape[1] - 2
+    at = replace(asked.relative, weights=within(asked.relative.weights, count))
+    return relative(closed, at, taylor(count))
+
+
+def closed_over(asked: OpenLoop, cells: Sequence[Cell]) -> tuple[Matrix, Matrix]:
+    """Return the matrices over cells (k, 2 + m, n, n), or of points (k, 2, n, n); and what is wanted beside.
+
+    Parameters
+    ----------
+    asked
+        The system.
+    cells
+        As for `look`.
+    """
     wide = any(low != high for low, high in cells[0])
     parameters = _parameters(cells, wide=wide)
     count = len(parameters) if wide else 0
@@ -298,9 +337,7 @@ def _matrices(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:
         maps.append(known[key])
     heard = [Feedback(within(one.now, count), within(one.before, count)) for one in asked.feedback]
     closed = close(maps, heard, asked.system.layout, numbers=numbers).matrix
-    at = replace(asked.relative, weights=within(asked.relative.weights, count))
-    found = relative(closed, at, numbers)
-    return np.broadcast_to(found, (len(cells), *found.shape[-3:]))
+    return np.broadcast_to(closed, (len(cells), *closed.shape[-3:])), over(asked.beside)
 
 
 def _parameters(cells: Sequence[Cell], *, wide: bool) -> list[Matrix]:

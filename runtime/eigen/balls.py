@@ -270,7 +270,9 @@ def _solve(matrix: Balls, right: Balls) -> Balls | None:
     return found.reshape(right.shape)
 
 
-BALLS = Arithmetic(_multiply, np.add, np.subtract, _exact, _solve)
+BALLS = Arithmetic(
+    _multiply, np.add, np.subtract, _exact, _solve, bounded=np.vectorize(flint.arb, otypes=[object])
+)
 
 
 def square(balls: Balls) -> Any:

@@ -70,9 +70,9 @@ def relative_rows(matrix: Matrix, at: Relative, numbers: Arithmetic = FLOATS) ->
     return numbers.subtract(within, numbers.multiply(at.weights, matrix[..., at.held, :]))
 
 
-def with_doubt(at: Relative) -> Relative:
-    """Return coordinates whose weights W come with their radii."""
-    return replace(at, weights=with_radius(at.weights, at.doubt))
+def with_doubt(at: Relative, numbers: Arithmetic = RADII) -> Relative:
+    """Return coordinates whose weights W come with what they may be off by, in some kind of number."""
+    return replace(at, weights=numbers.bounded(at.weights, at.doubt))
 
 
 def relative_bounded(matrix: Matrix, error: Floats, at: Relative) -> tuple[Matrix, Floats]:

@@ -38,10 +38,10 @@ FEW = 16
 
 @dataclass(frozen=True, slots=True)
 class Arithmetic:
-    """How matrices of a kind of number are multiplied, added, subtracted and solved, and exact ones written.
+    """How matrices of a kind of number are multiplied, added, subtracted and solved, and others written.
 
-    `solve` gives X of M X = R, None where it can't be said, or where nobody asks it of such numbers;
-    `vanishes` says that a matrix is zero.
+    `exact` writes what is exact, `bounded` what may be off by so much. `solve` gives X of M X = R, None where
+    it can't be said, or where nobody asks it of such numbers; `vanishes` says that a matrix is zero.
     """
 
     multiply: Callable[[Matrix, Matrix], Matrix]
@@ -50,6 +50,7 @@ class Arithmetic:
     exact: Callable[[Matrix], Matrix]
     solve: Callable[[Matrix, Matrix], Matrix | None] = lambda matrix, right: None
     vanishes: Callable[[Matrix], bool] = lambda matrix: not matrix.any()
+    bounded: Callable[[Matrix, Matrix], Matrix] = lambda value, off: value
 
 
 def common_shape(*shapes: tuple[int, ...]) -> tuple[int, ...]:
@@ -118,8 +119,15 @@ def _exact(value: Matrix) -> Matrix:
     return np.stack([value, np.zeros_like(value)], axis=-min(value.ndim + 1, 3))
 
 
-def solve(matrix: Matrix, right: Matrix) -> Matrix | None:
+def solve(matrix: Matrix, right: Matrix, numbers: Arithmetic | None = None) -> Matrix | None:
     """Return X of M X = R for all M (2, n, n) and R (2, n, m) within their radii; None where it has no bound.
+
+    Parameters
+    ----------
+    matrix, right
+        M and R.
+    numbers
+        `RADII`, if not given; or that of matrices over cells (see `taylor`), where X follows as they do.
 
     Notes
     -----
@@ -127,23 +135,34 @@ def solve(matrix: Matrix, right: Matrix) -> Matrix | None:
     For any T > 0 with B + |F| T ≤ T, entry by entry, E ≤ T (B being positive, |F| T < T, so that powers of
     |F| die out). T is (I − |F|)⁻¹ B, which is the least there is, and the same of a little of itself.
     """
+    numbers = numbers or RADII
     n = matrix.shape[-1]
     try:
         inverse = np.linalg.inv(value_of(matrix))
     except np.linalg.LinAlgError:
         return None
-    found, exact = inverse @ value_of(right), _exact(inverse)
-    wrong = RADII.subtract(_exact(np.eye(n)), _multiply(exact, matrix))
-    left = _multiply(exact, RADII.subtract(right, _multiply(matrix, _exact(found))))
-    off = np.abs(value_of(left)) + radius_of(left) + np.finfo(np.float64).tiny
-    size = (np.abs(value_of(wrong)) + radius_of(wrong)) * (1 + n * UNIT)
+    exact, found = numbers.exact(inverse), numbers.exact(inverse @ value_of(right))
+    moved = right[..., 2:, :, :] - matrix[..., 2:, :, :] @ value_of(found)[..., None, :, :]
+    found[..., 2:, :, :] = inverse[..., None, :, :] @ moved
+    wrong = numbers.subtract(numbers.exact(np.eye(n)), numbers.multiply(exact, matrix))
+    left = numbers.multiply(exact, numbers.subtract(right, numbers.multiply(matrix, found)))
+    off = _most(left) + np.finfo(np.float64).tiny
+    size = _most(wrong) * (1 + n * UNIT)
     try:
         grown = np.linalg.inv(np.eye(n) - size)
         bound = grown @ (off + SPARED * (grown @ off))
     except np.linalg.LinAlgError:
         return None
     serves = (bound > 0) & ((off + size @ bound) * (1 + (n + 4) * UNIT) <= bound)
-    return with_radius(found, bound) if serves.all() else None
+    radius_of(found)[...] = bound
+    return found if serves.all() else None
+
+
+def _most(matrix: Matrix) -> Matrix:
+    """Return the largest magnitudes of entries (…, n, m) within their radii, wherever in a cell."""
+    sides = np.abs(matrix[..., 2:, :, :]).sum(axis=-3)
+    found = np.abs(value_of(matrix)) + radius_of(matrix) + sides
+    return np.asarray(found * (1 + matrix.shape[-3] * UNIT))
 
 
 def _solve_floats(matrix: Matrix, right: Matrix) -> Matrix | None:
@@ -155,5 +174,10 @@ def _solve_floats(matrix: Matrix, right: Matrix) -> Matrix | None:
 
 FLOATS = Arithmetic(np.matmul, np.add, np.subtract, lambda value: value, _solve_floats)
 RADII = Arithmetic(
-    _multiply, lambda a, b: _added(a, b, np.add), lambda a, b: _added(a, b, np.subtract), _exact, solve
+    _multiply,
+    lambda a, b: _added(a, b, np.add),
+    lambda a, b: _added(a, b, np.subtract),
+    _exact,
+    solve,
+    bounded=with_radius,
 )

@@ -1,7 +1,7 @@
 """What the kernel computes with over many cells at once: floats with slopes, and a radius for all the rest.
 
 Takes: values of matrices at the middle of a cell of parameters, and how they change towards its sides.
-Gives: `taylor`; `within`, `reciprocal`, `step_over`.
+Gives: `taylor`; `within`, `hull`, `corners`; `reciprocal`, `step_over`.
 Guarantees: a sum, product, quotient or exponential holds that of all numbers its operands hold, at every
 point of the cell; rounding is charged. What can't be bounded is infinite or NaN.
 Does not: follow what is of the second order (it goes into the radius); charge what underflows, less than
@@ -16,6 +16,7 @@ Taylor models and other validated functional inclusion methods, 2003). Value and
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.frame.discretize import LEFT_OUT, TERMS, UNIT
-from apc.frame.radius import FEW, Arithmetic, common_shape, radius_of, value_of
+from apc.frame.radius import FEW, RADII, Arithmetic, common_shape, radius_of, solve, value_of, with_radius
 
 Matrix = NDArray[Any]
 
@@ -39,13 +40,32 @@ def taylor(parameters: int) -> Arithmetic:
     def exact(value: Matrix) -> Matrix:
         return np.stack([value, *[np.zeros_like(value)] * (1 + parameters)], axis=-min(value.ndim + 1, 3))
 
-    return Arithmetic(_multiply, _add, _subtract, exact)
+    def bounded(value: Matrix, off: Matrix) -> Matrix:
+        return within(with_radius(value, off), parameters)
+
+    found = Arithmetic(_multiply, _add, _subtract, exact, bounded=bounded)
+    return replace(found, solve=lambda matrix, right: solve(matrix, right, found))
 
 
 def within(matrix: Matrix, parameters: int) -> Matrix:
     """Return matrices with their radii (…, 2, n, m) over cells of parameters that they don't follow."""
     still = np.zeros((*matrix.shape[:-3], parameters, *matrix.shape[-2:]))
     return np.concatenate([matrix, still], axis=-3)
+
+
+def hull(matrix: Matrix) -> Matrix:
+    """Return matrices over cells as matrices with radii (…, 2, n, m) that hold them all over the cells."""
+    off = radius_of(matrix) + _spread(matrix)
+    return with_radius(value_of(matrix), off * (1 + matrix.shape[-3] * UNIT))
+
+
+def corners(matrix: Matrix) -> list[Matrix]:
+    """Return matrices over cells at each corner of these, with their radii (…, 2, n, m)."""
+    found = [matrix[..., :2, :, :]]
+    for by in range(2, matrix.shape[-3]):
+        slope = RADII.exact(matrix[..., by, :, :])
+        found = [turn(one, slope) for one in found for turn in (RADII.add, RADII.subtract)]
+    return found
 
 
 def _slopes(matrix: Matrix) -> Matrix:

@@ -48,7 +48,7 @@ def certified(loop: Loop, cut: Cut, dampings: NDArray[np.float64], *, passive: b
     closed = close_loop(loop)
     for bits in PRECISIONS:
         with precision(bits):
-            maps = cut.maps(frame_balls(closed), dampings, BALLS)
+            maps = cut.maps(frame_balls(closed), BALLS.exact(dampings[:, None]), BALLS)
             if maps is not None and (_gives_nothing(maps) if passive else _gives(maps, angle)):
                 return bits
     return 0

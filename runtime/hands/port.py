@@ -42,9 +42,10 @@ from apc.frame.devices import OWN_MASS, Device, find_device
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.ports import Ports, with_holds, with_ports
-from apc.frame.radius import RADII, Arithmetic, radius_of, solve, value_of, with_radius
+from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
 from apc.frame.schedule import Act, Propagate, Schedule, Send, Tick
 from apc.frame.site import LinearSite
+from apc.frame.taylor import hull
 
 Floats = NDArray[np.float64]
 Places = NDArray[np.intp]
@@ -355,6 +356,10 @@ def _wires(offsets: Sequence[int], size: int, sites: Sequence[Touched]) -> _Wire
     )
 
 
+# What is left of standing aside without some directions (2, k, k), and where all else is along them (2, n, k).
+Standing = tuple[Matrix, Matrix]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Cut:
     """Where a loop of an opened scene is cut, of a layout that many values share.
@@ -367,7 +372,9 @@ class Cut:
     counts: tuple[int, ...]
     rigid: Floats
 
-    def maps(self, whole: Matrix, dampings: Matrix, numbers: Arithmetic) -> Maps | None:
+    def maps(
+        self, whole: Matrix, dampings: Matrix, numbers: Arithmetic, stands: Standing | None = None
+    ) -> Maps | None:
         """Return the map of a closed matrix, or of many (k, …); None where others' motions can't be told.
 
         Parameters
@@ -375,9 +382,11 @@ class Cut:
         whole
             The matrix of the loop, its devices moved from outside.
         dampings
-            Of each site's device (…, sites), N·s/m.
+            Of each site's device, N·s/m, a column (…, sites, 1) of what the matrix is of.
         numbers
             What the matrix is of.
+        stands
+            From `stands_aside`, in numbers with their radii, if the matrix is one over a cell.
         """
         at, exact, multiply = self.at, numbers.exact, numbers.multiply
         of, across = exact(at.of), exact(at.of.T.copy())
@@ -388,6 +397,9 @@ class Cut:
         # A device is where it was as the frame began, and the intervals before have moved it since.
         at_once = whole[..., at.out[:, None], at.into]
         forces = numbers.add(multiply(felt, aside), multiply(at_once, of))
+        if stands is not None:
+            held, along = (numbers.bounded(value_of(one), radius_of(one)) for one in stands)
+            aside, forces = numbers.add(multiply(aside, held), along), multiply(forces, held)
         first = np.argmax(at.of, axis=0)
         many = _weights(forces[..., first, :], self.counts, numbers)
         each = many @ at.of.T
@@ -397,13 +409,10 @@ class Cut:
         b = numbers.subtract(multiply(placed, exact(at.sums)), multiply(aside, across))
         pole = multiply(multiply(of, static), across)
         half = multiply(numbers.add(pole, np.swapaxes(pole, -1, -2)), exact(np.eye(len(at.into)) / 4))
-        dampers = _diagonal((many * dampings) @ at.of.T / at.seconds)
+        per_second = at.of * many[..., None, :] / at.seconds[:, None]
+        share = numbers.bounded(per_second, 4 * UNIT * per_second)
+        damping = multiply(share, dampings) * np.eye(len(at.into))
         units = exact(_diagonal(np.sqrt(at.seconds / each)))
-        damping: Matrix = dampers
-        if numbers is RADII:
-            damping = with_radius(dampers, 4 * UNIT * dampers)
-        elif numbers is BALLS:
-            damping = np.vectorize(lambda one: flint.arb(one, 4 * UNIT * one), otypes=[object])(dampers)
 
         def scaled(matrix: Matrix) -> Matrix:
             return multiply(multiply(units, matrix), units)
@@ -418,49 +427,25 @@ class Cut:
             joined=bool((many == self.counts).all()),
         )
 
-    def slopes(
-        self, whole: Matrix, slope: Matrix, dampings: Matrix, free: Floats
-    ) -> tuple[Matrix, ...] | None:
-        """Return how A, B, C and D + W change with a parameter, with radii; devices count as they are many.
+    def stands_aside(self, whole: Matrix, free: Floats) -> Standing | None:
+        """Return what `maps` takes as given of directions in which devices stand aside, and all else too.
 
         Parameters
         ----------
-        whole, slope
-            The closed matrix (2, …) and how it changes, at all points meant.
-        dampings
-            How the devices' dampings change (2, sites, 1).
+        whole
+            The closed matrix (2, …) at some point of a box.
         free
-            Directions (k, d), at right angles, in which devices stand aside and all else moves along
-            whatever the parameter is.
+            The directions (k, d), at right angles; nobody is pushed along them, whatever the parameters are.
         """
-        at, exact, multiply, add = self.at, RADII.exact, RADII.multiply, RADII.add
-        of, across, sums = exact(at.of), exact(at.of.T.copy()), exact(at.sums)
-        a, placed, felt = _moving(whole, at, self.rigid, RADII)
-        aside = _aside(a, placed, of, RADII)
+        at = self.at
+        a, placed, _ = _moving(whole, at, self.rigid, RADII)
+        aside = _aside(a, placed, RADII.exact(at.of), RADII)
         if aside is None:
             return None
-        a_by, placed_by, felt_by = _moving(slope, at, self.rigid, RADII)
-        pushed = add(multiply(placed_by, of), multiply(a_by, aside))
-        aside_by = solve(RADII.subtract(exact(np.eye(a.shape[-1])), a), pushed)
-        if aside_by is None:
-            return None
-        left = np.eye(len(free)) - free @ free.T
-        held = with_radius(left, (left != 0) * (len(left) + 2) * UNIT)
-        aside_by = multiply(aside_by, held)
-        at_once = slope[..., at.out[:, None], at.into]
-        forces = multiply(add(multiply(felt_by, aside), multiply(at_once, of)), held)
-        forces = add(forces, multiply(felt, aside_by))
-        each = at.of @ self.counts
-        peers, units = exact(np.diag(each)), exact(np.diag(np.sqrt(at.seconds / each)))
-        static = multiply(peers, forces)[..., np.argmax(at.of, axis=0), :]
-        pole = multiply(multiply(of, static), across)
-        half = multiply(add(pole, np.swapaxes(pole, -1, -2)), exact(np.eye(len(at.into)) / 4))
-        each_by = multiply(exact(at.of * (each / at.seconds)[:, None]), dampings)
-        dampers = each_by * np.eye(len(at.into))
-        e = RADII.subtract(add(multiply(peers, multiply(at_once, sums)), dampers), half)
-        b = RADII.subtract(multiply(placed_by, sums), multiply(aside_by, across))
-        felt_by = multiply(units, multiply(peers, felt_by))
-        return a_by, multiply(b, units), felt_by, multiply(multiply(units, e), units)
+        along = free @ free.T
+        charge = (len(along) + 2) * UNIT
+        held, along = (with_radius(one, (one != 0) * charge) for one in (np.eye(len(along)) - along, along))
+        return held, RADII.multiply(aside, along)
 
 
 def port_loop(found: Openings, loop: Loop, *, option: str) -> tuple[PortLoop, Cut]:
@@ -488,7 +473,7 @@ def port_loop(found: Openings, loop: Loop, *, option: str) -> tuple[PortLoop, Cu
     closed = close_loop(loop)
     at = _wires(closed.offsets, len(closed.matrix), sites)
     whole = with_radius(closed.matrix, closed.error)
-    dampings = np.array([float(one.damping) for one in sites])
+    dampings = RADII.exact(np.array([[float(one.damping)] for one in sites]))
     cut = Cut(at, tuple(counts), np.zeros((len(closed.matrix), 0)))
     maps = cut.maps(whole, dampings, RADII)
     if maps is None:
@@ -518,14 +503,16 @@ def _diagonal(values: Floats) -> Floats:
 
 
 def _weights(static: Matrix, counts: Sequence[int], numbers: Arithmetic) -> Floats:
-    """Return `reciprocal`, of one matrix with its radii or of many in floats (k, …)."""
+    """Return `reciprocal`, of one matrix with its radii, over a cell or not, or of many in floats (k, …)."""
     if numbers is BALLS:  # any numbers will do, as long as they are the same throughout
         middle, off = np.vectorize(lambda one: (float(flint.arb(one).mid()), float(flint.arb(one).rad())))(
             static
         )
         return reciprocal(with_radius(middle, off), counts)
-    if numbers is RADII or len(counts) == 1:
-        return reciprocal(static, counts) if numbers is RADII else np.array(counts, dtype=np.float64)
+    if numbers is not FLOATS:
+        return reciprocal(hull(static), counts)
+    if len(counts) == 1:
+        return np.array(counts, dtype=np.float64)
     return np.stack([reciprocal(with_radius(one, EVEN * np.abs(one).max()), counts) for one in static])
 
 
@@ -569,8 +556,7 @@ def _moving(whole: Matrix, at: _Wires, rigid: Floats, numbers: Arithmetic) -> tu
     )
     if not rigid.size:
         return a, placed, felt
-    to = relative_coordinates(rigid[rest])
-    to = with_doubt(to) if numbers is RADII else to
+    to = with_doubt(relative_coordinates(rigid[rest]), numbers)
     less = relative_rows(np.concatenate([a, placed], axis=-1), to, numbers)
     return less[..., to.rest], less[..., len(rest) :], felt[..., to.rest]
 

@@ -32,6 +32,7 @@ from apc.analysis.box_proof import (
     BoxProof,
     ball_radii,
     middle,
+    one_by_one,
     range_ball,
     search_box,
     site_at,
@@ -102,8 +103,9 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
             if not stays_rigid(bare, [asked.open.sites[group.name] for group in bare.sites]):
                 note = f"{loop.name} moves freely in a direction that changes with the parameters"
                 return BoxProof(system.name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), (note,))
-        looks = partial(_reach_out, asked), partial(_is_unstable, asked)
-        return search_box(system.name, ranges, *looks, stable=STABLE, unstable=UNSTABLE)
+        is_unstable = partial(_is_unstable, asked)
+        looks = partial(one_by_one, partial(_reach_out, asked), is_unstable)
+        return search_box(system.name, ranges, looks, is_unstable, stable=STABLE, unstable=UNSTABLE)
 
 
 def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
