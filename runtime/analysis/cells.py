@@ -387,16 +387,15 @@ def _value(
 
 
 def _polynomial(terms: Polynomial, parameters: Sequence[Matrix], numbers: Arithmetic) -> Matrix:
-    total = None
-    for powers, (coefficient, off) in terms:
+    total = numbers.exact(np.zeros((1, 1)))
+    for place, (powers, (coefficient, off)) in enumerate(terms):
         term = numbers.exact(np.array([[coefficient]]))
         radius_of(term)[...] = off
         for number, power in zip(parameters, powers, strict=True):
             for _ in range(power):
                 one = coefficient == 1 and not off and term.ndim == 3
                 term = number if one else numbers.multiply(term, number)
-        total = term if total is None else numbers.add(total, term)
-    assert total is not None, "a quotient that is zero"
+        total = numbers.add(total, term) if place else term
     return total
 
 

@@ -141,7 +141,18 @@ def open_modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Po
 def held_device(
     system: CompiledSystem, prepared: Prepared, group: PeerGroup, part: str, unit_of: Mapping[str, str]
 ) -> Device:
-    """Return the device of a group that a hand holds, `part` of its peers or the only one; or refuse it.
+    """Return the device of a group that a hand holds, or refuse it.
+
+    Parameters
+    ----------
+    system, prepared
+        The compiled scene, and what `analysis.prepare` made of it.
+    group
+        The group, lifted.
+    part
+        What is held of its peers; the only device there is, if not given.
+    unit_of
+        Units of the parameters.
 
     Raises
     ------

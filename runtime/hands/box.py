@@ -195,34 +195,36 @@ def _looked(asked: _Question, cells: Sequence[Cell]) -> Iterator[Looked]:
         some = cells[start : start + TOGETHER]
         over = [closed_over(mode.loop, some) for mode in asked.cuts]
         for place, cell in enumerate(some):
-            if all(
-                _proved(mode, closed[place], dampings[place])
-                for mode, (closed, dampings) in zip(asked.cuts, over, strict=True)
-            ):
-                yield Looked(None)
-            else:
-                reach = asked.weights * [float(high - low) for low, high in cell]
-                yield Looked(reach, _is_unstable(asked, middle(cell)))
+            proved, sound = True, True
+            for mode, (closed, dampings) in zip(asked.cuts, over, strict=True):
+                if proved:
+                    proved, sound = _proved(mode, closed[place], dampings[place])
+            reach = asked.weights * [float(high - low) for low, high in cell]
+            unstable = not sound and _is_unstable(asked, middle(cell))
+            yield Looked(None if proved else reach, unstable)
 
 
-def _proved(mode: _Cut, closed: Matrix, dampings: Matrix) -> bool:
-    """Say whether no scene in a cell gives more energy than it got: at rest, and at any frequency."""
+def _proved(mode: _Cut, closed: Matrix, dampings: Matrix) -> tuple[bool, bool]:
+    """Say whether no scene in a cell gives more energy than it got: at rest, and at any frequency.
+
+    And whether, in floats, the one in its middle doesn't.
+    """
     numbers = taylor(len(closed) - 2)
     maps = mode.cut.maps(closed, dampings, numbers, mode.stands)
     if maps is None or not maps.joined or not np.isfinite(maps.weight).all():
-        return False
+        return False, False
     static = hull(maps.static)
     twice = RADII.add(static, np.swapaxes(static, -1, -2))
     # Where devices stand aside together and feel nothing, they do so all over the box.
     size = 4 * float(np.abs(twice).sum()) + 1.0
     if not is_positive(RADII.add(twice, RADII.exact(size * mode.free @ mode.free.T))):
-        return False
+        return False, False
     parts = maps.a, maps.b, maps.c, numbers.add(maps.d, maps.weight)
     a, b, c, e = (one[:2] for one in parts)
     # A storage that serves with half of what can be spared leaves the rest for the cell.
     least, _ = least_real(value_of(a), value_of(b), value_of(c), value_of(e), np.zeros(e.shape[-2:]))
     if not 0 < least < np.inf:
-        return least > 0
+        return least > 0, least > 0
     less = RADII.subtract(e, RADII.exact(least / 2 * np.eye(e.shape[-1])))
     at_corners = zip(*map(corners, parts), strict=True)
-    return proves_positive_between((a, b, c, less), list(at_corners), spared=SPARED)
+    return proves_positive_between((a, b, c, less), list(at_corners), spared=SPARED), True

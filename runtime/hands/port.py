@@ -356,7 +356,8 @@ def _wires(offsets: Sequence[int], size: int, sites: Sequence[Touched]) -> _Wire
     )
 
 
-# What is left of standing aside without some directions (2, k, k), and where all else is along them (2, n, k).
+# What is left of standing aside without some directions (2, k, k), and all else along those (2, n, k),
+# with their radii.
 Standing = tuple[Matrix, Matrix]
 
 

@@ -143,7 +143,7 @@ class PortEvaluator:
             dampers = np.stack(np.broadcast_arrays(*(dampings[key] for key in keys)), axis=-1)
             if numbers is RADII:
                 whole, dampers = whole.reshape(whole.shape[-3:]), dampers[0]
-            found.append(wired.cut.maps(whole, dampers, numbers))
+            found.append(wired.cut.maps(whole, numbers.exact(dampers[..., None]), numbers))
         return found
 
     def _lift(self, opened: Opened, values: Floats, numbers: Arithmetic) -> tuple[FrameMap, Floats]:
