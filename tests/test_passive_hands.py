@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +13,17 @@ import pytest
 
 import apc
 from apc.__main__ import run
+from apc.analysis import box_proof
 from apc.analysis.analysis import analyze, lifted_groups, prepare
 from apc.analysis.box import parse_range
+from apc.analysis.cells import closed_over
 from apc.compiler.errors import ApcError
+from apc.eigen.balls import precision
 from apc.eigen.dissipation import least_real
 from apc.frame.devices import clamped, held, with_hands
-from apc.frame.radius import value_of
+from apc.frame.radius import RADII, value_of
+from apc.frame.taylor import taylor
+from apc.hands import box as hands_box
 from apc.hands.box import prove_box
 from apc.hands.certify import certified
 from apc.hands.passivity import STABLE, UNSTABLE, passive_growth, passive_hands
@@ -337,6 +344,47 @@ def test_cells_are_halved_where_that_makes_them_easier_to_prove() -> None:
     found = prove_box(system, [parse_range(system, one) for one in boxes])
     assert found.stable
     assert found.cells < 40
+
+
+@pytest.mark.parametrize(
+    ("text", "boxes"),
+    [
+        (users(3, 200), ("contact.stiffness=±10%", "coordination.stiffness=±5%")),
+        (users(2, 150), ("device.mass=±20%", "device.damping=±20%", "cube.mass=±5%")),
+    ],
+)
+def test_the_map_of_moved_devices_is_within_its_radius_all_over_a_cell(
+    text: str, boxes: tuple[str, ...]
+) -> None:
+    """Against the same map at corners of the cell and inside it, each by itself."""
+    system = compiled(text)
+    ranges = [parse_range(system, one) for one in boxes]
+    generator = np.random.default_rng(4)
+    with precision(box_proof.BITS):
+        asked = hands_box._question(system, ranges)
+        assert not isinstance(asked, str)
+        whole = tuple((one.low, one.high) for one in ranges)
+        sides = [
+            *itertools.product((-1.0, 1.0), repeat=len(ranges)),
+            *generator.uniform(-1, 1, (5, len(ranges))),
+        ]
+        for mode in asked.cuts:
+            closed, dampings = closed_over(mode.loop, [whole])
+            over = mode.cut.maps(closed[0], dampings[0], taylor(len(ranges)), mode.stands)
+            assert over is not None
+            for side in sides:
+                point = [
+                    low + (1 + Fraction(float(one))) / 2 * (high - low)
+                    for (low, high), one in zip(whole, side, strict=True)
+                ]
+                matrix, damping = closed_over(mode.loop, [tuple((one, one) for one in point)])
+                here = mode.cut.maps(matrix[0], damping[0], RADII)
+                assert here is not None
+                for name in ("a", "b", "c", "d", "weight", "static"):
+                    found, truth = getattr(over, name), getattr(here, name)
+                    held = found[0] + np.tensordot(np.array(side, dtype=float), found[2:], axes=1)
+                    room = found[1] + truth[1] + 1e-15 * np.abs(found).sum(axis=0)  # of adding it up here
+                    assert (np.abs(held - truth[0]) <= room).all(), name
 
 
 def test_no_box_is_proved_where_hands_pull_unevenly_or_a_velocity_is_sampled() -> None:
