@@ -298,3 +298,12 @@ def test_the_result_is_a_table_a_text_and_plain_data() -> None:
 def test_values_that_are_none_are_told(values: dict[str, Any], message: str) -> None:
     (got,) = told(analyze_many, compiled(AVERAGE), values)
     assert got.startswith(f"analyze_many: {message}")
+
+
+def test_no_point_beside_a_double_eigenvalue_has_a_far_wider_bound() -> None:
+    """At 1708 N/m and 10 N/m two eigenvalues nearly meet, and the vectors nearly are one."""
+    contact, coordination = np.meshgrid(np.linspace(10, 3000, 200), [10.0, 25.0])
+    found = analyze_many(
+        compiled(AVERAGE), {"contact.stiffness": contact, "coordination.stiffness": coordination}
+    )
+    assert found.spectral_radius_error.max() < 2 * many.WIDER * np.median(found.spectral_radius_error)

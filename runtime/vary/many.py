@@ -63,6 +63,10 @@ TOGETHER, ENTRIES = 2048, 112 * 2**10
 # rounding does, wider than each one's own by about that. Of fewer on average than so many each has its own.
 NEAR, WORTH = 0.25, 4
 
+# A bound that is so many times as wide as most is made anew, by an analysis of its point, unless more than
+# this share of all are.
+WIDER, RARE = 4.0, 0.01
+
 # An evaluator takes as long to prepare as one analysis: for fewer points it isn't.
 FEWEST = 3
 
@@ -446,7 +450,9 @@ def _decided(
             allowed &= ~size[:, ~pattern].any(axis=1)
     some = np.flatnonzero(allowed)
     known = leading(family.evaluator, family.parts, [one.at(some) for one in systems], len(some))
-    into, some = known.certain, some[known.certain]
+    into = np.flatnonzero(known.certain)
+    into = into[~_loose(known.error[into])]
+    some = some[into]
     place, radius = rows[some], known.radius[into]
     found.verdict[place] = judge([True], family.rigid, family.drifts)[0]
     found.verdict[place[radius > 1]] = UNSTABLE
@@ -459,6 +465,16 @@ def _decided(
     done = np.zeros(len(rows), dtype=np.bool_)
     done[some] = True
     return done
+
+
+def _loose(error: Floats) -> Truths:
+    """Return which points have far wider bounds (k,) than most: an analysis of each tells them as ever.
+
+    Near an eigenvalue that is a double one what is shared with others no longer serves. Where many are wider
+    that is not why.
+    """
+    wide = error > WIDER * np.median(error) if len(error) else np.zeros(0, dtype=np.bool_)
+    return wide if wide.sum() <= RARE * len(error) else np.zeros(len(error), dtype=np.bool_)
 
 
 def _vectors(
