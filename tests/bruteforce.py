@@ -2,7 +2,7 @@
 
 The scene is the one of `sites.paper`: point masses under zero-order-held forces, in closed form. The matrix
 of one frame comes column by column, each the frame that starts from one unit vector. Numbers are floats or
-mpmath's (`frame_matrix(…, number=mpmath.mpf)`, at the working precision set by the caller) or anything with
+FLINT's (`frame_matrix(…, number=as_ball)`, at the working precision set by the caller) or anything with
 arithmetic and an `exp`.
 """
 
@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
+import flint
 import numpy as np
 from numpy.typing import NDArray
 
@@ -65,6 +66,13 @@ class Scene:
         if self.weights is None:
             return [(sender, 1) for sender in others]
         return [(j, self.weights[j, receiver]) for j in others if (j, receiver) in self.weights]
+
+
+def as_ball(value: Any) -> flint.arb:
+    """Return a number as a ball: FLINT's, at the working precision set by the caller."""
+    if isinstance(value, Fraction):
+        return flint.arb(flint.fmpq(value.numerator, value.denominator))
+    return flint.arb(value)
 
 
 def frame_matrix(

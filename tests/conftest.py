@@ -8,6 +8,8 @@ as many values of each parameter as they can, and all of them with `pytest --who
 
 from __future__ import annotations
 
+import gc
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -17,6 +19,21 @@ from hypothesis import HealthCheck, settings
 # How long an example takes, or the making of one, says nothing of whether a claim is true.
 settings.register_profile("apc", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("apc")
+
+# What a shell starts in the background is deaf to Ctrl-C, and so would be all that a test ends by it.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection() -> None:
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """All that was collected stays until the end: it is not looked through for garbage again and again."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import typing
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -187,6 +188,20 @@ def modules() -> dict[str, Path]:
 
 
 @functools.cache
+def tree_of(path: Path) -> tuple[ast.Module, tuple[ast.AST, ...]]:
+    """Return a file's tree, and all that is in it."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return tree, tuple(ast.walk(tree))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forgotten() -> Iterator[None]:
+    """Keep the trees of all files no longer than they are looked at."""
+    yield
+    tree_of.cache_clear()
+
+
+@functools.cache
 def imports() -> dict[str, set[str]]:
     """Return, of every module, the names of our own modules that it imports, anywhere in it."""
     return {name: imports_of(path) & set(ORDER) for name, path in modules().items()}
@@ -194,7 +209,7 @@ def imports() -> dict[str, set[str]]:
 
 def imports_of(path: Path) -> set[str]:
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in tree_of(path)[1]:
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -216,8 +231,7 @@ def test_a_module_imports_only_what_comes_before_it() -> None:
 
 def test_every_result_is_shown_as_text_and_as_data() -> None:
     for name, path in modules().items():
-        text = path.read_text(encoding="utf-8")
-        for node in ast.walk(ast.parse(text if "Result" in text else "")):
+        for node in tree_of(path)[1]:
             if isinstance(node, ast.ClassDef) and "Result" in map(ast.unparse, node.bases):
                 module, _, own = getattr(importlib.import_module(name), node.name).shown_by.partition(":")
                 for form in ("text", "document"):
@@ -264,9 +278,9 @@ def test_the_page_on_the_rooms_names_what_there_is() -> None:
 
 def test_nothing_is_evaluated_or_unpickled() -> None:
     for name, path in modules().items():
-        tree = ast.parse(path.read_text(encoding="utf-8"))
+        tree, nodes = tree_of(path)
         defined = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
-        for node in ast.walk(tree):
+        for node in nodes:
             if isinstance(node, ast.Call):
                 function = node.func
                 called = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")

@@ -18,7 +18,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
 from apc.eigen.balls import precision
 from tests.bench.contact_reference import Bounce, positions, reference
-from tests.bruteforce import Scene, frame_matrix
+from tests.bruteforce import Scene, as_ball, frame_matrix
 from tests.eventwise import experiment, play
 from tests.fifty_digits import events
 from tests.fifty_digits import truth as fifty_digits
@@ -28,16 +28,10 @@ from tests.sites import MS, columned, edged, grouped, linked, paper
 from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced
 
 
-def _arb(value: object) -> flint.arb:
-    if isinstance(value, Fraction):
-        return flint.arb(flint.fmpq(value.numerator, value.denominator))
-    return flint.arb(value)
-
-
 def _radius(scene: Scene, rigid: int) -> flint.arb:
     """Return the radius by the brute force of the tests, which knows the scene and no compiled function."""
     with precision(600):
-        rows = frame_matrix(scene, number=_arb, exp=lambda value: value.exp())
+        rows = frame_matrix(scene, number=as_ball, exp=lambda value: value.exp())
         values = flint.acb_mat([[flint.acb(e.mid()) for e in row] for row in rows]).eig(algorithm="approx")
         values.sort(key=lambda value: float(abs(value - 1).mid()))
         return max(abs(value).mid() for value in values[rigid:])

@@ -18,7 +18,7 @@ import pytest
 from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import CompiledSystem, Group, Parameter
 from apc.eigen.balls import precision
-from tests.bruteforce import Scene, frame_matrix
+from tests.bruteforce import Scene, as_ball, frame_matrix
 from tests.sites import MS, alone, columned, grouped, linked, paper
 
 TRANSLATING = "stable up to a common translation"
@@ -32,16 +32,10 @@ _OWN = {
 }
 
 
-def _arb(value: object) -> flint.arb:
-    if isinstance(value, Fraction):
-        return flint.arb(flint.fmpq(value.numerator, value.denominator))
-    return flint.arb(value)
-
-
 def truth(scene: Scene, bits: int) -> list[flint.acb]:
     """Return the eigenvalues of the full map, all peers as one, by propagating it event by event."""
     with precision(bits):
-        rows = frame_matrix(scene, number=_arb, exp=lambda value: value.exp())
+        rows = frame_matrix(scene, number=as_ball, exp=lambda value: value.exp())
         return flint.acb_mat([[flint.acb(e.mid()) for e in row] for row in rows]).eig(algorithm="approx")
 
 
@@ -182,7 +176,7 @@ def _characteristic(frames: int):  # type: ignore[no-untyped-def] # a helper of 
     """Return det(z − P − sign·z^(−d) Q S) of one user, from the brute force map of two."""
     with precision(300):
         base = {"kt": 5.0, "bt": 0.0, "kc": 500.0, "comm": 8 * MS}
-        two = frame_matrix(Scene(peers=2, operator="mean", **base), number=_arb, exp=lambda v: v.exp())
+        two = frame_matrix(Scene(peers=2, operator="mean", **base), number=as_ball, exp=lambda v: v.exp())
     # A user's own part, and what the other's packets do: packets of one frame ago are what is heard.
     size = len(two) // 2
     own = [[two[i][j] for j in range(size)] for i in range(size)]

@@ -18,7 +18,7 @@ from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.spectrum import oscillation
-from tests.bruteforce import Scene, frame_matrix
+from tests.bruteforce import Scene, as_ball, frame_matrix
 from tests.reference import CONTACT_LIMITS, HELPED_LIMITS, LIMITS, OPERATORS, RADII
 from tests.sites import MS, grouped, paper
 from tests.topologies import ROOT
@@ -90,17 +90,11 @@ def test_a_slow_late_network_brakes_like_a_damper(operator: str, viscosity: floa
 # ---- error bounds ----
 
 
-def _arb(value: object) -> flint.arb:
-    if isinstance(value, Fraction):
-        return flint.arb(flint.fmpq(value.numerator, value.denominator))
-    return flint.arb(value)
-
-
 def _truth(scene: Scene) -> list[flint.acb]:
     """Return the eigenvalues of the full map at 120 digits, of which four equal ones keep 30."""
     before, flint.ctx.dps = flint.ctx.dps, 120
     try:
-        rows = frame_matrix(scene, number=_arb, exp=lambda value: value.exp())
+        rows = frame_matrix(scene, number=as_ball, exp=lambda value: value.exp())
         return flint.acb_mat([[flint.acb(e.mid()) for e in row] for row in rows]).eig(algorithm="approx")
     finally:
         flint.ctx.dps = before

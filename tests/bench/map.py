@@ -27,7 +27,7 @@ from apc.vary.many import analyze_many
 from tests.bench.judge import Judge, parser_of
 from tests.bench.naive_region import modal_radii
 from tests.bench.paper_scene import CUBE_DAMPING, DEVICE_DAMPING, DEVICE_MASS, SHARED_MASS, TICKS, USERS
-from tests.bruteforce import Scene, frame_matrix
+from tests.bruteforce import Scene, as_ball, frame_matrix
 from tests.topologies import AVERAGE, MESH, compiled
 
 SIDE = 100  # of the map that is made at once
@@ -83,7 +83,7 @@ def _frame(
 
 def _step(kilograms: Fraction, damping: float) -> tuple[flint.arb, ...]:
     """Return what of x and v a millisecond leaves and what a force adds to them."""
-    mass, t = _arb(kilograms), _arb(MS)
+    mass, t = as_ball(kilograms), as_ball(MS)
     b = flint.arb(damping)
     decay = (-b * t / mass).exp()
     rise = (1 - decay) / b  # ∫₀ᵗ e^(−b s/m)/m ds
@@ -101,17 +101,11 @@ def check_truth() -> None:
     """Assert that the truth of one user is that of three, event by event."""
     for mesh in (False, True):
         scene = Scene(operator="sum" if mesh else "mean", kc=1500.0, kt=800.0, bt=2.0, bc=2.0, cube=CUBE)  # type: ignore[arg-type] # any number will do
-        rows = frame_matrix(scene, number=_arb, exp=lambda value: value.exp())
+        rows = frame_matrix(scene, number=as_ball, exp=lambda value: value.exp())
         whole = flint.acb_mat([[flint.acb(e.mid()) for e in row] for row in rows]).eig(algorithm="approx")
         whole.sort(key=lambda value: float(abs(value - 1).mid()))
         radius = max(abs(value).mid() for value in whole[1:])
         assert float(abs(radius - truth(mesh, 1500.0, 800.0, 2.0).radius)) < CERTAIN
-
-
-def _arb(value: object) -> flint.arb:
-    if isinstance(value, Fraction):
-        return flint.arb(flint.fmpq(value.numerator, value.denominator))
-    return flint.arb(value)
 
 
 @dataclass
