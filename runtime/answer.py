@@ -288,7 +288,7 @@ def _margins(system: CompiledSystem, prepared: Prepared, found: Analysis, *, qui
     if why := _too_large(system, prepared, found):
         return Margins((), why)
     try:
-        return margins(system, prepared=prepared, quick=quick)
+        return margins(system, prepared=prepared, quick=quick, rigid=found.rigid_modes)
     except ApcError as error:
         return Margins((), f"not looked for: {error.mistakes[0].what}")
 

@@ -276,21 +276,26 @@ def bounded_weight(weight: Fraction, doubt: float) -> tuple[float, float]:
 def feedback_of(loop: Loop | ClosedSystem, layout: StateLayout) -> list[Feedback]:
     """Return what each site hears, each weight with the radius of its doubt and of its rounding."""
     row_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in loop.sites]
-    starts = np.cumsum([0] + [len(group.schedule.sent) for group in loop.sites])
+    starts = np.cumsum([0] + [len(group.schedule.sent) for group in loop.sites]).tolist()
+    # Few weights at many places: each is looked at once, and plain keys are found faster than packets.
+    places = {(one.site, one.row, one.lag): place for one, place in layout.places.items()}
+    known: dict[tuple[int, int, float], tuple[float, float]] = {}
     found = []
     for g, group in enumerate(loop.sites):
         now = np.zeros((2, len(group.schedule.heard), starts[-1]))
         before = np.zeros((2, len(group.schedule.heard), len(layout.names)))
         for line, one in enumerate(group.schedule.heard):
             doubt = loop.doubts.get(one.way, 0.0)
+            columns, weights = [], []
             for h, weight in enumerate(loop.coupling[one.way][g]):
                 if not (weight or doubt):
                     continue
+                key = weight.numerator, weight.denominator, doubt
                 row = row_of[h][one.sent]
-                if one.lag == 0:
-                    now[:, line, starts[h] + row] = bounded_weight(weight, doubt)
-                else:
-                    before[:, line, layout.places[Packet(h, row, one.lag)]] = bounded_weight(weight, doubt)
+                columns.append(places[h, row, one.lag] if one.lag else starts[h] + row)
+                weights.append(known.get(key) or known.setdefault(key, bounded_weight(weight, doubt)))
+            if columns:
+                (before if one.lag else now)[:, line, columns] = np.array(weights).T
         found.append(Feedback(now, before))
     return found
 

@@ -73,19 +73,18 @@ def balance(size: Floats) -> Floats:
     np.fill_diagonal(squared, 0.0)
     scale = np.ones(len(size))
     for _ in range(SWEEPS):
-        settled = True
-        for i in range(len(size)):
-            column, row = float(squared[:, i].sum()), float(squared[i].sum())
-            if not (0 < column < np.inf and 0 < row < np.inf):
-                continue
-            factor = 2.0 ** round(np.log2(row / column) / 4)
-            if factor != 1.0:
-                settled = False
-                scale[i] *= factor
-                squared[:, i] *= factor * factor
-                squared[i] /= factor * factor
-        if settled:
+        columns, rows = squared.sum(axis=0), squared.sum(axis=1)
+        told = (columns > 0) & (columns < np.inf) & (rows > 0) & (rows < np.inf)
+        quarters = np.round(np.log2(rows[told] / columns[told]) / 4)
+        unsettled = np.flatnonzero(told)[quarters != 0]
+        if not len(unsettled):
             break
+        for i in unsettled.tolist():  # one after another, as each changes the sums of others
+            column, row = float(squared[:, i].sum()), float(squared[i].sum())
+            factor = 2.0 ** round(math.log2(row / column) / 4)
+            scale[i] *= factor
+            squared[:, i] *= factor * factor
+            squared[i] /= factor * factor
     return scale
 
 

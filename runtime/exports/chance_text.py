@@ -135,10 +135,10 @@ def chance_source(chance: Chance, own: str, channels: int, ring: int) -> str:
     drawn = [
         "double u[4], late = delays[w];",
         f"if (number == 0) {OPEN}",
-        f"  chances(key, 1, {own}_senders[w], {own}_receivers[w], u);",
+        f"  chances(1, key[0], key + 1, 1, {own}_senders + w, {own}_receivers + w, &u);",
         f"  way->bad = u[0] < {number(law.bad)};",
         CLOSE,
-        f"chances(key, number + 2, {own}_senders[w], {own}_receivers[w], u);",
+        f"chances(1, key[0], key + 1, number + 2, {own}_senders + w, {own}_receivers + w, &u);",
         f"int lost = u[1] < (way->bad ? {number(law.one_minus_h)} : {number(law.one_minus_k)});",
         f"way->bad = way->bad ? u[0] < 1 - {number(law.r)} : u[0] < {number(law.p)};",
     ]
@@ -158,8 +158,8 @@ def chance_source(chance: Chance, own: str, channels: int, ring: int) -> str:
         wins = f"one->due > way->arrived || (one->due == way->arrived && {wins})"
     body = "".join(f"    {one}\n" for one in drawn)
     return f"""\
-static const int {own}_senders[{count}] = {_row(sender for sender, _ in chance.ways)};
-static const int {own}_receivers[{count}] = {_row(receiver for _, receiver in chance.ways)};
+static const whole {own}_senders[{count}] = {_row(sender for sender, _ in chance.ways)};
+static const whole {own}_receivers[{count}] = {_row(receiver for _, receiver in chance.ways)};
 
 /* A packet goes out on all ways of its sender. */
 static void draw_{own}(model *m, int sender, long long number) {OPEN}

@@ -10,17 +10,21 @@ enum { TOTAL, COMPLETE, WEIGHED, DELIVER, ON_WAYS, COPY, COPY_WAYS, LOOK, MOVE, 
 
 typedef struct {
   whole ways, runs, slots, ticks, phase, period, first_tick, tick_period, kept, buckets, newest, zero, channels;
-  whole distribution, traced;
+  whole distribution, traced, stride;
   double p, r, one_minus_h, one_minus_k, bad_share, jitter, quantum;
   const double *trace, *delays;                   /* (traced,); of each way, in seconds */
   const whole *nominal, *senders, *receivers;     /* of each way: quanta, peers of the scene */
-  const whole *columns, *keys;                    /* of each way's sender and run; (channels, slots) */
+  const int32_t *columns;                         /* of each way's sender and run */
+  const whole *keys;                              /* (channels, slots) */
   double *held;                                   /* (channels, ways · runs): what is in effect */
-  whole *effective, *gap, *arrived;               /* (ways · runs,): numbers, and the tick that first saw it */
+  whole *effective, *gap;                         /* (ways · runs,): numbers */
   int8_t *bad;                                    /* (ways · runs,) */
-  int32_t *heads, *next;                          /* (buckets,), (kept, ways · runs): packets by their tick */
-  whole *waits;                                   /* (kept, ways · runs), where the order of arrival matters:
-                                                     from its arrival to its tick, in parts of a quantum */
+  int32_t *heads, *queue;                         /* (buckets,), (kept, stride): packets by their tick, run by run: the
+                                                     tick's next run, then its packets as TAG says */
+  int32_t *when, *places;                         /* (ways · runs,), (buckets,) zeros: while packets are drawn */
+  whole *arrived, *waits;                         /* (ways · runs,), (kept, ways · runs), where the order of arrival
+                                                     matters: the tick that saw what is in effect; from its arrival
+                                                     to its tick, in parts of a quantum */
   uint64_t key[2];                                /* of the first run */
   whole heard;                                    /* ticks so far */
 } Route;
@@ -56,48 +60,89 @@ static inline whole quotient(whole a, whole b) {
   return (a | b) >> 32 ? a / b : (whole)((uint32_t)a / (uint32_t)b);
 }
 
+enum { LAST = 1, LOST = 2, TAG = 4 }; /* a packet in the queue is TAG · way and run, + LOST, + LAST of its run */
+enum { BLOCK = 256 };                 /* ways whose chances are drawn before they are looked at */
+
+/* Draw the chances of some ways and runs from `begin` on. */
+static void draw_chances(const Route *r, whole number, whole begin, whole some, double (*u)[4]) {
+  whole way = begin / r->runs, run = begin % r->runs, senders[SIDE], receivers[SIDE];
+  uint64_t keys[SIDE];
+  for (whole i = 0; i < some; i += SIDE) {
+    for (int k = 0; k < SIDE; k++) {
+      senders[k] = r->senders[way], receivers[k] = r->receivers[way];
+      keys[k] = r->key[1] + ((uint64_t)run << 32); /* as `network.channel.luck_key` */
+      if (i + k + 1 < some && ++run == r->runs) run = 0, way++;
+    }
+    chances(SIDE, r->key[0], keys, number, senders, receivers, u + i);
+  }
+}
+
 /* Send packet `number` of every way: draw its luck and put it where the tick that first sees it will look. */
 static int draw(Route *r, whole number) {
   whole slot = number % r->kept, sent = r->phase + r->period * number, all = r->ways * r->runs;
   whole base = sent - r->first_tick - r->heard * r->tick_period, most = r->buckets * r->tick_period;
-  whole bucket = r->heard % r->buckets;
-  int32_t *next = r->next + slot * all;
+  whole bucket = r->heard % r->buckets, first = r->buckets, last = -1;
   int chance = !r->traced && (r->jitter > 0 || r->bad_share > 0 || r->one_minus_k > 0 || r->p > 0);
-  for (whole w = 0, way = 0, run = 0; w < all; w++, way += ++run == r->runs, run %= r->runs) {
-    const uint64_t key[2] = {r->key[0], r->key[1] + ((uint64_t)run << 32)}; /* as `network.channel.luck_key` */
+  double u[BLOCK][4];
+  const double jitter = r->jitter, quantum = r->quantum, good = r->one_minus_k, ill = r->one_minus_h;
+  const double worse = r->p, stays = 1 - r->r, *delays = r->delays;
+  const whole zero = r->zero, buckets = r->buckets, tick = r->tick_period, traced = r->traced, runs = r->runs;
+  int32_t *when = r->when, *places = r->places;
+  int8_t *is_bad = r->bad; /* what is written there might be any field, as far as a compiler knows: hence all these */
+  for (whole w = 0, way = 0, run = 0; w < all; w++, run = run + 1 < runs ? run + 1 : 0, way += !run) {
+    const double *own = u[w % BLOCK];
     double late;
-    int lost;
-    if (r->traced) {
-      late = r->trace[number % r->traced];
-      lost = 0;
-    } else {
-      double u[4] = {1, 1, 0, 0};
-      if (number == 0) {
-        double first[4];
-        chances(key, 1, r->senders[way], r->receivers[way], first);
-        r->bad[w] = first[0] < r->bad_share;
+    int lost = 0;
+    when[w] = -1;
+    if (traced) late = r->trace[number % traced];
+    else {
+      if (w % BLOCK == 0) {
+        whole some = all - w < BLOCK ? all - w : BLOCK;
+        if (number == 0) {
+          draw_chances(r, 1, w, some, u);
+          for (whole i = 0; i < some; i++) is_bad[w + i] = u[i][0] < r->bad_share;
+        }
+        if (chance) draw_chances(r, number + 2, w, some, u);
       }
-      if (chance) chances(key, number + 2, r->senders[way], r->receivers[way], u);
-      int bad = r->bad[w];
-      lost = u[1] < (bad ? r->one_minus_h : r->one_minus_k);
-      r->bad[w] = bad ? u[0] < 1 - r->r : u[0] < r->p;
-      late = r->delays[way];
-      if (r->jitter > 0) {
-        late += r->jitter * deviate(r->distribution, u[2], u[3]);
-        if (late < 0) late = 0;
+      late = delays[way];
+      if (chance) {
+        int bad = is_bad[w];
+        lost = own[1] < (bad ? ill : good);
+        is_bad[w] = bad ? own[0] < stays : own[0] < worse;
+        if (jitter > 0) {
+          late += jitter * deviate(r->distribution, own[2], own[3]);
+          if (late < 0) late = 0;
+        }
       }
     }
-    late /= r->quantum;
+    late /= quantum;
     lost |= !(late < LONGEST);
-    if (lost && !r->zero) continue;
+    if (lost && !zero) continue;
     whole fine = lost ? r->nominal[way] * ONE : (whole)rint(late * ONE);
     whole since = base + (fine + ONE - 1) / ONE; /* since the tick that is heard next */
-    whole ticks = since > 0 ? quotient(since + r->tick_period - 1, r->tick_period) : 0;
-    if (since > most || ticks >= r->buckets) return 1;
-    int32_t *head = r->heads + (bucket + ticks < r->buckets ? bucket + ticks : bucket + ticks - r->buckets), id = (int32_t)(2 * (slot * all + w) + lost);
-    next[w] = *head;
-    *head = id;
-    if (r->waits && !lost) r->waits[slot * all + w] = (ticks * r->tick_period - since) * ONE + (ONE - fine % ONE) % ONE;
+    whole ticks = since > 0 ? quotient(since + tick - 1, tick) : 0;
+    if (since > most || ticks >= buckets) return 1;
+    if (ticks < first) first = ticks;
+    if (ticks > last) last = ticks;
+    places[ticks]++;
+    when[w] = (int32_t)(2 * ticks + lost);
+    if (!r->newest && !lost)
+      r->waits[slot * all + w] = (ticks * tick - since) * ONE + (ONE - fine % ONE) % ONE;
+  }
+  int32_t at = (int32_t)(slot * r->stride);
+  for (whole ticks = first; ticks <= last; ticks++) {
+    int32_t count = places[ticks], *head = r->heads + (bucket + ticks) % buckets;
+    if (!count) continue;
+    r->queue[at] = *head;
+    *head = at++;
+    places[ticks] = at;
+    at += count;
+  }
+  for (whole w = 0; w < all; w++)
+    if (when[w] >= 0) r->queue[places[when[w] >> 1]++] = (int32_t)(TAG * w + (when[w] & 1 ? LOST : 0));
+  for (whole ticks = first; ticks <= last; ticks++) {
+    if (places[ticks]) r->queue[places[ticks] - 1] |= LAST;
+    places[ticks] = 0;
   }
   return 0;
 }
@@ -113,24 +158,33 @@ static inline int is_before(const Route *r, whole w, whole number) {
 static void deliver(const Plan *plan, Route *r, whole tick, whole newest) {
   whole all = r->ways * r->runs, newest_slot = newest % r->kept, frame = newest / r->slots % plan->frames_kept;
   for (; r->heard <= tick; r->heard++) {
-    int32_t *head = r->heads + r->heard % r->buckets, id = *head;
+    int32_t *head = r->heads + r->heard % r->buckets, at = *head;
     *head = -1;
-    for (; id >= 0; id = r->next[id >> 1]) {
-      whole slot = quotient(id >> 1, all), w = (id >> 1) - slot * all;
-      whole ago = newest_slot - slot + (slot > newest_slot ? r->kept : 0), number = newest - ago;
-      if (id & 1) {
-        if (number > r->gap[w]) r->gap[w] = number;
-        continue;
-      }
-      if (r->newest ? number < r->effective[w] : r->arrived[w] == r->heard && is_before(r, w, number)) continue;
-      r->effective[w] = number;
-      r->arrived[w] = r->heard;
-      whole frames_ago = quotient(ago, r->slots), kept = frame - frames_ago;
+    while (at >= 0) { /* a run: packets sent together */
+      whole slot = quotient(at, r->stride), ago = newest_slot - slot + (slot > newest_slot ? r->kept : 0);
+      whole number = newest - ago, frames_ago = quotient(ago, r->slots), kept = frame - frames_ago;
       const whole *keys = r->keys + r->slots - 1 - (ago - frames_ago * r->slots);
       if (kept < 0) kept += plan->frames_kept;
-      for (whole c = 0; c < r->channels; c++)
-        r->held[c * all + w] =
-          plan->packets[(kept * plan->keys + keys[c * r->slots]) * plan->peers + r->columns[w]];
+      int32_t next = r->queue[at], id;
+      do {
+        id = r->queue[++at];
+        whole w = id / TAG;
+        if (id & LOST) {
+          if (number > r->gap[w]) r->gap[w] = number;
+          continue;
+        }
+        if (r->newest) {
+          if (number < r->effective[w]) continue;
+        } else {
+          if (r->arrived[w] == r->heard && is_before(r, w, number)) continue;
+          r->arrived[w] = r->heard;
+        }
+        r->effective[w] = number;
+        for (whole c = 0; c < r->channels; c++)
+          r->held[c * all + w] =
+            plan->packets[(kept * plan->keys + keys[c * r->slots]) * plan->peers + r->columns[w]];
+      } while (!(id & LAST));
+      at = next;
     }
   }
 }
@@ -151,7 +205,7 @@ static double sum(const double *values, whole count) {
   return (lanes[0] + lanes[1]) + (lanes[2] + lanes[3]);
 }
 
-#define SIDE 8 /* runs that are added up at once */
+#define RUNS 8 /* runs that are added up at once */
 
 /* Adds the sums of all runs to what is there. */
 static void add_sums(const double *values, whole count, whole runs, double *to) {
@@ -164,13 +218,13 @@ static void add_sums(const double *values, whole count, whole runs, double *to) 
       to[run] += total;
     }
   else
-    for (whole run = 0; run < runs; run += SIDE) {
-      double lanes[4][SIDE] = {{0}};
-      whole some = runs - run < SIDE ? runs - run : SIDE;
+    for (whole run = 0; run < runs; run += RUNS) {
+      double lanes[4][RUNS] = {{0}};
+      whole some = runs - run < RUNS ? runs - run : RUNS;
       for (whole i = 0; i < count; i++) {
         const double *from = values + i * runs + run;
-        if (some == SIDE)
-          for (int k = 0; k < SIDE; k++) lanes[i % 4][k] += from[k];
+        if (some == RUNS)
+          for (int k = 0; k < RUNS; k++) lanes[i % 4][k] += from[k];
         else
           for (int k = 0; k < some; k++) lanes[i % 4][k] += from[k];
       }

@@ -19,23 +19,34 @@ static inline uint64_t high(uint64_t a, uint64_t b, uint64_t *low) {
 #endif
 }
 
-/* Philox-4x64-10, as in `network.philox`: numbers from 0 to less than 1. */
-static inline void chances(const uint64_t *key, whole block, whole sender, whole receiver, double *u) {
-  uint64_t one = block, two = sender, three = receiver, four = 0, low, other_low;
-  uint64_t first = key[0], second = key[1];
-  for (int turn = 0; turn < 10; turn++) {
-    uint64_t upper = high(0xD2E7470EE14C6C93u, one, &low), other = high(0xCA5A826395121157u, three, &other_low);
-    one = other ^ two ^ first;
-    two = other_low;
-    three = upper ^ four ^ second;
-    four = low;
-    first += 0x9E3779B97F4A7C15u;
-    second += 0xBB67AE8584CAA73Bu;
+/* Philox-4x64-10, as in `network.philox`: numbers from 0 to less than 1 of so many ways at once, at most SIDE, each
+   with its second word of the key. A number's rounds wait for one another, those of several ways do not. */
+#define SIDE 4
+static inline void chances(const int ways, uint64_t key, const uint64_t *keys, whole block, const whole *senders,
+                           const whole *receivers, double (*u)[4]) {
+  uint64_t one[SIDE], two[SIDE], three[SIDE], four[SIDE], second[SIDE];
+  for (int k = 0; k < ways; k++) {
+    one[k] = block, two[k] = senders[k], three[k] = receivers[k], four[k] = 0, second[k] = keys[k];
   }
-  u[0] = (one >> 11) * 0x1p-53;
-  u[1] = (two >> 11) * 0x1p-53;
-  u[2] = (three >> 11) * 0x1p-53;
-  u[3] = (four >> 11) * 0x1p-53;
+  for (int turn = 0; turn < 10; turn++) {
+    for (int k = 0; k < ways; k++) {
+      uint64_t low, other_low;
+      uint64_t upper = high(0xD2E7470EE14C6C93u, one[k], &low);
+      uint64_t other = high(0xCA5A826395121157u, three[k], &other_low);
+      one[k] = other ^ two[k] ^ key;
+      two[k] = other_low;
+      three[k] = upper ^ four[k] ^ second[k];
+      four[k] = low;
+      second[k] += 0xBB67AE8584CAA73Bu;
+    }
+    key += 0x9E3779B97F4A7C15u;
+  }
+  for (int k = 0; k < ways; k++) {
+    u[k][0] = (one[k] >> 11) * 0x1p-53;
+    u[k][1] = (two[k] >> 11) * 0x1p-53;
+    u[k][2] = (three[k] >> 11) * 0x1p-53;
+    u[k][3] = (four[k] >> 11) * 0x1p-53;
+  }
 }
 
 static inline double deviate(whole distribution, double one, double two) {

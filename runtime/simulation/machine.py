@@ -111,10 +111,10 @@ def _fields(*columns: tuple[str, str]) -> np.dtype[Any]:
 WHOLE, NUMBER, ADDRESS = "i8", "f8", "u8"
 ROUTE = _fields(
     ("ways runs slots ticks phase period first_tick tick_period kept buckets newest zero channels", WHOLE),
-    ("distribution traced", WHOLE),
+    ("distribution traced stride", WHOLE),
     ("p r one_minus_h one_minus_k bad_share jitter quantum", NUMBER),
-    ("trace delays nominal senders receivers columns keys held effective gap arrived bad", ADDRESS),
-    ("heads next waits key0 key1", ADDRESS),
+    ("trace delays nominal senders receivers columns keys held effective gap bad", ADDRESS),
+    ("heads queue when places arrived waits key0 key1", ADDRESS),
     ("heard", WHOLE),
 )
 MEMBER = _fields(
@@ -452,6 +452,7 @@ class Machine:
         route, law = hearing.routes[place], luck.law
         ways = len(route.pairs) * self.runs
         kept, buckets = luck.kept(route), luck.buckets(route)
+        stride = ways + min(ways, buckets)  # a packet of each way, and where each run of them begins
         trace = np.zeros(0) if law.trace is None else law.trace
         record = np.zeros(1, ROUTE)[0]
         self._set(
@@ -483,17 +484,20 @@ class Machine:
             nominal=self._own(luck.nominal),
             senders=self._own(route.pairs[:, 0]),
             receivers=self._own(route.pairs[:, 1]),
-            columns=self._own(self._columns(hearing.column_of[route.pairs[:, 0]])),
+            columns=self._own(self._columns(hearing.column_of[route.pairs[:, 0]]).astype(np.int32)),
             keys=self._own(hearing.channels[place]),
             held=self._changing(self._side_by_side(hearing.held[place])),
             effective=self._changing(((ways,), np.int64, START)),
             gap=self._changing(((ways,), np.int64, START)),
-            arrived=self._changing(((ways,), np.int64, -1)),
             bad=self._changing(((ways,), np.int8, 0)),
             heads=self._changing(((buckets,), np.int32, -1)),
-            next=self._own(np.empty((kept, ways), np.int32)),
+            stride=stride,
+            queue=self._own(np.empty((kept, stride), np.int32)),
+            when=self._own(np.empty(ways, np.int32)),
+            places=self._own(np.zeros(buckets, np.int32)),
         )
         if not luck.newest:
+            record["arrived"] = self._changing(((ways,), np.int64, -1)).ctypes.data
             record["waits"] = self._own(np.empty((kept, ways), np.int64)).ctypes.data
         return record
 

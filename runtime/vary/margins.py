@@ -35,6 +35,7 @@ from apc.vary.batch import BatchEvaluator, lifted_here
 from apc.vary.crossings import Root, Scan, scan_lines
 from apc.vary.delays import delay_now
 from apc.vary.evaluator import (
+    Asked,
     PointEvaluator,
     evaluator,
     free_parameters,
@@ -119,7 +120,13 @@ class Margins(Result):
 
 
 @part("margins")
-def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: bool = False) -> Margins:
+def margins(
+    system: CompiledSystem,
+    *,
+    prepared: Prepared | None = None,
+    quick: bool = False,
+    rigid: int | None = None,
+) -> Margins:
     """Find how much each stiffness, damping and delay may grow, all else as it is.
 
     Parameters
@@ -130,6 +137,9 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
         From `analysis.prepare`, of this system with any numbers.
     quick
         Give up, and say so, where the matrices are so large that it would take seconds.
+    rigid
+        How many rigid motions an analysis found, if there was one: what must be too large without them is
+        told before any matrix is made.
     """
     states = max(len(kind.states) for kind in system.kinds)
     if quick and states > FEW_STATES:  # as many in a loop, or nearly: no matrix is made to say so
@@ -137,7 +147,9 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         start = prepare_at_start(system, prepared)
-        found = _parameter_margins(system, coupler_parameters(system), start or prepared, quick)
+        free, at = coupler_parameters(system), start or prepared
+        why = _too_large(system, free, at, rigid) if quick and rigid is not None else None
+        found = why or _parameter_margins(system, free, at, quick)
         if isinstance(found, str):
             return Margins((), found)
         if start is None:
@@ -165,6 +177,15 @@ def _delays(system: CompiledSystem) -> list[Free]:
         waited += [link.delay, *(pair.delay for pair in link.delays)]
     free = {timing.name for timing in named_times(system) if timing.formula is None}
     return [Free(name) for name in dict.fromkeys(waited) if name in free]
+
+
+def _too_large(system: CompiledSystem, free: Sequence[Free], prepared: Prepared, rigid: int) -> str | None:
+    """Return that the matrices are too large to do in passing, where their loops tell it; else None."""
+    asked = Asked.of(system, free, prepared)
+    if not asked.parameters_suffice or long_loops(system, free, prepared):
+        return None
+    largest = max((loop.states for loop in arrange(*asked.lifted_anywhere()).loops), default=0)
+    return IN_PASSING.format(largest) if largest - rigid > FEW_STATES else None
 
 
 def _parameter_margins(

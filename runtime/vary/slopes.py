@@ -13,8 +13,9 @@ sites. A product of dM and a vector is a few products of one site.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem, Feedback, close, feedback_of
+from apc.eigen.dominant import misses_one
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, relative_bounded
 from apc.eigen.rigid import find_rigid_modes
@@ -94,11 +96,18 @@ def moved_systems(family: BatchEvaluator, here: Floats) -> list[Moved]:
     for group in family.groups:
         if site_key(group) not in sites:
             sites[site_key(group)] = _site(family, group, here)
-    exact = family.exact_at(here.tolist())
-    return [_moved(*pair, sites) for pair in zip(family.wirings, exact, strict=True)]
+    exact = cache(lambda: family.exact_at(here.tolist()))  # asked for only where something may be rigid
+    return [_moved(wiring, partial(_nth, exact, place), sites) for place, wiring in enumerate(family.wirings)]
 
 
-def _moved(wiring: Wiring, exact: ClosedSystem, sites: Mapping[tuple[int, int], _Site]) -> Moved:
+def _nth(made: Callable[[], Sequence[ClosedSystem]], place: int) -> ClosedSystem:
+    """Return one of what is made when it is asked for."""
+    return made()[place]
+
+
+def _moved(
+    wiring: Wiring, exact: Callable[[], ClosedSystem], sites: Mapping[tuple[int, int], _Site]
+) -> Moved:
     """Return one closed system with what it follows, in relative coordinates; NaN where these are not."""
     system, layout = wiring.system, wiring.system.layout
     own = [sites[site_key(group)] for group in system.sites]
@@ -120,8 +129,9 @@ def _moved(wiring: Wiring, exact: ClosedSystem, sites: Mapping[tuple[int, int], 
     matrix, error = matrix[..., :n], error[..., :n]
     at = relative_here(wiring, matrix, error)
     within, off = (one[0] for one in relative_bounded(matrix, error, at))
+    nothing = np.zeros((len(within), 0))
     if not (np.isfinite(within).all() and relative_at(wiring, matrix)[1].all()):
-        return Moved(system.name, np.full_like(within, np.nan), off, (), np.zeros((len(within), 0)))
+        return Moved(system.name, np.full_like(within, np.nan), off, (), nothing)
     through: list[Through] = []
     for one, start, count, offset, r in zip(own, starts, counts, layout.offsets, closed.heard, strict=False):
         z = np.eye(n)[offset : offset + one.bounded.p.shape[-1]]
@@ -136,7 +146,9 @@ def _moved(wiring: Wiring, exact: ClosedSystem, sites: Mapping[tuple[int, int], 
                 np.vstack([0 * z, radius_of(r)[..., :hears, :n].reshape(hears, n)]),
             )
             through += _relative(whole, at, matrix[0], error[0], moving=wiring.moving)
-    return Moved(system.name, within, off, tuple(through), _rigid_here(wiring, exact, matrix, within))
+    missed = misses_one(within[None], off[None])[0]
+    rigid = nothing if missed else _rigid_here(wiring, exact(), matrix, within)
+    return Moved(system.name, within, off, tuple(through), rigid)
 
 
 def _added_to(one: FrameMap) -> FrameMap:
