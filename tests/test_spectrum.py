@@ -6,6 +6,7 @@ import math
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import flint
 import mpmath
@@ -16,12 +17,15 @@ from scipy.optimize import brentq
 import apc
 from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.components.library import Library
+from apc.eigen import spectrum
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.spectrum import oscillation
+from tests.bench.growing import row
 from tests.bruteforce import Scene, as_ball, frame_matrix
 from tests.reference import CONTACT_LIMITS, HELPED_LIMITS, LIMITS, OPERATORS, RADII
 from tests.sites import MS, grouped, paper
-from tests.topologies import ROOT
+from tests.topologies import ROOT, compiled
 
 BOTH = {"comp": MS, "comm": 8 * MS}
 NONE = {"comp": Fraction(0), "comm": Fraction(0)}
@@ -352,3 +356,22 @@ def test_the_dense_system_gives_the_same_answer() -> None:
 
 def test_an_angle_below_a_rounding_is_none() -> None:
     assert oscillation(0.5, 1e-77, 0.008) == (0.0, 1.0)
+
+
+def test_only_the_modes_that_are_looked_at_are_followed_and_the_others_would_be_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = compiled(row(30, tmp_path), Library((tmp_path / "parts",)))
+    monkeypatch.setattr(spectrum, "_motions", followed := Mock(side_effect=spectrum._motions))
+    modes = analyze(system).modes
+    assert len(modes) > spectrum.LOOKED_AT
+    assert modes[-1].magnitude <= modes[0].magnitude
+    assert not followed.call_count
+    assert modes[0].frequency_hz > 0
+    assert [len(call.args[3]) for call in followed.call_args_list] == [spectrum.LOOKED_AT]
+    monkeypatch.setattr(spectrum, "LOOKED_AT", len(modes))
+    for one, other in zip(modes, analyze(system).modes, strict=True):
+        assert (one.eigenvalue, one.shape, one.error) == (other.eigenvalue, other.shape, other.error)
+        # The same vector and exponential, in products of other widths.
+        assert one.frequency_hz == pytest.approx(other.frequency_hz, rel=1e-9, abs=1e-9)
+        assert dict(one.participation) == pytest.approx(dict(other.participation), abs=1e-9)

@@ -429,7 +429,9 @@ def _with_turns(spectrum: Spectrum, whole: Spectrum) -> Spectrum:
         near = int(np.argmin(np.abs(values - mode.eigenvalue))) if np.isnan(mode.frequency_hz) else -1
         same = whole.modes[near] if near >= 0 else mode
         if same is mode or abs(same.eigenvalue - mode.eigenvalue) <= same.error + mode.error:
-            mode = replace(mode, frequency_hz=same.frequency_hz, damping_ratio=same.damping_ratio)
+            (own,), (other,) = mode.motion, same.motion
+            own = replace(own, frequency_hz=other.frequency_hz, damping_ratio=other.damping_ratio)
+            mode = replace(mode, motion=(own,))
         modes.append(mode)
     return replace(spectrum, modes=tuple(modes))
 

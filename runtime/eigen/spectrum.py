@@ -1,7 +1,8 @@
 """Eigenvalues with error bounds, and the verdict.
 
 Takes: the `ClosedSystem`s that make up a whole.
-Gives: `Mode`, `Spectrum`, `solve_spectrum`; `whole_vectors`, `angles_in_frame`, `oscillation`, `finite`.
+Gives: `Mode`, `Motion`, `Spectrum`, `solve_spectrum`; `whole_vectors`, `angles_in_frame`, `oscillation`,
+`finite`.
 Guarantees: rigid modes are removed before any eigenvalue is computed; every reported error bounds what
 rounding did since the site's coefficients. What floats leave open is proved in balls where that can be (see
 `certify`), or else says that it is open.
@@ -15,6 +16,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -47,6 +49,9 @@ DRIFTS = "drifts"
 UNSTABLE = "unstable"
 UNDECIDED = "undecided: |ρ−1| below the error bound"
 
+# So many modes are looked at as a rule, twice the rows of a table; how the rest move is made together.
+LOOKED_AT = 64
+
 # A mode that shrinks to less than this in a frame is one that ends in finite time, computed in floats.
 DEADBEAT = 1e-12
 
@@ -64,23 +69,48 @@ LEAST_SHARE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
+class Motion:
+    """What a mode does inside a frame, and which states do it.
+
+    `frequency_hz` and `damping_ratio` belong to s = log(eigenvalue)/frame on the branch the motion takes
+    inside the frame; both are NaN where that can't be told. `participation` shares the mode out among the
+    states (the shares add up to 1).
+    """
+
+    frequency_hz: float
+    damping_ratio: float
+    participation: tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Mode:
     """One eigenvalue of the whole system's frame map, held `multiplicity` times.
 
-    `magnitude` is per frame; `error` bounds |eigenvalue − truth|. `frequency_hz` and `damping_ratio` belong
-    to s = log(eigenvalue)/frame on the branch the motion takes inside the frame; both are NaN where that
-    can't be told. `shape` is the system the mode belongs to. `participation` shares the mode out among the
-    states (the shares add up to 1).
+    `magnitude` is per frame; `error` bounds |eigenvalue − truth|. `shape` is the system the mode belongs to.
+    `motion` is one `Motion`: of a large system it is dear, and made for the modes that are looked at.
     """
 
     eigenvalue: complex
     magnitude: float
     multiplicity: int
-    frequency_hz: float
-    damping_ratio: float
     shape: str
-    participation: tuple[tuple[str, float], ...]
     error: float
+    motion: Sequence[Motion]
+
+    @property
+    def frequency_hz(self) -> float:
+        """See `Motion`."""
+        return self.motion[0].frequency_hz
+
+    @property
+    def damping_ratio(self) -> float:
+        """See `Motion`."""
+        return self.motion[0].damping_ratio
+
+    @property
+    def participation(self) -> tuple[tuple[str, float], ...]:
+        """See `Motion`."""
+        return self.motion[0].participation
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +225,9 @@ class _Solved:
             return self.pairs
         parts = components(self.matrix != 0)
         several = [part for part in parts if len(part) > 1]
-        if len(parts) == 1:
+        # Vectors of a part are 0 beside it: what reaches farther was solved as a whole.
+        reached = np.sum([self.pairs.right[part].any(axis=0) for part in parts], axis=0)
+        if len(parts) == 1 or np.any(reached > 1):
             return self.pairs
         if len(several) == 1:
             alone = np.array([part[0] for part in parts if len(part) == 1], dtype=np.intp)
@@ -219,8 +251,8 @@ def _with_queues(matrix: Floats, pairs: Eigenpairs, part: Integers, alone: Integ
         return None
     own = pairs.right[alone].any(axis=0)
     late, rest = np.flatnonzero(own), np.flatnonzero(~own)
-    if len(late) != len(alone) or pairs.values[late].any() or not pairs.values[rest].all():
-        return None  # they are of more than their part already
+    if pairs.values[late].any() or not pairs.values[rest].all():
+        return None
     right, left = pairs.right.copy(), pairs.left.copy()
     try:
         # λ x_a = M_ap x_p of the part's; w_p M_pp + w_a M_ap = 0 of theirs.
@@ -324,59 +356,96 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
 
 
 def _modes(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> tuple[Mode, ...]:
-    """Describe the eigenvalues of all systems, the largest first."""
+    """List the eigenvalues of all systems, the largest first; how they move is made when it is looked at."""
     with single_threaded(), np.errstate(all="ignore"):
-        return tuple(sorted(_described(systems, solved), key=_rank))
-
-
-def _rank(mode: Mode) -> tuple[float, str, float, float]:
-    return -mode.magnitude, mode.shape, mode.eigenvalue.real, -mode.eigenvalue.imag
-
-
-def _described(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> list[Mode]:
-    vague: list[NDArray[np.bool_]] = []
-    parts: list[tuple[ClosedSystem, Complexes, Complexes, Floats]] = []
-    described: list[tuple[Floats, Floats]] = []
-    for system, one in zip(systems, solved, strict=True):
-        vectors, shares = whole_vectors(system, one.at, one.whole)
-        errors = one.bounds.errors
-        described.append((shares, errors))
-        magnitudes = np.abs(one.pairs.values)
-        gone = magnitudes <= np.maximum(DEADBEAT * len(system.names), np.minimum(errors, SMALL))
-        vague.append(gone)
-        parts.append((system, one.pairs.values[~gone], vectors[:, ~gone], shares[:, ~gone]))
-    modes = []
-    for system, one, (shares, errors), gone, known in zip(
-        systems, solved, described, vague, angles_in_frame(parts), strict=True
-    ):
-        # What ends in finite time has no frequency; but what is never computed anew can't end.
-        angles = np.full(len(gone), 0.0 if _ticks(system) else np.nan)
-        angles[~gone] = known
-        listed = zip(
-            one.pairs.values.tolist(),
-            angles.tolist(),
-            gone.tolist(),
-            errors.tolist(),
-            shares.T.tolist(),
-            strict=True,
+        ranked = sorted(
+            (
+                ((-abs(value), system.name, value.real, -value.imag), value, bound, (place, row))
+                for place, (system, one) in enumerate(zip(systems, solved, strict=True))
+                for row, (value, bound) in enumerate(
+                    zip(one.pairs.values.tolist(), one.bounds.errors.tolist(), strict=True)
+                )
+            ),
+            key=itemgetter(0),
         )
-        for value, angle, ends, bound, taking in listed:
-            frequency, damping = 0.0, 1.0
-            if not ends or math.isnan(angle):
-                frequency, damping = oscillation(abs(value), angle, system.frame_s)
+    vectors = [Later(functools.partial(_whole, one)) for one in solved]
+    modes = []
+    for some in (ranked[:LOOKED_AT], ranked[LOOKED_AT:]):
+        places = [place for *_, place in some]
+        motions = Later(functools.partial(_motions, systems, solved, vectors, places))
+        for number, (_, value, bound, (place, _)) in enumerate(some):
             modes.append(
                 Mode(
                     eigenvalue=value,
                     magnitude=abs(value),
-                    multiplicity=system.multiplicity,
-                    frequency_hz=frequency,
-                    damping_ratio=damping,
-                    shape=system.name,
-                    participation=tuple(zip(system.names, taking, strict=True)),
+                    multiplicity=systems[place].multiplicity,
+                    shape=systems[place].name,
                     error=bound,
+                    motion=Later(functools.partial(_one_of, motions, number)),
                 )
             )
-    return modes
+    return tuple(modes)
+
+
+def _one_of(motions: Sequence[Motion], number: int) -> tuple[Motion]:
+    return (motions[number],)
+
+
+def _whole(one: _Solved) -> tuple[Eigenpairs]:
+    with single_threaded(), np.errstate(all="ignore"):
+        return (one.whole,)
+
+
+def _motions(
+    systems: Sequence[ClosedSystem],
+    solved: Sequence[_Solved],
+    vectors: Sequence[Sequence[Eigenpairs]],
+    places: Sequence[tuple[int, int]],
+) -> tuple[Motion, ...]:
+    """Describe some eigenvalues, given by their systems and rows; of each system the vectors are at hand."""
+    with single_threaded(), np.errstate(all="ignore"):
+        rows = [
+            np.array([row for own, row in places if own == s], dtype=np.intp) for s in range(len(systems))
+        ]
+        own = [iter(one) for one in _described(systems, solved, vectors, rows)]
+        return tuple(next(own[s]) for s, _ in places)
+
+
+def _described(
+    systems: Sequence[ClosedSystem],
+    solved: Sequence[_Solved],
+    vectors: Sequence[Sequence[Eigenpairs]],
+    rows: Sequence[Integers],
+) -> list[list[Motion]]:
+    """Describe the eigenvalues of some rows of each system, in their order."""
+    vague: list[NDArray[np.bool_]] = []
+    parts: list[tuple[ClosedSystem, Complexes, Complexes, Floats]] = []
+    described: list[tuple[Complexes, Floats]] = []
+    for system, one, (pairs,), own in zip(systems, solved, vectors, rows, strict=True):
+        pairs = pairs.at(own)
+        vector, shares = whole_vectors(system, one.at, pairs)
+        errors = one.bounds.errors[own]
+        described.append((pairs.values, shares))
+        magnitudes = np.abs(pairs.values)
+        gone = magnitudes <= np.maximum(DEADBEAT * len(system.names), np.minimum(errors, SMALL))
+        vague.append(gone)
+        parts.append((system, pairs.values[~gone], vector[:, ~gone], shares[:, ~gone]))
+    found = []
+    for system, (values, shares), gone, known in zip(
+        systems, described, vague, angles_in_frame(parts), strict=True
+    ):
+        # What ends in finite time has no frequency; but what is never computed anew can't end.
+        angles = np.full(len(gone), 0.0 if _ticks(system) else np.nan)
+        angles[~gone] = known
+        listed = zip(values.tolist(), angles.tolist(), gone.tolist(), shares.T.tolist(), strict=True)
+        motions = []
+        for value, angle, ends, taking in listed:
+            frequency, damping = 0.0, 1.0
+            if not ends or math.isnan(angle):
+                frequency, damping = oscillation(abs(value), angle, system.frame_s)
+            motions.append(Motion(frequency, damping, tuple(zip(system.names, taking, strict=True))))
+        found.append(motions)
+    return found
 
 
 def _ticks(system: ClosedSystem) -> bool:

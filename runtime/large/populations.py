@@ -21,7 +21,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Closed, Feedback, StateLayout, close, lay_out
 from apc.eigen.peer_group import states_of
-from apc.eigen.spectrum import Mode, oscillation
+from apc.eigen.spectrum import Mode, Motion, oscillation
 from apc.frame.batch_lift import CHUNK, lift_rows
 from apc.frame.course import turns
 from apc.frame.jacobians import SiteJacobians
@@ -253,9 +253,7 @@ def mode_of(
         eigenvalue=value,
         magnitude=abs(value),
         multiplicity=multiplicity,
-        frequency_hz=frequency,
-        damping_ratio=damping,
         shape=shape,
-        participation=tuple((name, share / total) for name, share in shares.items()),
         error=error,
+        motion=(Motion(frequency, damping, tuple((name, share / total) for name, share in shares.items())),),
     )

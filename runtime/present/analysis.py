@@ -160,9 +160,17 @@ def analysis_text(result: Analysis) -> str:
 
 def analysis_document(result: Analysis) -> dict[str, Any]:
     """Return what `apc analyze --json` prints of the analysis itself."""
-    modes = [document(mode, {"participation": dict(mode.participation)}) for mode in result.modes]
+    modes = [_mode_document(mode) for mode in result.modes]
     found: dict[str, Any] = document(result, {"modes": modes})
     return found
+
+
+def _mode_document(mode: Mode) -> dict[str, Any]:
+    (motion,) = mode.motion
+    told: dict[str, Any] = document(mode, {"motion": None})
+    del told["motion"]
+    moved: dict[str, Any] = document(motion, {"participation": dict(motion.participation)})
+    return told | moved
 
 
 def analysis_picture(result: Analysis, ax: Any = None) -> Any:
