@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from fractions import Fraction
 
 import flint
@@ -92,6 +93,22 @@ def test_a_determinant_is_the_same_polynomial_at_every_age(kind: str) -> None:
                 assert off < 1e-12 * max(1.0, 1 / abs(determinant))
                 exact = complex(sum((change[i, i] for i in range(3)), flint.acb(0)))
                 assert abs(turning[row, place] - exact) < 1e-10 * max(abs(exact), 1.0)
+
+
+def test_a_circle_of_points_is_looked_at_part_by_part_each_as_if_alone() -> None:
+    random = np.random.default_rng(7)
+    fixed, heard = random.normal(0, 0.1, (1, 44, 44)), random.normal(0, 0.1, (1, 1, 44, 4))
+    sheet = _LateSheet(Bordered(fixed, heard, 40), np.array([0, 0]), np.array([[1], [3]]), 0, 3)
+    points = np.exp(1j * np.linspace(0.1, 3.0, 2000))
+    tracemalloc.start()
+    found = sheet.over(np.array([0.0, 1.0]), points)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 16 * len(points) * 44**2  # a matrix at every point, of which five are made
+    alone = sheet.at(np.array([0.0, 1.0]), np.repeat([0, 1], len(points)), np.tile(points, 2))
+    # Roundings of 44 steps, by the condition of what is far from singular.
+    assert np.abs(np.exp(found.value.ravel() - alone.value) - 1).max() < 1e-11
+    assert np.abs(found.turning.ravel() - alone.turning).max() < 1e-9
 
 
 def test_a_determinant_far_below_its_largest_value_keeps_its_digits() -> None:

@@ -26,7 +26,7 @@ from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.frozen import dataclass
 from apc.compiler.multiples import common_divisor
-from apc.eigen.bordered import Bordered, Logarithm, bordered, logarithm, side_by_side
+from apc.eigen.bordered import TOGETHER, Bordered, Logarithm, bordered, logarithm, side_by_side
 from apc.eigen.closing import Loop, without_packets
 from apc.eigen.modes import arrange
 from apc.eigen.rigid import find_rigid_modes
@@ -92,7 +92,14 @@ class _LateSheet:
         return logarithm(self.loops, None, self.lags[number], self.alike[number], points, self.rigid)
 
     def over(self, values: Floats, points: Complexes) -> Logarithm:
-        """Return the logarithm of F (k, z) at all values (k,) and points (z,).
+        """Return the logarithm of F (k, z) at all values (k,) and points (z,), some points after others."""
+        chunk = max(1, TOGETHER // self.loops.fixed.shape[-1] ** 2)
+        parts = [self._over(values, points[start : start + chunk]) for start in range(0, len(points), chunk)]
+        listed = ([getattr(part, name) for part in parts] for name in Logarithm.__slots__)
+        return Logarithm(*(np.concatenate(one, axis=1) for one in listed))
+
+    def _over(self, values: Floats, points: Complexes) -> Logarithm:
+        """Return `over` of a few points.
 
         Notes
         -----
