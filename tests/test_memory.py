@@ -81,6 +81,18 @@ def test_a_file_that_would_not_fit_while_it_is_written_is_refused_and_not_begun(
     assert [path.name for path in tmp_path.iterdir()] == ["scene.yaml"]
 
 
+def test_packets_that_would_not_fit_while_they_are_on_their_way_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    channel = "delay: 20 s, loss: 2 %, jitter: 3 ms, reorder: all}"
+    late = replaced(AVERAGE, ("count: 3", "count: 40"), ("delay: 8 ms}", channel))
+    _leave(monkeypatch, 2e7)
+    # 12 bytes a packet, 200 a way: within 20 s and the jitter 2,500 are sent, and three frames more are kept.
+    needs = r"E892 3,904,680 packets kept on 1,560 ways of lan, which is unreliable, take about 47\.2 MB"
+    with pytest.raises(ApcError, match=needs):
+        simulate(compiled(late), duration=Fraction(1))
+
+
 def test_rows_that_would_not_fit_are_refused_before_they_are_played(monkeypatch: pytest.MonkeyPatch) -> None:
     _leave(monkeypatch, 1e9)
     with pytest.raises(ApcError, match=r"E876 24 signals over 10000 s take about 3\.84 GB of memory"):

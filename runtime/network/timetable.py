@@ -23,16 +23,19 @@ from apc.compiler.compiled import CompiledSystem, Kind, Link
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.frame.exchange import Exchange
+from apc.memory import refuse_beyond
 from apc.network.channel import ChannelLaw, PacketSource, channel_law
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-# Ways from peer to peer: of each some packets are on their way, and 200 bytes are kept.
-MOST_WAYS = 2_000_000
-# Packets on their way on all ways of a link: 2 GiB of places in lists of 31 bits (see `engine.c`).
+# Ways from peer to peer: of each some packets are on their way, and so many bytes are kept.
+MOST_WAYS, WAY = 2_000_000, 200
+# Packets on their way on all ways of a link: 2 GiB of places in lists of 31 bits (see `engine.c`). Each
+# takes so many bytes, and so many more where the order of arrival matters.
 MOST_PACKETS = 2**29
+PACKET, ORDERED = 4, 8
 
 START = -1  # the "packet" before the first: the sender's start values
 
@@ -174,14 +177,16 @@ def _check_luck(system: CompiledSystem, route: Route, luck: Luck) -> None:
         raise ApcError(
             Mistake("E892", Place(system.origin.topology), what, hint="periods and delays in whole µs")
         )
-    packets = luck.kept(route) * ways
+    packets, hint = luck.kept(route) * ways, "a shorter delay or jitter, fewer peers, or graph: ring"
     if packets > MOST_PACKETS:
         what = (
             f"{route.link} is unreliable, and on {ways} ways up to {latest * float(luck.quantum):.3g} s long "
             f"{packets} packets are kept; at most {MOST_PACKETS} can be followed"
         )
-        hint = "a shorter delay or jitter, fewer peers, or graph: ring"
         raise ApcError(Mistake("E892", Place(system.origin.topology), what, hint=hint))
+    needed = WAY * ways + (PACKET if luck.newest else PACKET + ORDERED) * packets
+    what = f"{packets:,} packets kept on {ways:,} ways of {route.link}, which is unreliable,"
+    refuse_beyond(needed, "E892", Place(system.origin.topology), what, hint)
 
 
 class Listener:
