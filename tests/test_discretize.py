@@ -11,7 +11,7 @@ import pytest
 
 import apc.frame.discretize as discretizing
 from apc.compiler.errors import ApcError
-from apc.frame.discretize import FEW_TOGETHER, UNIT, Step, discretize
+from apc.frame.discretize import FEW_TOGETHER, UNIT, Step, discretize, exponential_values
 
 DAMPINGS = (0.0, 1e-12, 1e-6, 5.0, 1e6)
 MASSES = (1e-6, 0.1, 1e3)
@@ -145,3 +145,13 @@ def test_what_is_too_far_to_be_reached_by_the_series_is_within_the_bound() -> No
             true = mpmath.mpf("1.5") ** i / mpmath.factorial(i)
             off = UNIT * step.roundings * float(step.size[i, 0])
             assert abs(mpmath.mpf(float(step.matrix[i, 0])) - true) <= off
+
+
+@pytest.mark.parametrize("damping", [50.0, 5e3, 1e6])
+def test_what_is_slow_beside_what_is_fast_keeps_its_digits(damping: float) -> None:
+    """Two masses on a damper move together, slowly; squaring s times takes 2^s roundings of 1 from them."""
+    own = damping / 20
+    a = np.array([[0, 1, 0, 0], [0, -damping, 0, damping], [0, 0, 0, 1], [0, own, -0.1, -own]])
+    found = exponential_values(a[None], np.zeros((1, 4, 1)), 1.0)[0, :, :4]
+    step = discretize(a.astype(object), np.zeros((4, 1)).astype(object), [Fraction(1)])[0].matrix[:, :4]
+    assert np.abs(found - step).max() < 32 * UNIT + 0.1 * UNIT * damping

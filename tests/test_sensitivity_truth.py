@@ -192,3 +192,31 @@ couplers:
     assert (loose.verdict, loose.stable, loose.translations) == ("stable up to a common translation", True, 1)
     felt = analyze(apply(system, [Override(Free("p.ki"), Fraction(1))]))
     assert (felt.rigid_modes, felt.unfelt) == (0, ())
+
+
+UNCLOCKED = """\
+topology: unclocked
+peers: {user: {count: 2}}
+masses:
+  device: {mass: MASS kg, damping: DAMPING N*s/m}
+  cube: {mass: COPY kg, damping: BRAKE N*s/m, shared: true}
+couplers:
+  spring: {type: SpringDamper, a: device, b: cube, stiffness: SPRING N/m, damping: DAMPER N*s/m}
+"""
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        ("0.012024990784370273", "0.0021282909", "2.024910856889678", "0.040052959", "88.04437", "63.6466"),
+        ("0.017405540793130555", "3.17138972e-6", "0.0118822421", "2.86345e-5", "0.74912642", "1.096408"),
+        ("0.0012563506329556732", "0.0011384141", "0.01866965", "0.0101767", "0", "11.29332081"),
+    ],
+)
+def test_a_derivative_is_within_its_error_where_a_step_is_long_beside_what_dies_out(
+    numbers: tuple[str, ...],
+) -> None:
+    """A frame of 1 s, in which masses on a stiff damper settle 10³ to 10⁴ times over."""
+    names = ("MASS", "DAMPING", "COPY", "BRAKE", "SPRING", "DAMPER")
+    system = compiled(replaced(UNCLOCKED, *zip(names, numbers, strict=True)))
+    assert check_sensitivities(system, sensitivities(system)) == ""

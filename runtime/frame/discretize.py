@@ -300,29 +300,49 @@ def exponential_rows(
 
 
 def exponential_values(a: Matrix, b: Matrix, seconds: float) -> Matrix:
-    """Return the matrices of `exponential_rows` without their errors, which are most of its work."""
-    *_, step = _squared_steps(a, b, seconds)[-1]
-    return step
+    """Return the matrices of `exponential_rows` without their errors, which are most of its work.
+
+    Notes
+    -----
+    From E = F − I, E ← 2 E + E²: what is slow beside what is fast keeps the digits that 1 would take from it,
+    once more with each squaring.
+    """
+    x, g, last, squarings, times = _scaled(a, b, seconds)
+    phi = _phi(times, x, last)
+    grown = np.concatenate([times(phi), phi @ g], axis=-1)
+    n_x = a.shape[-1]
+    for _ in range(squarings):
+        grown = 2 * grown + grown[..., :n_x] @ grown
+    diagonal = np.arange(n_x)
+    grown[..., diagonal, diagonal] += 1
+    return np.asarray(grown)
 
 
 def _squared_steps(a: Matrix, b: Matrix, seconds: float) -> tuple[Matrix, Matrix, int, Iterator[Matrix]]:
     """Return X and B T/2^s of `exponential_rows`, the last power, and what gives each [F G] in turn."""
-    x = a * seconds
-    times, limit, last = _products(x)
-    norm = float(np.abs(x).sum(axis=-2).max(initial=0.0))
-    squarings = max(0, int(np.ceil(np.log2(norm / limit)))) if 0 < norm < np.inf else 0
-    scale = 2.0**-squarings
-    x, g = x * scale, b * (seconds * scale)
+    x, g, last, squarings, times = _scaled(a, b, seconds)
 
     def steps() -> Iterator[Matrix]:
-        phi = _phi(lambda other: times(other) * scale, x, last)
-        step = np.concatenate([np.eye(a.shape[-1]) + times(phi) * scale, phi @ g], axis=-1)
+        phi = _phi(times, x, last)
+        step = np.concatenate([np.eye(a.shape[-1]) + times(phi), phi @ g], axis=-1)
         yield step
         for _ in range(squarings):
             step = step @ _whole(step)
             yield step
 
     return x, g, last, steps()
+
+
+def _scaled(
+    a: Matrix, b: Matrix, seconds: float
+) -> tuple[Matrix, Matrix, int, int, Callable[[Matrix], Matrix]]:
+    """Return X and B T/2^s, the last power of the series, s, and what multiplies by X."""
+    x = a * seconds
+    times, limit, last = _products(x)
+    norm = float(np.abs(x).sum(axis=-2).max(initial=0.0))
+    squarings = max(0, int(np.ceil(np.log2(norm / limit)))) if 0 < norm < np.inf else 0
+    scale = 2.0**-squarings
+    return x * scale, b * (seconds * scale), last, squarings, lambda other: times(other) * scale
 
 
 def _whole(step: Matrix) -> Matrix:

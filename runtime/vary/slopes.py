@@ -295,10 +295,15 @@ def _slopes(
 
         error = size.mapped(lambda one: roundings * UNIT * one)
         for _ in range(PERTURBED_FRAMES):
+            # A step follows its site: what rounding makes of a stiff one is not what rounding it makes.
+            off_a_little = every_matrix(site, moved)
             other = compose(
-                every_matrix(site, moved),
+                off_a_little,
                 schedule,
-                {quanta: moved(step.matrix) for quanta, step in steps.items()},
+                {
+                    quanta: moved(_followed(off_a_little, seconds))
+                    for quanta, (seconds, _) in durations.items()
+                },
                 numbers=_with_slopes(FLOATS, count),
             )
             error = error.mapped(lambda e, a, b: np.maximum(e, SAFE * np.abs(a - b[1:])), slopes, other)
@@ -322,6 +327,24 @@ def _with_slopes(numbers: Arithmetic, count: int) -> Arithmetic:
     return Arithmetic(multiply, numbers.add, numbers.subtract, exact)
 
 
+def _differing(site: LinearSite) -> NDArray[np.intp]:
+    """Return which derivatives of A and B there are, by their places below these."""
+    return 1 + np.flatnonzero(site.a[1:].any(axis=(1, 2)) | site.b[1:].any(axis=(1, 2)))
+
+
+def _followed(site: LinearSite, seconds: float) -> Floats:
+    """Return a step (1 + k, n_x, n_x + n_u) with its derivatives below it."""
+    (a, b), n_x, n_u = (site.a, site.b), *site.b.shape[-2:]
+    found = np.zeros((len(a), n_x, n_x + n_u))
+    found[:1] = exponential_values(a[:1], b[:1], seconds)
+    moved = _differing(site)
+    # Of a large site one by one, as its own products leave out the zeros.
+    for some in np.split(moved, len(moved) if n_x > FEW_TOGETHER else 1) if len(moved) else ():
+        near, pushed = (one[:1] + (STEP * 1j) * one[some] for one in (a, b))
+        found[some] = exponential_values(near, pushed, seconds).imag / STEP
+    return found
+
+
 def _step(site: LinearSite, seconds: float) -> Step:
     """Return a step (1 + k, n_x, n_x + n_u), its derivatives below it, and the magnitudes of both.
 
@@ -331,13 +354,9 @@ def _step(site: LinearSite, seconds: float) -> Step:
     (a, b), n_x, n_u = (site.a, site.b), *site.b.shape[-2:]
     step = exponential_rows(a[:1], b[:1], seconds)
     half = exponential_values(a[:1], b[:1], seconds / 2)
-    found, size = np.zeros((2, len(a), n_x, n_x + n_u))
+    found, size = _followed(site, seconds), np.zeros((len(a), n_x, n_x + n_u))
     found[:1], size[:1] = step.matrix, np.maximum(np.abs(step.matrix), step.size)
-    moved = 1 + np.flatnonzero(a[1:].any(axis=(1, 2)) | b[1:].any(axis=(1, 2)))
-    # Of a large site one by one, as its own products leave out the zeros.
-    for some in np.split(moved, len(moved) if n_x > FEW_TOGETHER else 1) if len(moved) else ():
-        near, pushed = (one[:1] + (STEP * 1j) * one[some] for one in (a, b))
-        found[some] = exponential_values(near, pushed, seconds).imag / STEP
+    moved = _differing(site)
     whole = np.maximum(np.maximum(step.size, np.abs(half)), np.eye(n_x, n_x + n_u))
     below = np.broadcast_to(np.eye(n_x + n_u)[n_x:], (1, n_u, n_x + n_u))
     slopes = np.abs(np.concatenate([a[moved], b[moved]], axis=-1))

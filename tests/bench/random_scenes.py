@@ -113,6 +113,10 @@ def truth(system: CompiledSystem) -> tuple[flint.arb, int]:
 
 def check(found: Analysis, radius: flint.arb, rigid: int) -> str:
     """Return what is wrong with an analysis, "" if nothing is."""
+    if found.stable is None and rigid > found.rigid_modes:
+        radius = max(
+            radius, flint.arb(1)
+        )  # a motion that grows with t² leaves an eigenvalue 1, and is left open
     apart = abs(
         radius - flint.arb(found.spectral_radius)
     ).mid()  # 256 bits: no rounding that floats could see
