@@ -71,7 +71,7 @@ MOST_MS, MOST_PART, MOST_PART_VIRTUAL = 10.0, 0.2, 0.8
 # Of the C loop by hand over equal peers, which does not add up the work of each coupler; of real time, for 300 peers on
 # unreliable links, and how their time grows, which is as their ways do but for what no longer fits the caches; of the
 # NumPy program of many runs.
-MOST_OF_C, MOST_LOSSY, MOST_EXPONENT, MOST_OF_RUNS = 3.0, 1.0, 2.3, 1.5
+MOST_OF_C, MOST_LOSSY, MOST_EXPONENT, MOST_OF_RUNS = 3.0, 1.0, 2.2, 1.5
 RUNS, LOSS, SEED = 1000, 0.05, 3
 
 
