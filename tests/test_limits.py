@@ -145,7 +145,7 @@ def test_what_moves_together_has_a_limit_and_what_is_apart_has_none(monkeypatch:
 
 def test_the_states_of_a_peer_have_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(discretizing, "moved_together", lambda _: pytest.fail("it is looked at"))
-    with pytest.raises(ApcError, match=r"E812 one peer has 1001 states, and 1000 are the most"):
+    with pytest.raises(ApcError, match=r"E812 one peer has 1,001 states, and 1,000 are the most"):
         discretize(np.zeros((1001, 1001)), np.ones((1001, 1)), [Fraction(1)])
 
 

@@ -31,6 +31,7 @@ from apc.compiler.compiled import (
     group_count,
 )
 from apc.compiler.components.component import Number as NumberParameter
+from apc.compiler.components.component import Variable
 from apc.compiler.crowd import COUNT_ABOUT, heard_sums, with_heard
 from apc.compiler.equations.clocks import HoldCrossing
 from apc.compiler.equations.flatten import FlatKind
@@ -348,8 +349,14 @@ def compiled_parameter(scene: Scene, name: str, value: Value) -> Parameter:
         )
     variable = component.variable(own)
     assert variable is not None
+    return _start_value(name, value, variable)
+
+
+def _start_value(name: str, value: Value, variable: Variable) -> Parameter:
+    """Return the start value of a variable as a parameter of this whole name."""
+    unit, formula = format_dimension(value.dimension), _formula(value.expression)
     about = f"start value: {variable.about}"
-    return Parameter(name, unit, number, formula, about=about, exact=value.number)
+    return Parameter(name, unit, float(value.number), formula, about=about, exact=value.number)
 
 
 def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -> tuple[Parameter, ...]:
@@ -373,7 +380,7 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
             name = f"{part.name}.{variable.name}"
             if name in needed and variable.start is not None:
                 default = Value(variable.start, variable.unit.dimension, None, part.place)
-                found[name] = compiled_parameter(scene, name, given.get(variable.name, default))
+                found[name] = _start_value(name, given.get(variable.name, default), variable)
     for link in scene.links:
         if count_of(link.name) in needed:  # every group has its own value
             name = count_of(link.name)

@@ -30,6 +30,7 @@ from apc.frame.discretize import (
     TOO_LARGE,
     UNIT,
     moved_together,
+    refuse_many,
 )
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians
@@ -77,7 +78,11 @@ def check_frame(system: CompiledSystem) -> float:
     ------
     AssertionError
         The two differ by more than rounding.
+    ApcError
+        E806 a frame leaves the range of floats; E812 a peer has too many states.
     """
+    for kind in system.kinds:
+        refuse_many(len(kind.states), Place(system.origin.topology))
     numbers = resolve(system)
     sites = linear_sites(system, numbers.timings)
     schedules = build_schedules(system, numbers.timings, [site.pattern for site in sites])

@@ -1,8 +1,8 @@
 """What a linear system does in a while: the exact matrix exponential, inputs held.
 
 Takes: the matrices of dx/dt = A x + B u, exact, or of many sites at once in floats.
-Gives: `Step`, `discretize`, `moved_together`; in floats, `exponential`, `exponential_rows`, `step_rows`,
-`exponential_values`; `step_balls`.
+Gives: `Step`, `discretize`, `moved_together`, `refuse_many`; in floats, `exponential`, `exponential_rows`,
+`step_rows`, `exponential_values`; `step_balls`.
 Guarantees: every entry of `discretize` is right to the last digit but one, proved by ball arithmetic, whether
 a mode dies out in a nanosecond or never; where many states move together and it is off by no more than
 composing it rounds, it is had in floats. Every step comes with a bound.
@@ -138,6 +138,13 @@ def _discretized(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]
     return tuple(Step(*pair, roundings) for pair in zip(matrices, sizes, strict=True))
 
 
+def refuse_many(states: int, place: Place = Place("the scene")) -> None:
+    """Refuse more states of one peer than are exponentiated: ApcError E812."""
+    if states > MOST_STATES:
+        what = f"one peer has {states:,} states, and {MOST_STATES:,} are the most that are analysed"
+        raise ApcError(Mistake("E812", place, what, hint="smaller arrays, as count: 100"))
+
+
 def _pieces(a: NDArray[Any], b: NDArray[Any]) -> Iterator[tuple[Integers, Integers]]:
     """Yield states that move together with a few of the inputs that move them, until all are had.
 
@@ -149,9 +156,7 @@ def _pieces(a: NDArray[Any], b: NDArray[Any]) -> Iterator[tuple[Integers, Intege
     ApcError
         E812 too many states.
     """
-    if len(a) > MOST_STATES:
-        what = f"one peer has {len(a)} states, and {MOST_STATES} are the most that are analysed"
-        raise ApcError(Mistake("E812", Place("the scene"), what, hint="smaller arrays, as count: 100"))
+    refuse_many(len(a))
     for states in moved_together(a):
         inputs = np.flatnonzero(b[states].astype(np.bool_).any(axis=0))
         step = max(len(states), FEWEST_INPUTS)
