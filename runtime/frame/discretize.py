@@ -138,7 +138,7 @@ def _discretized(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]
     return tuple(Step(*pair, roundings) for pair in zip(matrices, sizes, strict=True))
 
 
-def refuse_many(states: int, place: Place = Place("the scene")) -> None:
+def refuse_many(states: int, place: Place) -> None:
     """Refuse more states of one peer than are exponentiated: ApcError E812."""
     if states > MOST_STATES:
         what = f"one peer has {states:,} states, and {MOST_STATES:,} are the most that are analysed"
@@ -156,7 +156,7 @@ def _pieces(a: NDArray[Any], b: NDArray[Any]) -> Iterator[tuple[Integers, Intege
     ApcError
         E812 too many states.
     """
-    refuse_many(len(a))
+    refuse_many(len(a), Place("the scene"))
     for states in moved_together(a):
         inputs = np.flatnonzero(b[states].astype(np.bool_).any(axis=0))
         step = max(len(states), FEWEST_INPUTS)
