@@ -76,9 +76,9 @@ PIECES, FURTHER, MOST_PIECES = 4, 1.5, 64
 FEW_STATES = 60
 IN_PASSING = "not looked for in passing: {} states (apc analyze --margins does)"
 
-# Of a larger one nothing is looked at value by value: each takes a tenth of a second; and larger ones are
-# estimated, as a bound takes seconds.
-MOST_SCANNED, MOST_BOUNDED = 120, 300
+# Of a larger one nothing is looked at value by value, which takes half a minute for a delay of one as large;
+# and what the response tells of it is estimated, as a bound takes seconds.
+MOST_SCANNED = 300
 
 # How far beyond a crossing, relative to the way there, an analysis says whether it is one.
 BESIDE = 1e-3
@@ -272,7 +272,7 @@ def _gain_margin(
     root = first_crossing(gains, start, float(top))
     if root is None:
         return _margin(free.label, parameter.unit, start, None, float(top))
-    if len(gains[root.system][0].a) > MOST_BOUNDED:
+    if len(gains[root.system][0].a) > MOST_SCANNED:
         crossing: Crossing | None = _estimated(root, line)
     else:
         beyond = root.value + BESIDE * (root.value - start)
