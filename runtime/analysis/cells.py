@@ -236,6 +236,7 @@ def _norm_below(matrix: Floats, limit: Floats) -> Truths:
     less than it by more than that rounds, γ_{n+1} tr / (1 − γ_{n+1}) (Rump, Verification of positive
     definiteness, 2006), and by what N ᵀN rounds.
     """
+    # Column by column for all at once: NumPy's own decomposition refuses a whole stack where it refuses one.
     n = matrix.shape[-1]
     rounded = (n + 2) * UNIT * (np.square(matrix).sum(axis=(1, 2)) + n) * 2
     left = -(matrix.swapaxes(1, 2) @ matrix)
