@@ -154,5 +154,5 @@ def test_what_is_slow_beside_what_is_fast_keeps_its_digits(damping: float) -> No
     a = np.array([[0, 1, 0, 0], [0, -damping, 0, damping], [0, 0, 0, 1], [0, own, -0.1, -own]])
     found = exponential_values(a[None], np.zeros((1, 4, 1)), 1.0)[0, :, :4]
     step = discretize(a.astype(object), np.zeros((4, 1)).astype(object), [Fraction(1)])[0].matrix[:, :4]
-    # Squaring 1 s times loses up to 2^s ≥ 2 ‖A‖ T roundings; a twentieth of that is asked for, and a few more.
+    # Squaring 1 s times loses up to 2^s ≥ 2 ‖A‖ T roundings; a twentieth of it is asked for, and a few more.
     assert np.abs(found - step).max() < 32 * UNIT + 0.1 * UNIT * damping
