@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from apc.analysis.analysis import analyze
-from apc.frame.course import turned_along
+from apc.frame.course import followed_closely, turned_along
 from apc.vary.critical import critical
 from tests.topologies import compiled
 
@@ -136,3 +136,51 @@ def test_what_rounding_leaves_of_a_course_does_not_turn_it() -> None:
     assert turned_along(course[:, None])[0] == 0
     swings = np.exp(-0.5 * np.arange(40)) * np.cos(np.arange(40) * np.pi)
     assert turned_along(swings[:, None])[0] == pytest.approx(39 * np.pi)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize(("distance", "known"), [(0.1, True), (1e-3, True), (1e-9, False)])
+def test_a_course_that_rounding_may_lead_past_zero_on_either_side_is_not_known(
+    side: float, distance: float, known: bool
+) -> None:
+    """From −1 to 1 past 0, and on by half a turn; a vector of an eigenvalue is hardly right to 1e-9."""
+    time = np.linspace(-1, 1, 17)[:, None]
+    course = time + 1j * side * distance * (1 - time**2)
+    angle, told = followed_closely(course, np.array([1.0 + 1e-12j]))
+    assert told == [known]
+    assert angle == pytest.approx([-side * math.pi], rel=1e-12)
+
+
+def test_a_mode_that_is_real_changes_its_sign_whatever_rounding_says() -> None:
+    time = np.linspace(-1, 1, 16)[:, None]
+    for rounding in (1e-13, -1e-13):
+        assert followed_closely(time * (1 + rounding * 1j * time), np.array([-1.0 + 0j]))[1] == [True]
+
+
+def test_modes_of_a_directed_graph_that_are_real_but_for_rounding_have_no_frequency() -> None:
+    """Followed with 320 bits the first pair turns once a frame, 1,000 Hz; in floats the last digit chooses."""
+    text = """\
+topology: weights
+clocks: {haptic: {period: 0.5 ms}, network: 1 ms}
+peers: {user: {count: 3}}
+masses:
+  device: {mass: 7.131 g}
+  cube: {mass: 0.1156 g, damping: 1.859 mN*s/m, shared: true}
+couplers:
+  contact:
+    {type: SampledSpringDamper, a: device, b: cube, stiffness: 2196 N/m, damping: 0.745 N*s/m, clock: haptic}
+  coordination:
+    {type: AveragePosition, object: cube, stiffness: 0.864 N/m, damping: 1.82 N*s/m, clock: haptic, link: lan}
+links:
+  lan:
+    clock: network
+    delay: 7/3 ms
+    graph: {arcs: [[1, 2, 0.233], [1, 3, 0.999], [2, 3, 0.248], [2, 1, 1.262], [3, 1, 0.904], [3, 2, 0.698]]}
+hands:
+  arm: {type: SpringDamperArm, flange: device, stiffness: 80 N/m, damping: 1 N*s/m}
+"""
+    common, one, other = analyze(compiled(text)).modes[:3]
+    assert common.frequency_hz == pytest.approx(1000)
+    assert one.eigenvalue == other.eigenvalue.conjugate()
+    assert one.magnitude == pytest.approx(common.magnitude, rel=1e-6)
+    assert math.isnan(one.frequency_hz) and math.isnan(other.frequency_hz)

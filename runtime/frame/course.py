@@ -60,9 +60,14 @@ OFF = 0.3
 # much in a whole frame is no mode any more (`spectrum.DEADBEAT`).
 FADED = 1e-14
 
-# Angles up to here are half a turn the other way, which rounding or the sign of a zero made of a change
-# of sign.
-HALF_TURN_BACK = -np.pi * (1 - 2.0**-40)
+# Angles this near to half a turn are a change of sign, turned by rounding or by the sign of a zero.
+ROUNDED = np.pi * 2.0**-40
+HALF_TURN_BACK = ROUNDED - np.pi
+
+# A step between points is as far from straight as an eighth of its second difference, or four times that if
+# this changes along it; and what passes 0 nearer than this, relative to its size, may pass it on either side
+# for the rounding of its vector.
+BENT, NEAR_ZERO = 0.5, 1e-6
 
 
 def turns(
@@ -115,11 +120,7 @@ def turns(
             if real[some].all():
                 given = [block.real for block in given]
             course = _course(site, schedule, points, given[0], given[1], states[some])
-            phases = _phases(course)
-            angle, widest = _turned(phases)
-            agreed = widest < CLOSE
-            if not agreed.all():
-                agreed |= np.abs(angle - _turned(phases[::2])[0]) < OFF  # half as finely
+            angle, agreed = followed_closely(course, values[some])
             found[some[agreed]] = _of_eigenvalue(angle[agreed], values[some[agreed]])
             seen[some[agreed]] = True
         left = left[~seen[left]]
@@ -180,10 +181,7 @@ def turns_of_many(
             break
         mine = every_matrix(site, partial(_some_of, left))
         course = _courses(mine, schedule, points, start[left], heard[left], states[left])
-        angle, widest = turned_along(course)
-        agreed = widest < CLOSE
-        if doubled > 0:
-            agreed |= np.abs(angle - turned_along(course[::2])[0]) < OFF
+        angle, agreed = followed_closely(course, values[left], again=doubled > 0)
         found[left[agreed]] = _of_eigenvalue(angle[agreed], values[left[agreed]])
         left = left[~agreed]
     return found
@@ -374,6 +372,45 @@ def _course(
             last = end.value.reshape(len(end.value), -1, width)[states, np.arange(len(states))]
             path = np.concatenate([*parts, last[:, None]], axis=1)
             return np.ascontiguousarray((path[..., 0] + 1j * path[..., 1] if width == 2 else path[..., 0]).T)
+
+
+def followed_closely(
+    course: Floats | Complexes, values: Complexes, *, again: bool = True
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return by how much modes' courses (points, k) turn (k,), in radians, and of which that is known (k,).
+
+    Where points are far apart, it is known if half of them tell the same and no step goes so near 0 that its
+    side isn't sure; not tried unless `again`.
+    """
+    phases = _phases(course)
+    angle, widest = _turned(phases)
+    known = widest < CLOSE
+    far = np.flatnonzero(~known)
+    if again and len(far):
+        some = phases[:, far]
+        known[far] = np.abs(angle[far] - _turned(some[::2])[0]) < OFF
+        known[far] &= _on_one_side(course[:, far], some, values[far].imag == 0)
+    return angle, known
+
+
+def _on_one_side(
+    course: Floats | Complexes, phases: NDArray[Any], real: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Say of which courses (points, k) no wide step may pass 0 on either side.
+
+    A step is straight but for its bend. A mode that is real changes its sign, along a line through 0, and one
+    that nearly is passes 0 on a side that rounding may choose.
+    """
+    start, end = course[:-1], course[1:]
+    with np.errstate(all="ignore"):
+        scale = np.maximum(np.abs(start), np.abs(end))
+        a, b = start / scale, end / scale
+        distance = np.abs((a.conj() * b).imag) / np.abs(b - a)
+        bend = np.abs(np.diff(course, 2, axis=0))
+        bend = np.maximum(np.pad(bend, ((1, 0), (0, 0))), np.pad(bend, ((0, 1), (0, 0)))) / scale
+        turned = np.abs(np.angle(phases[1:] * phases[:-1].conj()))
+        sure = (turned < CLOSE) | (distance > BENT * bend + NEAR_ZERO)
+    return np.asarray((sure | (np.pi - turned <= np.where(real, NEAR_ZERO, ROUNDED))).all(axis=0))
 
 
 def turned_along(course: Floats | Complexes) -> tuple[Floats, Floats]:

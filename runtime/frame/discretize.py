@@ -373,14 +373,18 @@ def _phi(times: Callable[[Matrix], Matrix], x: Matrix, last: int) -> Matrix:
 def _products(x: Matrix) -> tuple[Callable[[Matrix], Matrix], float, int]:
     """Return what multiplies by matrices (k, n, n), how large they may be for a series, and its last power.
 
-    Of a large one that is mostly zero products are short and squares are not.
+    Of large ones that are mostly zero products are short and squares are not.
     """
-    if len(x) > 1 or x.shape[-1] <= FEW_TOGETHER or np.count_nonzero(x) > SPARSE * x.size:
+    if x.shape[-1] <= FEW_TOGETHER or np.count_nonzero(x) > SPARSE * x.size:
         return lambda other: x @ other, 0.5, TERMS
     import scipy.sparse
 
-    sparse = scipy.sparse.csr_array(x[0])
-    return lambda other: np.asarray(sparse @ other[0])[None], 2.0, MORE_TERMS
+    own = [scipy.sparse.csr_array(one) for one in x]
+    return (
+        lambda other: np.stack([one @ block for one, block in zip(own, other, strict=True)]),
+        2.0,
+        MORE_TERMS,
+    )
 
 
 def moved_together(a: NDArray[Any]) -> Iterator[Integers]:

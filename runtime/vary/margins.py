@@ -76,9 +76,9 @@ PIECES, FURTHER, MOST_PIECES = 4, 1.5, 64
 FEW_STATES = 60
 IN_PASSING = "not looked for in passing: {} states (apc analyze --margins does)"
 
-# Of a larger one nothing is looked at value by value, which takes half a minute for a delay of one as large;
-# and what the response tells of it is estimated, as a bound takes seconds.
-MOST_SCANNED = 300
+# Of a larger one nothing is looked at value by value, which takes a minute or two for a delay of 800 states;
+# and what the response tells of it is estimated, as a bound takes longer still.
+MOST_SCANNED = 1000
 
 # How far beyond a crossing, relative to the way there, an analysis says whether it is one.
 BESIDE = 1e-3
