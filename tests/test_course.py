@@ -158,7 +158,7 @@ def test_a_mode_that_is_real_changes_its_sign_whatever_rounding_says() -> None:
 
 
 def test_modes_of_a_directed_graph_that_are_real_but_for_rounding_have_no_frequency() -> None:
-    """Followed with 320 bits the first pair turns once a frame, 1,000 Hz; in floats the last digit chooses."""
+    """Followed with 320 bits the pair turns once a frame, 1,000 Hz; in floats the last digit chooses."""
     text = """\
 topology: weights
 clocks: {haptic: {period: 0.5 ms}, network: 1 ms}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from fractions import Fraction
+from pathlib import Path
 
 import flint
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 from apc.analysis.analysis import lifted_groups, prepare
 from apc.compiler.errors import Place
+from apc.compiler.pipeline import compile_topology
 from apc.eigen.bordered import Bordered
 from apc.eigen.modes import split
 from apc.eigen.spectrum import solve_spectrum
@@ -19,6 +21,8 @@ from apc.threads import single_threaded
 from apc.vary.critical import critical
 from apc.vary.delays import borders, system_with_delay
 from apc.vary.lags import LateStretch, _LateSheet, _of_powers, late_stretches
+from apc.vary.one_gain import response_of
+from tests.bench.growing import row
 from tests.topologies import AVERAGE, MESH, compiled, replaced
 
 PHASED = replaced(AVERAGE, ("network: 8 ms", "network: {period: 4 ms, phase: 1 ms}"))
@@ -95,10 +99,18 @@ def test_a_determinant_is_the_same_polynomial_at_every_age(kind: str) -> None:
                 assert abs(turning[row, place] - exact) < 1e-10 * max(abs(exact), 1.0)
 
 
-def test_a_circle_of_points_is_looked_at_part_by_part_each_as_if_alone() -> None:
+def _random_loops() -> Bordered:
+    """Return two loops of 40 states, of which one hears packets of two ages."""
     random = np.random.default_rng(7)
-    fixed, heard = random.normal(0, 0.1, (1, 44, 44)), random.normal(0, 0.1, (1, 1, 44, 4))
-    sheet = _LateSheet(Bordered(fixed, heard, 40), np.array([0, 0]), np.array([[1], [3]]), 0, 3)
+    fixed, heard = random.normal(0, 0.1, (1, 44, 44)), random.normal(0, 0.1, (2, 2, 44, 4))
+    fixed[:, :, 40:] = np.eye(44)[:, 40:]
+    fixed = np.repeat(fixed, 2, axis=0)
+    heard[1, 0] = 0
+    return Bordered(fixed, heard, 40)
+
+
+def test_a_circle_of_points_is_looked_at_part_by_part_each_as_if_alone() -> None:
+    sheet = _LateSheet(_random_loops(), None, np.array([0, 1]), np.array([[1, 1], [3, 4]]), 0, 4)
     points = np.exp(1j * np.linspace(0.1, 3.0, 2000))
     tracemalloc.start()
     found = sheet.over(np.array([0.0, 1.0]), points)
@@ -111,6 +123,34 @@ def test_a_circle_of_points_is_looked_at_part_by_part_each_as_if_alone() -> None
     assert np.abs(found.turning.ravel() - alone.turning).max() < 1e-9
 
 
+def test_a_loop_taken_apart_is_the_same_loop() -> None:
+    """To the roundings of 44 states, by the condition of the vectors of 40: some hundred."""
+    loops, ages = _random_loops(), np.array([[1, 1], [3, 4], [3, 7]])
+    apart = response_of(-loops.fixed[0, :40, :40])
+    assert apart is not None
+    whole, parts = (_LateSheet(loops, one, np.array([0, 1, 1]), ages, 1, 7) for one in (None, apart))
+    values, points = np.arange(3.0), np.exp(1j * np.linspace(0.1, 3.0, 500))
+    for one, other in (
+        (whole.over(values, points), parts.over(values, points)),
+        *((sheet.at(values, np.repeat([0, 1, 2], 500), np.tile(points, 3)) for sheet in (whole, parts)),),
+    ):
+        assert np.abs(np.exp(one.value - other.value) - 1).max() < 1e-10
+        assert np.abs(one.turning - other.turning).max() < 1e-9
+
+
+def test_a_late_link_of_a_row_of_masses_is_as_stable_as_its_matrices_say(tmp_path: Path) -> None:
+    """80 states, more than are inverted at each point; as matrices, value by value."""
+    (tmp_path / "scene.yaml").write_text(row(34, tmp_path).replace("500 N/m", "900 N/m"), encoding="utf-8")
+    system = compile_topology(tmp_path / "scene.yaml")
+    found = critical(system, "lan.delay", upper="40 ms")
+    assert found.crossings
+    for one in found.crossings:
+        for side in (-1, 1):
+            changed = system_with_delay(system, Free("lan.delay"), Fraction(one.value + side * 1e-6))
+            stable = solve_spectrum(split(*lifted_groups(changed)).systems).stable
+            assert stable == ((one.stable_side == "below") == (side < 0))
+
+
 def test_a_determinant_far_below_its_largest_value_keeps_its_digits() -> None:
     # Six equal loops z⁺ = a z + b z of m frames ago: F = (ζ − a − b ζ^(−m))⁶, at ζ ≈ 1 next to nothing.
     many, a, b = 6, 0.5, 0.499999
@@ -119,7 +159,7 @@ def test_a_determinant_far_below_its_largest_value_keeps_its_digits() -> None:
     heard = np.vstack([-b * unit, nothing])[None, None]
     ages = np.array([[1], [40]])
     loops = Bordered(fixed, heard, many)
-    sheet = _LateSheet(loops, np.zeros(2, dtype=np.intp), ages, 0, 40)
+    sheet = _LateSheet(loops, None, np.zeros(2, dtype=np.intp), ages, 0, 40)
     points = np.exp(1j * np.array([1e-7, 1e-3, 1.0]))
     found = sheet.over(np.arange(2.0), points)
     one = points - a - b * points**-ages
