@@ -1,8 +1,8 @@
 """A closed system over many cells of some parameters at once, and which of them a norm proves stable.
 
 Takes: a `ClosedSystem`, its sites over `Fraction` and `Ratio`, its rigid motions; cells.
-Gives: `OpenLoop`, `open_loop`, `closed_over`; `OpenSystem`, `open_system`; `Cell`; `Looked`, `look`;
-`change_of_basis`.
+Gives: `OpenFrames`, `open_frames`, `frames_over`; `OpenLoop`, `open_loop`, `closed_over`; `OpenSystem`,
+`open_system`; `Cell`; `Looked`, `look`, `contracted`; `change_of_basis`.
 Guarantees: a cell that is said to be stable is proved so, at every point of it; rounding is charged.
 Does not: divide cells, or decide what floats leave open (see `box_proof`).
 
@@ -62,21 +62,34 @@ class _Written:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OpenLoop:
-    """One closed system over a box: its sites over the open parameters, who hears whom.
+class OpenFrames:
+    """Sites over the open parameters of a box, ready to be lifted over cells.
 
-    `written` are its sites in floats, `beside` another matrix that is wanted, `quotients` the numerators and
+    `written` are the sites in floats, `beside` another matrix that is wanted, `quotients` the numerators and
     denominators in these, none where this is 1; `steps` are [F G] by duration in quanta of the sites whose A
     and B stay.
     """
 
-    system: ClosedSystem
     sites: tuple[LinearSite, ...]
-    feedback: tuple[Feedback, ...]
+    schedules: tuple[Schedule, ...]
     written: tuple[LinearSite, ...]
     beside: Matrix
     steps: tuple[Mapping[int, Matrix], ...]
     quotients: tuple[tuple[Polynomial, Polynomial | None], ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OpenLoop:
+    """One closed system over a box: its sites over the open parameters, and who hears whom."""
+
+    system: ClosedSystem
+    frames: OpenFrames
+    feedback: tuple[Feedback, ...]
+
+    @property
+    def sites(self) -> tuple[LinearSite, ...]:
+        """Its sites' matrices, over `Fraction` and `Ratio`."""
+        return self.frames.sites
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,6 +138,22 @@ def open_loop(system: ClosedSystem, sites: Sequence[LinearSite], beside: Matrix 
     beside
         Another matrix over these that is wanted.
     """
+    frames = open_frames(sites, [group.schedule for group in system.sites], beside)
+    return OpenLoop(system, frames, tuple(feedback_of(system, system.layout)))
+
+
+def open_frames(
+    sites: Sequence[LinearSite], schedules: Sequence[Schedule], beside: Matrix | None = None
+) -> OpenFrames:
+    """Make sites ready to be lifted over cells.
+
+    Parameters
+    ----------
+    sites, schedules
+        Their matrices, over `Fraction` and `Ratio`, and what happens in their frames.
+    beside
+        Another matrix over these that is wanted.
+    """
     known: dict[str, int] = {}
     quotients: list[tuple[Polynomial, Polynomial | None]] = []
 
@@ -146,13 +175,12 @@ def open_loop(system: ClosedSystem, sites: Sequence[LinearSite], beside: Matrix 
 
     alike = {id(site): every_matrix(site, written) for site in sites}
     wanted = written(np.zeros((0, 0)) if beside is None else beside)
-    return OpenLoop(
-        system=system,
+    return OpenFrames(
         sites=tuple(sites),
-        feedback=tuple(feedback_of(system, system.layout)),
+        schedules=tuple(schedules),
         written=tuple(alike[id(site)] for site in sites),
         beside=wanted,
-        steps=tuple(_steps(site, group.schedule) for site, group in zip(sites, system.sites, strict=True)),
+        steps=tuple(_steps(site, schedule) for site, schedule in zip(sites, schedules, strict=True)),
         quotients=tuple(quotients),
     )
 
@@ -167,8 +195,12 @@ def look(asked: OpenSystem, cells: Sequence[Cell]) -> Looked:
     cells
         Of all its parameters, k of them; points, where low and high are the same.
     """
-    matrix = _matrices(asked, cells)
-    k, count, n = len(cells), matrix.shape[1] - 2, matrix.shape[-1]
+    return contracted(_matrices(asked, cells))
+
+
+def contracted(matrix: Matrix) -> Looked:
+    """Say over which cells all eigenvalues of matrices (k, 2 + m, n, n) are inside the circle."""
+    k, count, n = len(matrix), matrix.shape[1] - 2, matrix.shape[-1]
     proved, inside = np.full((2, k), not n)
     reach = np.zeros((k, count))
     if not n:
@@ -309,6 +341,23 @@ def closed_over(asked: OpenLoop, cells: Sequence[Cell]) -> tuple[Matrix, Matrix]
     cells
         As for `look`.
     """
+    maps, beside = frames_over(asked.frames, cells)
+    count = maps[0].p.shape[-3] - 2
+    heard = [Feedback(within(one.now, count), within(one.before, count)) for one in asked.feedback]
+    closed = close(maps, heard, asked.system.layout, numbers=taylor(count)).matrix
+    return np.broadcast_to(closed, (len(cells), *closed.shape[-3:])), beside
+
+
+def frames_over(asked: OpenFrames, cells: Sequence[Cell]) -> tuple[list[FrameMap], Matrix]:
+    """Return each site's frame over cells (k, 2 + m, …), k being 1 of what stays; and what is wanted beside.
+
+    Parameters
+    ----------
+    asked
+        The sites.
+    cells
+        As for `look`.
+    """
     wide = any(low != high for low, high in cells[0])
     parameters = _parameters(cells, wide=wide)
     count = len(parameters) if wide else 0
@@ -325,20 +374,18 @@ def closed_over(asked: OpenLoop, cells: Sequence[Cell]) -> tuple[Matrix, Matrix]
 
     known: dict[tuple[int, int], FrameMap] = {}
     maps = []
-    for site, steps, group in zip(asked.written, asked.steps, asked.system.sites, strict=True):
-        key = id(site), id(group.schedule)
+    for site, steps, schedule in zip(asked.written, asked.steps, asked.schedules, strict=True):
+        key = id(site), id(schedule)
         if key not in known:
             here = every_matrix(site, over)
-            durations = {one: float(one * group.schedule.quantum) for one in step_durations(group.schedule)}
+            durations = {one: float(one * schedule.quantum) for one in step_durations(schedule)}
             own = {
                 duration: within(steps[duration], count) if steps else step_over(here.a, here.b, seconds)
                 for duration, seconds in durations.items()
             }
-            known[key] = compose(here, group.schedule, own, numbers=numbers)
+            known[key] = compose(here, schedule, own, numbers=numbers)
         maps.append(known[key])
-    heard = [Feedback(within(one.now, count), within(one.before, count)) for one in asked.feedback]
-    closed = close(maps, heard, asked.system.layout, numbers=numbers).matrix
-    return np.broadcast_to(closed, (len(cells), *closed.shape[-3:])), over(asked.beside)
+    return maps, over(asked.beside)
 
 
 def _parameters(cells: Sequence[Cell], *, wide: bool) -> list[Matrix]:

@@ -47,6 +47,28 @@ def taylor(parameters: int) -> Arithmetic:
     return replace(found, solve=lambda matrix, right: solve(matrix, right, found))
 
 
+def arithmetic_of(matrix: Matrix) -> Arithmetic:
+    """Return what matrices with their radii (…, 2, n, m), or over cells (…, 2 + m, n, n'), compute with."""
+    return RADII if matrix.shape[-3] == 2 else taylor(matrix.shape[-3] - 2)
+
+
+def entrywise(left: Matrix, right: Matrix) -> Matrix:
+    """Return the product entry by entry of matrices over cells (…, 2 + m, n, n'), or of one and numbers.
+
+    Either may be one with its radii (…, 2, n, n') that stays all over the cells.
+    """
+    count = max(left.shape[-3], right.shape[-3]) - 2
+    left, right = (within(one, count - one.shape[-3] + 2) for one in (left, right))
+    a, b, off_a, off_b = value_of(left), value_of(right), radius_of(left), radius_of(right)
+    spread_a, spread_b, size_a, size_b = _spread(left), _spread(right), np.abs(a), np.abs(b)
+    first = _slopes(left) * b[..., None, :, :], a[..., None, :, :] * _slopes(right)
+    found = np.concatenate([(a * b)[..., None, :, :]] * 2 + [first[0] + first[1]], axis=-3)
+    off = spread_a * spread_b + (size_a + spread_a) * off_b + off_a * (size_b + spread_b + off_b)
+    off += (count + 2) * UNIT * (size_a * size_b + spread_a * size_b + size_a * spread_b)
+    radius_of(found)[...] = off * (1 + (count + 8) * UNIT)
+    return found
+
+
 def within(matrix: Matrix, parameters: int) -> Matrix:
     """Return matrices with their radii (…, 2, n, m) over cells of parameters that they don't follow."""
     still = np.zeros((*matrix.shape[:-3], parameters, *matrix.shape[-2:]))

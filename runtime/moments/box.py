@@ -6,16 +6,16 @@ Guarantees: stable means proved for every point of the box, unstable proved at t
 can't be had is refused by name.
 Does not: serve values that stand in, bursts or traces; leave a jitter open.
 
-Of a cell of the box, each entry of a peer's matrices is a ball that holds its values all over the cell, and
-so is each share that arrives. Frames composed of these, and loops closed of them, are matrices with radii
-(`frame.radius`), of which G(1) comes with its own (`gains.stein`): where its largest eigenvalue is below 1,
-the cell is proved. A cell where that fails is halved.
+The peers' frames are lifted over many cells of the box at once, and follow the parameters to first order with
+a radius for all the rest (`frame.taylor`); so do the loops of means closed of them, and the moments that luck
+drives (`gains.stein`). Where the largest eigenvalue of G(1) is below 1 all over a cell, and loops that no luck
+drives contract, the cell is proved. A cell where that fails is halved. A share that is lost is a radius.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
@@ -26,35 +26,26 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, prepare
 from apc.analysis.box import OpenSites, open_sites
-from apc.analysis.box_proof import (
-    BITS,
-    UNDECIDED,
-    BoxProof,
-    ball_radii,
-    middle,
-    one_by_one,
-    range_ball,
-    search_box,
-    site_at,
-)
-from apc.analysis.cells import Cell
+from apc.analysis.box_proof import BITS, TOGETHER, UNDECIDED, BoxProof, Looked, middle, search_box
+from apc.analysis.cells import Cell, OpenFrames, contracted, frames_over, open_frames
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
-from apc.eigen.balls import frame_steps, precision
-from apc.eigen.closing import without_packets
+from apc.eigen.balls import precision
+from apc.eigen.closing import Loop, without_packets
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.rigid import stays_rigid
 from apc.frame.discretize import UNIT
-from apc.frame.lift import compose, named
+from apc.frame.lift import FrameMap, named
 from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
-from apc.frame.radius import RADII, radius_of, value_of
-from apc.frame.site import LinearSite, every_matrix
-from apc.moments.crowd import Hearing, crowd, hearing, peer_classes
-from apc.moments.gains import TINY, Moments, below_1
+from apc.frame.radius import radius_of, value_of
+from apc.frame.taylor import hull
+from apc.moments.crowd import Classes, classes_of, hearing, moments_of, peer_classes, remembered_of
+from apc.moments.gains import TINY, below_1
+from apc.moments.mean_loops import Remembered
 from apc.moments.memory import is_memoryless
 from apc.moments.network import STABLE, UNSTABLE, Growth, growth, unreliable
 from apc.network.channel import channel_law
@@ -75,7 +66,11 @@ class _Question:
     ranges: tuple[Range, ...]
     own: tuple[int, ...]  # places of the ranges that are no link's
     open: OpenSites
-    told: Hearing
+    classes: Classes
+    frames: OpenFrames  # of all groups of peers, with their names
+    names: tuple[str, ...]
+    wide: Loop  # of all classes, its maps those of the whole box
+    memories: Sequence[Remembered]
     weights: Floats  # how much each range matters
 
 
@@ -97,15 +92,14 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
     """
     with single_threaded(), np.errstate(all="ignore"), precision(BITS):
         asked = _question(system, ranges)
-        loops, _ = peer_classes(asked.told)
-        for loop in loops:
+        for loop in asked.classes.loops:
             bare = without_packets(loop)
             if not stays_rigid(bare, [asked.open.sites[group.name] for group in bare.sites]):
                 note = f"{loop.name} moves freely in a direction that changes with the parameters"
                 return BoxProof(system.name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), (note,))
         is_unstable = partial(_is_unstable, asked)
-        looks = partial(one_by_one, partial(_reach_out, asked), is_unstable)
-        return search_box(system.name, ranges, looks, is_unstable, stable=STABLE, unstable=UNSTABLE)
+        looks = partial(_looked, asked), is_unstable
+        return search_box(system.name, ranges, *looks, stable=STABLE, unstable=UNSTABLE)
 
 
 def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
@@ -123,7 +117,15 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
         _refuse(_changed(system, ranges, point), prepared, one)
     opened = open_sites(system, [ranges[place] for place in own], prepared, lifted)
     told = hearing(opened.at, prepared)
-    asked = _Question(system, prepared, tuple(ranges), own, opened, told, np.ones(0))
+    names = tuple(group.name for group in told.groups)
+    frames = open_frames([opened.sites[name] for name in names], [group.schedule for group in told.groups])
+    whole = tuple((ranges[place].low, ranges[place].high) for place in own)
+    maps = [one.mapped(lambda block: hull(block)[0]) for one in frames_over(frames, [whole])[0]]
+    lifted_wide = [_with_map(*pair) for pair in zip(told.groups, maps, strict=True)]
+    wide = peer_classes(replace(told, groups=tuple(lifted_wide)))[0][0]
+    memories = remembered_of(opened.at, told, wide)
+    of = opened, classes_of(told), frames, names, wide, memories
+    asked = _Question(system, prepared, tuple(ranges), own, *of, np.ones(0))
     weights = []
     for place, varied in enumerate(ranges):
         point = [(one.low + one.high) / 2 for one in ranges]
@@ -131,6 +133,12 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
         low, high = (_growth_at(asked, one, bounded=False).radius for one in ends)
         weights.append(abs(high - low) / float(varied.high - varied.low))
     return replace(asked, weights=np.nan_to_num(weights, nan=1.0) + TINY)
+
+
+def _with_map(group: PeerGroup, frame: FrameMap) -> PeerGroup:
+    """Return peers with a map that has its radii (2, n, n')."""
+    parts = frame.mapped(value_of), frame.mapped(radius_of)
+    return group.with_lifted(named(group.jacobians.kind, group.schedule, *parts))
 
 
 def _refuse(system: CompiledSystem, prepared: Prepared, one: Range) -> None:
@@ -175,26 +183,42 @@ def _is_unstable(asked: _Question, point: Sequence[Fraction]) -> bool:
     return found.proved and found.stable is False
 
 
-def _reach_out(asked: _Question, cell: Cell) -> Floats | None:
-    """Return None when a cell is proved, or else how much each range matters in it."""
-    if below_1(_moments_of(asked, cell)):
-        return None
-    return asked.weights * [float(high - low) for low, high in cell]
+def _looked(asked: _Question, cells: Sequence[Cell]) -> Iterator[Looked]:
+    """Look at cells, their frames lifted many at a time, until one is found unstable."""
+    for start in range(0, len(cells), TOGETHER):
+        some = cells[start : start + TOGETHER]
+        own = [tuple(cell[place] for place in asked.own) for cell in some]
+        maps, _ = frames_over(asked.frames, own)
+        for place, cell in enumerate(some):
+            here = [one.mapped(lambda block, at=place: block[min(at, len(block) - 1)]) for one in maps]
+            proved, sound = _proved(asked, cell, dict(zip(asked.names, here, strict=True)))
+            reach = asked.weights * [float(high - low) for low, high in cell]
+            unstable = not sound and _is_unstable(asked, middle(cell))
+            yield Looked(None if proved else reach, unstable)
 
 
-def _moments_of(asked: _Question, cell: Cell) -> Moments:
-    """Return the loops and the luck of all scenes in a cell."""
-    balls = [range_ball(*cell[place]) for place in asked.own]
-    groups = tuple(_lifted(group, asked.open.sites[group.name], balls) for group in asked.told.groups)
-    system, doubts = asked.system, {}
+def _proved(asked: _Question, cell: Cell, frames: Mapping[str, FrameMap]) -> tuple[bool, bool]:
+    """Say whether second moments are proved to die out all over a cell; and whether, in floats, in its middle."""
+    of = moments_of(asked.classes, _memories(asked, cell), frames)
+    for matrix in of.means[1]:
+        found = contracted(matrix[None])
+        if not found.proved.all():
+            return False, bool(found.inside.all())
+    return below_1(of)
+
+
+def _memories(asked: _Question, cell: Cell) -> Sequence[Remembered]:
+    """Return what is remembered on each route, for all shares lost in a cell."""
     shares = [place for place in range(len(cell)) if place not in asked.own]
-    if shares:
-        system = _changed(system, asked.ranges, middle(cell), shares)
-        # A share lost is multilinear in what it is made of, and so between its values at the corners.
-        lost = [_lost(_changed(asked.system, asked.ranges, one, shares)) for one in itertools.product(*cell)]
-        for name, share in _lost(system).items():
-            doubts[name] = max(abs(one[name] - share) for one in lost) + 8 * UNIT
-    return crowd(system, asked.prepared, told=replace(asked.told, groups=groups), doubts=doubts)
+    if not shares:
+        return asked.memories
+    system = _changed(asked.system, asked.ranges, middle(cell), shares)
+    # A share lost is multilinear in what it is made of, and so between its values at the corners.
+    lost = [_lost(_changed(asked.system, asked.ranges, one, shares)) for one in itertools.product(*cell)]
+    doubts = {
+        name: max(abs(one[name] - share) for one in lost) + 8 * UNIT for name, share in _lost(system).items()
+    }
+    return remembered_of(system, asked.classes.told, asked.wide, doubts=doubts)
 
 
 def _lost(system: CompiledSystem) -> dict[str, float]:
@@ -205,12 +229,3 @@ def _lost(system: CompiledSystem) -> dict[str, float]:
         for link in system.links
         if link.channel is not None
     }
-
-
-def _lifted(group: PeerGroup, site: LinearSite, balls: Sequence[Any]) -> PeerGroup:
-    """Return peers with the frame of all values that balls of their parameters hold."""
-    inside = site_at(site, balls, None)
-    steps = {duration: ball_radii(step) for duration, step in frame_steps(inside, group.schedule).items()}
-    found = compose(every_matrix(inside, ball_radii), group.schedule, steps, numbers=RADII)
-    kind, schedule = group.jacobians.kind, group.schedule
-    return group.with_lifted(named(kind, schedule, found.mapped(value_of), found.mapped(radius_of)))

@@ -1,7 +1,7 @@
 """The mean loops and the luck of a scene: what its second moments are made of.
 
 Takes: a `CompiledSystem` whose links lose or delay packets independently of each other.
-Gives: `crowd`; `Hearing`, `hearing`, `own_value`; `peer_classes`, `remembered_of`, `standing_motions`,
+Gives: `crowd`; `Classes`, `classes_of`, `moments_of`; `Hearing`, `hearing`, `own_value`; `peer_classes`, `remembered_of`, `standing_motions`,
 `instants`.
 Guarantees: equal peers on complete graphs cost the same, however many they are; peers that can change places
 are one class on any graph.
@@ -26,6 +26,7 @@ from apc.eigen.modes import complete_degrees, complete_loops, couple, dense_loop
 from apc.eigen.peer_group import PeerGroup, used_ways
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.exchange import Exchange
+from apc.frame.lift import FrameMap
 from apc.frame.parameters import resolve
 from apc.frame.radius import with_radius
 from apc.frame.schedule import Event, Schedule, Selected, Send, Sent, Tick, Way, tick_by_tick
@@ -128,13 +129,26 @@ def standing_in(schedule: Schedule, kind: Kind) -> Schedule:
     )
 
 
-def crowd(
-    system: CompiledSystem,
-    prepared: Prepared,
-    *,
-    told: Hearing | None = None,
-    doubts: Mapping[str, float] = NO_DOUBTS,
-) -> Moments:
+@dataclass(frozen=True, slots=True, eq=False)
+class Classes:
+    """The loops of a scene, that of all classes of peers first, with their rigid motions.
+
+    `weights` says what a peer of one class weighs one of another by.
+    """
+
+    told: Hearing
+    loops: tuple[Loop, ...]
+    weights: Coupling
+    standing: tuple[Floats, ...]
+
+
+def classes_of(told: Hearing) -> Classes:
+    """Return the loops of a scene with their rigid motions."""
+    loops, weights = peer_classes(told)
+    return Classes(told, loops, weights, tuple(map(standing_motions, loops)))
+
+
+def crowd(system: CompiledSystem, prepared: Prepared, *, told: Hearing | None = None) -> Moments:
     """Make the mean loops of a scene and the luck that drives them.
 
     Parameters
@@ -145,14 +159,28 @@ def crowd(
         From `analysis.prepare`, of this system with any numbers.
     told
         Its peers, where they are not those of `hearing`.
-    doubts
-        How far the share of packets that a link loses may be off, by the link's name.
     """
-    told = told or hearing(system, prepared)
-    loops, weights = peer_classes(told)
-    common = loops[0]
-    remembered = {one.route: one for one in remembered_of(system, told, common, doubts=doubts)}
-    listened = _listened(common, weights, list(remembered.values()))
+    of = classes_of(told or hearing(system, prepared))
+    return moments_of(of, remembered_of(system, of.told, of.loops[0]))
+
+
+def moments_of(
+    of: Classes, memories: Sequence[Remembered], frames: Mapping[str, FrameMap] | None = None
+) -> Moments:
+    """Make the mean loops and the luck of a scene's classes of peers.
+
+    Parameters
+    ----------
+    of
+        The classes.
+    memories
+        From `remembered_of`.
+    frames
+        As for `mean_loops.mean_loop`.
+    """
+    told, loops, weights, common = of.told, of.loops, of.weights, of.loops[0]
+    remembered = {one.route: one for one in memories}
+    listened = _listened(common, weights, memories)
     luck = [
         Luck(
             route=one.route,
@@ -173,7 +201,7 @@ def crowd(
             if alone is None or one.site == alone
         }
         mean, channels = mean_loop(
-            loop, told.of(loop), list(remembered.values()), list(own.values()), standing_motions(loop)
+            loop, told.of(loop), memories, list(own.values()), of.standing[place], frames
         )
         classes = tuple(range(len(loop.sites))) if alone is None else (alone,)
         parts.append(Part(mean, alone, classes, dict(zip(own, channels, strict=True))))
@@ -244,7 +272,7 @@ def remembered_of(
     perfect
         Whether every packet counts as on time.
     doubts
-        As for `crowd`.
+        How far the share of packets that a link loses may be off, by the link's name.
     """
     heard: dict[Route, list[Selected]] = {}
     for site, rows in zip(common.sites, told.of(common), strict=True):

@@ -27,6 +27,7 @@ from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.pseudospectrum import balance
 from apc.frame.discretize import UNIT
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
+from apc.frame.taylor import arithmetic_of, corners, hull
 from apc.moments.mean_loops import Channel, MeanLoop, Route, scaled
 
 Floats = NDArray[np.float64]
@@ -40,6 +41,10 @@ NOTHING = 1e-24
 
 # Doublings until a sum counts as endless, 2^60 frames; or where what is doubled has grown to this.
 DOUBLINGS, ENDLESS = 60, 1e100
+
+# A φ that is not small is had from the corners of a cell of at most so many parameters, and somewhat larger
+# than the least, relatively to what is left.
+LARGE, MOST_SIDES, SPARED = 0.5, 6, 0.1
 
 TINY = float(np.finfo(np.float64).tiny)
 
@@ -134,7 +139,7 @@ class Enclosed:
 def stein(matrix: Matrix, driven: Matrix, numbers: Arithmetic) -> Matrix | None:
     """Return Σ_k M^k B M^kᵀ of a matrix M (n, n) and symmetric B (b, n, n), None where it does not end.
 
-    With radii, that it ends for every M within them is proved.
+    With radii, or over a cell, that it ends for every M within them is proved.
 
     Notes
     -----
@@ -142,6 +147,7 @@ def stein(matrix: Matrix, driven: Matrix, numbers: Arithmetic) -> Matrix | None:
     symmetric matrices for some diagonal D. For a P ≥ 0 with P − M P Mᵀ ≥ (1 − φ) D², φ < 1, the powers of M
     die out (Lyapunov), and X − X̂ = Σ_k M^k E M^kᵀ lies between −θ/(1 − φ) P and θ/(1 − φ) P. D² is as X̂ on
     its diagonal, P as floats have Σ_k M^k D² M^kᵀ; θ and φ are the largest sums of rows, over D (Gershgorin).
+    Over a cell X̂ follows the parameters to first order, and E is of the second.
     """
     if numbers is FLOATS:
         return _doubled(matrix, driven)
@@ -150,24 +156,59 @@ def stein(matrix: Matrix, driven: Matrix, numbers: Arithmetic) -> Matrix | None:
     if found is None or not n:
         return None if found is None else driven
     found = (found + np.swapaxes(found, -1, -2)) / 2
+    guessed = numbers.exact(found)
+    guessed[..., 2:, :, :] = _slopes(matrix, driven, found)
     weights = _weights(found, value_of(matrix))
     seed = np.diag(weights**2)
     still = _doubled(value_of(matrix), seed[None])
     if still is None:
         return None
     still = (still + np.swapaxes(still, -1, -2)) / 2
-    guessed = numbers.exact(np.concatenate([found, still]))
+    guessed = np.concatenate([guessed, numbers.exact(still)])
     added = np.concatenate([driven, numbers.exact(seed[None])])
     left = numbers.subtract(numbers.add(around(matrix, guessed, numbers), added), guessed)
-    scale = np.outer(weights, weights)
-    size = (np.abs(value_of(left)) + radius_of(left)) / scale
+    scale, within = np.outer(weights, weights), hull(left)
+    size = (np.abs(value_of(within)) + radius_of(within)) / scale
     *thetas, phi = size.sum(axis=-1).max(axis=-1) * (1 + (n + 8) * UNIT)
+    if not phi < LARGE:
+        phi = _share_at_corners(left[-1], seed, phi)
     shape = still[0] / scale
     if not (phi < 1 and is_positive(with_radius(shape, 2 * UNIT * np.abs(shape)))):
         return None
     wide = np.sqrt(np.diagonal(still[0]))
     reach = np.array(thetas)[:, None, None] / (1 - phi) * np.outer(wide, wide)
-    return with_radius(found, reach * (1 + 16 * UNIT))
+    guessed = guessed[:-1]
+    radius_of(guessed)[...] = reach * (1 + 16 * UNIT)
+    return guessed
+
+
+def _slopes(matrix: Matrix, driven: Matrix, found: Floats) -> Matrix:
+    """Return how Σ_k M^k B M^kᵀ (b, n, n) changes with each parameter of a cell (b, m, n, n), in floats."""
+    moved = matrix[2:] @ found[:, None] @ value_of(matrix).T
+    moved = driven[:, 2:] + moved + np.swapaxes(moved, -1, -2)
+    if not moved.size:
+        return moved
+    total = _doubled(value_of(matrix), moved.reshape(-1, *found.shape[1:]))
+    assert total is not None, "sums of one matrix end for all that drives it, or for nothing"
+    return (total + np.swapaxes(total, -1, -2)).reshape(moved.shape) / 2
+
+
+def _share_at_corners(left: Matrix, seed: Floats, most: float) -> float:
+    """Return a φ for which φ D² − E is positive all over a cell, E (2 + m, n, n); `most` where there is none.
+
+    E is straight over the cell, but for its radius: its largest eigenvalue is at a corner.
+    """
+    scale = np.sqrt(np.diagonal(seed))
+    if not np.isfinite(left).all() or len(left) - 2 > MOST_SIDES:
+        return most
+    inside = corners(left)
+    values = [value_of(one) / np.outer(scale, scale) for one in inside]
+    off = [float((radius_of(one) / np.outer(scale, scale)).sum(axis=-1).max()) for one in inside]
+    highest = [float(np.linalg.eigvalsh(one + one.T)[-1]) / 2 for one in values]
+    least = max(0.0, *(high + more for high, more in zip(highest, off, strict=True)))
+    share = least + SPARED * (1 - least)
+    sure = share < 1 and all(is_positive(RADII.subtract(RADII.exact(share * seed), one)) for one in inside)
+    return share if sure else most
 
 
 def _weights(found: Matrix, matrix: Matrix) -> Floats:
@@ -220,7 +261,7 @@ def gain_of(of: Moments) -> Gain:
         exact = numbers is FLOATS
         if exact not in known:
             known[exact] = [_driven(of, part, d, firsts, numbers) for part in of.parts for d in part.channels]
-        found = of_kind(np.zeros((2, firsts[-1], firsts[-1])), numbers)
+        found = numbers.exact(np.zeros((firsts[-1], firsts[-1])))
         shrink, root = number_of(1 / growth, numbers), number_of(growth**-0.5, numbers)
         for one in known[exact]:
             matrix, driven = scaled(one.matrix, root, numbers), scaled(one.driven, shrink, numbers)
@@ -279,7 +320,7 @@ def _driven(of: Moments, part: Part, d: int, firsts: Sequence[int], numbers: Ari
     """Return how a part answers to the luck of channels of kind d."""
     kind, channel = of.luck[d], part.channels[d]
     n = channel.matrix.shape[-1]
-    covariances = of_kind(RADII.exact(units_of(kind)), numbers)
+    covariances, full = numbers.exact(units_of(kind)), arithmetic_of(channel.matrix)
 
     def form(left: Matrix, right: Matrix, by: float) -> _Form:
         left, right, factor = of_kind(left, numbers), of_kind(right, numbers), number_of(by / 2, numbers)
@@ -299,7 +340,7 @@ def _driven(of: Moments, part: Part, d: int, firsts: Sequence[int], numbers: Ari
             own = None
             if c == d and part.apart is None:
                 # o oᵀ + (m oᵀ + o mᵀ)/n, of which the form has both halves
-                mixed = RADII.add(scaled(miss, number_of(2 * alone, RADII), RADII), channel.own[slot])
+                mixed = full.add(scaled(miss, number_of(2 * alone, full), full), channel.own[slot])
                 own = form(mixed, channel.own[slot], 1.0)
             elif c == d:
                 own = form(miss, channel.own[slot], -2 * alone)
@@ -380,13 +421,18 @@ def mean_square_radius(
     return Enclosed(radius, min(below, radius), max(above, square[1], radius))
 
 
-def below_1(of: Moments) -> bool:
-    """Say whether it is proved that second moments die out, for all matrices within their radii."""
-    driven, alone = of.means
-    if not _square(alone)[1] < 1:
-        return False
-    bounds = _bounds(gain_of(of), 1.0) if driven else None
-    return not driven or (bounds is not None and bounds[1] < 1)
+def below_1(of: Moments) -> tuple[bool, bool]:
+    """Say whether it is proved that what luck drives dies out, for all matrices within their radii or a cell.
+
+    And whether, in floats, it does so in the middle.
+    """
+    driven, _ = of.means
+    if not driven:
+        return True, True
+    gain = gain_of(of)
+    bounds = _bounds(gain, 1.0, arithmetic_of(driven[0]))
+    proved = bounds is not None and bounds[1] < 1
+    return proved, proved or _largest(gain, 1.0) < 1
 
 
 def _growth(loops: Sequence[Matrix]) -> float:
@@ -405,14 +451,15 @@ def _size(values: NDArray[Any]) -> float:
     return float(np.abs(values).max(initial=0.0))
 
 
-def _bounds(of: Gain, growth: float) -> tuple[float, float] | None:
+def _bounds(of: Gain, growth: float, numbers: Arithmetic = RADII) -> tuple[float, float] | None:
     """Return bounds on the largest eigenvalue of G(λ), None where there are none.
 
     Of G, terms fall as 1/λ or faster: where it is ρ at λ, it is 1 between λ min(ρ, 1) and λ max(ρ, 1).
     """
-    matrix = of(growth, RADII)
+    matrix = of(growth, numbers)
     if matrix is None or not np.isfinite(matrix).all():
         return None
+    matrix = hull(matrix)
     if matrix.shape[-1] == 1:
         value, off = abs(float(matrix[0, 0, 0])), float(matrix[1, 0, 0])
         return (value - off) * (1 - UNIT), (value + off) * (1 + UNIT)

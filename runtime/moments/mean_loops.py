@@ -33,6 +33,7 @@ from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
 from apc.frame.schedule import Selected, Sent, Way
+from apc.frame.taylor import arithmetic_of, entrywise, hull, within
 from apc.moments.memory import CHANCE_ROUNDINGS, Memory
 
 Floats = NDArray[np.float64]
@@ -116,6 +117,8 @@ def scaled(matrix: Matrix, by: Matrix, numbers: Arithmetic) -> Matrix:
     """Return matrices entry by entry times others, or times numbers."""
     if numbers is FLOATS:
         return np.asarray(matrix * by)
+    if max(matrix.shape[-3], by.shape[-3]) > 2:
+        return entrywise(matrix, by)
     value, factor, off = value_of(matrix), value_of(by), radius_of(by)
     product = value * factor
     radius = radius_of(matrix) * (np.abs(factor) + off) + np.abs(value) * off + UNIT * np.abs(product)
@@ -164,9 +167,20 @@ class Site:
     sent: Mapping[Sent, int]
 
 
-def with_memory(group: PeerGroup, remembered: Sequence[Remembered]) -> Site:
-    """Return a site whose state holds what its receivers remember of it on the mean."""
-    plain, row_of = group.lifted.bounded, {one: row for row, one in enumerate(group.schedule.sent)}
+def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: FrameMap | None = None) -> Site:
+    """Return a site whose state holds what its receivers remember of it on the mean.
+
+    Parameters
+    ----------
+    group
+        The site.
+    remembered
+        What they remember.
+    frame
+        Its map, where it is not the group's: over a cell, say.
+    """
+    plain, row_of = frame or group.lifted.bounded, {one: row for row, one in enumerate(group.schedule.sent)}
+    arithmetic, more = arithmetic_of(plain.p), plain.p.shape[-3] - 2
     numbers = [
         (one, channel)
         for one in remembered
@@ -210,15 +224,15 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered]) -> Site:
     plainly = np.zeros((2, n_s, n_m + n_s))
     plainly[0, :, n_m:] = np.eye(n_s)
     rows.append(plainly)
-    listed, keeping = np.concatenate(rows, axis=-2), np.concatenate(kept, axis=-2)
-    n_z = plain.p.shape[-1]
-    p = np.zeros((2, n_z + n_m, n_z + n_m))
+    listed, keeping = (within(np.concatenate(some, axis=-2), more) for some in (rows, kept))
+    n_z, multiply = plain.p.shape[-1], arithmetic.multiply
+    p = np.zeros((2 + more, n_z + n_m, n_z + n_m))
     p[:, :n_z, :n_z] = plain.p
-    p[:, n_z:, :n_z] = RADII.multiply(keeping[..., n_m:], plain.s)
+    p[:, n_z:, :n_z] = multiply(keeping[..., n_m:], plain.s)
     p[:, n_z:, n_z:] = keeping[..., :n_m]
-    q = np.concatenate([plain.q, RADII.multiply(keeping[..., n_m:], plain.d)], axis=-2)
-    s = np.concatenate([RADII.multiply(listed[..., n_m:], plain.s), listed[..., :n_m]], axis=-1)
-    d = RADII.multiply(listed[..., n_m:], plain.d)
+    q = np.concatenate([plain.q, multiply(keeping[..., n_m:], plain.d)], axis=-2)
+    s = np.concatenate([multiply(listed[..., n_m:], plain.s), listed[..., :n_m]], axis=-1)
+    d = multiply(listed[..., n_m:], plain.d)
     names = [
         f"{channel} heard" for (_, channel), many in zip(numbers, counts, strict=True) for _ in range(many)
     ]
@@ -272,6 +286,7 @@ def mean_loop(
     remembered: Sequence[Remembered],
     listened: Sequence[Listened],
     standing: Floats,
+    frames: Mapping[str, FrameMap] | None = None,
 ) -> tuple[MeanLoop, list[Channel]]:
     """Close a loop of means, and say what the luck of some channels does to it.
 
@@ -287,9 +302,12 @@ def mean_loop(
         The channels.
     standing
         The rigid motions over the loop's own z, site after site (Σ n_z, d).
+    frames
+        The sites' maps by name, where they are not the loop's: over a cell of m parameters (2 + m, …), as
+        then are all matrices.
     """
     of_route = {one.route: one for one in remembered}
-    sites = [with_memory(group, remembered) for group in loop.sites]
+    sites = [with_memory(group, remembered, frames[group.name] if frames else None) for group in loop.sites]
     offsets = np.cumsum([0] + [len(one.names) for one in sites]).tolist()
     starts = np.cumsum([0] + [one.map.s.shape[-2] for one in sites]).tolist()
     layout = StateLayout(tuple(offsets[:-1]), tuple(name for one in sites for name in one.names), {})
@@ -314,13 +332,16 @@ def mean_loop(
                     span = slice(first, first + own.values.shape[-1])
                     before[:, line, span] = RADII.multiply(by, own.values[:, place, None])[:, 0]
         feedback.append(Feedback(now, before))
-    closed = close([one.map for one in sites], feedback, layout, numbers=RADII)
+    more = sites[0].map.p.shape[-3] - 2
+    numbers = arithmetic_of(sites[0].map.p)
+    feedback = [Feedback(within(one.now, more), within(one.before, more)) for one in feedback]
+    closed = close([one.map for one in sites], feedback, layout, numbers=numbers)
     at = relative_coordinates(standing_state(closed.matrix[..., : offsets[-1]], standing, loop, offsets))
     rest, n = at.rest, len(at.rest)
     moved = closed.matrix[:, rest]
     if len(at.held):
-        weights = with_radius(at.weights, at.doubt)
-        moved = RADII.subtract(moved, RADII.multiply(weights, closed.matrix[:, at.held]))
+        weights = within(with_radius(at.weights, at.doubt), more)
+        moved = numbers.subtract(moved, numbers.multiply(weights, closed.matrix[:, at.held]))
 
     def missed(columns: NDArray[np.intp]) -> dict[tuple[int, Route, int], Matrix]:
         return {
@@ -331,14 +352,14 @@ def mean_loop(
 
     found = []
     for channel, own, first, last in zip(listened, apart, firsts, firsts[1:], strict=False):
-        states = len(own.kept[0])
-        matrix = np.zeros((2, n + states, n + states))
+        states, kept = len(own.kept[0]), within(own.kept, more)
+        matrix = np.zeros((2 + more, n + states, n + states))
         matrix[:, :n, :n], matrix[:, :n, n:] = moved[..., rest], moved[..., first : first + states]
-        matrix[:, n:, n:] = own.kept[..., :states]
-        driven = np.concatenate([moved[..., first + states : last], own.kept[..., states:]], axis=-2)
+        matrix[:, n:, n:] = kept[..., :states]
+        driven = np.concatenate([moved[..., first + states : last], kept[..., states:]], axis=-2)
         misses = missed(np.concatenate([rest, np.arange(first, last)]))
-        within = [np.concatenate([np.zeros((2, rows.shape[-2], n)), rows], axis=-1) for rows in own.misses]
-        found.append(Channel(channel, matrix, driven, misses, tuple(within)))
+        inside = [np.concatenate([np.zeros((2, rows.shape[-2], n)), rows], axis=-1) for rows in own.misses]
+        found.append(Channel(channel, matrix, driven, misses, tuple(within(one, more) for one in inside)))
     mean = MeanLoop(loop.name, loop.multiplicity, moved[..., rest], at, tuple(offsets), missed(rest))
     return mean, found
 
@@ -360,6 +381,7 @@ def standing_state(matrix: Matrix, standing: Floats, loop: Loop, offsets: Sequen
         np.eye(len(rest)) - value[np.ix_(rest, rest)], value[np.ix_(rest, moving)] @ standing
     )
     basis[rest] = [[float(Fraction(one).limit_denominator(FINEST)) for one in row] for row in held.tolist()]
-    off = RADII.subtract(RADII.multiply(matrix, RADII.exact(basis)), RADII.exact(basis))
+    numbers = arithmetic_of(matrix)
+    off = hull(numbers.subtract(numbers.multiply(matrix, numbers.exact(basis)), numbers.exact(basis)))
     assert (np.abs(value_of(off)) <= radius_of(off)).all(), "what stands still is heard otherwise"
     return basis
