@@ -7,12 +7,25 @@ loss), and `second_moments`, an event-by-event program that shares nothing with 
 from __future__ import annotations
 
 import math
+from fractions import Fraction
+from functools import partial
 
+import numpy as np
 import pytest
 
 import apc
 from apc.analysis.analysis import prepare
+from apc.analysis.box import parse_range
+from apc.analysis.box_proof import BITS
+from apc.analysis.cells import Cell, frames_over
 from apc.compiler.compiled import CompiledSystem
+from apc.eigen.balls import precision
+from apc.frame.radius import RADII, radius_of, value_of
+from apc.frame.taylor import taylor
+from apc.moments import box
+from apc.moments.crowd import crowd, moments_of
+from apc.moments.gains import Moments, gain_of
+from apc.threads import single_threaded
 from apc.vary.margins import Margins, margins
 from apc.vary.over_network import network_margins, network_sensitivities
 from apc.vary.sensitivity import Sensitivity
@@ -155,3 +168,61 @@ def test_a_jitter_is_no_range_of_a_box() -> None:
     with pytest.raises(apc.ApcError, match=r"E831 lan\.jitter is a time"):
         apc.prove_box(scene(more=", jitter: 2 ms"), {"lan.jitter": "±1%"})
     assert apc.prove_box(scene(more=", jitter: 2 ms"), {"contact.stiffness": "±0.01%"}).stable
+
+
+def _over(asked: box._Question, cell: Cell) -> Moments:
+    """Return the loops and the luck of a scene over a cell."""
+    maps, _ = frames_over(asked.frames, [tuple(cell[place] for place in asked.own)])
+    here = [one.mapped(partial(box._of_cell, 0, len(cell))) for one in maps]
+    frames = dict(zip(asked.names, here, strict=True))
+    return moments_of(asked.classes, box._memories(asked, cell), frames)
+
+
+@pytest.mark.parametrize(
+    ("more", "ranges"),
+    [
+        (", loss: 10 %", ("contact.stiffness=±1%", "device.mass=±0.5%", "lan.loss=9 %:11 %")),
+        (", loss: 10 %, jitter: 2 ms", ("coordination.stiffness=±1%", "lan.loss=0 %:2 %")),
+        (", jitter: 3 ms", ("cube.damping=±2%", "coordination.damping=0 N*s/m:0.2 N*s/m")),
+    ],
+)
+def test_second_moments_over_a_cell_hold_those_of_every_point(more: str, ranges: tuple[str, ...]) -> None:
+    """G(1), and each loop that no luck drives, at corners and at random, against analyses of the points."""
+    system = scene(more=more)
+    listed = [parse_range(system, one) for one in ranges]
+    random = np.random.default_rng(3)
+    with single_threaded(), np.errstate(all="ignore"), precision(BITS):
+        asked = box._question(system, listed)
+        cell = tuple((one.low, one.high) for one in listed)
+        over, wide = _over(asked, cell), taylor(len(cell))
+        own = [*asked.own, *(place for place in range(len(cell)) if place not in asked.own)]
+        for turns in (
+            0.999 * np.ones(len(cell)),
+            -0.999 * np.ones(len(cell)),
+            *random.uniform(-1, 1, (4, len(cell))),
+        ):
+            shares = [Fraction((1 + turn) / 2) for turn in turns]
+            at = [low + (high - low) * share for (low, high), share in zip(cell, shares, strict=True)]
+            point = crowd(box._changed(system, listed, at), asked.prepared)
+            pairs = [(gain_of(over)(1.0, wide), gain_of(point)(1.0, RADII))]
+            pairs += zip(over.means[1], point.means[1], strict=True)
+            for all_over, one in pairs:
+                assert all_over is not None and one is not None
+                straight = value_of(all_over) + np.tensordot(turns[own], all_over[2:], 1)
+                rounded = 64 * np.finfo(float).eps * np.abs(all_over).sum(axis=0)
+                off = radius_of(all_over) + radius_of(one) + rounded
+                assert (np.abs(straight - value_of(one)) <= off).all()
+        # What is not straight is of the second order: of half a cell, a quarter.
+        half = tuple(((3 * low + high) / 4, (low + 3 * high) / 4) for low, high in cell)
+        gains = [gain_of(one)(1.0, wide) for one in (over, _over(asked, half))]
+        wide_one, narrow = (float(radius_of(one).max()) for one in gains if one is not None)
+        assert narrow < 0.35 * wide_one
+
+
+def test_a_box_as_wide_as_tolerances_are_is_proved() -> None:
+    """Three users and a tenth of the packets: in every corner the radius is below 0.98."""
+    system = scene(more=", loss: 10 %")
+    found = apc.prove_box(system, {"contact.stiffness": "±10%", "coordination.stiffness": "±10%"})
+    assert found.stable and found.open_share == 0
+    found = apc.prove_box(system, {"lan.loss": "1 %:20 %", "contact.stiffness": "±10%"})
+    assert found.stable and found.cells < 100

@@ -1,8 +1,8 @@
 """Proof that a scene is stable for every value of some parameters in a box.
 
 Takes: a `CompiledSystem` and ranges.
-Gives: `BoxProof`, `prove_box`; `search_box`, `Look`, `Looked`, `one_by_one`, `middle`;
-`site_at`, `range_ball`, `ball_radii`; `BITS`, `TOGETHER`, `UNDECIDED`.
+Gives: `BoxProof`, `prove_box`; `search_box`, `Look`, `Looked`, `middle`; `BITS`, `TOGETHER`,
+`UNDECIDED`.
 Guarantees: stable means proved for every point of the box, unstable proved at the point that is named.
 Does not: find the boundary (see the share that is left open).
 
@@ -49,7 +49,6 @@ from apc.eigen.ratios import Ratio
 from apc.eigen.relative import independent_places, relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here, stays_rigid, what_stands
 from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE
-from apc.frame.discretize import UNIT
 from apc.frame.names import Range
 from apc.frame.site import LinearSite, entrywise
 from apc.result import Result
@@ -228,27 +227,6 @@ def search_box(
     return answer(stable, found.cells, 0.0, ())
 
 
-def one_by_one(
-    reach_out: Callable[[Cell], Floats | None],
-    is_unstable: Callable[[tuple[Fraction, ...]], bool],
-    cells: Sequence[Cell],
-) -> Iterator[Looked]:
-    """Look at cells one by one, for `search_box`.
-
-    Parameters
-    ----------
-    reach_out
-        Returns None when a cell is proved, or else how much each parameter matters in it.
-    is_unstable
-        As for `search_box`.
-    cells
-        Which.
-    """
-    for cell in cells:
-        reach = reach_out(cell)
-        yield Looked(reach, reach is not None and is_unstable(middle(cell)))
-
-
 def _halved(whole: Cell, looks: Look) -> _Halved:
     """Prove cells, the larger before the smaller; all as in `search_box`."""
     level, looked, work = [whole], 0, 0.0
@@ -313,7 +291,7 @@ def _is_unstable(question: OpenSystem, point: Sequence[Fraction]) -> bool:
 
 def _matrix(question: OpenSystem, point: Sequence[Any], by: int | None) -> Balls:
     """Return the matrix in relative coordinates at a point of balls, or its slope by a parameter there."""
-    sites = [site_at(site, point, by) for site in question.loop.sites]
+    sites = [_site_at(site, point, by) for site in question.loop.sites]
     steps = [
         frame_steps(site, group.schedule, step_duals)
         for site, group in zip(sites, question.loop.system.sites, strict=True)
@@ -324,7 +302,7 @@ def _matrix(question: OpenSystem, point: Sequence[Any], by: int | None) -> Balls
     return reduced_balls(matrix, question.rigid.exact, independent_places(question.rigid.basis.T))
 
 
-def site_at(site: LinearSite, point: Sequence[Any], by: int | None) -> LinearSite:
+def _site_at(site: LinearSite, point: Sequence[Any], by: int | None) -> LinearSite:
     """Return a site's matrices at a point; `by` a parameter, each entry that depends on it with its slope."""
 
     def at(entry: Any) -> Any:
@@ -340,7 +318,7 @@ def site_at(site: LinearSite, point: Sequence[Any], by: int | None) -> LinearSit
 
 def _reach_out(question: OpenSystem, cell: Cell) -> Floats | None:
     """Return None when a cell is proved, or else how much each parameter moves the matrix in it."""
-    balls = [range_ball(low, high) for low, high in cell]
+    balls = [_range_ball(low, high) for low, high in cell]
     centre = square(_matrix(question, [rational_ball(value) for value in middle(cell)], None))
     slopes = [square(_matrix(question, balls, by)) for by in range(len(cell))]
     reaches = [rational_ball((high - low) / 2) for low, high in cell]
@@ -366,22 +344,9 @@ def _reach_out(question: OpenSystem, cell: Cell) -> Floats | None:
     return np.array([float(_frobenius(one).mid()) for one in turned])
 
 
-def range_ball(low: Fraction, high: Fraction) -> Any:
+def _range_ball(low: Fraction, high: Fraction) -> Any:
     """Return a ball that holds a range."""
     return flint.arb(rational_ball(low)).union(flint.arb(rational_ball(high)))
-
-
-def ball_radii(balls: Balls) -> Floats:
-    """Return balls (n, m) as floats with their radii (2, n, m)."""
-    found = np.zeros((2, *balls.shape))
-    for place, ball in np.ndenumerate(balls):
-        if isinstance(ball, int):
-            found[(0, *place)] = ball
-            continue
-        value = float(ball.mid())
-        found[(0, *place)] = value
-        found[(1, *place)] = float((ball - value).abs_upper()) * (1 + 4 * UNIT)
-    return found
 
 
 def _floats(matrix: Any) -> Floats:

@@ -52,13 +52,18 @@ def arithmetic_of(matrix: Matrix) -> Arithmetic:
     return RADII if matrix.shape[-3] == 2 else taylor(matrix.shape[-3] - 2)
 
 
+def over_as_many(matrix: Matrix, other: Matrix) -> Matrix:
+    """Return matrices over as many parameters as others, none of which moves them but those that did."""
+    return within(matrix, other.shape[-3] - matrix.shape[-3])
+
+
 def entrywise(left: Matrix, right: Matrix) -> Matrix:
     """Return the product entry by entry of matrices over cells (…, 2 + m, n, n'), or of one and numbers.
 
     Either may be one with its radii (…, 2, n, n') that stays all over the cells.
     """
-    count = max(left.shape[-3], right.shape[-3]) - 2
-    left, right = (within(one, count - one.shape[-3] + 2) for one in (left, right))
+    left, right = over_as_many(left, right), over_as_many(right, left)
+    count = left.shape[-3] - 2
     a, b, off_a, off_b = value_of(left), value_of(right), radius_of(left), radius_of(right)
     spread_a, spread_b, size_a, size_b = _spread(left), _spread(right), np.abs(a), np.abs(b)
     first = _slopes(left) * b[..., None, :, :], a[..., None, :, :] * _slopes(right)
@@ -70,7 +75,9 @@ def entrywise(left: Matrix, right: Matrix) -> Matrix:
 
 
 def within(matrix: Matrix, parameters: int) -> Matrix:
-    """Return matrices with their radii (…, 2, n, m) over cells of parameters that they don't follow."""
+    """Return matrices with their radii (…, 2, n, m) over cells of more parameters, which don't move them."""
+    if parameters <= 0:
+        return matrix
     still = np.zeros((*matrix.shape[:-3], parameters, *matrix.shape[-2:]))
     return np.concatenate([matrix, still], axis=-3)
 

@@ -6,10 +6,11 @@ Guarantees: stable means proved for every point of the box, unstable proved at t
 can't be had is refused by name.
 Does not: serve values that stand in, bursts or traces; leave a jitter open.
 
-The peers' frames are lifted over many cells of the box at once, and follow the parameters to first order with
-a radius for all the rest (`frame.taylor`); so do the loops of means closed of them, and the moments that luck
-drives (`gains.stein`). Where the largest eigenvalue of G(1) is below 1 all over a cell, and loops that no luck
-drives contract, the cell is proved. A cell where that fails is halved. A share that is lost is a radius.
+The peers' frames are lifted over many cells of the box at once, and follow the parameters to first order
+with a radius for all the rest (`frame.taylor`), as does the share that each link loses; so do the loops of
+means closed of them, and the moments that luck drives (`gains.stein`). Where the largest eigenvalue of G(1)
+is below 1 all over a cell, and loops that no luck drives contract, the cell is proved. A cell where that
+fails is halved.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
 from apc.frame.radius import radius_of, value_of
-from apc.frame.taylor import hull
+from apc.frame.taylor import hull, within
 from apc.moments.crowd import Classes, classes_of, hearing, moments_of, peer_classes, remembered_of
 from apc.moments.gains import TINY, below_1
 from apc.moments.mean_loops import Remembered
@@ -53,6 +54,7 @@ from apc.network.nominal import channel_numbers
 from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
+Matrix = NDArray[Any]
 
 PLACE = Place("box")
 
@@ -190,15 +192,21 @@ def _looked(asked: _Question, cells: Sequence[Cell]) -> Iterator[Looked]:
         own = [tuple(cell[place] for place in asked.own) for cell in some]
         maps, _ = frames_over(asked.frames, own)
         for place, cell in enumerate(some):
-            here = [one.mapped(lambda block, at=place: block[min(at, len(block) - 1)]) for one in maps]
+            here = [one.mapped(partial(_of_cell, place, len(cell))) for one in maps]
             proved, sound = _proved(asked, cell, dict(zip(asked.names, here, strict=True)))
             reach = asked.weights * [float(high - low) for low, high in cell]
             unstable = not sound and _is_unstable(asked, middle(cell))
             yield Looked(None if proved else reach, unstable)
 
 
+def _of_cell(place: int, count: int, block: Matrix) -> Matrix:
+    """Return the matrix of one cell (2 + m, n, n'), of as many parameters, from those of all."""
+    one = block[min(place, len(block) - 1)]
+    return within(one, count - len(one) + 2)
+
+
 def _proved(asked: _Question, cell: Cell, frames: Mapping[str, FrameMap]) -> tuple[bool, bool]:
-    """Say whether second moments are proved to die out all over a cell; and whether, in floats, in its middle."""
+    """Say whether second moments die out, proved all over a cell, and in floats in its middle."""
     of = moments_of(asked.classes, _memories(asked, cell), frames)
     for matrix in of.means[1]:
         found = contracted(matrix[None])
@@ -213,12 +221,34 @@ def _memories(asked: _Question, cell: Cell) -> Sequence[Remembered]:
     if not shares:
         return asked.memories
     system = _changed(asked.system, asked.ranges, middle(cell), shares)
-    # A share lost is multilinear in what it is made of, and so between its values at the corners.
-    lost = [_lost(_changed(asked.system, asked.ranges, one, shares)) for one in itertools.product(*cell)]
-    doubts = {
-        name: max(abs(one[name] - share) for one in lost) + 8 * UNIT for name, share in _lost(system).items()
-    }
-    return remembered_of(system, asked.classes.told, asked.wide, doubts=doubts)
+    moved = _moves(asked, cell, shares)
+    return remembered_of(system, asked.classes.told, asked.wide, lost=moved)
+
+
+def _moves(asked: _Question, cell: Cell, shares: Sequence[int]) -> dict[str, tuple[float, ...]]:
+    """Return how the share that each link loses changes over a cell, after what of that is not straight.
+
+    It is multilinear in what it is made of, and what is not straight is so too: largest at a corner.
+    """
+    inner = middle(cell)
+
+    def lost(point: Sequence[Fraction]) -> dict[str, float]:
+        return _lost(_changed(asked.system, asked.ranges, point, shares))
+
+    still, sides = lost(inner), []
+    for place in shares:
+        ends = [lost([*inner[:place], end, *inner[place + 1 :]]) for end in cell[place]]
+        sides.append({name: (ends[1][name] - ends[0][name]) / 2 for name in still})
+    off = dict.fromkeys(still, 0.0)
+    for turns in itertools.product((0, 1), repeat=len(shares)) if len(shares) > 1 else ():
+        point = list(inner)
+        for place, turn in zip(shares, turns, strict=True):
+            point[place] = cell[place][turn]
+        for name, share in lost(point).items():
+            straight = sum((2 * turn - 1) * side[name] for turn, side in zip(turns, sides, strict=True))
+            off[name] = max(off[name], abs(share - still[name] - straight))
+    first = len(asked.own) * (0.0,)
+    return {name: (off[name] + 16 * UNIT, *first, *(side[name] for side in sides)) for name in still}
 
 
 def _lost(system: CompiledSystem) -> dict[str, float]:

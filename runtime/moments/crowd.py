@@ -1,8 +1,8 @@
 """The mean loops and the luck of a scene: what its second moments are made of.
 
 Takes: a `CompiledSystem` whose links lose or delay packets independently of each other.
-Gives: `crowd`; `Classes`, `classes_of`, `moments_of`; `Hearing`, `hearing`, `own_value`; `peer_classes`, `remembered_of`, `standing_motions`,
-`instants`.
+Gives: `crowd`; `Classes`, `classes_of`, `moments_of`; `Hearing`, `hearing`, `own_value`; `peer_classes`,
+`remembered_of`, `standing_motions`, `instants`.
 Guarantees: equal peers on complete graphs cost the same, however many they are; peers that can change places
 are one class on any graph.
 Does not: say what it can't serve (see `network`).
@@ -28,7 +28,6 @@ from apc.eigen.rigid import find_rigid_modes
 from apc.frame.exchange import Exchange
 from apc.frame.lift import FrameMap
 from apc.frame.parameters import resolve
-from apc.frame.radius import with_radius
 from apc.frame.schedule import Event, Schedule, Selected, Send, Sent, Tick, Way, tick_by_tick
 from apc.frame.scheduling import build_schedules
 from apc.moments.gains import Luck, Moments, Part
@@ -40,7 +39,7 @@ Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
 Flags = NDArray[np.bool_]
 
-NO_DOUBTS: Mapping[str, float] = {}
+EXACTLY: Mapping[str, tuple[float, ...]] = {}
 
 # A link on which every packet takes the nominal delay.
 PERFECT = ChannelLaw(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, "uniform", None)
@@ -224,7 +223,7 @@ def _spreads(one: Remembered) -> tuple[Matrix, ...]:
     """Return the covariances of each slot's luck: all numbers of a packet have the same."""
     numbers = np.ones((len(one.channels), len(one.channels)))
     spreads = [one.memory.spread(slot) for slot in range(one.memory.slots)]
-    return tuple(with_radius(np.kron(numbers, spread), np.kron(numbers, off)) for spread, off in spreads)
+    return tuple(np.stack([np.kron(numbers, layer) for layer in spread]) for spread in spreads)
 
 
 def peer_classes(told: Hearing) -> tuple[tuple[Loop, ...], Coupling]:
@@ -259,7 +258,7 @@ def remembered_of(
     common: Loop,
     *,
     perfect: bool = False,
-    doubts: Mapping[str, float] = NO_DOUBTS,
+    lost: Mapping[str, tuple[float, ...]] = EXACTLY,
 ) -> list[Remembered]:
     """Return what is remembered on each route that anybody listens to.
 
@@ -271,8 +270,9 @@ def remembered_of(
         The loop of all classes.
     perfect
         Whether every packet counts as on time.
-    doubts
-        How far the share of packets that a link loses may be off, by the link's name.
+    lost
+        How far the share of packets that a link loses may be off, and how it changes over a cell, by the
+        link's name, as for `memory.memory_of`.
     """
     heard: dict[Route, list[Selected]] = {}
     for site, rows in zip(common.sites, told.of(common), strict=True):
@@ -289,8 +289,8 @@ def remembered_of(
         sent = times[link.clock]
         ticks = {(row.clock, row.tick): times[row.clock][row.tick] for row in listed}
         law = PERFECT if perfect or link.channel is None else channel_law(system, link, delay)
-        off = doubts.get(route[0], 0.0)
-        memory = memory_of(law, delay, sent, ticks, told.frame, strictly=told.strictly, doubt=off)
+        off = lost.get(route[0], (0.0,))
+        memory = memory_of(law, delay, sent, ticks, told.frame, strictly=told.strictly, lost=off)
         found.append(remember(route, memory, sorted({row.channel for row in listed})))
     return found
 

@@ -33,8 +33,8 @@ from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
 from apc.frame.schedule import Selected, Sent, Way
-from apc.frame.taylor import arithmetic_of, entrywise, hull, within
-from apc.moments.memory import CHANCE_ROUNDINGS, Memory
+from apc.frame.taylor import arithmetic_of, entrywise, hull, over_as_many
+from apc.moments.memory import Memory
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -128,8 +128,8 @@ def scaled(matrix: Matrix, by: Matrix, numbers: Arithmetic) -> Matrix:
 def remember(route: Route, memory: Memory, channels: Sequence[str]) -> Remembered:
     """Follow what is remembered on a route through a frame."""
     n_e, slots = memory.chances.shape
-    sizes = [len(memory.uncertain(slot)) for slot in range(slots)]
-    known, luck = np.zeros((2, n_e, memory.count + slots)), np.zeros((2, n_e, sum(sizes)))
+    sizes, layers = [len(memory.uncertain(slot)) for slot in range(slots)], 2 + len(memory.moves)
+    known, luck = np.zeros((layers, n_e, memory.count + slots)), np.zeros((layers, n_e, sum(sizes)))
     known[0, np.arange(n_e), memory.old] = 1.0
     before, luck_before = [], []
     first = 0
@@ -139,12 +139,13 @@ def remember(route: Route, memory: Memory, channels: Sequence[str]) -> Remembere
         luck_before.append(luck[:, uncertain])
         known[:, certain], luck[:, certain] = 0.0, 0.0
         known[0, certain, memory.count + slot] = 1.0
-        own = memory.chances[uncertain, slot, None]
-        off = CHANCE_ROUNDINGS * UNIT + memory.doubts[uncertain, slot, None]
-        missed = with_radius(1 - own, off + UNIT)
+        chance = memory.chance(slot)
+        missed = -chance[..., None]
+        missed[0] += 1
+        missed[1] = chance[1, :, None] + UNIT
         known[:, uncertain] = scaled(known[:, uncertain], missed, RADII)
         luck[:, uncertain] = scaled(luck[:, uncertain], missed, RADII)
-        known[:, uncertain, memory.count + slot] = with_radius(own, off)[..., 0]
+        known[:, uncertain, memory.count + slot] = chance
         luck[0, uncertain, first + np.arange(len(uncertain))] = 1.0
         first += len(uncertain)
     return Remembered(
@@ -180,7 +181,6 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: Frame
         Its map, where it is not the group's: over a cell, say.
     """
     plain, row_of = frame or group.lifted.bounded, {one: row for row, one in enumerate(group.schedule.sent)}
-    arithmetic, more = arithmetic_of(plain.p), plain.p.shape[-3] - 2
     numbers = [
         (one, channel)
         for one in remembered
@@ -193,13 +193,13 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: Frame
     def over_all(block: Matrix, place: int) -> Matrix:
         """Return rows over one number's kept values and packets as rows over those of all."""
         one, channel = numbers[place]
-        found = np.zeros((2, block.shape[-2], n_m + n_s))
+        found = np.zeros((len(block), block.shape[-2], n_m + n_s))
         found[..., firsts[place] : firsts[place + 1]] = block[..., : one.memory.count]
         for slot in range(one.memory.slots):
             found[..., n_m + row_of[Sent(one.route[0], channel, slot)]] = block[..., one.memory.count + slot]
         return found
 
-    rows, kept = [np.zeros((2, 0, n_m + n_s))], [np.zeros((2, 0, n_m + n_s))]
+    rows, kept = list[Matrix](), list[Matrix]()
     values: dict[tuple[Route, str, int], int] = {}
     misses: dict[tuple[Route, int], slice] = {}
     count = 0
@@ -218,15 +218,17 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: Frame
                 held = over_all(one.followed.before[slot], place)
                 packet = np.zeros_like(held)
                 packet[0, :, n_m + row_of[Sent(one.route[0], channel, slot)]] = 1.0
-                rows.append(RADII.subtract(packet, held))
+                rows.append(arithmetic_of(held).subtract(packet, held))
                 count += held.shape[-2]
             misses[one.route, slot] = slice(start, count)
     plainly = np.zeros((2, n_s, n_m + n_s))
     plainly[0, :, n_m:] = np.eye(n_s)
-    rows.append(plainly)
-    listed, keeping = (within(np.concatenate(some, axis=-2), more) for some in (rows, kept))
-    n_z, multiply = plain.p.shape[-1], arithmetic.multiply
-    p = np.zeros((2 + more, n_z + n_m, n_z + n_m))
+    rows, kept = [*rows, plainly], [*kept, np.zeros((2, 0, n_m + n_s))]
+    listed, keeping = (
+        np.concatenate([over_as_many(one, plain.p) for one in some], axis=-2) for some in (rows, kept)
+    )
+    n_z, multiply = plain.p.shape[-1], arithmetic_of(plain.p).multiply
+    p = np.zeros((len(plain.p), n_z + n_m, n_z + n_m))
     p[:, :n_z, :n_z] = plain.p
     p[:, n_z:, :n_z] = multiply(keeping[..., n_m:], plain.s)
     p[:, n_z:, n_z:] = keeping[..., :n_m]
@@ -260,7 +262,7 @@ def _apart(one: Remembered) -> _Apart:
     states = memory.count * count
 
     def over_all(block: Matrix, luck: Matrix, number: int) -> Matrix:
-        found = np.zeros((2, block.shape[-2], states + lucks[-1]))
+        found = np.zeros((len(block), block.shape[-2], states + lucks[-1]))
         found[..., number * memory.count : (number + 1) * memory.count] = block[..., : memory.count]
         for slot, size in enumerate(sizes):
             first = states + lucks[slot] + number * size
@@ -276,8 +278,14 @@ def _apart(one: Remembered) -> _Apart:
     return _Apart(
         np.concatenate(values, axis=-2),
         np.concatenate([own[:, memory.kept] for own in values], axis=-2),
-        tuple(np.stack([-value_of(rows), radius_of(rows)]) for rows in misses),
+        tuple(_negative(rows) for rows in misses),
     )
+
+
+def _negative(rows: Matrix) -> Matrix:
+    found = -rows
+    radius_of(found)[...] = radius_of(rows)
+    return found
 
 
 def mean_loop(
@@ -313,9 +321,9 @@ def mean_loop(
     layout = StateLayout(tuple(offsets[:-1]), tuple(name for one in sites for name in one.names), {})
     apart = [_apart(of_route[one.route]) for one in listened]
     firsts = np.cumsum([offsets[-1]] + [one.values.shape[-1] for one in apart]).tolist()
-    feedback = []
+    feedback, like, numbers = list[Feedback](), sites[0].map.p, arithmetic_of(sites[0].map.p)
     for g, rows in enumerate(heard):
-        now, before = np.zeros((2, len(rows), starts[-1])), np.zeros((2, len(rows), firsts[-1]))
+        now, before = (np.zeros((len(like), len(rows), many)) for many in (starts[-1], firsts[-1]))
         for line, row in enumerate(rows):
             one = of_route.get((row.way.link, row.way.delay))
             if one is None or row.gap or row.channel not in one.channels:
@@ -324,23 +332,21 @@ def mean_loop(
             for h, weight in enumerate(loop.coupling[row.way][g]):
                 if weight:
                     place = starts[h] + sites[h].values[one.route, row.channel, value]
-                    now[:, line, place] = bounded_weight(weight, loop.doubts.get(row.way, 0.0))
+                    now[:2, line, place] = bounded_weight(weight, loop.doubts.get(row.way, 0.0))
             place = one.channels.index(row.channel) * len(one.memory.old) + value
             for channel, own, first in zip(listened, apart, firsts, strict=False):
                 if channel.site == g and channel.route == one.route and channel.weights.get(row.way):
                     by = np.array(bounded_weight(channel.weights[row.way], 0.0)).reshape(2, 1, 1)
                     span = slice(first, first + own.values.shape[-1])
-                    before[:, line, span] = RADII.multiply(by, own.values[:, place, None])[:, 0]
+                    weighed = scaled(own.values[:, place, None], by, RADII)
+                    before[:, line, span] = over_as_many(weighed, like)[:, 0]
         feedback.append(Feedback(now, before))
-    more = sites[0].map.p.shape[-3] - 2
-    numbers = arithmetic_of(sites[0].map.p)
-    feedback = [Feedback(within(one.now, more), within(one.before, more)) for one in feedback]
     closed = close([one.map for one in sites], feedback, layout, numbers=numbers)
     at = relative_coordinates(standing_state(closed.matrix[..., : offsets[-1]], standing, loop, offsets))
     rest, n = at.rest, len(at.rest)
     moved = closed.matrix[:, rest]
     if len(at.held):
-        weights = within(with_radius(at.weights, at.doubt), more)
+        weights = over_as_many(with_radius(at.weights, at.doubt), like)
         moved = numbers.subtract(moved, numbers.multiply(weights, closed.matrix[:, at.held]))
 
     def missed(columns: NDArray[np.intp]) -> dict[tuple[int, Route, int], Matrix]:
@@ -352,14 +358,15 @@ def mean_loop(
 
     found = []
     for channel, own, first, last in zip(listened, apart, firsts, firsts[1:], strict=False):
-        states, kept = len(own.kept[0]), within(own.kept, more)
-        matrix = np.zeros((2 + more, n + states, n + states))
+        states, kept = len(own.kept[0]), over_as_many(own.kept, like)
+        matrix = np.zeros((len(like), n + states, n + states))
         matrix[:, :n, :n], matrix[:, :n, n:] = moved[..., rest], moved[..., first : first + states]
         matrix[:, n:, n:] = kept[..., :states]
         driven = np.concatenate([moved[..., first + states : last], kept[..., states:]], axis=-2)
         misses = missed(np.concatenate([rest, np.arange(first, last)]))
-        inside = [np.concatenate([np.zeros((2, rows.shape[-2], n)), rows], axis=-1) for rows in own.misses]
-        found.append(Channel(channel, matrix, driven, misses, tuple(within(one, more) for one in inside)))
+        within = [over_as_many(rows, like) for rows in own.misses]
+        within = [np.concatenate([np.zeros((*rows.shape[:-1], n)), rows], axis=-1) for rows in within]
+        found.append(Channel(channel, matrix, driven, misses, tuple(within)))
     mean = MeanLoop(loop.name, loop.multiplicity, moved[..., rest], at, tuple(offsets), missed(rest))
     return mean, found
 

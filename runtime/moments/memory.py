@@ -50,13 +50,15 @@ class Memory:
 
     Value e of those there are once all packets of a frame are sent was `old[e]` before it, one of `count`
     kept from the frames before; slot k's packet takes its place with probability `chances[e, k]`, known to
-    within `doubts[e, k]` and its rounding. `heard` says which value a tick (clock, index) hears; `kept` which
-    values are kept for the next frame, in order.
+    within `doubts[e, k]` and its rounding; over a cell of m parameters it moves by `moves[:, e, k]` from the
+    middle to the upper side of each, all chances by the same share of them. `heard` says which value a tick
+    (clock, index) hears; `kept` which values are kept for the next frame, in order.
     """
 
     old: NDArray[np.intp]  # (n_e,)
     chances: Floats  # (n_e, slots)
     doubts: Floats  # (n_e, slots)
+    moves: Floats  # (m, n_e, slots)
     heard: Mapping[tuple[str, int], int]
     kept: NDArray[np.intp]  # (count,)
 
@@ -75,18 +77,30 @@ class Memory:
         own = self.chances[:, slot]
         return np.flatnonzero((own > 0) & (own < 1))
 
-    def spread(self, slot: int) -> tuple[Floats, Floats]:
-        """Return the covariance (n, n) of whether a slot's packet takes the place of its uncertain values.
+    def chance(self, slot: int) -> Floats:
+        """Return the chances (2 + m, n) of a slot's uncertain values, with their radii and over a cell."""
+        place = self.uncertain(slot)
+        own, off = self.chances[place, slot], self.doubts[place, slot] + CHANCE_ROUNDINGS * UNIT
+        return np.concatenate([np.stack([own, off]), self.moves[:, place, slot]])
 
-        And how far it may be off: a chance π has the variance π (1 − π), of slope 1 − 2 π.
+    def spread(self, slot: int) -> Floats:
+        """Return the covariance (2 + m, n, n) of whether a slot's packet takes the place of uncertain values.
+
+        With its radius, and over a cell: min(π, ϖ) − π ϖ of two chances, which one is the smaller being the
+        same all over the cell; the variance π (1 − π) has the slope 1 − 2 π.
         """
         place = self.uncertain(slot)
-        own, doubt = self.chances[place, slot], self.doubts[place, slot]
+        own, doubt, moves = self.chances[place, slot], self.doubts[place, slot], self.moves[:, place, slot]
+        wander = np.abs(moves).sum(axis=0)
         found = np.minimum.outer(own, own) - np.outer(own, own)
-        both = np.outer(own, doubt) + np.outer(doubt, own) + np.outer(doubt, doubt)
+        least = np.where(own[:, None] <= own, moves[:, :, None], moves[:, None, :])
+        slopes = least - own[:, None] * moves[:, None, :] - moves[:, :, None] * own
+        both = np.outer(own + wander, doubt) + np.outer(doubt, own + wander) + np.outer(doubt, doubt)
         off = np.maximum.outer(doubt, doubt) + both
-        np.fill_diagonal(off, np.abs(1 - 2 * own) * doubt + doubt**2)
-        return found, off * (1 + 8 * UNIT) + 2 * CHANCE_ROUNDINGS * UNIT * found
+        np.fill_diagonal(off, (np.abs(1 - 2 * own) + 2 * wander) * doubt + doubt**2)
+        off += np.outer(wander, wander)
+        off = off * (1 + 8 * UNIT) + (2 * CHANCE_ROUNDINGS + len(moves)) * UNIT * (found + 4 * wander)
+        return np.concatenate([np.stack([found, off]), slopes])
 
 
 def is_memoryless(law: ChannelLaw) -> bool:
@@ -136,7 +150,7 @@ def memory_of(
     frame: Fraction,
     *,
     strictly: bool = False,
-    doubt: float = 0.0,
+    lost: tuple[float, ...] = (0.0,),
 ) -> Memory:
     """Describe what ticks hear of one sender; what was described lately is remembered.
 
@@ -150,12 +164,13 @@ def memory_of(
         The length of a frame, in seconds.
     strictly
         Whether a tick misses what arrives just then.
-    doubt
-        How far the share of packets that get lost may be off.
+    lost
+        How far the share of packets that get lost may be off; over a cell of parameters, after it, how much
+        it changes from the middle to the upper side of each.
     """
     assert law.trace is None, "recorded delays leave nothing to chance"
     numbers = law.p, law.r, law.one_minus_h, law.one_minus_k, law.delay, law.jitter, law.distribution
-    return _memory_of(numbers, delay, tuple(sent), tuple(ticks.items()), frame, strictly, doubt)
+    return _memory_of(numbers, delay, tuple(sent), tuple(ticks.items()), frame, strictly, lost)
 
 
 @functools.lru_cache(maxsize=LATELY)
@@ -166,7 +181,7 @@ def _memory_of(
     told: tuple[tuple[tuple[str, int], Fraction], ...],
     frame: Fraction,
     strictly: bool,
-    doubt: float,
+    lost: tuple[float, ...],
 ) -> Memory:
     law, ticks = ChannelLaw(*numbers, None), dict(told)
     ahead = math.ceil(max(Fraction(law.longest), delay) / frame) + 2
@@ -202,10 +217,12 @@ def _memory_of(
     known = {listed[place][: len(listed[place]) - slots]: number for number, place in enumerate(kept)}
     old = [known[key[slots:]] for key in listed]
     chances = np.array([key[:slots][::-1] for key in listed])
+    doubt, *moves = (one / (1 - law.mean_loss) if one else 0.0 for one in lost)
     return Memory(
         old=np.array(old, np.intp),
         chances=chances,
-        doubts=chances * (doubt / (1 - law.mean_loss)) * (1 + 8 * UNIT) if doubt else np.zeros(chances.shape),
+        doubts=chances * (doubt * (1 + 8 * UNIT) + 4 * UNIT * sum(map(abs, moves))),
+        moves=np.array([chances * -move for move in moves]).reshape(len(moves), *chances.shape),
         heard={tick: of_time[int(time * unit)] for tick, time in ticks.items()},
         kept=np.array(kept, np.intp),
     )
