@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from apc.analysis.analysis import analyze
-from apc.frame.course import turned_along
+from apc.frame.course import A_TURN, FEWEST, _fast_enough, _fastest, turned_along
 from apc.vary.critical import critical
 from tests.topologies import compiled
 
@@ -136,3 +136,20 @@ def test_what_rounding_leaves_of_a_course_does_not_turn_it() -> None:
     assert turned_along(course[:, None])[0] == 0
     swings = np.exp(-0.5 * np.arange(40)) * np.cos(np.arange(40) * np.pi)
     assert turned_along(swings[:, None])[0] == pytest.approx(39 * np.pi)
+
+
+def test_what_stands_for_the_fastest_swing_is_a_bound_and_asks_for_no_more_points() -> None:
+    """Masses in a row, of which stiffness and mass are far apart: the bound holds, and only few points use it."""
+    n = 40
+    spring = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    a = np.block([[np.zeros((n, n)), np.eye(n)], [-1e4 * spring, -3.0 * np.eye(n)]])
+    fastest = _fastest(a)
+    assert fastest == pytest.approx(
+        100 * math.sqrt(2 - 2 * math.cos(math.pi * n / (n + 1))) / math.tau, rel=1e-3
+    )
+    bounds = []
+    for longest in (1e-5, 1e-3, 3e-3, 1e-2, 1.0):
+        found = _fast_enough(a, longest)
+        assert found == fastest or (found >= fastest and A_TURN * found * longest <= FEWEST)
+        bounds.append(found > fastest)
+    assert bounds[0] and not bounds[-1]
