@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from apc.analysis.analysis import analyze
-from apc.frame.course import followed_closely, turned_along
+from apc.frame.course import A_TURN, FEWEST, _fast_enough, _fastest, followed_closely, turned_along
 from apc.vary.critical import critical
 from tests.topologies import compiled
 
@@ -184,3 +184,19 @@ hands:
     assert one.eigenvalue == other.eigenvalue.conjugate()
     assert one.magnitude == pytest.approx(common.magnitude, rel=1e-6)
     assert math.isnan(one.frequency_hz) and math.isnan(other.frequency_hz)
+
+
+def test_what_stands_for_the_fastest_swing_is_a_bound_and_asks_for_no_more_points() -> None:
+    """Masses in a row, springs stiff: the bound holds, and stands in where the fewest points are enough."""
+    n = 40
+    spring = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    a = np.block([[np.zeros((n, n)), np.eye(n)], [-1e4 * spring, -3.0 * np.eye(n)]])
+    fastest = _fastest(a)
+    closed_form = 200 * math.cos(math.pi / (2 * (n + 1))) / math.tau  # of the stiffest mode, hardly damped
+    assert fastest == pytest.approx(closed_form, rel=1e-3)
+    bounds = []
+    for longest in (1e-5, 1e-3, 3e-3, 1e-2, 1.0):
+        found = _fast_enough(a, longest)
+        assert found == fastest or (found >= fastest and A_TURN * found * longest <= FEWEST)
+        bounds.append(found > fastest)
+    assert bounds[0] and not bounds[-1]

@@ -86,3 +86,15 @@ def test_two_that_hardly_differ_keep_their_common_disc() -> None:
     moved = np.linalg.eigvals(mixed)
     assert (np.abs(pairs.values[:, None] - moved).min(axis=1) <= found.errors).all()
     assert found.errors[:2].min() >= apart / 2
+
+
+@pytest.mark.parametrize("masses", [20, 60])
+def test_conjugates_folded_into_real_columns_are_bounded_as_tightly_as_unfolded(masses: int) -> None:
+    """Given as complex, the same matrix is enclosed by complex products: both hold the radius."""
+    matrix = _chain(masses, 3)
+    error = 1e-15 * np.abs(matrix)
+    (pairs, folded), (_, unfolded) = (enclose_eigenvalues(one, error) for one in (matrix, matrix + 0j))
+    assert (np.abs(pairs.values.imag) > 1e-3).sum() > masses
+    assert max(folded.low, unfolded.low) <= min(folded.high, unfolded.high)
+    assert folded.high - folded.low <= 2 * (unfolded.high - unfolded.low)
+    assert np.median(folded.errors) <= 2 * np.median(unfolded.errors)

@@ -353,6 +353,7 @@ def _basis(right: Complexes, left: Complexes, label: Places, large: int) -> Matr
         basis[:, cluster] = np.linalg.qr(right[:, cluster])[0]
         rows[cluster] = np.linalg.qr(rows[cluster].T)[0].T
     if large:
+        rows = _folded(rows.T, _conjugates(rows.T)).T
         held = independent_places(rows)
         free = np.delete(free, held)
         if len(free) != n - large:
@@ -362,7 +363,47 @@ def _basis(right: Complexes, left: Complexes, label: Places, large: int) -> Matr
         except np.linalg.LinAlgError:
             return None
     basis[free, np.arange(large, n)] = 1.0
-    return basis if basis.imag.any() else basis.real
+    return basis
+
+
+def _conjugates(columns: Complexes) -> Places:
+    """Return the first of each two conjugate columns side by side; none unless all others are real."""
+    turning = np.flatnonzero(columns.imag.any(axis=0))
+    first, second = turning[::2], turning[1::2]
+    beside = len(first) == len(second) and (second == first + 1).all()
+    return first if beside and (columns[:, second] == columns[:, first].conj()).all() else first[:0]
+
+
+def _folded(columns: Complexes, first: Places) -> Matrix:
+    """Return columns with a + bi and a − bi, of which these are the first, as a and b: R of X = R U.
+
+    Real products and inverses are a quarter of the work of complex ones.
+    """
+    if not len(first):
+        return columns if columns.imag.any() else columns.real
+    folded = columns.real.copy()
+    folded[:, first + 1] = columns[:, first].imag
+    return folded
+
+
+def _unfolded(folded: Matrix, first: Places) -> Matrix:
+    """Return R U of R, see `_folded`."""
+    if not len(first):
+        return folded
+    columns = folded.astype(np.complex128)
+    columns[:, first] += 1j * folded[:, first + 1]
+    columns[:, first + 1] = folded[:, first] - 1j * folded[:, first + 1]
+    return columns
+
+
+def _unfolded_rows(folded: Matrix, first: Places) -> Matrix:
+    """Return U⁻¹ S of rows S, see `_folded`."""
+    if not len(first):
+        return folded
+    rows = folded.astype(np.complex128)
+    rows[first] = (folded[first] - 1j * folded[first + 1]) / 2
+    rows[first + 1] = rows[first].conj()
+    return rows
 
 
 def _block_diagonal(
@@ -370,12 +411,16 @@ def _block_diagonal(
 ) -> tuple[Matrix, Floats] | None:
     """Return diag(T₁, …, T_k, T) and a bound on |G|, the products' roundings included; None without X⁻¹."""
     n = len(matrix)
+    first = _conjugates(basis)
+    folded = _folded(basis, first)
     try:
-        inverse = np.linalg.inv(basis)
+        apart = np.linalg.inv(folded)
     except np.linalg.LinAlgError:
         return None
+    # Half of a sum of four real products each is off by less than is charged to a complex one.
     charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
-    moved = matrix @ basis
+    inverse, moved = _unfolded_rows(apart, first), _unfolded(matrix @ folded, first)
+    product = _unfolded(_unfolded_rows(apart @ folded, first), first)
     size, weight = np.abs(basis), np.abs(inverse)
     # What is outside the blocks is never asked for: nearly all of them are of one.
     alone = np.einsum("ij,ji->i", inverse, moved)
@@ -390,7 +435,7 @@ def _block_diagonal(
         carried[:, block] = size[:, block] @ np.abs(own)
     doubt = np.abs(left) + (error + charge * np.abs(matrix)) @ size + charge * carried
     # The computed inverse Y is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
-    wrong = np.abs(np.eye(n) - inverse @ basis).sum(axis=1) + charge * (weight @ size.sum(axis=1))
+    wrong = np.abs(np.eye(n) - product).sum(axis=1) + charge * (weight @ size.sum(axis=1))
     defect = float(wrong.max(initial=0.0))
     if not defect < 0.5:
         return None

@@ -26,6 +26,7 @@ from apc.frame.lift import Seen, follow
 from apc.frame.radius import FLOATS
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.site import LinearSite, every_matrix
+from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -92,13 +93,15 @@ def turns(
         The eigenvalues (k,).
     """
     found = np.full(len(values), np.nan)
-    swing = _swing(site.a.tobytes(), len(site.a)) if site.a.size <= FEW_ENTRIES else _fastest(site.a)
+    durations = [event.duration for event in schedule.events if isinstance(event, Propagate)]
+    longest = float(max(durations, default=0) * schedule.quantum)
+    few = site.a.size <= FEW_ENTRIES
+    swing = _swing(site.a.tobytes(), len(site.a)) if few else _fast_enough(site.a, longest)
     mirrored = _mirrored(start, heard, states, values)
     real = values.imag == 0
     if real.all() or len(real) > FEW:  # else they are followed with complex ones
         real &= ~start.imag.any(axis=0) & ~heard.imag.any(axis=0)
     left = np.flatnonzero(~mirrored)
-    durations = [event.duration for event in schedule.events if isinstance(event, Propagate)]
     for doubled in range(1, DOUBLINGS + 1):
         if not len(left):
             break
@@ -132,6 +135,17 @@ def turns(
 def _swing(entries: bytes, n_x: int) -> float:
     """Return `_fastest` of few entries, row by row; what only couplers change is remembered."""
     return _fastest(np.frombuffer(entries).reshape(n_x, n_x))
+
+
+def _fast_enough(a: Floats, longest: float) -> float:
+    """Return `_fastest` of a large A; a bound on it where that asks for no more points in the longest step.
+
+    No eigenvalue's imaginary part is larger than the norm of the skew part of D⁻¹ A D (Bendixson, Acta
+    Mathematica 25, 1902).
+    """
+    balanced = load_pool("scipy.linalg").matrix_balance(a, permute=False)[0]
+    bound = float(np.abs(balanced - balanced.T).sum(axis=0).max(initial=0.0)) / (4 * np.pi)
+    return bound if A_TURN * bound * longest <= FEWEST else _fastest(a)
 
 
 def _fastest(a: Floats) -> float:

@@ -296,8 +296,8 @@ def exponential_rows(
         whole, off = _whole(step), np.concatenate([error, np.zeros((*b.shape[:-2], n_u, n_x + n_u))], axis=-2)
         size = np.abs(whole)
         terms = int(np.count_nonzero(whole, axis=-1).max(initial=0))
-        error = (size[..., :n_x, :] + error) @ off + error @ size
-        error += (terms + 2) * UNIT * (size[..., :n_x, :] @ size)
+        large = size[..., :n_x, :]
+        error = (large + error) @ off + (error + (terms + 2) * UNIT * large) @ size
         step = following
     # Composing a step rounds it as often as it is wide: one that is off by so much is no larger for it.
     charge = max(charge, float(n_x + n_u))
