@@ -8,6 +8,7 @@ import socket
 from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -127,13 +128,21 @@ def test_a_cluster_without_workers_is_told(monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_cluster_lost_on_the_way_keeps_what_is_finished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # So long a client looks for a scheduler that it has lost, if that goes before it says so.
-    monkeypatch.setattr(sweep_cluster, "PATIENCE_S", 60)
+    clients: list[distributed.Client] = []
+    connect = distributed.Client
+
+    def connected(address: str, **options: Any) -> distributed.Client:
+        clients.append(connect(address, **options))
+        return clients[-1]
+
+    monkeypatch.setattr(distributed, "Client", connected)
     target = tmp_path / "r.csv"
     lost = distributed.LocalCluster(n_workers=1, processes=True, dashboard_address=":0")
 
     def lose(done: int, points: int) -> None:
         if done >= 64:
+            # So long a client looks for a scheduler that it has lost, if that goes before it says so.
+            clients[0]._timeout = 5
             lost.close()
 
     with pytest.raises(ApcError, match="E888 the connection to the cluster is lost"):
