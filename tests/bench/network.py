@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg import matrix_balance, null_space
 from scipy.sparse.linalg import LinearOperator, eigs
 
+from apc import prove_box
 from apc.analysis.analysis import prepare
 from apc.benchmark.timing import median_time, timed
 from apc.moments.almost_sure import COURSES, FRAMES, almost_sure
@@ -33,6 +34,7 @@ Floats = NDArray[np.float64]
 STIFFNESS, LOSS = 1100.0, 0.1
 BURSTS = 0.02, 0.1  # from good to bad, and back: bursts of ten packets, a sixth of all
 PEERS, MANY, TAGGED = 3, 10**6, 5
+FEW_STIFFNESS, WIDTHS = 800.0, (0.02, 0.1, 0.3, 0.5)  # of boxes
 
 # Seconds: of what is independent, of a curve, of bursts by all moments, and by those of orders 2 and 3. A
 # million users may take so many times what three do.
@@ -197,6 +199,27 @@ def bursts(judge: Judge) -> None:
     target("bursts, 5 users", seconds, TAGGED_S, judge)
 
 
+def boxes(judge: Judge, points: int) -> None:
+    """Print boxes of a stiffness and the share lost, and what grows at points of them by hand."""
+    print(f"\nboxes about {FEW_STIFFNESS:g} N/m and {LOSS:.0%} lost, 2 users")
+    system = system_of(scene(2, FEW_STIFFNESS, loss=f"{LOSS:.0%}"))
+    random = np.random.default_rng(15)
+    for wide in WIDTHS:
+        low, high = FEW_STIFFNESS * (1 - wide), FEW_STIFFNESS * (1 + wide)
+        ranges = {
+            "coordination.stiffness": f"±{wide:.0%}",
+            "lan.loss": f"{LOSS * (1 - wide)}:{LOSS * (1 + wide)}",
+        }
+        seconds, found = median_time(partial(prove_box, system, ranges), 3)
+        drawn = random.uniform((low, LOSS * (1 - wide)), (high, LOSS * (1 + wide)), (points, 2))
+        hand, grown = timed(lambda drawn=drawn: max(by_hand(2, *one) for one in drawn.tolist()))
+        holds = judge.right(f"a box of {wide:.0%}", found.stable is not True or grown < 1)
+        print(
+            f"  ±{wide:<4.0%} {found.cells:5} cells {1e3 * seconds:9.1f} ms   {found.open_share:6.1%} open   "
+            f"at {points} points by hand {1e3 * hand / points:.1f} ms each, at most {grown:.4f} {holds}"
+        )
+
+
 def luck(judge: Judge) -> None:
     """Print the exponent of almost every course of luck, beside courses played by hand."""
     system = system_of(scene(PEERS, STIFFNESS, loss=f"{LOSS:.0%}"))
@@ -238,6 +261,7 @@ def main() -> None:
         independent(judge, 5 if given.quick else 15)
         curve(judge)
         bursts(judge)
+        boxes(judge, 5 if given.quick else 20)
         luck(judge)
         coverage(judge, 20 if given.quick else 100)
     judge.end()
