@@ -164,6 +164,15 @@ def test_a_box_that_is_not_served_is_refused_by_name(more: str, box: dict[str, s
     assert error.value.mistakes[0].hint == f"apc critical {next(iter(box))} --in mean-square"
 
 
+def test_peers_on_a_graph_of_their_own_have_boxes_too() -> None:
+    """Each of them is a site; a ring of three is the complete graph."""
+    ranges = {"coordination.stiffness": "±5%", "lan.loss": "5 %:10 %"}
+    graphs = "{edges: [[1, 2], [2, 3], [1, 3]]}", "{arcs: [[1, 2], [2, 3, 0.7], [3, 1]]}"
+    for graph, stable in zip(graphs, (True, False), strict=True):
+        found = apc.prove_box(scene(more=f", loss: 10 %, graph: {graph}"), ranges)
+        assert found.stable is stable
+
+
 def test_a_jitter_is_no_range_of_a_box() -> None:
     with pytest.raises(apc.ApcError, match=r"E831 lan\.jitter is a time"):
         apc.prove_box(scene(more=", jitter: 2 ms"), {"lan.jitter": "±1%"})
@@ -174,7 +183,7 @@ def _over(asked: box._Question, cell: Cell) -> Moments:
     """Return the loops and the luck of a scene over a cell."""
     maps, _ = frames_over(asked.frames, [tuple(cell[place] for place in asked.own)])
     here = [one.mapped(partial(box._of_cell, 0, len(cell))) for one in maps]
-    frames = dict(zip(asked.names, here, strict=True))
+    frames = {name: here[which] for name, which in asked.places.items()}
     return moments_of(asked.classes, box._memories(asked, cell), frames)
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, prepare
-from apc.analysis.box import OpenSites, open_sites
+from apc.analysis.box import open_sites
 from apc.analysis.box_proof import BITS, TOGETHER, UNDECIDED, BoxProof, Looked, middle, search_box
 from apc.analysis.cells import Cell, OpenFrames, contracted, frames_over, open_frames
 from apc.compiler.compiled import CompiledSystem
@@ -67,10 +67,9 @@ class _Question:
     prepared: Prepared
     ranges: tuple[Range, ...]
     own: tuple[int, ...]  # places of the ranges that are no link's
-    open: OpenSites
     classes: Classes
-    frames: OpenFrames  # of all groups of peers, with their names
-    names: tuple[str, ...]
+    frames: OpenFrames  # of all groups of peers
+    places: Mapping[str, int]  # which of these each site of a loop is, by its name
     wide: Loop  # of all classes, its maps those of the whole box
     memories: Sequence[Remembered]
     weights: Floats  # how much each range matters
@@ -96,7 +95,7 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
         asked = _question(system, ranges)
         for loop in asked.classes.loops:
             bare = without_packets(loop)
-            if not stays_rigid(bare, [asked.open.sites[group.name] for group in bare.sites]):
+            if not stays_rigid(bare, [asked.frames.sites[asked.places[site.name]] for site in bare.sites]):
                 note = f"{loop.name} moves freely in a direction that changes with the parameters"
                 return BoxProof(system.name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), (note,))
         is_unstable = partial(_is_unstable, asked)
@@ -119,14 +118,20 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
         _refuse(_changed(system, ranges, point), prepared, one)
     opened = open_sites(system, [ranges[place] for place in own], prepared, lifted)
     told = hearing(opened.at, prepared)
-    names = tuple(group.name for group in told.groups)
-    frames = open_frames([opened.sites[name] for name in names], [group.schedule for group in told.groups])
+    sites = [opened.sites[group.name] for group in told.groups]
+    frames = open_frames(sites, [group.schedule for group in told.groups])
     whole = tuple((ranges[place].low, ranges[place].high) for place in own)
     maps = [one.mapped(lambda block: hull(block)[0]) for one in frames_over(frames, [whole])[0]]
     lifted_wide = [_with_map(*pair) for pair in zip(told.groups, maps, strict=True)]
     wide = peer_classes(replace(told, groups=tuple(lifted_wide)))[0][0]
     memories = remembered_of(opened.at, told, wide)
-    of = opened, classes_of(told), frames, names, wide, memories
+    classes = classes_of(told)
+    places = {
+        site.name: next(place for place, group in enumerate(told.groups) if site.peers[0] in group.peers)
+        for loop in classes.loops
+        for site in loop.sites
+    }
+    of = classes, frames, places, wide, memories
     asked = _Question(system, prepared, tuple(ranges), own, *of, np.ones(0))
     weights = []
     for place, varied in enumerate(ranges):
@@ -193,7 +198,8 @@ def _looked(asked: _Question, cells: Sequence[Cell]) -> Iterator[Looked]:
         maps, _ = frames_over(asked.frames, own)
         for place, cell in enumerate(some):
             here = [one.mapped(partial(_of_cell, place, len(cell))) for one in maps]
-            proved, sound = _proved(asked, cell, dict(zip(asked.names, here, strict=True)))
+            frames = {name: here[which] for name, which in asked.places.items()}
+            proved, sound = _proved(asked, cell, frames)
             reach = asked.weights * [float(high - low) for low, high in cell]
             unstable = not sound and _is_unstable(asked, middle(cell))
             yield Looked(None if proved else reach, unstable)

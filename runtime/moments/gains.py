@@ -42,9 +42,8 @@ NOTHING = 1e-24
 # Doublings until a sum counts as endless, 2^60 frames; or where what is doubled has grown to this.
 DOUBLINGS, ENDLESS = 60, 1e100
 
-# A φ that is not small is had from the corners of a cell of at most so many parameters, and somewhat larger
-# than the least, relatively to what is left.
-LARGE, MOST_SIDES, SPARED = 0.5, 6, 0.1
+# Where φ is not small, these are tried at the corners of a cell of at most so many parameters.
+LARGE, SHARES, MOST_SIDES = 0.5, (0.1, 0.5, 0.9), 6
 
 TINY = float(np.finfo(np.float64).tiny)
 
@@ -170,13 +169,14 @@ def stein(matrix: Matrix, driven: Matrix, numbers: Arithmetic) -> Matrix | None:
     scale, within = np.outer(weights, weights), hull(left)
     size = (np.abs(value_of(within)) + radius_of(within)) / scale
     *thetas, phi = size.sum(axis=-1).max(axis=-1) * (1 + (n + 8) * UNIT)
+    held = still[0], phi
     if not phi < LARGE:
-        phi = _share_at_corners(left[-1], seed, phi)
-    shape = still[0] / scale
-    if not (phi < 1 and is_positive(with_radius(shape, 2 * UNIT * np.abs(shape)))):
+        held = _held_at_corners(matrix, seed, numbers) or held
+    shape = held[0] / scale
+    if not (held[1] < 1 and is_positive(with_radius(shape, 2 * UNIT * np.abs(shape)))):
         return None
-    wide = np.sqrt(np.diagonal(still[0]))
-    reach = np.array(thetas)[:, None, None] / (1 - phi) * np.outer(wide, wide)
+    wide = np.sqrt(np.diagonal(held[0]))
+    reach = np.array(thetas)[:, None, None] / (1 - held[1]) * np.outer(wide, wide)
     guessed = guessed[:-1]
     radius_of(guessed)[...] = reach * (1 + 16 * UNIT)
     return guessed
@@ -193,22 +193,32 @@ def _slopes(matrix: Matrix, driven: Matrix, found: Floats) -> Matrix:
     return (total + np.swapaxes(total, -1, -2)).reshape(moved.shape) / 2
 
 
-def _share_at_corners(left: Matrix, seed: Floats, most: float) -> float:
-    """Return a φ for which φ D² − E is positive all over a cell, E (2 + m, n, n); `most` where there is none.
+def _held_at_corners(matrix: Matrix, seed: Floats, numbers: Arithmetic) -> tuple[Floats, float] | None:
+    """Return a P (n, n) and a φ < 1 with P − M P Mᵀ ≥ (1 − φ) D² all over a cell, None where there are none.
 
-    E is straight over the cell, but for its radius: its largest eigenvalue is at a corner.
+    Notes
+    -----
+    Of M/γ in place of M, γ between the spectral radius and 1, P has some of itself to spare, (1 − γ²) P;
+    where D is small beside what moves, units of that take its place. What is left is straight over the cell
+    but for its radius: it is positive if it is so at each corner.
     """
-    scale = np.sqrt(np.diagonal(seed))
-    if not np.isfinite(left).all() or len(left) - 2 > MOST_SIDES:
-        return most
-    inside = corners(left)
-    values = [value_of(one) / np.outer(scale, scale) for one in inside]
-    off = [float((radius_of(one) / np.outer(scale, scale)).sum(axis=-1).max()) for one in inside]
-    highest = [float(np.linalg.eigvalsh(one + one.T)[-1]) / 2 for one in values]
-    least = max(0.0, *(high + more for high, more in zip(highest, off, strict=True)))
-    share = least + SPARED * (1 - least)
-    sure = share < 1 and all(is_positive(RADII.subtract(RADII.exact(share * seed), one)) for one in inside)
-    return share if sure else most
+    value = value_of(matrix)
+    if len(matrix) - 2 > MOST_SIDES:
+        return None
+    decay = (1 + float(np.abs(np.linalg.eigvals(value)).max(initial=0.0))) / 2
+    units = balance(np.abs(value) + np.abs(matrix[2:]).sum(axis=0)) ** 2
+    for inner in (seed, np.diag(units * (np.diagonal(seed) / units).max())):
+        found = _doubled(value / decay, inner[None])
+        if found is None:
+            return None
+        found = (found + np.swapaxes(found, -1, -2)) / 2
+        guessed = numbers.exact(found)
+        left = numbers.subtract(guessed, around(matrix, guessed, numbers))
+        for share in SHARES:
+            spared = numbers.subtract(left, numbers.exact((1 - share) * seed))
+            if all(is_positive(one) for one in corners(spared[0])):
+                return found[0], share
+    return None
 
 
 def _weights(found: Matrix, matrix: Matrix) -> Floats:
