@@ -154,6 +154,7 @@ def test_of_an_ideal_link_a_box_is_nominal_until_it_may_lose_packets() -> None:
         ),
         (burst(0.1, 10), {"contact.stiffness": "±1%"}, "over bursts of lan"),
         (burst(0.1, 10), {"lan.loss.r": "±1%"}, "over bursts of lan"),
+        (", loss: {p: 0.3, r: 0.7}", {"lan.loss.r": "0.56:0.98"}, "over bursts of lan"),
         (", loss: 100 %", {"contact.stiffness": "±1%"}, "no box is proved: lan loses everything"),
     ],
 )

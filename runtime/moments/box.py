@@ -113,8 +113,12 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
         found = hearing(changed, prepared)
         return found.groups, found.exchange
 
-    for one in ranges:  # inside the box, as a link may lose nothing at an end of it
-        point = [each.low + (each.high - each.low) / 3 for each in ranges]
+    # Inside the box, as a link may lose nothing at an end of it; and moved along each range, as chances that
+    # add up to 1 somewhere, by chance, are those of bursts beside it.
+    inside = [one.low + (one.high - one.low) / 3 for one in ranges]
+    _refuse(_changed(system, ranges, inside), prepared, ranges[0])
+    for place, one in enumerate(ranges):
+        point = [*inside[:place], one.high - (one.high - one.low) / 3, *inside[place + 1 :]]
         _refuse(_changed(system, ranges, point), prepared, one)
     opened = open_sites(system, [ranges[place] for place in own], prepared, lifted)
     told = hearing(opened.at, prepared)
