@@ -472,7 +472,7 @@ def _bounds(of: Gain, growth: float, numbers: Arithmetic = RADII) -> tuple[float
     matrix = hull(matrix)
     if matrix.shape[-1] == 1:
         value, off = abs(float(matrix[0, 0, 0])), float(matrix[1, 0, 0])
-        return (value - off) * (1 - UNIT), (value + off) * (1 + UNIT)
+        return (value - off) * (1 - 4 * UNIT), (value + off) * (1 + 4 * UNIT)  # 1 + UNIT is 1 in floats
     _, found = enclose_eigenvalues(value_of(matrix), radius_of(matrix))
     return found.low, found.high
 

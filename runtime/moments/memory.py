@@ -90,7 +90,9 @@ class Memory:
         same all over the cell; the variance π (1 − π) has the slope 1 − 2 π.
         """
         place = self.uncertain(slot)
-        own, doubt, moves = self.chances[place, slot], self.doubts[place, slot], self.moves[:, place, slot]
+        own, moves = self.chances[place, slot], self.moves[:, place, slot]
+        # Of a chance near 1 the variance is small, and what the chance rounds is not.
+        doubt = self.doubts[place, slot] + CHANCE_ROUNDINGS * UNIT
         wander = np.abs(moves).sum(axis=0)
         found = np.minimum.outer(own, own) - np.outer(own, own)
         least = np.where(own[:, None] <= own, moves[:, :, None], moves[:, None, :])
@@ -99,7 +101,7 @@ class Memory:
         off = np.maximum.outer(doubt, doubt) + both
         np.fill_diagonal(off, (np.abs(1 - 2 * own) + 2 * wander) * doubt + doubt**2)
         off += np.outer(wander, wander)
-        off = off * (1 + 8 * UNIT) + (2 * CHANCE_ROUNDINGS + len(moves)) * UNIT * (found + 4 * wander)
+        off = off * (1 + 8 * UNIT) + (4 + len(moves)) * UNIT * (own + 4 * wander)
         return np.concatenate([np.stack([found, off]), slopes])
 
 
