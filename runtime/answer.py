@@ -151,7 +151,7 @@ def answer(
     buzz, no_buzz = _buzz(system, prepared, modes) if with_buzz else (None, "")
     return Answer(
         analysis=replace(found, notes=(*found.notes, *notes)),
-        network=_over_network(system, prepared, found, nominal, certify=certify),
+        network=_over_network(system, prepared, found, nominal, certify=certify, quick=not every_margin),
         sensitivities=moved,
         margins=nominal,
         contact_modes=modes,
@@ -165,7 +165,13 @@ def answer(
 
 
 def _over_network(
-    system: CompiledSystem, prepared: Prepared, found: Analysis, nominal: Margins, *, certify: bool
+    system: CompiledSystem,
+    prepared: Prepared,
+    found: Analysis,
+    nominal: Margins,
+    *,
+    certify: bool,
+    quick: bool,
 ) -> NetworkAnswer | None:
     """Return the answer over the network as it is; imported here, as most scenes have an ideal one."""
     if all(link.channel is None for link in system.links):
@@ -179,7 +185,7 @@ def _over_network(
     if why := _too_large(system, prepared, found) or _too_many_products(system):
         return NetworkAnswer(verdict, _not_told(0.0, why), Margins((), why))
     moved = network_sensitivities(system, prepared)
-    return NetworkAnswer(verdict, moved, network_margins(system, prepared, nominal))
+    return NetworkAnswer(verdict, moved, network_margins(system, prepared, nominal, quick=quick))
 
 
 def _switching(system: CompiledSystem, prepared: Prepared, modes: ContactModes) -> Switching:

@@ -22,10 +22,11 @@ from apc.compiler.compiled import CompiledSystem
 from apc.eigen.balls import precision
 from apc.frame.radius import RADII, radius_of, value_of
 from apc.frame.taylor import taylor
-from apc.moments import box
+from apc.moments import box, network
 from apc.moments.crowd import crowd, moments_of
 from apc.moments.gains import Moments, gain_of
 from apc.threads import single_threaded
+from apc.vary import over_network
 from apc.vary.margins import Margins, margins
 from apc.vary.over_network import network_margins, network_sensitivities
 from apc.vary.sensitivity import Sensitivity
@@ -172,6 +173,20 @@ def test_peers_on_a_graph_of_their_own_have_boxes_too() -> None:
     for graph, stable in zip(graphs, (True, False), strict=True):
         found = apc.prove_box(scene(more=f", loss: 10 %, graph: {graph}"), ranges)
         assert found.stable is stable
+
+
+def test_margins_that_take_long_are_looked_for_if_asked_and_never_of_an_unstable_scene(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    system, unstable = scene(), scene(stiffness=2000)
+    in_passing = partial(network_margins, nominal=Margins((), ""), quick=True)
+    assert in_passing(system, prepare(system)).rows
+    monkeypatch.setattr(over_network, "MOST_IN_PASSING", 1)
+    assert "(apc analyze --margins does)" in in_passing(system, prepare(system)).note
+    assert grown(system).rows
+    monkeypatch.setattr(network, "QUICK", 0)
+    assert grown(system).note.startswith("not looked for: over this network, to judge one value takes long")
+    assert grown(unstable).note == "none: the scene is not stable in mean square as it is"
 
 
 def test_a_jitter_is_no_range_of_a_box() -> None:

@@ -328,6 +328,16 @@ def test_a_box_is_proved_where_the_boundary_is_far_and_refuted_where_it_is_insid
         assert stiffness > 458.242164
 
 
+def test_a_box_of_hands_says_that_it_leaves_packets_lost_out_and_has_no_range_of_them() -> None:
+    system = compiled(replaced(users(3, 200), ("delay: 8 ms}", "delay: 8 ms, loss: 10 %}")))
+    found = prove_box(system, [parse_range(system, "contact.stiffness=±1%")])
+    assert found.stable
+    left_out = str(found).splitlines()[1]
+    assert left_out.startswith("left out: packet loss (10 %) of lan")
+    with pytest.raises(ApcError, match=r'E896 .* Write: apc analyze --box "lan.loss=0:0.2"'):
+        prove_box(system, [parse_range(system, "lan.loss=0:20 %")])
+
+
 def test_a_box_of_two_kinds_of_devices_is_proved() -> None:
     text = replaced(
         AVERAGE, ("user: {count: 3}", "a: {count: 1, set: {device.mass: 0.2 kg}}\n  b: {count: 2}")

@@ -24,6 +24,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.formula import FaultError, carrying, exactly
 from apc.compiler.frozen import dataclass
 from apc.compiler.plain import RULES
+from apc.compiler.words import with_unit
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup, Runs
@@ -140,15 +141,19 @@ def _parameter(system: CompiledSystem, free: Free, place: Place) -> Parameter:
 
 def _check_limits(parameter: Parameter, low: Fraction, high: Fraction, name: str, place: Place) -> None:
     """Refuse an empty range, and one beyond the parameter's bounds."""
+    low_text, high_text = (with_unit(f"{float(one):g}", parameter.unit) for one in (low, high))
     if not low < high:
-        raise ApcError(Mistake("E833", place, f"{name} runs from low to high", "a low below the high"))
+        raise ApcError(
+            Mistake("E833", place, f"the box of {name}", "a low below the high", f"{low_text} to {high_text}")
+        )
     least, most = parameter.minimum, parameter.maximum
     if least is not None and (low < Fraction(least) or (parameter.open_minimum and low == Fraction(least))):
-        wanted = f"{'more than' if parameter.open_minimum else 'at least'} {least:g} {parameter.unit}"
-        raise ApcError(Mistake("E833", place, f"the box of {name}", wanted, f"{float(low):g}"))
+        end = with_unit(f"{least:g}", parameter.unit)
+        wanted = f"{'more than' if parameter.open_minimum else 'at least'} {end}"
+        raise ApcError(Mistake("E833", place, f"the box of {name}", wanted, low_text))
     if most is not None and high > Fraction(most):
-        wanted = f"at most {most:g} {parameter.unit}"
-        raise ApcError(Mistake("E833", place, f"the box of {name}", wanted, f"{float(high):g}"))
+        wanted = f"at most {with_unit(f'{most:g}', parameter.unit)}"
+        raise ApcError(Mistake("E833", place, f"the box of {name}", wanted, high_text))
 
 
 def open_box(system: CompiledSystem, ranges: Sequence[Range]) -> Box:
@@ -210,7 +215,7 @@ def open_sites(
     """
     for place, one in enumerate(ranges):
         if any(other.free.meets(one.free) for other in ranges[:place]):
-            raise ApcError(Mistake("E831", _PLACE, f"{one.free.label} is left open twice"))
+            raise ApcError(Mistake("E831", _PLACE, f"{one.free.label} has two ranges in one box"))
     if not all(site.parameters_suffice for site in prepared.jacobians):
         what = f"{system.name} is not linear: where it is linearized may move with the parameters"
         raise ApcError(Mistake("E832", Place(system.origin.topology), what))

@@ -74,7 +74,8 @@ class BoxProof(Result):
     """What was proved of a box; `stable` is None when neither was.
 
     `cells` were looked at; `open_share` of the box's volume is left open. `point`, SI values in the order of
-    `ranges`, is where it is unstable, or the middle of the largest cell left open.
+    `ranges`, is where it is unstable, or the middle of the largest cell left open. `left_out` says what the
+    verdict is without.
     """
 
     shown_by = "analysis:box_proof"
@@ -87,6 +88,7 @@ class BoxProof(Result):
     open_share: float
     point: tuple[float, ...]
     notes: tuple[str, ...]
+    left_out: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -427,15 +427,6 @@ def _on_one_side(
     return np.asarray((sure | (np.pi - turned <= np.where(real, NEAR_ZERO, ROUNDED))).all(axis=0))
 
 
-def turned_along(course: Floats | Complexes) -> tuple[Floats, Floats]:
-    """Return by how much courses (points, k) turn about 0, in radians, and the widest angle between points.
-
-    A change of sign is half a turn forwards, whatever the sign of the zero beside it; a course that stays at
-    0 has no angle.
-    """
-    return _turned(_phases(course))
-
-
 def _phases(course: Floats | Complexes) -> NDArray[Any]:
     """Return the directions of courses (points, k), of unit length; where one stays at 0, NaN."""
     size = np.abs(course)
@@ -449,7 +440,11 @@ def _phases(course: Floats | Complexes) -> NDArray[Any]:
 
 
 def _turned(phases: NDArray[Any]) -> tuple[Floats, Floats]:
-    """Return `turned_along` of directions (points, k)."""
+    """Return by how much directions (points, k) turn about 0, in radians, and the widest angle between points.
+
+    A change of sign is half a turn forwards, whatever the sign of the zero beside it; a course that stays at
+    0 has no angle.
+    """
     turned = phases[1:] * phases[:-1].conj()
     angles = np.arctan2(turned.imag, turned.real)
     if (angles <= HALF_TURN_BACK).any():

@@ -14,6 +14,7 @@ proves the cell. A cell where that fails is halved.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from typing import Any
@@ -29,6 +30,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
+from apc.compiler.words import with_unit
 from apc.eigen.balls import precision
 from apc.eigen.closing import ClosedSystem, close_loop
 from apc.eigen.dissipation import is_positive, least_real, proves_positive_between
@@ -44,6 +46,7 @@ from apc.frame.site import LinearSite
 from apc.frame.taylor import corners, hull, taylor
 from apc.hands.passivity import OPTION, STABLE, UNSTABLE, circulates, passive_growth
 from apc.hands.port import Cut, Maps, Standing, open_ports, port_loop
+from apc.network.nominal import left_out, refuse_channel_number
 from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
@@ -97,17 +100,23 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
     Raises
     ------
     ApcError
-        E930 devices that feel each other unevenly; E831 and E832 as `box.open_sites`; those of
-        `passivity.passive_hands`.
+        E896 a number of an unreliable link; E930 devices that feel each other unevenly; E831 and E832 as
+        `box.open_sites`; those of `passivity.passive_hands`.
     """
     refuse_hands(system, OPTION)
+    for one in ranges:
+        low, high = (with_unit(f"{float(end):g}", one.unit) for end in (one.low, one.high))
+        hint = f'apc analyze --box "{one.free.label}={low}:{high}"'
+        refuse_channel_number(system, one.free, PLACE, instead=hint)
     with single_threaded(), np.errstate(all="ignore"), precision(BITS):
         asked = _question(system, ranges)
         if isinstance(asked, str):
             inner = tuple(map(float, middle(tuple((one.low, one.high) for one in ranges))))
-            return BoxProof(system.name, tuple(ranges), UNSTABLE, False, 1, 1.0, inner, (asked,))
-        looks = partial(_looked, asked), partial(_is_unstable, asked)
-        return search_box(system.name, ranges, *looks, stable=STABLE, unstable=UNSTABLE)
+            found = BoxProof(system.name, tuple(ranges), UNSTABLE, False, 1, 1.0, inner, (asked,))
+        else:
+            looks = partial(_looked, asked), partial(_is_unstable, asked)
+            found = search_box(system.name, ranges, *looks, stable=STABLE, unstable=UNSTABLE)
+        return replace(found, left_out=left_out(system))
 
 
 def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question | str:

@@ -203,7 +203,8 @@ def _looked(asked: _Question, cells: Sequence[Cell]) -> Iterator[Looked]:
         for place, cell in enumerate(some):
             here = [one.mapped(partial(_of_cell, place, len(cell))) for one in maps]
             frames = {name: here[which] for name, which in asked.places.items()}
-            proved, sound = _proved(asked, cell, frames)
+            finite = all(np.isfinite(block).all() for one in here for block in (one.p, one.q, one.s, one.d))
+            proved, sound = _proved(asked, cell, frames) if finite else (False, False)
             reach = asked.weights * [float(high - low) for low, high in cell]
             unstable = not sound and _is_unstable(asked, middle(cell))
             yield Looked(None if proved else reach, unstable)

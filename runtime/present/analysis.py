@@ -345,13 +345,14 @@ def box_proof_text(found: BoxProof) -> str:
         said = f"proved {found.verdict} for every value in the box ({counted(found.cells, 'cell')})"
     elif found.stable is False:
         said = "not stable in all of the box"
-        lines += ["proved unstable at", *where]
+        lines += [f"proved {found.verdict} at", *where]
     else:
-        share = f"{100 * found.open_share:.2g} %"
+        share = f"{100 * found.open_share:.3g} %"
         said = f"undecided, {share} of the box is left open ({counted(found.cells, 'cell')})"
         lines += ["among others around", *where] if found.point else []
     lines += [f"  {text}" for text in found.notes]
-    return "\n".join([f"{found.topology}:", *wrapped(said), *lines])
+    told = [line for text in found.left_out for line in wrapped(text)]
+    return "\n".join([f"{found.topology}:", *told, *wrapped(said), *lines])
 
 
 def _range(found: Range) -> str:
@@ -368,6 +369,7 @@ def box_proof_document(found: BoxProof) -> dict[str, Any]:
     """Return what was proved of a box as plain data."""
     return {
         "topology": found.topology,
+        "left_out": list(found.left_out),
         "box": [range_document(one) for one in found.ranges],
         "verdict": found.verdict,
         "stable": found.stable,

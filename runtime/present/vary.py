@@ -131,14 +131,14 @@ def margins_text(found: Margins) -> str:
     lines = [f"  {'may grow':<{width}}  from           to               times  at"]
     for one in found.rows:
         name, unit = f"  {one.parameter:<{width}}  ", one.unit
-        start = f"{one.present:.5g} {unit}"
+        start = with_unit(f"{one.present:.5g}", unit)
         if one.note:
             lines.append(f"{name}{start:<14} not looked for: {one.note}")
             continue
         if one.value is None:
-            lines.append(f"{name}{start:<14} none found up to {one.scanned:.5g} {unit}")
+            lines.append(f"{name}{start:<14} none found up to {with_unit(f'{one.scanned:.5g}', unit)}")
             continue
-        end = f"{known_digits(one.value, one.error or 0.0, 7)} {unit}"
+        end = with_unit(known_digits(one.value, one.error or 0.0, 7), unit)
         times = f"{one.factor:.4g}" if one.factor is not None else "–"
         jump = ", jump" if one.kind == "jump" else ""
         at = "–" if one.frequency_hz is None else in_hertz(one.frequency_hz)

@@ -32,7 +32,7 @@ from apc.network.nominal import channel_numbers
 from apc.threads import single_threaded
 from apc.vary.evaluator import free_parameters
 from apc.vary.growth import BOUNDED, MEAN_SQUARE, FirstLost, allowed, first_lost, growth_at
-from apc.vary.margins import GROWTH, Margin, Margins, coupler_parameters
+from apc.vary.margins import GROWTH, IN_PASSING, Margin, Margins, coupler_parameters
 from apc.vary.search import SAMPLES
 from apc.vary.sensitivity import Sensitivities, Sensitivity, varied
 
@@ -48,11 +48,17 @@ SHARES = 16
 # More numbers than this are not varied: at some ten milliseconds a value they would take a minute.
 MOST_VARIED = 60
 
+# More numbers times states than this are looked at only if asked: a score of values of each number, of some
+# milliseconds and one more for every two states, are half a minute.
+MOST_IN_PASSING = 500
+
 # What grows is called so.
 MOMENTS = "second moments"
 
 
-def network_margins(system: CompiledSystem, prepared: Prepared, nominal: Margins) -> Margins:
+def network_margins(
+    system: CompiledSystem, prepared: Prepared, nominal: Margins, *, quick: bool = False
+) -> Margins:
     """Find how much each stiffness, damping, probability and jitter may grow, stable in mean square.
 
     Parameters
@@ -61,6 +67,8 @@ def network_margins(system: CompiledSystem, prepared: Prepared, nominal: Margins
         The compiled scene, and what `analysis.prepare` made of it.
     nominal
         The margins over the nominal network: how far to look from a value of 0.
+    quick
+        Whether margins that take long are left out.
     """
     with (
         part("margins"),
@@ -69,11 +77,16 @@ def network_margins(system: CompiledSystem, prepared: Prepared, nominal: Margins
         np.errstate(all="ignore"),
     ):
         free = [*coupler_parameters(system), *_of_channels(system)]
-        here = _looked_at(system, prepared, len(free))
-        if isinstance(here, str):
-            return Margins((), f"not looked for: {here}")
-        if not here.stable:
+        states = max(len(kind.states) for kind in system.kinds)
+        if quick and len(free) * states > MOST_IN_PASSING:
+            return Margins((), IN_PASSING.format(f"{len(free)} numbers of {states}"))
+        if why := _too_many(len(free)):
+            return Margins((), f"not looked for: {why}")
+        here = growth(system, prepared)
+        if not here.why and not here.stable:
             return Margins((), "none: the scene is not stable in mean square as it is")
+        if why := _not_varied(here):
+            return Margins((), f"not looked for: {why}")
         scales = {one.parameter: one.value or one.scanned / GROWTH for one in nominal.rows}
         rows: list[Margin] = []
         notes, open_sides, looked = [], [], 0
@@ -98,18 +111,22 @@ def network_margins(system: CompiledSystem, prepared: Prepared, nominal: Margins
     return Margins(tuple(rows), "; ".join(notes))
 
 
-def _looked_at(system: CompiledSystem, prepared: Prepared, count: int) -> Growth | str:
-    """Return what second moments grow by, or why nothing is looked at for many values of so many numbers."""
-    if count > MOST_VARIED:
-        return f"over this network, {count} numbers take too long to vary (apc critical varies one)"
-    found = growth(system, prepared)
-    if found.why:
-        return f"over the network, the scene is not judged: {found.why}"
-    if not found.quick:
+def _too_many(count: int) -> str:
+    """Return why so many numbers are not varied, "" where they are."""
+    if count <= MOST_VARIED:
+        return ""
+    return f"over this network, {count} numbers take too long to vary (apc critical varies one)"
+
+
+def _not_varied(here: Growth) -> str:
+    """Return why a scene is not looked at for many values, "" where it is."""
+    if here.why:
+        return f"over the network, the scene is not judged: {here.why}"
+    if not here.quick:
         return (
             "over this network, to judge one value takes long (apc critical looks at those of one parameter)"
         )
-    return found
+    return ""
 
 
 def _of_channels(system: CompiledSystem) -> list[Free]:
@@ -168,9 +185,8 @@ def network_sensitivities(system: CompiledSystem, prepared: Prepared) -> Sensiti
         np.errstate(all="ignore"),
     ):
         free = [*varied(system), *_of_channels(system)]
-        here = _looked_at(system, prepared, len(free))
-        if isinstance(here, str):
-            return Sensitivities(0.0, (), (), f"what moves it most: not looked for: {here}")
+        if why := _too_many(len(free)) or _not_varied(here := growth(system, prepared)):
+            return Sensitivities(0.0, (), (), f"what moves it most: not looked for: {why}")
         rows, without = [], []
         for one in free:
             present = value_now(system, one)
