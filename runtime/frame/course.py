@@ -440,7 +440,7 @@ def _phases(course: Floats | Complexes) -> NDArray[Any]:
 
 
 def _turned(phases: NDArray[Any]) -> tuple[Floats, Floats]:
-    """Return by how much directions (points, k) turn about 0, in radians, and the widest angle between points.
+    """Return by how much directions (points, k) turn about 0, in radians, and the widest angle of a step.
 
     A change of sign is half a turn forwards, whatever the sign of the zero beside it; a course that stays at
     0 has no angle.
