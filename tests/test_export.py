@@ -18,6 +18,7 @@ from apc.__main__ import run
 from apc.analysis.analysis import lifted_groups
 from apc.compiler.errors import ApcError
 from apc.exports.lifted import StateSpace, state_space
+from apc.frame import devices
 from apc.frame.devices import Push, find_push
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
@@ -131,6 +132,21 @@ def test_python_control_finds_the_margins_that_apc_finds() -> None:
     margin = next(one for one in apc.margins(system).rows if one.parameter == "wall.stiffness")
     assert gain == pytest.approx(margin.factor, rel=1e-9)
     assert crossing / (2 * np.pi) == pytest.approx(margin.frequency_hz, rel=1e-9)
+
+
+def test_of_each_part_it_is_found_once_what_a_force_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part of many positions is looked through whole: once for each of them took minutes."""
+    asked: list[str] = []
+    known = devices.find_device
+
+    def counted(*told: Any, part: str) -> Any:
+        asked.append(part)
+        return known(*told, part=part)
+
+    monkeypatch.setattr(devices, "find_device", counted)
+    state_space(shipped("planar-users"))
+    assert asked
+    assert len(asked) == len(set(asked))
 
 
 def test_a_force_on_what_a_bar_joins_moves_both_its_ends() -> None:

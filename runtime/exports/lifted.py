@@ -41,7 +41,7 @@ from apc.eigen.modes import dense_loop
 from apc.eigen.peer_group import PeerGroup, states_of
 from apc.exports.words import Port
 from apc.finite_equations import finite_equations
-from apc.frame.devices import Push, find_push
+from apc.frame.devices import Device, Push, find_push
 from apc.frame.discretize import TOO_LARGE, discretize
 from apc.frame.exchange import Exchange
 from apc.frame.lift import MOST_PACKETS, FrameMap, check_packets, compose, named, step_durations
@@ -338,9 +338,10 @@ def _masses(system: CompiledSystem, group: PeerGroup) -> tuple[list[Push], list[
     unit_of = {one.name: one.unit for one in system.parameters}
     found: dict[str, Push] = {}
     refused: dict[str, None] = {}
+    known: dict[str, Device | str | None] = {}
     for place, state in enumerate(group.jacobians.kind.states):
         if state.unit == "m":
-            one = find_push(group.jacobians, group.parameters, unit_of, group.listening, place)
+            one = find_push(group.jacobians, group.parameters, unit_of, group.listening, place, known)
             if isinstance(one, Push):
                 found.setdefault(one.part, one)
             elif one is not None:

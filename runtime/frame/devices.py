@@ -199,6 +199,7 @@ def find_push(
     unit_of: Mapping[str, str],
     listening: Listening | None,
     position: int,
+    known: dict[str, Device | str | None] | None = None,
 ) -> Push | str | None:
     """Return what a force along a position of a peer does, None where nothing has a mass, or why not.
 
@@ -208,11 +209,17 @@ def find_push(
         As for `find_device`.
     position
         Its place among the states.
+    known
+        What each part is found to be, kept here from one position of a peer to the next: of a part of many
+        positions all are looked through.
     """
+    known = {} if known is None else known
     kind, name = site.kind, site.kind.states[position].name
     why = None
     for part in (_part(name), name):
-        found = find_device(site, parameters, unit_of, listening, part=part)
+        if part not in known:
+            known[part] = find_device(site, parameters, unit_of, listening, part=part)
+        found = known[part]
         if isinstance(found, Device):
             return Push(found.part, (found.velocity,), (found.inverse,), found.symbolic)
         why = found
