@@ -84,7 +84,8 @@ def network_margins(
             return Margins((), f"not looked for: {why}")
         here = growth(system, prepared)
         if not here.why and not here.stable:
-            return Margins((), "none: the scene is not stable in mean square as it is")
+            known = "stable" if here.stable is False else "proved stable"
+            return Margins((), f"none: the scene is not {known} in mean square as it is")
         if why := _not_varied(here):
             return Margins((), f"not looked for: {why}")
         scales = {one.parameter: one.value or one.scanned / GROWTH for one in nominal.rows}
