@@ -2,8 +2,9 @@
 
 None depends on another either, or on what the user keeps: they run in several processes at once.
 
-A test marked `few(count)` has more cases than its claim needs each time: so many of them run, chosen to show
-as many values of each parameter as they can, and all of them with `pytest --whole`.
+A test marked `whole` runs with `pytest --whole` only: it is slow, or about the inside of a deep proof. One
+marked `few(count)` has more cases than its claim needs each time: so many of them run, chosen to show as many
+values of each parameter as they can, and all of them with `pytest --whole`.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--whole", action="store_true", help="run every case of the tests marked few, too")
+    parser.addoption(
+        "--whole", action="store_true", help="run every test, and every case of those marked few"
+    )
 
 
 @pytest.hookimpl(trylast=True)  # of what is selected otherwise
@@ -45,10 +48,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if config.getoption("--whole"):
         return
     marked: dict[str, tuple[int, list[pytest.Function]]] = {}
+    left_out = {item for item in items if item.get_closest_marker("whole")}
     for item in items:
-        if isinstance(item, pytest.Function) and (mark := item.get_closest_marker("few")):
+        mark = item.get_closest_marker("few")
+        if mark and item not in left_out and isinstance(item, pytest.Function):
             marked.setdefault(item.nodeid.partition("[")[0], (mark.args[0], []))[1].append(item)
-    left_out = {item for count, cases in marked.values() for item in {*cases} - {*few(cases, count)}}
+    left_out |= {item for count, cases in marked.values() for item in {*cases} - {*few(cases, count)}}
     config.hook.pytest_deselected(items=[item for item in items if item in left_out])
     items[:] = [item for item in items if item not in left_out]
 
