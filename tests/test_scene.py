@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from pathlib import Path
 
 import pytest
 
 from apc.compiler.compiled import Experiment
 from apc.compiler.language.expression import format_expression
 from apc.compiler.scene.groups import LARGEST_COUNT
-from tests.topologies import AVERAGE, MESH, ONE_MASS, replaced, scene, told
+from apc.compiler.store import save
+from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, library, replaced, scene, told
 
 GROUPS = replaced(
     AVERAGE,
@@ -313,3 +315,114 @@ def test_what_is_not_a_mapping_is_no_topology() -> None:
         "scene.yaml:1:1: E203 a topology wants a mapping of keys to values, got a list. "
         "Write: topology: my-scene"
     ]
+
+
+KINDS = """\
+topology: kinds
+clocks: {haptic: 1 ms, slow: 2 ms, network: 8 ms}
+peers: {left: {count: 2}, right: {count: 2}}
+masses:
+  device: {mass: 0.1 kg}
+  cube: {mass: 0.6 kg, damping: 5 N*s/m, shared: true}
+couplers:
+  contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic}
+  coordination: {type: AveragePosition, object: cube, stiffness: 500 N/m, clock: haptic, link: lan}
+links:
+  lan: {clock: network, delay: 8 ms}
+  wan: {clock: network, delay: 8 ms}
+hands:
+  arm: {type: SpringDamperArm, flange: device, stiffness: 50 N/m, damping: 1 N*s/m}
+"""
+# Of each kind of part: what stands there, a key more or another, and, if it is refused, the code of why.
+DEVICE, CONTACT, LAN, ARM = "mass: 0.1 kg", "b: cube, ", "lan: {clock: network", "flange: device, "
+KEYS = [
+    (DEVICE, "type: Falcon, mass: 0.1 kg", ""),
+    (DEVICE, "mass: 0.1 kg, at: [left]", "E210 E210"),
+    (DEVICE, "mass: 0.1 kg, shared: true", ""),
+    (DEVICE, "mass: 0.1 kg, count: 2", "E210 E210"),
+    (DEVICE, "mass: 0.1 kg, flange: cube", ""),
+    (DEVICE, "mass: 0.1 kg, x: 1 mm", ""),
+    (DEVICE, "mass: 0.2 kg", ""),
+    (CONTACT, "b: cube, at: [left], ", ""),
+    (CONTACT, "b: cube, at: [], ", "E203"),
+    (CONTACT, "b: cube, shared: true, ", "E210"),
+    (CONTACT, "b: cube, count: 2, ", ""),
+    (CONTACT, "b: ground, ", ""),
+    (CONTACT, "b: cube, delay: 1 ms, ", ""),
+    (CONTACT, "b: cube, link: lan, ", "E202"),
+    (CONTACT, "b: cube, graph: ring, ", "E202"),
+    (LAN, "lan: {type: Mass, clock: network", "E201 E210 E202 E202"),
+    (LAN, "lan: {at: [left], clock: network", "E211"),
+    (LAN, "lan: {at: left, clock: network", "E211"),
+    (LAN, "lan: {shared: true, clock: network", "E210"),
+    (LAN, "lan: {count: 2, clock: network", "E208"),
+    (LAN, "lan: {clock: slow", ""),
+    (LAN, "lan: {graph: ring, clock: network", ""),
+    (LAN, "lan: {delays: {left: {right: 9 ms}}, clock: network", ""),
+    (LAN, "lan: {loss: 1 %, clock: network", ""),
+    (LAN, "lan: {loss: 1 %, on_loss: zero, clock: network", ""),
+    (LAN, "lan: {jitter: 1 ms, clock: network", ""),
+    (LAN, "lan: {jitter: 1 ms, distribution: pareto, clock: network", ""),
+    (LAN, "lan: {jitter: 1 ms, reorder: all, clock: network", ""),
+    (LAN, "lan: {distribution: pareto, clock: network", "E262"),
+    (ARM, "flange: device, at: [right], ", ""),
+    (ARM, "flange: device, at: [left, right], ", "same"),
+    (ARM, "flange: device, shared: true, ", "E210"),
+    (ARM, "flange: device, count: 2, ", ""),
+    (ARM, "flange: cube, ", ""),
+    (ARM, "flange: device, position: 1 mm, ", ""),
+    ("left: {count: 2", "left: {count: 2, set: {arm.stiffness: 60 N/m}", ""),
+    ("left: {count: 2", "left: {count: 2, set: {lan.delay: 9 ms}", "E211"),
+    ("link: lan", "link: lan, at: [right]", ""),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "codes"), KEYS)
+def test_every_key_of_every_kind_of_part_is_obeyed_or_refused(
+    old: str, new: str, codes: str, tmp_path: Path
+) -> None:
+    """A key is accepted only where it makes another model: not a byte of it would be written otherwise."""
+    text = replaced(KINDS, (old, new))
+    if codes not in ("", "same"):
+        assert [line.split()[1] for line in told(compiled, text)] == codes.split()
+        return
+    written = []
+    for name, scene_text in (("plain", KINDS), ("keyed", text)):
+        save(compiled(scene_text), tmp_path / name)
+        written.append((tmp_path / name).read_bytes())
+    assert (written[0] == written[1]) == (codes == "same")
+
+
+def test_who_takes_part_is_said_by_what_uses_a_link() -> None:
+    [line] = messages(("lan: {clock", "lan: {at: [left], clock"), text=KINDS)
+    assert line == (
+        "11:13: E211 lan is a link, which joins all peers: who takes part is said by what uses it. "
+        "Write: coordination: {at: [left]}"
+    )
+    assert not messages(("link: lan}", "link: lan, at: [left]}"), text=KINDS)
+
+
+def test_a_group_sets_nothing_of_a_part_that_it_has_not() -> None:
+    text = replaced(KINDS, ("b: cube, ", "b: cube, at: [left], "))
+    line = ("right: {count: 2}", "right: {count: 2, set: {contact.stiffness: 1 N/m}}")
+    assert messages(line, text=text) == [
+        "3:51: E211 right sets contact.stiffness and has no contact, which is at left. "
+        "Write: at: [left, right]"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("body", "has"),
+    [
+        ("extends: Link\nparameters: {colour: {unit: 1, default: 1}}\n", "colour"),
+        ("extends: Link\nvariables: {x: {unit: m}}\nequations: [x = 0]\n", "x"),
+    ],
+)
+def test_what_no_link_obeys_is_refused_of_its_component(body: str, has: str, tmp_path: Path) -> None:
+    own = library(tmp_path, f"component: Own\n{body}")
+    text = replaced(KINDS, ("wan: {", "wan: {type: Own, "))
+    assert [line.partition("E210 ")[2] for line in told(lambda: scene(text, own))] == [
+        f"wan is a Own, which is no link: a link has no {has}. Write: type: Link"
+    ]
+    text = replaced(KINDS, ("  contact: {", "  carried: {type: Link, clock: network}\n  contact: {"))
+    assert [line.split()[1] for line in told(scene, text)] == ["E210"]

@@ -224,6 +224,7 @@ def _read_groups(
 ) -> tuple[SceneGroup, ...]:
     """Read what each group of peers sets for itself: anything but what is of a link."""
     own = {name: items for name, items in settable.items() if not sections.is_of_link(name)}
+    places = {part.name: part.groups for part in parts}
 
     def explained(name: str, place: Place) -> bool:
         """Return whether it was said why a group can't set `part.parameter`; of a link's, say it here."""
@@ -239,7 +240,7 @@ def _read_groups(
     found = []
     for group in bodies.values():
         place = group.body.place
-        settings = read_settings(group, own, clocks, numbers.read_for, explained, numbers.mistakes)
+        settings = read_settings(group, own, places, clocks, numbers.read_for, explained, numbers.mistakes)
         settings = with_followers(settings, parts, numbers.values, numbers.peers, place, numbers.mistakes)
         found.append(
             SceneGroup(
