@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from apc.compiler.compiled import Experiment
 from apc.compiler.language.expression import format_expression
 from apc.compiler.scene.groups import LARGEST_COUNT
 from apc.compiler.store import save
+from apc.frame.names import unit_of
 from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, library, replaced, scene, told
 
 GROUPS = replaced(
@@ -426,3 +428,50 @@ def test_what_no_link_obeys_is_refused_of_its_component(body: str, has: str, tmp
     ]
     text = replaced(KINDS, ("  contact: {", "  carried: {type: Link, clock: network}\n  contact: {"))
     assert [line.split()[1] for line in told(scene, text)] == ["E210"]
+
+
+SHAKEN = """\
+topology: shaken
+parameters: {f: 2 Hz, w: 4 rad/s}
+peers: {user: {count: 1}}
+masses: {device: {mass: 1 kg}}
+hands: {push: {type: SineForce, flange: device, force: 1 N, frequency: f, phase: 90 deg}}
+"""
+
+
+def test_what_counts_cycles_or_radians_is_shown_in_its_unit_everywhere() -> None:
+    found = compiled(SHAKEN)
+    units = {one.name: one.unit for one in found.parameters}
+    assert (units["f"], units["w"], units["push.frequency"], units["push.phase"]) == (
+        "Hz",
+        "rad/s",
+        "Hz",
+        "rad",
+    )
+    assert unit_of(found, "push.frequency") == "Hz"
+
+
+@pytest.mark.parametrize(
+    ("written", "told_of", "right"),
+    [
+        ("w", "w, which is in rad/s. Write: frequency: w/(2*pi)", "w/(2*pi)"),
+        ("2*(f + f) - f", "", ""),
+        ("w + w", "w + w, which is in rad/s. Write: frequency: (w + w)/(2*pi)", "(w + w)/(2*pi)/2"),
+    ],
+)
+def test_a_name_keeps_what_its_unit_counts(written: str, told_of: str, right: str) -> None:
+    line = messages(("frequency: f", f"frequency: {written}"), text=SHAKEN)
+    assert [one.partition("wants Hz, got ")[2] for one in line] == [told_of][: bool(told_of)]
+    if right:
+        found = scene(replaced(SHAKEN, ("frequency: f", f"frequency: {right}")))
+        frequency = dict(found.part("push").values)["frequency"].number
+        assert float(frequency) == pytest.approx(4 / (2 * math.pi))
+
+
+def test_no_name_of_a_topology_or_component_is_pi(tmp_path: Path) -> None:
+    assert messages(("f: 2 Hz", "pi: 3, f: 2 Hz"), text=SHAKEN) == [
+        "2:14: E205 pi is a word of the language and can't be a name."
+    ]
+    own = "component: Own\nparameters: {pi: {unit: 1}}\nconnectors: {a: Flange}\nequations: [a.f = 0]\n"
+    text = replaced(ONE_MASS, ("  device: {", "  other: {type: Own, pi: 3}\n  device: {"))
+    assert "E205 pi is a word" in told(lambda: scene(text, library(tmp_path, own)))[0]

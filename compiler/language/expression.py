@@ -108,6 +108,8 @@ class Vector(Spanned):
 
 V = TypeVar("V")
 
+PI = Fraction("3.1415926535897932384626433832795028841971693993751")  # OEIS A000796; the name `pi`
+
 Expr = Number | Name | Negate | Binary | Compare | Logic | Not | Call | Conditional | Vector
 
 
@@ -228,6 +230,8 @@ def _inside(expr: Expr, level: int) -> str:
 
 def _format_number(value: Fraction) -> tuple[str, int]:
     """Return the shortest exact decimal, or a quotient when there is none."""
+    if value == PI:
+        return "pi", Level.ATOM
     sign, level = ("-", Level.SIGN) if value < 0 else ("", Level.ATOM)
     numerator, denominator = abs(value.numerator), value.denominator
     twos = (denominator & -denominator).bit_length() - 1

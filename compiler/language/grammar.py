@@ -18,7 +18,7 @@ The grammar, loosest first; `^` and `**` are the same:
     sign        = ("-" | "+") sign | power
     power       = atom ["^" exponent]
     exponent    = ["-"] number | "(" ["-"] number ["/" number] ")"
-    atom        = number | name | function "(" expression {"," expression} ")" | "(" expression ")"
+    atom        = number | "pi" | name | function "(" expression {"," expression} ")" | "(" expression ")"
                 | "{" expression {"," expression} "}"
     name        = segment {"." segment},   segment = letter {letter | digit | "_"} ["[" integer "]"]
 """
@@ -35,6 +35,7 @@ from apc.compiler.language.expression import (
     FUNCTIONS,
     KEYWORDS,
     LEVELS,
+    PI,
     Binary,
     Call,
     Compare,
@@ -376,6 +377,8 @@ class _Parser:
     def name_or_call(self) -> Expr:
         token = self.step()
         if self.kind != "(":
+            if token.text == "pi":
+                return Number(PI, start=token.start, end=token.end)
             return Name(tuple(token.text.split(".")), start=token.start, end=token.end)
         function = token.text
         if function not in FUNCTIONS:

@@ -14,16 +14,19 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from fractions import Fraction
 from functools import lru_cache
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
+from apc.compiler.language.expression import PI
 from apc.compiler.language.unit_grammar import NAME, FaultError, parse_factor
-from apc.compiler.language.unit_names import COMMON, look_up, spelled
+from apc.compiler.language.unit_names import COMMON, look_up, spelled, turning
 from apc.compiler.words import cut
 
+TURN = 2 * PI  # a cycle in radians
 MAX_LENGTH = 200  # characters of a quantity
 MAX_NUMBER_EXPONENT = 300  # of 1e300: still a float
 
@@ -114,6 +117,8 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
     if found.unit.dimension == wanted.dimension and (
         found.unit != NO_UNIT or wanted.dimension == DIMENSIONLESS
     ):
+        if found.unit.dimension.clashes(wanted.dimension):
+            raise ApcError(_other_turning(found, wanted, place, what))
         return found
     number = _QUANTITY_START.match(text.strip())
     assert number is not None
@@ -125,6 +130,17 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
         got += f" ({name} is {spelled(name)}: case matters)"
     hint = f"{what}: {number.group().strip()}" + ("" if wanted.text == "1" else f" {right}")
     raise ApcError(Mistake("E204", place, what, named, got, hint))
+
+
+def _other_turning(found: Quantity, wanted: Unit, place: Place, what: str) -> Mistake:
+    """Return what is told of cycles where radians are due, or the reverse: 20 Hz are 125.66 rad/s."""
+    number = _QUANTITY_START.match(found.text.strip())
+    assert number is not None
+    turns = TURN if wanted.dimension.turning == "rad" else 1 / TURN
+    same = f"{float(found.value * turns / wanted.scale):.9g} {wanted.text}"
+    got = f"{cut(found.text.strip())}, which is {same}"
+    hint = f"{what}: {same}, or {what}: {number.group().strip()} {wanted.text}"
+    return Mistake("E204", place, what, wanted.text, got, hint)
 
 
 def _confused(unit: Unit, wanted: Dimension) -> tuple[str, str] | None:
@@ -201,4 +217,4 @@ def _unit(text: str) -> Unit:
     if len(text) > MAX_LENGTH:
         raise FaultError("E222", 0, "a unit", expected=f"at most {MAX_LENGTH} characters", got=f"{len(text)}")
     scale, dimension = parse_factor(text, look_up)
-    return Unit(text.strip(), scale, dimension)
+    return Unit(text.strip(), scale, replace(dimension, turning=turning(text)))

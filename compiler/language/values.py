@@ -194,6 +194,11 @@ def _expression(
         its = "has no unit" if found == DIMENSIONLESS else f"is in {format_dimension(found or dimension)}"
         got = f"{brief(text)}, which {its}"
         raise ApcError(Mistake("E204", place, what, unit, got, f"{what}: 1 {unit}"))
+    if found is not None and found.clashes(dimension):  # of a name, a sum or a choice: no product has it
+        got = f"{brief(text)}, which is in {format_dimension(found)}"
+        whole = format_expression(tree) if isinstance(tree, Name) else f"({format_expression(tree)})"
+        turned = f"2*pi*{whole}" if dimension.turning == "rad" else f"{whole}/(2*pi)"
+        raise ApcError(Mistake("E204", place, what, unit, got, f"{what}: {turned}"))
     return tree
 
 

@@ -329,7 +329,7 @@ def _check_column(
     column: Column, lines: tuple[int, ...], item: Number | Variable, mistakes: Mistakes
 ) -> None:
     """Check a column's unit, and each of its numbers against the parameter's bounds."""
-    if column.unit.dimension != item.unit.dimension:
+    if column.unit.dimension != item.unit.dimension or column.unit.dimension.clashes(item.unit.dimension):
         expected = format_dimension(item.unit.dimension)
         got = f"[{column.unit.text}]" if column.unit.text != "1" else "no unit"
         hint = f"{column.name} [{item.unit.text}]"

@@ -61,7 +61,7 @@ def parse_override(system: CompiledSystem, text: str, place: Place = OVERRIDE) -
             value, place.shifted(len(text) - len(value)) if place.line else place, what=name, unit=unit
         )
     except ApcError as error:  # what is to be written is a setting, too
-        mistakes = [replace(one, hint=one.hint.replace(f"{name}: ", f"{name}=", 1)) for one in error.mistakes]
+        mistakes = [replace(one, hint=one.hint.replace(f"{name}: ", f"{name}=")) for one in error.mistakes]
         raise ApcError(mistakes) from None
     return Override(free, found.value)
 
