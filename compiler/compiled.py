@@ -362,7 +362,7 @@ class CompiledSystem:
     """A compiled scene. `dropped` lists what the scene named but does not need, with the reason.
 
     `followers` are the names of all parameters and timings with a formula, of any group, in an order in which
-    each stands behind what it follows from.
+    each stands behind what it follows from. `warnings` say what the topology seldom means, and where.
     `region` are the axes x and y of the study of that name, empty or one if the scene leaves them open.
     """
 
@@ -379,6 +379,7 @@ class CompiledSystem:
     experiment: Experiment = Experiment()
     region: tuple[Axis, ...] = ()
     followers: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """Return what it is in a line."""

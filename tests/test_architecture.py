@@ -40,7 +40,7 @@ HOUSE = (
     ("apc.compiler.components", "component parts declarations component_check definitions library"),
     (
         "apc.compiler.scene",
-        "named_numbers timebase instances sections channels graphs links groups studies scene",
+        "named_numbers timebase instances sections channels graphs links groups oddities studies scene",
     ),
     (
         "apc.compiler.equations",
