@@ -49,11 +49,16 @@ def counts_peers(parameter: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """Ticks at `phase + k*period`, k = 0, 1, …; `period` and `phase` are names of timings."""
+    """Ticks at `phase + k*period`, k = 0, 1, …; `period` and `phase` are names of timings.
+
+    `line` and `column` say where in the topology its period stands, 0 if that isn't known.
+    """
 
     name: str
     period: str
     phase: str
+    line: int = 0
+    column: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

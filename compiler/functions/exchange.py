@@ -243,7 +243,8 @@ def used_clocks(
     for clock in scene.clocks:
         if clock.name in used:
             period = timings.use(f"{clock.name}.period", clock.period)
-            clocks.append(Clock(clock.name, period, timings.use(f"{clock.name}.phase", clock.phase)))
+            phase, place = timings.use(f"{clock.name}.phase", clock.phase), clock.period.place
+            clocks.append(Clock(clock.name, period, phase, place.line, place.column))
         else:
             dropped.append((clock.name, "nothing ticks with it"))
     return clocks, dropped

@@ -32,6 +32,7 @@ MAX_NUMBER_EXPONENT = 300  # of 1e300: still a float
 
 _NUMBER = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _QUANTITY_START = re.compile(rf"\s*[+-]?{_NUMBER}(?:\s*/\s*{_NUMBER})?")
+_EXPONENT = re.compile(r"\^-?[0-9]+|\*\*-?[0-9]+|[²³]")
 _NOT_FINITE = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
 
 
@@ -128,8 +129,25 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
     elif (confused := _confused(found.unit, wanted.dimension)) is not None:
         name, right = confused
         got += f" ({name} is {spelled(name)}: case matters)"
-    hint = f"{what}: {number.group().strip()}" + ("" if wanted.text == "1" else f" {right}")
+    else:
+        right = _meant(found.unit, wanted)
+    shown = number.group().strip()
+    hint = f"{what}: {shown} {right}".removesuffix(" 1") if right else ""
     raise ApcError(Mistake("E204", place, what, named, got, hint))
+
+
+def _meant(unit: Unit, wanted: Unit) -> str:
+    """Return a unit of the dimension that is wanted in which the number as written may be meant.
+
+    That is the unit without one of its exponents, or with a letter more, or failing that the one that is
+    wanted, if a value in it is as large: 5 N/mm^2 are not proposed as 5 N/m, a millionth of it.
+    """
+    texts = [unit.text[: one.start()] + unit.text[one.end() :] for one in _EXPONENT.finditer(unit.text)]
+    for name in NAME.findall(unit.text):
+        longer = (other for other in COMMON if other.startswith(name) and len(other) == len(name) + 1)
+        texts += [re.sub(rf"\b{re.escape(name)}\b", other, unit.text) for other in longer]
+    fitting = (text for text in texts if _unit(text).dimension == wanted.dimension)
+    return next(fitting, wanted.text if unit.scale == wanted.scale else "")
 
 
 def _other_turning(found: Quantity, wanted: Unit, place: Place, what: str) -> Mistake:

@@ -132,10 +132,9 @@ def check_keys(mapping: Mapping, allowed: Collection[str], what: str, mistakes: 
     for key, node in mapping.entries:
         if key.text not in allowed:
             told = f"{what} has no key {brief(key.text)}"
-            if key.text[:1].isdigit():  # 0,1 kg reads as 0 and a key
-                told += " (a comma ends a value: decimals want a point)"
-            add_unknown("E202", key.place, told, key.text, allowed, mistakes)
-            close = nearest(key.text, allowed)
+            left = [one for one in allowed if one not in meant]  # what stands there already was not meant
+            close = nearest(key.text, left)
+            add_unknown("E202", key.place, told, close, [close] if close else allowed, mistakes)
             if close and close not in meant:
                 meant[close] = (Scalar(close, close, key.plain, key.place), node)
     return Mapping(tuple(meant.values()), mapping.place)
