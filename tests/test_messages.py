@@ -1220,8 +1220,8 @@ def test_a_component_is_told_of_before_the_files_beside_it(tmp_path: Path, capsy
     assert [re.search(r"E\d+", one)[0] for one in lines] == ["E303", "E219"]  # type: ignore[index] # both have one
 
 
-# What stands in the first scene, what a user writes instead, the code and place of the one message, and what a
-# number is then by each line that it says to write.
+# What stands in the first scene, what a user writes instead, the code and place of the one message, and what
+# a number is then by each line that it says to write.
 HARMLESS = [
     ("mass: 0.1 kg", "mass: 0,1 kg", "9:18: E203", {"mass: 0.1 kg": ("device.mass", 0.1)}),
     ("1000 N/m", "5 N/mm^2", "12:76: E204", {"stiffness: 5 N/mm": ("contact.stiffness", 5000.0)}),
