@@ -29,7 +29,7 @@ E117 compiler/source: a YAML file has too many nodes
 E201 compiler/components compiler/scene: something due is left out
 E202 compiler/source: a key is not known where it stands
 E203 compiler/components compiler/scene compiler/source: a value has another form than is due
-E204 compiler/components compiler/language compiler/scene runtime/regions: a quantity has another unit than is due
+E204 compiler/components compiler/language compiler/scene runtime/regions: a quantity has a wrong unit
 E205 compiler/components compiler/scene compiler/source: a name is taken, or a word of the language
 E206 compiler/components compiler/language compiler/scene compiler/view: a name names nothing that is there
 E207 compiler/language compiler/scene runtime/cli: a number is out of its bounds

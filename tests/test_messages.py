@@ -1312,3 +1312,55 @@ def test_clocks_that_do_not_come_together_are_told_at_the_odd_one() -> None:
     text = replaced(AVERAGE, ("haptic: 1 ms", "haptic: 1.0001 ms"))
     [line] = told_of(lambda: analyze(compiled(text)))
     assert line.startswith("scene.yaml:4:11: E805 ")
+
+
+UNHELD = """\
+component: Unheld
+connectors: {a: Flange}
+parameters: {k: {unit: N/m}, clock: clock}
+equations: [a.f = k*sample(a.x)]
+"""
+
+
+def test_a_fault_of_a_component_is_told_once_however_many_parts_and_groups_have_it(tmp_path: Path) -> None:
+    text = replaced(
+        AVERAGE,
+        ("user: {count: 3}", "left: {count: 2, set: {contact.delay: 2 ms}}\n  right: {count: 1}"),
+        (
+            "couplers:\n",
+            "couplers:\n  one: {type: Unheld, a: device, k: 1 N/m, clock: haptic}\n"
+            "  two: {type: Unheld, a: cube, k: 1 N/m, clock: haptic}\n",
+        ),
+    )
+    [line] = told_of(lambda: compiled(text, library(tmp_path, UNHELD)))
+    assert "E505 one.a.f acts on what it is joined to at all times" in line
+
+
+def test_what_is_left_out_of_a_part_is_told_once_with_all_that_is_to_be_written() -> None:
+    text = replaced(
+        AVERAGE,
+        ("type: SampledSpringDamper, a: device, b: cube, ", "type: VirtualWall, "),
+        ("stiffness: 1000 N/m, clock: haptic, delay: 1 ms", ""),
+    )
+    first, *others = [line for line in told_of(compiled, text) if "E201" in line]
+    assert not others
+    hint = first.partition("Write: ")[2]
+    assert "has no stiffness" in first
+    assert hint.count(": ") > 1
+    assert not [
+        line
+        for line in told_of(
+            compiled, replaced(text, ("VirtualWall, ", f"VirtualWall, flange: device, {hint}"))
+        )
+        if "studies" not in line
+    ]
+
+
+def test_all_who_hear_nobody_are_told_at_once() -> None:
+    text = replaced(DEAF, ("user: {count: 3}", "near: {count: 2}, far: {count: 2}"))
+    [line] = told_of(compiled, text)
+    assert line.endswith(
+        "E801 far[1] and far[2] hear nobody over lan: there is no mean over nobody. "
+        "Write: an arc to each in its graph, or at: [near] in what uses lan"
+    )
+    assert not told_of(compiled, replaced(text, ("link: lan}}", "link: lan, at: [near]}}")))

@@ -116,7 +116,7 @@ def is_made(name: str) -> bool:
 
 def flatten(scene: Scene) -> FlatSystem:
     """Write out the equations of every kind. Raises ApcError with every mistake found on the way."""
-    mistakes = Mistakes()
+    mistakes = Mistakes(scene.names)
     delays = _delay_names(scene)
     structures: dict[object, list[SceneGroup]] = {}
     for group in scene.groups:

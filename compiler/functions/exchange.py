@@ -13,6 +13,7 @@ from fractions import Fraction
 from graphlib import TopologicalSorter
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apc.compiler.compiled import (
     PEERS,
@@ -45,6 +46,7 @@ from apc.compiler.scene.links import SceneLink
 from apc.compiler.scene.scene import Scene, SceneGroup
 
 NO_DELAY = "no delay"
+MOST_DEAF = 3  # names of peers that hear nobody
 LOSS_ABOUT = (
     "probability that a good link turns bad after a packet",
     "probability that a bad link turns good after a packet",
@@ -183,14 +185,33 @@ def check_heard(scene: Scene, kinds: Mapping[str, Kind]) -> None:
         deaf = np.repeat([bool(one) for one in taken], counts)
         deaf[receivers[np.repeat(sends, counts)[senders]]] = False
         if deaf.any():
-            first = int(deaf.argmax())
             starts = np.cumsum([0, *counts])
-            place = int(np.searchsorted(starts, first, "right")) - 1
-            name = f"{scene.groups[place].name}[{first - starts[place] + 1}]"
-            what = f"{name} hears nobody over {link.name}: there is no {taken[place]} over nobody"
-            hint = f"an arc to {name} in its graph"
+            alone = [
+                group.name
+                for group, start in zip(scene.groups, starts, strict=False)
+                if deaf[start : start + group.count].all()
+            ]
+            places = np.flatnonzero(deaf)
+            named = [
+                f"{scene.groups[of].name}[{one - starts[of] + 1}]"
+                for one in places[:MOST_DEAF].tolist()
+                for of in (_group_of(one, starts),)
+            ]
+            more = [f"{len(places) - MOST_DEAF} more"] if len(places) > MOST_DEAF else []
+            names = " and ".join(filter(None, (", ".join((*named, *more)[:-1]), (*named, *more)[-1])))
+            hear, operator = "hears" if len(places) == 1 else "hear", taken[_group_of(int(places[0]), starts)]
+            what = f"{names} {hear} nobody over {link.name}: there is no {operator} over nobody"
+            others = [group.name for group in scene.groups if group.name not in alone]
+            hint = f"an arc to {'each' if len(places) > 1 else named[0]} in its graph"
+            if alone and others:
+                hint += f", or at: [{', '.join(others)}] in what uses {link.name}"
             mistakes.add("E801", link.place, what, hint=hint)
     mistakes.raise_if_any()
+
+
+def _group_of(peer: int, starts: NDArray[np.int64]) -> int:
+    """Return the place of the group that a peer is of, counted from 0 over the groups in order."""
+    return int(np.searchsorted(starts, peer, "right")) - 1
 
 
 def _taken(kind: Kind, link: str) -> str:

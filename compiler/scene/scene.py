@@ -94,6 +94,11 @@ class Scene:
         """The number of peers."""
         return sum(group.count for group in self.groups)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of its groups and parts."""
+        return (*(group.name for group in self.groups), *(part.name for part in self.parts))
+
     def part(self, name: str) -> Part:
         """Return the part of this name."""
         return next(part for part in self.parts if part.name == name)
@@ -168,6 +173,7 @@ def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene |
     named = root.get("parameters")
     bodies = read_counts(peers, files, lambda node: read_count_by_names(node, named, mistakes))
     counts = {name: group.count for name, group in bodies.items()}
+    mistakes.names = tuple(counts)
     numbers = read_named_numbers(named, sum(counts.values()), mistakes)
     clocks = read_clocks(root.get("clocks"), numbers, {*numbers.values, *counts}, mistakes)
     sections = PartSections(root, library, {*numbers.values, *counts, *clocks}, mistakes)
