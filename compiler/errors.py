@@ -131,7 +131,7 @@ class ApcError(Exception):
 class Mistakes:
     """Collects mistakes so that a file's faults are reported together.
 
-    `names` are those of parts and groups: what differs by one of them alone, of the same code at the same place,
+    `names` are those of parts and groups: what differs by one of them alone, of one code at one place,
     is one mistake. A component's text is at fault once, however many parts are of it.
     """
 

@@ -21,6 +21,7 @@ from apc.compiler.errors import Mistakes, Place, place_in
 from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import (
+    INTERVAL,
     SMOOTH,
     Binary,
     Call,
@@ -401,6 +402,8 @@ class _Instance:
 
     def _name(self, node: Name) -> Expr:
         head = node.parts[0]
+        if head.startswith(INTERVAL):
+            return Name((self.references[head.removeprefix(INTERVAL)[:-1]], "period"))
         if node.parts in (("peers",), ("time",)):
             return Name(node.parts)
         if any(table.name == head for table in self.part.tables) and len(node.parts) == 1:

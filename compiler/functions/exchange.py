@@ -55,12 +55,18 @@ LOSS_ABOUT = (
 )
 
 
+def period_of(clock: str) -> str:
+    """Return the name of a clock's period among timings and parameters."""
+    return f"{clock}.period"
+
+
 class Timings:
     """The periods, phases and delays that the model refers to, each once."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self._parts = {part.name: dict(part.values) for part in scene.parts}
+        self._periods = {period_of(clock.name): clock.period for clock in scene.clocks}
         self._found: dict[str, Timing] = {}
 
     @property
@@ -98,6 +104,8 @@ class Timings:
 
     def _parameter(self, name: str, own: dict[str, tuple[str, Value]]) -> str:
         """Register a delay parameter, under the group's name if it sets its own."""
+        if name in self._periods:
+            return self.use(name, self._periods[name])
         if name not in own:
             part, _, parameter = name.rpartition(".")
             return self.use(name, self._parts[part][parameter])
@@ -263,7 +271,7 @@ def used_clocks(
     clocks, dropped = [], []
     for clock in scene.clocks:
         if clock.name in used:
-            period = timings.use(f"{clock.name}.period", clock.period)
+            period = timings.use(period_of(clock.name), clock.period)
             phase, place = timings.use(f"{clock.name}.phase", clock.phase), clock.period.place
             clocks.append(Clock(clock.name, period, phase, place.line, place.column))
         else:
@@ -421,6 +429,13 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
                 )
                 for (name, value), about in zip(link.channel.loss, LOSS_ABOUT, strict=False)
             }
+    for clock in scene.clocks:
+        if (name := period_of(clock.name)) in needed:  # by `interval`; the timing of this name is the same number
+            value, about = clock.period, f"from one tick of {clock.name} to the next"
+            formula = _formula(value.expression)
+            found[name] = Parameter(
+                *(name, "s", float(value.number), formula, 0.0, True), about=about, exact=value.number
+            )
     for group in scene.groups:
         name = group_count(group.name)
         formula = _formula(None if group.counted is None else group.counted.expression)

@@ -50,6 +50,7 @@ from apc.compiler.language.expression import (
     Number,
     Vector,
     format_expression,
+    interval_of,
 )
 from apc.compiler.language.lexer import Token, tokens
 from apc.compiler.words import cut
@@ -391,6 +392,11 @@ class _Parser:
         arguments = self.arguments(")", f"an argument of {function}")
         end = self.expect(")", f"{function}(").end
         self.check_count(function, len(arguments), token.start)
+        if function == "interval":
+            clock = arguments[0]
+            if not (isinstance(clock, Name) and len(clock.parts) == 1):
+                self.fail("E325", function, "the name of a clock", self.said(clock), at=clock.start)
+            return Name((interval_of(clock.parts[0]),), start=token.start, end=end)
         return self.built(Call(function, arguments, start=token.start, end=end), *arguments)
 
     def arguments(self, close: str, each: str) -> tuple[Expr, ...]:
