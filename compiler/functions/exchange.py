@@ -430,7 +430,7 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
                 for (name, value), about in zip(link.channel.loss, LOSS_ABOUT, strict=False)
             }
     for clock in scene.clocks:
-        if (name := period_of(clock.name)) in needed:  # by `interval`; the timing of this name is the same number
+        if (name := period_of(clock.name)) in needed:  # by `interval`: the same number as the timing
             value, about = clock.period, f"from one tick of {clock.name} to the next"
             formula = _formula(value.expression)
             found[name] = Parameter(
