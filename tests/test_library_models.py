@@ -21,6 +21,7 @@ from apc.compiler.components.library import Library
 from apc.compiler.pipeline import compile_topology
 from apc.frame.overrides import apply, parse_override
 from apc.simulation.trajectory import simulate
+from apc.vary.critical import critical
 from tests.topologies import MESH, ONE_MASS, SCENES, compiled, library, replaced, scene, told
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -684,6 +685,8 @@ def test_a_filter_of_ones_own_has_the_period_of_the_clock_each_group_names(tmp_p
                             ("slow.period=4 ms", ("slow: 5 ms", "slow: 4 ms"))):  # fmt: skip
         written = compiled(replaced(FILTERED, period), own)
         assert _motion(_set(system, setting)) == _motion(written)
+    stiffest = [critical(one, "wall.stiffness").value for one in (_set(system, setting), written)]
+    assert stiffest[0] == stiffest[1]
     assert {one.name: one.exact for one in system.parameters if one.name.endswith(".period")} == {
         "haptic.period": Fraction(1, 1000),
         "slow.period": Fraction(1, 200),

@@ -11,9 +11,11 @@ import pytest
 from apc.compiler.compiled import Experiment
 from apc.compiler.language.expression import format_expression
 from apc.compiler.scene.groups import LARGEST_COUNT
+from apc.compiler.scene.scene import build_scene
+from apc.compiler.source.source import parse_source
 from apc.compiler.store import save
 from apc.frame.names import unit_of
-from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, library, replaced, scene, told
+from tests.topologies import AVERAGE, MESH, ONE_MASS, built_in, compiled, library, replaced, scene, told
 
 GROUPS = replaced(
     AVERAGE,
@@ -475,3 +477,13 @@ def test_no_name_of_a_topology_or_component_is_pi(tmp_path: Path) -> None:
     own = "component: Own\nparameters: {pi: {unit: 1}}\nconnectors: {a: Flange}\nequations: [a.f = 0]\n"
     text = replaced(ONE_MASS, ("  device: {", "  other: {type: Own, pi: 3}\n  device: {"))
     assert "E205 pi is a word" in told(lambda: scene(text, library(tmp_path, own)))[0]
+
+
+def test_a_table_tells_cycles_and_radians_apart(tmp_path: Path) -> None:
+    (tmp_path / "users.csv").write_text("push.frequency [rad/s]\n1\n2\n", encoding="utf-8")
+    text = replaced(SHAKEN, ("user: {count: 1}", "user: {table: users.csv}"))
+    read = parse_source(text.encode(), file="scene.yaml", path=tmp_path / "scene.yaml")
+    [line] = told(build_scene, read, built_in())
+    assert line.partition("E702 ")[2] == (
+        "the heading push.frequency wants [Hz], got [rad/s]. Write: push.frequency [Hz], each divided by 2*pi"
+    )

@@ -179,8 +179,9 @@ def _refuse_computed(text: str, place: Place, what: str, unit: str) -> None:
     found = _COMPUTED.fullmatch(text.strip())
     if found is None or is_quantity(text) or not found["numbers"].strip():
         return
+    none: dict[tuple[str, ...], Fraction] = {}  # a name has no value here
     try:
-        number = evaluate(parse_expression(found["numbers"], place), {}.__getitem__)
+        number = evaluate(parse_expression(found["numbers"], place), none.__getitem__)
         if parse_unit(found["unit"], place).dimension != parse_unit(unit, place).dimension:
             return
     except ApcError:

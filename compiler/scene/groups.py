@@ -333,6 +333,8 @@ def _check_column(
         expected = format_dimension(item.unit.dimension)
         got = f"[{column.unit.text}]" if column.unit.text != "1" else "no unit"
         hint = f"{column.name} [{item.unit.text}]"
+        if column.unit.dimension.clashes(item.unit.dimension):
+            hint += f", each {'divided by' if expected == 'Hz' else 'times'} 2*pi"
         mistakes.add(
             "E702", column.place, f"the heading {column.name}", expected=f"[{expected}]", got=got, hint=hint
         )
