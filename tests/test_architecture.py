@@ -29,7 +29,7 @@ HOUSE = (
         "apc.compiler",
         "frozen errors digits timings files words multiples weights plain compiled crowd formula seal cache",
     ),
-    ("apc.compiler.source", "nodes yaml_faults compose source reading"),
+    ("apc.compiler.source", "nodes yaml_faults reading compose source"),
     (
         "apc.compiler.language",
         """

@@ -1224,6 +1224,10 @@ def test_a_component_is_told_of_before_the_files_beside_it(tmp_path: Path, capsy
 # a number is then by each line that it says to write.
 HARMLESS = [
     ("mass: 0.1 kg", "mass: 0,1 kg", "9:18: E203", {"mass: 0.1 kg": ("device.mass", 0.1)}),
+    ("haptic: 1 ms", "haptic: 0,5 ms", "4:11: E221", {"haptic: 0.5 ms": ("haptic.period", 0.0005)}),
+    ("1000 N/m", "1,500 N/m", "12:76: E203",
+     {"stiffness: 1.500 N/m": ("contact.stiffness", 1.5),
+      "stiffness: 1500 N/m": ("contact.stiffness", 1500.0)}),
     ("1000 N/m", "5 N/mm^2", "12:76: E204", {"stiffness: 5 N/mm": ("contact.stiffness", 5000.0)}),
     ("1000 N/m", "5 N/m^2", "12:76: E204", {"stiffness: 5 N/m": ("contact.stiffness", 5.0)}),
     ("1000 N/m", "5 kJ", "12:76: E204", {}),

@@ -23,7 +23,7 @@ from apc.compiler.language.unit_text import format_dimension, format_si
 from apc.compiler.language.units import parse_quantity, parse_unit, quantity
 from apc.compiler.language.vectors import number_of
 from apc.compiler.source.nodes import Node, Scalar
-from apc.compiler.source.reading import add_unknown, brief, read_text
+from apc.compiler.source.reading import add_unknown, brief, either_comma, read_text
 
 PEERS = ("peers",)
 
@@ -36,6 +36,7 @@ _QUANTITY = re.compile(
 )
 # 1 000 N/m; and 2*pi*100 N/m, a product of numbers alone with a unit behind it.
 _SPACED = re.compile(r"[+-]?[0-9]{1,3}([ _'\u00a0\u2009][0-9]{3})+(?![0-9])")
+_COMMA = re.compile(r"([+-]?[0-9]+),([0-9]+)([^0-9,].*)?", re.DOTALL)
 _COMPUTED = re.compile(r"(?P<numbers>[-+*/^().\d\s]*(?:pi[-+*/^().\d\s]*)*)(?P<unit>[^\W\d_°%µΩ].*)")
 _WORD_NUMBER = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
 
@@ -147,7 +148,7 @@ def read_binding(
     if text in named:
         return Binding(named[text], None, dimension, node.place)
     try:
-        _refuse_spaces(text, node.place, what)
+        _refuse_marks(text, node.place, what)
         _refuse_computed(text, node.place, what, unit)
         if is_quantity(text):
             _refuse_mixture(text, node.place, what, names_known)
@@ -166,8 +167,11 @@ def read_binding(
         return None
 
 
-def _refuse_spaces(text: str, place: Place, what: str) -> None:
-    """Raise ApcError for a number whose thousands are set apart."""
+def _refuse_marks(text: str, place: Place, what: str) -> None:
+    """Raise ApcError for a number with a decimal comma, or whose thousands are set apart."""
+    if (found := _COMMA.fullmatch(text.strip())) is not None:
+        hint = either_comma(what, found[1], found[2], found[3])
+        raise ApcError(Mistake("E221", place, what, "a decimal point", brief(text), hint))
     if (found := _SPACED.match(text.strip())) is not None:
         joined = re.sub(r"[^0-9+-]", "", found[0]) + text.strip()[found.end() :]
         told = "a number without spaces or marks inside"

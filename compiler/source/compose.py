@@ -18,6 +18,7 @@ import yaml
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, nearest
 from apc.compiler.frozen import dataclass
 from apc.compiler.source.nodes import Lines, Mapping, Node, Scalar, Sequence
+from apc.compiler.source.reading import either_comma
 from apc.compiler.source.yaml_faults import NO_COLON, not_yaml, with_colon
 from apc.compiler.words import cut
 
@@ -30,6 +31,7 @@ _CORE = "tag:yaml.org,2002:"
 _INTEGER = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _WHOLE = re.compile(r"[-+]?[0-9]+")
+_DIGITS = re.compile(r"[0-9]+")
 _WORDS: dict[str, bool | float | None] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL")),
     **dict.fromkeys(("true", "True", "TRUE"), True),
@@ -174,7 +176,9 @@ class _Composer:
                 if key.text[:1].isdigit() and isinstance(given, Scalar) and _WHOLE.fullmatch(given.text):
                     assert before is not None
                     name, number = before[0].text, f"{given.text},{key.text}"
-                    hint = f"{name}: {given.text}.{key.text}"
+                    digits = _DIGITS.match(key.text)
+                    assert digits is not None
+                    hint = either_comma(name, given.text, digits[0], key.text[digits.end() :])
                     self.mistakes.add(
                         "E203", given.place, name, expected="a decimal point", got=number, hint=hint
                     )

@@ -27,6 +27,13 @@ def form(node: Node) -> str:
     return brief(node.text) if node.plain else f'"{brief(node.text)}"'
 
 
+def either_comma(key: str, whole: str, digits: str, rest: str | None) -> str:
+    """Return what to write for a number with a comma: 0,5 is 0.5, and 1,500 may be 1500 as well."""
+    decimal = f"{key}: {whole}.{digits}{rest or ''}"
+    thousands = len(digits) == 3 and whole.lstrip("+-0")
+    return f"{decimal}, or {key}: {whole}{digits}{rest or ''}" if thousands else decimal
+
+
 def brief(text: str) -> str:
     """Return a text short enough for one line of a message."""
     flat = " ".join(text.split())
