@@ -12,7 +12,7 @@ language                    expression, lexer, grammar: text to trees; evaluatio
                             probes: of what ping and irtt wrote
 components                  component, parts, declarations, component_check, definitions, library
 scene                       named_numbers, timebase, instances, sections, channels, graphs, links, groups,
-                            studies: a section each; scene: all of them
+                            studies: a section each; oddities: warnings; scene: all of them
 equations                   connections: where connectors meet; flatten
                             reductions: what is heard of the others; clock_inference: what ticks together;
                             clocks

@@ -49,11 +49,16 @@ def counts_peers(parameter: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """Ticks at `phase + k*period`, k = 0, 1, …; `period` and `phase` are names of timings."""
+    """Ticks at `phase + k*period`, k = 0, 1, …; `period` and `phase` are names of timings.
+
+    `line` and `column` say where in the topology its period stands, 0 if that isn't known.
+    """
 
     name: str
     period: str
     phase: str
+    line: int = 0
+    column: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -362,7 +367,7 @@ class CompiledSystem:
     """A compiled scene. `dropped` lists what the scene named but does not need, with the reason.
 
     `followers` are the names of all parameters and timings with a formula, of any group, in an order in which
-    each stands behind what it follows from.
+    each stands behind what it follows from. `warnings` say what the topology seldom means, and where.
     `region` are the axes x and y of the study of that name, empty or one if the scene leaves them open.
     """
 
@@ -379,6 +384,7 @@ class CompiledSystem:
     experiment: Experiment = Experiment()
     region: tuple[Axis, ...] = ()
     followers: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """Return what it is in a line."""

@@ -8,6 +8,7 @@ Does not: print, or decide exit codes.
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections.abc import Iterable
 from dataclasses import replace
@@ -128,9 +129,14 @@ class ApcError(Exception):
 
 
 class Mistakes:
-    """Collects mistakes so that a file's faults are reported together."""
+    """Collects mistakes so that a file's faults are reported together.
 
-    def __init__(self) -> None:
+    `names` are those of parts and groups: what differs by one of them alone, of one code at one place,
+    is one mistake. A component's text is at fault once, however many parts are of it.
+    """
+
+    def __init__(self, names: Iterable[str] = ()) -> None:
+        self.names = tuple(names)
         self._found: dict[Mistake, None] = {}
 
     def add(
@@ -161,7 +167,9 @@ class Mistakes:
     def raise_if_any(self) -> None:
         """Raise `ApcError` with all mistakes in file order, if there is one."""
         if self._found:
-            raise ApcError(sorted(self._found, key=lambda mistake: (mistake.place, mistake.code)))
+            named = re.compile(rf"(?<!\w)({'|'.join(map(re.escape, self.names)) or 'no name'})(?!\w)")
+            once = {(one.place, one.code, named.sub("…", one.sentence)): one for one in reversed(self._found)}
+            raise ApcError(sorted(once.values(), key=lambda mistake: (mistake.place, mistake.code)))
 
 
 def nearest(name: str, known: Iterable[str], *, alike: float = 0.6) -> str:

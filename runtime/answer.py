@@ -62,7 +62,8 @@ class Answer(Result):
     one was asked for. `network` is the verdict over the network as it is, with what moves the growth of mean
     squares and how far that lets each number grow; None where all packets are on time.
     `switching` says whether contacts may open and close at will, None where nothing switches; `buzz` is None
-    where it was not asked for, and where there is none to predict, which `no_buzz` says.
+    where it was not asked for, and where there is none to predict, which `no_buzz` says. `warnings` are those
+    of the topology.
     """
 
     shown_by = "analysis:answer"
@@ -78,6 +79,7 @@ class Answer(Result):
     detailed: bool
     box: BoxProof | None
     no_buzz: str = ""
+    warnings: tuple[str, ...] = ()
 
 
 def judge(
@@ -161,6 +163,7 @@ def answer(
         detailed=every_convention,
         box=proved_box(system, box) if box else None,
         no_buzz=no_buzz,
+        warnings=system.warnings,
     )
 
 

@@ -14,7 +14,7 @@ clocks: {tick: 1 ms}
 peers: {user: {count: 1}}
 masses: {device: {mass: 0.1 kg, damping: 5 N*s/m, x: 1 mm}}
 couplers:
-  it: {type: VirtualWall, flange: device, stiffness: 900 N/m, clock: tick, period: 1 ms, x: 1 mm}
+  it: {type: VirtualWall, flange: device, stiffness: 900 N/m, clock: tick, x: 1 mm}
 """
 
 

@@ -29,7 +29,7 @@ HOUSE = (
         "apc.compiler",
         "frozen errors digits timings files words multiples weights plain compiled crowd formula seal cache",
     ),
-    ("apc.compiler.source", "nodes yaml_faults compose source reading"),
+    ("apc.compiler.source", "nodes yaml_faults reading compose source"),
     (
         "apc.compiler.language",
         """
@@ -40,7 +40,7 @@ HOUSE = (
     ("apc.compiler.components", "component parts declarations component_check definitions library"),
     (
         "apc.compiler.scene",
-        "named_numbers timebase instances sections channels graphs links groups studies scene",
+        "named_numbers timebase instances sections channels graphs links groups oddities studies scene",
     ),
     (
         "apc.compiler.equations",

@@ -141,7 +141,7 @@ clocks: {tick: 1 ms}
 peers: {user: {count: 1}}
 masses: {device: {mass: 0.1 kg, damping: 2 N*s/m}}
 couplers:
-  it: {type: VirtualWall, flange: device, stiffness: 1500 N/m, clock: tick, period: 1 ms, delay: 1 ms}
+  it: {type: VirtualWall, flange: device, stiffness: 1500 N/m, clock: tick, delay: 1 ms}
 hands: {hand: {type: ConstantForce, flange: device, force: 3 N}}
 """
 
@@ -231,7 +231,7 @@ clocks: {haptic: 1 ms}
 peers: {user: {count: 1}}
 masses: {device: {mass: 0.1 kg, damping: 1 N*s/m, x: 1 mm}}
 couplers:
-  wall: {type: VirtualWall, flange: device, stiffness: 5000 N/m, clock: haptic, period: 1 ms, x: 1 mm}
+  wall: {type: VirtualWall, flange: device, stiffness: 5000 N/m, clock: haptic, x: 1 mm}
 hands: {push: {type: ConstantForce, flange: device, force: FORCE}}
 """
 

@@ -29,7 +29,7 @@ E117 compiler/source: a YAML file has too many nodes
 E201 compiler/components compiler/scene: something due is left out
 E202 compiler/source: a key is not known where it stands
 E203 compiler/components compiler/scene compiler/source: a value has another form than is due
-E204 compiler/components compiler/language runtime/regions: a quantity has another unit than is due
+E204 compiler/components compiler/language compiler/scene runtime/regions: a quantity has a wrong unit
 E205 compiler/components compiler/scene compiler/source: a name is taken, or a word of the language
 E206 compiler/components compiler/language compiler/scene compiler/view: a name names nothing that is there
 E207 compiler/language compiler/scene runtime/cli: a number is out of its bounds
@@ -53,6 +53,10 @@ E225 compiler/language: a unit's exponent or scale is too large
 E226 compiler/language: a quantity is too large for a number
 E261 compiler/scene: a number is no probability
 E262 compiler/scene: words about a link's packets contradict or lack one another
+W271 compiler/scene: nobody uses a link
+W272 compiler/scene: a mass is joined to nothing
+W273 compiler/scene: nothing couples copies
+W274 compiler/scene: a mass that follows the others is not shared
 E303 compiler/components: an equation names what is not there
 E321 compiler/language: a character can't stand in an expression
 E322 compiler/language: an expression's form is wrong
@@ -233,7 +237,7 @@ def told() -> dict[str, frozenset[str]]:
             parts = path.relative_to(ROOT).parts
             room = "/".join(parts[:2]) if len(parts) > 2 else top
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Constant) and re.fullmatch(r"E\d{3}", str(node.value)):
+                if isinstance(node, ast.Constant) and re.fullmatch(r"[EW]\d{3}", str(node.value)):
                     found[str(node.value)] = found.get(str(node.value), frozenset()) | {room}
     return found
 
@@ -252,5 +256,5 @@ def test_what_a_docstring_says_is_raised_can_be_raised() -> None:
     known = {code for code, _, _ in catalogue()}
     for top in ("compiler", "runtime"):
         for path in (ROOT / top).rglob("*.py"):
-            named = set(re.findall(r"\bE\d{3}\b", path.read_text(encoding="utf-8")))
+            named = set(re.findall(r"\b[EW]\d{3}\b", path.read_text(encoding="utf-8")))
             assert named <= known, f"{path}: {named - known}"

@@ -87,7 +87,7 @@ clocks: {tick: 1 ms}
 peers: {user: {count: 1}}
 masses: {device: {mass: 0.1 kg, damping: 1 N*s/m}}
 couplers:
-  wall: {type: VirtualWall, flange: device, position: 5 mm, stiffness: 500 N/m, clock: tick, period: 1 ms}
+  wall: {type: VirtualWall, flange: device, position: 5 mm, stiffness: 500 N/m, clock: tick}
 hands: {push: {type: ConstantForce, flange: device, force: 1 N}}
 """
 

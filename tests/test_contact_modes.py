@@ -130,7 +130,7 @@ def test_walls_and_contacts_are_switched_together_and_one_by_one() -> None:
         (
             "  coordination:",
             "  wall: {type: EnclosureWalls, flange: cube, low: -100 mm, high: 100 mm,"
-            " stiffness: 500 N/m, clock: haptic, period: 1 ms}\n  coordination:",
+            " stiffness: 500 N/m, clock: haptic}\n  coordination:",
         ),
     )
     found = contact_modes(compiled(walled))

@@ -377,3 +377,12 @@ def test_a_tower_of_powers_ends(text: str) -> None:
         assert value(text) == 0  # what is too small for a float is zero
     except ApcError as error:
         assert "E331" in str(error)
+
+
+def test_pi_is_a_number_of_the_language() -> None:
+    assert float(value("2*pi*x", x=Fraction(1, 2))) == math.pi
+    assert format_expression(parse("2*pi*x - pi/2")) == "2*pi*x - pi/2"
+    assert parse("pi.x") == Name(("pi", "x"))
+    assert parse("pie") == Name(("pie",))
+    assert "E325 there is no function pi" in refusal("pi(x)")
+    assert "E326" in refusal("x^pi")

@@ -134,7 +134,7 @@ masses:
   cube: {{mass: 0.3 kg, damping: 5 N*s/m}}
 couplers:
   near: {{type: SampledSpringDamper, a: device, b: cube, stiffness: 800 N/m, clock: fast, delay: {late}}}
-  wall: {{type: VirtualWall, flange: cube, stiffness: 90 N/m, damping: 1 N*s/m, period: {slow}, clock: slow}}
+  wall: {{type: VirtualWall, flange: cube, stiffness: 90 N/m, damping: 1 N*s/m, clock: slow}}
   far: {{type: AveragePosition, object: cube, stiffness: 300 N/m, damping: 2 N*s/m, clock: fast, link: lan}}
 links: {{lan: {{clock: network, delay: {delay}}}}}
 """

@@ -31,7 +31,7 @@ couplers:
   contact:      {type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic,
                  delay: 1 ms}
   coordination: {type: DeadReckoning, object: cube, stiffness: 200 N/m, damping: 5 N*s/m,
-                 threshold: 0.1 mm, clock: haptic, period: 1 ms, delay: 1 ms, link: lan}
+                 threshold: 0.1 mm, clock: haptic, delay: 1 ms, link: lan}
 links: {lan: {clock: network, delay: 8 ms, loss: 0 %}}
 hands: {arm: {type: SpringDamperArm, flange: device, stiffness: 100 N/m, damping: 2 N*s/m}}
 """

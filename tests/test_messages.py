@@ -9,9 +9,11 @@ from typing import Any
 import pytest
 
 from apc.__main__ import run
+from apc.analysis.analysis import analyze
 from apc.compiler.errors import ApcError
 from apc.compiler.language.expression import FUNCTIONS
 from apc.compiler.pipeline import check_definition, run_stages
+from apc.frame.overrides import parse_override
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 from tests.topologies import told as told_of
 
@@ -62,12 +64,12 @@ TOPOLOGY = [
     (
         "haptic: 1 ms",
         "haptic: 1",
-        "4:11: E204 haptic wants ms, got 1 (no unit). Write: haptic: 1 ms",
+        "4:11: E204 haptic wants a time or a rate, got 1 (no unit). Write: haptic: 1 ms, or haptic: 1 Hz",
     ),
     (
         "haptic: 1 ms",
         "haptic: 1 kg",
-        "4:11: E204 haptic wants ms, got 1 kg. Write: haptic: 1 ms",
+        "4:11: E204 haptic wants ms, got 1 kg.",
     ),
     (
         "haptic: 1 ms",
@@ -122,8 +124,7 @@ TOPOLOGY = [
     (
         "haptic: 1 ms",
         "haptic:1 ms",
-        "5:10: E109 a ': ' cannot stand here: the line above ends wrongly, or the text needs "
-        "quotes. Write: key: 'text: with a colon'",
+        "4:3: E109 a key stands here without its colon and a space. Write: haptic: 1 ms",
     ),
     (
         "user: {count: 3}",
@@ -931,9 +932,7 @@ def test_the_line_is_shown_with_a_caret_under_the_place(
 ) -> None:
     text = replaced(AVERAGE, ("haptic: 1 ms", "haptic: 1 kg"))
     assert told(tmp_path, monkeypatch, {"scene.yaml": text}) == [
-        "scene.yaml:4:11: E204 haptic wants ms, got 1 kg. Write: haptic: 1 ms\n"
-        "      haptic: 1 kg\n"
-        "              ^"
+        "scene.yaml:4:11: E204 haptic wants ms, got 1 kg.\n      haptic: 1 kg\n              ^"
     ]
 
 
@@ -989,7 +988,7 @@ def test_all_mistakes_of_a_file_come_together_in_its_order_each_once(
         ("studies:", "experiment: {seed: x}\nstudies:"),
     )
     assert [one.splitlines()[0] for one in told(tmp_path, monkeypatch, {"scene.yaml": text})] == [
-        "scene.yaml:4:11: E204 haptic wants ms, got 1 kg. Write: haptic: 1 ms",
+        "scene.yaml:4:11: E204 haptic wants ms, got 1 kg.",
         "scene.yaml:5:12: E207 the period of clock network wants more than 0 s, got 0 s. Write: "
         "network: 1 ms",
         "scene.yaml:7:26: E206 set names device.mas, which is no parameter or variable of a part; "
@@ -1219,3 +1218,153 @@ def test_a_component_is_told_of_before_the_files_beside_it(tmp_path: Path, capsy
     assert run(["check", str(tmp_path / "own.yaml")]) == 1
     lines = [one for one in capsys.readouterr().err.splitlines() if one.startswith(str(tmp_path))]
     assert [re.search(r"E\d+", one)[0] for one in lines] == ["E303", "E219"]  # type: ignore[index] # both have one
+
+
+# What stands in the first scene, what a user writes instead, the code and place of the one message, and what
+# a number is then by each line that it says to write.
+HARMLESS = [
+    ("mass: 0.1 kg", "mass: 0,1 kg", "9:18: E203", {"mass: 0.1 kg": ("device.mass", 0.1)}),
+    ("haptic: 1 ms", "haptic: 0,5 ms", "4:11: E221", {"haptic: 0.5 ms": ("haptic.period", 0.0005)}),
+    ("1000 N/m", "1,500 N/m", "12:76: E203",
+     {"stiffness: 1.500 N/m": ("contact.stiffness", 1.5),
+      "stiffness: 1500 N/m": ("contact.stiffness", 1500.0)}),
+    ("1000 N/m", "5 N/mm^2", "12:76: E204", {"stiffness: 5 N/mm": ("contact.stiffness", 5000.0)}),
+    ("1000 N/m", "5 N/m^2", "12:76: E204", {"stiffness: 5 N/m": ("contact.stiffness", 5.0)}),
+    ("1000 N/m", "5 kJ", "12:76: E204", {}),
+    ("1000 N/m", "1 000 N/m", "12:76: E221", {"stiffness: 1000 N/m": ("contact.stiffness", 1000.0)}),
+    ("1000 N/m", "12'500.5 N/m", "12:76: E221", {"stiffness: 12500.5 N/m": ("contact.stiffness", 12500.5)}),
+    ("1000 N/m", "2*pi*100 N/m", "12:76: E204",
+     {"stiffness: 628.318531 N/m": ("contact.stiffness", 628.318531)}),
+    ("1000 N/m", "(1 + 2)/4 kN/m", "12:76: E204", {"stiffness: 0.75 kN/m": ("contact.stiffness", 750.0)}),
+    ("1000 N/m", "1000", "12:76: E204", {"stiffness: 1000 N/m": ("contact.stiffness", 1000.0)}),
+    ("mass: 0.1 kg", "mass: 100 gr", "9:22: E223", {"g": ("device.mass", 0.1)}),
+    ("mass: 0.1 kg", "mass: 0.1 Kg", "9:22: E223", {"kg": ("device.mass", 0.1)}),
+    ("damping: 5 N*s/m}\n  cube", "damping: 5 Ns/m}\n  cube", "9:37: E223", {"N*s": ("device.damping", 5.0)}),
+    ("haptic: 1 ms", "haptic: 1000", "4:11: E204",
+     {"haptic: 1000 Hz": ("haptic.period", 0.001), "haptic: 1000 ms": ("haptic.period", 1.0)}),
+    ("haptic: 1 ms", "haptic: 2", "4:11: E204",
+     {"haptic: 2 ms": ("haptic.period", 0.002), "haptic: 2 Hz": ("haptic.period", 0.5)}),
+    ("haptic: 1 ms", "haptic: 1 m", "4:11: E204", {"haptic: 1 ms": ("haptic.period", 0.001)}),
+    ("haptic: 1 ms", "haptic: 8 Ms", "4:13: E223", {"ms": ("haptic.period", 0.008)}),
+    ("haptic: 1 ms", "haptic 1 ms", "4:3: E109", {"haptic: 1 ms": ("haptic.period", 0.001)}),
+    ("network: 8 ms", "network 8 ms", "5:3: E109", {"network: 8 ms": ("network.period", 0.008)}),
+    ("haptic: 1 ms", "haptic = 1 ms", "4:3: E109", {"haptic: 1 ms": ("haptic.period", 0.001)}),
+    ("haptic: 1 ms", "haptic:1 ms", "4:3: E109", {"haptic: 1 ms": ("haptic.period", 0.001)}),
+    ("count: 3", "count 3", "7:10: E109", {"count: 3": ("user.count", 3.0)}),
+    ("  device: {", "  - device: {", "9:3: E109",
+     {"device: {mass: 0.1 kg, damping: 5 N*s/m}": ("device.mass", 0.1)}),
+    ("  cube:   {", "  - cube: {", "10:3: E109",
+     {"cube: {mass: 0.6 kg, damping: 5 N*s/m, shared: true}": ("cube.mass", 0.6)}),
+    ("  device: {", "  device {", "9:3: E109",
+     {"device: {mass: 0.1 kg, damping: 5 N*s/m}": ("device.mass", 0.1)}),
+    ("peers:", "users:", "6:1: E202", {"peers": ("user.count", 3.0)}),
+    ("lan: {clock: network, ", "lan: {", "15:3: E201", {"clock: network": ("network.period", 0.008)}),
+    ("b: cube, ", "b: device, ", "12:3: E210", {}),
+    ("links:", "hands: {arm: {flange: device, stiffness: 9 N/m, damping: 1 N*s/m}}\nlinks:", "14:9: E201",
+     {"type: SpringDamperArm": ("arm.stiffness", 9.0)}),
+    ("links:", "hands: {arm: {flange: device, force: 2 N}}\nlinks:", "14:9: E201",
+     {"type: ConstantForce": ("arm.force", 2.0)}),
+]  # fmt: skip
+
+
+def _written(text: str, place: str, hint: str) -> str:
+    """Return a text with a line that is proposed in the place of what stands there: nothing is weighed."""
+    lines = text.splitlines()
+    row, column = (int(one) - 1 for one in place.split(":")[:2])
+    line, key = lines[row], hint.partition(": ")[0]
+    entry = re.compile(rf"(?<!\w){re.escape(key)}: (?:[^,}}\s]|(?<!\}}) (?!#))*(,\d[^,}}]*)?")
+    if "E109" in place:
+        rest = line[column:].partition("  #")[0]
+        rest = rest if "{" in rest or "{" not in line[:column] else re.split("[,}]", rest)[0]
+        lines[row] = line.replace(rest.rstrip(), hint, 1)
+    elif ": " not in hint:  # a word, or a unit
+        lines[row] = line[:column] + re.sub(r"[\w]+", hint, line[column:], count=1)
+    elif entry.search(line):
+        lines[row] = entry.sub(hint, line, count=1)
+    else:
+        lines[row] = line[:column] + line[column:].replace("{", f"{{{hint}, ", 1)
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize(("old", "new", "place", "lines"), HARMLESS)
+def test_each_line_that_is_proposed_is_accepted_and_means_what_was_meant(
+    old: str, new: str, place: str, lines: dict[str, tuple[str, float]], tmp_path: Path, monkeypatch: Any
+) -> None:
+    wrong = replaced(AVERAGE, (old, new))
+    [told_line] = told(tmp_path, monkeypatch, {"scene.yaml": wrong})
+    first = told_line.splitlines()[0]
+    assert first.startswith(f"scene.yaml:{place} ")
+    hint = first.partition("Write: ")[2]
+    assert hint.split(", or ") == (list(lines) or [""])
+    for line, (name, number) in lines.items():
+        found = compiled(_written(wrong, place, line))
+        known = {one.name: float(one.number) for one in (*found.parameters, *found.timings)}
+        assert known[name] == number
+
+
+def test_a_value_for_one_peer_is_told_as_a_list(tmp_path: Path) -> None:
+    line = told_of(parse_override, compiled(AVERAGE), "user[2].device.x=10 mm")[0]
+    hint = line.partition("Write: ")[2]
+    assert hint == "peers: {user: {count: 3, set: {device.x: [0 m, 10 mm, 0 m]}}}"
+    found = compiled(replaced(AVERAGE, ("peers:\n  user: {count: 3}", hint)))
+    assert [column.values.tolist() for column in found.groups[0].columns] == [[0.0, 0.01, 0.0]]
+    many = compiled(replaced(AVERAGE, ("count: 3", "count: 30")))
+    assert "table: users.csv" in told_of(parse_override, many, "user[2].device.x=10 mm")[0]
+
+
+def test_clocks_that_do_not_come_together_are_told_at_the_odd_one() -> None:
+    text = replaced(AVERAGE, ("haptic: 1 ms", "haptic: 1.0001 ms"))
+    [line] = told_of(lambda: analyze(compiled(text)))
+    assert line.startswith("scene.yaml:4:11: E805 ")
+
+
+UNHELD = """\
+component: Unheld
+connectors: {a: Flange}
+parameters: {k: {unit: N/m}, clock: clock}
+equations: [a.f = k*sample(a.x)]
+"""
+
+
+def test_a_fault_of_a_component_is_told_once_however_many_parts_and_groups_have_it(tmp_path: Path) -> None:
+    text = replaced(
+        AVERAGE,
+        ("user: {count: 3}", "left: {count: 2, set: {contact.delay: 2 ms}}\n  right: {count: 1}"),
+        (
+            "couplers:\n",
+            "couplers:\n  one: {type: Unheld, a: device, k: 1 N/m, clock: haptic}\n"
+            "  two: {type: Unheld, a: cube, k: 1 N/m, clock: haptic}\n",
+        ),
+    )
+    [line] = told_of(lambda: compiled(text, library(tmp_path, UNHELD)))
+    assert "E505 one.a.f acts on what it is joined to at all times" in line
+
+
+def test_what_is_left_out_of_a_part_is_told_once_with_all_that_is_to_be_written() -> None:
+    text = replaced(
+        AVERAGE,
+        ("type: SampledSpringDamper, a: device, b: cube, ", "type: VirtualWall, "),
+        ("stiffness: 1000 N/m, clock: haptic, delay: 1 ms", ""),
+    )
+    first, *others = [line for line in told_of(compiled, text) if "E201" in line]
+    assert not others
+    hint = first.partition("Write: ")[2]
+    assert "has no stiffness" in first
+    assert hint.count(": ") > 1
+    assert not [
+        line
+        for line in told_of(
+            compiled, replaced(text, ("VirtualWall, ", f"VirtualWall, flange: device, {hint}"))
+        )
+        if "studies" not in line
+    ]
+
+
+def test_all_who_hear_nobody_are_told_at_once() -> None:
+    text = replaced(DEAF, ("user: {count: 3}", "near: {count: 2}, far: {count: 2}"))
+    [line] = told_of(compiled, text)
+    assert line.endswith(
+        "E801 far[1] and far[2] hear nobody over lan: there is no mean over nobody. "
+        "Write: an arc to each in its graph, or at: [near] in what uses lan"
+    )
+    assert not told_of(compiled, replaced(text, ("link: lan}}", "link: lan, at: [near]}}")))

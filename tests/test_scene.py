@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
+from pathlib import Path
 
 import pytest
 
 from apc.compiler.compiled import Experiment
 from apc.compiler.language.expression import format_expression
 from apc.compiler.scene.groups import LARGEST_COUNT
-from tests.topologies import AVERAGE, MESH, ONE_MASS, replaced, scene, told
+from apc.compiler.scene.scene import build_scene
+from apc.compiler.source.source import parse_source
+from apc.compiler.store import save
+from apc.frame.names import unit_of
+from tests.topologies import AVERAGE, MESH, ONE_MASS, built_in, compiled, library, replaced, scene, told
 
 GROUPS = replaced(
     AVERAGE,
@@ -125,7 +131,7 @@ def test_all_mistakes_of_a_file_come_together_in_its_order() -> None:
     assert messages(
         ("haptic: 1 ms", "haptic: 1 kg"), ("0.1 kg", "0.1"), ("link: lan", "link: lam"), ("8 ms}", "-8 ms}")
     ) == [
-        "4:11: E204 haptic wants ms, got 1 kg. Write: haptic: 1 ms",
+        "4:11: E204 haptic wants ms, got 1 kg.",
         "9:18: E204 mass wants kg, got 0.1 (no unit). Write: mass: 0.1 kg",
         "13:109: E206 coordination names link lam, which isn't in links; the nearest is lan. Write: lan",
         "15:32: E207 delay wants 0 ms or more, got -8 ms.",
@@ -313,3 +319,171 @@ def test_what_is_not_a_mapping_is_no_topology() -> None:
         "scene.yaml:1:1: E203 a topology wants a mapping of keys to values, got a list. "
         "Write: topology: my-scene"
     ]
+
+
+KINDS = """\
+topology: kinds
+clocks: {haptic: 1 ms, slow: 2 ms, network: 8 ms}
+peers: {left: {count: 2}, right: {count: 2}}
+masses:
+  device: {mass: 0.1 kg}
+  cube: {mass: 0.6 kg, damping: 5 N*s/m, shared: true}
+couplers:
+  contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic}
+  coordination: {type: AveragePosition, object: cube, stiffness: 500 N/m, clock: haptic, link: lan}
+links:
+  lan: {clock: network, delay: 8 ms}
+  wan: {clock: network, delay: 8 ms}
+hands:
+  arm: {type: SpringDamperArm, flange: device, stiffness: 50 N/m, damping: 1 N*s/m}
+"""
+# Of each kind of part: what stands there, a key more or another, and, if it is refused, the code of why.
+DEVICE, CONTACT, LAN, ARM = "mass: 0.1 kg", "b: cube, ", "lan: {clock: network", "flange: device, "
+KEYS = [
+    (DEVICE, "type: Falcon, mass: 0.1 kg", ""),
+    (DEVICE, "mass: 0.1 kg, at: [left]", "E210"),
+    (DEVICE, "mass: 0.1 kg, shared: true", ""),
+    (DEVICE, "mass: 0.1 kg, count: 2", "E210"),
+    (DEVICE, "mass: 0.1 kg, flange: cube", ""),
+    (DEVICE, "mass: 0.1 kg, x: 1 mm", ""),
+    (DEVICE, "mass: 0.2 kg", ""),
+    (CONTACT, "b: cube, at: [left], ", ""),
+    (CONTACT, "b: cube, at: [], ", "E203"),
+    (CONTACT, "b: cube, shared: true, ", "E210"),
+    (CONTACT, "b: cube, count: 2, ", ""),
+    (CONTACT, "b: ground, ", ""),
+    (CONTACT, "b: cube, delay: 1 ms, ", ""),
+    (CONTACT, "b: cube, link: lan, ", "E202"),
+    (CONTACT, "b: cube, graph: ring, ", "E202"),
+    (LAN, "lan: {type: Mass, clock: network", "E201 E202 E210"),
+    (LAN, "lan: {at: [left], clock: network", "E211"),
+    (LAN, "lan: {at: left, clock: network", "E211"),
+    (LAN, "lan: {shared: true, clock: network", "E210"),
+    (LAN, "lan: {count: 2, clock: network", "E208"),
+    (LAN, "lan: {clock: slow", ""),
+    (LAN, "lan: {graph: ring, clock: network", ""),
+    (LAN, "lan: {delays: {left: {right: 9 ms}}, clock: network", ""),
+    (LAN, "lan: {loss: 1 %, clock: network", ""),
+    (LAN, "lan: {loss: 1 %, on_loss: zero, clock: network", ""),
+    (LAN, "lan: {jitter: 1 ms, clock: network", ""),
+    (LAN, "lan: {jitter: 1 ms, distribution: pareto, clock: network", ""),
+    (LAN, "lan: {jitter: 1 ms, reorder: all, clock: network", ""),
+    (LAN, "lan: {distribution: pareto, clock: network", "E262"),
+    (ARM, "flange: device, at: [right], ", ""),
+    (ARM, "flange: device, at: [left, right], ", "same"),
+    (ARM, "flange: device, shared: true, ", "E210"),
+    (ARM, "flange: device, count: 2, ", ""),
+    (ARM, "flange: cube, ", ""),
+    (ARM, "flange: device, position: 1 mm, ", ""),
+    ("left: {count: 2", "left: {count: 2, set: {arm.stiffness: 60 N/m}", ""),
+    ("left: {count: 2", "left: {count: 2, set: {lan.delay: 9 ms}", "E211"),
+    ("link: lan", "link: lan, at: [right]", ""),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "codes"), KEYS)
+def test_every_key_of_every_kind_of_part_is_obeyed_or_refused(
+    old: str, new: str, codes: str, tmp_path: Path
+) -> None:
+    """A key is accepted only where it makes another model: not a byte of it would be written otherwise."""
+    text = replaced(KINDS, (old, new))
+    if codes not in ("", "same"):
+        assert sorted({line.split()[1] for line in told(compiled, text)}) == codes.split()
+        return
+    written = []
+    for name, scene_text in (("plain", KINDS), ("keyed", text)):
+        save(compiled(scene_text), tmp_path / name)
+        written.append((tmp_path / name).read_bytes())
+    assert (written[0] == written[1]) == (codes == "same")
+
+
+def test_who_takes_part_is_said_by_what_uses_a_link() -> None:
+    [line] = messages(("lan: {clock", "lan: {at: [left], clock"), text=KINDS)
+    assert line == (
+        "11:13: E211 lan is a link, which joins all peers: who takes part is said by what uses it. "
+        "Write: coordination: {at: [left]}"
+    )
+    assert not messages(("link: lan}", "link: lan, at: [left]}"), text=KINDS)
+
+
+def test_a_group_sets_nothing_of_a_part_that_it_has_not() -> None:
+    text = replaced(KINDS, ("b: cube, ", "b: cube, at: [left], "))
+    line = ("right: {count: 2}", "right: {count: 2, set: {contact.stiffness: 1 N/m}}")
+    assert messages(line, text=text) == [
+        "3:51: E211 right sets contact.stiffness and has no contact, which is at left. "
+        "Write: at: [left, right]"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("body", "has"),
+    [
+        ("extends: Link\nparameters: {colour: {unit: 1, default: 1}}\n", "colour"),
+        ("extends: Link\nvariables: {x: {unit: m}}\nequations: [x = 0]\n", "x"),
+    ],
+)
+def test_what_no_link_obeys_is_refused_of_its_component(body: str, has: str, tmp_path: Path) -> None:
+    own = library(tmp_path, f"component: Own\n{body}")
+    text = replaced(KINDS, ("wan: {", "wan: {type: Own, "))
+    assert [line.partition("E210 ")[2] for line in told(lambda: scene(text, own))] == [
+        f"wan is a Own, which is no link: a link has no {has}. Write: type: Link"
+    ]
+    text = replaced(KINDS, ("  contact: {", "  carried: {type: Link, clock: network}\n  contact: {"))
+    assert [line.split()[1] for line in told(scene, text)] == ["E210"]
+
+
+SHAKEN = """\
+topology: shaken
+parameters: {f: 2 Hz, w: 4 rad/s}
+peers: {user: {count: 1}}
+masses: {device: {mass: 1 kg}}
+hands: {push: {type: SineForce, flange: device, force: 1 N, frequency: f, phase: 90 deg}}
+"""
+
+
+def test_what_counts_cycles_or_radians_is_shown_in_its_unit_everywhere() -> None:
+    found = compiled(SHAKEN)
+    units = {one.name: one.unit for one in found.parameters}
+    assert (units["f"], units["w"], units["push.frequency"], units["push.phase"]) == (
+        "Hz",
+        "rad/s",
+        "Hz",
+        "rad",
+    )
+    assert unit_of(found, "push.frequency") == "Hz"
+
+
+@pytest.mark.parametrize(
+    ("written", "told_of", "right"),
+    [
+        ("w", "w, which is in rad/s. Write: frequency: w/(2*pi)", "w/(2*pi)"),
+        ("2*(f + f) - f", "", ""),
+        ("w + w", "w + w, which is in rad/s. Write: frequency: (w + w)/(2*pi)", "(w + w)/(2*pi)/2"),
+    ],
+)
+def test_a_name_keeps_what_its_unit_counts(written: str, told_of: str, right: str) -> None:
+    line = messages(("frequency: f", f"frequency: {written}"), text=SHAKEN)
+    assert [one.partition("wants Hz, got ")[2] for one in line] == [told_of][: bool(told_of)]
+    if right:
+        found = scene(replaced(SHAKEN, ("frequency: f", f"frequency: {right}")))
+        frequency = dict(found.part("push").values)["frequency"].number
+        assert float(frequency) == pytest.approx(4 / (2 * math.pi))
+
+
+def test_no_name_of_a_topology_or_component_is_pi(tmp_path: Path) -> None:
+    assert messages(("f: 2 Hz", "pi: 3, f: 2 Hz"), text=SHAKEN) == [
+        "2:14: E205 pi is a word of the language and can't be a name."
+    ]
+    own = "component: Own\nparameters: {pi: {unit: 1}}\nconnectors: {a: Flange}\nequations: [a.f = 0]\n"
+    text = replaced(ONE_MASS, ("  device: {", "  other: {type: Own, pi: 3}\n  device: {"))
+    assert "E205 pi is a word" in told(lambda: scene(text, library(tmp_path, own)))[0]
+
+
+def test_a_table_tells_cycles_and_radians_apart(tmp_path: Path) -> None:
+    (tmp_path / "users.csv").write_text("push.frequency [rad/s]\n1\n2\n", encoding="utf-8")
+    text = replaced(SHAKEN, ("user: {count: 1}", "user: {table: users.csv}"))
+    read = parse_source(text.encode(), file="scene.yaml", path=tmp_path / "scene.yaml")
+    [line] = told(build_scene, read, built_in())
+    assert line.partition("E702 ")[2] == (
+        "the heading push.frequency wants [Hz], got [rad/s]. Write: push.frequency [Hz], each divided by 2*pi"
+    )

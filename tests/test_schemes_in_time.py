@@ -115,7 +115,7 @@ clocks: {haptic: 1 ms, network: 8 ms}
 peers: {left: {count: 1, set: {push.force: 1 N}}, right: {count: 1}}
 masses: {cube: {mass: 1 kg}}
 couplers:
-  it: {type: TYPE, object: cube, stiffness: 500 N/m, clock: haptic, period: 1 ms, link: lan}
+  it: {type: TYPE, object: cube, stiffness: 500 N/m, clock: haptic, link: lan}
 links: {lan: {clock: network, delay: 50 ms}}
 hands: {push: {type: ConstantForce, flange: cube, force: 0 N}}
 """
@@ -212,7 +212,7 @@ def test_set_position_modulation_gives_no_energy(delay: int, energy: float) -> N
     harvested, by Cauchy and Schwarz; at ticks nothing is made.
     """
     text = replaced(
-        COPIES.replace("period: 1 ms, link", "period: 1 ms, damping: 2 N*s/m, link"),
+        COPIES.replace("haptic, link", "haptic, damping: 2 N*s/m, link"),
         ("TYPE", "SetPositionModulation, ceiling: 0.02 J"),
         ("push.force: 1 N", "push.force: 0 N, cube.x: 10 mm, it.x: 10 mm, it.goal: 10 mm"),
         ("delay: 50 ms", f"delay: {delay} ms, loss: 20 %"),
@@ -241,7 +241,7 @@ def test_set_position_modulation_with_energy_enough_is_a_spring_and_damper() -> 
         return [500 * mean(heard, 0)], memory, []
 
     text = replaced(
-        COPIES.replace("period: 1 ms, link", "period: 1 ms, damping: 6 N*s/m, link"),
+        COPIES.replace("haptic, link", "haptic, damping: 6 N*s/m, link"),
         ("TYPE", "SetPositionModulation, energy: 1e6 J, ceiling: 1e7 J"),
     )
     hand = ByHand([[(1.0, 6.0, 500.0)]] * 2, everybody(2), law, told=0, late=50, comp=0)
@@ -267,7 +267,7 @@ peers: {teller: {count: 1, set: {MOTION}}, hearer: {count: 1}}
 masses: {cube: {mass: 2 kg}}
 couplers:
   it: {type: DeadReckoning, object: cube, stiffness: 0 N/m, threshold: 0.5 mm, clock: haptic,
-       period: 1 ms, link: lan}
+       link: lan}
 links: {lan: {clock: network, delay: 8 ms}}
 hands: {push: {type: ConstantForce, flange: cube, force: 0 N}}
 """

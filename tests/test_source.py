@@ -141,7 +141,7 @@ def test_a_character_of_a_text_is_found_in_its_line_unless_it_was_folded() -> No
         ),
         (
             "a: 1\nb\nc: 2\n",
-            "a.yaml:2:1: E109 this line is neither 'key: value' nor '- item'. Write: key: value",
+            "a.yaml:2:1: E109 a key stands here without its colon and a space. Write: b:",
         ),
         (
             "a:\n  b: 1\n c: 2\n",

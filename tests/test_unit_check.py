@@ -20,6 +20,8 @@ UNITS = {
     "n": "1",
     "delay": "s",
     "others.x": "m",
+    "rate": "Hz",
+    "speed": "rad/s",
     "time": "s",
 }
 
@@ -131,3 +133,9 @@ def test_a_part_that_is_wrong_inside_is_reported_once() -> None:
 def test_an_expression_alone_is_checked_too() -> None:
     with pytest.raises(ApcError, match="E402 v wants m like x, got m/s"):
         dimension("x + v")
+
+
+def test_cycles_and_radians_are_not_added() -> None:
+    assert mistakes("speed = 2*rate") == []  # a product counts neither
+    assert mistakes("speed = rate") == ["13: E401 rate wants rad/s like speed, got Hz."]
+    assert mistakes("speed = 2*pi*rate + 1/delay") == []

@@ -1,5 +1,7 @@
 """`units`: exact values, the dimensions of common units, and the messages for everything else."""
 
+import math
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.language import unit_names, units
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
+from apc.compiler.language.si_forms import is_si
 from apc.compiler.language.unit_text import format_dimension, format_si
 from apc.compiler.language.units import NO_UNIT, parse_quantity, parse_unit, quantity
 from apc.compiler.language.values import is_quantity
@@ -115,7 +118,72 @@ def test_a_refused_quantity_is_answered_with_one_line(text: str, message: str) -
     assert refusal(text) == message
 
 
-@pytest.mark.parametrize("text", ["(((%^9)^9)^9)^9", "((((Qm^9/Qm^9)^9)^9)^9)^9", "(" * 99 + "m" + ")" * 99])
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [
+        *(("100 gr", "g"), ("3 dr", ""), ("2 drachm", ""), ("5 st", "s"), ("1 ct", ""), ("3 furlong", "")),
+        *(("2 fathom", ""), ("1 a", ""), ("8 Ms", "ms"), ("1 ks", ""), ("2 Mim", "m"), ("5 kinch", "")),
+        *(("1 oz_t", ""), ("1 stone", "s"), ("1 eV", ""), ("3 cal", ""), ("1 Gy", ""), ("5 Bq", "")),
+        *(("1 fortnight", ""), ("1 dpt", ""), ("20 mN_mm", ""), ("1 cup", ""), ("1 baud", ""), ("1 Qm", "")),
+    ],
+)
+def test_a_unit_that_is_out_of_use_is_refused_and_not_taken_for_one_that_is_meant(
+    text: str, meant: str
+) -> None:
+    told = refusal(text)
+    assert re.search(r"E22[234] ", told)
+    assert told.partition("Write: ")[2] in (meant, "")
+
+
+def test_a_gram_is_no_grain() -> None:
+    assert refusal("100 gr") == (
+        "5: E223 there is no unit gr here: grain is out of use; there are kg, g, lb. Write: g"
+    )
+
+
+@pytest.mark.parametrize(
+    "name", [*unit_names.COMMON, "lbf", "ozf", "gf", "psi", "bar", "mbar", "mil", "slug"]
+)
+def test_what_a_haptics_engineer_writes_is_a_unit(name: str) -> None:
+    assert parse_unit(name, HERE).scale > 0
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "same", "as_it_is"),
+    [
+        ("20 Hz", "rad/s", "125.663706 rad/s", "20 rad/s"),
+        ("0.02 kHz", "rad/s", "125.663706 rad/s", "0.02 rad/s"),
+        ("30 rpm", "Hz", "0.5 Hz", "30 Hz"),
+        ("360 deg/s", "Hz", "1 Hz", "360 Hz"),
+        ("1 Hz", "deg/s", "360 deg/s", "1 deg/s"),
+    ],
+)
+def test_cycles_and_radians_a_second_are_told_apart(text: str, unit: str, same: str, as_it_is: str) -> None:
+    told = wanting(text, unit)
+    assert told == (
+        f"a.yaml:1:12: E204 stiffness wants {unit}, got {text}, which is {same}. "
+        f"Write: stiffness: {same}, or stiffness: {as_it_is}"
+    )
+    turns = quantity(same, HERE, what="", unit=unit).value / parse_quantity(text, HERE).value
+    turning = 2 * math.pi if parse_unit(text.split()[1], HERE).dimension.turning == "Hz" else 0.5 / math.pi
+    assert float(turns) == pytest.approx(turning, rel=1e-8)
+    assert quantity("3 1/s", HERE, what="", unit=unit).value == 3
+
+
+@pytest.mark.parametrize(
+    ("unit", "shown"),
+    [
+        *(("Hz", "Hz"), ("kHz", "Hz"), ("1/s", "1/s"), ("rad/s", "rad/s"), ("rpm", "rad/s"), ("deg", "rad")),
+        *(("rad/s^2", "rad/s^2"), ("N*m/rad", "N*m"), ("1", "1"), ("%", "1")),
+    ],
+)
+def test_a_unit_is_shown_with_what_it_counts(unit: str, shown: str) -> None:
+    text = format_dimension(parse_unit(unit, HERE).dimension)
+    assert text == shown
+    assert is_si(text)
+
+
+@pytest.mark.parametrize("text", ["(((%^9)^9)^9)^9", "((((Tm^9/Tm^9)^9)^9)^9)^9", "(" * 99 + "m" + ")" * 99])
 def test_a_unit_is_bounded_in_every_direction(text: str) -> None:
     try:
         assert parse_unit(text, HERE).dimension in (LENGTH, DIMENSIONLESS)

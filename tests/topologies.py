@@ -75,7 +75,7 @@ def wall(mass: float, damping: float, delay: float, stiffness: float, virtual: f
         "topology: wall\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
         f"masses: {{device: {{mass: {mass} kg, damping: {damping} N*s/m, x: 1 mm}}}}\n"
         f"couplers: {{it: {{type: VirtualWall, flange: device, stiffness: {stiffness!r} N/m, clock: tick,"
-        f" period: 1 ms, damping: {virtual!r} N*s/m, delay: {delay} s, x: 1 mm}}}}\n"
+        f" damping: {virtual!r} N*s/m, delay: {delay} s, x: 1 mm}}}}\n"
     )
 
 

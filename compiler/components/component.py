@@ -21,7 +21,7 @@ from apc.compiler.source.nodes import Node
 OTHERS = "others"
 # Words of the language, which nothing may have as its name.
 RESERVED = frozenset(
-    {"peers", "others", "time", "ground", "type", "at", "shared", "set", *FUNCTIONS, *KEYWORDS}
+    {"peers", "others", "time", "pi", "ground", "type", "at", "shared", "set", *FUNCTIONS, *KEYWORDS}
 )
 # A parameter of one of these roles isn't a number: it names, or describes, something of the scene.
 ROLES = ("clock", "link", "graph", "delays", "loss", "trace", "table")

@@ -35,6 +35,7 @@ from apc.compiler.language.expression import (
     Expr,
     Name,
     format_expression,
+    interval_of,
     names,
     transform,
     walk,
@@ -79,6 +80,9 @@ class ComponentNames:
             self.dimensions[(parameter.name,)] = parameter.unit.dimension
             for word, _ in parameter.words:
                 self.dimensions.setdefault((word,), parameter.unit.dimension)
+        for clock in component.parameters:
+            if isinstance(clock, Reference) and clock.role == "clock":
+                self.dimensions[(interval_of(clock.name),)] = SECOND
         self.dimensions[(OTHERS,)] = DIMENSIONLESS  # for count(others)
         for send in component.sends:
             self.dimensions[(OTHERS, send.name)] = send.dimension

@@ -120,6 +120,7 @@ def read_entry(
     body, faulty = _entry_by_entry(body, numbers, vectors, scope, mistakes)
     reader = _EntryReader(name, body, place, scope, mistakes, index, count, vectors, faulty, hand)
     told = reader.parameters(component)
+    reader.tell_missing()
     starts = reader.starts(component)
     connections = tuple(
         joined
@@ -231,6 +232,15 @@ class _EntryReader:
         self.mistakes = mistakes
         self.index = index
         self.count = count
+        self.missing: dict[str, str] = {}  # what is due and left out, and what to write
+
+    def tell_missing(self) -> None:
+        """Record what is left out: one mistake, whose line has all of it."""
+        if self.missing:
+            *most, last = self.missing
+            listed = f"{', '.join(most)} and {last}" if most else last
+            hint = ", ".join(f"{key}: {value}" for key, value in self.missing.items())
+            self.mistakes.add("E201", self.place, f"{self.name} has no {listed}", hint=hint)
 
     def parameters(self, component: Component) -> _Told:
         """Read the component's parameters, each by what it is."""
@@ -292,16 +302,14 @@ class _EntryReader:
         if whole not in self.faulty and index <= 1:
             one = f"1 {parameter.unit.text}".removesuffix(" 1")
             value = f"[{', '.join([one] * self.vectors[whole])}]" if index else one
-            hint = f"{whole}: {value}"
-            self.mistakes.add("E201", self.place, f"{self.name} has no {whole}", hint=hint)
+            self.missing[whole] = value
         return None
 
     def option(self, parameter: Option) -> str | None:
         node = self.body.get(parameter.name)
         if node is None:
             if parameter.default is None:
-                hint = f"{parameter.name}: {parameter.words[0]}"
-                self.mistakes.add("E201", self.place, f"{self.name} has no {parameter.name}", hint=hint)
+                self.missing[parameter.name] = parameter.words[0]
             return parameter.default
         word = read_text(node, parameter.name, self.mistakes, hint=f"{parameter.name}: {parameter.words[0]}")
         if word is None or word in parameter.words:
@@ -320,8 +328,7 @@ class _EntryReader:
         node = self.body.get(parameter.name)
         if node is None:
             known = self.scope.references(parameter.role, "", self.place) or ()
-            hint = f"{parameter.name}: {next(iter(known), 'name')}"
-            self.mistakes.add("E201", self.place, f"{self.name} has no {parameter.name}", hint=hint)
+            self.missing[parameter.name] = next(iter(known), "name")
             return None
         word = read_text(node, parameter.name, self.mistakes)
         if word is None:

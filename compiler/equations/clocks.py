@@ -142,7 +142,7 @@ class ClockedSystem:
 
 def partition(flat: FlatSystem) -> ClockedSystem:
     """Give every variable its clock. Raises ApcError with every crossing that isn't said."""
-    mistakes = Mistakes()
+    mistakes = Mistakes(flat.scene.names)
     kinds = tuple(_Partitioner(kind, mistakes).run() for kind in flat.kinds)
     mistakes.raise_if_any()
     return ClockedSystem(flat.scene, kinds)

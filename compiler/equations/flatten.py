@@ -21,6 +21,7 @@ from apc.compiler.errors import Mistakes, Place, place_in
 from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import (
+    INTERVAL,
     SMOOTH,
     Binary,
     Call,
@@ -116,7 +117,7 @@ def is_made(name: str) -> bool:
 
 def flatten(scene: Scene) -> FlatSystem:
     """Write out the equations of every kind. Raises ApcError with every mistake found on the way."""
-    mistakes = Mistakes()
+    mistakes = Mistakes(scene.names)
     delays = _delay_names(scene)
     structures: dict[object, list[SceneGroup]] = {}
     for group in scene.groups:
@@ -401,6 +402,8 @@ class _Instance:
 
     def _name(self, node: Name) -> Expr:
         head = node.parts[0]
+        if head.startswith(INTERVAL):
+            return Name((self.references[head.removeprefix(INTERVAL)[:-1]], "period"))
         if node.parts in (("peers",), ("time",)):
             return Name(node.parts)
         if any(table.name == head for table in self.part.tables) and len(node.parts) == 1:

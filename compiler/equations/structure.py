@@ -95,7 +95,7 @@ class SortedSystem:
 
 def sort(clocked: ClockedSystem) -> SortedSystem:
     """Sort and solve every partition. Raises ApcError naming the equations and unknowns left over."""
-    mistakes = Mistakes()
+    mistakes = Mistakes(clocked.scene.names)
     nonzero = _positive_parameters(clocked.scene)
     kinds = tuple(
         sort_kind(kind, mistakes, nonzero=nonzero, vanishes=Vanishing(_numbers(clocked.scene, kind)))

@@ -13,6 +13,7 @@ from fractions import Fraction
 from graphlib import TopologicalSorter
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apc.compiler.compiled import (
     PEERS,
@@ -45,6 +46,7 @@ from apc.compiler.scene.links import SceneLink
 from apc.compiler.scene.scene import Scene, SceneGroup
 
 NO_DELAY = "no delay"
+MOST_DEAF = 3  # names of peers that hear nobody
 LOSS_ABOUT = (
     "probability that a good link turns bad after a packet",
     "probability that a bad link turns good after a packet",
@@ -53,12 +55,18 @@ LOSS_ABOUT = (
 )
 
 
+def period_of(clock: str) -> str:
+    """Return the name of a clock's period among timings and parameters."""
+    return f"{clock}.period"
+
+
 class Timings:
     """The periods, phases and delays that the model refers to, each once."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self._parts = {part.name: dict(part.values) for part in scene.parts}
+        self._periods = {period_of(clock.name): clock.period for clock in scene.clocks}
         self._found: dict[str, Timing] = {}
 
     @property
@@ -96,6 +104,8 @@ class Timings:
 
     def _parameter(self, name: str, own: dict[str, tuple[str, Value]]) -> str:
         """Register a delay parameter, under the group's name if it sets its own."""
+        if name in self._periods:
+            return self.use(name, self._periods[name])
         if name not in own:
             part, _, parameter = name.rpartition(".")
             return self.use(name, self._parts[part][parameter])
@@ -183,14 +193,33 @@ def check_heard(scene: Scene, kinds: Mapping[str, Kind]) -> None:
         deaf = np.repeat([bool(one) for one in taken], counts)
         deaf[receivers[np.repeat(sends, counts)[senders]]] = False
         if deaf.any():
-            first = int(deaf.argmax())
             starts = np.cumsum([0, *counts])
-            place = int(np.searchsorted(starts, first, "right")) - 1
-            name = f"{scene.groups[place].name}[{first - starts[place] + 1}]"
-            what = f"{name} hears nobody over {link.name}: there is no {taken[place]} over nobody"
-            hint = f"an arc to {name} in its graph"
+            alone = [
+                group.name
+                for group, start in zip(scene.groups, starts, strict=False)
+                if deaf[start : start + group.count].all()
+            ]
+            places = np.flatnonzero(deaf)
+            named = [
+                f"{scene.groups[of].name}[{one - starts[of] + 1}]"
+                for one in places[:MOST_DEAF].tolist()
+                for of in (_group_of(one, starts),)
+            ]
+            more = [f"{len(places) - MOST_DEAF} more"] if len(places) > MOST_DEAF else []
+            names = " and ".join(filter(None, (", ".join((*named, *more)[:-1]), (*named, *more)[-1])))
+            hear, operator = "hears" if len(places) == 1 else "hear", taken[_group_of(int(places[0]), starts)]
+            what = f"{names} {hear} nobody over {link.name}: there is no {operator} over nobody"
+            others = [group.name for group in scene.groups if group.name not in alone]
+            hint = f"an arc to {'each' if len(places) > 1 else named[0]} in its graph"
+            if alone and others:
+                hint += f", or at: [{', '.join(others)}] in what uses {link.name}"
             mistakes.add("E801", link.place, what, hint=hint)
     mistakes.raise_if_any()
+
+
+def _group_of(peer: int, starts: NDArray[np.int64]) -> int:
+    """Return the place of the group that a peer is of, counted from 0 over the groups in order."""
+    return int(np.searchsorted(starts, peer, "right")) - 1
 
 
 def _taken(kind: Kind, link: str) -> str:
@@ -242,8 +271,9 @@ def used_clocks(
     clocks, dropped = [], []
     for clock in scene.clocks:
         if clock.name in used:
-            period = timings.use(f"{clock.name}.period", clock.period)
-            clocks.append(Clock(clock.name, period, timings.use(f"{clock.name}.phase", clock.phase)))
+            period = timings.use(period_of(clock.name), clock.period)
+            phase, place = timings.use(f"{clock.name}.phase", clock.phase), clock.period.place
+            clocks.append(Clock(clock.name, period, phase, place.line, place.column))
         else:
             dropped.append((clock.name, "nothing ticks with it"))
     return clocks, dropped
@@ -399,6 +429,13 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
                 )
                 for (name, value), about in zip(link.channel.loss, LOSS_ABOUT, strict=False)
             }
+    for clock in scene.clocks:
+        if (name := period_of(clock.name)) in needed:  # by `interval`: the same number as the timing
+            value, about = clock.period, f"from one tick of {clock.name} to the next"
+            formula = _formula(value.expression)
+            found[name] = Parameter(
+                *(name, "s", float(value.number), formula, 0.0, True), about=about, exact=value.number
+            )
     for group in scene.groups:
         name = group_count(group.name)
         formula = _formula(None if group.counted is None else group.counted.expression)

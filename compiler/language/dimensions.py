@@ -7,6 +7,7 @@ Does not: know units, which have a scale as well (see `units`), or their text (s
 
 from __future__ import annotations
 
+from dataclasses import field
 from fractions import Fraction
 
 from apc.compiler.frozen import dataclass
@@ -14,9 +15,18 @@ from apc.compiler.frozen import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Dimension:
-    """A product of powers of SI base units, sorted by name and without zeros; the radian is the number 1."""
+    """A product of powers of SI base units, sorted by name and without zeros; the radian is the number 1.
+
+    `turning` says what a quantity written in it counts, cycles ("Hz") or radians ("rad"), as far as its unit
+    tells: in no comparison, and what is computed of it no longer has it.
+    """
 
     exponents: tuple[tuple[str, Fraction | int], ...]
+    turning: str = field(default="", compare=False)
+
+    def clashes(self, other: Dimension) -> bool:
+        """Say whether one counts cycles and the other radians."""
+        return {self.turning, other.turning} == {"Hz", "rad"}
 
     def multiply(self, other: Dimension) -> Dimension:
         """Return the dimension of a product."""

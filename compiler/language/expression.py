@@ -1,8 +1,8 @@
 """The nodes of an expression's tree, walking and changing them, and their text.
 
 Takes: `Expr` trees.
-Gives: the node types, `Equation`, `format_expression`, `children`, `rebuild`, `walk`, `names`, `transform`,
-`fold`.
+Gives: the node types, `Equation`, `format_expression`, `interval_of`, `children`, `rebuild`, `walk`, `names`,
+`transform`, `fold`.
 Guarantees: plain frozen data; the text has no more parentheses than the tree needs.
 Does not: read text (see `grammar`), or know what a name means, or its unit.
 """
@@ -106,7 +106,10 @@ class Vector(Spanned):
     entries: tuple[Expr, ...]
 
 
+INTERVAL = "interval("  # how the name of a clock's period begins, see `interval_of`
 V = TypeVar("V")
+
+PI = Fraction("3.1415926535897932384626433832795028841971693993751")  # OEIS A000796; the name `pi`
 
 Expr = Number | Name | Negate | Binary | Compare | Logic | Not | Call | Conditional | Vector
 
@@ -144,6 +147,7 @@ FUNCTIONS: dict[str, tuple[int, int]] = {
     "mean": (1, 1),
     "sum": (1, 1),
     "count": (1, 1),
+    "interval": (1, 1),
     "dot": (2, 2),
     "norm": (1, 1),
     "cross": (2, 2),
@@ -228,6 +232,8 @@ def _inside(expr: Expr, level: int) -> str:
 
 def _format_number(value: Fraction) -> tuple[str, int]:
     """Return the shortest exact decimal, or a quotient when there is none."""
+    if value == PI:
+        return "pi", Level.ATOM
     sign, level = ("-", Level.SIGN) if value < 0 else ("", Level.ATOM)
     numerator, denominator = abs(value.numerator), value.denominator
     twos = (denominator & -denominator).bit_length() - 1
@@ -281,6 +287,11 @@ def rebuild(expr: Expr, parts: tuple[Expr, ...]) -> Expr:
             return replace(expr, condition=parts[0], then=parts[1], otherwise=parts[2])
         case Vector():
             return replace(expr, entries=parts)
+
+
+def interval_of(clock: str) -> str:
+    """Return the name by which a component's equations have the period of one of its clocks."""
+    return f"{INTERVAL}{clock})"
 
 
 def walk(expr: Expr) -> Iterator[Expr]:

@@ -18,7 +18,7 @@ The grammar, loosest first; `^` and `**` are the same:
     sign        = ("-" | "+") sign | power
     power       = atom ["^" exponent]
     exponent    = ["-"] number | "(" ["-"] number ["/" number] ")"
-    atom        = number | name | function "(" expression {"," expression} ")" | "(" expression ")"
+    atom        = number | "pi" | name | function "(" expression {"," expression} ")" | "(" expression ")"
                 | "{" expression {"," expression} "}"
     name        = segment {"." segment},   segment = letter {letter | digit | "_"} ["[" integer "]"]
 """
@@ -35,6 +35,7 @@ from apc.compiler.language.expression import (
     FUNCTIONS,
     KEYWORDS,
     LEVELS,
+    PI,
     Binary,
     Call,
     Compare,
@@ -49,6 +50,7 @@ from apc.compiler.language.expression import (
     Number,
     Vector,
     format_expression,
+    interval_of,
 )
 from apc.compiler.language.lexer import Token, tokens
 from apc.compiler.words import cut
@@ -376,6 +378,8 @@ class _Parser:
     def name_or_call(self) -> Expr:
         token = self.step()
         if self.kind != "(":
+            if token.text == "pi":
+                return Number(PI, start=token.start, end=token.end)
             return Name(tuple(token.text.split(".")), start=token.start, end=token.end)
         function = token.text
         if function not in FUNCTIONS:
@@ -388,6 +392,11 @@ class _Parser:
         arguments = self.arguments(")", f"an argument of {function}")
         end = self.expect(")", f"{function}(").end
         self.check_count(function, len(arguments), token.start)
+        if function == "interval":
+            clock = arguments[0]
+            if not (isinstance(clock, Name) and len(clock.parts) == 1):
+                self.fail("E325", function, "the name of a clock", self.said(clock), at=clock.start)
+            return Name((interval_of(clock.parts[0]),), start=token.start, end=end)
         return self.built(Call(function, arguments, start=token.start, end=end), *arguments)
 
     def arguments(self, close: str, each: str) -> tuple[Expr, ...]:

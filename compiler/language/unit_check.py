@@ -124,7 +124,7 @@ class _Checker:
         like = next(part for part, dimension in known if dimension == usual)
         unit = "a plain number" if usual == DIMENSIONLESS else format_dimension(usual)
         for part, dimension in known:
-            if dimension is not None and dimension != usual:
+            if dimension is not None and (dimension != usual or dimension.clashes(usual)):
                 self.add(code, part, f"{unit} like {self.said(like)}", dimension)
         return usual
 

@@ -35,7 +35,7 @@ class FaultError(Exception):
     """A mistake that does not know yet where its text stands, so that results can be kept by text."""
 
     def __init__(
-        self, code: str, offset: int, what: str, *, expected: str = "", got: str = "", hint: str = ""
+        self, code: str, offset: int, what: str, expected: str = "", got: str = "", hint: str = ""
     ) -> None:
         super().__init__(what)
         self.code, self.offset, self.what = code, offset, what

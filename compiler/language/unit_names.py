@@ -1,8 +1,10 @@
 """What the name of a unit stands for.
 
-Takes: a name such as `ms`. Gives: `look_up`, its scale and dimension; `spelled`, its long name; `COMMON`.
-Guarantees: exact scales (an angle in degrees uses π to 50 digits); the units that scenes are written in are
-known here; pint, which knows what every unit is, is imported when the first rare one is read.
+Takes: a name such as `ms`. Gives: `look_up`, its scale and dimension; `spelled`, its long name; `turning`,
+whether a unit counts cycles or radians; `COMMON`.
+Guarantees: exact scales (an angle in degrees uses π to 50 digits); no unit that is out of use in mechanics is
+taken for one that is meant; the units that scenes are written in are known here; pint, which knows what every
+unit is, is imported when the first rare one is read.
 Does not: know the grammar of units (see `unit_grammar`).
 """
 
@@ -15,7 +17,7 @@ from typing import Any
 
 from apc.compiler.errors import nearest
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension, product
-from apc.compiler.language.unit_grammar import Factor, FaultError
+from apc.compiler.language.unit_grammar import NAME, Factor, FaultError
 from apc.compiler.words import cut
 
 _BASES = {
@@ -47,6 +49,23 @@ COMMON = (
     ),
 )
 
+# The units there are, by pint's names: those of SI with its prefixes, and what is used beside them. A grain
+# or a dram, which pint knows as well, is a slip of whoever means a gram.
+_PREFIXED = (
+    *("meter", "gram", "second", "ampere", "kelvin", "mole", "candela", "newton", "pascal", "joule", "watt"),
+    *("volt", "coulomb", "farad", "ohm", "siemens", "weber", "tesla", "henry", "hertz", "radian"),
+    *("lumen", "lux", "liter", "bar"),
+)
+_ALONE = (
+    *("minute", "hour", "day", "degree", "arcminute", "arcsecond", "turn", "percent", "permille", "ppm"),
+    *("revolutions_per_minute", "revolutions_per_second", "inch", "foot", "yard", "mil", "thou", "micron"),
+    *("metric_ton", "pound", "ounce", "slug", "force_pound", "force_ounce", "force_gram", "force_kilogram"),
+    *("pound_force_per_square_inch", "standard_gravity"),
+)
+_PREFIXES = ("", "pico", "nano", "micro", "milli", "centi", "deci", "hecto", "kilo", "mega", "giga", "tera")
+_LONG = ("hecto", "kilo", "mega", "giga", "tera")  # no prefix of a second
+_ANGLES = ("rad", "radian", "degree", "arcminute", "arcsecond", "turn", "_per_minute", "_per_second")
+
 
 @lru_cache(maxsize=1)
 def _registry() -> Any:
@@ -64,6 +83,28 @@ def _full_name(name: str) -> str | None:
     # Nm is a yarn count to pint, and a slip for N*m to everyone else.
     names = [prefix + unit for prefix, unit, _ in found if unit != "number_meter"]
     return names[0] if names else None
+
+
+def _is_in_use(name: str) -> bool:
+    """Return whether a name that pint knows is of a unit that is written in mechanics."""
+    if name == "°":
+        return True
+    prefix, unit, _ = _registry().parse_unit_name(name)[0]
+    if unit in _PREFIXED:
+        return prefix in _PREFIXES and not (unit == "second" and prefix in _LONG)
+    return not prefix and unit in _ALONE
+
+
+@lru_cache(maxsize=1024)
+def turning(text: str) -> str:
+    """Return whether a unit counts cycles ("Hz") or radians ("rad"); an empty text if it tells of neither."""
+    for name in NAME.findall(text):
+        long = name if name in _OF_HAPTICS else spelled(name)
+        if long.endswith(("Hz", "hertz")):
+            return "Hz"
+        if long.endswith(_ANGLES):
+            return "rad"
+    return ""
 
 
 def spelled(name: str) -> str:
@@ -114,6 +155,7 @@ def _of_haptics() -> dict[str, Factor]:
         prefix + name: (factor * scale, Dimension(exponents))
         for name, (exponents, scale) in units.items()
         for prefix, factor in prefixes.items()
+        if prefix + name != "ks"
     }
     return {"%": (Fraction(1, 100), DIMENSIONLESS), **prefixed}
 
@@ -138,7 +180,19 @@ def look_up(name: str, offset: int) -> Factor:
     if factor is None:
         what = f"{name} ({spelled(name)}) is no multiple of an SI unit"
         raise FaultError("E224", offset, what, hint="K" if "degree_" in spelled(name) else "")
+    if not _is_in_use(name):
+        raise FaultError("E223", offset, *_instead(name, factor[1]))
     return factor
+
+
+def _instead(name: str, dimension: Dimension) -> tuple[str, str, str, str]:
+    """Return what is told of a unit that is out of use: words, and the unit that was probably meant."""
+    like = [other for other in COMMON if look_up(other, 0)[1] == dimension]
+    told = f"; there are {', '.join(like[:3])}" if like else ""
+    what = f"there is no unit {name} here: {spelled(name).replace('_', ' ')} is out of use{told}"
+    alike = [other for other in like if other.lower() == name.lower()]
+    alike += [other for other in like if name.lower().startswith(other)]
+    return what, "", "", next(iter(alike), "")
 
 
 def _proposal(name: str) -> str:

@@ -11,15 +11,19 @@ from fractions import Fraction
 from functools import lru_cache
 
 from apc.compiler.language.dimensions import Dimension
-from apc.compiler.language.si_forms import FORMS
+from apc.compiler.language.si_forms import FORMS, TURNING
 from apc.compiler.language.unit_grammar import parse_factor
 from apc.compiler.language.units import Unit
 
 
 def format_dimension(dimension: Dimension) -> str:
-    """Return the dimension as an SI unit `parse_unit` reads: `N*s/m`, `1`, or a product of base units."""
+    """Return the dimension as an SI unit `parse_unit` reads: `N*s/m`, `1`, or a product of base units.
+
+    What counts cycles is in Hz, what counts radians in rad, rad/s or rad/s^2.
+    """
     known = _forms().get(dimension)
-    return known if known is not None else _product(dimension)
+    text = known if known is not None else _product(dimension)
+    return TURNING[dimension.turning].get(text, text) if dimension.turning else text
 
 
 @lru_cache(maxsize=1)

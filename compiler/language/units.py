@@ -14,21 +14,25 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from fractions import Fraction
 from functools import lru_cache
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
+from apc.compiler.language.expression import PI
 from apc.compiler.language.unit_grammar import NAME, FaultError, parse_factor
-from apc.compiler.language.unit_names import COMMON, look_up, spelled
+from apc.compiler.language.unit_names import COMMON, look_up, spelled, turning
 from apc.compiler.words import cut
 
+TURN = 2 * PI  # a cycle in radians
 MAX_LENGTH = 200  # characters of a quantity
 MAX_NUMBER_EXPONENT = 300  # of 1e300: still a float
 
 _NUMBER = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _QUANTITY_START = re.compile(rf"\s*[+-]?{_NUMBER}(?:\s*/\s*{_NUMBER})?")
+_EXPONENT = re.compile(r"\^-?[0-9]+|\*\*-?[0-9]+|[²³]")
 _NOT_FINITE = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
 
 
@@ -114,6 +118,8 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
     if found.unit.dimension == wanted.dimension and (
         found.unit != NO_UNIT or wanted.dimension == DIMENSIONLESS
     ):
+        if found.unit.dimension.clashes(wanted.dimension):
+            raise ApcError(_other_turning(found, wanted, place, what))
         return found
     number = _QUANTITY_START.match(text.strip())
     assert number is not None
@@ -123,8 +129,36 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
     elif (confused := _confused(found.unit, wanted.dimension)) is not None:
         name, right = confused
         got += f" ({name} is {spelled(name)}: case matters)"
-    hint = f"{what}: {number.group().strip()}" + ("" if wanted.text == "1" else f" {right}")
+    else:
+        right = _meant(found.unit, wanted)
+    shown = number.group().strip()
+    hint = f"{what}: {shown} {right}".removesuffix(" 1") if right else ""
     raise ApcError(Mistake("E204", place, what, named, got, hint))
+
+
+def _meant(unit: Unit, wanted: Unit) -> str:
+    """Return a unit of the dimension that is wanted in which the number as written may be meant.
+
+    That is the unit without one of its exponents, or with a letter more, or failing that the one that is
+    wanted, if a value in it is as large: 5 N/mm^2 are not proposed as 5 N/m, a millionth of it.
+    """
+    texts = [unit.text[: one.start()] + unit.text[one.end() :] for one in _EXPONENT.finditer(unit.text)]
+    for name in NAME.findall(unit.text):
+        longer = (other for other in COMMON if other.startswith(name) and len(other) == len(name) + 1)
+        texts += [re.sub(rf"\b{re.escape(name)}\b", other, unit.text) for other in longer]
+    fitting = (text for text in texts if _unit(text).dimension == wanted.dimension)
+    return next(fitting, wanted.text if unit.scale == wanted.scale else "")
+
+
+def _other_turning(found: Quantity, wanted: Unit, place: Place, what: str) -> Mistake:
+    """Return what is told of cycles where radians are due, or the reverse: 20 Hz are 125.66 rad/s."""
+    number = _QUANTITY_START.match(found.text.strip())
+    assert number is not None
+    turns = TURN if wanted.dimension.turning == "rad" else 1 / TURN
+    same = f"{float(found.value * turns / wanted.scale):.9g} {wanted.text}"
+    got = f"{cut(found.text.strip())}, which is {same}"
+    hint = f"{what}: {same}, or {what}: {number.group().strip()} {wanted.text}"
+    return Mistake("E204", place, what, wanted.text, got, hint)
 
 
 def _confused(unit: Unit, wanted: Dimension) -> tuple[str, str] | None:
@@ -201,4 +235,4 @@ def _unit(text: str) -> Unit:
     if len(text) > MAX_LENGTH:
         raise FaultError("E222", 0, "a unit", expected=f"at most {MAX_LENGTH} characters", got=f"{len(text)}")
     scale, dimension = parse_factor(text, look_up)
-    return Unit(text.strip(), scale, dimension)
+    return Unit(text.strip(), scale, replace(dimension, turning=turning(text)))

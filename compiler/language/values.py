@@ -23,7 +23,7 @@ from apc.compiler.language.unit_text import format_dimension, format_si
 from apc.compiler.language.units import parse_quantity, parse_unit, quantity
 from apc.compiler.language.vectors import number_of
 from apc.compiler.source.nodes import Node, Scalar
-from apc.compiler.source.reading import add_unknown, brief, read_text
+from apc.compiler.source.reading import add_unknown, brief, either_comma, read_text
 
 PEERS = ("peers",)
 
@@ -34,6 +34,10 @@ _QUANTITY = re.compile(
     r"(\s*([^\W\d_]|[°%µΩ(]).*|\s+1\s*[*·⋅/].*|\s*)\Z",
     re.DOTALL,
 )
+# 1 000 N/m; and 2*pi*100 N/m, a product of numbers alone with a unit behind it.
+_SPACED = re.compile(r"[+-]?[0-9]{1,3}([ _'\u00a0\u2009][0-9]{3})+(?![0-9])")
+_COMMA = re.compile(r"([+-]?[0-9]+),([0-9]+)([^0-9,].*)?", re.DOTALL)
+_COMPUTED = re.compile(r"(?P<numbers>[-+*/^().\d\s]*(?:pi[-+*/^().\d\s]*)*)(?P<unit>[^\W\d_°%µΩ].*)")
 _WORD_NUMBER = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
 
 
@@ -144,6 +148,8 @@ def read_binding(
     if text in named:
         return Binding(named[text], None, dimension, node.place)
     try:
+        _refuse_marks(text, node.place, what)
+        _refuse_computed(text, node.place, what, unit)
         if is_quantity(text):
             _refuse_mixture(text, node.place, what, names_known)
             number = quantity(text, node.place, what=what, unit=unit).value
@@ -159,6 +165,34 @@ def read_binding(
         return None
     except AlreadyReportedError:
         return None
+
+
+def _refuse_marks(text: str, place: Place, what: str) -> None:
+    """Raise ApcError for a number with a decimal comma, or whose thousands are set apart."""
+    if (found := _COMMA.fullmatch(text.strip())) is not None:
+        hint = either_comma(what, found[1], found[2], found[3])
+        raise ApcError(Mistake("E221", place, what, "a decimal point", brief(text), hint))
+    if (found := _SPACED.match(text.strip())) is not None:
+        joined = re.sub(r"[^0-9+-]", "", found[0]) + text.strip()[found.end() :]
+        told = "a number without spaces or marks inside"
+        raise ApcError(Mistake("E221", place, what, told, brief(text), f"{what}: {joined}"))
+
+
+def _refuse_computed(text: str, place: Place, what: str, unit: str) -> None:
+    """Raise ApcError for numbers that are computed and have a unit behind them, as 2*pi*100 N/m."""
+    found = _COMPUTED.fullmatch(text.strip())
+    if found is None or is_quantity(text) or not found["numbers"].strip():
+        return
+    none: dict[tuple[str, ...], Fraction] = {}  # a name has no value here
+    try:
+        number = evaluate(parse_expression(found["numbers"], place), none.__getitem__)
+        if parse_unit(found["unit"], place).dimension != parse_unit(unit, place).dimension:
+            return
+    except ApcError:
+        return
+    told = "a number with its unit, or an expression without units"
+    hint = f"{what}: {float(number):.9g} {found['unit']}"
+    raise ApcError(Mistake("E204", place, what, told, brief(text), hint))
 
 
 def _refuse_mixture(text: str, place: Place, what: str, names_known: Collection[str]) -> None:
@@ -194,6 +228,11 @@ def _expression(
         its = "has no unit" if found == DIMENSIONLESS else f"is in {format_dimension(found or dimension)}"
         got = f"{brief(text)}, which {its}"
         raise ApcError(Mistake("E204", place, what, unit, got, f"{what}: 1 {unit}"))
+    if found is not None and found.clashes(dimension):  # of a name, a sum or a choice: no product has it
+        got = f"{brief(text)}, which is in {format_dimension(found)}"
+        whole = format_expression(tree) if isinstance(tree, Name) else f"({format_expression(tree)})"
+        turned = f"2*pi*{whole}" if dimension.turning == "rad" else f"{whole}/(2*pi)"
+        raise ApcError(Mistake("E204", place, what, unit, got, f"{what}: {turned}"))
     return tree
 
 

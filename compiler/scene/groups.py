@@ -172,6 +172,7 @@ def _allowed_count(
 def read_settings(
     group: GroupBody,
     settable: Mapping[str, list[tuple[str, Settable]]],
+    places: Mapping[str, Collection[str]],
     clocks: Collection[str],
     read_number: Callable[[Node, str, Settable], Value | None],
     explained: Callable[[str, Place], bool],
@@ -185,6 +186,8 @@ def read_settings(
         The group.
     settable
         What can be set: by the name a person writes, the whole names it stands for.
+    places
+        The groups that have each part.
     clocks
         The clocks of the scene.
     read_number
@@ -206,6 +209,8 @@ def read_settings(
             what = f"set names {brief(key.text)}, which is no parameter or variable of a part"
             add_unknown("E206", key.place, what, key.text, list(settable), mistakes)
             continue
+        if _is_elsewhere(items, key.text, key.place, group.name, places, mistakes):
+            continue
         for whole, item in items:
             if isinstance(item, Option | Reference):
                 word = _word(node, key.text, item, clocks, mistakes)
@@ -218,12 +223,32 @@ def read_settings(
             elif (value := read_number(node, key.text, item)) is not None:
                 values.append((whole, value))
     for column_ in group.table.columns if group.table is not None else ():
+        items = settable.get(column_.name)
+        if items and _is_elsewhere(items, column_.name, column_.place, group.name, places, mistakes):
+            continue
         for whole, item in _items_of(column_, settable, explained, mistakes):
             if whole in columns or whole in dict(values):
                 mistakes.add("E702", column_.place, f"{whole} is given by set and by the table")
             columns[whole] = column_.numbers
             _check_column(column_, group.table.lines if group.table is not None else (), item, mistakes)
     return Settings(tuple(values), tuple(words), tuple(columns.items()))
+
+
+def _is_elsewhere(
+    items: SequenceType[tuple[str, Settable]],
+    name: str,
+    place: Place,
+    group: str,
+    places: Mapping[str, Collection[str]],
+    mistakes: Mistakes,
+) -> bool:
+    """Record what a group sets of a part that it doesn't have; return whether that is so."""
+    part = items[0][0].rpartition(".")[0]
+    if group in places[part] or not places[part]:
+        return False
+    what = f"{group} sets {name} and has no {part}, which is at {', '.join(places[part])}"
+    mistakes.add("E211", place, what, hint=f"at: [{', '.join((*places[part], group))}]")
+    return True
 
 
 def _entry_by_entry(
@@ -304,10 +329,12 @@ def _check_column(
     column: Column, lines: tuple[int, ...], item: Number | Variable, mistakes: Mistakes
 ) -> None:
     """Check a column's unit, and each of its numbers against the parameter's bounds."""
-    if column.unit.dimension != item.unit.dimension:
+    if column.unit.dimension != item.unit.dimension or column.unit.dimension.clashes(item.unit.dimension):
         expected = format_dimension(item.unit.dimension)
         got = f"[{column.unit.text}]" if column.unit.text != "1" else "no unit"
         hint = f"{column.name} [{item.unit.text}]"
+        if column.unit.dimension.clashes(item.unit.dimension):
+            hint += f", each {'divided by' if expected == 'Hz' else 'times'} 2*pi"
         mistakes.add(
             "E702", column.place, f"the heading {column.name}", expected=f"[{expected}]", got=got, hint=hint
         )

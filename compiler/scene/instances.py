@@ -40,6 +40,7 @@ from apc.compiler.source.reading import (
 )
 
 PART_KEYS = ("at", "shared", "count")
+LINK_ROLES = ("graph", "delays", "loss", "trace")
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +109,8 @@ class PartReader:
         """Read a part's entry, once for each element of an array, and write out the parts inside."""
         entry = self.entries[name]
         shared = self._shared(name, entry.component, entry.body.get("shared"))
-        groups = self._groups_of(name, entry.body.get("at"))
+        groups = self._groups_of(name, entry)
+        self._check_roles(name, entry)
         peers = sum(self.counts.get(group, 0) for group in groups)
         if entry.component.hears_others and peers == 1:
             what = f"{name} ({entry.component.name}) follows the other peers and"
@@ -210,14 +212,27 @@ class PartReader:
             self.mistakes.add("E210", node.place, what)
         return node.value
 
-    def _groups_of(self, name: str, node: Node | None) -> tuple[str, ...]:
+    def _check_roles(self, name: str, entry: PartEntry) -> None:
+        """Record a part that is no link and would have what only a link obeys: a graph, losses."""
+        roles = [p for p in entry.component.parameters if isinstance(p, Reference) and p.role in LINK_ROLES]
+        if roles and entry.section != "links":
+            what = f"{name} is a {entry.component.name}, whose {roles[0].name} only a link has"
+            self.mistakes.add("E210", entry.place, what, hint=f"links: {{{name}: …}}")
+
+    def _groups_of(self, name: str, entry: PartEntry) -> tuple[str, ...]:
+        node = entry.body.get("at")
         if node is None:
             return tuple(self.counts)
-        if not isinstance(node, Sequence):
-            got = form(node)
-            self.mistakes.add(
-                "E203", node.place, "at", expected="a list of groups", got=got, hint="at: [user]"
-            )
+        if entry.section == "links":
+            what = f"{name} is a link, which joins all peers: who takes part is said by what uses it"
+            told = form(node) if not isinstance(node, Sequence) else ", ".join(map(form, node.items))
+            hint = f"{self._user_of(name)}: {{at: [{told}]}}"
+            self.mistakes.add("E211", node.place, what, hint=hint)
+            return tuple(self.counts)
+        if not (isinstance(node, Sequence) and node.items):
+            got = form(node) if not isinstance(node, Sequence) else "an empty one"
+            hint = f"at: [{', '.join(self.counts)}]"
+            self.mistakes.add("E203", node.place, "at", expected="a list of groups", got=got, hint=hint)
             return ()
         found = []
         for item in node.items:
@@ -230,6 +245,16 @@ class PartReader:
                 what = f"{name} is at {brief(group)}, which is no group of peers"
                 add_unknown("E206", item.place, what, group, list(self.counts), self.mistakes)
         return tuple(found)
+
+    def _user_of(self, link: str) -> str:
+        """Return the first part that names a link, or an example of one."""
+        users = (
+            name
+            for name, entry in self.entries.items()
+            for _, value in entry.body.entries
+            if isinstance(value, Scalar) and value.text == link
+        )
+        return next(users, "coordination")
 
 
 def _inside(part: Part, inner: Inner, peers: int) -> Part:

@@ -22,6 +22,8 @@ from apc.compiler.scene.instances import Part
 from apc.compiler.scene.named_numbers import NamedNumbers
 from apc.compiler.source.nodes import Mapping, Node
 
+OBEYED = ("delay", "jitter", "distribution", "reorder", "on_loss")  # a link's numbers and words
+
 
 @dataclass(frozen=True, slots=True)
 class SceneLink:
@@ -71,6 +73,10 @@ def read_link(
         what = f"{part.name} is a {part.component.name}, which is no link: it has no clock and delay"
         files.mistakes.add("E210", part.place, what, hint="type: Link")
         return None
+    if idle := _idle(part):
+        what = f"{part.name} is a {part.component.name}, which is no link: a link has no {idle}"
+        files.mistakes.add("E210", part.place, what, hint="type: Link")
+        return None
     channel = read_channel(
         part.name,
         body,
@@ -83,6 +89,17 @@ def read_link(
     if clock is None or "delay" not in values:
         return None  # reported where it is
     return SceneLink(part.name, clock, values["delay"], graph, delays, channel, part.place)
+
+
+def _idle(part: Part) -> str:
+    """Return something that a link's component has and no link obeys, if there is such a thing."""
+    component = part.component
+    named = (*(name for name, _ in component.connectors), *(one.name for one in component.variables))
+    named += tuple(p.name for p in component.parameters if isinstance(p, Reference) and p.role == "link")
+    named += tuple(
+        p.name for p in component.parameters if not isinstance(p, Reference) and p.name not in OBEYED
+    )
+    return next(iter((*named, *("equations" for _ in (*component.equations, *component.inner)))), "")
 
 
 def _read_delays(

@@ -18,7 +18,7 @@ from apc.compiler.cache import SUFFIX
 from apc.compiler.compiled import Axis, Experiment
 from apc.compiler.components.component import Settable
 from apc.compiler.components.library import Library, definition_of
-from apc.compiler.errors import Mistakes, Place, visible
+from apc.compiler.errors import Mistake, Mistakes, Place, visible
 from apc.compiler.files import RefusedError, files_below
 from apc.compiler.frozen import dataclass
 from apc.compiler.language.tables import NamedFiles
@@ -28,6 +28,7 @@ from apc.compiler.scene.groups import Columns, GroupBody, read_counts, read_sett
 from apc.compiler.scene.instances import Part, PartReader, settable_names
 from apc.compiler.scene.links import SceneLink, read_link
 from apc.compiler.scene.named_numbers import NamedNumbers, read_count_by_names, read_named_numbers
+from apc.compiler.scene.oddities import oddities
 from apc.compiler.scene.sections import SECTIONS, PartSections
 from apc.compiler.scene.studies import read_experiment, read_region
 from apc.compiler.scene.timebase import SceneClock, read_clocks
@@ -73,7 +74,7 @@ class SceneGroup:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A topology, whole. `texts` are the digests of the files it names."""
+    """A topology, whole. `texts` are the digests of the files it names; `warnings` are no mistakes."""
 
     name: str
     about: str
@@ -86,11 +87,17 @@ class Scene:
     region: tuple[Axis, ...]
     texts: tuple[tuple[str, str], ...]
     place: Place
+    warnings: tuple[Mistake, ...] = ()
 
     @property
     def peers(self) -> int:
         """The number of peers."""
         return sum(group.count for group in self.groups)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of its groups and parts."""
+        return (*(group.name for group in self.groups), *(part.name for part in self.parts))
 
     def part(self, name: str) -> Part:
         """Return the part of this name."""
@@ -166,6 +173,7 @@ def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene |
     named = root.get("parameters")
     bodies = read_counts(peers, files, lambda node: read_count_by_names(node, named, mistakes))
     counts = {name: group.count for name, group in bodies.items()}
+    mistakes.names = tuple(counts)
     numbers = read_named_numbers(named, sum(counts.values()), mistakes)
     clocks = read_clocks(root.get("clocks"), numbers, {*numbers.values, *counts}, mistakes)
     sections = PartSections(root, library, {*numbers.values, *counts, *clocks}, mistakes)
@@ -179,18 +187,25 @@ def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene |
     read_links = tuple(link for link in links if link is not None)
     settable = settable_names(parts)
     varied = settable | _of_losses(read_links)
+    groups = _read_groups(bodies, settable, parts, clocks, sections, numbers)
+    if mistakes:
+        odd: tuple[Mistake, ...] = ()  # what is missing would be told a second time
+    else:
+        own = {name for group in groups for name, _ in (*group.values, *group.words, *group.columns)}
+        odd = oddities(parts, sections.entries, counts, own)
     return Scene(
         title,
         about,
         tuple(clocks.values()),
         tuple(numbers.values.items()),
-        _read_groups(bodies, settable, parts, clocks, sections, numbers),
+        groups,
         tuple(part for part in parts if part.section != "links"),
         read_links,
         read_experiment(root.get("experiment"), numbers.read_time, mistakes),
         read_region(root.get("studies"), varied, sections.is_reported, numbers.read_for, mistakes),
         tuple(sorted(files.digests.items())),
         root.place,
+        odd,
     )
 
 
@@ -224,6 +239,7 @@ def _read_groups(
 ) -> tuple[SceneGroup, ...]:
     """Read what each group of peers sets for itself: anything but what is of a link."""
     own = {name: items for name, items in settable.items() if not sections.is_of_link(name)}
+    places = {part.name: part.groups for part in parts}
 
     def explained(name: str, place: Place) -> bool:
         """Return whether it was said why a group can't set `part.parameter`; of a link's, say it here."""
@@ -239,7 +255,7 @@ def _read_groups(
     found = []
     for group in bodies.values():
         place = group.body.place
-        settings = read_settings(group, own, clocks, numbers.read_for, explained, numbers.mistakes)
+        settings = read_settings(group, own, places, clocks, numbers.read_for, explained, numbers.mistakes)
         settings = with_followers(settings, parts, numbers.values, numbers.peers, place, numbers.mistakes)
         found.append(
             SceneGroup(

@@ -13,10 +13,10 @@ from collections.abc import Collection
 from apc.compiler.components.definitions import read_type
 from apc.compiler.components.library import Library
 from apc.compiler.components.parts import Scope, read_count
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.scene.instances import PartEntry
 from apc.compiler.scene.named_numbers import NamedNumbers, read_new_name
-from apc.compiler.source.nodes import Mapping, Node
+from apc.compiler.source.nodes import Mapping, Node, Scalar
 from apc.compiler.source.reading import entries, read_mapping
 
 SECTIONS = ("masses", "couplers", "links", "hands")
@@ -62,13 +62,41 @@ class PartSections:
                 self.faulty.add(key.text)  # until it has been read
             if name is None or body is None:
                 continue
-            default, example = DEFAULT_TYPES.get(section), _TYPE_EXAMPLES.get(section, "Mass")
+            default = DEFAULT_TYPES.get(section)
+            typed = default is not None or body.get("type") is not None
+            example = _TYPE_EXAMPLES.get(section, "Mass") if typed else self._example(section, body)
             component = read_type(key, body, default, self.library, mistakes, example=example)
             if component is not None:
                 count = read_count(name, body, mistakes, single=section == "links")
                 self.entries[name] = PartEntry(section, body, component, key.place, count)
                 self.taken.add(name)
                 self.faulty.discard(name)
+
+    def _words(self) -> set[str]:
+        """Return every word that an entry says."""
+        return {
+            value.text
+            for entry in self.entries.values()
+            for _, value in entry.body.entries
+            if isinstance(value, Scalar)
+        }
+
+    def _example(self, section: str, body: Mapping) -> str:
+        """Return a type to propose for an entry without one: with its keys, and as few others as can be."""
+        keys = {key.text for key, _ in body.entries} - {"at", "shared", "count"}
+        usual = _TYPE_EXAMPLES.get(section, "Mass")
+        fitting = []
+        for name in (usual, *self.library.component_names):
+            try:
+                component = self.library.component(name)
+            except ApcError:
+                continue  # told where it is asked for
+            own = {name for name, _ in component.connectors} if component is not None else set()
+            if component is not None and (section != "hands" or own == {"flange"}):
+                known = own | {one.name for one in (*component.parameters, *component.variables)}
+                fitting.append((len(known), known >= keys, name))
+        named = {name: fits for _, fits, name in fitting}
+        return usual if named.get(usual) else next((n for _, fits, n in sorted(fitting) if fits), usual)
 
     def is_reported(self, name: str) -> bool:
         """Return whether `part.parameter` is of a part that is missing for a fault that was reported."""
@@ -92,7 +120,9 @@ class PartSections:
                 what = f"the topology has no {section} section"
                 self.mistakes.add("E201", self.root.place, what, hint=example)
                 return None
-            known = clocks if role == "clock" else links
+            known: Collection[str] = clocks if role == "clock" else links
+            if not word:  # what to propose: first what nothing has named yet
+                known = sorted(known, key=lambda name: name in self._words())
             reported = word not in known and not (isinstance(node, Mapping) and node.get(word) is None)
             return None if reported else known
 

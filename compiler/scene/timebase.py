@@ -15,8 +15,10 @@ from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.values import Value
 from apc.compiler.scene.named_numbers import NamedNumbers, read_new_name
-from apc.compiler.source.nodes import Mapping, Node
-from apc.compiler.source.reading import check_keys, entries, read_mapping
+from apc.compiler.source.nodes import Mapping, Node, Scalar
+from apc.compiler.source.reading import brief, check_keys, entries, read_mapping
+
+LIKE_A_RATE = 30  # a larger number without a unit is rather a rate in Hz than a period in ms
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +67,12 @@ def _read_clock(name: str, node: Node, numbers: NamedNumbers, mistakes: Mistakes
             mistakes.add("E201", node.place, f"clock {name} has no period", hint="period: 1 ms")
         if body.get("phase") is not None:
             phase = numbers.read_time(body.get("phase"), "phase")
+    elif isinstance(node, Scalar) and type(node.value) in (int, float) and node.plain:
+        rates = f"{name}: {node.text} Hz", f"{name}: {node.text} ms"
+        hint = ", or ".join(rates if abs(float(node.text)) > LIKE_A_RATE else reversed(rates))
+        got = f"{brief(node.text)} (no unit)"
+        mistakes.add("E204", node.place, name, expected="a time or a rate", got=got, hint=hint)
+        return None
     else:
         period = numbers.read_time(node, name)
     return None if period is None or phase is None else SceneClock(name, period, phase)

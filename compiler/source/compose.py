@@ -18,7 +18,8 @@ import yaml
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, nearest
 from apc.compiler.frozen import dataclass
 from apc.compiler.source.nodes import Lines, Mapping, Node, Scalar, Sequence
-from apc.compiler.source.yaml_faults import not_yaml
+from apc.compiler.source.reading import either_comma
+from apc.compiler.source.yaml_faults import NO_COLON, not_yaml, with_colon
 from apc.compiler.words import cut
 
 MAX_DEPTH = 64  # levels of nesting; a scene needs about six
@@ -29,6 +30,8 @@ MAX_NUMBER = 400  # characters of a scalar still tried as a number: Python refus
 _CORE = "tag:yaml.org,2002:"
 _INTEGER = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+_WHOLE = re.compile(r"[-+]?[0-9]+")
+_DIGITS = re.compile(r"[0-9]+")
 _WORDS: dict[str, bool | float | None] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL")),
     **dict.fromkeys(("true", "True", "TRUE"), True),
@@ -158,10 +161,30 @@ class _Composer:
             pairs = zip(done.nodes[::2], done.nodes[1::2], strict=True)
             # A key that is no scalar has been reported; it is left out so that the rest can be read.
             entries = tuple((key, value) for key, value in pairs if isinstance(key, Scalar))
+            self._check_entries(entries)
             node = Mapping(entries, done.place)
         else:
             node = Sequence(tuple(done.nodes), done.place)
         self._add(node, done.anchor, done.size, done.height)
+
+    def _check_entries(self, entries: tuple[tuple[Scalar, Node], ...]) -> None:
+        """Record a decimal comma, which ends a value, and a key without its colon."""
+        before: tuple[Scalar, Node] | None = None
+        for key, node in entries:
+            if isinstance(node, Scalar) and node.value is None and not node.text and key.plain:
+                given = before[1] if before is not None else None
+                if key.text[:1].isdigit() and isinstance(given, Scalar) and _WHOLE.fullmatch(given.text):
+                    assert before is not None
+                    name, number = before[0].text, f"{given.text},{key.text}"
+                    digits = _DIGITS.match(key.text)
+                    assert digits is not None
+                    hint = either_comma(name, given.text, digits[0], key.text[digits.end() :])
+                    self.mistakes.add(
+                        "E203", given.place, name, expected="a decimal point", got=number, hint=hint
+                    )
+                elif line := with_colon(key.text):
+                    self.mistakes.add("E109", key.place, NO_COLON, hint=line)
+            before = key, node
 
     def _alias(self, event: Any) -> None:
         place, name = self.lines.of(event.start_mark), event.anchor

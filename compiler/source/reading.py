@@ -27,6 +27,13 @@ def form(node: Node) -> str:
     return brief(node.text) if node.plain else f'"{brief(node.text)}"'
 
 
+def either_comma(key: str, whole: str, digits: str, rest: str | None) -> str:
+    """Return what to write for a number with a comma: 0,5 is 0.5, and 1,500 may be 1500 as well."""
+    decimal = f"{key}: {whole}.{digits}{rest or ''}"
+    thousands = len(digits) == 3 and whole.lstrip("+-0")
+    return f"{decimal}, or {key}: {whole}{digits}{rest or ''}" if thousands else decimal
+
+
 def brief(text: str) -> str:
     """Return a text short enough for one line of a message."""
     flat = " ".join(text.split())
@@ -132,10 +139,9 @@ def check_keys(mapping: Mapping, allowed: Collection[str], what: str, mistakes: 
     for key, node in mapping.entries:
         if key.text not in allowed:
             told = f"{what} has no key {brief(key.text)}"
-            if key.text[:1].isdigit():  # 0,1 kg reads as 0 and a key
-                told += " (a comma ends a value: decimals want a point)"
-            add_unknown("E202", key.place, told, key.text, allowed, mistakes)
-            close = nearest(key.text, allowed)
+            left = [one for one in allowed if one not in meant]  # what stands there already was not meant
+            close = nearest(key.text, left)
+            add_unknown("E202", key.place, told, close, [close] if close else allowed, mistakes)
             if close and close not in meant:
                 meant[close] = (Scalar(close, close, key.plain, key.place), node)
     return Mapping(tuple(meant.values()), mapping.place)

@@ -14,6 +14,12 @@ import yaml
 from apc.compiler.errors import Mistake, Place
 from apc.compiler.source.nodes import Lines
 
+NO_COLON = "a key stands here without its colon and a space"
+AMONG_KEYS = "this line is an item of a list, and stands among keys"
+# A key and what stands behind it, where a colon, or the space behind it, is missing.
+_KEY_ONLY = re.compile(r"([A-Za-z]\w*)(?:\s*[=:]\s*|\s+)(\S.*)|([A-Za-z]\w*)")
+_OPENED = re.compile(r"([A-Za-z]\w*)\s*\{")  # `device {mass: 1 kg`, whose bracket is part of a text
+
 # Part of PyYAML's problem, or of what it was doing, in either of its two parsers -> our sentence and hint.
 _PROBLEMS: tuple[tuple[str, str, str], ...] = (
     ("unexpected end of stream", "this quote is never closed", ""),
@@ -33,7 +39,7 @@ _PROBLEMS: tuple[tuple[str, str, str], ...] = (
         "",
     ),
     ("node content", "a value or a closing bracket is missing here", ""),
-    ("could not find expected ':'", "this line is neither 'key: value' nor '- item'", "key: value"),
+    ("could not find expected ':'", NO_COLON, ""),
     ("expected ',' or '}'", "this { is never closed, or a comma is missing behind it", ""),
     ("expected ',' or ']'", "this [ is never closed, or a comma is missing behind it", ""),
     ("flow mapping", "this { is never closed, or a comma is missing behind it", ""),
@@ -47,6 +53,44 @@ _PROBLEMS: tuple[tuple[str, str, str], ...] = (
 # What a bracket stands behind in a text, and what it holds with the rest of the text.
 _TEXT = re.compile(r"[^\s,:{}\[\]'\"][^,:{}\[\]'\"]*\Z")
 _BRACKET = re.compile(r"[\[{][^{}\[\]]*[\]}][^,:{}\[\]]*")
+
+
+def with_colon(text: str) -> str:
+    """Return a line that lacks the colon behind its key as it was meant; an empty text if it has no key."""
+    found = _KEY_ONLY.fullmatch(text.strip())
+    if found is None:
+        return ""
+    return f"{found[1]}: {found[2]}" if found[1] else ""
+
+
+def _line_above(line: int, lines: Lines) -> int:
+    """Return the line above one that isn't empty or a comment, -1 if there is none."""
+    above = line - 1
+    while above >= 0 and (not lines.lines[above].strip() or lines.lines[above].lstrip().startswith("#")):
+        above -= 1
+    return above
+
+
+def _without_colon(line: int, lines: Lines) -> Mistake | None:
+    """Return what is told of a line whose key has no colon; None if it has one."""
+    text = lines.lines[line].partition(" #")[0] if 0 <= line < len(lines.lines) else ""
+    stripped = text.strip()
+    found = _KEY_ONLY.fullmatch(stripped)
+    if bracket := _OPENED.match(stripped):
+        found, stripped = bracket, f"{bracket[1]} {stripped[bracket.end() - 1 :]}"
+    elif found is None or ": " in stripped or stripped.endswith(":") or stripped.startswith("- "):
+        return None
+    place = lines.place(line, len(text) - len(text.lstrip()))
+    return Mistake("E109", place, NO_COLON, hint=with_colon(stripped) or f"{stripped}:")
+
+
+def _item_among_keys(line: int, lines: Lines) -> Mistake | None:
+    """Return what is told of a line that is an item where keys stand around it; None if it is none."""
+    text = lines.lines[line].partition(" #")[0] if 0 <= line < len(lines.lines) else ""
+    if not text.lstrip().startswith("- "):
+        return None
+    place = lines.place(line, len(text) - len(text.lstrip()))
+    return Mistake("E109", place, AMONG_KEYS, hint=text.strip().removeprefix("- ").strip())
 
 
 def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Mistake:
@@ -69,6 +113,17 @@ def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Mistake:
         text = before[0] + bracket[0].rstrip()
         where = place.shifted(-len(before[0]))
         return Mistake("E109", where, f"a text with {rest[0]} in it needs quotes here", hint=f'"{text}"')
+    if "mapping values" in told:
+        for line in (mark.line, _line_above(mark.line, lines)):
+            if (found := _without_colon(line, lines)) is not None:
+                return found
+    opening = error.context_mark.line if error.context_mark is not None else mark.line
+    if "could not find expected ':'" in told and (found := _without_colon(opening, lines)):
+        return found
+    if "block" in told:
+        for line in (mark.line, opening):
+            if (found := _item_among_keys(line, lines)) is not None:
+                return found
     for part, sentence, hint in _PROBLEMS:
         if part in told:
             opened = sentence.startswith("this ") and error.context_mark is not None

@@ -30,6 +30,7 @@ def check_command(file: str | None) -> None:
     from apc.analysis.selfcheck import check_frame
     from apc.compiler.pipeline import check_definition, compile_topology
     from apc.inputs import find_input
+    from apc.present.analysis import warning_lines
 
     path = Path(file) if file else find_input(compiled_too=False)
     if found := check_definition(path):
@@ -38,6 +39,8 @@ def check_command(file: str | None) -> None:
     system = compile_topology(path)
     check_frame(system)
     tell(f"{path}: no mistakes. {system.name}, {counted(system.peers, 'peer')}.")
+    for line in warning_lines(system.warnings):
+        tell(line)
 
 
 @click.command("compile", cls=Command)

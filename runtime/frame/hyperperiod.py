@@ -124,4 +124,6 @@ def _check_frame_length(
             f"({clocks}); at most {MOST_TICKS} can be analysed"
         )
         hint = "periods that are simple multiples of one another"
-        raise ApcError(Mistake("E805", Place(system.origin.topology), what, hint=hint))
+        odd = max(system.clocks, key=lambda clock: period.get(clock.name, Fraction(0)).denominator)
+        place = Place(system.origin.topology, odd.line, odd.column)
+        raise ApcError(Mistake("E805", place, what, hint=hint))

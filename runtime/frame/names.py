@@ -9,6 +9,7 @@ Does not: read or change values.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from fractions import Fraction
 
@@ -27,6 +28,12 @@ from apc.compiler.words import with_unit
 
 # The sections of a topology, which a name may start with.
 SECTIONS = ("clocks", "couplers", "hands", "links", "masses", "parameters")
+
+# A number of one peer, which is none that can be set: user[1].device.x.
+_ONE_PEER = re.compile(r"(?P<group>\w+)\[(?P<peer>\d{1,9})\]\.(?P<rest>.+)")
+
+GIVEN = "…"  # where the value stands that was to be set
+MOST_LISTED = 20  # peers whose values are written out
 
 # The numbers of the hand that `--hands held` puts on each device.
 HELD = ("hand.mass", "hand.damping", "hand.stiffness")
@@ -106,10 +113,31 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE, *, counts: 
     if name in HELD and not any(one.startswith("hand.") for one in known):
         what = f"{written} is of the hand that --hands held puts on each device"
         raise ApcError(Mistake("E622", place, what, hint=f"--hands held --set {name}=…"))
+    one_peer = _ONE_PEER.fullmatch(name)
+    if (
+        one_peer is not None
+        and one_peer["group"] in groups
+        and one_peer["rest"] in {one.name for one in system.parameters}
+    ):
+        raise _of_one_peer(system, one_peer, place)
     if name not in known:
         near = nearest(name, sorted(known))
         raise ApcError(Mistake("E622", place, f"{written} is no parameter of {system.name}", hint=near))
     return Free(name, group)
+
+
+def _of_one_peer(system: CompiledSystem, found: re.Match[str], place: Place) -> ApcError:
+    """Return what is told of a value for one peer of a group: `user[1].device.x`."""
+    group, rest = next(one for one in system.groups if one.name == found["group"]), found["rest"]
+    what = f"{found[0]} is of one peer, and a setting is of all or of one group: a list gives each its own"
+    parameter = next(one for one in system.parameters if one.name == rest)
+    own = next((one for one in group.values if one.name == rest), parameter)
+    value = with_unit(f"{own.value:.12g}", own.unit)
+    values = [GIVEN if k == int(found["peer"]) else value for k in range(1, group.count + 1)]
+    hint = f"peers: {{{group.name}: {{count: {group.count}, set: {{{rest}: [{', '.join(values)}]}}}}}}"
+    if group.count > MOST_LISTED:
+        hint = f"peers: {{{group.name}: {{table: users.csv}}}}, a row a peer, and a column of {rest}"
+    return ApcError(Mistake("E622", place, what, hint=hint))
 
 
 def is_named(name: str) -> bool:

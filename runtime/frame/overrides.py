@@ -23,7 +23,7 @@ from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.formula import exact_value
 from apc.compiler.frozen import dataclass
 from apc.compiler.words import with_unit
-from apc.frame.names import OVERRIDE, Free, find, unit_of
+from apc.frame.names import GIVEN, OVERRIDE, Free, find, unit_of
 from apc.frame.parameters import Scope, columns_of, scope_of
 
 N = TypeVar("N", Parameter, Timing)
@@ -54,14 +54,17 @@ def parse_override(system: CompiledSystem, text: str, place: Place = OVERRIDE) -
     if not (equals and name and value):
         form = "contact.stiffness=800 N/m"
         raise ApcError(Mistake("E621", place, "an override", "NAME=VALUE", text[:80], form))
-    free = find(system, name, place, counts=True)
+    try:
+        free = find(system, name, place, counts=True)
+    except ApcError as error:  # of one peer, with the value that it was to have
+        raise ApcError(replace(one, hint=one.hint.replace(GIVEN, value)) for one in error.mistakes) from None
     unit = unit_of(system, free.name)
     try:
         found = quantity(
             value, place.shifted(len(text) - len(value)) if place.line else place, what=name, unit=unit
         )
     except ApcError as error:  # what is to be written is a setting, too
-        mistakes = [replace(one, hint=one.hint.replace(f"{name}: ", f"{name}=", 1)) for one in error.mistakes]
+        mistakes = [replace(one, hint=one.hint.replace(f"{name}: ", f"{name}=")) for one in error.mistakes]
         raise ApcError(mistakes) from None
     return Override(free, found.value)
 

@@ -82,6 +82,7 @@ def compile_text(system: CompiledSystem, needs: Needs, target: Path, difference:
         f"  frame {_time(float(needs.frame))}: {ticks or 'no clock is used, any frame will do'}",
         *note(f"self-check: {_self_check(system, difference)}"),
     ]
+    lines += warning_lines(system.warnings)
     for text in (*_pairwise(system), *(f"left out: {name}, as {reason}" for name, reason in system.dropped)):
         lines += note(text)
     return "\n".join(lines)
@@ -199,7 +200,13 @@ def answer_text(found: Answer) -> str:
         parts.append("\n".join(wrapped(f"Warning: {found.conventions.warning}")))
     if found.box is not None:
         parts.append(str(found.box))
-    return "\n\n".join(parts)
+    first, *rest = "\n\n".join(parts).split("\n")
+    return "\n".join((first, *warning_lines(found.warnings), *rest))
+
+
+def warning_lines(warnings: Sequence[str]) -> list[str]:
+    """Return the warnings of a topology as lines to stand under a sentence."""
+    return [line for text in warnings for line in note(f"Warning: {text}")]
 
 
 def network_answer_text(found: NetworkAnswer) -> str:
@@ -227,7 +234,7 @@ def answer_document(found: Answer) -> dict[str, Any]:
         "switching": found.switching.to_dict() if found.switching else None,
         "buzz": found.buzz.to_dict() if found.buzz else None,
         "buzz_note": "" if found.buzz else found.no_buzz or NOT_PLAYED,
-        "warnings": [found.conventions.warning] if found.conventions.warning else [],
+        "warnings": [*found.warnings, *filter(None, (found.conventions.warning,))],
     }
     if found.detailed:
         told["conventions"] = found.conventions.to_dict()

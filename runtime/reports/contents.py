@@ -195,7 +195,8 @@ def _texts(path: Path, system: CompiledSystem) -> Iterable[tuple[str, str]]:
 def _compiled(system: CompiledSystem, call: str) -> Section:
     found = needs(system)
     rows = [(one.name, one.states, one.motion, one.remembered, one.packets) for one in found.sites]
-    told = [f"left out: {name}, as {reason}" for name, reason in system.dropped]
+    told = [f"Warning: {one}" for one in system.warnings]
+    told += [f"left out: {name}, as {reason}" for name, reason in system.dropped]
     table = Table("What a peer keeps", ("kind", "states", "motion", "delayed", "on the network"), tuple(rows))
     frame = Table(
         "The scene",

@@ -49,7 +49,7 @@ peers: {user: {count: 2}}
 masses: {device: {mass: 1 kg, damping: 2 N*s/m, x: 1 mm}}
 couplers:
   tie: {type: Cubic, flange: device, stiffness: 3 N/m, soft: 0.1 N^-2}
-  wall: {type: VirtualWall, flange: device, stiffness: 900 N/m, clock: tick, period: 1 ms}
+  wall: {type: VirtualWall, flange: device, stiffness: 900 N/m, clock: tick}
 """
 _EDGES = """\
 topology: scene
