@@ -2,9 +2,10 @@
 
 Takes: `CompiledSystem`. Gives: a file, and the same system back.
 Guarantees: written whole or not at all; a damaged file, or one of another format version, is refused by name;
-every name, row and peer that one part of a model names is there in the other. A file from anywhere is only
-data: nothing in it is run or unpickled, no library of its is loaded; it is checked in full before anything is
-made of it, and what is made is no larger than what it holds. No topology is needed to load.
+every name is one that a topology can give, and each that one part of a model names, as every row and peer, is
+there in the other. A file from anywhere is only data: nothing in it is run or unpickled, no library of its is
+loaded; it is checked in full before anything is made of it, and what is made is no larger than what it holds.
+No topology is needed to load.
 Does not: compile, or ask whether the topology has changed since (see `cache`), or whether a model is true to
 its topology.
 
@@ -66,6 +67,14 @@ from apc.compiler.seal import seal
 from apc.compiler.timings import part
 
 FOREIGN = "it is not what apc compile writes"
+# What names are made of: words, with places in arrays; of a link's loss two numbers have netem's names.
+_WORD = r"[A-Za-z][A-Za-z0-9_]{0,62}"
+_PLACED = rf"{_WORD}(\[[0-9]+\])*"
+_PATH = rf"{_PLACED}(\.{_PLACED})*(\.1-[hk])?"
+_KIND = rf"{_WORD}( and {_WORD})*"
+_PARAMETER = rf"{_PATH}|count\({_WORD}\)"
+_TIMING = rf"{_PATH}|no delay|delay of {_PATH}( at {_KIND})?"
+_HEARD = r"(mean|sum|max|min|count)\((?!.*(\*/|/[/*]|\.\.))[A-Za-z0-9_.()\[\]{}<>=!,+*/^ -]+\)"
 _RATIONAL = re.compile(r"-?[0-9]{1,4000}(/[0-9]{1,4000})?\Z")
 
 
@@ -148,6 +157,7 @@ def _is_consistent(system: CompiledSystem) -> bool:
     duration = system.experiment.duration
     return (
         bool(system.groups)
+        and _are_names(system)
         and all(_are_different(one.name for one in listed) for listed in named)
         and timings.keys() >= {*periods, *delays}
         and all(timings[name] > 0 for name in periods)
@@ -178,6 +188,30 @@ def _is_consistent(system: CompiledSystem) -> bool:
         and len(system.region) <= 2
         and all(axis.low < axis.high for axis in system.region)
     )
+
+
+def _are_names(system: CompiledSystem) -> bool:
+    """Return whether every name is one that a topology can give; its own title alone is any text."""
+    kinds = system.kinds
+    clocks = [partition for kind in kinds for partition in kind.clocks]
+    paths = [state.name for kind in kinds for state in kind.states]
+    paths += [hold.name for kind in kinds for hold in kind.holds]
+    paths += [limit.name for kind in kinds for limit in kind.limits]
+    paths += [part for kind in kinds for part in (*kind.hands, *kind.held)]
+    paths += [part for kind in kinds if kind.ports is not None for part in kind.ports.parts]
+    paths += [channel for kind in kinds for sending in kind.sends for channel in sending.channels]
+    paths += [output for partition in clocks for output in partition.outputs]
+    paths += [axis.parameter for axis in system.region]
+    paths += [name for name, _ in system.dropped]
+    grammar = {
+        _WORD: [one.name for one in (*system.clocks, *system.links, *system.groups)],
+        _PATH: paths,
+        _KIND: [kind.name for kind in kinds],
+        _PARAMETER: [one.name for one in system.parameters],
+        _TIMING: [one.name for one in system.timings],
+        _HEARD: [receive.name for partition in clocks for receive in partition.receives],
+    }
+    return all(re.fullmatch(form, name) for form, names in grammar.items() for name in names)
 
 
 def _are_units_consistent(system: CompiledSystem) -> bool:

@@ -311,7 +311,12 @@ def test_all_peers_of_a_scene_on_this_machine(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    text = replaced(MOVING, ("{count: 3,", "{count: 2,"), ("delay: 8 ms}", "delay: 8 ms, loss: 20 %}"))
+    text = replaced(
+        MOVING,
+        ("three-users-average", f"{tmp_path}/of/another/folder"),  # a title, which is any text
+        ("{count: 3,", "{count: 2,"),
+        ("delay: 8 ms}", "delay: 8 ms, loss: 20 %}"),
+    )
     Path("three.yaml").write_text(text, encoding="utf-8")
     ran = subprocess.run(
         [sys.executable, "-m", "apc", "play", "--duration", "2 s", "--emulate", "--json"],
@@ -323,7 +328,7 @@ def test_all_peers_of_a_scene_on_this_machine(
     assert max(far for far, _ in told["apart"].values()) <= 1e-9
     for way in told["ways"]:
         assert 0.05 < way["came"]["lost"]["share"] < 0.4  # of 250, of which 20 % are lost: 6 deviations
-    run_folder = next(Path().glob("*.run"))
+    run_folder = Path("three.run")
     assert run(["compare", str(run_folder)]) == 0
     assert "packets were held back and lost at the sender" in capsys.readouterr().out
     (run_folder / "user-1.npz").write_bytes(b"PK")
