@@ -2,7 +2,7 @@
 
 Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `same_file`;
 `write_file`, `write_text`, `write_texts`, `check_target`, `unwritable`, `is_special`, `is_stdout`, and for
-what is written piece by piece `begin_file`, `finish_file`, `drop_file`, `partial_name`.
+what is written piece by piece `begin_file`, `finish_file`, `drop_file`, `partial_name`; `unlink_link`.
 Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
 waited for. What is written is there whole or not at all: a file is replaced by one of its mode and owner, a
 link stays and its file is written; a device or pipe, or what standard output writes to, is written to, never
@@ -288,6 +288,12 @@ def partial_name(path: Path) -> Path:
     target = _target(path)
     new = is_special(path) or not target.is_file()
     return path if new else target.with_name(f"{target.stem}.partial{target.suffix}")
+
+
+def unlink_link(path: Path) -> None:
+    """Remove a link where a file of a name that nobody chose is to be written: it may lead anywhere."""
+    if path.is_symlink():
+        path.unlink()
 
 
 def drop_file(temporary: Path) -> None:

@@ -56,7 +56,7 @@ HOUSE = (
     (
         "apc",
         """
-        threads memory later finite_equations distribution suffixes optional option_value result tables
+        threads memory later finite_equations distribution suffixes optional option_value result tables npz
         processes
         """,
     ),
