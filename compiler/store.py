@@ -1,6 +1,6 @@
 """NAME.apc: the compiled model on disk.
 
-Takes: `CompiledSystem`. Gives: a file, and the same system back.
+Takes: `CompiledSystem`. Gives: a file, and the same system back; `typed`.
 Guarantees: written whole or not at all; a damaged file, or one of another format version, is refused by name;
 every name is one that a topology can give, and each that one part of a model names, as every row and peer, is
 there in the other. A file from anywhere is only data: nothing in it is run or unpickled, no library of its is
@@ -125,7 +125,7 @@ def unpacked(archive: Archive, path: Path) -> CompiledSystem:
         raise ApcError(
             Mistake("E603", Place(str(path)), what, hint=f"apc compile {path.with_suffix('.yaml')}")
         )
-    system = _typed(CompiledSystem, document["system"], archive.members)
+    system = typed(CompiledSystem, document["system"], archive.members)
     assert isinstance(system, CompiledSystem)
     if not _is_consistent(system):
         raise _damaged(path, FOREIGN)
@@ -425,23 +425,23 @@ def _hints(wanted: type) -> dict[str, Any]:
     return typing.get_type_hints(wanted)
 
 
-def _typed(wanted: Any, value: Any, members: dict[str, bytes]) -> Any:
-    """Build a value of the wanted type from its plain form; functions stay data."""
+def typed(wanted: Any, value: Any, members: dict[str, bytes]) -> Any:
+    """Build a value of the wanted type from its plain form; functions stay data. Raises one of DAMAGE."""
     origin = typing.get_origin(wanted)
     if dataclasses.is_dataclass(wanted) and isinstance(wanted, type):
         if not isinstance(value, dict) or value.keys() != _hints(wanted).keys():
             raise TypeError(f"expected the fields of {wanted}")
-        return wanted(**{name: _typed(hint, value[name], members) for name, hint in _hints(wanted).items()})
+        return wanted(**{name: typed(hint, value[name], members) for name, hint in _hints(wanted).items()})
     if origin is tuple:
         if not isinstance(value, list):
             raise TypeError(f"expected a list, got {value!r}")
         arguments = typing.get_args(wanted)
         if arguments[-1] is Ellipsis:
-            return tuple(_typed(arguments[0], item, members) for item in value)
-        return tuple(_typed(a, item, members) for a, item in zip(arguments, value, strict=True))
+            return tuple(typed(arguments[0], item, members) for item in value)
+        return tuple(typed(a, item, members) for a, item in zip(arguments, value, strict=True))
     if origin in (typing.Union, types.UnionType):
         inner = [a for a in typing.get_args(wanted) if a is not type(None)]
-        return None if value is None else _typed(inner[0], value, members)
+        return None if value is None else typed(inner[0], value, members)
     if origin is np.ndarray:
         return _array(typing.get_args(typing.get_args(wanted)[1])[0], value, members)
     if wanted is Any:

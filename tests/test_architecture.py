@@ -118,7 +118,7 @@ HOUSE = (
         """,
     ),
     ("apc", "answer"),
-    ("apc.loop", "packets realtime device peer run start beside"),
+    ("apc.loop", "packets realtime device peer run reading start beside"),
     ("apc.comparison", "effort choice comparison"),
     (
         "apc.regions",

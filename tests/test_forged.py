@@ -138,7 +138,8 @@ def test_forged_files_of_every_sort_do_nothing_else_and_end() -> None:
 
     Here a dozen; thousands are `python -m tests.fuzz --inputs 0 --models 5000`.
     """
-    command = [sys.executable, "-m", "tests.fuzz", "--inputs", "0", "--models", "12", "--seed", "7"]
+    counts = ("--models", "12", "--recordings", "12", "--parts", "12")
+    command = [sys.executable, "-m", "tests.fuzz", "--inputs", "0", *counts, "--seed", "7"]
     ran = subprocess.run(
         [*command, "--out", str(Path.cwd() / "failures")],
         cwd=ROOT,
@@ -147,7 +148,8 @@ def test_forged_files_of_every_sort_do_nothing_else_and_end() -> None:
         check=False,
     )
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    assert "12 forged models" in ran.stdout
+    for what in ("models", "recordings", "parts"):
+        assert f"12 forged {what}" in ran.stdout
 
 
 # ---- what stands for a topology ----
