@@ -114,7 +114,7 @@ def play_command(
     )
     if how.patience < 0:
         raise ApcError(Mistake("E207", Place("--wait"), "the time", "0 s or more", patience, '--wait "30 s"'))
-    check_folder(folder)
+    check_folder(folder, path)
     if peer is None:
         if listen or to or device:
             raise click.UsageError("--listen, --to and --device are of one peer: --peer says which")

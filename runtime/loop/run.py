@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import check_target, unwritable, write_file, write_text
+from apc.compiler.files import check_target, same_file, unlink_link, unwritable, write_file, write_text
 from apc.compiler.frozen import dataclass
 from apc.loop.peer import NANO, Loop
 from apc.simulation.blocks import instants_of
@@ -120,8 +120,8 @@ def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
     )
 
 
-def check_folder(folder: Path) -> None:
-    """Refuse, before anything is played, a folder that can't hold a run.
+def check_folder(folder: Path, scene: Path) -> None:
+    """Refuse, before anything is played, a folder that can't hold a run of a scene.
 
     Raises
     ------
@@ -132,6 +132,8 @@ def check_folder(folder: Path) -> None:
         what = "is there already, and is no folder"
     elif folder.exists() and any(folder.iterdir()) and not (folder / SCENE).is_file():
         what = "is there already, and is no folder of a run"
+    elif any(same_file(folder / SCENE, one) for one in (scene, scene.parent / f"{scene.stem}.apc")):
+        what = "holds the scene that is played, and is no folder of a run"
     else:
         check_target(folder / SCENE if folder.exists() else folder)
         return
@@ -163,6 +165,7 @@ def write_run(folder: Path, system: CompiledSystem, peers: Sequence[PeerRun], *,
             path.unlink()
     except OSError as error:
         raise unwritable(folder, error) from None
+    unlink_link(folder / SCENE)
     store.save(system, folder / SCENE)
     for one in peers:
         _write_peer(folder, one, system)
@@ -185,10 +188,12 @@ def _write_peer(folder: Path, peer: PeerRun, system: CompiledSystem) -> None:
         with temporary.open("wb") as file:
             np.savez_compressed(file, **arrays)
 
-    write_file(folder / f"{file_name(peer.name)}.npz", write)
+    unlink_link(path := folder / f"{file_name(peer.name)}.npz")
+    write_file(path, write)
     for link, sender in sorted({(int(link), int(sender)) for link, sender in peer.arrivals[:, :2]}):
         rows = ("lost" if math.isinf(one) else f"{one * 1e3:.6f}" for one in delays_of(peer, link, sender))
-        write_text(folder / trace_name(system, link, sender, peer.number), "\n".join(["delay [ms]", *rows]))
+        unlink_link(path := folder / trace_name(system, link, sender, peer.number))
+        write_text(path, "\n".join(["delay [ms]", *rows]))
 
 
 PLAIN = (
