@@ -204,7 +204,7 @@ def _are_names(system: CompiledSystem) -> bool:
     paths += [axis.parameter for axis in system.region]
     paths += [name for name, _ in system.dropped]
     grammar = {
-        _WORD: [one.name for one in (*system.clocks, *system.links, *system.groups)],
+        _WORD: [one.name for listed in (system.clocks, system.links, system.groups) for one in listed],
         _PATH: paths,
         _KIND: [kind.name for kind in kinds],
         _PARAMETER: [one.name for one in system.parameters],

@@ -445,6 +445,19 @@ def test_what_is_no_file_of_a_peer_is_refused_at_once(kept: Path) -> None:
     assert "E973 holds 3 peers of a scene with 2" in told(read_run, kept)[0]
 
 
+def test_a_run_is_not_written_to_where_links_in_its_folder_lead(kept: Path, tmp_path: Path) -> None:
+    found, mine = read_run(kept), tmp_path / "mine.txt"
+    mine.write_text("mine", encoding="utf-8")
+    names = sorted(path.name for path in kept.iterdir())
+    assert len(names) == 5, "the scene, two peers and a way each"
+    for name in names:
+        (kept / name).unlink()
+        (kept / name).symlink_to(mine)
+    write_run(kept, found.system, found.peers)
+    assert mine.read_text() == "mine"
+    assert len(read_run(kept).peers) == 2
+
+
 def test_what_cant_be_played_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -133,13 +133,16 @@ def _peer(found: dict[str, NDArray[Any]]) -> PeerRun:
         raise DamageError("what it tells is not what apc play writes") from None
     routed = {f"{name}{at}" for name in ("packets", "missing") for at in range(min(told.routes, len(found)))}
     _want(found.keys() == {"told", *ARRAYS, *routed}, "its links are not those it tells of")
-    plain = {name: getattr(told, name) for name in _Told.__dataclass_fields__ if name != "routes"}
+    plain: dict[str, Any] = {
+        name: getattr(told, name) for name in _Told.__dataclass_fields__ if name != "routes"
+    }
     plain["dropped"] = dict(told.dropped)
     plain["sent"] = {(link, other): count for link, other, count in told.sent}
     plain["offsets"] = {other: (trip, ahead) for other, trip, ahead in told.offsets}
+    arrays: dict[str, Any] = {name: found[name] for name in ARRAYS}
     return PeerRun(
         **plain,
-        **{name: found[name] for name in ARRAYS},
+        **arrays,
         packets=tuple(found[f"packets{at}"] for at in range(told.routes)),
         missing=tuple(found[f"missing{at}"] for at in range(told.routes)),
     )
