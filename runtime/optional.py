@@ -1,23 +1,32 @@
 """Libraries that are there only where somebody asked for them: those of the extras plot, data and cluster.
 
 Takes: the name of a module, and of the extra that installs it. Gives: `need`, `missing`.
-Guarantees: a library that isn't there is a mistake with the line that installs it.
+Guarantees: a library that isn't there is a mistake with the line that installs it. On the command line none
+reads a file of the working folder for its settings.
 Does not: import anything before it is needed.
 """
 
 from __future__ import annotations
 
 import importlib
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.distribution import install_line
 
+HOME = Path(__file__).parent  # with the settings of matplotlib in it
+
 
 def need(module: str, extra: str) -> Any:
     """Import an optional library. Raises ApcError (E875) if it isn't there."""
     try:
-        return importlib.import_module(module)
+        with _at_home(module):
+            return importlib.import_module(module)
     except ImportError as error:
         raise missing(f"{module} is not installed", install_line(extra)) from error
 
@@ -25,3 +34,24 @@ def need(module: str, extra: str) -> Any:
 def missing(what: str, hint: str) -> ApcError:
     """Return the mistake (E875) that a library or program isn't there; `hint` says what to do."""
     return ApcError(Mistake("E875", Place("apc"), what, hint=hint))
+
+
+@contextmanager
+def _at_home(module: str) -> Iterator[None]:
+    """Import a module in apc's own folder: matplotlib takes a file of the working folder for its settings.
+
+    These name a program to run, among others. In a program of the user's own that is for the user to say.
+    """
+    if module in sys.modules or "apc.cli" not in sys.modules:
+        yield
+        return
+    try:
+        before = Path.cwd()
+    except OSError:  # it was removed, with all that was in it
+        yield
+        return
+    os.chdir(HOME)
+    try:
+        yield
+    finally:
+        os.chdir(before)

@@ -3,9 +3,10 @@
 Takes: a function of what all tasks share and of a task; tasks.
 Gives: `Workers`, `this_process`, `local_processes`, `cores`; `Patience`, `results`; `model_bytes`,
 `model_of_bytes`.
-Guarantees: every process starts afresh (spawned, never forked), computes with one thread, and ends with the
-one that started it, whatever ends that one; an interrupt from the keyboard reaches the first process alone;
-one that is lost is told, one that is silent is told of.
+Guarantees: every process starts afresh (spawned, never forked), imports nothing from the working folder that
+the first one would not, computes with one thread, and ends with the one that started it, whatever ends that
+one; an interrupt from the keyboard reaches the first process alone; one that is lost is told, one that is
+silent is told of.
 Does not: keep results, or decide which tasks are wanted.
 """
 
@@ -33,6 +34,8 @@ from apc.threads import single_threaded
 Shared = TypeVar("Shared")
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+
+SAFE_PATH = "PYTHONSAFEPATH"  # what makes Python leave the working folder out of its path
 
 # Seconds without a result after which that is told, and again after twice as many.
 SILENCE = 60.0
@@ -98,10 +101,11 @@ def local_processes(
     context = multiprocessing.get_context("spawn")
     # Nothing is ever sent through it: the other end closes when this process closes it, or dies.
     lifeline, held = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(jobs, context, _begin, (lifeline, compute, shared))
+    with _safe_path():  # it starts one that tidies up after all others
+        pool = ProcessPoolExecutor(jobs, context, _begin, (lifeline, compute, shared))
 
     def submit(task: Task) -> Future[Result]:
-        with _interrupts_ignored():  # a process started now inherits it, and keeps it while it imports
+        with _safe_path(), _interrupts_ignored():  # a process started now inherits both
             return pool.submit(_compute, task)
 
     def trouble(error: BaseException) -> ApcError | None:
@@ -173,7 +177,26 @@ def _tell_silence(seconds: float, patience: Patience, place: Place) -> None:
 
 
 @contextmanager
+def _safe_path() -> Iterator[None]:
+    """Have what is started import the standard library's `struct`, not a struct.py of the working folder.
+
+    A process is spawned as `python -c`, which puts the working folder before everything else. It gets this
+    one's path once it runs.
+    """
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[SAFE_PATH]
+        else:
+            os.environ[SAFE_PATH] = before
+
+
+@contextmanager
 def _interrupts_ignored() -> Iterator[None]:
+    """Ignore the keyboard, as a process started now does too while it imports."""
     if threading.current_thread() is not threading.main_thread():  # only it may set how signals are taken
         yield
         return

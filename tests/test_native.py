@@ -45,6 +45,17 @@ def test_what_was_compiled_once_is_found_again(cache: Path) -> None:
 
 
 @needs_compiler
+def test_a_linker_opens_nothing_of_the_working_folder(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(module, "PATIENCE", 5.0)
+    for name in ("libgcc_s.so.1", "libm.so.6", "libc.so.6"):
+        os.mkfifo(name)  # who opens it waits for ever
+    assert half(native(TEXT)) == 1.5
+
+
+@needs_compiler
 @pytest.mark.parametrize("part", [0, 7, 13, 19])
 def test_a_library_with_a_bit_turned_is_compiled_again(cache: Path, part: int) -> None:
     native(TEXT)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import matplotlib.colors
@@ -317,3 +320,32 @@ def test_a_picture_has_the_size_words_and_style_that_are_asked_for() -> None:
     own = matplotlib.figure.Figure().subplots()
     assert found.plot(own, labels={word: "Realteil"}) is own
     assert own.get_xlabel() == "Realteil"
+
+
+@pytest.mark.parametrize("settings", ["animation.ffmpeg_path: ./ran", "\udcff\udcfe", None])
+def test_a_picture_is_drawn_without_the_settings_in_the_working_folder(
+    tmp_path: Path, settings: str | None
+) -> None:
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    if settings is None:
+        os.mkfifo(tmp_path / "matplotlibrc")  # who opens it waits for ever
+    else:
+        (tmp_path / "matplotlibrc").write_text(settings, errors="surrogateescape")
+    made = "from apc.__main__ import run; failed = run(['show', 'scene.yaml', '--out', 'scene.png'])"
+    told = "import matplotlib; print(failed, matplotlib.rcParams['animation.ffmpeg_path'])"
+    ran = subprocess.run(
+        [sys.executable, "-c", f"{made}\n{told}"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert ran.stdout.splitlines()[-1:] == ["0 ffmpeg"], ran.stderr
+    assert (tmp_path / "scene.png").is_file()
+
+
+def test_settings_that_somebody_made_in_python_stay(tmp_path: Path) -> None:
+    with matplotlib.rc_context({"animation.ffmpeg_path": "mine"}):
+        assert run(["show", str(SCENES / "three-users-average.yaml"), "--out", str(tmp_path / "a.png")]) == 0
+        assert matplotlib.rcParams["animation.ffmpeg_path"] == "mine"

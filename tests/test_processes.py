@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from fractions import Fraction
 from pathlib import Path
 
@@ -66,6 +68,43 @@ def test_processes_end_at_once_whatever_they_do() -> None:
         futures = [workers.submit(part) for part in range(LONG.parts)]
     assert all(future.cancelled() or future.exception() is not None for future in futures)
     assert set(workers_of_mine()) <= before
+
+
+# All that start processes, in one that was itself started elsewhere.
+STARTING = """\
+from apc.__main__ import run
+from apc.explore.desk import Desk
+from apc.explore.sections import Task
+from apc.inputs import open_scene
+from apc.processes import model_bytes
+
+if __name__ == "__main__":
+    over = ["--over", "contact.stiffness=1 N/m:2 N/m:200"]
+    ran = [
+        run(["sweep", "scene.yaml", *over, "--jobs", "2", "--out", "r.csv"]),
+        run(["simulate", "lossy.yaml", "--duration", "40 ms", "--runs", "80", "--jobs", "2"]),
+        run(["bench", "scene.yaml", "--scale", "3,4"]),
+        run(["play", "scene.yaml", "--duration", "40 ms"]),
+    ]
+    model = model_bytes(open_scene("scene.yaml", ()))
+    desk = Desk(model, ("motion",), lambda call, _: call(), lambda *_: None)
+    desk.ask(Task("motion", (), None))
+    desk.close()
+    raise SystemExit(any(ran))
+"""
+
+
+def test_no_process_that_is_started_runs_what_lies_beside_a_topology(tmp_path: Path) -> None:
+    script, folder = tmp_path / "script.py", tmp_path / "folder"
+    script.write_text(STARTING, encoding="utf-8")
+    folder.mkdir()
+    (folder / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    (folder / "lossy.yaml").write_text(LOSSY, encoding="utf-8")
+    for name in (*sys.stdlib_module_names, "apc", "casadi", "numpy", "scipy"):
+        (folder / f"{name}.py").write_text(f"open('{name}.ran', 'w')\n", encoding="utf-8")
+    ran = subprocess.run([sys.executable, script], cwd=folder, capture_output=True, text=True, check=False)
+    assert sorted(path.name for path in folder.glob("*.ran")) == []
+    assert ran.returncode == 0, ran.stderr
 
 
 def test_a_process_stopped_from_outside_is_told_and_finished_parts_are_kept(tmp_path: Path) -> None:

@@ -1,18 +1,16 @@
 """What a peer of a run did and heard, on disk: one file a peer, a trace a way, and the scene they played.
 
-Takes: a `Loop` that has ended. Gives: `PeerRun`, `Run`, `run_of`, `check_folder`, `write_run`, `read_run`.
-Guarantees: a file is whole or not there; nothing of it is run when it is read.
-Does not: judge it (see `beside`).
+Takes: a `Loop` that has ended. Gives: `PeerRun`, `Run`, `run_of`, `check_folder`, `write_run`.
+Guarantees: a file is whole or not there.
+Does not: read it again (see `reading`), or judge it (see `beside`).
 """
 
 from __future__ import annotations
 
 import json
 import math
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +18,7 @@ from numpy.typing import NDArray
 from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import check_target, unwritable, write_file, write_text
+from apc.compiler.files import check_target, same_file, unlink_link, unwritable, write_file, write_text
 from apc.compiler.frozen import dataclass
 from apc.loop.peer import NANO, Loop
 from apc.simulation.blocks import instants_of
@@ -91,7 +89,7 @@ def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
         for i in range(2)
     )
     kept = kept.astype(bool) & np.isfinite(rows).all(axis=1)
-    log = np.array(player.log, np.int64).reshape(-1, 3)
+    log = np.maximum(np.array(player.log, np.int64).reshape(-1, 3), 0)  # where a clock was set back
     return PeerRun(
         name=loop.name,
         number=loop.own,
@@ -108,16 +106,22 @@ def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
         took=log[:, 2] / NANO,
         arrivals=np.array(player.arrivals, np.int64).reshape(-1, 5),
         sent=dict(player.sent),
-        packets=tuple(np.array([one for one, _ in seen], np.int64) for seen in player.seen),
-        missing=tuple(np.array([one for _, one in seen], np.bool_) for seen in player.seen),
+        packets=tuple(
+            np.array([one for one, _ in seen], np.int64).reshape(len(seen), len(mine))
+            for seen, mine in zip(player.seen, player.mine, strict=True)
+        ),
+        missing=tuple(
+            np.array([one for _, one in seen], np.bool_).reshape(len(seen), len(mine))
+            for seen, mine in zip(player.seen, player.mine, strict=True)
+        ),
         dropped=dict(loop.post.dropped),
         not_given=not_given,
         offsets={one: (trip / NANO, ahead / NANO) for one, (trip, ahead) in loop.offsets.items()},
     )
 
 
-def check_folder(folder: Path) -> None:
-    """Refuse, before anything is played, a folder that can't hold a run.
+def check_folder(folder: Path, scene: Path) -> None:
+    """Refuse, before anything is played, a folder that can't hold a run of a scene.
 
     Raises
     ------
@@ -128,6 +132,8 @@ def check_folder(folder: Path) -> None:
         what = "is there already, and is no folder"
     elif folder.exists() and any(folder.iterdir()) and not (folder / SCENE).is_file():
         what = "is there already, and is no folder of a run"
+    elif any(same_file(folder / SCENE, one) for one in (scene, scene.parent / f"{scene.stem}.apc")):
+        what = "holds the scene that is played, and is no folder of a run"
     else:
         check_target(folder / SCENE if folder.exists() else folder)
         return
@@ -159,6 +165,7 @@ def write_run(folder: Path, system: CompiledSystem, peers: Sequence[PeerRun], *,
             path.unlink()
     except OSError as error:
         raise unwritable(folder, error) from None
+    unlink_link(folder / SCENE)
     store.save(system, folder / SCENE)
     for one in peers:
         _write_peer(folder, one, system)
@@ -181,10 +188,12 @@ def _write_peer(folder: Path, peer: PeerRun, system: CompiledSystem) -> None:
         with temporary.open("wb") as file:
             np.savez_compressed(file, **arrays)
 
-    write_file(folder / f"{file_name(peer.name)}.npz", write)
+    unlink_link(path := folder / f"{file_name(peer.name)}.npz")
+    write_file(path, write)
     for link, sender in sorted({(int(link), int(sender)) for link, sender in peer.arrivals[:, :2]}):
         rows = ("lost" if math.isinf(one) else f"{one * 1e3:.6f}" for one in delays_of(peer, link, sender))
-        write_text(folder / trace_name(system, link, sender, peer.number), "\n".join(["delay [ms]", *rows]))
+        unlink_link(path := folder / trace_name(system, link, sender, peer.number))
+        write_text(path, "\n".join(["delay [ms]", *rows]))
 
 
 PLAIN = (
@@ -223,38 +232,3 @@ def trace_name(system: CompiledSystem, link: int, sender: int, receiver: int) ->
     """Return the name of the trace of a way."""
     names = [f"{group.name}-{place + 1}" for group in system.groups for place in range(group.count)]
     return f"{system.links[link].name}-{names[sender]}-to-{names[receiver]}.csv"
-
-
-def read_run(folder: Path) -> Run:
-    """Read a run. Raises ApcError E973 if a folder is none, damaged, or of several scenes."""
-    files = sorted(folder.glob("*.npz"))
-    if not (folder / SCENE).is_file() or not files:
-        what = f"holds no run: {SCENE} and a file a peer, as apc play writes them"
-        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out RUN"))
-    system = store.load(folder / SCENE)
-    peers = tuple(sorted((_read_peer(path) for path in files), key=lambda one: one.number))
-    if len({one.digest for one in peers}) > 1:
-        what = "holds peers of different scenes, or with different --set"
-        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
-    return Run(str(folder), system, peers)
-
-
-def _read_peer(path: Path) -> PeerRun:
-    try:
-        with np.load(path, allow_pickle=False) as found:
-            told = json.loads(found["told"].tobytes())
-            routes = range(int(told["routes"]))
-            plain: dict[str, Any] = {
-                name: tuple(told[name]) if isinstance(told[name], list) else told[name] for name in PLAIN
-            }
-            arrays: dict[str, Any] = {name: found[name] for name in ARRAYS}
-            return PeerRun(
-                **plain,
-                **arrays,
-                sent={(link, other): count for link, other, count in told["sent"]},
-                packets=tuple(found[f"packets{at}"] for at in routes),
-                missing=tuple(found[f"missing{at}"] for at in routes),
-                offsets={one: (trip, ahead) for one, trip, ahead in told["offsets"]},
-            )
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise ApcError(Mistake("E973", Place(str(path)), f"is no peer of a run: {error}")) from None

@@ -195,7 +195,7 @@ def play_all(system: CompiledSystem, how: Play) -> tuple[Part, ...]:
         raise ApcError(Mistake("E975", Place(system.name), what, hint='apc play FILE --peer "user[1]" …'))
     names = [exchange.peer_name(one) for one in range(exchange.peers)]
     sockets = {name: listen_at((LOOPBACK, 0)) for name in names}
-    stop, end = multiprocessing.get_context("spawn").Pipe(duplex=False)
+    stop, end = multiprocessing.Pipe(duplex=False)
     parts = []
     shared = _Shared(model_bytes(system), sockets, how, stop)
     lost = Mistake("E975", Place(system.name), "one of the peers ended without a word")

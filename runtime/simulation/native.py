@@ -59,7 +59,7 @@ def compiler() -> tuple[str, str] | None:
             said = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=10, check=True)
         except (OSError, subprocess.SubprocessError):
             continue
-        return path, said.stdout
+        return str(Path(path).absolute()), said.stdout
     return None
 
 
@@ -79,6 +79,7 @@ def _library(text: str, found: tuple[str, str], options: tuple[str, ...]) -> Pat
             source.write_text(text, encoding="utf-8")
             subprocess.run(
                 [path, *options, str(source), "-o", str(built), "-lm"],
+                cwd=name,  # linkers look for libraries where they are started
                 capture_output=True,
                 timeout=PATIENCE,
                 check=True,
