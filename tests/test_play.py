@@ -44,6 +44,7 @@ from apc.loop.start import Part, Play, play_all
 from apc.network.recorded import describe
 from apc.present.loop import ticks_text
 from apc.processes import Workers
+from tests.fuzz.packets import run_packets
 from tests.topologies import AVERAGE, replaced
 from tests.wire import HOUR, SOON, Other, Wire, loop_at, send_packets
 
@@ -456,6 +457,14 @@ def test_a_device_outside_is_measured_and_pushed(scene: CompiledSystem, tmp_path
     # What acts from tick k on is recorded at tick k + 1, as it was just before that.
     for tick in range(len(acting) - 1):
         assert forces[tick] == pytest.approx(-acting[tick + 1], abs=1e-12)
+
+
+def test_a_forged_datagram_is_dropped_in_meeting_and_in_playing(scene: CompiledSystem) -> None:
+    """Here some; thousands are `python -m tests.fuzz --inputs 0 --packets 10000`."""
+    failures, outcomes = run_packets(scene, 300, 7)
+    assert not failures
+    assert min(outcomes.values()) > 20
+    assert len(outcomes) == 7
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")

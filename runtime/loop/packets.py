@@ -41,6 +41,7 @@ DATA_BODY, HELLO_BODY, ANSWER_BODY = struct.Struct("<HQH"), struct.Struct("<QQ")
 OF_KEY = struct.Struct("<IQIQ")
 SCENE = 8  # bytes of the scene's digest
 SEAL = 16  # bytes of the keyed hash
+FAR = 1 << 61  # nanoseconds, 73 years: what follows from times within them is told in 64 bits
 
 # Why a datagram was dropped, in the order in which that is looked at, and how a person is told.
 DROPPED = {
@@ -201,9 +202,12 @@ class Post:
                 if all(map(math.isfinite, told)):
                     return Data(sender, time, link, count, told)
         elif sort == HELLO and len(body) == HELLO_BODY.size:
-            return Hello(sender, time, *HELLO_BODY.unpack(body))
+            hello = Hello(sender, time, *HELLO_BODY.unpack(body))
+            return hello if hello.nonce else None
         elif sort == ANSWER and len(body) == ANSWER_BODY.size:
-            return Answer(sender, time, *ANSWER_BODY.unpack(body))
+            answer = Answer(sender, time, *ANSWER_BODY.unpack(body))
+            times = answer.time, answer.asked, answer.came, answer.begins
+            return answer if answer.nonce and max(map(abs, times)) < FAR else None
         return None
 
     def drop(self, why: str) -> None:

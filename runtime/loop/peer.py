@@ -193,7 +193,7 @@ class Loop:
         """
         end, leads = now() + int(patience * NANO), self.own < min(self.others)
         self.player.warm_up()
-        while not self.begins:
+        while not self.session:
             self._knock(self.others)
             self.take_in(now() + KNOCK)
             if self.told is not None:

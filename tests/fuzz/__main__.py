@@ -12,7 +12,9 @@ from pathlib import Path
 
 from tests.fuzz.inputs import SORTS
 from tests.fuzz.models import FILE, forge
+from tests.fuzz.packets import run_packets
 from tests.fuzz.running import once, run_all, run_models, shrunk
+from tests.topologies import AVERAGE, compiled
 
 
 def main() -> int:
@@ -20,6 +22,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--inputs", type=int, default=2000, help="how many hostile inputs (default 2000)")
     parser.add_argument("--models", type=int, default=0, help="how many forged compiled models")
+    parser.add_argument("--packets", type=int, default=0, help="how many forged datagrams")
     parser.add_argument("--scenes", type=int, default=0, help="how many valid scenes against brute force")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--start", type=int, default=0, help="the first input of the seed to run")
@@ -52,12 +55,23 @@ def main() -> int:
     wrong = bool(failures)
     if options.models:
         wrong |= _forged(options.models, options.seed, options.out)
+    if options.packets:
+        wrong |= _packets(options.packets, options.seed)
     if options.scenes:
         from tests.test_properties import check_scenes
 
         check_scenes(options.scenes)
         print(f"{options.scenes} scenes agree with brute force")
     return int(wrong)
+
+
+def _packets(count: int, seed: int) -> bool:
+    """Give forged datagrams to a peer, tell of those that were taken, and return whether any was."""
+    failures, outcomes = run_packets(compiled(AVERAGE), count, seed)
+    for sort, number in sorted(outcomes.items()):
+        print(f"{number:8d}  datagram: {sort}")
+    print(f"{count} forged datagrams, {len(failures)} taken or not survived", *failures, sep="\n")
+    return bool(failures)
 
 
 def _forged(count: int, seed: int, out: Path) -> bool:
