@@ -25,6 +25,7 @@ import io
 import json
 import lzma
 import os
+import re
 import struct
 import zipfile
 import zlib
@@ -86,30 +87,53 @@ def read_archive(path: Path) -> Archive:
     ValueError
         Or another of DAMAGE: it is none. A document of another format is returned without members.
     """
-    data = read_file(path, LARGEST)
+    members = unzipped(read_file(path, LARGEST), LARGEST)
+    text = members.pop(MEMBER)
+    found = members.pop(SEAL, b"").decode()
+    if sum(map(text.count, (b"[", b"{", b","))) > MOST_VALUES:
+        raise DamageError(f"it holds more than {MOST_VALUES} values")
+    document = json.loads(text)
+    if document["format"] != FORMAT:
+        return Archive(document, {}, sealed=False)
+    if members.keys() != document["members"].keys() or document.keys() != FIELDS:
+        raise ValueError("it holds what nothing names")
+    for name, digest in document["members"].items():
+        if hashlib.sha256(members[name]).hexdigest() != digest:
+            raise DamageError(f"its member {name} was changed")
+    return Archive(document, members, is_sealed(text, found))
+
+
+def unzipped(data: bytes, most: int, names: re.Pattern[str] | None = None) -> dict[str, bytes]:
+    """Return the members of a ZIP archive.
+
+    Parameters
+    ----------
+    data
+        The archive.
+    most
+        How many bytes all of them may have.
+    names
+        What each must be called.
+
+    Raises
+    ------
+    DamageError
+        It unpacks to more, or a member is called otherwise.
+    ValueError
+        Or another of DAMAGE: it is none, or holds a name twice.
+    """
     _check_end(data)
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         listed = archive.infolist()
         if any(one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for one in listed):
             raise ValueError("it is packed otherwise")
-        if sum(one.file_size for one in listed) > LARGEST:
-            raise DamageError(f"it unpacks to more than {LARGEST >> 20} MiB")
-        text = _member(archive, MEMBER)
-        if sum(map(text.count, (b"[", b"{", b","))) > MOST_VALUES:
-            raise DamageError(f"it holds more than {MOST_VALUES} values")
-        document = json.loads(text)
-        if document["format"] != FORMAT:
-            return Archive(document, {}, sealed=False)
-        names = sorted(one.filename for one in listed if one.filename != SEAL)
-        if names != sorted((MEMBER, *document["members"])) or document.keys() != FIELDS:
-            raise ValueError("it holds what nothing names")
-        members = {}
-        for name, digest in document["members"].items():
-            members[name] = _member(archive, name)
-            if hashlib.sha256(members[name]).hexdigest() != digest:
-                raise DamageError(f"its member {name} was changed")
-        found = _member(archive, SEAL).decode() if SEAL in archive.namelist() else ""
-        return Archive(document, members, is_sealed(text, found))
+        if sum(one.file_size for one in listed) > most:
+            raise DamageError(f"it unpacks to more than {most >> 20} MiB")
+        if names is not None and not all(names.fullmatch(one.filename) for one in listed):
+            raise DamageError("it holds what does not belong there")
+        if len({one.filename for one in listed}) < len(listed):
+            raise ValueError("it holds a name twice")
+        return {one.filename: _member(archive, one) for one in listed}
 
 
 def _check_end(data: bytes) -> None:
@@ -127,10 +151,10 @@ def _check_end(data: bytes) -> None:
         raise DamageError(f"its list of members is larger than {MOST_LISTED >> 20} MiB")
 
 
-def _member(archive: zipfile.ZipFile, name: str) -> bytes:
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
     """Return a member, no more of it than the archive's list says, whatever it would unpack to."""
-    with archive.open(name) as stream:
-        return stream.read(archive.getinfo(name).file_size)
+    with archive.open(member) as stream:
+        return stream.read(member.file_size)
 
 
 def record_of(archive: Archive) -> Record:

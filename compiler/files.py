@@ -2,11 +2,11 @@
 
 Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `same_file`;
 `write_file`, `write_text`, `write_texts`, `check_target`, `unwritable`, `is_special`, `is_stdout`, and for
-what is written piece by piece `begin_file`, `finish_file`, `drop_file`, `partial_name`.
+what is written piece by piece `begin_file`, `finish_file`, `drop_file`, `partial_name`; `unlink_link`.
 Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
-waited for. What is written is there whole or not at all: a file is replaced by one of its mode and owner, a
-link stays and its file is written; a device or pipe, or what standard output writes to, is written to, never
-replaced.
+waited for. What is written is there whole or not at all, and what a writer left that was killed goes with the
+next: a file is replaced by one of its mode and owner unless it is read-only, a link stays and its file is
+written; a device or pipe, or what standard output writes to, is written to, never replaced.
 Does not: know a format, or say at which line a file was named.
 """
 
@@ -28,6 +28,11 @@ MOST_DEPTH = 8
 STDOUT = 1  # the descriptor of standard output
 KERNELS = ("/proc", "/sys")  # file systems whose files are answers of the kernel
 KERNELS_OWN = "is an answer of the system's kernel"
+
+MOST_WRITERS = 1000  # of one file at once
+UNFINISHED = ".unfinished"  # how the name of a temporary file ends that goes with the next writer
+
+_locks: dict[Path, int] = {}  # what keeps the temporary files of this process from being taken for left ones
 
 Why = Literal["missing", "folder", "special", "large", "forbidden", "unreadable"]
 
@@ -178,18 +183,19 @@ def write_file(path: Path, write: Callable[[Path], None]) -> None:
     ApcError
         E601 it can't be written; then what was there before is as it was.
     """
-    temporary: Path | None = None
     try:
         temporary = begin_file(path)
+    except (OSError, ValueError) as error:
+        raise unwritable(path, error) from error
+    try:
         write(temporary)
         finish_file(temporary, path)
-    except (OSError, ValueError) as error:
-        if isinstance(error, ValueError) and temporary is not None:
-            raise  # not of the name: of what `write` does
+    except OSError as error:
+        drop_file(temporary)
         raise unwritable(path, error) from error
-    finally:
-        if temporary is not None:
-            drop_file(temporary)
+    except BaseException:
+        drop_file(temporary)
+        raise
 
 
 def write_text(path: Path, text: str) -> None:
@@ -211,9 +217,10 @@ def write_texts(texts: Mapping[Path, str]) -> None:
                 ready[path].write_bytes(text.encode())
             except (OSError, ValueError) as error:
                 raise unwritable(path, error) from error
-        for path, temporary in ready.items():
+        for path in texts:
             try:
-                finish_file(temporary, path)
+                finish_file(ready[path], path)
+                del ready[path]
             except (OSError, ValueError) as error:
                 raise unwritable(path, error) from error
     finally:
@@ -237,27 +244,102 @@ def unwritable(path: Path, error: OSError | ValueError) -> ApcError:
 def begin_file(path: Path) -> Path:
     """Make the empty temporary file of a path: beside what it leads to, so that a rename puts it there.
 
+    What writers of the same path left that were killed is removed.
+
     Raises
     ------
     OSError
-        It can't be made: the folder isn't there or allows no new files, or a folder is in the way.
+        It can't be made: the folder isn't there or allows no new files, a folder is in the way, or a file
+        that is read-only.
     ValueError
         The name can't be one.
     """
     target = _target(path)
     if target.is_dir():
         raise IsADirectoryError(None, "it is a folder")
-    folder = None if is_special(path) else target.parent
-    import tempfile  # where nothing is written it is not needed
+    if is_special(path) or sys.platform == "win32":
+        import tempfile  # where nothing is written it is not needed
 
+        folder = None if is_special(path) else target.parent
+        handle, name = tempfile.mkstemp(prefix=f".{target.name[:48]}.", dir=folder)
+        os.close(handle)
+        return Path(name)
+    if target.exists() and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)):
+        raise PermissionError(None, "it is read-only")
     # The name of the target need not fit: a temporary's is longer.
-    handle, name = tempfile.mkstemp(prefix=f".{target.name[:64]}.", dir=folder)
-    os.close(handle)
-    return Path(name)
+    names = (target.with_name(f".{target.name[:48]}.{place}{UNFINISHED}") for place in range(MOST_WRITERS))
+    made = next((temporary for temporary in names if _is_begun(temporary)), None)
+    if made is None:
+        raise FileExistsError(None, "too many are writing it")
+    while (left := next(names, None)) is not None and os.path.lexists(left):
+        _remove_left(left)
+    return made
+
+
+def _is_begun(temporary: Path) -> bool:
+    """Make a temporary file and lock it, unless there is one that another writer has locked.
+
+    The lock ends with the process, however that ends.
+    """
+    while True:
+        try:
+            handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        except FileExistsError:
+            if not _remove_left(temporary):
+                return False
+            continue
+        if _is_locked(handle) is not True and _leads_to(temporary, handle):
+            _locks[temporary] = handle
+            return True
+        os.close(handle)  # it was taken for one that was left, in the instant before it was locked
+
+
+def _remove_left(temporary: Path) -> bool:
+    """Remove a temporary file of this user's whose writer is no more, and say whether it is gone."""
+    try:
+        handle = os.open(temporary, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return True
+    except OSError:
+        return False
+    try:
+        found = os.fstat(handle)
+        if not stat.S_ISREG(found.st_mode) or found.st_uid != os.geteuid() or _is_locked(handle) is not False:
+            return False
+        if _leads_to(temporary, handle):
+            temporary.unlink()
+    except OSError:
+        return False
+    finally:
+        os.close(handle)
+    return True
+
+
+def _is_locked(handle: int) -> bool | None:
+    """Lock an open file, unless another writer has; say whether one has, None where there are no locks."""
+    import fcntl
+
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return None
+    return False
+
+
+def _leads_to(path: Path, handle: int) -> bool:
+    """Return whether a path still is that of an open file."""
+    try:
+        return os.path.samestat(path.lstat(), os.fstat(handle))
+    except FileNotFoundError:
+        return False
 
 
 def finish_file(temporary: Path, path: Path) -> None:
     """Put a temporary file where it belongs: in place of a file, with its mode; into a device or pipe.
+
+    Then there is no temporary file any more: its name may be that of another writer's.
 
     Raises
     ------
@@ -267,6 +349,7 @@ def finish_file(temporary: Path, path: Path) -> None:
     if is_special(path):
         with temporary.open("rb") as source, os.fdopen(_drain(path), "wb") as drain:
             shutil.copyfileobj(source, drain)
+        drop_file(temporary)
         return
     target = _target(path)
     try:
@@ -280,7 +363,15 @@ def finish_file(temporary: Path, path: Path) -> None:
         if (made.st_uid, made.st_gid) != (before.st_uid, before.st_gid):
             _give(temporary, before)
         temporary.chmod(stat.S_IMODE(before.st_mode))
-    temporary.replace(target)
+    handle = _locks.pop(temporary, None)
+    try:
+        temporary.replace(target)
+    except OSError:
+        if handle is not None:
+            _locks[temporary] = handle
+        raise
+    if handle is not None:
+        os.close(handle)
 
 
 def partial_name(path: Path) -> Path:
@@ -290,9 +381,24 @@ def partial_name(path: Path) -> Path:
     return path if new else target.with_name(f"{target.stem}.partial{target.suffix}")
 
 
+def unlink_link(path: Path) -> None:
+    """Remove a link where a file of a name that nobody chose is to be written: it may lead anywhere.
+
+    Raises ApcError (E601) if it can't be removed.
+    """
+    try:
+        if path.is_symlink():
+            path.unlink()
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
 def drop_file(temporary: Path) -> None:
-    """Remove a temporary file, if it is still there."""
+    """Remove a temporary file that was not put where it belongs."""
+    handle = _locks.pop(temporary, None)
     temporary.unlink(missing_ok=True)
+    if handle is not None:
+        os.close(handle)
 
 
 def _target(path: Path) -> Path:

@@ -1,10 +1,11 @@
 """NAME.apc: the compiled model on disk.
 
-Takes: `CompiledSystem`. Gives: a file, and the same system back.
+Takes: `CompiledSystem`. Gives: a file, and the same system back; `typed`.
 Guarantees: written whole or not at all; a damaged file, or one of another format version, is refused by name;
-every name, row and peer that one part of a model names is there in the other. A file from anywhere is only
-data: nothing in it is run or unpickled, no library of its is loaded; it is checked in full before anything is
-made of it, and what is made is no larger than what it holds. No topology is needed to load.
+every name is one that a topology can give, and each that one part of a model names, as every row and peer, is
+there in the other. A file from anywhere is only data: nothing in it is run or unpickled, no library of its is
+loaded; it is checked in full before anything is made of it, and what is made is no larger than what it holds.
+No topology is needed to load.
 Does not: compile, or ask whether the topology has changed since (see `cache`), or whether a model is true to
 its topology.
 
@@ -66,6 +67,14 @@ from apc.compiler.seal import seal
 from apc.compiler.timings import part
 
 FOREIGN = "it is not what apc compile writes"
+# What names are made of: words, with places in arrays; of a link's loss two numbers have netem's names.
+_WORD = r"[A-Za-z][A-Za-z0-9_]{0,62}"
+_PLACED = rf"{_WORD}(\[[0-9]+\])*"
+_PATH = rf"{_PLACED}(\.{_PLACED})*(\.1-[hk])?"
+_KIND = rf"{_WORD}( and {_WORD})*"
+_PARAMETER = rf"{_PATH}|count\({_WORD}\)"
+_TIMING = rf"{_PATH}|no delay|delay of {_PATH}( at {_KIND})?"
+_HEARD = r"(mean|sum|max|min|count)\((?!.*(\*/|/[/*]|\.\.))[A-Za-z0-9_.()\[\]{}<>=!,+*/^ -]+\)"
 _RATIONAL = re.compile(r"-?[0-9]{1,4000}(/[0-9]{1,4000})?\Z")
 
 
@@ -116,7 +125,7 @@ def unpacked(archive: Archive, path: Path) -> CompiledSystem:
         raise ApcError(
             Mistake("E603", Place(str(path)), what, hint=f"apc compile {path.with_suffix('.yaml')}")
         )
-    system = _typed(CompiledSystem, document["system"], archive.members)
+    system = typed(CompiledSystem, document["system"], archive.members)
     assert isinstance(system, CompiledSystem)
     if not _is_consistent(system):
         raise _damaged(path, FOREIGN)
@@ -148,6 +157,7 @@ def _is_consistent(system: CompiledSystem) -> bool:
     duration = system.experiment.duration
     return (
         bool(system.groups)
+        and _are_names(system)
         and all(_are_different(one.name for one in listed) for listed in named)
         and timings.keys() >= {*periods, *delays}
         and all(timings[name] > 0 for name in periods)
@@ -178,6 +188,30 @@ def _is_consistent(system: CompiledSystem) -> bool:
         and len(system.region) <= 2
         and all(axis.low < axis.high for axis in system.region)
     )
+
+
+def _are_names(system: CompiledSystem) -> bool:
+    """Return whether every name is one that a topology can give; its own title alone is any text."""
+    kinds = system.kinds
+    clocks = [partition for kind in kinds for partition in kind.clocks]
+    paths = [state.name for kind in kinds for state in kind.states]
+    paths += [hold.name for kind in kinds for hold in kind.holds]
+    paths += [limit.name for kind in kinds for limit in kind.limits]
+    paths += [part for kind in kinds for part in (*kind.hands, *kind.held)]
+    paths += [part for kind in kinds if kind.ports is not None for part in kind.ports.parts]
+    paths += [channel for kind in kinds for sending in kind.sends for channel in sending.channels]
+    paths += [output for partition in clocks for output in partition.outputs]
+    paths += [axis.parameter for axis in system.region]
+    paths += [name for name, _ in system.dropped]
+    grammar = {
+        _WORD: [one.name for one in (*system.clocks, *system.links, *system.groups)],
+        _PATH: paths,
+        _KIND: [kind.name for kind in kinds],
+        _PARAMETER: [one.name for one in system.parameters],
+        _TIMING: [one.name for one in system.timings],
+        _HEARD: [receive.name for partition in clocks for receive in partition.receives],
+    }
+    return all(re.fullmatch(form, name) for form, names in grammar.items() for name in names)
 
 
 def _are_units_consistent(system: CompiledSystem) -> bool:
@@ -391,23 +425,23 @@ def _hints(wanted: type) -> dict[str, Any]:
     return typing.get_type_hints(wanted)
 
 
-def _typed(wanted: Any, value: Any, members: dict[str, bytes]) -> Any:
-    """Build a value of the wanted type from its plain form; functions stay data."""
+def typed(wanted: Any, value: Any, members: dict[str, bytes]) -> Any:
+    """Build a value of the wanted type from its plain form; functions stay data. Raises one of DAMAGE."""
     origin = typing.get_origin(wanted)
     if dataclasses.is_dataclass(wanted) and isinstance(wanted, type):
         if not isinstance(value, dict) or value.keys() != _hints(wanted).keys():
             raise TypeError(f"expected the fields of {wanted}")
-        return wanted(**{name: _typed(hint, value[name], members) for name, hint in _hints(wanted).items()})
+        return wanted(**{name: typed(hint, value[name], members) for name, hint in _hints(wanted).items()})
     if origin is tuple:
         if not isinstance(value, list):
             raise TypeError(f"expected a list, got {value!r}")
         arguments = typing.get_args(wanted)
         if arguments[-1] is Ellipsis:
-            return tuple(_typed(arguments[0], item, members) for item in value)
-        return tuple(_typed(a, item, members) for a, item in zip(arguments, value, strict=True))
+            return tuple(typed(arguments[0], item, members) for item in value)
+        return tuple(typed(a, item, members) for a, item in zip(arguments, value, strict=True))
     if origin in (typing.Union, types.UnionType):
         inner = [a for a in typing.get_args(wanted) if a is not type(None)]
-        return None if value is None else _typed(inner[0], value, members)
+        return None if value is None else typed(inner[0], value, members)
     if origin is np.ndarray:
         return _array(typing.get_args(typing.get_args(wanted)[1])[0], value, members)
     if wanted is Any:

@@ -18,7 +18,15 @@ from typing import TYPE_CHECKING
 
 from apc.compiler.cache import DAMAGE, LARGEST, SUFFIX, Archive, changed, read_archive, record_of
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import RefusedError, check_file, check_target, is_special, read_file, same_file
+from apc.compiler.files import (
+    RefusedError,
+    check_file,
+    check_target,
+    is_special,
+    partial_name,
+    read_file,
+    same_file,
+)
 from apc.compiler.timings import part
 from apc.suffixes import written
 
@@ -245,7 +253,8 @@ def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path |
     ApcError
         E601 one of them can't be written; E616 one is read, or given twice.
     """
-    named = [path, path.parent / f"{path.stem}.yaml", *(path.parent / text for text in texts)]
+    own = (path, path.parent / f"{path.stem}.yaml", path.parent / f"{path.stem}.apc")
+    named = [*own, *(path.parent / text for text in texts)]
 
     def read(file: Path) -> bool:
         # `Path.is_file` raises for a name that is too long, which whoever writes it says.
@@ -262,8 +271,9 @@ def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path |
             if output.absolute() == before.absolute() or same_file(output, before):
                 what = f"is given to {other} and to {option}: the second would replace the first"
                 raise ApcError(Mistake("E616", Place(str(output)), what, hint=hint))
-        # Beside a CSV file of rows stands what made them, see `present.recording`.
-        for file in (output, output.with_name(f"{output.name}.json")):
+        # Beside rows stands what made them, see `present.recording`; beside C its header, see `exports.code`.
+        beside = (f"{output.name}.json", f"{output.stem}.h", f"{output.stem}_test.c")
+        for file in (output, partial_name(output), *(output.with_name(name) for name in beside)):
             if read(file):
                 what = f"is read by this command: {option.removesuffix('=')} would replace it"
                 raise ApcError(Mistake("E616", Place(str(file)), what, hint=hint))

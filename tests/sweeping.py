@@ -58,7 +58,7 @@ def start_waiting(folder: Path, count: int, *words: str) -> subprocess.Popen[str
 def parts(target: Path) -> dict[str, tuple[int, int]]:
     """Return the finished parts of a sweep: by name, what changes when a file is written anew."""
     folder = target.with_name(f"{target.name}.parts")
-    return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in folder.glob("part-*.npz")}
+    return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in folder.glob("part-*")}
 
 
 def wait_for_parts(running: subprocess.Popen[str], target: Path, count: int) -> None:

@@ -56,7 +56,7 @@ HOUSE = (
     (
         "apc",
         """
-        threads memory later finite_equations distribution suffixes optional option_value result tables
+        threads memory later finite_equations distribution suffixes optional option_value result tables npz
         processes
         """,
     ),
@@ -118,7 +118,7 @@ HOUSE = (
         """,
     ),
     ("apc", "answer"),
-    ("apc.loop", "packets realtime device peer run start beside"),
+    ("apc.loop", "packets realtime device peer run reading start beside"),
     ("apc.comparison", "effort choice comparison"),
     (
         "apc.regions",

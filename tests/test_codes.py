@@ -151,7 +151,7 @@ E880 runtime/cli: --over is not PATH=VALUES
 E881 runtime/sweeps runtime/vary: values to sweep are written wrong
 E883 runtime/cli runtime/sweeps runtime/vary: a sweep has nothing, too much or the same thing twice
 E884 runtime/sweeps: a sweep can't compute what is asked of it
-E885 runtime/sweeps: other work stands where a sweep keeps its parts
+E885 runtime/sweeps: something else stands where a sweep keeps its parts
 E886 runtime/regions: a published condition is written wrong
 E887 runtime: a table needs a library that is not installed
 E888 runtime/sweeps: a cluster can't compute

@@ -3,28 +3,34 @@
 from __future__ import annotations
 
 import os
+import signal
 import stat
+import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import click
 import pytest
 
 import apc
 from apc.__main__ import run
+from apc.cli import commands
 from apc.compiler import files
 from apc.compiler.errors import ApcError
 from apc.compiler.files import (
     RefusedError,
     begin_file,
+    drop_file,
     files_below,
     finish_file,
     read_file,
     write_file,
     write_texts,
 )
-from tests.topologies import AVERAGE, replaced, told
+from tests.topologies import AVERAGE, ROOT, replaced, told
 
 FIFO = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
 
@@ -155,7 +161,7 @@ def test_a_device_is_written_to_and_stays_a_device(tmp_path: Path) -> None:
     temporary = begin_file(Path(os.devnull))
     assert temporary.parent != Path(os.devnull).parent, "nothing is made among the devices"
     finish_file(temporary, Path(os.devnull))
-    temporary.unlink()
+    assert not temporary.exists()
     after = Path(os.devnull).stat()
     assert (before.st_ino, before.st_mode) == (after.st_ino, after.st_mode)
     assert link.is_symlink()
@@ -332,6 +338,179 @@ def test_two_files_that_define_one_name_are_refused_naming_both(
     Path("scene.yaml").write_text(f"library: [./parts, ./parts/]\n{AVERAGE}", encoding="utf-8")
     Path("parts/two.yaml").unlink()
     assert run(["check"]) == 0, "a folder that is named twice defines nothing twice"
+
+
+# Every option that names a file to write, with what else its command wants.
+WRITING = {
+    ("analyze", "--plot"): ("scene.yaml", "new.svg"),
+    ("bench", "--plot"): ("scene.yaml", "new.svg"),
+    ("compare", "--out"): ("scene.yaml", "new.json"),
+    ("critical", "--plot"): ("contact.stiffness", "scene.yaml", "new.svg"),
+    ("export", "--out"): ("scene.yaml", "new.npz"),
+    ("feel", "--out"): ("scene.yaml", "new.csv"),
+    ("network", "--out"): ("delays.csv", "new.csv"),
+    ("region", "--out"): ("scene.yaml", "--x", "contact.stiffness=1 N/m:2 N/m", "--y",
+                          "coordination.stiffness=1 N/m:2 N/m", "new.csv"),
+    ("report", "--out"): ("scene.yaml", "new.html"),
+    ("show", "--out"): ("scene.yaml", "new.txt"),
+    ("simulate", "--out"): ("scene.yaml", "--duration", "40 ms", "new.csv"),
+    ("simulate", "--plot"): ("scene.yaml", "--duration", "40 ms", "new.svg"),
+    ("simulate", "--still"): ("scene.yaml", "--duration", "40 ms", "new.svg"),
+    ("sweep", "--out"): ("scene.yaml", "--over", "contact.stiffness=1 N/m:2 N/m:2", "--jobs", "1", "new.csv"),
+}  # fmt: skip
+# A folder, which has a test of its own; written by no scene; read and not written.
+OTHERS = {("play", "--out"), ("schema", "--out"), ("play", "--device"), ("play", "--secret-file"),
+          ("bench", "--hard"), ("report", "--check")}  # fmt: skip
+
+
+def writing(command: tuple[str, str]) -> list[str]:
+    """Return the words of a command that writes a file, which is the last of them."""
+    *words, target = WRITING[command]
+    return [command[0], *words, command[1], target]
+
+
+def test_every_option_that_names_a_file_to_write_is_known_here() -> None:
+    context = click.Context(commands.apc)
+    found = {
+        (name, option.opts[0])
+        for name in commands.apc.list_commands(context)
+        for option in commands.apc.get_command(context, name).params
+        if isinstance(option.type, click.Path)
+    }
+    assert found == {*WRITING, *OTHERS}
+
+
+@pytest.fixture
+def inputs(folder: Path) -> tuple[Path, ...]:
+    """Return what a command reads: the topology, its table and compiled model, a recording."""
+    scene = replaced(AVERAGE, ("{count: 3}", "{table: users.csv}"))
+    Path("users.csv").write_text("device.mass [kg]\n0.1\n0.2\n", encoding="utf-8")
+    Path("scene.yaml").write_text(scene, encoding="utf-8")
+    Path("delays.csv").write_text("delay [ms]\n1\n2\nlost\n3\n", encoding="utf-8")
+    assert run(["compile", "scene.yaml"]) == 0
+    return tuple(Path(name) for name in ("scene.yaml", "users.csv", "scene.apc", "delays.csv"))
+
+
+@pytest.mark.parametrize("command", WRITING)
+def test_a_link_to_what_a_command_reads_is_refused(
+    inputs: tuple[Path, ...], capsys: pytest.CaptureFixture[str], command: tuple[str, str]
+) -> None:
+    before = [one.read_bytes() for one in inputs]
+    words = writing(command)
+    target = Path(words[-1])
+    for read in inputs[3:] if command[0] == "network" else inputs[:3]:
+        for link in (target.symlink_to, target.hardlink_to):
+            link(read)
+            capsys.readouterr()
+            assert f"{target}: E616 is read by this command" in failed(capsys, *words)
+            target.unlink()
+    assert [one.read_bytes() for one in inputs] == before
+
+
+@pytest.mark.parametrize("command", [*WRITING, ("schema", "--out")])
+def test_a_file_that_is_read_only_stays(
+    inputs: tuple[Path, ...], capsys: pytest.CaptureFixture[str], command: tuple[str, str]
+) -> None:
+    words = writing(command) if command in WRITING else [*command, "new.json"]
+    target = Path(words[-1])
+    target.write_text("mine", encoding="utf-8")
+    target.chmod(0o444)
+    capsys.readouterr()
+    assert failed(capsys, *words) == f"{target}: E601 can't be written: it is read-only."
+    assert target.read_text() == "mine"
+    assert not list(Path().glob(".*"))
+
+
+def test_beside_what_is_asked_for_nothing_that_is_read_is_replaced(
+    inputs: tuple[Path, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words, beside in (
+        (["export", "scene.yaml", "--peer", "user[1]", "--out", "new.c"], ("new.h", "new_test.c")),
+        (["simulate", "scene.yaml", "--duration", "40 ms", "--out", "new.csv"], ("new.csv.json",)),
+    ):
+        for name in beside:
+            Path(name).symlink_to("scene.apc")
+            capsys.readouterr()
+            assert f"{name}: E616 is read by this command" in failed(capsys, *words)
+            Path(name).unlink()
+    capsys.readouterr()
+    assert "E973 holds the scene that is played" in failed(
+        capsys, "play", "scene.yaml", "--duration", "40 ms", "--out", "."
+    )
+
+
+# ---- what a writer that was killed has left ----
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from apc.compiler.files import write_file
+
+def write(temporary):
+    temporary.write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+
+write_file(Path(sys.argv[1]), write)
+"""
+
+
+def kill_a_writer(path: Path) -> None:
+    ran = subprocess.run([sys.executable, "-c", KILLED, str(path)], cwd=ROOT, check=False)
+    assert ran.returncode == -signal.SIGKILL
+
+
+def test_what_killed_writers_left_goes_with_the_next(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    held = begin_file(path)
+    kill_a_writer(path)
+    kill_a_writer(path)  # which takes the place of the one before
+    assert len(list(tmp_path.iterdir())) == 2
+    drop_file(held)
+    kill_a_writer(path)
+    assert len(list(tmp_path.iterdir())) == 1
+    write_file(path, fill("whole"))
+    assert [(one.name, one.read_text()) for one in tmp_path.iterdir()] == [("r.csv", "whole")]
+
+
+def test_what_others_are_writing_stays(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    first, second = begin_file(path), begin_file(path)
+    first.write_text("first", encoding="utf-8")
+    write_file(path, fill("third"))
+    second.write_text("second", encoding="utf-8")
+    finish_file(first, path)
+    assert path.read_text() == "first"
+    finish_file(second, path)
+    assert path.read_text() == "second"
+    assert [one.name for one in tmp_path.iterdir()] == ["r.csv"]
+
+
+@FIFO
+def test_what_is_no_file_of_ours_is_no_temporary(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    name = begin_file(path)
+    drop_file(name)
+    (tmp_path / "mine.txt").write_text("mine", encoding="utf-8")
+    for make in (os.mkfifo, Path.mkdir, lambda one: one.symlink_to("mine.txt")):
+        make(name)
+        write_file(path, fill("whole"))
+        assert os.path.lexists(name)
+        name.rmdir() if name.is_dir() else name.unlink()
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+def test_of_many_writers_at_once_each_writes_it_whole(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    texts = {str(number) * 10_000 for number in range(8)}
+
+    def write(text: str) -> None:
+        for _ in range(20):
+            write_file(path, fill(text))
+            assert path.read_text() in texts
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(write, texts))
+    assert [one.name for one in tmp_path.iterdir()] == ["r.csv"]
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from apc.compiler import cache, seal, store
 from apc.compiler.cache import MEMBER, SEAL
 from apc.inputs import load_fresh
 from tests.fuzz.models import ask, packed, zipped
-from tests.topologies import AVERAGE, ROOT, compiled, replaced, told
+from tests.topologies import AVERAGE, ROOT, SCENES, compiled, replaced, told
 
 MODEL = Path("scene.apc")
 BY_NAME = ("analyze", "critical contact.stiffness", "simulate --duration 20ms --no-jit", "region")
@@ -138,7 +138,8 @@ def test_forged_files_of_every_sort_do_nothing_else_and_end() -> None:
 
     Here a dozen; thousands are `python -m tests.fuzz --inputs 0 --models 5000`.
     """
-    command = [sys.executable, "-m", "tests.fuzz", "--inputs", "0", "--models", "12", "--seed", "7"]
+    counts = ("--models", "12", "--recordings", "12", "--parts", "12")
+    command = [sys.executable, "-m", "tests.fuzz", "--inputs", "0", *counts, "--seed", "7"]
     ran = subprocess.run(
         [*command, "--out", str(Path.cwd() / "failures")],
         cwd=ROOT,
@@ -147,7 +148,8 @@ def test_forged_files_of_every_sort_do_nothing_else_and_end() -> None:
         check=False,
     )
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    assert "12 forged models" in ran.stdout
+    for what in ("models", "recordings", "parts"):
+        assert f"12 forged {what}" in ran.stdout
 
 
 # ---- what stands for a topology ----
@@ -233,6 +235,39 @@ def test_what_a_model_from_elsewhere_names_is_not_read(capsys: pytest.CaptureFix
     assert load_fresh(MODEL).peers == 3
     Path("scene.yaml").write_text(AVERAGE + "# changed\n", encoding="utf-8")
     assert "E605 is stale: scene.yaml has changed" in told(load_fresh, MODEL)[0]
+
+
+# ---- names ----
+
+# Of what is text in a model all but these is a name, or of a closed list of words.
+TEXTS = {"about", "origin", "text", "unit", "units", "exact", "value", "formula"}
+
+
+def names_in(value: Any) -> set[str]:
+    """Return the names that a document holds."""
+    if isinstance(value, dict):
+        return set().union(*(names_in(one) for key, one in value.items() if key not in TEXTS))
+    if isinstance(value, list):
+        return set().union(*map(names_in, value))
+    return {value} if isinstance(value, str) else set()
+
+
+@pytest.mark.parametrize("scene", ["lossy-average", "limited-motor", "two-handed-tool", "planar-users"])
+def test_a_model_with_a_name_that_no_topology_can_give_is_refused(scene: str) -> None:
+    store.save(compiled((SCENES / f"{scene}.yaml").read_text(encoding="utf-8")), MODEL)
+    document, members = opened()
+    title = document["system"]["name"]
+    text = json.dumps(document["system"])
+    names = names_in(document["system"]) - {title}
+    assert {"device.x" if scene == "lossy-average" else "peers", "haptic"} <= names
+    for name in names:
+        for other in (f"../{name}", f"/{name}", f"{name}*/", f"{name}'"):
+            renamed = json.loads(text.replace(json.dumps(name), json.dumps(other)))
+            MODEL.write_bytes(packed({**document, "system": renamed}, members))
+            assert "E604 is damaged" in told(store.load, MODEL)[0], (name, other)
+    system = {**document["system"], "name": f"../../{title}"}  # which is any text
+    MODEL.write_bytes(packed({**document, "system": system}, members))
+    assert store.load(MODEL).name == f"../../{title}"
 
 
 # ---- numbers ----

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import io
 import json
 import math
 import multiprocessing
+import os
 import random
 import select
 import shutil
@@ -19,7 +21,7 @@ import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext
@@ -39,13 +41,15 @@ from apc.loop.beside import Ticks, compare_run
 from apc.loop.device import device_function
 from apc.loop.packets import Address, Answer, Data, Hello, Post
 from apc.loop.peer import AT_ONCE, KNOCK, NANO, Loop
-from apc.loop.run import delays_of, read_run, run_of, write_run
+from apc.loop.reading import read_run
+from apc.loop.run import delays_of, run_of, write_run
 from apc.loop.start import Part, Play, play_all
 from apc.network.recorded import describe
 from apc.present.loop import ticks_text
 from apc.processes import Workers
+from tests.fuzz.arrays import recorded
 from tests.fuzz.packets import run_packets
-from tests.topologies import AVERAGE, replaced
+from tests.topologies import AVERAGE, replaced, told
 from tests.wire import HOUR, SOON, Other, Wire, loop_at, send_packets
 
 DIGEST = hashlib.sha256(b"a scene").digest()
@@ -483,7 +487,12 @@ def test_all_peers_of_a_scene_on_this_machine(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    text = replaced(MOVING, ("{count: 3,", "{count: 2,"), ("delay: 8 ms}", "delay: 8 ms, loss: 20 %}"))
+    text = replaced(
+        MOVING,
+        ("three-users-average", f"{tmp_path}/of/another/folder"),  # a title, which is any text
+        ("{count: 3,", "{count: 2,"),
+        ("delay: 8 ms}", "delay: 8 ms, loss: 20 %}"),
+    )
     Path("three.yaml").write_text(text, encoding="utf-8")
     ran = subprocess.run(
         [sys.executable, "-m", "apc", "play", "--duration", "2 s", "--emulate", "--json"],
@@ -495,12 +504,116 @@ def test_all_peers_of_a_scene_on_this_machine(
     assert max(far for far, _ in told["apart"].values()) <= 1e-9
     for way in told["ways"]:
         assert 0.05 < way["came"]["lost"]["share"] < 0.4  # of 250, of which 20 % are lost: 6 deviations
-    run_folder = next(Path().glob("*.run"))
+    run_folder = Path("three.run")
     assert run(["compare", str(run_folder)]) == 0
     assert "packets were held back and lost at the sender" in capsys.readouterr().out
     (run_folder / "user-1.npz").write_bytes(b"PK")
     assert run(["compare", str(run_folder)]) == 1
     assert "E973" in capsys.readouterr().err
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Path:
+    """Return the folder of a run of two peers."""
+    folder = tmp_path / "a.run"
+    folder.mkdir()
+    for name, content in recorded().items():
+        (folder / name).write_bytes(content)
+    return folder
+
+
+def changed(folder: Path, **how: Callable[[Any], Any]) -> None:
+    """Write a peer's file anew, with another value of what it tells or of its arrays."""
+    path = folder / "user-1.npz"
+    with np.load(path) as found:
+        arrays = dict(found)
+    told = json.loads(arrays["told"].tobytes())
+    for name, change in how.items():
+        kept = told if name in told else arrays
+        kept[name] = change(kept[name])
+    arrays["told"] = np.frombuffer(json.dumps(told).encode(), np.uint8)
+    np.savez_compressed(path, **arrays)
+
+
+def put(place: Any, number: float) -> Callable[[Any], Any]:
+    """Return a change of one number of an array."""
+
+    def change(array: Any) -> Any:
+        array = array.copy()
+        array[place] = number
+        return array
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "why"),
+    [
+        ("time", put(3, math.inf), "a time or signal is no finite number"),
+        ("values", put((3, 0), math.nan), "a time or signal is no finite number"),
+        ("time", put(3, 0.0), "its times do not increase"),
+        ("time", put(-1, 1e9), "it leaves out a frame or more"),
+        ("time", lambda array: array[:-1], "it has not one value of each signal at each time"),
+        ("values", lambda array: array[:, 1:], "it has not one value of each signal at each time"),
+        ("values", lambda array: array.ravel(), "its values has 1 dimensions, not 2"),
+        ("values", lambda array: array.astype(object), "its values is no array of <f8"),
+        ("late", put(0, -1.0), "a tick began, or took, no time there is"),
+        ("took", put(0, math.inf), "a tick began, or took, no time there is"),
+        ("took", lambda array: array[1:], "its ticks did not begin as often as they ended"),
+        ("arrivals", put((0, 0), 1), "a packet came from where none comes"),
+        ("arrivals", put((0, 1), -1), "a packet came from where none comes"),
+        ("arrivals", put((0, 2), -1), "a packet has no time that there is"),
+        ("arrivals", put((0, 2), 2**62), "a way has more than 10,000,000 packets"),
+        ("arrivals", put((0, 3), -1), "a packet has no time that there is"),
+        ("arrivals", put((0, 4), 2**63 - 1), "a packet came at no time that there is"),
+        ("arrivals", lambda array: array[:, 1:], "what came is not told in five numbers"),
+        ("packets0", put((0, 0), -2), "a packet has a number that none has"),
+        ("packets0", lambda array: array[:, :0], "it hears other peers than the scene's"),
+        ("missing0", lambda array: array[1:], "it hears other peers than the scene's"),
+        ("missing0", lambda array: array.astype(np.int64), "its missing0 is no array of |b1"),
+        ("number", lambda _: 1, "the scene has no such peer"),
+        ("number", lambda _: -1, "the scene has no such peer"),
+        ("name", lambda _: "../../x", "the scene has no such peer"),
+        ("first", lambda _: -1, "it joins after the end"),
+        ("first", lambda _: 10**30, "it joins after the end"),
+        ("frames", lambda _: 0, "it joins after the end"),
+        ("routes", lambda _: 10**30, "its links are not those it tells of"),
+        ("routes", lambda _: 0, "its links are not those it tells of"),
+        ("signals", lambda listed: listed[1:], "its signals are not those of the scene"),
+        ("dropped", lambda _: {"late": -1}, "a count is negative"),
+        ("dropped", lambda _: {"x": 1}, "datagrams are dropped for no known reason"),
+        ("sent", lambda _: [[0, 1, -1]], "a count is negative"),
+        ("sent", lambda _: [[9, 1, 1]], "it tells of a peer or link that isn't there"),
+        ("offsets", lambda _: [[9, 0.0, 0.0]], "it tells of a peer or link that isn't there"),
+        ("offsets", lambda _: [[1, math.nan, 0.0]], "what it tells is not what apc play writes"),
+        ("stopped", lambda _: 1, "what it tells is not what apc play writes"),
+        ("not_given", lambda _: ["\x1b[2J"], "what it tells is not what apc play writes"),
+    ],
+)
+def test_what_no_peer_of_the_scene_can_have_done_is_refused(
+    kept: Path, name: str, change: Callable[[Any], Any], why: str
+) -> None:
+    assert len(read_run(kept).peers) == 2
+    changed(kept, **{name: change})
+    (message,) = told(read_run, kept)
+    assert message.startswith(f"{kept / 'user-1.npz'}: E973 is no peer of this run: {why}")
+
+
+def test_what_is_no_file_of_a_peer_is_refused_at_once(kept: Path) -> None:
+    path, bomb = kept / "user-1.npz", io.BytesIO()
+    np.savez_compressed(bomb, told=np.zeros((8 << 20) - 128, np.uint8))
+    path.write_bytes(
+        bomb.getvalue().replace((8 << 20).to_bytes(4, "little"), (1 << 31).to_bytes(4, "little"))
+    )
+    assert "E973 is no peer of this run: it unpacks to more than 1024 MiB." in told(read_run, kept)[0]
+    path.unlink()
+    os.mkfifo(path)  # who opens it waits for ever
+    assert "E973 is no peer of this run: is a device, pipe or socket." in told(read_run, kept)[0]
+    path.unlink()
+    path.symlink_to("user-2.npz")
+    assert "E973 holds a peer twice" in told(read_run, kept)[0]
+    (kept / "user-3.npz").symlink_to("user-2.npz")
+    assert "E973 holds 3 peers of a scene with 2" in told(read_run, kept)[0]
 
 
 def test_what_cant_be_played_is_told(

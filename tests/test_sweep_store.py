@@ -1,20 +1,20 @@
-"""Finished parts on disk: whole or not there, one sweep's only, one process at a time."""
+"""Finished parts on disk: whole or not there, and only what this user's apc wrote for this sweep."""
 
 from __future__ import annotations
 
 import errno
-import json
-import shutil
-import subprocess
-import sys
+import hmac
+import io
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from apc.compiler import seal
 from apc.sweeps import store as sweep_store
 from apc.sweeps.quantities import Cells
-from apc.sweeps.store import open_parts, remove_parts
+from apc.sweeps.store import Parts, open_parts
 from tests.topologies import told
 
 CELLS = (
@@ -26,6 +26,12 @@ CELLS = (
 MINE = {"model": "abc", "over": [1, 2]}
 
 
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path_factory.mktemp("cache")
+    monkeypatch.setattr(seal, "_folder", lambda: folder)
+
+
 def assert_kept(cells: Cells | None) -> None:
     assert cells is not None
     for one, kept in zip(CELLS, cells, strict=True):
@@ -33,173 +39,151 @@ def assert_kept(cells: Cells | None) -> None:
         np.testing.assert_array_equal(one, kept)
 
 
-def claim(target: Path, description: dict[str, object]) -> None:
-    with open_parts(target, description):
-        pass
+def written(target: Path) -> tuple[Parts, Path]:
+    """Return the parts of a sweep of which part 0 is done, and its file."""
+    parts = open_parts(target, MINE)
+    parts.write(0, CELLS)
+    [path] = parts.folder.iterdir()
+    return parts, path
 
 
 def test_rows_come_back_as_they_were(tmp_path: Path) -> None:
     target = tmp_path / "r.csv"
-    with open_parts(target, MINE) as parts:
-        assert parts.there() == set()
-        parts.write(7, CELLS)
-    with open_parts(target, MINE) as parts:
-        assert parts.there() == {7}
-        assert_kept(parts.read(7))
-        assert parts.read(8) is None
-        remove_parts(target)
+    parts = open_parts(target, MINE)
+    assert parts.there() == set()
+    parts.write(7, CELLS)
+    again = open_parts(target, MINE)
+    assert again.there() == {7}
+    assert_kept(again.read(7))
+    assert again.read(8) is None
+    again.remove()
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("damage", ["cut", "changed", "emptied", "moved"])
-def test_a_damaged_part_counts_as_not_there(tmp_path: Path, damage: str) -> None:
-    target = tmp_path / "r.csv"
-    with open_parts(target, MINE) as parts:
-        parts.write(0, CELLS)
-        path = tmp_path / "r.csv.parts" / "part-0.npz"
-        content = path.read_bytes()
-        if damage == "cut":
-            path.write_bytes(content[:-5])
-        elif damage == "changed":
-            path.write_bytes(content.replace("stable".encode("utf-32-le"), "Stable".encode("utf-32-le")))
-        elif damage == "emptied":
-            path.write_bytes(b"")
-        else:
-            path.rename(path.with_name("part-3.npz"))
-        assert parts.read(0) is None and parts.read(3) is None
+def repacked(content: bytes, **changed: np.ndarray) -> bytes:
+    """Return a part with other numbers, under the seal it had."""
+    mark, _, body = content.partition(b"\n")
+    with np.load(io.BytesIO(body)) as found:
+        arrays = {**found, **changed}
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return mark + b"\n" + file.getvalue()
 
 
-def test_parts_of_another_sweep_are_never_mixed_in(tmp_path: Path) -> None:
-    target = tmp_path / "r.csv"
-    with open_parts(target, MINE) as parts:
-        parts.write(0, CELLS)
-    assert told(claim, target, {**MINE, "over": [1, 3]}) == [
-        f"{target}.parts: E885 holds unfinished work of another sweep: different are its over. "
-        f"Write: another --out than {target}, or delete that folder"
-    ]
-    (tmp_path / "r.csv.parts" / "manifest.json").write_bytes(b"{")
-    (message,) = told(claim, target, MINE)
-    assert "E885 is there and was not made by apc sweep" in message
-    assert (tmp_path / "r.csv.parts" / "part-0.npz").is_file(), "nothing of it is lost"
+DAMAGES = {
+    "cut": lambda content: content[:-5],
+    "begun": lambda content: content[:40],
+    "only sealed": lambda content: content[:65],
+    "emptied": lambda content: b"",
+    "changed": lambda content: content.replace(b"stable", b"Stable"),
+    "longer": lambda content: content + b"\0",
+    "of other numbers": lambda content: repacked(content, numbers=np.zeros((1, 2))),
+    "of another shape": lambda content: repacked(content, numbers=np.zeros(2)),
+    "of objects": lambda content: repacked(content, texts=np.array([None])),
+    "without a seal": lambda content: content.partition(b"\n")[2],
+    "sealed by another": lambda content: (
+        hmac.digest(b"guess", content[65:], "sha256").hex().encode() + content[64:]
+    ),
+    "something else": lambda content: b"thesis",
+}
 
 
-def test_a_second_process_on_the_same_target_is_refused(tmp_path: Path) -> None:
-    target = tmp_path / "r.csv"
-    code = (
-        "import sys\nfrom pathlib import Path\nfrom apc.sweeps.store import open_parts\n"
-        "with open_parts(Path(sys.argv[1]), {}) as parts:\n"
-        "    parts.write(0, ())\n    print('held', flush=True)\n    sys.stdin.read()\n"
-    )
-    command = [sys.executable, "-c", code, str(target)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
-        assert other.stdout is not None and other.stdout.readline() == "held\n"
-        assert told(claim, target, {}) == [
-            f"{target}.parts: E885 is being worked on by another process; wait for it, "
-            "or choose another --out."
-        ]
-        other.kill()
-    assert told(claim, target, {}) == [], "the lock dies with its holder"
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_part_that_is_not_as_it_was_written_counts_as_not_there(tmp_path: Path, damage: str) -> None:
+    parts, path = written(tmp_path / "r.csv")
+    assert_kept(parts.read(0))
+    path.write_bytes(DAMAGES[damage](path.read_bytes()))
+    assert parts.read(0) is None
+    parts.write(0, CELLS)
+    assert_kept(parts.read(0))
 
 
-def test_what_a_killed_process_left_half_written_goes(tmp_path: Path) -> None:
-    target = tmp_path / "r.csv"
-    with open_parts(target, MINE) as parts:
-        parts.write(0, CELLS)
-    (tmp_path / "r.csv.parts" / ".part-1.npz.abc").write_bytes(b"half")
-    shutil.copytree(tmp_path / "r.csv.parts", tmp_path / ".r.csv.finished")
-    with open_parts(target, MINE):
-        names = sorted(path.name for path in (tmp_path / "r.csv.parts").iterdir())
-        assert names == ["lock", "manifest.json", "part-0.npz"]
-        assert not (tmp_path / ".r.csv.finished").exists()
+def test_a_part_is_no_other_part_and_of_no_other_sweep(tmp_path: Path) -> None:
+    parts, path = written(tmp_path / "r.csv")
+    path.with_name(path.name.replace("part-0", "part-3")).write_bytes(path.read_bytes())
+    other = open_parts(tmp_path / "r.csv", {**MINE, "over": [1, 3]})
+    other._path(0).write_bytes(path.read_bytes())
+    assert parts.read(3) is None and other.read(0) is None
 
 
-def test_a_sweep_of_which_nothing_came_leaves_nothing(tmp_path: Path) -> None:
-    claim(tmp_path / "r.csv", MINE)
-    assert list(tmp_path.iterdir()) == []
+def test_a_part_of_another_user_counts_as_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parts, _ = written(tmp_path / "r.csv")
+    monkeypatch.setattr(seal, "_folder", lambda: tmp_path / "other")
+    assert parts.read(0) is None
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(b"")
-    target = tmp_path / "file" / "r.csv"
-    assert told(claim, target, MINE) == [f"{target}.parts: E601 can't be written: Not a directory."]
+def test_without_a_secret_a_process_takes_up_what_it_wrote_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(seal, "_folder", lambda: tmp_path / "file" / "cache")
+    parts, _ = written(tmp_path / "r.csv")
+    assert_kept(parts.read(0))
+    monkeypatch.setattr(sweep_store, "_OWN", b"another process")
+    assert parts.read(0) is None
 
 
-def test_a_full_disk_keeps_the_finished_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("kind", ["pipe", "link to what never ends", "folder"])
+def test_what_is_no_file_counts_as_not_there(tmp_path: Path, kind: str) -> None:
+    parts, path = written(tmp_path / "r.csv")
+    path.unlink()
+    make = {"pipe": os.mkfifo, "folder": Path.mkdir}
+    make.get(kind, lambda one: one.symlink_to("/dev/zero"))(path)
+    assert parts.read(0) is None
+
+
+def test_sweeps_of_one_target_don_t_touch_each_other_s_parts(tmp_path: Path) -> None:
+    parts, path = written(tmp_path / "r.csv")
+    other = open_parts(tmp_path / "r.csv", {**MINE, "over": [1, 3]})
+    other.write(0, CELLS)
+    assert parts.there() == other.there() == {0}
+    other.remove()
+    assert [one.name for one in parts.folder.iterdir()] == [path.name]
+    assert_kept(parts.read(0))
+
+
+def test_of_a_full_disk_the_finished_parts_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(path: Path, content: bytes) -> None:
         path.write_bytes(content[:3])
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    target = tmp_path / "r.csv"
-    with open_parts(target, MINE) as parts:
-        parts.write(0, CELLS)
-        monkeypatch.setattr(sweep_store, "_fill", full)
-        part = tmp_path / "r.csv.parts" / "part-1.npz"
-        assert told(parts.write, 1, CELLS) == [f"{part}: E601 can't be written: No space left on device."]
-        assert parts.there() == {0}
-        assert_kept(parts.read(0))
+    parts, _ = written(tmp_path / "r.csv")
+    with monkeypatch.context() as patched:
+        patched.setattr(sweep_store, "_fill", full)
+        message = f"{parts._path(1)}: E601 can't be written: No space left on device."
+        assert told(parts.write, 1, CELLS) == [message]
+        assert told(open_parts(tmp_path / "s.csv", MINE).write, 0, CELLS) != []
+    assert parts.there() == {0}
+    assert_kept(parts.read(0))
+    assert [one.name for one in tmp_path.iterdir()] == ["r.csv.parts"], "nothing came of the other"
 
 
-def test_a_folder_that_no_sweep_made_is_refused_and_stays(tmp_path: Path) -> None:
-    target = tmp_path / "w.csv"
-    folder, finished = tmp_path / "w.csv.parts", tmp_path / ".w.csv.finished"
-    for one in (folder, finished):
-        one.mkdir()
-        (one / "part-0.npz").write_text("thesis", encoding="utf-8")
-    (message,) = told(claim, target, MINE)
-    assert message.startswith(f"{folder}: E885 is there and was not made by apc sweep")
-    (folder / "manifest.json").write_text('{"name": "a page of the web"}', encoding="utf-8")
-    assert told(claim, target, MINE) == [message]
-    assert [(one / "part-0.npz").read_text() for one in (folder, finished)] == ["thesis", "thesis"]
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    parts = open_parts(tmp_path / "file" / "r.csv", MINE)
+    assert told(parts.write, 0, CELLS) == [f"{parts.folder}: E601 can't be written: Not a directory."]
 
 
-def test_an_empty_folder_that_no_sweep_made_stays(tmp_path: Path) -> None:
-    (tmp_path / "w.csv.parts").mkdir()
-    assert len(told(claim, tmp_path / "w.csv", MINE)) == 1
-    assert (tmp_path / "w.csv.parts").is_dir()
+@pytest.mark.parametrize("kind", ["file", "link"])
+def test_what_is_no_folder_in_its_place_is_refused_and_stays(tmp_path: Path, kind: str) -> None:
+    folder = tmp_path / "w.csv.parts"
+    (tmp_path / "other").mkdir()
+    folder.write_text("thesis", encoding="utf-8") if kind == "file" else folder.symlink_to("other")
+    (message,) = told(open_parts, tmp_path / "w.csv", MINE)
+    assert message.startswith(f"{folder}: E885 is there and is no folder")
+    assert list((tmp_path / "other").iterdir()) == []
 
 
-def test_what_others_put_into_a_folder_of_parts_stays_when_the_sweep_is_done(tmp_path: Path) -> None:
-    target = tmp_path / "w.csv"
-    with open_parts(target, MINE) as parts:
-        parts.write(0, CELLS)
-        (parts.folder / "notes.txt").write_text("mine", encoding="utf-8")
-        (parts.folder / ".hidden").write_text("mine", encoding="utf-8")
-        remove_parts(target)
-    assert {path.name for path in tmp_path.rglob("*") if path.is_file()} == {"notes.txt", ".hidden"}
-
-
-def test_a_link_in_the_place_of_the_folder_is_refused_and_what_it_leads_to_stays(tmp_path: Path) -> None:
-    target, other = tmp_path / "w.csv", tmp_path / "other.csv"
-    with open_parts(other, MINE) as parts:
-        parts.write(0, CELLS)
-    (tmp_path / "w.csv.parts").symlink_to("other.csv.parts")
-    (tmp_path / ".w.csv.finished").symlink_to("other.csv.parts")
-    assert len(told(claim, target, MINE)) == 1
-    assert (tmp_path / "other.csv.parts" / "part-0.npz").is_file()
-
-
-def test_a_finished_folder_of_somebody_elses_does_not_stop_the_tidying_up(tmp_path: Path) -> None:
-    target = tmp_path / "w.csv"
-    (tmp_path / ".w.csv.finished").mkdir()
-    (tmp_path / ".w.csv.finished" / "mine.txt").write_text("mine", encoding="utf-8")
-    with open_parts(target, MINE) as parts:
-        parts.write(0, CELLS)
-        remove_parts(target)
-    assert [path.name for path in tmp_path.rglob("*")] == [".w.csv.finished", "mine.txt"]
-
-
-def test_a_part_carries_its_sweep_so_that_no_other_takes_it(tmp_path: Path) -> None:
-    target, other = tmp_path / "w.csv", {**MINE, "over": [3]}
-    with open_parts(target, MINE) as parts:
-        parts.write(0, CELLS)
-    manifest = tmp_path / "w.csv.parts" / "manifest.json"
-    kept = manifest.read_text(encoding="utf-8")
-    manifest.unlink()
-    (message,) = told(claim, target, other)
-    assert "E885 is there and was not made by apc sweep" in message
-    manifest.write_text(json.dumps({"made by": "apc sweep", **other}), encoding="utf-8")
-    with open_parts(target, other) as parts:
-        assert parts.read(0) is None
-    manifest.write_text(kept, encoding="utf-8")
-    with open_parts(target, MINE) as parts:
-        assert_kept(parts.read(0))
+def test_what_others_put_into_the_folder_stays(tmp_path: Path) -> None:
+    parts, path = written(tmp_path / "w.csv")
+    notes = [
+        parts.folder / name for name in ("notes.txt", ".hidden", "part-0.npz", "part-x", "manifest.json")
+    ]
+    for one in notes:
+        one.write_text("mine", encoding="utf-8")
+    path.unlink()
+    path.symlink_to("notes.txt")  # a part is not written to where a link leads
+    parts.write(0, CELLS)
+    parts.remove()
+    assert {one.read_text() for one in notes} == {"mine"}
+    assert sorted(parts.folder.iterdir()) == sorted(notes)

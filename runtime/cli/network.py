@@ -34,14 +34,15 @@ def network_command(recording: str, interval: str | None, out: Path | None, as_j
         irtt client -i 8ms -d 60s -o lan.json HOST
         apc network lan.json
     """
-    from apc.compiler.files import check_target, write_text
+    from apc.compiler.files import write_text
+    from apc.inputs import check_outputs
     from apc.network.recorded import describe
     from apc.option_value import option_value
     from apc.suffixes import check_suffix
 
     if out is not None:
         check_suffix(out, (".csv",), "--out")
-        check_target(out)
+        check_outputs(Path(recording), (), {"--out": out})
     between = None
     if interval is not None:
         between = float(option_value("--interval", interval, what="a time", unit="s"))

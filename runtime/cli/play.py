@@ -59,7 +59,10 @@ from apc.compiler.errors import ApcError, Mistake, Place
     "--wait", "patience", default="30 s", show_default=True, metavar='"TIME"', help="For the others."
 )
 @click.option(
-    "--out", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the run is kept; NAME.run."
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Where the run is kept; NAME.run for NAME.yaml.",
 )
 @json_option
 def play_command(
@@ -92,16 +95,18 @@ def play_command(
     Hosts that play together keep their clocks by NTP or PTP: how far apart
     they are when the peers meet is taken off, what they drift is not.
     """
-    from apc.inputs import open_scene
+    from apc.inputs import find_input, open_scene
     from apc.loop.device import device_function
-    from apc.loop.run import check_folder, read_run, write_run
+    from apc.loop.reading import read_run
+    from apc.loop.run import check_folder, write_run
     from apc.loop.start import Play, play_all, play_one
     from apc.option_value import option_value
     from apc.simulation.trajectory import duration_of, parse_duration
 
-    system = open_scene(file, settings, told=note_aside)
+    path = Path(file) if file else find_input(compiled_too=True)
+    folder = out or Path(f"{path.stem}.run")
+    system = open_scene(str(path), settings, told=note_aside)
     asked = parse_duration(duration) if duration is not None else None
-    folder = out or Path(f"{system.name}.run")
     how = Play(
         duration=duration_of(system, asked),
         secret=_secret(secret_file),
@@ -111,7 +116,7 @@ def play_command(
     )
     if how.patience < 0:
         raise ApcError(Mistake("E207", Place("--wait"), "the time", "0 s or more", patience, '--wait "30 s"'))
-    check_folder(folder)
+    check_folder(folder, path)
     if peer is None:
         if listen or to or device:
             raise click.UsageError("--listen, --to and --device are of one peer: --peer says which")

@@ -124,7 +124,7 @@ def compare_run(run: Run) -> RunComparison:
         Those of `prepare`, for a scene that can't be simulated.
     """
     system, peers = run.system, run.peers
-    simulation = prepare(live_scene(system), Settings(_duration(peers)))
+    simulation = prepare(live_scene(system), Settings(_duration(peers), jit=False))
     frame = float(simulation.frame * simulation.quantum)
     why_not = _incomplete(system, peers)
     return RunComparison(
@@ -151,6 +151,8 @@ def _incomplete(system: CompiledSystem, peers: tuple[PeerRun, ...]) -> str:
         return f"of {system.peers} peers {len(peers)} left their part of the run"
     if own := [one.name for one in peers if one.outside]:
         return f"{', '.join(own)} had a device outside, whose motion is not known"
+    if none := [one.name for one in peers if not all(map(len, one.packets))]:
+        return f"{', '.join(none)} ended before the first tick that hears"
     late = [one.name for one in peers if one.first]
     return f"{', '.join(late)} joined later, or again, in a state that others had not" if late else ""
 

@@ -1,9 +1,8 @@
 """What a peer of a run did and heard, on disk: one file a peer, a trace a way, and the scene they played.
 
-Takes: a `Loop` that has ended. Gives: `PeerRun`, `Run`, `run_of`, `check_folder`, `write_run`, `read_run`.
-Guarantees: a run is put where it belongs when all of it is written, until then what is there stays; peers
-that did not play together are no run; nothing of it is run when it is read.
-Does not: judge it (see `beside`).
+Takes: a `Loop` that has ended. Gives: `PeerRun`, `Run`, `run_of`, `check_folder`, `write_run`.
+Guarantees: a run is put where it belongs when all of it is written, until then what is there stays.
+Does not: read it again (see `reading`), or judge it (see `beside`).
 """
 
 from __future__ import annotations
@@ -11,18 +10,15 @@ from __future__ import annotations
 import json
 import math
 import tempfile
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import check_target, unwritable
+from apc.compiler.files import check_target, same_file, unwritable
 from apc.compiler.frozen import dataclass
 from apc.loop.peer import NANO, Loop
 from apc.processes import model_bytes
@@ -95,7 +91,7 @@ def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
         for i in range(2)
     )
     kept = kept.astype(bool) & np.isfinite(rows).all(axis=1)
-    log = np.array(player.log, np.int64).reshape(-1, 3)
+    log = np.maximum(np.array(player.log, np.int64).reshape(-1, 3), 0)  # where a clock was set back
     return PeerRun(
         name=loop.name,
         number=loop.own,
@@ -113,16 +109,22 @@ def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
         took=log[:, 2] / NANO,
         arrivals=np.array(player.arrivals, np.int64).reshape(-1, 5),
         sent=dict(player.sent),
-        packets=tuple(np.array([one for one, _ in seen], np.int64) for seen in player.seen),
-        missing=tuple(np.array([one for _, one in seen], np.bool_) for seen in player.seen),
+        packets=tuple(
+            np.array([one for one, _ in seen], np.int64).reshape(len(seen), len(mine))
+            for seen, mine in zip(player.seen, player.mine, strict=True)
+        ),
+        missing=tuple(
+            np.array([one for _, one in seen], np.bool_).reshape(len(seen), len(mine))
+            for seen, mine in zip(player.seen, player.mine, strict=True)
+        ),
         dropped=dict(loop.post.dropped),
         not_given=not_given,
         offsets={one: (trip / NANO, ahead / NANO) for one, (trip, ahead) in loop.offsets.items()},
     )
 
 
-def check_folder(folder: Path) -> None:
-    """Refuse, before anything is played, a folder that can't hold a run.
+def check_folder(folder: Path, scene: Path) -> None:
+    """Refuse, before anything is played, a folder that can't hold a run of a scene.
 
     Raises
     ------
@@ -133,6 +135,8 @@ def check_folder(folder: Path) -> None:
         what = "is there already, and is no folder"
     elif folder.exists() and any(folder.iterdir()) and not (folder / SCENE).is_file():
         what = "is there already, and is no folder of a run"
+    elif any(same_file(folder / SCENE, one) for one in (scene, scene.parent / f"{scene.stem}.apc")):
+        what = "holds the scene that is played, and is no folder of a run"
     else:
         check_target(folder / SCENE if folder.exists() else folder)
         return
@@ -232,38 +236,3 @@ def trace_name(system: CompiledSystem, link: int, sender: int, receiver: int) ->
     """Return the name of the trace of a way."""
     names = [f"{group.name}-{place + 1}" for group in system.groups for place in range(group.count)]
     return f"{system.links[link].name}-{names[sender]}-to-{names[receiver]}.csv"
-
-
-def read_run(folder: Path) -> Run:
-    """Read a run. Raises ApcError E973 if a folder is none, damaged, or of several scenes."""
-    files = sorted(folder.glob("*.npz"))
-    if not (folder / SCENE).is_file() or not files:
-        what = f"holds no run: {SCENE} and a file a peer, as apc play writes them"
-        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out RUN"))
-    system = store.load(folder / SCENE)
-    peers = tuple(sorted((_read_peer(path) for path in files), key=lambda one: one.number))
-    if len({(one.digest, one.session) for one in peers}) > 1:
-        what = "holds peers that did not play together: of other runs, of other scenes, or with another --set"
-        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
-    return Run(str(folder), system, peers)
-
-
-def _read_peer(path: Path) -> PeerRun:
-    try:
-        with np.load(path, allow_pickle=False) as found:
-            told = json.loads(found["told"].tobytes())
-            routes = range(int(told["routes"]))
-            plain: dict[str, Any] = {
-                name: tuple(told[name]) if isinstance(told[name], list) else told[name] for name in PLAIN
-            }
-            arrays: dict[str, Any] = {name: found[name] for name in ARRAYS}
-            return PeerRun(
-                **plain,
-                **arrays,
-                sent={(link, other): count for link, other, count in told["sent"]},
-                packets=tuple(found[f"packets{at}"] for at in routes),
-                missing=tuple(found[f"missing{at}"] for at in routes),
-                offsets={one: (trip, ahead) for one, trip, ahead in told["offsets"]},
-            )
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise ApcError(Mistake("E973", Place(str(path)), f"is no peer of a run: {error}")) from None

@@ -11,6 +11,8 @@ matplotlib is loaded when something is drawn and not before; it writes GIF by Pi
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -86,17 +88,15 @@ def save_animation(system: CompiledSystem, found: Trajectory, path: Path) -> Non
     writer = moving.writers["ffmpeg" if path.suffix.lower() == ".mp4" else "pillow"](fps=RATE)
 
     def write(temporary: Path) -> None:
-        named = temporary.with_name(f"{temporary.name}{path.suffix.lower()}")  # writers go by the suffix
-        try:
+        with tempfile.TemporaryDirectory(prefix="apc-animation-") as folder:
+            named = Path(folder, f"moving{path.suffix.lower()}")  # writers go by the suffix
             with writer.saving(figure, named, DPI):
                 for row in rows.tolist():
                     title.set_text(f"{system.name}: {found.time[row]:.3f} s{told}")
                     for actor, track in zip(actors, tracks, strict=True):
                         actor.move(track[row])
                     writer.grab_frame()
-            named.replace(temporary)
-        finally:
-            named.unlink(missing_ok=True)
+            shutil.copyfile(named, temporary)
 
     write_file(path, write)
 

@@ -246,16 +246,16 @@ class Recording:
         return self.path.with_name(f"{self.path.name}{added}")
 
     def _away(self) -> None:
-        for temporary in self._files:
-            drop_file(temporary)
+        while self._files:
+            drop_file(self._files.popitem()[0])
 
     def _finish(self, partial: bool) -> None:
         self._writer.finish()
         if partial:
             self.path = partial_name(self.path)
-        for temporary, added in self._files.items():
+        for temporary, added in [*self._files.items()]:
             finish_file(temporary, self._place(added))
-        self._away()
+            del self._files[temporary]
         self._open = False
 
     def _rescued(self, error: OSError) -> ApcError:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,7 @@ from apc.processes import Patience, Workers, cores, local_processes, model_bytes
 from apc.result import Result
 from apc.sweeps.grid import Grid, build_grid, check_size, parse_axis
 from apc.sweeps.quantities import BEGINNINGS, Cells, by_criterion, find_quantity
-from apc.sweeps.store import Parts, open_parts, remove_parts
+from apc.sweeps.store import Parts, open_parts
 from apc.sweeps.work import Computed, Work, compute_part, program_versions
 from apc.tables import BLOCK, Column, check_table_path, read_table, write_table
 from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE, criterion_of, refuse_time
@@ -166,8 +166,8 @@ def sweep(
     ------
     ApcError
         An axis is at fault (E622, E881 to E883, E896, E204, …); E884 nothing is computed under that name;
-        E885 other work stands at the target; E878, E887 or E601 the target can't be written; E888 the
-        cluster; E889 a process ended, or nothing came for too long. What is finished is kept.
+        E885 something else stands where its parts are kept; E878, E887 or E601 the target can't be written;
+        E888 the cluster; E889 a process ended, or nothing came for too long. What is finished is kept.
     """
     texts = {name: text if isinstance(text, str) else ",".join(text) for name, text in over.items()}
     check_size(list(texts.values()))
@@ -196,19 +196,19 @@ def sweep(
     )
     work = Work(model_bytes(system), work_of, grid, part_points(grid.points, quick=quantity.quick))
     made_of = _description(system, work)
-    with _kept(out, made_of) as kept:
-        whose = Whose(jobs or cores(), cluster, patience or Patience())
-        notes = _compute_missing(work, kept, whose, progress)
-        listed = (*(Column(axis.heading) for axis in grid.axes), *quantity.columns)
-        counts = Counter[str](), Counter[str]()
-        blocks, held = _blocks(work, kept, [one.kind for one in listed], counts), None
-        if isinstance(kept, _Memory):
-            held = tuple(np.concatenate(own) for own in zip(*blocks, strict=True))
-            blocks = ([column[at : at + BLOCK] for column in held] for at in range(0, grid.points, BLOCK))
-        if out is not None:
-            write_table(out, listed, blocks, made_of)
-        if out is not None and isinstance(kept, Parts):
-            remove_parts(out)
+    kept = _kept(out, made_of)
+    whose = Whose(jobs or cores(), cluster, patience or Patience())
+    notes = _compute_missing(work, kept, whose, progress)
+    listed = (*(Column(axis.heading) for axis in grid.axes), *quantity.columns)
+    counts = Counter[str](), Counter[str]()
+    blocks, held = _blocks(work, kept, [one.kind for one in listed], counts), None
+    if isinstance(kept, _Memory):
+        held = tuple(np.concatenate(own) for own in zip(*blocks, strict=True))
+        blocks = ([column[at : at + BLOCK] for column in held] for at in range(0, grid.points, BLOCK))
+    if out is not None:
+        write_table(out, listed, blocks, made_of)
+    if isinstance(kept, Parts):
+        kept.remove()
     return Sweep(system.name, of, grid, listed, held, *counts, out, made_of, notes)
 
 
@@ -284,13 +284,8 @@ def _in_a_file(out: Path | None) -> bool:
     return out is not None and not is_special(out)
 
 
-@contextmanager
-def _kept(out: Path | None, made_of: Mapping[str, Any]) -> Iterator[_Kept]:
-    if out is None or not _in_a_file(out):
-        yield _Memory()
-        return
-    with open_parts(out, made_of) as parts:
-        yield parts
+def _kept(out: Path | None, made_of: Mapping[str, Any]) -> _Kept:
+    return open_parts(out, made_of) if out is not None and _in_a_file(out) else _Memory()
 
 
 @dataclass(frozen=True, slots=True)
@@ -308,7 +303,8 @@ def _compute_missing(work: Work, kept: _Kept, whose: Whose, progress: Progress |
     missing = [part for part in range(work.parts) if part not in there or kept.read(part) is None]
     damaged = [part for part in missing if part in there]
     done = work.grid.points - sum(len(work.points_of(part)) for part in missing)
-    notes = [f"part {part} was damaged and is computed again" for part in damaged]
+    again = "was damaged, or written by somebody else, and is computed again"
+    notes = [f"part {part} {again}" for part in damaged]
     if done:
         notes.append(f"{done:,} points were there already")
     if progress:
@@ -353,7 +349,8 @@ def _blocks(
     rows = 0
     for number in range(work.parts):
         cells = kept.read(number)
-        assert cells is not None, f"part {number} was written and is gone"
+        if cells is None:  # another process with the same sweep was done, and removed it
+            cells = compute_part(work, number).cells
         places = work.grid.places(work.points_of(number))
         columns = [own[places[:, axis]] for axis, own in enumerate(values)] + list(cells)
         counts[0].update(cells[0].tolist())

@@ -11,9 +11,8 @@ import time
 from pathlib import Path
 
 from tests.fuzz.inputs import SORTS
-from tests.fuzz.models import FILE, forge
 from tests.fuzz.packets import run_packets
-from tests.fuzz.running import once, run_all, run_models, shrunk
+from tests.fuzz.running import FORGERIES, once, run_all, run_forged, shrunk
 from tests.topologies import AVERAGE, compiled
 
 
@@ -21,7 +20,8 @@ def main() -> int:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--inputs", type=int, default=2000, help="how many hostile inputs (default 2000)")
-    parser.add_argument("--models", type=int, default=0, help="how many forged compiled models")
+    for what in FORGERIES:
+        parser.add_argument(f"--{what}", type=int, default=0, help=f"how many forged {what}")
     parser.add_argument("--packets", type=int, default=0, help="how many forged datagrams")
     parser.add_argument("--scenes", type=int, default=0, help="how many valid scenes against brute force")
     parser.add_argument("--seed", type=int, default=1)
@@ -53,8 +53,9 @@ def main() -> int:
         (folder / "told.txt").write_text(text, encoding="utf-8")
         print(f"\n{folder}: {text}")
     wrong = bool(failures)
-    if options.models:
-        wrong |= _forged(options.models, options.seed, options.out)
+    for what in FORGERIES:
+        if count := getattr(options, what):
+            wrong |= _forged(what, count, options.seed, options.out)
     if options.packets:
         wrong |= _packets(options.packets, options.seed)
     if options.scenes:
@@ -74,17 +75,18 @@ def _packets(count: int, seed: int) -> bool:
     return bool(failures)
 
 
-def _forged(count: int, seed: int, out: Path) -> bool:
-    """Run forged models, tell what came of them, and return whether anything was wrong."""
-    failures, outcomes = run_models(count, seed)
+def _forged(what: str, count: int, seed: int, out: Path) -> bool:
+    """Run forged files, tell what came of them, and return whether anything was wrong."""
+    failures, outcomes = run_forged(what, count, seed)
     for outcome, number in sorted(outcomes.items()):
-        print(f"{number:8d}  model: {outcome}")
-    print(f"{count} forged models")
+        print(f"{number:8d}  {what}: {outcome}")
+    print(f"{count} forged {what}")
     for number, (key, (index, told)) in enumerate(failures.items(), start=1):
-        folder = out / f"model-{number:02d}"
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / FILE).write_bytes(forge(f"{seed}/{index}").content)
-        text = f"{key}\nseed {seed}, model {index}\n\n{told}\n"
+        folder = out / f"{what}-{number:02d}"
+        for name, content in FORGERIES[what][1](f"{seed}/{index}")[1]:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(content)
+        text = f"{key}\nseed {seed}, number {index}\n\n{told}\n"
         (folder / "told.txt").write_text(text, encoding="utf-8")
         print(f"\n{folder}: {text}")
     return bool(failures)

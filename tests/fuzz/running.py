@@ -33,7 +33,7 @@ from apc.compiler.components.library import Library
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.language import unit_names
 from apc.compiler.pipeline import run_stages
-from tests.fuzz import models
+from tests.fuzz import arrays, models
 from tests.fuzz.inputs import MODELS, PLAYED, SENTINEL, TOPOLOGY, Input, make_input
 
 SECONDS = 5.0  # of processor time, the longest an input may take to compile
@@ -175,31 +175,32 @@ def _worker(seed: int, start: int, stop: int, sort: str | None) -> Iterator[tupl
     return _watched(work, start, stop)
 
 
-def run_models(count: int, seed: int) -> tuple[dict[str, tuple[int, str]], Counter[str]]:
-    """Run forged models number 0 to `count` of a seed.
+def run_forged(what: str, count: int, seed: int) -> tuple[dict[str, tuple[int, str]], Counter[str]]:
+    """Run forged files number 0 to `count` of a seed.
+
+    Parameters
+    ----------
+    what
+        One of `FORGERIES`.
 
     Returns
     -------
     failures
         Of each cause, the number of the first and what is told of it.
     outcomes
-        How many models of each sort came to what.
+        How many files of each sort came to what.
     """
-    with tempfile.TemporaryDirectory() as name:  # load everything once
-        for document, members in models.bases():
-            path = Path(name) / models.FILE
-            path.write_bytes(models.packed(document, members))
-            assert models.ask(path, everything=True) == "answered"
+    warm_up, forge, ask = FORGERIES[what]
+    warm_up()
     failures: dict[str, tuple[int, str]] = {}
     outcomes: Counter[str] = Counter()
-
     following = 0
 
     def work(tell: Callable[[int, str, str], None]) -> None:
         for index in range(following, count):
-            forged = models.forge(f"{seed}/{index}")
-            key, told = _traced(((models.FILE, forged.content),), _asked, QUESTIONS)
-            tell(index, key, told or forged.sort)
+            sort, files = forge(f"{seed}/{index}")
+            key, told = _traced(files, lambda: (ask(), ""), QUESTIONS)
+            tell(index, key, told or sort)
 
     while following < count:
         for index, key, told in _watched(work, following, count):
@@ -207,13 +208,45 @@ def run_models(count: int, seed: int) -> tuple[dict[str, tuple[int, str]], Count
             if key in ("answered", "refused"):
                 outcomes[f"{told}: {key}"] += 1
             else:
-                outcomes[f"{models.forge(f'{seed}/{index}').sort}: FAILED"] += 1
+                outcomes[f"{forge(f'{seed}/{index}')[0]}: FAILED"] += 1
                 failures.setdefault(key, (index, told))
     return failures, outcomes
 
 
-def _asked() -> tuple[str, str]:
-    return models.ask(Path(models.FILE)), ""
+def _forge_model(seed: str) -> tuple[str, arrays.Files]:
+    forged = models.forge(seed)
+    return forged.sort, ((models.FILE, forged.content),)
+
+
+def _warm_models() -> None:
+    """Load everything once: what is loaded later looks as if a file had had it loaded."""
+    with tempfile.TemporaryDirectory() as name:
+        for document, members in models.bases():
+            path = Path(name) / models.FILE
+            path.write_bytes(models.packed(document, members))
+            assert models.ask(path, everything=True) == "answered"
+
+
+def _warm_arrays(files: arrays.Files, ask: Callable[[], str]) -> None:
+    """Read what nobody changed."""
+    assert _traced(files, lambda: (ask(), "")) == ("answered", "")
+
+
+FORGERIES: dict[
+    str, tuple[Callable[[], None], Callable[[str], tuple[str, arrays.Files]], Callable[[], str]]
+] = {
+    "models": (_warm_models, _forge_model, lambda: models.ask(Path(models.FILE))),
+    "recordings": (
+        lambda: _warm_arrays(arrays.recording(), arrays.ask_recording),
+        arrays.forge_recording,
+        arrays.ask_recording,
+    ),
+    "parts": (
+        lambda: _warm_arrays(arrays.part(), arrays.ask_part),
+        arrays.forge_part,
+        arrays.ask_part,
+    ),
+}
 
 
 def once(given: Input) -> tuple[str, str]:

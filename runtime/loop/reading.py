@@ -1,0 +1,209 @@
+"""A run read from its folder, whoever wrote it.
+
+Takes: the folder. Gives: `read_run`.
+Guarantees: what is read is what peers of the scene beside it can have done: sizes, names and numbers fit the
+scene and one another; nothing of it is run.
+Does not: ask whether it was so.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler import store
+from apc.compiler.cache import DAMAGE, DamageError
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.files import RefusedError, read_file
+from apc.compiler.frozen import dataclass
+from apc.compiler.words import counted
+from apc.loop.packets import DROPPED
+from apc.loop.peer import live_scene
+from apc.loop.run import ARRAYS, SCENE, PeerRun, Run
+from apc.network.timetable import START, Route
+from apc.npz import read_arrays
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import Simulation, prepare
+
+LARGEST = (
+    1 << 30
+)  # bytes of a peer's file, and of what it unpacks to: three hours of a thousand ticks a second
+LONGEST = 1 << 24  # bytes of what is told in words
+MOST_PACKETS = 10**7  # of a way, the lost ones between the first and the last included
+LATEST = 1 << 62  # nanoseconds: what any two differ by can be told as well
+KINDS = {
+    "told": ("|u1", 1),
+    "time|late|took": ("<f8", 1),
+    "values": ("<f8", 2),
+    "arrivals": ("<i8", 2),
+    "packets[0-9]{1,5}": ("<i8", 2),
+    "missing[0-9]{1,5}": ("|b1", 2),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """What a peer's file says in words and single numbers; see `PeerRun`."""
+
+    name: str
+    number: int
+    digest: str
+    session: int
+    first: int
+    frames: int
+    stopped: bool
+    emulated: bool
+    outside: bool
+    signals: tuple[str, ...]
+    dropped: tuple[tuple[str, int], ...]
+    not_given: tuple[str, ...]
+    sent: tuple[tuple[int, int, int], ...]
+    offsets: tuple[tuple[int, float, float], ...]
+    routes: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scene:
+    """What a peer's file is held against: the scene's `names` of peers, and what simulates it."""
+
+    names: tuple[str, ...]
+    links: tuple[str, ...]
+    simulation: Simulation
+
+    @property
+    def routes(self) -> tuple[Route, ...]:
+        """What is heard over one link at the ticks of one clock, each."""
+        return self.simulation.population.hearing.routes
+
+
+def read_run(folder: Path) -> Run:
+    """Read a run. Raises ApcError E973 if a folder is none, damaged, or of several scenes."""
+    files = sorted(folder.glob("*.npz"))
+    if not (folder / SCENE).is_file() or not files:
+        what = f"holds no run: {SCENE} and a file a peer, as apc play writes them"
+        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out RUN"))
+    system = store.load(folder / SCENE)
+    if len(files) > system.peers:
+        what = f"holds {counted(len(files), 'peer', ',')} of a scene with {system.peers:,}"
+        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
+    names = tuple(f"{group.name}[{place + 1}]" for group in system.groups for place in range(group.count))
+    simulation = prepare(live_scene(system), Settings(Fraction(1, 1000), jit=False))
+    scene = _Scene(names, tuple(link.name for link in system.links), simulation)
+    peers = tuple(sorted((_read_peer(path, scene) for path in files), key=lambda one: one.number))
+    if len({(one.digest, one.session) for one in peers}) > 1:
+        what = "holds peers that did not play together: of other runs, of other scenes, or with another --set"
+        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
+    if len({one.number for one in peers}) < len(peers):
+        what = "holds a peer twice"
+        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
+    return Run(str(folder), system, peers)
+
+
+def _read_peer(path: Path, scene: _Scene) -> PeerRun:
+    try:
+        found = read_arrays(read_file(path, LARGEST), KINDS, LARGEST)
+        peer = _peer(found)
+        _check_told(peer, scene)
+        _check_signals(peer, scene)
+        _check_packets(peer, scene)
+    except (RefusedError, DamageError) as error:
+        raise ApcError(Mistake("E973", Place(str(path)), f"is no peer of this run: {error}")) from None
+    return peer
+
+
+def _want(right: bool | np.bool_, otherwise: str) -> None:
+    if not right:
+        raise DamageError(otherwise)
+
+
+def _peer(found: dict[str, NDArray[Any]]) -> PeerRun:
+    """Return what arrays hold, of which only the types are known to be right."""
+    _want({"told", *ARRAYS} <= found.keys(), f"it lacks one of {', '.join(('told', *ARRAYS))}")
+    _want(found["told"].size <= LONGEST, "it tells too much")
+    try:
+        document = json.loads(found["told"].tobytes())
+        document["dropped"] = [list(one) for one in document["dropped"].items()]
+        told = store.typed(_Told, document, {})
+    except DAMAGE:
+        raise DamageError("what it tells is not what apc play writes") from None
+    routed = {f"{name}{at}" for name in ("packets", "missing") for at in range(min(told.routes, len(found)))}
+    _want(found.keys() == {"told", *ARRAYS, *routed}, "its links are not those it tells of")
+    plain = {name: getattr(told, name) for name in _Told.__dataclass_fields__ if name != "routes"}
+    plain["dropped"] = dict(told.dropped)
+    plain["sent"] = {(link, other): count for link, other, count in told.sent}
+    plain["offsets"] = {other: (trip, ahead) for other, trip, ahead in told.offsets}
+    return PeerRun(
+        **plain,
+        **{name: found[name] for name in ARRAYS},
+        packets=tuple(found[f"packets{at}"] for at in range(told.routes)),
+        missing=tuple(found[f"missing{at}"] for at in range(told.routes)),
+    )
+
+
+def _check_told(peer: PeerRun, scene: _Scene) -> None:
+    """Check what is told against the scene."""
+    peers, links = range(len(scene.names)), range(len(scene.links))
+    _want(peer.number in peers and peer.name == scene.names[peer.number], "the scene has no such peer")
+    _want(re.fullmatch("[0-9a-f]{64}", peer.digest) is not None, "it doesn't say of which scene it is")
+    _want(0 <= peer.session < 1 << 64, "its session is no number of 64 bits")
+    _want(0 <= peer.first < peer.frames <= LATEST, "it joins after the end")
+    _want(peer.dropped.keys() <= DROPPED.keys(), "datagrams are dropped for no known reason")
+    counts = [*peer.dropped.values(), *peer.sent.values()]
+    _want(all(0 <= count <= LATEST for count in counts), "a count is negative, or beyond all time")
+    sent = all(link in links and other in peers for link, other in peer.sent)
+    _want(
+        sent and all(other in peers for other in peer.offsets), "it tells of a peer or link that isn't there"
+    )
+
+
+def _check_signals(peer: PeerRun, scene: _Scene) -> None:
+    """Check what was recorded at instants: their order, and that each is within a frame of the last."""
+    simulation = scene.simulation
+    frame = float(simulation.frame * simulation.quantum)
+    signals = tuple(one.name for one in simulation.signals if one.name.startswith(f"{peer.name}."))
+    _want(peer.signals == signals, "its signals are not those of the scene")
+    _want(
+        peer.values.shape == (len(peer.time), len(signals)),
+        "it has not one value of each signal at each time",
+    )
+    _want(
+        np.isfinite(peer.time).all() and np.isfinite(peer.values).all(),
+        "a time or signal is no finite number",
+    )
+    steps = np.diff(peer.time, prepend=peer.first * frame)
+    _want((steps[1:] > 0).all() and (peer.time >= 0).all(), "its times do not increase")
+    _want((steps <= frame * (1 + 1e-9)).all(), "it leaves out a frame or more")
+    _want(len(peer.late) == len(peer.took), "its ticks did not begin as often as they ended")
+    for ticks in (peer.late, peer.took):
+        _want(np.isfinite(ticks).all() and (ticks >= 0).all(), "a tick began, or took, no time there is")
+
+
+def _check_packets(peer: PeerRun, scene: _Scene) -> None:
+    """Check what came, and what ticks saw of it."""
+    _want(len(peer.packets) == len(scene.routes), "it hears other links than the scene's")
+    for route, packets, missing in zip(scene.routes, peer.packets, peer.missing, strict=True):
+        ways = int((route.pairs[:, 1] == peer.number).sum())
+        _want(packets.shape == missing.shape == (len(packets), ways), "it hears other peers than the scene's")
+        _want(((packets >= START) & (packets <= LATEST)).all(), "a packet has a number that none has")
+    _want(peer.arrivals.shape[1:] == (5,), "what came is not told in five numbers")
+    links, senders, counts, sampled, came = peer.arrivals.T
+    _want(((counts >= 0) & (sampled >= 0) & (sampled <= LATEST)).all(), "a packet has no time that there is")
+    _want(((came >= -LATEST) & (came <= LATEST)).all(), "a packet came at no time that there is")
+    heard = {
+        (scene.links.index(route.link), sender)
+        for route in scene.routes
+        for sender in route.pairs[route.pairs[:, 1] == peer.number, 0].tolist()
+    }
+    _want(
+        {*zip(links.tolist(), senders.tolist(), strict=True)} <= heard, "a packet came from where none comes"
+    )
+    for link, sender in heard:
+        own = counts[(links == link) & (senders == sender)]
+        span = int(own.max(initial=0)) - int(own.min(initial=LATEST))
+        _want(span < MOST_PACKETS, f"a way has more than {MOST_PACKETS:,} packets")
