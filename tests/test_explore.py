@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import http.client
 import json
+import logging
 import re
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from fractions import Fraction
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, ClassVar
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
@@ -29,11 +33,24 @@ from tests.topologies import AVERAGE, SCENES
 
 pytest.importorskip("bokeh")
 
+from bokeh.document import Document
+
 from apc.explore import figures, sections
 from apc.explore.desk import DRAWN, Desk
 from apc.explore.motion import STRUCK, motion_of
+from apc.explore.page import Page, scene_of
 from apc.explore.sections import Task, Told, compute
-from apc.explore.sliders import Slider, axes_of, overrides_of, place_of, set_to, sliders_of, with_value
+from apc.explore.server import MOST, _shortened
+from apc.explore.sliders import (
+    Slider,
+    axes_of,
+    is_number,
+    overrides_of,
+    place_of,
+    set_to,
+    sliders_of,
+    with_value,
+)
 from apc.explore.written import with_values
 from apc.processes import Workers, model_bytes
 
@@ -514,22 +531,64 @@ def test_a_scene_may_name_its_numbers_as_the_link_does(browser: Any, tmp_path: P
 
 
 SERVED = """
+import os, webbrowser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
 from tornado.httpclient import AsyncHTTPClient
 from apc.explore.server import bound, run
 
-async def opened():
+async def opened(url):
+    path = Path(unquote(urlsplit(url).path))
+    print(url.startswith("file:///"), oct(path.stat().st_mode), link in path.read_text(), path)
     await AsyncHTTPClient().fetch(link)
     raise KeyboardInterrupt
 
+webbrowser.open = opened
 server, link = bound(lambda tab: tab.on_session_destroyed(lambda session_context: print("closed")), 0)
+run(server, link, browser=True)
+"""
+
+
+def test_the_browser_opens_a_file_of_ours_and_ctrl_c_closes_the_tabs_that_are_open() -> None:
+    """What a browser is started with, all users see: the link's token is not in it."""
+    ended = subprocess.run([sys.executable, "-c", SERVED], capture_output=True, text=True, check=False)
+    opened, *closed = ended.stdout.splitlines()
+    own, mode, leads, path = opened.split()
+    assert (own, mode, leads) == ("True", "0o100600", "True")
+    assert not Path(path).exists()
+    assert (closed, ended.stderr) == (["closed"], "")
+
+
+FLOODED = """
+import resource, socket
+from tornado.httpclient import AsyncHTTPClient
+from apc.explore.server import MOST, bound, run
+
+async def opened():
+    port = int(link.rpartition(":")[2].partition("/")[0])
+    silent = [socket.socket() for _ in range({silent})]
+    for one in silent:
+        one.setblocking(False)
+        one.connect_ex(("127.0.0.1", port))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (silent[-1].fileno() + {left}, 4096))
+    for _ in range(3):
+        print((await AsyncHTTPClient().fetch(link)).code)
+    raise KeyboardInterrupt
+
+server, link = bound(lambda tab: None, 0)
 server.io_loop.add_callback(opened)
 run(server, link, browser=False)
 """
 
 
-def test_ctrl_c_closes_the_tabs_that_are_open() -> None:
-    ended = subprocess.run([sys.executable, "-c", SERVED], capture_output=True, text=True, check=False)
-    assert (ended.stdout, ended.stderr) == ("closed\n", "")
+@pytest.mark.parametrize("left", [MOST + 20, 40], ids=["enough", "few"])
+def test_connections_that_ask_for_nothing_keep_nobody_out(left: int) -> None:
+    """More than are taken, or than there are descriptors for: those that came first go, without a word."""
+    script = FLOODED.format(silent=2 * MOST, left=left)
+    ended = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert (ended.stdout, ended.stderr) == ("200\n" * 3, "")
 
 
 def test_a_region_that_takes_long_keeps_nothing_waiting(browser: Any) -> None:
@@ -576,6 +635,104 @@ def test_what_is_written_and_drawn_stands_out_in_light_and_in_dark(seen: Any) ->
             own = luminance(seen(np.array([int(one[k : k + 2], 16) / 255 for k in (1, 3, 5)])))
             low, high = sorted((own, page))
             assert (high + 0.05) / (low + 0.05) >= least, one
+
+
+class Asked:
+    """What stands in the place of a `Desk`: it keeps what it is asked."""
+
+    asked: ClassVar[list[Task]] = []
+
+    def __init__(self, model: bytes, order: Sequence[str], *_: object) -> None:
+        self.order, self.busy = order, None
+
+    def ask(self, task: Task) -> bool:
+        self.asked.append(task)
+        return True
+
+    def forget(self, section: str) -> None:
+        pass
+
+    def put_before(self, other: Asked) -> None:
+        pass
+
+
+@pytest.fixture
+def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Page:
+    """Give the page of a tab without a browser, and without those who compute for it."""
+    monkeypatch.setattr("apc.explore.page.Desk", Asked)
+    monkeypatch.setattr(Asked, "asked", [])
+    document, request = Document(), SimpleNamespace(arguments={})
+    context = SimpleNamespace(request=request)
+    document._session_context = lambda: context  # type: ignore[assignment]
+    found = Page(scene_of(compiled(LOSSY, tmp_path), (), None), document)
+    found._deliver("verdict", Told(None, "none"))
+    names = ["user[1].device.x", "user[1].cube.x"]
+    found._deliver(
+        "feel", Told({"names": names, "at": names[0], "notes": ()} | {one: np.ones(2) for one in FELT})
+    )
+    Asked.asked.clear()
+    return found
+
+
+FELT = ("frequency", "magnitude", "phase")
+NAN, INFINITY = {"type": "number", "value": "nan"}, {"type": "number", "value": "+inf"}
+ZEROS = {"type": "bytes", "data": base64.b64encode(gzip.compress(bytes(8))).decode()}
+ARRAY = {"type": "ndarray", "array": ZEROS, "dtype": "float64", "shape": [1], "order": "little"}
+WRONG = [NAN, INFINITY, -5, -0.6, 10**6, 10**400, 1e308, True, None, "", "text", [1], {"type": "map"}, ARRAY]
+
+
+def says(page: Page, model: Any, value: Any) -> None:
+    """Have the browser say a value, as Bokeh reads it; where that refuses it, nobody of the page is asked."""
+    event = {"kind": "ModelChanged", "model": {"id": model.id}, "attr": "value", "new": value}
+    try:
+        page.document.apply_json_patch({"events": [event]})
+    except ValueError as error:
+        record = logging.makeLogRecord({"msg": "", "exc_info": (type(error), error, error.__traceback__)})
+        assert _shortened(record) and record.exc_info is None
+        assert record.getMessage().startswith("a message of the page was ignored: ValueError(")
+
+
+def test_what_the_browser_can_t_say_changes_nothing(page: Page) -> None:
+    models = [*page.handles, *page.selects, page.begins, page.meant, page.at]
+    before = [one.value for one in models]
+    for value in WRONG:
+        for model in models:
+            says(page, model, value)
+        for x, y in ((value, 1.0), (1.0, value)):
+            if not is_number(value):  # of those the nearest values are taken
+                values = [["model", {"id": page.region.plot.id}], ["x", x], ["y", y]]
+                tap = {"type": "event", "name": "tap", "values": {"type": "map", "entries": values}}
+                told = {"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": tap}
+                page.document.apply_json_patch({"events": [told]})
+        assert [one.value for one in models] == before, value
+    assert page.places == [one.start for one in page.sliders]
+    assert not Asked.asked
+
+
+def test_what_the_browser_may_say_is_computed(page: Page) -> None:
+    """A slider to its last value, an axis, what is played and what stable means, a hand, a click."""
+    last = len(page.sliders[0].values) - 1
+    says(page, page.handles[0], last)
+    assert page.places[0] == last
+    says(page, page.selects[0], "device.mass")
+    assert page.sliders[page.chosen[0]].label == "device.mass"
+    says(page, page.begins, "as the scene begins")
+    assert next(one for one in reversed(Asked.asked) if one.section == "motion").asked is False
+    says(page, page.at, "user[1].cube.x")
+    assert Asked.asked[-1].asked == "user[1].cube.x"
+    says(page, page.meant, "packets as they are lost and late (takes long)")
+    assert page.meant.value.startswith("packets")
+    says(page, page.handles[0], last + 1)
+    assert "contact.stiffness can&#x27;t be" in page.message.model.text
+
+
+def test_a_fault_of_ours_keeps_its_traceback() -> None:
+    try:
+        place_of(None, 1.0)  # type: ignore[arg-type]
+    except AttributeError as error:
+        record = logging.makeLogRecord({"msg": "x", "exc_info": (type(error), error, error.__traceback__)})
+    assert _shortened(record)
+    assert record.msg == "x" and record.exc_info
 
 
 def status(link: str, **headers: str) -> int:

@@ -5,6 +5,7 @@ No claim is on how late anything was: a busy machine only makes what is heard la
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import json
@@ -20,7 +21,11 @@ import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -31,20 +36,25 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError
+from apc.compiler.errors import ApcError, Mistake
 from apc.loop.beside import Ticks, compare_run
 from apc.loop.device import device_function
 from apc.loop.packets import Address, Answer, Data, Hello, Post
-from apc.loop.peer import Loop
+from apc.loop.peer import AT_ONCE, KNOCK, NANO, Loop
 from apc.loop.reading import read_run
 from apc.loop.run import delays_of, run_of, write_run
+from apc.loop.start import Part, Play, play_all
 from apc.network.recorded import describe
 from apc.present.loop import ticks_text
+from apc.processes import Workers
 from tests.fuzz.arrays import recorded
+from tests.fuzz.packets import run_packets
 from tests.topologies import AVERAGE, replaced, told
+from tests.wire import HOUR, SOON, Other, Wire, loop_at, send_packets
 
 DIGEST = hashlib.sha256(b"a scene").digest()
 HERE: Address = ("127.0.0.1", 5000)
+THERE: Address = ("127.0.0.1", 5009)
 MOVING = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: 3 mm}}"))
 
 
@@ -52,47 +62,96 @@ def post(own: int = 1, *, digest: bytes = DIGEST, secret: bytes = b"") -> Post:
     return Post(own, digest, secret, {HERE: 2})
 
 
-@pytest.mark.parametrize("secret", [b"", b"sixteen bytes or more"])
+SECRETS = pytest.mark.parametrize("secret", [b"", b"sixteen bytes or more"], ids=["open", "secret"])
+
+
+def met(secret: bytes = b"") -> tuple[Post, Post]:
+    """Return the posts of peers 2 and 1 that have said hello, at `HERE` and elsewhere."""
+    two, one = post(2, secret=secret), post(secret=secret)
+    two.addresses = {THERE: 1}
+    two.read(one.answer(1, two_asks(two, one), 2, 3, 4), THERE)
+    one.read(two.hello(5, 1), HERE)
+    assert (two.nonces, one.nonces) == ({1: one.nonce}, {2: two.nonce})
+    return two, one
+
+
+def two_asks(two: Post, one: Post) -> Hello:
+    found = one.read(two.hello(0, 1), HERE)
+    assert isinstance(found, Hello)
+    return found
+
+
+@SECRETS
 def test_what_is_written_is_read(secret: bytes) -> None:
-    sender, receiver = post(2, secret=secret), post(secret=secret)
+    sender, receiver = met(secret)
     datagrams = [
-        sender.data(17, 3, 4, (1.5, -0.0, 1e-300)),
-        sender.hello(18, 2**63),
-        sender.answer(19, Hello(1, 5, 7), 6, -1),
+        sender.data(17, 1, 3, 4, (1.5, -0.0, 1e-300)),
+        sender.hello(18, 1),
+        sender.answer(19, Hello(1, 5, receiver.nonce, 0), 6, -1, 8),
     ]
-    assert [receiver.read(one, HERE) for one in datagrams] == [
+    assert [receiver.read(one or b"", HERE) for one in datagrams] == [
         Data(2, 17, 3, 4, (1.5, -0.0, 1e-300)),
-        Hello(2, 18, 2**63),
-        Answer(2, 19, 7, 6, -1),
+        Hello(2, 18, sender.nonce, receiver.nonce),
+        Answer(2, 19, sender.nonce, receiver.nonce, 5, 6, -1, 8),
     ]
     assert not receiver.dropped
+    assert post(2, secret=secret).data(17, 1, 3, 4, ()) is None  # it has met nobody
 
 
-def test_what_is_not_a_peers_changes_nothing_but_a_counter() -> None:
-    """10⁵ datagrams of random bytes, and of each other kind: dropped by name."""
+@SECRETS
+def test_what_is_not_a_peers_changes_nothing_but_a_counter(secret: bytes) -> None:
+    """10⁴ datagrams of random bytes, every bit of good ones turned, others' scenes, secrets and addresses."""
     luck = random.Random(1)
-    secret = b"sixteen bytes or more"
-    good = post(2, secret=secret).data(17, 0, 4, (1.0,))
-    receiver = post(secret=secret)
-    for _ in range(100_000):
+    sender, receiver = met(secret)
+    good = sender.data(17, 1, 0, 4, (1.0,))
+    assert good is not None
+    before = dict(receiver.nonces), dict(receiver.keys)
+    for _ in range(10_000):
         assert receiver.read(luck.randbytes(luck.randrange(200)), HERE) is None
-    assert receiver.dropped == {"malformed": 100_000}
-    for at in range(8 * len(good)):  # every bit of a good one turned
-        torn = bytearray(good)
-        torn[at // 8] ^= 1 << at % 8
-        assert receiver.read(bytes(torn), HERE) is None
+    assert receiver.dropped == {"malformed": 10_000}
+    said = [good, sender.hello(18, 1), sender.answer(19, Hello(1, 5, receiver.nonce, 0), 6, -1, 8)]
+    for one in said:
+        for at in range(8 * len(one)):
+            torn = bytearray(one)
+            torn[at // 8] ^= 1 << at % 8
+            assert receiver.read(bytes(torn), HERE) is None
+    assert receiver.dropped["other scene"] == 3 * 8 * 8
     assert receiver.read(good, ("127.0.0.1", 5001)) is None
-    assert receiver.read(post(2, digest=b"other" * 8, secret=secret).data(17, 0, 4, (1.0,)), HERE) is None
-    assert (
-        receiver.read(post(2, secret=b"another secret of some length").data(17, 0, 4, (1.0,)), HERE) is None
-    )
-    assert receiver.read(post(3, secret=secret).data(17, 0, 4, (1.0,)), HERE) is None
     assert receiver.dropped["stranger"] == 1
-    assert receiver.dropped["other scene"] == 1 + 8 * 8
-    assert receiver.dropped["forged"] > 100
+    before_forged = receiver.dropped["forged"]
+    others = [post(2, secret=b"another secret of some length"), post(2, digest=b"other" * 8, secret=secret)]
+    for one in (*others, post(3, secret=secret)):
+        assert receiver.read(one.hello(18, 1), HERE) is None
+    assert receiver.dropped["forged"] == before_forged + 1
+    again = met(secret)[0].data(17, 1, 0, 4, (1.0,))  # of another session
+    assert receiver.read(again or b"", HERE) is None
+    assert receiver.dropped["forged"] == before_forged + 2
     for value in (math.nan, math.inf):
-        assert receiver.read(post(2, secret=secret).data(17, 0, 4, (value,)), HERE) is None
+        assert receiver.read(sender.data(17, 1, 0, 4, (value,)) or b"", HERE) is None
+    assert (receiver.nonces, receiver.keys) == before
     assert receiver.read(good, HERE) is not None
+
+
+def played(
+    wire: Wire,
+    scene: CompiledSystem,
+    secret: bytes,
+    value: float,
+    replayed: Sequence[tuple[int, bytes, Address]] = (),
+) -> Loop:
+    """Play a scene with two others; all that is replayed comes at once and when it came, twice."""
+    loop, start = loop_at(wire, scene, DIGEST, secret), wire.time
+    others = [Other(wire, number, DIGEST, secret) for number in (1, 2)]
+    for time, datagram, address in replayed:
+        wire.send(datagram, address, start + 1)
+        wire.send(datagram, address, time)
+    loop.meet(60)
+    send_packets(loop, others, value)
+    for time, datagram, address in replayed:
+        wire.send(datagram, address, loop.begins + 1)
+        wire.send(datagram, address, time + wire.time - start)
+    loop.run()
+    return loop
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +172,110 @@ def loops(system: CompiledSystem, duration: str, *, emulate: bool = False) -> It
         yield Loop(
             system, name, sockets[name], others, digest=DIGEST, duration=Fraction(duration), emulate=emulate
         )
+
+
+@SECRETS
+def test_of_what_was_heard_in_one_session_nothing_is_taken_in_another(
+    scene: CompiledSystem, secret: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All of it is sent again, at once and when it came, while the peers meet and while they play."""
+    wires = [Wire(monkeypatch)]
+    played(wires[0], scene, secret, 1.0)
+    recorded = wires[0].given
+    assert len(recorded) > 20
+    wires.append(Wire(monkeypatch))
+    without = played(wires[1], scene, secret, 2.0)
+    wires.append(Wire(monkeypatch))
+    found = played(wires[2], scene, secret, 2.0, recorded)
+    assert found.begins == without.begins
+    assert found.offsets == without.offsets
+    assert found.player.arrivals == without.player.arrivals
+    assert len(found.player.arrivals) == 2 * found.frames
+    assert np.array_equal(np.concatenate(found.rows), np.concatenate(without.rows))
+    assert set(found.post.dropped) == {"forged", "unasked"}
+
+
+def test_a_peer_that_is_started_again_is_heard_and_what_it_was_before_is_not(
+    scene: CompiledSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even where what it says to be known gets lost: a packet that nobody can read has it asked."""
+    wire = Wire(monkeypatch)
+    loop = loop_at(wire, scene, DIGEST, b"", "1/2")
+    others = [Other(wire, number, DIGEST, b"") for number in (1, 2)]
+    loop.meet(60)
+    width = len(loop.player.links[0].channels_of(1))
+    loop.take_in(loop.begins)
+    others[0].send(wire.time + SOON, 0, (0.5,) * width)
+    loop.take_in(wire.time + 2 * SOON)
+    before = list(wire.given)
+    again = Other(wire, 1, DIGEST, b"")
+    again.ask()
+    loop.take_in(wire.time + 2 * SOON)  # it now knows this peer's nonce, and this peer not yet its own
+    assert loop.post.nonces[1] == others[0].post.nonce
+    for count in (1, 2):
+        again.send(wire.time + SOON, count, (0.75,) * width)
+        loop.take_in(wire.time + KNOCK)
+    for _, datagram, address in before:
+        wire.send(datagram, address)
+    loop.take_in(wire.time + KNOCK)
+    assert loop.post.nonces[1] == again.post.nonce
+    assert [row[1:3] for row in loop.player.arrivals] == [(1, 0), (1, 2)]
+    assert set(loop.post.dropped) == {"forged", "heard before"}
+
+
+def test_nobody_is_there_who_says_what_was_said_in_another_session(
+    scene: CompiledSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wire = Wire(monkeypatch)
+    played(wire, scene, b"", 1.0)
+    recorded, wire = wire.given, Wire(monkeypatch)
+    loop = loop_at(wire, scene, DIGEST, b"")
+    for _ in range(10):
+        for _, datagram, address in recorded:
+            wire.send(datagram, address, wire.time + NANO // 100)
+    with pytest.raises(ApcError, match=r"E972 user\[2\], user\[3\] did not say within 1 s"):
+        loop.meet(1)
+    assert not loop.session
+
+
+def test_peers_whose_clocks_were_started_at_different_times_begin_at_one_instant(
+    scene: CompiledSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A clock that is never set counts from when its host was started, even after the scene began."""
+    for ahead in (HOUR, -HOUR):
+        wire = Wire(monkeypatch)
+        loop = loop_at(wire, scene, DIGEST, b"", "2")
+        one, _ = (Other(wire, number, DIGEST, b"", ahead) for number in (1, 2))
+        one.begins, one.session = wire.time + ahead - NANO, 7  # a second ago
+        loop.meet(60)
+        assert (loop.session, loop.begins) == (7, one.begins - ahead)
+        assert loop.first == (wire.time - loop.begins) // loop.frame_ns + 2
+
+
+def test_no_tick_waits_where_the_system_s_clock_is_set(
+    scene: CompiledSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop = played(Wire(monkeypatch), scene, b"", 1.0)
+    assert [late for _, late, _ in loop.player.log] == [0] * 104
+
+
+def test_a_flood_is_read_after_a_tick_s_work(scene: CompiledSystem, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Datagrams without end, of strangers and of a peer, at 10 µs each: of them a late tick reads so many."""
+    for address in (("192.0.2.9", 9), ("127.0.0.1", 5001)):
+        wire = Wire(monkeypatch, cost=10_000)
+        loop = loop_at(wire, scene, DIGEST, b"")
+        _ = [Other(wire, number, DIGEST, b"") for number in (1, 2)]
+        loop.meet(60)
+        wire.endless = (bytes(100), address)
+        loop.run()
+        assert wire.reads > 5_000
+        assert (
+            max(late for _, late, _ in loop.player.log) <= 2 * AT_ONCE * wire.cost
+        )  # begun before, and after
+        loop.begins -= HOUR  # late by an hour
+        before = wire.reads
+        loop.wait(0)
+        assert wire.reads == before + AT_ONCE
 
 
 def test_peers_do_what_is_simulated_with_the_packets_they_heard(
@@ -300,6 +463,14 @@ def test_a_device_outside_is_measured_and_pushed(scene: CompiledSystem, tmp_path
         assert forces[tick] == pytest.approx(-acting[tick + 1], abs=1e-12)
 
 
+def test_a_forged_datagram_is_dropped_in_meeting_and_in_playing(scene: CompiledSystem) -> None:
+    """Here some; thousands are `python -m tests.fuzz --inputs 0 --packets 10000`."""
+    failures, outcomes = run_packets(scene, 300, 7)
+    assert not failures
+    assert min(outcomes.values()) > 20
+    assert len(outcomes) == 7
+
+
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 def test_a_device_may_be_in_c(tmp_path: Path) -> None:
     text = "double apc_device(double time, const double *force) { return force ? -*force : 2 * time; }"
@@ -470,6 +641,9 @@ def test_what_cant_be_played_is_told(
     Path("own").mkdir()
     Path("own/thesis.txt").write_text("mine", encoding="utf-8")
     Path("short.txt").write_text("abc", encoding="utf-8")
+    Path("short.txt").chmod(0o600)
+    Path("open to all.txt").write_text("sixteen bytes or more", encoding="utf-8")
+    Path("open to all.txt").chmod(0o604)
     there = sorted(str(one) for one in Path().rglob("*"))
     listed = [
         (["--peer", "user[4]", *other], "E970 a peer wants one of user[1], user[2], user[3], got user[4]."),
@@ -491,6 +665,7 @@ def test_what_cant_be_played_is_told(
         (["--peer", "user[1]", *other, "--device", "no.py"], "E976"),
         (["--out", "own"], "E973 is there already, and is no folder of a run"),
         (["--secret-file", "short.txt"], "E974 a secret wants 16 bytes or more, got 3."),
+        (["--secret-file", "open to all.txt"], "users of this machine. Write: chmod 600 'open to all.txt'"),
         (["--secret-file", "none.txt"], "E974"),
     ]  # fmt: skip
     for words, message in listed:
@@ -517,16 +692,16 @@ def test_a_ways_delays_begin_with_the_first_that_came_and_end_with_the_last(scen
     assert struct.calcsize("<d") == 8
 
 
-def test_an_answer_is_taken_whenever_it_comes_and_once(scene: CompiledSystem) -> None:
-    """A peer that starts slowly answers old hellos: these are answers too; a replay and a guess are not."""
+def test_of_answers_the_shortest_round_trip_tells_a_clock_and_the_first_the_beginning(
+    scene: CompiledSystem,
+) -> None:
+    """A peer that starts slowly answers old hellos: these are answers too."""
     loop = next(loops(scene, "1"))
-    loop.asked = {17: (1, 1_000), 18: (1, 2_000)}
-    for nonce in (17, 18, 17, 19):
-        loop._met(Answer(1, 5_000, nonce, 4_000, 9_000), 6_000)
-    assert loop.post.dropped == {"unasked": 2}
-    assert loop.offsets[1][0] == 6_000 - 2_000 - 1_000  # the shorter round trip
-    loop._met(Answer(2, 5_000, 18, 4_000, 9_000), 6_000)
-    assert loop.post.dropped == {"unasked": 3}
+    for asked, begins in ((1_000, 0), (2_000, 9_000), (1_000, 8_000)):
+        loop._met(Answer(1, 5_000, 3, 4, asked, 4_000, begins, int(begins > 0)), 6_000)
+    assert loop.offsets[1][0] == 6_000 - 2_000 - 1_000
+    assert loop.told is not None
+    assert loop.told.begins == 9_000
 
 
 def test_what_ends_a_loop_leaves_what_was_done(scene: CompiledSystem, tmp_path: Path) -> None:
@@ -580,6 +755,82 @@ def test_ctrl_c_ends_a_peer_and_what_it_did_is_kept(tmp_path: Path) -> None:
         assert playing.returncode == 0, told[1]
         assert "stopped before the end" in told[0]
         assert all(one.stopped for one in read_run(tmp_path / "all.run").peers)
+
+
+def test_a_peer_that_is_lost_or_silent_takes_nothing_of_the_others_along(
+    scene: CompiledSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One ends at once with what it did, one is killed, one does not end when all are told to."""
+    whole = run_of(next(loops(scene, "1")), DIGEST, ())
+    ended: dict[str, Future[Part]] = {f"user[{at}]": Future() for at in (1, 2, 3)}
+    ended["user[1]"].set_result(Part(whole))
+    ended["user[2]"].set_exception(BrokenProcessPool())
+
+    def workers(compute: object, shared: object, jobs: int, lost: Mistake) -> nullcontext[Workers[str, Part]]:
+        assert jobs == 1
+        return nullcontext(Workers(ended.__getitem__, 2, lambda _: ApcError(lost)))
+
+    waits = iter([wait, None, wait])  # Ctrl-C when both have ended
+
+    def waiting(*given: Any, **how: Any) -> Any:
+        if (now := next(waits)) is None:
+            raise KeyboardInterrupt
+        return now(*given, **how)
+
+    monkeypatch.setattr("apc.loop.start.local_processes", workers)
+    monkeypatch.setattr("apc.loop.start.wait", waiting)
+    monkeypatch.setattr("apc.loop.start.TO_END", 0.0)
+    parts = play_all(scene, Play(Fraction(1), b"", emulate=False, seed=None, patience=1.0))
+    assert [one.run for one in parts if one.run] == [whole]
+    assert [str(one.trouble) for one in parts if one.trouble] == [
+        "user[2]: E975 ended without a word: what it played is lost.",
+        "user[3]: E975 did not end within 0 s of being told to, and was ended: what it played is lost.",
+    ]
+
+
+def written(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_a_run_is_put_in_place_whole_or_not_at_all(
+    scene: CompiledSystem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a disk that is full after one of two peers the older run stays, and where none was, none is."""
+    folder, save = tmp_path / "a.run", np.savez_compressed
+    one, two, three = (run_of(loop, DIGEST, ()) for loop in loops(scene, "1"))
+    one = replace(one, arrivals=np.array([[0, 1, 5, 40, 50]]))
+    write_run(folder, scene, [one, two, three], whole=True)
+    before = written(folder)
+    assert sorted(before) == [
+        "lan-user-2-to-user-1.csv",
+        "scene.apc",
+        *(f"user-{at}.npz" for at in (1, 2, 3)),
+    ]
+
+    def full(path: Path, **arrays: Any) -> None:
+        if path.name == "user-2.npz":
+            path.write_bytes(b"PK")
+            raise OSError(errno.ENOSPC, "No space left on device")
+        save(path, **arrays)
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    later = [replace(peer, session=7) for peer in (one, two)]
+    for whole in (True, False):
+        for target in (folder, tmp_path / "b.run"):
+            with pytest.raises(ApcError, match=f"{target.name}: E601 can't be written: No space left"):
+                write_run(target, scene, later, whole=whole)
+    assert written(folder) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["a.run"]
+    monkeypatch.setattr(np, "savez_compressed", save)
+    (folder / "notes.txt").write_text("mine", encoding="utf-8")
+    write_run(folder, scene, [replace(three, session=7)])  # one that plays by itself
+    with pytest.raises(ApcError, match="E973 holds peers that did not play together: of other runs"):
+        read_run(folder)
+    write_run(folder, scene, later, whole=True)
+    assert sorted(written(folder)) == sorted(
+        ["lan-user-2-to-user-1.csv", "notes.txt", "scene.apc", "user-1.npz", "user-2.npz"]
+    )
+    assert [peer.session for peer in read_run(folder).peers] == [7, 7]
 
 
 def test_tables_fit_a_terminal_whatever_peers_are_called() -> None:

@@ -8,6 +8,8 @@ Does not: compute.
 
 from __future__ import annotations
 
+import os
+import shlex
 from pathlib import Path
 
 import click
@@ -125,14 +127,14 @@ def play_command(
         outside = None if device is None else device_function(device)
         with at_work("playing"):
             parts = (play_one(system, peer, listening, addresses, how, device=outside),)
-    troubles = [one.trouble for one in parts if one.trouble is not None]
+    troubles = [mistake for one in parts if one.trouble for mistake in one.trouble.mistakes]
     played = [one.run for one in parts if one.run is not None]
     if played:
         write_run(folder, system, played, whole=peer is None)
-    for trouble in troubles:
+    if troubles:
         if played:
             note_aside(f"{folder} holds what was played until then")
-        raise trouble
+        raise ApcError(troubles)
     if not played:
         raise KeyboardInterrupt
     if peer is None:
@@ -152,8 +154,12 @@ def _secret(path: Path | None) -> bytes:
         secret = read_file(path, 1 << 16).strip()
     except RefusedError as refused:
         raise ApcError(Mistake("E974", Place("--secret-file"), f"{path} {refused.words}")) from None
+    file = shlex.quote(str(path))
+    if os.name == "posix" and path.stat().st_mode & 0o077:
+        what = f"{path} may be read by other users of this machine"
+        raise ApcError(Mistake("E974", Place("--secret-file"), what, hint=f"chmod 600 {file}"))
     if len(secret) < SHORTEST:
-        hint = f"head -c 32 /dev/urandom | base64 > {path}"
+        hint = f"(umask 077; head -c 32 /dev/urandom | base64 > {file})"
         expected, got = f"{SHORTEST} bytes or more", str(len(secret))
         raise ApcError(Mistake("E974", Place("--secret-file"), "a secret", expected, got, hint))
     return secret

@@ -2,14 +2,16 @@
 
 Takes: a compiled model; a Bokeh document, one a tab.
 Gives: `Scene`, `scene_of`, `open_page`.
-Guarantees: whatever a slider says is what is computed; nothing is computed on the thread that serves the
-page; the link holds the values of the sliders that were moved, and a link with values opens with them.
+Guarantees: whatever a slider says is what is computed, and what it can't say changes nothing; nothing is
+computed on the thread that serves the page; the link holds the values of the sliders that were moved, and a
+link with values opens with them.
 Does not: compute.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib.resources import files
 from typing import Any
 from urllib.parse import quote
@@ -31,6 +33,9 @@ from apc.explore.server import TOKEN
 from apc.explore.sliders import (
     Slider,
     axes_of,
+    is_number,
+    is_one_of,
+    is_place,
     overrides_of,
     place_of,
     set_to,
@@ -224,8 +229,8 @@ class Page:
             Select(title=f"Region: {way} axis", value=self.sliders[place].label, options=names, width=250)
             for way, place in zip(("horizontal", "vertical"), self.chosen, strict=False)
         ]
-        for select in self.selects:
-            select.on_change("value", lambda attr, old, new: self._choose())
+        for number, select in enumerate(self.selects):
+            self._hear(select, partial(is_one_of, names), partial(self._choose, number))
         self.region.plot.on_event(Tap, self._tapped)
         duration = self.system.experiment.duration
         self.begins = Select(
@@ -234,11 +239,12 @@ class Page:
             value=BEGINS if duration else STRUCK,
             stylesheets=[FOCUS],
         )
-        self.begins.on_change("value", lambda attr, old, new: self._moved())
+        self._hear(self.begins, partial(is_one_of, (STRUCK, BEGINS)), lambda _: self._moved())
         self.meant = Select(title="Stable, where", options=[LIVE, SLOW], value=LIVE, stylesheets=[FOCUS])
-        self.meant.on_change("value", lambda attr, old, new: self._moved())
+        self._hear(self.meant, partial(is_one_of, (LIVE, SLOW)), lambda _: self._moved())
         self.at = Select(title="The hand holds", visible=False, stylesheets=[FOCUS])
-        self.at.on_change("value", lambda attr, old, new: self._ask_feel())
+        self.held: list[str] = []
+        self._hear(self.at, lambda name: is_one_of(self.held, name), lambda _: self._ask_feel())
         controls: list[Any] = [self.message.model, *self.selects]
         if any(link.channel is not None for link in self.system.links):
             controls.append(self.meant)
@@ -323,30 +329,57 @@ class Page:
             stylesheets=[FOCUS],
             disabled=len(texts) == 1,
         )
-        handle.on_change("value", lambda attr, old, new: self._set({place: round(new)}))
+        self._hear(handle, partial(is_place, one), lambda value: self._set({place: round(value)}))
         return handle
+
+    def _hear(self, model: Any, may: Callable[[Any], bool], then: Callable[[Any], None]) -> None:
+        """Act on what the browser says of a model's value; where that can't be, it stays what it was.
+
+        Parameters
+        ----------
+        model
+            A slider or a choice: it has a title and a value.
+        may
+            Whether a value, of whatever type, is one that the model may have.
+        then
+            Takes the value.
+        """
+
+        def changed(attr: str, old: Any, new: Any) -> None:
+            if self.moving:
+                return
+            if may(new):
+                then(new)
+                return
+            self._put({model: old})
+            self.message.say(f"{model.title} can't be {new!r:.40}, and stays as it was.")
+
+        model.on_change("value", changed)
+
+    def _put(self, values: Mapping[Any, Any]) -> None:
+        """Give models their values, which is no wish of somebody's."""
+        self.moving = True
+        for model, value in values.items():
+            model.value = value
+        self.moving = False
 
     def _set(self, places: Mapping[int, int]) -> None:
         """Take the values of sliders that were moved, and move those that were not moved by hand."""
-        if self.moving:
-            return
         for number, place in places.items():
             self.places[number], self.last = place, number
-        self.moving = True
-        for number, place in places.items():
-            self.handles[number].value = place
-        self.moving = False
+        self._put({self.handles[number]: place for number, place in places.items()})
         self._moved()
 
     def _tapped(self, event: Any) -> None:
-        """Set the sliders of both axes to where the region was clicked."""
+        """Set the sliders of both axes to where the region was clicked, if that is somewhere."""
+        if not (is_number(event.x) and is_number(event.y)):
+            return
         pairs = zip(self.chosen, (event.x, event.y), strict=False)
         self._set({number: place_of(self.sliders[number], at) for number, at in pairs})
 
-    def _choose(self) -> None:
-        """Take other axes for the region."""
-        labels = [one.label for one in self.sliders]
-        self.chosen = [labels.index(select.value) for select in self.selects]
+    def _choose(self, axis: int, label: str) -> None:
+        """Take another axis for the region."""
+        self.chosen[axis] = [one.label for one in self.sliders].index(label)
         self._moved()
 
     def _moved(self) -> None:
@@ -455,8 +488,9 @@ class Page:
                 self.motion.show(found["motion"])
             case "feel" if found is not None:
                 self.feel.show(found)
-                if len(found["names"]) > 1:
-                    self.at.update(options=found["names"], value=found["at"], visible=True)
+                self.held = found["names"]
+                if len(self.held) > 1:
+                    self.at.update(options=self.held, value=found["at"], visible=True)
             case "numbers" if found is not None:
                 self._save_numbers(found)
             case "margins" | "network" if found is not None:

@@ -4,7 +4,8 @@ Takes: what makes a document for each tab; a port.
 Gives: `serve`, `bound`.
 Guarantees: it listens on the loopback interface; a request without the link's token, or that comes from a
 page of another origin, is refused, on whatever path of the page; no file is served but the program's own
-scripts; a tab's session can't be entered from another.
+scripts; a tab's session can't be entered from another; connections that ask for nothing keep nobody out; the
+token stands in no process's arguments.
 Does not: know what the page shows.
 """
 
@@ -15,7 +16,13 @@ import hmac
 import logging
 import secrets
 import signal
-from collections.abc import Awaitable, Callable
+import traceback
+from asyncio import AbstractEventLoop
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from html import escape
+from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 
 from bokeh.application import Application
@@ -36,6 +43,54 @@ TOKEN = "token"  # the argument of the link that holds it
 
 # How often it is looked for tabs that were closed, and after how long they count as such, in ms.
 LOOKED, CLOSED = 2_000, 10_000
+
+
+# Connections that have not become a tab's socket: beyond so many the one that came first is closed. A browser
+# opens six. Seconds in which a request must have been said.
+MOST, SAID = 100, 10.0
+FULL = (errno.EMFILE, errno.ENFILE)  # no descriptor is left to accept a connection with
+
+# What the browser opens, where only its owner sees the link.
+LEADING = """<!DOCTYPE html><meta charset="utf-8"><title>apc explore</title>
+<meta name="referrer" content="no-referrer"><meta http-equiv="refresh" content="0; url={link}">
+<p><a href="{link}">The page of apc explore</a>
+"""
+
+
+class Door(HTTPServer):  # type: ignore[misc] # Tornado's types are not looked at
+    """Takes connections in; where there are too many the one that has waited longest goes."""
+
+    def initialize(self, application: BokehTornado) -> None:
+        """Make it ready: Tornado's way to construct one."""
+        super().initialize(application, idle_connection_timeout=SAID, body_timeout=SAID)
+        self.waiting: dict[Any, None] = {}
+
+    def handle_stream(self, stream: Any, address: Any) -> None:
+        """Take in a new connection."""
+        if len(self.waiting) >= MOST:
+            self.let_go()
+        self.waiting[stream] = None
+        super().handle_stream(stream, address)
+
+    def on_close(self, server_conn: Any) -> None:
+        """Forget a connection that was closed, or has become a tab's socket."""
+        self.waiting.pop(server_conn.stream, None)
+        super().on_close(server_conn)
+
+    def let_go(self) -> None:
+        """Close the connection that came first."""
+        if self.waiting:
+            first = next(iter(self.waiting))
+            del self.waiting[first]
+            first.close()
+
+    def troubled(self, loop: AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Make room where no connection can be accepted, which asyncio tells with a traceback each time."""
+        error = context.get("exception")
+        if isinstance(error, OSError) and error.errno in FULL:
+            self.let_go()
+        else:
+            loop.default_exception_handler(context)
 
 
 class Gate(AuthProvider):  # type: ignore[misc] # Bokeh's types are not looked at
@@ -102,9 +157,10 @@ def bound(make: Callable[[Document], None], port: int) -> tuple[BaseServer, str]
         include_headers=[],
         include_cookies=[],
     )
-    http = HTTPServer(application)
+    http, loop = Door(application), IOLoop.current()
     http.add_sockets(sockets)
-    return BaseServer(IOLoop.current(), application, http), f"http://{address}/?{TOKEN}={token}"
+    loop.asyncio_loop.set_exception_handler(http.troubled)
+    return BaseServer(loop, application, http), f"http://{address}/?{TOKEN}={token}"
 
 
 def run(server: BaseServer, link: str, *, browser: bool) -> None:
@@ -117,17 +173,15 @@ def run(server: BaseServer, link: str, *, browser: bool) -> None:
     browser
         Whether to open the link.
     """
-    import webbrowser
-
     # Who is refused is told so; the terminal is not, nor of tabs that close, and no token is printed again.
     for name in ("tornado.access", "tornado.general", "bokeh.server.views.ws"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    if browser:
-        server.io_loop.add_callback(webbrowser.open, link)
+    logging.getLogger("bokeh.server.protocol_handler").addFilter(_shortened)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # even where Ctrl-C is ignored
     server.start()
     try:
-        server.io_loop.start()
+        with _opened(server.io_loop, link) if browser else nullcontext():
+            server.io_loop.start()
     except KeyboardInterrupt:
         pass
     finally:
@@ -136,3 +190,25 @@ def run(server: BaseServer, link: str, *, browser: bool) -> None:
         for session in server.get_sessions():
             for close in session.document.session_destroyed_callbacks:
                 close(session.document.session_context)
+
+
+@contextmanager
+def _opened(loop: IOLoop, link: str) -> Iterator[None]:
+    """Have the browser open a file that leads to the link: all users of the machine see what it opens."""
+    import webbrowser
+
+    with NamedTemporaryFile("w", prefix="apc-explore-", suffix=".html", encoding="utf-8") as file:
+        file.write(LEADING.format(link=escape(link)))
+        file.flush()
+        loop.add_callback(webbrowser.open, Path(file.name).as_uri())
+        yield
+
+
+def _shortened(record: logging.LogRecord) -> bool:
+    """Tell in a line that Bokeh refused a message of the page; a fault of ours keeps its traceback."""
+    _, error, reached = record.exc_info or (None, None, None)
+    ours = any(frame.f_globals["__name__"].startswith("apc.") for frame, _ in traceback.walk_tb(reached))
+    if not ours:
+        record.msg, record.args = f"a message of the page was ignored: {error!r:.200}", ()
+        record.exc_info = None
+    return True

@@ -1,7 +1,8 @@
 """Which numbers of a scene have a slider, and the values that each can be set to.
 
 Takes: a `CompiledSystem`.
-Gives: `Slider`, `sliders_of`, `set_to`, `with_value`; `text_of`, `place_of`, `overrides_of`, `axes_of`.
+Gives: `Slider`, `sliders_of`, `set_to`, `with_value`; `text_of`, `place_of`, `overrides_of`, `axes_of`;
+`is_number`, `is_place`, `is_one_of`.
 Guarantees: every value is an exact rational within the parameter's bounds, and the scene's own is among them;
 what a slider says of a value, `apc --set` takes.
 Does not: draw, or analyse.
@@ -9,11 +10,13 @@ Does not: draw, or analyse.
 
 from __future__ import annotations
 
+import sys
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from math import ceil, floor, lcm, log10
+from typing import Any
 
 from apc.compiler.compiled import CompiledSystem, group_count
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -245,6 +248,22 @@ def _people(system: CompiledSystem) -> list[Slider]:
         about = f"how many peers {group.name} has"
         found.append(_slider(system, free, PEOPLE, about, values, Fraction(group.count), span))
     return found
+
+
+def is_number(value: Any) -> bool:
+    """Return whether what a browser says is a number, and a finite one."""
+    whole = isinstance(value, int | float) and not isinstance(value, bool)
+    return whole and abs(value) <= sys.float_info.max  # an int may be larger
+
+
+def is_place(slider: Slider, value: Any) -> bool:
+    """Return whether what a browser says is the place of a value of a slider."""
+    return is_number(value) and 0 <= round(value) < len(slider.values)
+
+
+def is_one_of(names: Iterable[str], value: Any) -> bool:
+    """Return whether what a browser says is one of several names."""
+    return isinstance(value, str) and value in names
 
 
 def place_of(slider: Slider, value: Fraction | float) -> int:

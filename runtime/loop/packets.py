@@ -1,44 +1,54 @@
 """Packets between peers on a real network: their bytes, and who is let in.
 
 Takes: what a peer sends; datagrams from anywhere. Gives: `Post`, `Data`, `Hello`, `Answer`; `DROPPED`.
-Guarantees: a datagram that is not of this version, this scene, a known peer at its own address and, where
-there is a secret, sealed with it, changes nothing but a counter; nor does one heard before.
+Guarantees: a datagram that is not of this version, this scene, a known peer at its own address and sealed as
+this session wants it changes nothing but a counter; nor does one heard before, in this session or another.
 Does not: wait, or know what values mean (see `peer`).
 
-A datagram is a head, a body by its sort, and with a secret the first 16 bytes of HMAC-SHA-256 over both (RFC
-2104, RFC 4868's length). Numbers are little-endian, times nanoseconds of the sender's clock:
+A datagram is a head, a body by its sort, and the first 16 bytes of HMAC-SHA-256 over both (RFC 2104, the
+length of RFC 4868). Numbers are little-endian, times nanoseconds of the sender's clock:
 
     head    "apc", version, sort, the scene's first 8 bytes of SHA-256, sender u32, time i64
     data    link u16, count of the packet u64, how many values u16, the values f64
-    hello   a number drawn by chance u64
-    answer  that number u64, when the hello came i64, when the scene begins i64 (0: not known yet)
+    hello   the sender's nonce u64, the receiver's as far as it is known u64 (0: not yet)
+    answer  both nonces as in a hello, the hello's time i64, when that came i64, when the scene begins i64,
+            the session u64 (0: neither is known yet)
+
+A peer draws its nonce by chance as it starts. Who says it is there now: what was said in an earlier session
+has another one. Hellos and answers are sealed with the secret, which is empty if there is none, data with a
+key of two peers and both their nonces:
+
+    HMAC-SHA-256(secret, "session", number and nonce of the lower peer, number and nonce of the higher one)
+
+So data of an earlier session, or of a peer before it was started again, are nobody's.
 """
 
 from __future__ import annotations
 
 import hmac
 import math
+import secrets
 import struct
 from collections import Counter
 from collections.abc import Mapping
 
 from apc.compiler.frozen import dataclass
 
-MAGIC, VERSION = b"apc", 1
+MAGIC, VERSION = b"apc", 2
 DATA, HELLO, ANSWER = range(3)
 HEAD = struct.Struct("<3sBB8sIq")
-DATA_BODY, HELLO_BODY, ANSWER_BODY = struct.Struct("<HQH"), struct.Struct("<Q"), struct.Struct("<Qqq")
+DATA_BODY, HELLO_BODY, ANSWER_BODY = struct.Struct("<HQH"), struct.Struct("<QQ"), struct.Struct("<QQqqqQ")
+OF_KEY = struct.Struct("<IQIQ")
 SCENE = 8  # bytes of the scene's digest
 SEAL = 16  # bytes of the keyed hash
-LARGEST = 65_507  # bytes of a datagram over IPv4
-MOST_VALUES = (LARGEST - HEAD.size - DATA_BODY.size - SEAL) // 8
+FAR = 1 << 61  # nanoseconds, 73 years: what follows from times within them is told in 64 bits
 
 # Why a datagram was dropped, in the order in which that is looked at, and how a person is told.
 DROPPED = {
     "stranger": "of a stranger",
     "malformed": "torn, or of another version",
     "other scene": "of another scene, or of one with another --set",
-    "forged": "without the secret's seal",
+    "forged": "without the secret's seal, or of another session",
     "heard before": "heard before",
     "joining": "before it had joined",
     "early": "of a time that was still to come",
@@ -63,26 +73,37 @@ class Data:
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """A peer that wants to know whether its other is there, and when the scene begins."""
+    """A peer that asks another, whose nonce it `heard`, whether it is there, and when the scene begins."""
 
     sender: int
     time: int
     nonce: int
+    heard: int
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a peer says to a `Hello` that came at `came`; the scene `begins` then, 0 if that is unknown."""
+    """What a peer says to the hello of time `asked` that came at `came`: the scene begins at `begins`.
+
+    `session` tells this time that the scene is played from any other; 0 if it is not known yet.
+    """
 
     sender: int
     time: int
     nonce: int
+    heard: int
+    asked: int
     came: int
     begins: int
+    session: int
 
 
 class Post:
-    """What one peer writes and reads; `dropped` counts what was let go, by why."""
+    """What one peer writes and reads.
+
+    `nonces` are those of the others that are there, `unmet` the others that can't be told or understood until
+    they are asked again; `dropped` counts what was let go, by why.
+    """
 
     def __init__(self, own: int, scene: bytes, secret: bytes, addresses: Mapping[Address, int]) -> None:
         """Take who is who.
@@ -100,44 +121,75 @@ class Post:
         """
         self.own, self.scene, self.secret = own, scene[:SCENE], secret
         self.addresses = dict(addresses)
+        self.nonce = 1 + secrets.randbelow((1 << 64) - 1)
+        self.nonces: dict[int, int] = {}
+        self.keys: dict[int, bytes] = {}
+        self.past: set[int] = set()  # nonces of others before they were started again
+        self.unmet: set[int] = set()
         self.dropped: Counter[str] = Counter()
 
-    def data(self, time: int, link: int, count: int, values: tuple[float, ...]) -> bytes:
-        """Return the datagram of a packet.
+    def data(self, time: int, to: int, link: int, count: int, values: tuple[float, ...]) -> bytes | None:
+        """Return the datagram of a packet, None if the other has not been there.
 
         Parameters
         ----------
         time
             When it is sent, by this peer's clock.
+        to
+            The number of the other.
         link, count, values
             As in `Data`.
         """
+        if to not in self.keys:
+            self.unmet.add(to)
+            return None
         body = DATA_BODY.pack(link, count, len(values)) + struct.pack(f"<{len(values)}d", *values)
-        return self._sealed(DATA, time, body)
+        return self._sealed(DATA, time, body, self.keys[to])
 
-    def hello(self, time: int, nonce: int) -> bytes:
-        """Return the datagram that asks whether somebody is there."""
-        return self._sealed(HELLO, time, HELLO_BODY.pack(nonce))
+    def hello(self, time: int, to: int) -> bytes:
+        """Return the datagram that asks another whether it is there."""
+        body = HELLO_BODY.pack(self.nonce, self.nonces.get(to, 0))
+        return self._sealed(HELLO, time, body, self.secret)
 
-    def answer(self, time: int, to: Hello, came: int, begins: int) -> bytes:
+    def answer(self, time: int, to: Hello, came: int, begins: int, session: int) -> bytes:
         """Return the datagram that says so.
 
         Parameters
         ----------
-        time, came, begins
+        time, came, begins, session
             As in `Answer`.
         to
             The hello that is answered.
         """
-        return self._sealed(ANSWER, time, ANSWER_BODY.pack(to.nonce, came, begins))
+        body = ANSWER_BODY.pack(self.nonce, to.nonce, to.time, came, begins, session)
+        return self._sealed(ANSWER, time, body, self.secret)
 
     def read(self, datagram: bytes, address: Address) -> Data | Hello | Answer | None:
         """Return what a datagram says, None if it is dropped."""
         why = self._refused(datagram, address)
-        said = None if why else self._said(datagram[: -SEAL if self.secret else None])
-        if said is None:
+        said = None if why else self._said(datagram[:-SEAL])
+        if said is not None and not isinstance(said, Data):
+            why = self._meet(said)
+        if why or said is None:
             self.drop(why or "malformed")
+            return None
         return said
+
+    def _meet(self, said: Hello | Answer) -> str:
+        """Take who says this peer's nonce for one that is there; return why it is let go, empty if not."""
+        if said.nonce in self.past:
+            return "heard before"
+        if said.heard != self.nonce:
+            return "unasked" if isinstance(said, Answer) else ""
+        before = self.nonces.get(said.sender)
+        if before != said.nonce:
+            if before is not None:
+                self.past.add(before)
+            self.nonces[said.sender] = said.nonce
+            (low, one), (high, two) = sorted([(self.own, self.nonce), (said.sender, said.nonce)])
+            told = b"session" + OF_KEY.pack(low, one, high, two)
+            self.keys[said.sender] = hmac.digest(self.secret, told, "sha256")
+        return ""
 
     def _said(self, datagram: bytes) -> Data | Hello | Answer | None:
         """Return what a datagram says whose head is right, None if the rest is not."""
@@ -150,9 +202,12 @@ class Post:
                 if all(map(math.isfinite, told)):
                     return Data(sender, time, link, count, told)
         elif sort == HELLO and len(body) == HELLO_BODY.size:
-            return Hello(sender, time, *HELLO_BODY.unpack(body))
+            hello = Hello(sender, time, *HELLO_BODY.unpack(body))
+            return hello if hello.nonce else None
         elif sort == ANSWER and len(body) == ANSWER_BODY.size:
-            return Answer(sender, time, *ANSWER_BODY.unpack(body))
+            answer = Answer(sender, time, *ANSWER_BODY.unpack(body))
+            times = answer.time, answer.asked, answer.came, answer.begins
+            return answer if answer.nonce and max(map(abs, times)) < FAR else None
         return None
 
     def drop(self, why: str) -> None:
@@ -161,22 +216,27 @@ class Post:
 
     def _refused(self, datagram: bytes, address: Address) -> str:
         """Return why a datagram is let go for what it is, before what it says is read; empty if it is not."""
-        known, sealed = self.addresses.get(address), SEAL if self.secret else 0
+        known = self.addresses.get(address)
         if known is None:
             return "stranger"
-        if len(datagram) < HEAD.size + sealed:
+        if len(datagram) < HEAD.size + SEAL:
             return "malformed"
-        magic, version, _, scene, sender, _ = HEAD.unpack_from(datagram)
+        magic, version, sort, scene, sender, _ = HEAD.unpack_from(datagram)
         if (magic, version, sender) != (MAGIC, VERSION, known):
             return "malformed"
         if scene != self.scene:
             return "other scene"
-        whole = not sealed or hmac.compare_digest(self._seal(datagram[:-SEAL]), datagram[-SEAL:])
-        return "" if whole else "forged"
+        key = self.keys.get(known) if sort == DATA else self.secret
+        if key is not None and hmac.compare_digest(_seal(key, datagram[:-SEAL]), datagram[-SEAL:]):
+            return ""
+        if sort == DATA:  # it may have been started again since it was there
+            self.unmet.add(known)
+        return "forged"
 
-    def _sealed(self, sort: int, time: int, body: bytes) -> bytes:
+    def _sealed(self, sort: int, time: int, body: bytes, key: bytes) -> bytes:
         whole = HEAD.pack(MAGIC, VERSION, sort, self.scene, self.own, time) + body
-        return whole + self._seal(whole) if self.secret else whole
+        return whole + _seal(key, whole)
 
-    def _seal(self, whole: bytes) -> bytes:
-        return hmac.digest(self.secret, whole, "sha256")[:SEAL]
+
+def _seal(key: bytes, whole: bytes) -> bytes:
+    return hmac.digest(key, whole, "sha256")[:SEAL]

@@ -6,10 +6,11 @@ done; a peer that begins late, or again, joins at the instant it is; others that
 out as the link says.
 Does not: move others, or keep hosts' clocks together: the difference between two clocks is measured as peers
 meet (half of the shortest round trip is its error), and what they drift apart afterwards is in the delays.
+Where a host sets its clock to another time, nothing changes: the clock that is read is never set.
 
 A scene's time 0 is told by the peer with the lowest number once all it knows are there, unless one of them
-knows it already. What ticks at an instant is done as that is over, by the program of the simulation cut at
-every instant; the peer's device moves as it does there.
+knows it already; the nonce of the one that told it first is the session. What ticks at an instant is done as
+that is over, by the program of the simulation cut at every instant; the peer's device moves as it does there.
 """
 
 from __future__ import annotations
@@ -20,11 +21,10 @@ import re
 import select
 import socket
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from multiprocessing.connection import Connection
-from random import SystemRandom
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,8 +58,9 @@ TRIPS, BETWEEN = 10, NANO // 200
 HEAD_START = NANO // 2  # between telling when a scene begins and its beginning
 LARGEST = 1 << 16  # bytes of a datagram
 AHEAD = 1024  # packets whose luck is drawn at once
-AT_ONCE = 1000  # datagrams taken in before a tick, so that a flood can't hold it up
-LUCK = SystemRandom()
+# Datagrams read before the clock is looked at again, and all that a late tick reads: some tenths of a
+# millisecond, whatever comes.
+AT_ONCE = 32
 PEER = re.compile(r"(?P<group>[A-Za-z_][A-Za-z0-9_]*)\[(?P<place>[0-9]{1,9})\]\Z")
 
 
@@ -146,11 +147,11 @@ class Loop:
         self.socket = listening
         self.socket.setblocking(False)
         self.begins = 0  # when the scene begins, by this host's clock; 0 while not known
+        self.session = 0  # what all peers that play together know it by; 0 while not known
         # Of each other the shortest round trip, and how far its clock was ahead then.
         self.offsets: dict[int, tuple[int, int]] = {}
-        self.asked: dict[int, tuple[int, int]] = {}  # by what is to be answered: who was asked, and when
-        self.told: tuple[int, int] | None = None  # who told when the scene begins, and when by that clock
-        self.present: set[int] = set()
+        self.told: Answer | None = None  # the first that said when the scene begins
+        self.knocked = 0  # when others were asked last
         self.first = 0  # the frame with which it joins
         self.stopped = False
         self.trouble: ApcError | None = None  # why it ended before its end, where nobody stopped it
@@ -192,32 +193,31 @@ class Loop:
         """
         end, leads = now() + int(patience * NANO), self.own < min(self.others)
         self.player.warm_up()
-        while not self.begins:
-            self._knock()
+        while not self.session:
+            self._knock(self.others)
             self.take_in(now() + KNOCK)
             if self.told is not None:
                 for _ in range(TRIPS):
-                    self._knock()
+                    self._knock(self.others)
                     self.take_in(now() + BETWEEN)
-                other, begins = self.told
-                self.begins = begins - self.offsets[other][1]
-            if leads and not self.begins and self.present == set(self.others):
-                self.begins = now() + HEAD_START
-            if not self.begins and now() > end:
+                self.begins = self.told.begins - self.offsets[self.told.sender][1]
+                self.session = self.told.session
+            elif leads and set(self.others) == set(self.post.nonces):
+                self.begins, self.session = now() + HEAD_START, self.post.nonce
+            elif now() > end:
                 raise self._alone(patience)
         if now() > self.begins:  # who begins late, or again, comes in with the frame after the next
             self.first = (now() - self.begins) // self.frame_ns + 2
             self.player.instant = self.first * self.frame_ns
 
-    def _knock(self) -> None:
-        """Ask all others whether they are there."""
-        for other, address in self.others.items():
-            number, time = LUCK.getrandbits(64), now()
-            self.asked[number] = other, time
-            self._send(self.post.hello(time, number), address)
+    def _knock(self, others: Iterable[int]) -> None:
+        """Ask others whether they are there."""
+        self.knocked = now()
+        for other in others:
+            self._send(self.post.hello(now(), other), self.others[other])
 
     def _alone(self, patience: float) -> ApcError:
-        missing = sorted(set(self.others) - self.present) or sorted(self.others)[:1]
+        missing = sorted(set(self.others) - set(self.post.nonces)) or sorted(self.others)[:1]
         names = ", ".join(self.exchange.peer_name(one) for one in missing)
         dropped = self.post.dropped.items()
         told = "; ".join(f"{counted(count, 'datagram')} dropped: {DROPPED[why]}" for why, count in dropped)
@@ -258,6 +258,9 @@ class Loop:
                 _, _, datagram, address = heapq.heappop(held)
                 self._send(datagram, address)
             self._read()
+            if self.post.unmet and now() >= self.knocked + KNOCK:
+                self._knock(self.post.unmet)
+                self.post.unmet.clear()
             left = min(until, held[0][0] if held else until) - now()
             ready, _, _ = select.select(self.watched, [], [], max(left, 0) / NANO)
             if self.stop in ready:
@@ -279,24 +282,18 @@ class Loop:
                 case Data() as packet:
                     self.player.hear(packet, came - self.begins)
                 case Hello() as hello:
-                    self.present.add(hello.sender)
-                    self._send(self.post.answer(now(), hello, came, self.begins), address)
+                    answer = self.post.answer(now(), hello, came, self.begins, self.session)
+                    self._send(answer, address)
                 case Answer() as answer:
                     self._met(answer, came)
 
     def _met(self, answer: Answer, came: int) -> None:
         """Learn another's clock, and when the scene begins, by a round trip (RFC 5905, section 8)."""
-        other, asked = self.asked.get(answer.nonce, (None, 0))
-        if other != answer.sender:
-            self.post.drop("unasked")
-            return
-        del self.asked[answer.nonce]
-        self.present.add(answer.sender)
-        trip = (came - asked) - (answer.time - answer.came)
-        ahead = ((answer.came - asked) + (answer.time - came)) // 2
+        trip = (came - answer.asked) - (answer.time - answer.came)
+        ahead = ((answer.came - answer.asked) + (answer.time - came)) // 2
         self.offsets[answer.sender] = min(self.offsets.get(answer.sender, (trip, ahead)), (trip, ahead))
-        if answer.begins and self.told is None:
-            self.told = answer.sender, answer.begins
+        if answer.session and self.told is None:
+            self.told = answer
 
     def _send(self, datagram: bytes, address: Address) -> None:
         try:
@@ -418,10 +415,13 @@ class _OnePeer(Stepwise):
             instant = link.instant(count)
             for other in link.told:
                 delay = self.network.delay(link, other, count) if self.network else 0
-                self.sent[link.place, other] += loop.begins > 0
+                self.sent[link.place, other] += loop.begins != 0
                 if delay is not None and loop.begins:
                     at = loop.begins + instant + delay
-                    datagram = loop.post.data(at, link.place, count, values)
+                    datagram = loop.post.data(at, other, link.place, count, values)
+                    if datagram is None:
+                        loop.post.drop("not sent")
+                        continue
                     heapq.heappush(self.held_back, (at, len(self.log), datagram, loop.others[other]))
 
     def hear(self, packet: Data, came: int) -> None:

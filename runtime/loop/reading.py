@@ -54,6 +54,7 @@ class _Told:
     name: str
     number: int
     digest: str
+    session: int
     first: int
     frames: int
     stopped: bool
@@ -95,8 +96,8 @@ def read_run(folder: Path) -> Run:
     simulation = prepare(live_scene(system), Settings(Fraction(1, 1000), jit=False))
     scene = _Scene(names, tuple(link.name for link in system.links), simulation)
     peers = tuple(sorted((_read_peer(path, scene) for path in files), key=lambda one: one.number))
-    if len({one.digest for one in peers}) > 1:
-        what = "holds peers of different scenes, or with different --set"
+    if len({(one.digest, one.session) for one in peers}) > 1:
+        what = "holds peers that did not play together: of other runs, of other scenes, or with another --set"
         raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
     if len({one.number for one in peers}) < len(peers):
         what = "holds a peer twice"
@@ -153,6 +154,7 @@ def _check_told(peer: PeerRun, scene: _Scene) -> None:
     peers, links = range(len(scene.names)), range(len(scene.links))
     _want(peer.number in peers and peer.name == scene.names[peer.number], "the scene has no such peer")
     _want(re.fullmatch("[0-9a-f]{64}", peer.digest) is not None, "it doesn't say of which scene it is")
+    _want(0 <= peer.session < 1 << 64, "its session is no number of 64 bits")
     _want(0 <= peer.first < peer.frames <= LATEST, "it joins after the end")
     _want(peer.dropped.keys() <= DROPPED.keys(), "datagrams are dropped for no known reason")
     counts = [*peer.dropped.values(), *peer.sent.values()]

@@ -1,7 +1,7 @@
 """What a peer of a run did and heard, on disk: one file a peer, a trace a way, and the scene they played.
 
 Takes: a `Loop` that has ended. Gives: `PeerRun`, `Run`, `run_of`, `check_folder`, `write_run`.
-Guarantees: a file is whole or not there.
+Guarantees: a run is put where it belongs when all of it is written, until then what is there stays.
 Does not: read it again (see `reading`), or judge it (see `beside`).
 """
 
@@ -9,18 +9,19 @@ from __future__ import annotations
 
 import json
 import math
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import check_target, same_file, unlink_link, unwritable, write_file, write_text
+from apc.compiler.files import check_target, same_file, unwritable
 from apc.compiler.frozen import dataclass
 from apc.loop.peer import NANO, Loop
+from apc.processes import model_bytes
 from apc.simulation.blocks import instants_of
 
 Floats = NDArray[np.float64]
@@ -34,19 +35,20 @@ ARRAYS = ("time", "values", "late", "took", "arrivals")
 class PeerRun:
     """What one peer did.
 
-    `first` is the frame it joined with, of `frames`; `outside` says that it had a device outside. `values`
-    (rows, signals) are its `signals` at `time` (rows,) in seconds, as `simulate` gives them. `late` and
-    `took` (n,) are how long after its due each instant began and how long it was worked on, in seconds.
-    `arrivals` (n, 5) are link, sender, count of a packet, the instant of its sample and that of its coming,
-    in nanoseconds of the scene; `sent` counts packets by (link, receiver). `packets` and `missing` are, a
-    route of the scene each, what its ticks saw on its own ways (ticks, ways). `dropped` counts datagrams by
-    why; `not_given` is what the system did not give; `offsets` are, of each other, the shortest round trip
-    and how far its clock was ahead, in seconds.
+    `session` is one number of all that played together; `first` is the frame it joined with, of `frames`;
+    `outside` says that it had a device outside. `values` (rows, signals) are its `signals` at `time`
+    (rows,) in seconds, as `simulate` gives them. `late` and `took` (n,) are how long after its due each
+    instant began and how long it was worked on, in seconds. `arrivals` (n, 5) are link, sender, count of a
+    packet, the instant of its sample and that of its coming, in nanoseconds of the scene; `sent` counts
+    packets by (link, receiver). `packets` and `missing` are, a route of the scene each, what its ticks saw
+    on its own ways (ticks, ways). `dropped` counts datagrams by why; `not_given` is what the system did not
+    give; `offsets` are, of each other, the shortest round trip and how far its clock was ahead, in seconds.
     """
 
     name: str
     number: int
     digest: str
+    session: int
     first: int
     frames: int
     stopped: bool
@@ -94,6 +96,7 @@ def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
         name=loop.name,
         number=loop.own,
         digest=digest.hex(),
+        session=loop.session,
         first=loop.first,
         frames=loop.frames,
         stopped=loop.stopped,
@@ -159,20 +162,26 @@ def write_run(folder: Path, system: CompiledSystem, peers: Sequence[PeerRun], *,
     ApcError
         E601 it can't be written.
     """
+    here = folder if folder.is_dir() else folder.parent
     try:
-        folder.mkdir(exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name[:64]}.", dir=here) as temporary:
+            ready = Path(temporary)
+            (ready / SCENE).write_bytes(model_bytes(system))
+            for one in peers:
+                _write_peer(ready, one, system)
+            folder.mkdir(exist_ok=True)
+            written = {path.name for path in ready.iterdir()}
+            for name in sorted(written, key=lambda name: name != SCENE):  # by which a run's folder is known
+                (ready / name).replace(folder / name)
         for path in (*folder.glob("*.npz"), *folder.glob("*-to-*.csv")) if whole else ():
-            path.unlink()
+            if path.name not in written:
+                path.unlink()
     except OSError as error:
         raise unwritable(folder, error) from None
-    unlink_link(folder / SCENE)
-    store.save(system, folder / SCENE)
-    for one in peers:
-        _write_peer(folder, one, system)
 
 
 def _write_peer(folder: Path, peer: PeerRun, system: CompiledSystem) -> None:
-    """Write what a peer did, and a trace of every way that it heard. Raises ApcError E601 if it can't."""
+    """Write what a peer did, and a trace of every way that it heard. Raises OSError if it can't."""
     told = {
         **{name: getattr(peer, name) for name in PLAIN},
         "sent": [[*key, count] for key, count in peer.sent.items()],
@@ -183,23 +192,18 @@ def _write_peer(folder: Path, peer: PeerRun, system: CompiledSystem) -> None:
     arrays |= {f"packets{at}": one for at, one in enumerate(peer.packets)}
     arrays |= {f"missing{at}": one for at, one in enumerate(peer.missing)}
     arrays["told"] = np.frombuffer(json.dumps(told).encode(), np.uint8)
-
-    def write(temporary: Path) -> None:
-        with temporary.open("wb") as file:
-            np.savez_compressed(file, **arrays)
-
-    unlink_link(path := folder / f"{file_name(peer.name)}.npz")
-    write_file(path, write)
+    np.savez_compressed(folder / f"{file_name(peer.name)}.npz", **arrays)
     for link, sender in sorted({(int(link), int(sender)) for link, sender in peer.arrivals[:, :2]}):
         rows = ("lost" if math.isinf(one) else f"{one * 1e3:.6f}" for one in delays_of(peer, link, sender))
-        unlink_link(path := folder / trace_name(system, link, sender, peer.number))
-        write_text(path, "\n".join(["delay [ms]", *rows]))
+        text = "\n".join(["delay [ms]", *rows, ""])
+        (folder / trace_name(system, link, sender, peer.number)).write_text(text, encoding="utf-8")
 
 
 PLAIN = (
     "name",
     "number",
     "digest",
+    "session",
     "first",
     "frames",
     "stopped",

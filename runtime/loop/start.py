@@ -2,7 +2,8 @@
 
 Takes: a compiled scene, addresses. Gives: `Play`, `Part`, `play_one`, `play_all`; `address_of`, `listen_at`,
 `is_loopback`.
-Guarantees: every process ends with the one that started it; Ctrl-C ends all, and what was done is given.
+Guarantees: every process ends with the one that started it; Ctrl-C ends all, and what was done is given; one
+that is lost, or does not end, is told, and takes nothing of the others along.
 Does not: step (see `peer`), or write (see `run`).
 """
 
@@ -14,8 +15,8 @@ import multiprocessing
 import signal
 import socket
 from collections.abc import Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, wait
-from contextlib import contextmanager, nullcontext
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import ExitStack, contextmanager, nullcontext
 from fractions import Fraction
 from multiprocessing.connection import Connection
 
@@ -29,10 +30,11 @@ from apc.loop.packets import Address
 from apc.loop.peer import Loop, StoppedError
 from apc.loop.realtime import claim
 from apc.loop.run import PeerRun, run_of
-from apc.processes import local_processes, model_bytes, model_of_bytes
+from apc.processes import Workers, local_processes, model_bytes, model_of_bytes
 
 MOST_PEERS = 64  # processes of one machine
 LOOPBACK = "127.0.0.1"
+TO_END = 10.0  # seconds for a peer to end in, and hand over what it did
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,10 +186,12 @@ def _interrupts() -> Iterator[Connection]:
 def play_all(system: CompiledSystem, how: Play) -> tuple[Part, ...]:
     """Play all peers of a scene on loopback, a process each; Ctrl-C ends all, and what was done is given.
 
+    One that ends without a word, or not at all, is the trouble (E975) of its own part.
+
     Raises
     ------
     ApcError
-        E975 the peers are too many, or one of them ended without a word; what one of them raises.
+        E975 the peers are too many.
     """
     exchange = build_exchange(system, resolve(system).timings)
     if exchange.peers > MOST_PEERS:
@@ -195,39 +199,60 @@ def play_all(system: CompiledSystem, how: Play) -> tuple[Part, ...]:
         raise ApcError(Mistake("E975", Place(system.name), what, hint='apc play FILE --peer "user[1]" …'))
     names = [exchange.peer_name(one) for one in range(exchange.peers)]
     sockets = {name: listen_at((LOOPBACK, 0)) for name in names}
+    addresses = {name: listening.getsockname() for name, listening in sockets.items()}
     stop, end = multiprocessing.Pipe(duplex=False)
-    parts = []
-    shared = _Shared(model_bytes(system), sockets, how, stop)
-    lost = Mistake("E975", Place(system.name), "one of the peers ended without a word")
-    with local_processes(_play_named, shared, len(names), lost) as workers:
-        running = {workers.submit(name) for name in names}
+    model, parts, patience = model_bytes(system), [], None
+    running: dict[Future[Part], tuple[str, Workers[str, Part]]] = {}
+    with ExitStack() as stack:
+        for name, listening in sockets.items():  # a pool for each: one that is lost breaks its own
+            shared = _Shared(model, listening, addresses, how, stop)
+            lost = Mistake("E975", Place(name), "ended without a word: what it played is lost")
+            workers = stack.enter_context(local_processes(_play_named, shared, 1, lost))
+            running[workers.submit(name)] = name, workers
         while running:
             try:
-                done, running = wait(running, return_when=FIRST_COMPLETED)
+                done, _ = wait(running, patience, return_when=FIRST_COMPLETED)
             except KeyboardInterrupt:
                 end.close()
+                patience = TO_END if patience is None else 0.0
                 continue
             for one in done:
-                if (error := one.exception()) is not None:
-                    raise workers.trouble(error) or error
-                parts.append(one.result())
+                name, workers = running.pop(one)
+                parts.append(_part(one, workers))
+            if not done:
+                break
+    silent = f"did not end within {TO_END:g} s of being told to, and was ended: what it played is lost"
+    for name, _ in running.values():
+        parts.append(Part(None, ApcError(Mistake("E975", Place(name), silent))))
     for listening in sockets.values():
         listening.close()
     return tuple(parts)
 
 
+def _part(done: Future[Part], workers: Workers[str, Part]) -> Part:
+    """Return what a process did that has ended, by itself or by what is told as its trouble."""
+    error = done.exception()
+    if error is None:
+        return done.result()
+    trouble = error if isinstance(error, ApcError) else workers.trouble(error)
+    if trouble is None:
+        raise error
+    return Part(None, trouble)
+
+
 @dataclass(frozen=True, slots=True)
 class _Shared:
-    """What all processes get: `stop` can be read when they are to end."""
+    """What a process gets: where it listens, and all addresses; `stop` can be read when it is to end."""
 
     model: bytes
-    sockets: Mapping[str, socket.socket]
+    listening: socket.socket
+    addresses: Mapping[str, Address]
     how: Play
     stop: Connection
 
 
 def _play_named(shared: _Shared, name: str) -> Part:
     """Play one peer in a process of its own."""
-    addresses = {other: one.getsockname() for other, one in shared.sockets.items() if other != name}
-    listening = shared.sockets[name]
-    return play_one(model_of_bytes(shared.model), name, listening, addresses, shared.how, shared.stop)
+    addresses = {other: address for other, address in shared.addresses.items() if other != name}
+    system = model_of_bytes(shared.model)
+    return play_one(system, name, shared.listening, addresses, shared.how, shared.stop)

@@ -11,7 +11,9 @@ import time
 from pathlib import Path
 
 from tests.fuzz.inputs import SORTS
+from tests.fuzz.packets import run_packets
 from tests.fuzz.running import FORGERIES, once, run_all, run_forged, shrunk
+from tests.topologies import AVERAGE, compiled
 
 
 def main() -> int:
@@ -20,6 +22,7 @@ def main() -> int:
     parser.add_argument("--inputs", type=int, default=2000, help="how many hostile inputs (default 2000)")
     for what in FORGERIES:
         parser.add_argument(f"--{what}", type=int, default=0, help=f"how many forged {what}")
+    parser.add_argument("--packets", type=int, default=0, help="how many forged datagrams")
     parser.add_argument("--scenes", type=int, default=0, help="how many valid scenes against brute force")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--start", type=int, default=0, help="the first input of the seed to run")
@@ -53,12 +56,23 @@ def main() -> int:
     for what in FORGERIES:
         if count := getattr(options, what):
             wrong |= _forged(what, count, options.seed, options.out)
+    if options.packets:
+        wrong |= _packets(options.packets, options.seed)
     if options.scenes:
         from tests.test_properties import check_scenes
 
         check_scenes(options.scenes)
         print(f"{options.scenes} scenes agree with brute force")
     return int(wrong)
+
+
+def _packets(count: int, seed: int) -> bool:
+    """Give forged datagrams to a peer, tell of those that were taken, and return whether any was."""
+    failures, outcomes = run_packets(compiled(AVERAGE), count, seed)
+    for sort, number in sorted(outcomes.items()):
+        print(f"{number:8d}  datagram: {sort}")
+    print(f"{count} forged datagrams, {len(failures)} taken or not survived", *failures, sep="\n")
+    return bool(failures)
 
 
 def _forged(what: str, count: int, seed: int, out: Path) -> bool:

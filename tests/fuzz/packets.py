@@ -1,0 +1,188 @@
+"""Forged datagrams: torn, sealed with other keys, of other sessions, heard before, and of a peer gone wrong.
+
+Takes: a seed. Gives: `run_packets`.
+Guarantees: of equal seed comes equal input; what takes them is a peer that has met the others and plays.
+"""
+
+from __future__ import annotations
+
+import random
+import struct
+from collections import Counter
+from collections.abc import Callable
+
+import pytest
+
+from apc.compiler.compiled import CompiledSystem
+from apc.loop.packets import ANSWER, DATA, HELLO, Address, Hello, Post
+from apc.loop.peer import Loop
+from tests.wire import OWN, SOON, Other, Wire, loop_at, send_packets
+
+DIGEST = bytes(range(32))
+SECRET = b"sixteen bytes or more"
+EXTREME = (0, 1, -1, 2**31, 2**61 - 1, 1 - 2**61, 2**63 - 1, -(2**63))
+Forgery = tuple[bytes, Address]
+
+
+def run_packets(system: CompiledSystem, count: int, seed: int) -> tuple[list[str], Counter[str]]:
+    """Give a peer so many forged datagrams, in meeting the others and in playing with them.
+
+    Returns
+    -------
+    failures
+        What each was that was taken, or raised.
+    outcomes
+        How many of each sort there were.
+    """
+    failures: list[str] = []
+    outcomes: Counter[str] = Counter()
+    with pytest.MonkeyPatch.context() as patch:
+        earlier = _met(patch, system)
+        _play(earlier)
+        for given in (_meeting, _playing):
+            here = _met(patch, system)
+            _play(here)
+            for index in range(given is _playing, count, 2):
+                luck = random.Random(f"{seed}/{index}")
+                sort = luck.choice(list(FORGED))
+                told = given(here, FORGED[sort](luck, here, earlier), sort in INSIDE)
+                outcomes[sort] += 1
+                if told:
+                    failures.append(f"{sort}, seed {seed}, datagram {index}: {told}")
+    return failures, outcomes
+
+
+class _Scene:
+    """A peer that plays with two others: `given` are the datagrams that it took from them."""
+
+    def __init__(self, wire: Wire, loop: Loop, others: list[Other]) -> None:
+        self.wire, self.loop, self.others = wire, loop, others
+        self.given: list[Forgery] = []
+
+    def state(self) -> object:
+        """Return all that a datagram might change."""
+        loop = self.loop
+        kept = loop.player.packets.tobytes(), list(loop.player.arrivals), len(loop.player.ahead)
+        return kept, dict(loop.post.nonces), dict(loop.post.keys), dict(loop.offsets), loop.told, loop.begins
+
+
+def _met(patch: pytest.MonkeyPatch, system: CompiledSystem) -> _Scene:
+    wire = Wire(patch)
+    loop = loop_at(wire, system, DIGEST, SECRET)
+    others = [Other(wire, number, DIGEST, SECRET) for number in (1, 2)]
+    loop.meet(60)
+    return _Scene(wire, loop, others)
+
+
+def _play(scene: _Scene) -> None:
+    send_packets(scene.loop, scene.others, 1.0)
+    scene.loop.take_in(scene.loop.begins + scene.loop.frame_ns)
+    scene.given = [(datagram, address) for _, datagram, address in scene.wire.given]
+
+
+def _playing(here: _Scene, forged: Forgery, may: bool) -> str:
+    """Return what is wrong as a peer that plays is given a datagram, empty if nothing is."""
+    before = here.state()
+    here.wire.coming.clear()
+    here.wire.send(*forged)
+    try:
+        here.loop.take_in(here.wire.time + SOON)
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return "" if may or here.state() == before else "it was taken"
+
+
+def _meeting(here: _Scene, forged: Forgery, may: bool) -> str:
+    """Return what is wrong as a peer meets the others and is given a datagram first."""
+    loop, told = here.loop, ""
+    loop.begins, loop.session, loop.told = 0, 0, None
+    loop.offsets.clear()
+    here.wire.coming.clear()
+    here.wire.send(*forged)
+    try:
+        loop.meet(60)
+        told = "" if may or loop.session == loop.post.nonce else "it was told when the scene begins"
+    except Exception as error:
+        told = f"{type(error).__name__}: {error}"
+    return told or _playing(here, (here.others[0].post.hello(1, 0), here.others[0].address), True)
+
+
+def _random(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
+    return luck.randbytes(luck.randrange(200)), luck.choice(here.others).address
+
+
+def _torn(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
+    """Return a good one with bits turned, bytes gone, or the end of another."""
+    datagram, address = luck.choice(here.given)
+    torn = bytearray(datagram)
+    for _ in range(luck.randrange(1, 4)):
+        torn[luck.randrange(len(torn))] ^= 1 << luck.randrange(8)
+    other = luck.choice(here.given)[0]
+    cut = luck.randrange(len(datagram))
+    ways = [bytes(torn), datagram[:cut], datagram + luck.randbytes(1 + cut)]
+    if other[cut:] != datagram[cut:]:
+        ways.append(datagram[:cut] + other[cut:])
+    return luck.choice(ways), address
+
+
+def _again(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
+    """Return one that was heard, or one of somebody else's at an address."""
+    datagram, address = luck.choice(here.given)
+    stranger = ("192.0.2.1", 5000)
+    where = [address, OWN, stranger, *(one.address for one in here.others)]
+    return datagram, luck.choice(where)
+
+
+def _earlier(luck: random.Random, _: _Scene, earlier: _Scene) -> Forgery:
+    return luck.choice(earlier.given)
+
+
+def _own(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
+    """Return what the peer itself may have sent."""
+    post, other = here.loop.post, luck.choice(here.others)
+    data = post.data(1, other.post.own, 0, 1, (1.0, 1.0))
+    assert data is not None
+    return luck.choice([data, post.hello(1, other.post.own)]), other.address
+
+
+def _guessed(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
+    """Return one of somebody who knows everything but the secret."""
+    other = luck.choice(here.others)
+    post = Post(other.post.own, DIGEST, luck.choice([b"", b"password", SECRET[:-1]]), {OWN: 0})
+    post.nonces = {0: here.loop.post.nonce}
+    post.keys = {0: luck.choice([post.secret, SECRET, luck.randbytes(32)])}
+    asked = Hello(0, here.wire.time, here.loop.post.nonce, 0)
+    data = post.data(1, 0, 0, luck.randrange(99), (1.0, 1.0))
+    told = [post.hello(1, 0), post.answer(1, asked, 2, 3, 4), data]
+    return luck.choice(told) or b"", other.address
+
+
+def _wrong(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
+    """Return one that a peer gone wrong has sealed: numbers that can't be, lengths that don't fit."""
+    post, whole = (other := luck.choice(here.others)).post, lambda: luck.choice(EXTREME)
+    times = struct.pack("<qqq", whole(), whole(), whole())
+    own, heard = luck.choice([0, *[post.nonce] * 9]), luck.choice([0, *[here.loop.post.nonce] * 9])
+    nonces = struct.pack("<QQ", own, heard)
+    values = [luck.choice([0.0, 1e308, float("nan"), float("inf")]) for _ in range(luck.randrange(4))]
+    data = struct.pack("<HQH", luck.choice([0, 1, 2**16 - 1]), whole() % 2**64, luck.choice([len(values), 9]))
+    bodies = {
+        HELLO: nonces,
+        ANSWER: nonces + times + struct.pack("<Q", luck.choice([0, 1])),
+        DATA: data + struct.pack(f"<{len(values)}d", *values),
+        luck.randrange(3, 256): nonces,
+    }
+    sort = luck.choice(list(bodies))
+    body = bodies[sort][: None if luck.random() < 0.8 else luck.randrange(20)]
+    return post._sealed(sort, whole(), body, post.keys[0] if sort == DATA else SECRET), other.address
+
+
+FORGED: dict[str, Callable[[random.Random, _Scene, _Scene], Forgery]] = {
+    "random bytes": _random,
+    "torn": _torn,
+    "heard before": _again,
+    "of an earlier session": _earlier,
+    "this peer's own": _own,
+    "sealed without the secret": _guessed,
+    "of a peer gone wrong": _wrong,
+}
+INSIDE = ("of a peer gone wrong",)  # it may tell another time, and stops nobody
