@@ -48,7 +48,7 @@ from apc.eigen.dominant import misses_one
 from apc.eigen.ratios import Ratio
 from apc.eigen.relative import independent_places, relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here, stays_rigid, what_stands
-from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE
+from apc.eigen.spectrum import UNSTABLE, up_to
 from apc.frame.names import Range
 from apc.frame.site import LinearSite, entrywise
 from apc.result import Result
@@ -131,10 +131,13 @@ def _prove_box(name: str, box: Box) -> BoxProof:
     whole: Cell = tuple((one.low, one.high) for one in box.ranges)
     questions: list[OpenSystem] = []
     notes: list[str] = []
-    translations = 0
+    translations = rotations = 0
     for system, sites in zip(box.systems, box.sites, strict=True):
         free = _rigid_modes(system)
-        translations += what_stands(system, with_drifts=False).translations if free.names else 0
+        if free.names:
+            standing = what_stands(system, with_drifts=False)
+            translations += standing.translations
+            rotations += standing.rotations
         if free.drifts or (free.names and not stays_rigid(system, sites)):
             what = "drifts" if free.drifts else "moves freely in a direction that changes with the parameters"
             notes.append(f"{system.name} {what}: nothing can be proved for a whole box")
@@ -156,7 +159,7 @@ def _prove_box(name: str, box: Box) -> BoxProof:
             left, where = found.open_share, found.point
     if left:
         return _answer(name, box, UNDECIDED, None, cells, left, where, notes)
-    return _answer(name, box, STABLE_TRANSLATING if translations else STABLE, True, cells, 0.0, ())
+    return _answer(name, box, up_to(translations, rotations), True, cells, 0.0, ())
 
 
 def _rigid_modes(system: ClosedSystem) -> RigidModes:

@@ -56,6 +56,10 @@ _WORDS = {
         "Nothing ties the peers to the ground; moved together they stay where they are.\n"
         "Every other motion dies out."
     ),
+    "stable up to a common rotation": (
+        "Nothing holds the peers' angles; turned together they stay as they are.\n"
+        "Every other motion dies out."
+    ),
     "drifts": "Nothing slows a common motion down. Every other motion dies out.",
     "unstable": "Some motion grows until the devices shake or hit their limits.",
 }
@@ -124,9 +128,10 @@ def analysis_text(result: Analysis) -> str:
         lines += note(text)
     lines.append("")
     words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
-    if result.rigid_modes > 1 and result.verdict == "stable up to a common translation":
+    motions = result.translations + result.rotations
+    if motions > 1 and result.verdict.startswith("stable up to"):
         words = (
-            f"{result.rigid_modes} motions are held back by nothing, of all peers together or of some "
+            f"{motions} motions are held back by nothing, of all peers together or of some "
             "beside others: moved so they stay where they are. Every other motion dies out."
         )
     if result.linearized:
@@ -137,8 +142,9 @@ def analysis_text(result: Analysis) -> str:
         words = "Nothing here is free to move."
     lines += [line for one in words.splitlines() for line in wrapped(one, "  ", "  ")]
     removed = ""
-    if result.translations:
-        removed = f", {counted(result.translations, 'translation')} left out"
+    if motions:
+        named = (("translation", result.translations), ("rotation", result.rotations))
+        removed = f", {' and '.join(counted(count, noun) for noun, count in named if count)} left out"
     lines += [
         "",
         f"  spectral radius  {measured(result.spectral_radius, result.spectral_radius_error)}"
