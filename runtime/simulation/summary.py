@@ -209,10 +209,9 @@ class Watch:
         # Of the positions that turn and don't settle, the one that swings most.
         restless = np.isnan(settled[self.positions]) & (turns[self.positions] >= FEWEST_TURNS)
         restless &= number >= 2 * tail
-        units = np.array([self.listed[place].unit for place in self.positions])
-        for unit in np.unique(units):  # a length and an angle are each compared with their like
-            alike = np.array(self.positions)[units == unit]
-            span[alike] = span[alike].max(axis=0)
+        for unit in POSITIONS:  # a length and an angle are each compared with their like
+            alike = [place for place in self.positions if self.listed[place].unit == unit]
+            span[alike] = span[alike].max(axis=0, initial=0.0)
         share = np.where(restless, (swing / span)[self.positions], -1.0)
         which = np.full(self.runs, -1, np.int64)
         if self.positions:
