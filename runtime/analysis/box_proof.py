@@ -108,7 +108,7 @@ Look = Callable[[Sequence[Cell]], Iterator[Looked]]
 
 
 @part("box")
-def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
+def prove_box(system: CompiledSystem, ranges: Sequence[Range], *, cells: int | None = None) -> BoxProof:
     """Prove a scene stable in a whole box, or find a point of it where it is unstable.
 
     Parameters
@@ -117,6 +117,8 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
         The compiled scene.
     ranges
         The parameters left open, see `box.parse_range`.
+    cells
+        How many cells of each closed system are looked at at most; without it, as many as take some seconds.
 
     Raises
     ------
@@ -124,10 +126,10 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
         E831 and E832 as `box.open_box`.
     """
     with single_threaded(), np.errstate(all="ignore"), precision(BITS):
-        return _prove_box(system.name, open_box(system, ranges))
+        return _prove_box(system.name, open_box(system, ranges), cells)
 
 
-def _prove_box(name: str, box: Box) -> BoxProof:
+def _prove_box(name: str, box: Box, most: int | None) -> BoxProof:
     whole: Cell = tuple((one.low, one.high) for one in box.ranges)
     questions: list[OpenSystem] = []
     notes: list[str] = []
@@ -151,7 +153,7 @@ def _prove_box(name: str, box: Box) -> BoxProof:
                 return _answer(name, box, UNSTABLE, False, 1, 1.0, point)
     cells, left, where = 0, 1.0 if notes else 0.0, tuple[Fraction, ...]()
     for question in questions:
-        found = _halved(whole, partial(_looked, question))
+        found = _halved(whole, partial(_looked, question), most)
         cells += found.cells
         if found.unstable:
             return _answer(name, box, UNSTABLE, False, cells, 1.0, found.point)
@@ -201,6 +203,7 @@ def search_box(
     *,
     stable: str,
     unstable: str,
+    cells: int | None = None,
 ) -> BoxProof:
     """Look at the middle and the corners of a box, then prove it cell by cell.
 
@@ -214,6 +217,8 @@ def search_box(
         Whether it is proved unstable at a point.
     stable, unstable
         The verdicts.
+    cells
+        As of `prove_box`.
     """
     whole: Cell = tuple((one.low, one.high) for one in ranges)
 
@@ -224,7 +229,7 @@ def search_box(
     for point in (middle(whole), *itertools.product(*whole)):
         if is_unstable(point):
             return answer(unstable, 1, 1.0, point)
-    found = _halved(whole, looks)
+    found = _halved(whole, looks, cells)
     if found.unstable:
         return answer(unstable, found.cells, 1.0, found.point)
     if found.open_share:
@@ -232,10 +237,14 @@ def search_box(
     return answer(stable, found.cells, 0.0, ())
 
 
-def _halved(whole: Cell, looks: Look) -> _Halved:
+def _halved(whole: Cell, looks: Look, most: int | None) -> _Halved:
     """Prove cells, the larger before the smaller; all as in `search_box`."""
     level, looked, work = [whole], 0, 0.0
-    while level and work < MOST_CELLS:
+
+    def enough() -> bool:
+        return work >= MOST_CELLS if most is None else looked >= most
+
+    while level and not enough():
         halves, done = list[Cell](), 0
         for cell, one in zip(level, looks(level), strict=False):
             looked, done, work = looked + 1, done + 1, work + one.work
@@ -246,7 +255,7 @@ def _halved(whole: Cell, looks: Look) -> _Halved:
                 low, high = cell[widest]
                 for half in ((low, (low + high) / 2), ((low + high) / 2, high)):
                     halves.append((*cell[:widest], half, *cell[widest + 1 :]))
-            if work >= MOST_CELLS:
+            if enough():
                 break
         level = level[done:] + halves
     share = float(sum((_volume(cell) for cell in level), Fraction(0)) / _volume(whole))

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from apc.frame.names import Range
 
 MOST_ROWS = 16
+MORE_CELLS = 10  # times as many as left a box open, to try next
 DECIMALS = 6  # of a magnitude
 MOST_UNFELT = 4  # names of what is left out beside the translations
 LEAST_MAGNITUDE = 1e-6  # its six digits would show as zero
@@ -203,8 +204,8 @@ def answer_text(found: Answer) -> str:
         parts.append(str(found.conventions))
     elif found.conventions.warning:
         parts.append("\n".join(wrapped(f"Warning: {found.conventions.warning}")))
-    if found.box is not None:
-        parts.append(str(found.box))
+    if found.box is not None:  # that was asked for
+        parts.insert(0, str(found.box))
     return "\n\n".join(parts)
 
 
@@ -355,7 +356,9 @@ def box_proof_text(found: BoxProof) -> str:
     else:
         share = f"{100 * found.open_share:.3g} %"
         said = f"undecided, {share} of the box is left open ({counted(found.cells, 'cell')})"
-        lines += ["among others around", *where] if found.point else []
+        if found.point:  # else nothing was looked at, as its notes say
+            lines += ["among others around", *where]
+            lines += wrapped(f"more cells may decide it: --cells {MORE_CELLS * found.cells}")
     lines += [f"  {text}" for text in found.notes]
     told = [line for text in found.left_out for line in wrapped(text)]
     return "\n".join([f"{found.topology}:", *told, *wrapped(said), *lines])
