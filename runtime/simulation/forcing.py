@@ -39,7 +39,7 @@ MOST_HALVED = 2**18  # panels of the intervals of one chunk: some seconds; a jum
 MOST_PANELS = 256  # integrated at once: what is held of them stays within some MB, however many there are
 # Instants of one walk: the arrays it holds then stay in the cache of a processor.
 MOST_INSTANTS = 8192
-MOST_VALUES = 2**21  # of all operations of a long expression, which the walk keeps
+MOST_VALUES = 2**23  # of all operations of a long expression, which the walk keeps
 LOOKS = 5  # instants of an interval at which a switch that is not linear in time is looked for
 
 # A switch is found to this share of the interval, or to a rounding of its instant.
