@@ -76,7 +76,7 @@ def _moved(group: PeerGroup, *, named: bool) -> list[tuple[float, str, str]]:
     added += np.abs(site.a) @ np.abs(np.array(x, dtype=np.float64))
     prefix = f"{group.name}." if named else ""
     found = []
-    for place in np.flatnonzero(np.abs(rates) > ROUNDED * added):
+    for place in np.flatnonzero(np.abs(rates) > ROUNDED * added).tolist():
         name, rate = prefix + kind.states[place].name, abs(float(rates[place]))
         inverse, unit = max(
             (

@@ -153,7 +153,7 @@ def _alone(asked: _Question, place: int) -> float:
 
     How much a range matters in a cell is what it adds to bounds there, not how much it moves the radius.
     """
-    inner = middle([(one.low, one.high) for one in asked.ranges])
+    inner = middle(tuple((one.low, one.high) for one in asked.ranges))
     half = (asked.ranges[place].high - asked.ranges[place].low) / 2
     for _ in range(MOST_HALVINGS):
         cell = [(value, value) for value in inner]
