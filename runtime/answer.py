@@ -114,6 +114,7 @@ def answer(
     method: str = "auto",
     certify: bool = False,
     box: Sequence[Range] = (),
+    cells: int | None = None,
     every_convention: bool = False,
     every_margin: bool = False,
     with_buzz: bool = False,
@@ -130,6 +131,8 @@ def answer(
         Prove the verdict in ball arithmetic.
     box
         Ranges of parameters over which to prove stability as well.
+    cells
+        Of how many cells of the box that is tried at most, see `proved_box`.
     every_convention
         Repeat the analysis under every order of coincident events, however long it takes.
     every_margin
@@ -161,7 +164,7 @@ def answer(
         buzz=buzz,
         conventions=compared,
         detailed=every_convention,
-        box=proved_box(system, box) if box else None,
+        box=proved_box(system, box, cells=cells) if box else None,
         no_buzz=no_buzz,
         warnings=system.warnings,
     )
@@ -208,7 +211,9 @@ def _buzz(system: CompiledSystem, prepared: Prepared, modes: ContactModes | None
         return None, error.mistakes[0].reason
 
 
-def proved_box(system: CompiledSystem, box: Sequence[Range], *, passive: bool = False) -> BoxProof:
+def proved_box(
+    system: CompiledSystem, box: Sequence[Range], *, passive: bool = False, cells: int | None = None
+) -> BoxProof:
     """Return the proof over a box; imported here, as few analyses ask for one.
 
     Parameters
@@ -219,6 +224,8 @@ def proved_box(system: CompiledSystem, box: Sequence[Range], *, passive: bool = 
         Ranges of parameters.
     passive
         Whether every passive hand is meant, over the nominal network.
+    cells
+        How many cells are looked at at most; without it, as many as take some seconds.
 
     Raises
     ------
@@ -229,7 +236,7 @@ def proved_box(system: CompiledSystem, box: Sequence[Range], *, passive: bool = 
     if passive:
         from apc.hands.box import prove_box as prove_for_hands
 
-        return prove_for_hands(system, box)
+        return prove_for_hands(system, box, cells=cells)
     from apc.analysis.box_proof import prove_box
     from apc.network.nominal import channel_numbers, left_out
 
@@ -237,8 +244,8 @@ def proved_box(system: CompiledSystem, box: Sequence[Range], *, passive: bool = 
     if left_out(system) or any(one.free.name in numbers for one in box):
         from apc.moments.box import prove_box as prove_over_network
 
-        return prove_over_network(system, box)
-    return prove_box(system, box)
+        return prove_over_network(system, box, cells=cells)
+    return prove_box(system, box, cells=cells)
 
 
 def sensitivities_of(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Sensitivities:

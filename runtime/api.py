@@ -470,7 +470,11 @@ def buzz(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = 
 
 
 def prove_box(
-    model: CompiledSystem | str | Path, box: Mapping[str, str], *, set: Mapping[str, str] | None = None
+    model: CompiledSystem | str | Path,
+    box: Mapping[str, str],
+    *,
+    cells: int | None = None,
+    set: Mapping[str, str] | None = None,
 ) -> BoxProof:
     """Prove that a scene is stable for every value of some parameters within their ranges.
 
@@ -480,12 +484,15 @@ def prove_box(
         As for `analyze`.
     box
         Ranges by parameter, such as {"contact.stiffness": "±1%"} or "900 N/m:1100 N/m".
+    cells
+        How many cells are looked at at most; without it, as many as take some seconds.
     """
     from apc.analysis.box import parse_range
     from apc.answer import proved_box
 
     system = _model(model, set)
-    return proved_box(system, [parse_range(system, f"{name}={value}") for name, value in box.items()])
+    ranges = [parse_range(system, f"{name}={value}") for name, value in box.items()]
+    return proved_box(system, ranges, cells=cells)
 
 
 def parameters(model: CompiledSystem | str | Path) -> Parameters:

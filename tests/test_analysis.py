@@ -39,6 +39,7 @@ def test_the_answer_is_plain_data() -> None:
         "proof",
         "left_out",
         "translations",
+        "rotations",
         "unfelt",
     ]
     assert (found["topology"], found["peers"], found["frame_s"]) == ("paper", 3, 0.008)

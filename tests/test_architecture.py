@@ -74,7 +74,7 @@ HOUSE = (
     (
         "apc.eigen",
         """
-        graph_modes peer_group listening peers closing graph_loops modes
+        graph_modes peer_group listening peers rest closing graph_loops modes
         eigenpairs dominant ratios rigid dissipation pseudospectrum apart relative enclosure balls winding
         bordered roots certify spectrum
         """,

@@ -7,14 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from apc.analysis.analysis import analyze
 from apc.analysis.box import parse_range
 from apc.analysis.box_proof import BoxProof, prove_box
+from apc.answer import answer
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
+from apc.vary.critical import critical
 from tests.sites import columned, derived, grouped, paper
 from tests.topologies import AVERAGE, ONE_MASS, SCENES, compiled, library, replaced
 
@@ -75,6 +79,32 @@ def test_an_instability_inside_the_box_is_found() -> None:
     found = _proof(compiled(AVERAGE), "contact.stiffness=1 N/m:3000 N/m")
     assert found.stable is False
     assert found.point[0] > 1800
+
+
+def test_an_open_box_stands_first_and_says_that_more_cells_may_decide_it() -> None:
+    system = compiled(AVERAGE)
+    box = [parse_range(system, "coordination.stiffness=100 N/m:1 N/mm")]
+    text = str(answer(system, box=box, cells=1))
+    assert text.startswith("three-users-average:\nundecided, 100 % of the box is left open (2 cells)")
+    assert "--cells 20\n" in text
+    assert str(answer(system, box=box)).startswith("three-users-average:\nproved stable")
+
+
+@settings(max_examples=8, deadline=None)
+@given(share=st.floats(0.05, 0.9), width=st.floats(0.01, 0.2))
+def test_a_box_across_the_boundary_is_never_proved_and_one_below_it_holds_no_unstable_point(
+    share: float, width: float
+) -> None:
+    system = compiled(AVERAGE)
+    largest = critical(system, "coordination.stiffness").value
+    assert largest is not None
+    across = _proof(system, f"coordination.stiffness={largest * (1 - width)} N/m:{largest * (1 + width)} N/m")
+    assert not across.stable
+    low, high = largest * share, largest * min(share + width, 0.98)
+    below = _proof(system, f"coordination.stiffness={low} N/m:{high} N/m", "device.mass=±0.5%")
+    assert below.stable
+    middle = Override(Free("coordination.stiffness"), Fraction((low + high) / 2))
+    assert analyze(apply(system, [middle])).stable
 
 
 def test_what_can_not_be_proved_is_left_open_and_says_where(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,6 +20,8 @@ from apc.analysis.box_proof import BITS
 from apc.analysis.cells import Cell, frames_over
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.balls import precision
+from apc.frame.names import Free
+from apc.frame.overrides import Override, apply
 from apc.frame.radius import RADII, radius_of, value_of
 from apc.frame.taylor import taylor
 from apc.moments import box, network
@@ -32,6 +34,7 @@ from apc.vary.over_network import network_margins, network_sensitivities
 from apc.vary.sensitivity import Sensitivity
 from tests.second_moments import Law, second_moment_radius
 from tests.test_mean_square import burst, scene
+from tests.topologies import compiled
 
 
 def grown(system: CompiledSystem) -> Margins:
@@ -131,12 +134,45 @@ def test_a_box_in_mean_square_is_decided_as_references_say(
     assert found.verdict == ("stable in mean square" if stable else "unstable in mean square")
 
 
-def test_what_is_left_open_of_a_box_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("apc.analysis.box_proof.MOST_CELLS", 20)
-    found = apc.prove_box(scene(), {"coordination.stiffness": "1000 N/m:1143.2 N/m"})
+def test_what_is_left_open_of_a_box_is_said() -> None:
+    found = apc.prove_box(scene(), {"coordination.stiffness": "1000 N/m:1143.2 N/m"}, cells=20)
     assert (found.stable, found.cells) == (None, 20)
     assert 0 < found.open_share <= 1
     assert 1000 < found.point[0] < 1143.2
+
+
+ARMED = """\
+topology: armed
+clocks: {haptic: 1 ms, network: 8 ms}
+peers: {user: {count: 2}}
+masses:
+  device: {mass: 0.1 kg, damping: 5 N*s/m}
+  cube:   {mass: 0.6 kg, damping: 20 N*s/m, shared: true}
+couplers:
+  contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic}
+  coordination: {type: AveragePosition, object: cube, stiffness: 500 N/m, clock: haptic, link: lan}
+hands:
+  arm: {type: MassSpringDamperArm, flange: device, mass: 0.2 kg, stiffness: 100 N/m, damping: 5 N*s/m}
+links:
+  lan: {clock: network, delay: 20 ms, loss: 5 %}
+"""
+
+
+def test_a_wide_box_far_inside_is_proved_and_points_of_it_are_stable() -> None:
+    """Its cells are halved where that makes them easier to prove: the mass, which hardly moves the radius."""
+    system = compiled(ARMED)
+    box = {"arm.mass": "±20%", "coordination.stiffness": "500 N/m:600 N/m"}
+    found = apc.prove_box(system, box, cells=50)
+    assert (found.verdict, found.open_share) == ("stable in mean square", 0.0)
+    generator = np.random.default_rng(3)
+    names = ("arm.mass", "coordination.stiffness")
+    for point in generator.uniform([0.16, 500], [0.24, 600], (2, 2)).tolist():
+        at = [Override(Free(name), Fraction(value)) for name, value in zip(names, point, strict=True)]
+        judged = network.judge_network(apply(system, at))
+        assert judged is not None
+        assert judged.stable
+    beyond = apc.prove_box(system, box | {"coordination.stiffness": "2500 N/m:2650 N/m"}, cells=4)
+    assert not beyond.stable, "the largest stable stiffness is 2569 N/m"
 
 
 def test_of_an_ideal_link_a_box_is_nominal_until_it_may_lose_packets() -> None:

@@ -188,3 +188,33 @@ def test_a_force_that_changes_without_end_is_refused(tmp_path: Path, monkeypatch
     monkeypatch.setattr(forcings, "MOST_HALVED", 1000)
     with pytest.raises(ApcError, match=r"E871 a force changes too fast: .* more than 1,000 places"):
         moved(tmp_path, "type: SineForce, force: 1 N, frequency: 1e9 Hz", "1/10")
+
+
+def test_a_long_table_is_looked_up_and_evaluated_once_a_row_however_many_intervals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    generator = np.random.default_rng(4)
+    times = np.cumsum(generator.uniform(1e-4, 3e-3, 60)) + 2.0
+    numbers = generator.normal(size=60)
+    rows = "".join(
+        f"{one!r},{other!r}\n" for one, other in zip(times.tolist(), numbers.tolist(), strict=True)
+    )
+    (tmp_path / "force.csv").write_text(f"time [s],force [N]\n{rows}", encoding="utf-8")
+    text = f"{ONE_MASS}hands: {{hand: {{type: TableForce, flange: device, force: force.csv}}}}\n"
+    (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
+    system = compile_topology(tmp_path / "scene.yaml")
+    seen: list[int] = []
+
+    def counting(function: Any, parameters: Any, instants: Any) -> Any:
+        seen.append(instants.size)
+        return walked(function, parameters, instants)
+
+    walked = forcings.at_instants
+    monkeypatch.setattr(forcings, "at_instants", counting)
+    simulate(system, duration=Fraction(3))
+    assert sum(seen) <= len(times) + 2
+    [kind] = system.kinds
+    site = SiteForcing(forcing_of(rates(kind)), resolve(system).parameters[0][0], ())
+    at = np.sort(generator.uniform(1.9, 2.3, (3, 200)))
+    expected = np.interp(at, times, numbers) / 2
+    assert np.abs(site.force(at)[0] - expected).max() <= 1e-13 * np.abs(expected).max()

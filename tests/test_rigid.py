@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from apc.analysis.analysis import lifted_groups
+from apc.analysis.analysis import analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import dense, split
 from apc.eigen.rigid import find_rigid_modes, rigid_modes_before
 from apc.eigen.spectrum import solve_spectrum
 from tests.sites import MS, grouped, paper
+from tests.topologies import AVERAGE, compiled, library
 
 
 def _closed(system: CompiledSystem) -> Sequence[ClosedSystem]:
@@ -151,3 +153,75 @@ def test_groups_and_the_dense_system_have_the_same_rigid_modes() -> None:
         for one in split(groups, exchange).systems
     )
     assert counted == find_rigid_modes(dense(groups, exchange)).directions.shape[1] == 2 + 3 * 2
+
+
+WHEEL = """\
+component: Wheel
+connectors: {a: Flange}
+parameters:
+  mass: {unit: kg}
+  damping: {unit: N*s/m}
+  stiffness: {unit: N/m}
+  inertia: {unit: kg*m^2}
+  turning: {unit: N*m*s}
+  twist: {unit: N*m}
+  clock: clock
+  link: link
+sends: {phi: sample(phi)}
+variables:
+  x: {unit: m, start: 0 m}
+  v: {unit: m/s, start: 0 m/s}
+  phi: {unit: rad, start: 0}
+  w: {unit: rad/s, start: 0 rad/s}
+  t: {unit: N*m}
+equations:
+  - der(x) = v
+  - mass*der(v) = a.f - damping*v - stiffness*x
+  - der(phi) = w
+  - t = twist*(sample(phi) - mean(others.phi))
+  - inertia*der(w) = -hold(t) - turning*w
+  - a.x = x
+"""
+WHEELS = """\
+topology: wheels
+clocks: {haptic: 1 ms, network: 4 ms}
+peers: {left: {count: 1}, right: {count: 1, set: {wheel.phi: 0.1}}}
+masses:
+  wheel: {type: Wheel, mass: 1 kg, damping: 5 N*s/m, stiffness: K, inertia: 0.001 kg*m^2, turning: 0.01 N*m*s,
+          twist: TWIST, clock: haptic, link: lan}
+links: {lan: {clock: network, delay: 4 ms}}
+"""
+# What is kept follows what the others keep, and pulls nothing.
+KEPT = """\
+component: Kept
+connectors: {object: Flange}
+parameters: {lag: {unit: s, default: 1 s}, clock: clock, link: link}
+sends: {s: sample(s)}
+variables: {s: {unit: N, start: 1 N}, y: {unit: N, start: 0 N}}
+equations:
+  - der(s) = (hold(y) - s)/lag
+  - y = mean(others.s)
+  - object.f = 0*s
+"""
+
+
+def _wheels(folder: Path, twist: str, stiffness: str = "0 N/m") -> CompiledSystem:
+    return compiled(WHEELS.replace("TWIST", twist).replace("K,", f"{stiffness},"), library(folder, WHEEL))
+
+
+def test_what_turns_freely_is_a_rotation_and_what_shifts_freely_a_translation(tmp_path: Path) -> None:
+    free = analyze(_wheels(tmp_path, "0.1 N*m"))
+    assert (free.translations, free.rotations, free.unfelt) == (2, 1, ())
+    assert "2 translations and 1 rotation left out" in str(free)
+    assert "3 motions are held back by nothing" in str(free)
+    held = analyze(_wheels(tmp_path, "0.1 N*m", "300 N/m"))
+    assert (held.verdict, held.translations, held.rotations) == ("stable up to a common rotation", 0, 1)
+    assert "turned together" in str(held)
+
+
+def test_what_is_left_out_though_some_of_it_moves_in_modes_is_a_common_shift(tmp_path: Path) -> None:
+    text = AVERAGE.replace("links:", "  kept: {type: Kept, object: cube, clock: haptic, link: lan}\nlinks:")
+    found = analyze(compiled(text, library(tmp_path, KEPT)))
+    assert found.unfelt == ("the common shift of kept.s, kept.s sent",)
+    assert any(share[0].startswith("kept.s") for mode in found.modes for share in mode.participation)
+    assert "the common shift of kept.s" in str(found)

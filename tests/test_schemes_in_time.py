@@ -180,6 +180,7 @@ def test_a_linearization_says_unstable_of_what_settles() -> None:
     assert found.verdict == "unstable"
     assert str(found).startswith(
         "two-users-passivity: unstable, linearized at its start\n"
+        "  the start is not at rest: 2 N acts on pusher.device; what happens is played:\n    apc simulate\n"
         "  left out: the scene is not linear, and this holds near its start values only\n\n"
         "  To first order, some motion grows until the devices shake or hit their limits.\n"
         "  What it does in time is played: apc simulate\n"

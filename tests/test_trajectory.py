@@ -77,6 +77,30 @@ def test_a_mass_that_is_pushed_moves_on_and_one_that_stops_settles() -> None:
     assert found.time[1] == 0.001, "where nothing ticks there is a row a millisecond"
 
 
+def test_a_verdict_on_no_position_or_on_some_says_so() -> None:
+    text = AVERAGE.replace("{count: 3}", "{count: 3, set: {device.x: [10 mm, 0 mm, -5 mm]}}")
+    none = simulate(compiled(text), duration=Fraction(1), signals=["*.v"])
+    assert none.summary.verdict == "not judged"
+    assert "No position was recorded" in str(none)
+    one = simulate(compiled(text), duration=Fraction(1), signals=["user[1].cube.x"])
+    assert "on every recorded position stays" in str(one)
+    still = simulate(compiled(AVERAGE), duration=Fraction(1), signals=["user[1].cube.x"])
+    assert "No recorded position moves." in str(still)
+
+
+def test_the_swing_that_is_told_is_the_largest_of_its_unit_not_the_first() -> None:
+    """A light device beside a heavy cube swings most, whatever share of its own way each makes."""
+    start = "{count: 3, set: {device.x: [10 mm, 0 mm, -5 mm]}}"
+    text = AVERAGE.replace("{count: 3}", start).replace("stiffness: 1000", "stiffness: 2500")
+    text = text.replace("device: {mass", "zero: {mass: 9 kg, damping: 5 N*s/m}\n  device: {mass")
+    tie = "  tie: {type: SpringDamper, a: zero, b: device, stiffness: 1 N/m}\n  contact:"
+    found = simulate(compiled(text.replace("  contact:", tie)), duration=Fraction(1)).summary
+    assert found.verdict == "shakes"
+    assert found.swing is not None
+    largest = max(found.extents, key=lambda one: (one.unit == "m") * (one.high - one.low))
+    assert found.swing[0] == largest.name
+
+
 def test_columns_are_found_by_name_and_have_units() -> None:
     headings = [one.heading for one in AVERAGE_RUN.signals]
     assert headings[:3] == ["right[1].device.x [m]", "right[1].device.v [m/s]", "right[1].cube.x [m]"]

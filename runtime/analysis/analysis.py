@@ -2,7 +2,7 @@
 
 Takes: a `CompiledSystem`.
 Gives: `Analysis`, `analyze`; `Prepared`, `prepare`, `timed` and `prepare_at_start` for many analyses of one
-system.
+system; `near_start`.
 Guarantees: the cost grows with the number of different peers, not of peers, and not with the length of a
 delay; of equal input comes equal output.
 Does not: read files, or draw.
@@ -27,15 +27,16 @@ from apc.eigen.closing import Loop, close_loop
 from apc.eigen.modes import arrange
 from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of, used_ways
 from apc.eigen.peers import group_of_row, peer_groups
-from apc.eigen.rigid import LENGTHS, what_stands
+from apc.eigen.rest import unrest
+from apc.eigen.rigid import LENGTH, Standing, what_stands
 from apc.eigen.spectrum import (
     DRIFTS,
     STABLE_TRANSLATING,
     TO_DRIFT,
     Mode,
     Spectrum,
-    judge,
     solve_spectrum,
+    up_to,
 )
 from apc.finite_equations import finite_equations
 from apc.frame.ages import at_timings, linear_sites
@@ -49,6 +50,8 @@ from apc.frame.start import at_start
 from apc.network.nominal import left_out
 from apc.result import Look, Result
 from apc.threads import single_threaded
+
+NOT_LINEAR = "left out: the scene is not linear, and this holds near its start values only"
 
 SETTLED = 0.02  # of where it began: a motion counts as settled
 
@@ -76,8 +79,9 @@ class Analysis(Result):
     `states_per_peer` is that of the largest kind of peer in the scene. `method` is one of `methods.METHODS`.
     `linearized` says that some site is not affine: the answer then holds near its start values only. `notes`
     say why it was analysed as it was; `proof` says what ball arithmetic proved, "" where floats decided;
-    `left_out` says what of the scene the answer does not look at. Of the rigid modes `translations` move
-    something; the others are of what `unfelt` names, memories that nothing reads at these values.
+    `left_out` says what of the scene the answer does not look at. Of the rigid modes
+    `translations` and `rotations` move something; the others are of what `unfelt` names, memories that
+    nothing reads at these values.
     """
 
     shown_by = "analysis:analysis"
@@ -98,6 +102,7 @@ class Analysis(Result):
     proof: str = ""
     left_out: tuple[str, ...] = ()
     translations: int = 0
+    rotations: int = 0
     unfelt: tuple[str, ...] = ()
 
     def plot(self, ax: Any = None, **look: Unpack[Look]) -> Any:
@@ -161,6 +166,28 @@ def _starting(system: CompiledSystem, sites: tuple[SiteJacobians, ...]) -> tuple
     return found if len(found) == len(sites) else None
 
 
+def near_start(system: CompiledSystem, prepared: Prepared | None = None) -> tuple[str, ...]:
+    """Return what an answer says of a scene that it linearizes: what is not at rest where it starts, and that
+    it holds there only; nothing of a linear scene.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    prepared
+        From `prepare`, of this system with any numbers.
+    """
+    sites = prepared.jacobians if prepared else linear_sites(system)
+    if all(sites[group.kind].affine for group in system.groups):
+        return ()
+    try:
+        groups, _ = lifted_groups(system, prepared=prepared)
+    except ApcError:  # at these values there is no answer
+        return (NOT_LINEAR,)
+    moves = unrest(groups)
+    return (*([f"{moves}; what happens is played: apc simulate"] if moves else []), NOT_LINEAR)
+
+
 @part("analysis")
 def analyze(
     system: CompiledSystem,
@@ -221,10 +248,11 @@ def analyze(
         population = (
             () if plan.loops else plan.groups or _representatives(system, prepared, numbers, exchange)
         )
-        translations, drifts, unfelt = _what_stands(spectrum, plan.loops, population)
+        stands = _what_stands(spectrum, plan.loops, population)
         verdict, stable = spectrum.verdict, spectrum.stable
-        if unfelt and verdict in (STABLE_TRANSLATING, DRIFTS):
-            verdict, stable = judge([True], translations, drifts)
+        if verdict in (STABLE_TRANSLATING, DRIFTS):
+            told = up_to(stands.translations, stands.rotations)
+            verdict, stable = (DRIFTS, False) if stands.drifts else (told, True)
         proof = spectrum.proof if verdict == DRIFTS else spectrum.proof.replace(TO_DRIFT, "stable")
         of = (("linearization", linearized), ("nominal network", bool(left_out(system))))
         if proof and any(is_so for _, is_so in of):
@@ -247,41 +275,47 @@ def analyze(
         linearized=linearized,
         notes=(*plan.notes, *notes, *spectrum.notes),
         proof=proof,
-        left_out=left_out(system, linear=not linearized),
-        unfelt=unfelt,
-        translations=translations,
+        left_out=(*near_start(system, prepared), *left_out(system)),
+        unfelt=stands.names,
+        translations=stands.translations,
+        rotations=stands.rotations,
     )
 
 
-def _what_stands(
-    spectrum: Spectrum, loops: Sequence[Loop], population: Sequence[PeerGroup]
-) -> tuple[int, int, tuple[str, ...]]:
-    """Return how many translations and drifts there are, and what else neither grows nor dies out.
+def _what_stands(spectrum: Spectrum, loops: Sequence[Loop], population: Sequence[PeerGroup]) -> Standing:
+    """Return what neither grows nor dies out.
 
-    Where the loops are not at hand, of a large population, what is not felt is that of peers by themselves.
+    Where the loops are not at hand, of a large population, what is not felt is that of peers by themselves,
+    and what moves counts as a translation.
     """
-    drifts = spectrum.drifts
     if not spectrum.rigid_modes or not any(
         map(_remembers, (*population, *(g for one in loops for g in one.sites)))
     ):
-        return spectrum.rigid_modes, drifts, ()
+        return Standing(spectrum.rigid_modes, 0, spectrum.drifts, 0, ())
     listed: Sequence[tuple[Loop, int]] = [(loop, loop.multiplicity) for loop in loops]
     for group in population:
         anyhow = {way: ((Fraction(-1, 3),),) for way in used_ways([group.schedule])}
         listed = [*listed, (Loop(group.name, 1, (group,), anyhow), group.count)]
-    found = [(what_stands(loop, with_drifts=bool(drifts and loops)), many) for loop, many in listed]
+    with_drifts = bool(spectrum.drifts and loops)
+    found = [(what_stands(loop, with_drifts=with_drifts), many) for loop, many in listed]
     names = tuple(dict.fromkeys(name for one, _ in found for name in one.names))
-    if loops:
-        drifts = sum(one.drifts * many for one, many in found)
-        return sum(one.translations * many for one, many in found), drifts, names
-    return spectrum.rigid_modes - sum(one.unfelt * many for one, many in found), drifts, names
+    unfelt = sum(one.unfelt * many for one, many in found)
+    if not loops:
+        return Standing(spectrum.rigid_modes - unfelt, 0, spectrum.drifts, unfelt, names)
+    return Standing(
+        translations=sum(one.translations * many for one, many in found),
+        rotations=sum(one.rotations * many for one, many in found),
+        drifts=sum(one.drifts * many for one, many in found),
+        unfelt=unfelt,
+        names=names,
+    )
 
 
 def _remembers(group: PeerGroup) -> bool:
-    """Say whether peers keep more than lengths and angles with their rates."""
+    """Say whether peers keep more than lengths with their rates."""
     kind = group.jacobians.kind
     return any(one.memories for one in kind.clocks) or any(
-        state.unit.partition("/")[0] not in LENGTHS for state in kind.states
+        state.unit.partition("/")[0] != LENGTH for state in kind.states
     )
 
 

@@ -48,7 +48,7 @@ from apc.eigen.dominant import misses_one
 from apc.eigen.ratios import Ratio
 from apc.eigen.relative import independent_places, relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here, stays_rigid, what_stands
-from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE
+from apc.eigen.spectrum import UNSTABLE, up_to
 from apc.frame.names import Range
 from apc.frame.site import LinearSite, entrywise
 from apc.result import Result
@@ -108,7 +108,7 @@ Look = Callable[[Sequence[Cell]], Iterator[Looked]]
 
 
 @part("box")
-def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
+def prove_box(system: CompiledSystem, ranges: Sequence[Range], *, cells: int | None = None) -> BoxProof:
     """Prove a scene stable in a whole box, or find a point of it where it is unstable.
 
     Parameters
@@ -117,6 +117,8 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
         The compiled scene.
     ranges
         The parameters left open, see `box.parse_range`.
+    cells
+        How many cells of each closed system are looked at at most; without it, as many as take some seconds.
 
     Raises
     ------
@@ -124,17 +126,20 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
         E831 and E832 as `box.open_box`.
     """
     with single_threaded(), np.errstate(all="ignore"), precision(BITS):
-        return _prove_box(system.name, open_box(system, ranges))
+        return _prove_box(system.name, open_box(system, ranges), cells)
 
 
-def _prove_box(name: str, box: Box) -> BoxProof:
+def _prove_box(name: str, box: Box, most: int | None) -> BoxProof:
     whole: Cell = tuple((one.low, one.high) for one in box.ranges)
     questions: list[OpenSystem] = []
     notes: list[str] = []
-    translations = 0
+    translations = rotations = 0
     for system, sites in zip(box.systems, box.sites, strict=True):
         free = _rigid_modes(system)
-        translations += what_stands(system, with_drifts=False).translations if free.names else 0
+        if free.names:
+            standing = what_stands(system, with_drifts=False)
+            translations += standing.translations
+            rotations += standing.rotations
         if free.drifts or (free.names and not stays_rigid(system, sites)):
             what = "drifts" if free.drifts else "moves freely in a direction that changes with the parameters"
             notes.append(f"{system.name} {what}: nothing can be proved for a whole box")
@@ -148,7 +153,7 @@ def _prove_box(name: str, box: Box) -> BoxProof:
                 return _answer(name, box, UNSTABLE, False, 1, 1.0, point)
     cells, left, where = 0, 1.0 if notes else 0.0, tuple[Fraction, ...]()
     for question in questions:
-        found = _halved(whole, partial(_looked, question))
+        found = _halved(whole, partial(_looked, question), most)
         cells += found.cells
         if found.unstable:
             return _answer(name, box, UNSTABLE, False, cells, 1.0, found.point)
@@ -156,7 +161,7 @@ def _prove_box(name: str, box: Box) -> BoxProof:
             left, where = found.open_share, found.point
     if left:
         return _answer(name, box, UNDECIDED, None, cells, left, where, notes)
-    return _answer(name, box, STABLE_TRANSLATING if translations else STABLE, True, cells, 0.0, ())
+    return _answer(name, box, up_to(translations, rotations), True, cells, 0.0, ())
 
 
 def _rigid_modes(system: ClosedSystem) -> RigidModes:
@@ -198,6 +203,7 @@ def search_box(
     *,
     stable: str,
     unstable: str,
+    cells: int | None = None,
 ) -> BoxProof:
     """Look at the middle and the corners of a box, then prove it cell by cell.
 
@@ -211,6 +217,8 @@ def search_box(
         Whether it is proved unstable at a point.
     stable, unstable
         The verdicts.
+    cells
+        As of `prove_box`.
     """
     whole: Cell = tuple((one.low, one.high) for one in ranges)
 
@@ -221,7 +229,7 @@ def search_box(
     for point in (middle(whole), *itertools.product(*whole)):
         if is_unstable(point):
             return answer(unstable, 1, 1.0, point)
-    found = _halved(whole, looks)
+    found = _halved(whole, looks, cells)
     if found.unstable:
         return answer(unstable, found.cells, 1.0, found.point)
     if found.open_share:
@@ -229,10 +237,14 @@ def search_box(
     return answer(stable, found.cells, 0.0, ())
 
 
-def _halved(whole: Cell, looks: Look) -> _Halved:
+def _halved(whole: Cell, looks: Look, most: int | None) -> _Halved:
     """Prove cells, the larger before the smaller; all as in `search_box`."""
     level, looked, work = [whole], 0, 0.0
-    while level and work < MOST_CELLS:
+
+    def enough() -> bool:
+        return work >= MOST_CELLS if most is None else looked >= most
+
+    while level and not enough():
         halves, done = list[Cell](), 0
         for cell, one in zip(level, looks(level), strict=False):
             looked, done, work = looked + 1, done + 1, work + one.work
@@ -243,7 +255,7 @@ def _halved(whole: Cell, looks: Look) -> _Halved:
                 low, high = cell[widest]
                 for half in ((low, (low + high) / 2), ((low + high) / 2, high)):
                     halves.append((*cell[:widest], half, *cell[widest + 1 :]))
-            if work >= MOST_CELLS:
+            if enough():
                 break
         level = level[done:] + halves
     share = float(sum((_volume(cell) for cell in level), Fraction(0)) / _volume(whole))

@@ -62,6 +62,13 @@ SECONDS_A_PEER = 1e-4
     '--box contact.stiffness=±1%, or --box "contact.stiffness=900 N/m:1100 N/m". May be repeated.',
 )
 @click.option(
+    "--cells",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Divide the box into so many cells at most before it is left undecided; without it, into as many as "
+    "take some seconds.",
+)
+@click.option(
     "--conventions",
     "every_convention",
     is_flag=True,
@@ -89,6 +96,7 @@ def analyze_command(
     method: str,
     certify: bool,
     box: tuple[str, ...],
+    cells: int | None,
     every_convention: bool,
     every_margin: bool,
     with_buzz: bool,
@@ -116,7 +124,7 @@ def analyze_command(
         asked = {"--method": method != AUTO, "--conventions": every_convention, "--buzz": with_buzz}
         asked |= {"--margins": every_margin, "--plot": plot is not None}
         refused = [name for name, given in asked.items() if given]
-        _judge_passive(system, refused, box, certify=certify, as_json=as_json)
+        _judge_passive(system, refused, box, cells, certify=certify, as_json=as_json)
         return
     if hands not in HANDS:  # one of the library: all that were measured
         box = (*box, *(f"{name}={low}:{high}" for name, (low, high, _) in published(hands).items()))
@@ -132,6 +140,7 @@ def analyze_command(
             method=method,
             certify=certify,
             box=ranges,
+            cells=cells,
             every_convention=every_convention,
             every_margin=every_margin,
             with_buzz=with_buzz,
@@ -146,7 +155,13 @@ def analyze_command(
 
 
 def _judge_passive(
-    system: CompiledSystem, asked: list[str], box: tuple[str, ...], *, certify: bool, as_json: bool
+    system: CompiledSystem,
+    asked: list[str],
+    box: tuple[str, ...],
+    cells: int | None,
+    *,
+    certify: bool,
+    as_json: bool,
 ) -> None:
     """Say whether a scene is stable with any passive hands, in a box if asked; refuse anything else."""
     from apc.hands.passivity import passive_hands
@@ -162,8 +177,7 @@ def _judge_passive(
         from apc.analysis.box import parse_range
         from apc.answer import proved_box
 
-        print_result(
-            proved_box(system, [parse_range(system, one) for one in box], passive=True), as_json=as_json
-        )
+        ranges = [parse_range(system, one) for one in box]
+        print_result(proved_box(system, ranges, passive=True, cells=cells), as_json=as_json)
         return
     print_result(passive_hands(system, certify=certify), as_json=as_json)

@@ -42,11 +42,14 @@ from apc.frame.site import LinearSite
 
 Floats = NDArray[np.float64]
 
-# The units of what moves.
-LENGTHS = ("m", "rad")
+# The units of what moves: a radian is 1, as are the parameters of what turns in space.
+LENGTH, ANGLE = "m", "1"
 
 # What most entries of forms are: to multiply by it is worth sparing.
 ONE = Fraction(1)
+
+# Of what shifts together, as many are named.
+MOST_NAMED = 4
 
 # Systems whose rigid modes are remembered as a guess, and how many states they have at most.
 KEPT, FEW_STATES = 64, 200
@@ -222,13 +225,15 @@ def _parameters_of(site: SiteJacobians) -> list[int]:
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """What neither grows nor dies out: `translations` of what moves, `drifts` of that, and the rest.
+    """What neither grows nor dies out: `translations` and `rotations`, which turn something, `drifts` among
+    them, and the rest.
 
     `unfelt` are directions in which nothing moves: what a memory keeps that nothing reads, and what it adds
-    up. `names` says what these are of.
+    up. `names` says what these are of: a memory, or the common shift of several.
     """
 
     translations: int
+    rotations: int
     drifts: int
     unfelt: int
     names: tuple[str, ...]
@@ -248,7 +253,8 @@ def what_stands(system: ClosedSystem | Loop, *, with_drifts: bool = True) -> Sta
         Whether to look for drifts, which is most of the work.
     """
     exact, numbering, still, vectors = _standing_motions(system)
-    moving = _moving_places(system.sites, len(system.names))
+    turning = _places(system.sites, ANGLE)
+    moving = [*turning, *_places(system.sites, LENGTH)]  # what turns anything is a rotation
     basis: dict[int, list[Fraction]] = {}
     unfelt = [left for vector in vectors if (left := _beyond(basis, vector, moving)) is not None]
     rates: dict[int, list[Fraction]] = {}
@@ -258,24 +264,35 @@ def what_stands(system: ClosedSystem | Loop, *, with_drifts: bool = True) -> Sta
         left = _beyond(rates, [*rate, *state], moving)
         if left is not None and (rest := _beyond(basis, left[len(rate) :], moving)) is not None:
             unfelt.append(rest)
-    places = {place for vector in unfelt for place, entry in enumerate(vector) if entry}
+    angles = sum(place in turning for place in basis)
     return Standing(
-        translations=len(basis),
+        translations=len(basis) - angles,
+        rotations=angles,
         drifts=len(rates),
         unfelt=len(unfelt),
-        names=tuple(dict.fromkeys(system.names[place].partition("(")[0] for place in sorted(places))),
+        names=tuple(dict.fromkeys(_shifted(system.names, vector) for vector in unfelt)),
     )
 
 
-def _moving_places(sites: Sequence[PeerGroup], n: int) -> list[int]:
-    """Return where in the state the lengths and angles are that change between the ticks."""
+def _shifted(names: Sequence[str], vector: Sequence[Fraction]) -> str:
+    """Return what a direction shifts."""
+    listed = list(
+        dict.fromkeys(name.partition("(")[0] for name, entry in zip(names, vector, strict=True) if entry)
+    )
+    if len(listed) == 1:
+        return listed[0]
+    more = ["…"] if len(listed) > MOST_NAMED else []
+    return f"the common shift of {', '.join([*listed[:MOST_NAMED], *more])}"
+
+
+def _places(sites: Sequence[PeerGroup], unit: str) -> list[int]:
+    """Return where in the state that is of a unit which changes between the ticks."""
     found, start = [], 0
     ends = [states_of(group.schedule, group.jacobians) for group in sites]
     for group, size in zip(sites, ends, strict=True):
         states = group.jacobians.kind.states
-        found += [start + place for place, state in enumerate(states) if state.unit in LENGTHS]
+        found += [start + place for place, state in enumerate(states) if state.unit == unit]
         start += size
-    assert start == n
     return found
 
 

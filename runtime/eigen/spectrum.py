@@ -45,6 +45,7 @@ Matrix = NDArray[Any]  # float64 or complex128
 
 STABLE = "stable"
 STABLE_TRANSLATING = "stable up to a common translation"
+STABLE_TURNING = "stable up to a common rotation"
 DRIFTS = "drifts"
 UNSTABLE = "unstable"
 UNDECIDED = "undecided: |ρ−1| below the error bound"
@@ -310,7 +311,14 @@ def judge(inside: Sequence[bool | None], rigid: int, drifts: int) -> tuple[str, 
         return UNDECIDED, None
     if drifts:
         return DRIFTS, False
-    return (STABLE_TRANSLATING if rigid else STABLE), True
+    return up_to(rigid), True
+
+
+def up_to(translations: int, rotations: int = 0) -> str:
+    """Return the verdict of what is stable up to so many motions."""
+    if translations:
+        return STABLE_TRANSLATING
+    return STABLE_TURNING if rotations else STABLE
 
 
 def _solve(systems: Sequence[ClosedSystem], free: Sequence[RigidModes]) -> list[_Solved]:

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups, prepare
+from apc.analysis.analysis import Prepared, lifted_groups, near_start, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.frozen import dataclass
@@ -191,8 +191,7 @@ def peers_of(
 def about(system: CompiledSystem) -> tuple[float, tuple[str, ...]]:
     """Return how long a frame of a scene is, in seconds, and what its linear map leaves out."""
     prepared = prepare(system)
-    affine = all(prepared.jacobians[group.kind].affine for group in system.groups)
-    return float(prepared.schedules[0].frame_s), left_out(system, linear=affine)
+    return float(prepared.schedules[0].frame_s), (*near_start(system, prepared), *left_out(system))
 
 
 def made_by(system: CompiledSystem) -> str:

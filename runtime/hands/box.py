@@ -87,7 +87,7 @@ class _Question:
 
 
 @part("box")
-def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
+def prove_box(system: CompiledSystem, ranges: Sequence[Range], *, cells: int | None = None) -> BoxProof:
     """Prove a scene stable with every passive hand in a whole box, or find a point of it where it is not.
 
     Parameters
@@ -96,6 +96,8 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
         The compiled scene.
     ranges
         The parameters left open, see `analysis.box.parse_range`.
+    cells
+        As of `analysis.box_proof.prove_box`.
 
     Raises
     ------
@@ -115,7 +117,7 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
             found = BoxProof(system.name, tuple(ranges), UNSTABLE, False, 1, 1.0, inner, (asked,))
         else:
             looks = partial(_looked, asked), partial(_is_unstable, asked)
-            found = search_box(system.name, ranges, *looks, stable=STABLE, unstable=UNSTABLE)
+            found = search_box(system.name, ranges, *looks, stable=STABLE, unstable=UNSTABLE, cells=cells)
         return replace(found, left_out=left_out(system))
 
 

@@ -16,7 +16,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, prepare
+from apc.analysis.analysis import Prepared, near_start, prepare
 from apc.analysis.analysis import analyze as judge
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -243,7 +243,7 @@ def feel(
         h2=h2,
         stable=verdict.stable,
         linearized=not linear,
-        left_out=left_out(system, linear=linear),
+        left_out=(*near_start(system, prepared), *left_out(system)),
         notes=tuple(note for note, applies in notes.items() if applies),
     )
 

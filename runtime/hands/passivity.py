@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, analyze, lifted_groups, prepare
+from apc.analysis.analysis import Prepared, analyze, lifted_groups, near_start, prepare
 from apc.analysis.contact_modes import contact_modes
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
@@ -198,7 +198,11 @@ def passive_hands(
         why=why,
         proof=proof,
         linearized=not linear,
-        left_out=(*left_out(system, linear=linear), *_as_at_start(system, prepared, linear=linear)),
+        left_out=(
+            *near_start(system, prepared),
+            *left_out(system),
+            *_as_at_start(system, prepared, linear=linear),
+        ),
     )
 
 

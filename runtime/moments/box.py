@@ -45,7 +45,7 @@ from apc.frame.parameters import resolve
 from apc.frame.radius import radius_of, value_of
 from apc.frame.taylor import hull, within
 from apc.moments.crowd import Classes, classes_of, hearing, moments_of, peer_classes, remembered_of
-from apc.moments.gains import TINY, below_1
+from apc.moments.gains import below_1
 from apc.moments.mean_loops import Remembered
 from apc.moments.memory import is_memoryless
 from apc.moments.network import STABLE, UNSTABLE, Growth, growth, unreliable
@@ -57,6 +57,12 @@ Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
 
 PLACE = Place("box")
+
+# What a cell takes, in cells in balls.
+WORK = 0.5
+
+# How often a range is halved until it is proved alone: what is left of it then is nothing.
+MOST_HALVINGS = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +82,7 @@ class _Question:
 
 
 @part("box")
-def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
+def prove_box(system: CompiledSystem, ranges: Sequence[Range], *, cells: int | None = None) -> BoxProof:
     """Prove a scene stable in mean square in a whole box, or find a point of it where it is not.
 
     Parameters
@@ -85,6 +91,8 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
         The compiled scene.
     ranges
         The parameters left open, see `analysis.box.parse_range`.
+    cells
+        As of `analysis.box_proof.prove_box`.
 
     Raises
     ------
@@ -100,11 +108,11 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range]) -> BoxProof:
                 return BoxProof(system.name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), (note,))
         is_unstable = partial(_is_unstable, asked)
         looks = partial(_looked, asked), is_unstable
-        return search_box(system.name, ranges, *looks, stable=STABLE, unstable=UNSTABLE)
+        return search_box(system.name, ranges, *looks, stable=STABLE, unstable=UNSTABLE, cells=cells)
 
 
 def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
-    """Leave parameters open, and see how much each matters at the middle of the box."""
+    """Leave parameters open, and see how wide each may be about the middle of the box."""
     numbers = channel_numbers(system)
     own = tuple(place for place, one in enumerate(ranges) if one.free.name not in numbers)
     prepared = prepare(system)
@@ -137,13 +145,24 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
     }
     of = classes, frames, places, wide, memories
     asked = _Question(system, prepared, tuple(ranges), own, *of, np.ones(0))
-    weights = []
-    for place, varied in enumerate(ranges):
-        point = [(one.low + one.high) / 2 for one in ranges]
-        ends = [[*point[:place], end, *point[place + 1 :]] for end in (varied.low, varied.high)]
-        low, high = (_growth_at(asked, one, bounded=False).radius for one in ends)
-        weights.append(abs(high - low) / float(varied.high - varied.low))
-    return replace(asked, weights=np.nan_to_num(weights, nan=1.0) + TINY)
+    return replace(asked, weights=np.array([1 / _alone(asked, place) for place in range(len(ranges))]))
+
+
+def _alone(asked: _Question, place: int) -> float:
+    """Return up to what width about the box's middle a cell is proved in which one range moves alone.
+
+    How much a range matters in a cell is what it adds to bounds there, not how much it moves the radius.
+    """
+    inner = middle(tuple((one.low, one.high) for one in asked.ranges))
+    half = (asked.ranges[place].high - asked.ranges[place].low) / 2
+    for _ in range(MOST_HALVINGS):
+        cell = [(value, value) for value in inner]
+        cell[place] = inner[place] - half, inner[place] + half
+        maps, _ = frames_over(asked.frames, [tuple(cell[own] for own in asked.own)])
+        if _look(asked, tuple(cell), maps, 0)[0]:
+            break
+        half /= 2
+    return float(2 * half)
 
 
 def _with_map(group: PeerGroup, frame: FrameMap) -> PeerGroup:
@@ -201,13 +220,18 @@ def _looked(asked: _Question, cells: Sequence[Cell]) -> Iterator[Looked]:
         own = [tuple(cell[place] for place in asked.own) for cell in some]
         maps, _ = frames_over(asked.frames, own)
         for place, cell in enumerate(some):
-            here = [one.mapped(partial(_of_cell, place, len(cell))) for one in maps]
-            frames = {name: here[which] for name, which in asked.places.items()}
-            finite = all(np.isfinite(block).all() for one in here for block in (one.p, one.q, one.s, one.d))
-            proved, sound = _proved(asked, cell, frames) if finite else (False, False)
+            proved, sound = _look(asked, cell, maps, place)
             reach = asked.weights * [float(high - low) for low, high in cell]
             unstable = not sound and _is_unstable(asked, middle(cell))
-            yield Looked(None if proved else reach, unstable)
+            yield Looked(None if proved else reach, unstable, WORK)
+
+
+def _look(asked: _Question, cell: Cell, maps: Sequence[FrameMap], place: int) -> tuple[bool, bool]:
+    """Return `_proved` of a cell of some that peers' frames were lifted over together."""
+    here = [one.mapped(partial(_of_cell, place, len(cell))) for one in maps]
+    finite = all(np.isfinite(block).all() for one in here for block in one.blocks)
+    frames = {name: here[which] for name, which in asked.places.items()}
+    return _proved(asked, cell, frames) if finite else (False, False)
 
 
 def _of_cell(place: int, count: int, block: Matrix) -> Matrix:

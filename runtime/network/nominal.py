@@ -15,23 +15,19 @@ from apc.frame.names import Free, unit_of
 from apc.frame.parameters import scope_of
 from apc.network.channel import channel_law
 
-NOT_LINEAR = "left out: the scene is not linear, and this holds near its start values only"
 
-
-def left_out(system: CompiledSystem, *, linear: bool = True, network: bool = True) -> tuple[str, ...]:
+def left_out(system: CompiledSystem, *, network: bool = True) -> tuple[str, ...]:
     """Return what an analysis of the nominal network leaves out, for each unreliable link.
 
     Parameters
     ----------
     system
         The compiled scene.
-    linear
-        Whether the answer holds for motions of any size.
     network
         Whether the answer is of the nominal network.
     """
     timings = {timing.name: timing.value for timing in system.timings}
-    notes = [] if linear else [NOT_LINEAR]
+    notes = []
     for link in system.links:
         if link.channel is None or not network:
             continue

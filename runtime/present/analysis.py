@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from apc.frame.names import Range
 
 MOST_ROWS = 16
+MORE_CELLS = 10  # times as many as left a box open, to try next
 DECIMALS = 6  # of a magnitude
 MOST_UNFELT = 4  # names of what is left out beside the translations
 LEAST_MAGNITUDE = 1e-6  # its six digits would show as zero
@@ -54,6 +55,10 @@ _WORDS = {
     "stable": "Every motion dies out.",
     "stable up to a common translation": (
         "Nothing ties the peers to the ground; moved together they stay where they are.\n"
+        "Every other motion dies out."
+    ),
+    "stable up to a common rotation": (
+        "Nothing holds the peers' angles; turned together they stay as they are.\n"
         "Every other motion dies out."
     ),
     "drifts": "Nothing slows a common motion down. Every other motion dies out.",
@@ -125,9 +130,10 @@ def analysis_text(result: Analysis) -> str:
         lines += note(text)
     lines.append("")
     words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
-    if result.rigid_modes > 1 and result.verdict == "stable up to a common translation":
+    motions = result.translations + result.rotations
+    if motions > 1 and result.verdict.startswith("stable up to"):
         words = (
-            f"{result.rigid_modes} motions are held back by nothing, of all peers together or of some "
+            f"{motions} motions are held back by nothing, of all peers together or of some "
             "beside others: moved so they stay where they are. Every other motion dies out."
         )
     if result.linearized:
@@ -138,8 +144,9 @@ def analysis_text(result: Analysis) -> str:
         words = "Nothing here is free to move."
     lines += [line for one in words.splitlines() for line in wrapped(one, "  ", "  ")]
     removed = ""
-    if result.translations:
-        removed = f", {counted(result.translations, 'translation')} left out"
+    if motions:
+        named = (("translation", result.translations), ("rotation", result.rotations))
+        removed = f", {' and '.join(counted(count, noun) for noun, count in named if count)} left out"
     lines += [
         "",
         f"  spectral radius  {measured(result.spectral_radius, result.spectral_radius_error)}"
@@ -198,8 +205,8 @@ def answer_text(found: Answer) -> str:
         parts.append(str(found.conventions))
     elif found.conventions.warning:
         parts.append("\n".join(wrapped(f"Warning: {found.conventions.warning}")))
-    if found.box is not None:
-        parts.append(str(found.box))
+    if found.box is not None:  # that was asked for
+        parts.insert(0, str(found.box))
     first, *rest = "\n\n".join(parts).split("\n")
     return "\n".join((first, *warning_lines(found.warnings), *rest))
 
@@ -356,7 +363,9 @@ def box_proof_text(found: BoxProof) -> str:
     else:
         share = f"{100 * found.open_share:.3g} %"
         said = f"undecided, {share} of the box is left open ({counted(found.cells, 'cell')})"
-        lines += ["among others around", *where] if found.point else []
+        if found.point:  # else nothing was looked at, as its notes say
+            lines += ["among others around", *where]
+            lines += wrapped(f"more cells may decide it: --cells {MORE_CELLS * found.cells}")
     lines += [f"  {text}" for text in found.notes]
     told = [line for text in found.left_out for line in wrapped(text)]
     return "\n".join([f"{found.topology}:", *told, *wrapped(said), *lines])

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.timings import part
-from apc.compiler.words import counted, in_hertz, wrapped
+from apc.compiler.words import counted, in_hertz, with_unit, wrapped
 from apc.optional import need
 from apc.present.forms import document, json_text, note
 from apc.present.pictures import check_format, colours_of, write_figure
@@ -61,12 +61,14 @@ MOST_CURVES = 24  # in a panel: more can't be told apart
 MOST_POINTS = 2000  # of a curve: about one a pixel and a half of a wide picture
 WIDTH, HEIGHT = 9.0, 2.4  # inches: of the figure, of a panel
 PATHS = 2.0  # times as high is a plane
+RECORDED_REST = "No recorded position moves."
 _WORDS = {
     "rests": "Nothing moves: no force and no start value sets it in motion.",
-    "settles": "From {settled} on every position stays within 5 % of its range.",
+    "settles": "From {settled} on every {position} stays within 5 % of its range.",
+    "not judged": "No position was recorded: whether the motion settles is not told.",
     "dies away": "At the end it still swings, less and less: {swing}.",
     "shakes": "At the end it swings without dying away: {swing}.",
-    "moves on": "At the end some position still moves on.",
+    "moves on": "At the end some {position} still moves on.",
     "diverges": "{stopped} leaves the range of numbers after {stopped_at}.",
 }
 
@@ -107,11 +109,17 @@ def played_text(found: Played) -> str:
         name, size, rate = summary.swing
         unit = next(one.unit for one in summary.extents if one.name == name)
         swing = f"{name} by {_quantity(size, unit)}, {rate:.3g} times a second"
-    words = _WORDS[summary.verdict].format(
-        settled=_quantity(summary.settled or 0.0, "s"),
-        swing=swing,
-        stopped=summary.stopped,
-        stopped_at=_quantity(summary.stopped_at or 0.0, "s"),
+    rests_in_part = summary.verdict == "rests" and summary.unrecorded
+    words = (
+        RECORDED_REST
+        if rests_in_part
+        else _WORDS[summary.verdict].format(
+            position="recorded position" if summary.unrecorded else "position",
+            settled=_quantity(summary.settled or 0.0, "s"),
+            swing=swing,
+            stopped=summary.stopped,
+            stopped_at=_quantity(summary.stopped_at or 0.0, "s"),
+        )
     )
     lines = [f"{found.topology}: {summary.verdict}", ""]
     lines += wrapped(words, "  ", "  ")
@@ -155,7 +163,7 @@ def _quantity(value: float, unit: str) -> str:
     """Return a number with its unit, thousandths of it where it is small."""
     if value and abs(value) < 0.1 and unit in ("m", "s", "J", "N"):
         return f"{1e3 * value:.3g} m{unit}" if abs(value) >= 1e-4 else f"{1e6 * value:.3g} µ{unit}"
-    return f"{value:.3g} {unit}"
+    return with_unit(f"{value:.3g}", unit)
 
 
 def _method(provenance: Provenance) -> str:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
+from apc.analysis.analysis import Prepared, analyze, near_start, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.frozen import dataclass
@@ -310,7 +310,8 @@ def region(
         linearized=not affine,
         criterion=meant,
         left_out=(
-            *left_out(system, linear=affine, network=meant != MEAN_SQUARE),
+            *near_start(system, prepared),
+            *left_out(system, network=meant != MEAN_SQUARE),
             *notes_for_all_groups(system, free),
         ),
         system=system,

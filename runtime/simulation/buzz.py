@@ -29,7 +29,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.peer_group import PeerGroup
-from apc.eigen.rigid import LENGTHS
+from apc.eigen.rigid import LENGTH
 from apc.frame.exchange import build_exchange
 from apc.frame.parameters import resolve
 from apc.result import Result
@@ -198,7 +198,7 @@ def _contacts(
             name = exchange.peer_name(int(peer))
             for one in pushes:
                 states = group.jacobians.kind.states
-                places = [k for k, state in enumerate(states) if state.unit == LENGTHS[0] and one.slopes[k]]
+                places = [k for k, state in enumerate(states) if state.unit == LENGTH and one.slopes[k]]
                 if one.slopes[one.states :].any() or not places:
                     raise _refused(system, f"{one.part} follows more than positions and velocities")
                 stiffness = float(np.abs(one.slopes[places]).max())

@@ -15,6 +15,7 @@ rounding, a panel is halved.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import casadi
@@ -31,11 +32,14 @@ from apc.simulation.quadrature import AGREE, Kernel, Panels, integrate, magnitud
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
+COMPARISONS = (casadi.OP_LT, casadi.OP_LE, casadi.OP_EQ, casadi.OP_NE)
+KEPT = 64  # sites whose forces are kept in pieces
 MOST_HALVINGS = 30  # below 1e-9 of an interval, what a jump is missed by is far below a rounding
 MOST_HALVED = 2**18  # panels of the intervals of one chunk: some seconds; a jump in an interval takes sixty
 MOST_PANELS = 256  # integrated at once: what is held of them stays within some MB, however many there are
 # Instants of one walk: the arrays it holds then stay in the cache of a processor.
 MOST_INSTANTS = 8192
+MOST_VALUES = 2**23  # of all operations of a long expression, which the walk keeps
 LOOKS = 5  # instants of an interval at which a switch that is not linear in time is looked for
 
 # A switch is found to this share of the interval, or to a rounding of its instant.
@@ -52,6 +56,8 @@ class Forcing:
 
     `force(p, t)` is their rows of g, `drift(p, t)` those of t dg/dt: a rounding of t changes g by so many.
     Not smooth is g at sign changes of `switches(p, t)`; `affine` says that all of them are linear in time.
+    Where g is straight between these, `line(p, t)` tells what `switches` and `force` are at t and then how
+    fast each changes, else it is None.
     """
 
     pushed: tuple[int, ...]
@@ -59,6 +65,37 @@ class Forcing:
     drift: Any  # casadi.Function
     switches: Any  # casadi.Function
     affine: bool
+    line: Any | None = None  # casadi.Function
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lines:
+    """A force that is straight between `breaks` (k,): of each piece its value at an instant, and its slope.
+
+    The instants are `at` (k + 1,), the values and slopes (pushed, k + 1).
+    """
+
+    breaks: Floats
+    at: Floats
+    values: Floats
+    slopes: Floats
+
+    def force(self, instants: Floats) -> Floats:
+        """Return the force at instants, as `at_instants`."""
+        piece = np.searchsorted(self.breaks, instants, side="right")
+        return np.asarray(self.values[:, piece] + self.slopes[:, piece] * (instants - self.at[piece]))
+
+    def drift(self, instants: Floats) -> Floats:
+        """Return what a rounding of the instants changes it by so many times."""
+        return np.asarray(self.slopes[:, np.searchsorted(self.breaks, instants, side="right")] * instants)
+
+    def within(self, starts: Floats, length: float) -> tuple[Integers, Floats]:
+        """Return the intervals (k,) in which it breaks, and how long after their beginning."""
+        first = np.searchsorted(self.breaks, starts, side="right")
+        many = np.maximum(np.searchsorted(self.breaks, starts + length) - first, 0)
+        rows = np.repeat(np.arange(len(starts)), many)
+        place = np.arange(len(rows)) - np.repeat(np.cumsum(many) - many, many) + first[rows]
+        return rows, self.breaks[place] - starts[rows]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,6 +105,21 @@ class SiteForcing:
     forcing: Forcing
     parameters: Floats
     kernels: tuple[Kernel, ...]
+
+    @property
+    def lines(self) -> Lines | None:
+        """The forces in pieces, None where they are not straight between switches."""
+        return _lines(self.forcing, self.parameters.tobytes()) if self.forcing.line else None
+
+    def force(self, instants: Floats) -> Floats:
+        """Return the forces at instants, as `at_instants`."""
+        lines = self.lines
+        return lines.force(instants) if lines else at_instants(self.forcing.force, self.parameters, instants)
+
+    def drift(self, instants: Floats) -> Floats:
+        """Return by how much a rounding of the instants changes them, relatively."""
+        lines = self.lines
+        return lines.drift(instants) if lines else at_instants(self.forcing.drift, self.parameters, instants)
 
 
 def forcing_of(rates: Rates) -> Forcing:
@@ -84,13 +136,49 @@ def forcing_of(rates: Rates) -> Forcing:
         slopes = casadi.jacobian(casadi.vertcat(*found), t)
         affine = not (slopes.nnz() and casadi.depends_on(slopes, t))
     column = casadi.vertcat(*found) if found else type_(0, 1)
+    line = None
+    if type_ is casadi.SX and affine and not _moves(slope := casadi.jacobian(g, t), t):
+        told = casadi.vertcat(column, g, casadi.jacobian(column, t), slope)
+        line = casadi.Function("line", [p, t], [casadi.densify(told)])
     return Forcing(
         pushed=pushed,
         force=casadi.Function("force", [p, t], [casadi.densify(g)]),
         drift=casadi.Function("drift", [p, t], [casadi.densify(t * casadi.jacobian(g, t))]),
         switches=casadi.Function("switches", [p, t], [casadi.densify(column)]),
         affine=affine,
+        line=line,
     )
+
+
+def _moves(expression: Any, time: Any) -> bool:
+    """Say whether an expression hangs on time otherwise than by what has switched."""
+    dense = casadi.densify(expression)
+    work, seen = [dense[place] for place in range(dense.numel())], set[int]()
+    while work:
+        node = work.pop()
+        if node.element_hash() in seen or node.op() in COMPARISONS:
+            continue
+        seen.add(node.element_hash())
+        if node.element_hash() == time.element_hash():
+            return True
+        work += [node.dep(place) for place in range(node.n_dep())]
+    return False
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _lines(forcing: Forcing, numbers: bytes) -> Lines:
+    """Return forces that are straight between switches, of a site of such parameters."""
+    parameters, switches = np.frombuffer(numbers), forcing.switches.numel_out(0)
+    pushed = len(forcing.pushed)
+    start = at_instants(forcing.line, parameters, np.zeros(1))[:, 0]
+    changing = start[switches + pushed : 2 * switches + pushed]
+    with np.errstate(all="ignore"):
+        breaks = -start[:switches] / changing
+    breaks = np.array(sorted(set(breaks[np.isfinite(breaks)].tolist())))
+    ends = np.concatenate([breaks[:1] - 1, breaks, breaks[-1:] + 1]) if len(breaks) else np.zeros(2)
+    at = (ends[1:] + ends[:-1]) / 2
+    found = at_instants(forcing.line, parameters, at)
+    return Lines(breaks, at, found[switches : switches + pushed], found[2 * switches + pushed :])
 
 
 def at_instants(function: Any, parameters: Floats, instants: Floats) -> Floats:
@@ -118,8 +206,9 @@ def at_instants(function: Any, parameters: Floats, instants: Floats) -> Floats:
         return values.reshape(len(values), *instants.shape)
     listed = list(parameters)
     with np.errstate(all="ignore"):
-        for start in range(0, flat.size, MOST_INSTANTS):
-            some = slice(start, start + MOST_INSTANTS)
+        together = max(1, min(MOST_INSTANTS, MOST_VALUES // function.n_instructions()))
+        for start in range(0, flat.size, together):
+            some = slice(start, start + together)
             for row, found in enumerate(
                 evaluate_exact(function, [listed, [flat[some]]], number=np.float64, rules=ROWS)[0]
             ):
@@ -195,14 +284,14 @@ def _integrated(
     (k, n_x), at least `size`.
     """
     instants = starts[:, None] + found.after
-    g = at_instants(site.forcing.force, site.parameters, instants)
+    g = site.force(instants)
     fine, apart = integrate(found, g)
     size = np.maximum(magnitude(found, g), size)
     off: NDArray[np.bool_] = ~np.all(apart <= AGREE * size, axis=1)
     off &= np.isfinite(fine).all(axis=1)  # halves of what has no value have none either
     if off.any():  # it may be that of rounding the instants, which no halving mends
         some = found if len(found.after) == 1 else found.chosen(off)
-        drift = at_instants(site.forcing.drift, site.parameters, instants[off])
+        drift = site.drift(instants[off])
         moved = magnitude(some, np.where(np.isfinite(drift), drift, 0.0))
         off[off] = ~np.all(apart[off] <= AGREE * (size[off] + moved), axis=1)
     return fine, off, size
@@ -226,6 +315,10 @@ def _switched(site: SiteForcing, kernel: Kernel, starts: Floats) -> tuple[Intege
     forcing, length = site.forcing, float(kernel.duration)
     if not forcing.switches.numel_out(0):
         return np.empty(0, np.int64), np.empty(0)
+    if site.lines:
+        row, at = site.lines.within(starts, length)
+        inside = (at > PLACED * length) & (at < length)
+        return row[inside], at[inside]
     looks = np.linspace(0.0, length, 2 if forcing.affine else LOOKS)
     values = at_instants(forcing.switches, site.parameters, starts[:, None] + looks)
     switch, row, gap = np.nonzero(np.sign(values[:, :, 1:]) != np.sign(values[:, :, :-1]))

@@ -8,7 +8,7 @@ Settled means: from some time on, well before the end, every position stays with
 its last value; the range is the largest that any peer's position of that name goes through. A motion that
 does not settle *shakes* if it turns to and fro without dying away, *dies away* if it turns and gets smaller,
 *diverges* if a number leaves the range of floats, and *moves on* otherwise. It *rests* if no position ever
-changes.
+changes. Without a position that was recorded it is *not judged*. An angle is a position, too.
 
 The work a coupler does is ∫ −f v dt over the forces it holds, f the flow into the coupler at each of its
 flanges and v that flange's velocity: exact, as f is constant between events. Positive work feeds the motion.
@@ -21,6 +21,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.compiled import CompiledSystem
 from apc.compiler.frozen import dataclass
 from apc.simulation.blocks import Block
 from apc.simulation.limits import Broken, LimitWatch
@@ -33,6 +34,8 @@ BAND = 0.05  # of the range: the 5 % of control engineering's settling time
 LATE = 0.9  # of the duration: what settles after that has not been seen to
 TAIL = 0.2  # of the duration: the end, where a motion that goes on is judged
 LEAST_WAY = 0.2  # of the range: a shorter way from first to last has no overshoot to speak of
+POSITIONS = ("m", "1")  # the units of what decides whether a motion settles: a radian is 1
+NOT_JUDGED = "not judged"
 FEWEST_TURNS = 4  # within the tail: two periods
 SMALLER = 0.9  # a swing of less than this part of that in the time before is dying away
 BUCKETS = 512  # times that extremes are kept for
@@ -57,10 +60,11 @@ class Extent:
 class Summary:
     """A simulation in numbers, SI.
 
-    `verdict` is "rests", "settles", "dies away", "shakes", "moves on" or "diverges"; `settled` is the time
-    from which on it stays, in seconds. `overshoot` is a part of the way from first to last. `copies` are
-    (name, distance at the end) of what is sent to the others as it is. `work` is (part, J). `broken` are the
-    limits that recorded signals went beyond, the first one first.
+    `verdict` is "rests", "settles", "dies away", "shakes", "moves on", "diverges" or "not judged"; `settled`
+    is the time from which on it stays, in seconds. `overshoot` is a part of the way from first to last.
+    `copies` are (name, distance at the end) of what is sent to the others as it is. `work` is (part, J).
+    `broken` are the limits that recorded signals went beyond, the first one first. `unrecorded` positions of
+    the scene were not looked at.
     """
 
     verdict: str
@@ -77,6 +81,7 @@ class Summary:
     end: float
     extents: tuple[Extent, ...]
     broken: tuple[Broken, ...] = ()
+    unrecorded: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,6 +209,9 @@ class Watch:
         # Of the positions that turn and don't settle, the one that swings most.
         restless = np.isnan(settled[self.positions]) & (turns[self.positions] >= FEWEST_TURNS)
         restless &= number >= 2 * tail
+        for unit in POSITIONS:  # a length and an angle are each compared with their like
+            alike = [place for place in self.positions if self.listed[place].unit == unit]
+            span[alike] = span[alike].max(axis=0, initial=0.0)
         share = np.where(restless, (swing / span)[self.positions], -1.0)
         which = np.full(self.runs, -1, np.int64)
         if self.positions:
@@ -218,7 +226,9 @@ class Watch:
         calm = ~np.isnan(times).any(axis=0)
         whole = (high.max(axis=0) - low.min(axis=0))[self.positions]
         still = calm & ~whole.any(axis=0) & bool(self.positions)
-        verdict = np.where(still, "rests", np.where(calm, "settles", verdict))
+        verdict = np.where(
+            still, "rests", np.where(calm, "settles" if self.positions else NOT_JUDGED, verdict)
+        )
         verdict = np.where(stopped, "diverges", verdict)
         seconds = self.ends[-1] - (self.ends[number - tail - 1] if number > tail else 0.0)
         return Judged(
@@ -273,6 +283,7 @@ class Watch:
             end=self.ends[-1],
             extents=extents,
             broken=self.limits.broken(),
+            unrecorded=_positions(self.simulation.system) - len(self.positions),
         )
 
     def copies(self) -> list[tuple[str, str, Floats]]:
@@ -284,7 +295,7 @@ class Watch:
         last = self.last.reshape(-1, self.runs)
         found = []
         for name in self.simulation.sent:
-            here = [i for i, one in enumerate(signals) if one.local == name and one.unit in ("m", "rad")]
+            here = [i for i, one in enumerate(signals) if one.local == name and one.unit in POSITIONS]
             if len(here) > 1:
                 found.append((name, signals[here[0]].unit, np.ptp(last[here], axis=0)))
         return found
@@ -316,7 +327,13 @@ class Watch:
 
 def is_position(signal: Signal) -> bool:
     """Say whether a signal is a place, which decides whether a motion settles."""
-    return signal.role == "state" and signal.unit in ("m", "rad")
+    return signal.role == "state" and signal.unit in POSITIONS
+
+
+def _positions(system: CompiledSystem) -> int:
+    """Return how many positions there are in a scene."""
+    each = [sum(state.unit in POSITIONS for state in kind.states) for kind in system.kinds]
+    return sum(group.count * each[group.kind] for group in system.groups)
 
 
 def _overshoot(extents: Sequence[Extent]) -> tuple[str, float] | None:

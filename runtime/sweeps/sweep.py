@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.analysis.analysis import near_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import is_special
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
-from apc.frame.ages import linear_sites
 from apc.frame.names import notes_for_all_groups
 from apc.memory import refuse_beyond
 from apc.network.nominal import left_out, refuse_channel_number
@@ -236,11 +236,8 @@ def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
         "peers": system.peers,
         "of": work.of,
         "left_out": [
-            *left_out(
-                system,
-                linear=all(site.affine for site in linear_sites(system)),
-                network=not work.of.startswith(BEGINNINGS[MEAN_SQUARE]),
-            ),
+            *near_start(system),
+            *left_out(system, network=not work.of.startswith(BEGINNINGS[MEAN_SQUARE])),
             *notes_for_all_groups(system, [axis.free for axis in work.grid.axes]),
         ],
         "points": work.grid.points,

@@ -21,7 +21,7 @@ from apc.eigen.certify import MOST_PROVED, schur_cohn
 from apc.eigen.closing import ClosedSystem, Loop
 from apc.eigen.relative import independent_places
 from apc.eigen.rigid import RigidModes
-from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE, solve_spectrum
+from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, STABLE_TURNING, UNSTABLE, solve_spectrum
 from apc.vary.crossings import Root
 
 # Half the width asked of a bracket, relative to the value: half of 1e-12, rounding set aside.
@@ -112,7 +112,7 @@ def bracket_in_floats(
     @functools.cache
     def above(value: float) -> bool | None:
         verdict = solve_spectrum(systems(value), in_balls=in_balls).verdict
-        sides = {STABLE: True, STABLE_TRANSLATING: True, UNSTABLE: False}
+        sides = {STABLE: True, STABLE_TRANSLATING: True, STABLE_TURNING: True, UNSTABLE: False}
         return (sides[verdict] == root.rising) if verdict in sides else None
 
     error = solve_spectrum(systems(root.value), in_balls=in_balls).spectral_radius_error

@@ -17,7 +17,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from apc.analysis.analysis import Prepared, analyze, hangs_on_heard, prepare, prepare_at_start
+from apc.analysis.analysis import Prepared, analyze, hangs_on_heard, near_start, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
@@ -152,7 +152,6 @@ def critical(
         limits = [_limit(*one, free, unit) for one in (("--lower", lower), ("--upper", upper))]
         _check_limits(system, free, limits, timed=timed)
         prepared = prepare(system)
-        linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
 
         def stable_of(changed: CompiledSystem) -> bool | None:
             if by_growth:
@@ -194,7 +193,10 @@ def critical(
         enters=found.enters,
         verdict=verdict,
         system=system,
-        left_out=left_out(system, linear=linear, network=chosen_criterion != MEAN_SQUARE),
+        left_out=(
+            *near_start(system, prepared),
+            *left_out(system, network=chosen_criterion != MEAN_SQUARE),
+        ),
         criterion=chosen_criterion,
         groups=values_by_group(system, free),
         stretches=found.stretches,

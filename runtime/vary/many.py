@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Analysis, Prepared, analyze, prepare, timed
+from apc.analysis.analysis import Analysis, Prepared, analyze, near_start, prepare, timed
 from apc.analysis.plan import make_plan
 from apc.compiler.compiled import CompiledSystem, Parameter
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -272,7 +272,6 @@ def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
     found = many_analyses(system, varied).at(np.stack(places, axis=1))
     shape = arrays[0].shape
     units = [unit_of(system, one.name) for one in frees]
-    affine = all(site.affine for site in linear_sites(system))
     return Analyses(
         topology=system.name,
         parameters=tuple(
@@ -281,7 +280,7 @@ def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
         ),
         values=tuple(arrays),
         **{one.name: getattr(found, one.name).reshape(shape) for one in fields(found)},
-        left_out=(*left_out(system, linear=affine), *notes_for_all_groups(system, frees)),
+        left_out=(*near_start(system), *left_out(system), *notes_for_all_groups(system, frees)),
     )
 
 
