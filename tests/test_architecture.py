@@ -105,7 +105,7 @@ HOUSE = (
         "apc.vary",
         """
         wiring batch slopes crossings plane bracket counting loops evaluator ports leading many bends marginal
-        one_gain delays lags search counts growth critical locus margins sensitivity over_network
+        delays lags search counts growth critical locus effort margins sensitivity over_network
         """,
     ),
     ("apc.sweeps", "grid quantities work store cluster sweep"),

@@ -32,7 +32,7 @@ from apc.network.nominal import channel_numbers
 from apc.threads import single_threaded
 from apc.vary.evaluator import free_parameters
 from apc.vary.growth import BOUNDED, MEAN_SQUARE, FirstLost, allowed, first_lost, growth_at
-from apc.vary.margins import GROWTH, IN_PASSING, Margin, Margins, coupler_parameters
+from apc.vary.margins import GROWTH, NOT_STABLE, Margin, Margins, coupler_parameters
 from apc.vary.search import SAMPLES
 from apc.vary.sensitivity import Sensitivities, Sensitivity, varied
 
@@ -79,13 +79,14 @@ def network_margins(
         free = [*coupler_parameters(system), *_of_channels(system)]
         states = max(len(kind.states) for kind in system.kinds)
         if quick and len(free) * states > MOST_IN_PASSING:
-            return Margins((), IN_PASSING.format(f"{len(free)} numbers of {states}"))
+            count = f"{len(free)} numbers of {states} states"
+            return Margins((), f"not looked for in passing: {count} (apc analyze --margins does)")
         if why := _too_many(len(free)):
             return Margins((), f"not looked for: {why}")
         here = growth(system, prepared)
         if not here.why and not here.stable:
             known = "stable" if here.stable is False else "proved stable"
-            return Margins((), f"none: the scene is not {known} in mean square as it is")
+            return Margins((), NOT_STABLE.format(f"{known} in mean square"))
         if why := _not_varied(here):
             return Margins((), f"not looked for: {why}")
         scales = {one.parameter: one.value or one.scanned / GROWTH for one in nominal.rows}
