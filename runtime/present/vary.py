@@ -130,8 +130,7 @@ def critical_document(found: Critical) -> dict[str, Any]:
 def margins_text(found: Margins) -> str:
     """Return the table of the margins, of at most 80 columns."""
     if not found.rows:
-        text = f"margins {found.note or 'none: there is nothing to vary'}"
-        return "\n".join(note(text))
+        return "\n".join(note(f"margins {found.note}"))
     width = max(len(one.parameter) for one in found.rows)
     lines = [f"  {'may grow':<{width}}  from           to               times  at"]
     for one in found.rows:

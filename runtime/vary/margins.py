@@ -1,7 +1,7 @@
 """How much each coupler's stiffness and damping, and each delay, may grow before the boundary.
 
 Takes: a `CompiledSystem`.
-Gives: `Margin`, `Margins`, `margins`; `coupler_parameters`; `STIFFNESSES`.
+Gives: `Margin`, `Margins`, `margins`; `not_looked`; `coupler_parameters`; `STIFFNESSES`.
 Guarantees: a margin is the next crossing above the present value, with its error; none is said together with
 how far was looked.
 Does not: look below the present value (see `critical`), or vary two at once (see `box`).
@@ -136,10 +136,10 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
         borne = affordable([effort.of_parameter()] * len(free), most if fitting else -1.0)
         chosen = [one for one, within in zip(free, borne, strict=True) if within]
         why = IN_PASSING if fitting else f"{largest:,} states"
-        rest = [_not_looked(system, one, why) for one in free if one not in chosen]
+        rest = [not_looked(system, one, why) for one in free if one not in chosen]
         delays = _delays(system) if start is not None else []
         if quick and rest and not chosen:  # and whether the scene is stable is not known
-            return Margins((*rest, *(_not_looked(system, one, why) for one in delays)), _notes(rest, start))
+            return Margins((*rest, *(not_looked(system, one, why) for one in delays)), _notes(rest, start))
         found = _parameter_margins(system, chosen, at)
         if isinstance(found, str):
             return Margins((), found)
@@ -161,6 +161,7 @@ def _notes(rows: Sequence[Margin], start: Prepared | None) -> str:
     )
     notes += [f"{ESTIMATE}: {', '.join(estimated)}"] * bool(estimated)
     notes += [ASKED] * any(one.note == IN_PASSING for one in rows)
+    notes += ["none: there is nothing to vary"] * (not rows)
     return "; ".join(notes)
 
 
@@ -309,25 +310,26 @@ def _delay_margin(
     end, count = delay_reach(system, free, now, pieces=PIECES, further=FURTHER)
     if count > MOST_PIECES:
         why = f"{count} orders of events up to {float(end):.4g} s"
-        return 0.0, _not_looked(system, free, why)
+        return 0.0, not_looked(system, free, why)
     late = all(free.name != hold.delay for kind in system.kinds for hold in kind.holds)
     states = max(effort.states, default=0)
     if states > MOST_DELAYED and not late:
-        return 0.0, _not_looked(system, free, f"{states:,} states in each order of events")
+        return 0.0, not_looked(system, free, f"{states:,} states in each order of events")
     cost = effort.of_delay(count, late=late)
     if cost > most:
-        return 0.0, _not_looked(system, free, IN_PASSING)
+        return 0.0, not_looked(system, free, IN_PASSING)
     try:
         found = search_delay(
             system, free, now, end, prepared, from_stable=True, in_balls=states <= FEW_STATES
         )
     except ApcError as error:
-        return cost, _not_looked(system, free, error.mistakes[0].what)
+        return cost, not_looked(system, free, error.mistakes[0].what)
     crossing = found.edges[0] if found.edges else None
     return cost, _margin(free.name, "s", float(now), crossing, found.scanned[1])
 
 
-def _not_looked(system: CompiledSystem, free: Free, why: str) -> Margin:
+def not_looked(system: CompiledSystem, free: Free, why: str) -> Margin:
+    """Return the row of a parameter of which nothing was looked for, and why."""
     present = value_now(system, free)
     unit = unit_of(system, free.name)
     return Margin(free.label, unit, present, None, None, None, None, "", present, why)
