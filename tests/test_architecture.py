@@ -123,7 +123,7 @@ HOUSE = (
     (
         "apc.regions",
         """
-        passivity overlay eigenpairs peaks surrogate cells curves boundary_points boundary axes strips region
+        passivity overlay eigenpairs peaks rectangle cells curves boundary_points boundary axes strips region
         panels
         """,
     ),

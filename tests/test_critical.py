@@ -15,17 +15,19 @@ import pytest
 from apc.__main__ import run
 from apc.analysis.analysis import analyze
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError
+from apc.compiler.errors import ApcError, Place
 from apc.compiler.pipeline import compile_topology
 from apc.eigen.balls import precision
-from apc.frame.names import Free
+from apc.frame.names import Free, find
 from apc.frame.overrides import Override, apply
 from apc.present.vary import critical_document
 from apc.vary.critical import critical
 from apc.vary.crossings import scan, scan_lines
+from apc.vary.delays import borders
 from apc.vary.evaluator import PointEvaluator
 from apc.vary.lags import LateStretch, late_stretches
-from apc.vary.margins import coupler_parameters, margins
+from apc.vary.margins import _delays, coupler_parameters, margins
+from apc.vary.search import Crossing
 from tests.bruteforce import Scene, as_ball, frame_matrices, frame_matrix
 from tests.reference import CONTACT_LIMITS, LIMITS
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
@@ -566,3 +568,40 @@ def test_a_scan_from_a_value_that_means_nothing_begins_beyond_it() -> None:
     found = critical(compiled(waves), "coordination.impedance", upper="1 N*s/m")
     assert found.verdict == "stable at every value scanned"
     assert 0 < found.scanned[0] < 1e-9
+
+
+def _sides(system: CompiledSystem, name: str, one: Crossing, low: float, high: float) -> list[Fraction]:
+    """Return a value on either side: just outside the error, of a jump within the stretches beside it."""
+    if one.kind == "jump":
+        free, at = find(system, name, Place("test")), Fraction(one.value).limit_denominator(10**9)
+        following = borders(system, free, place=Place("test"))
+        after = following(at + Fraction(one.error))
+        before = Fraction(low)
+        while (further := following(before)) < at - Fraction(one.error):
+            before = further
+        inside = Fraction(28_571, 104_729)
+        return [before + inside * (at - Fraction(one.error) - before), at + inside * (after - at)]
+    width = 2 * Fraction(one.error)
+    return [max(Fraction(one.value) - width, Fraction(low)), min(Fraction(one.value) + width, Fraction(high))]
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize(
+    "path", [*sorted(SCENES.glob("*.yaml")), *sorted(HARD.glob("*.yaml"))], ids=lambda path: path.stem
+)
+def test_every_crossing_that_is_answered_is_one_between_two_analyses(path: Path) -> None:
+    """Of each delay and the first stiffness: other verdicts on its two sides, none of them open."""
+    system = compile_topology(path)
+    names = [one.label for one in coupler_parameters(system) if one.label.endswith("stiffness")][:1]
+    for name in [*(one.label for one in _delays(system)), *names]:
+        try:
+            found = critical(system, name, criterion="nominal")
+        except ApcError as error:
+            assert error.mistakes[0].code in ("E844", "E845", "E846"), error
+            continue
+        for one in found.crossings:
+            below, above = (
+                analyze(apply(system, [Override(find(system, name, Place("test")), value)])).stable
+                for value in _sides(system, name, one, *found.scanned)
+            )
+            assert (below, above) == ((True, False) if one.stable_side == "below" else (False, True)), one
