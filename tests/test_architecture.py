@@ -135,7 +135,7 @@ HOUSE = (
         """,
     ),
     ("apc.benchmark", "timing truth bench hard scale"),
-    ("apc", "inputs"),
+    ("apc", "inputs arguments"),
     ("apc.reports", "contents"),
     (
         "apc.present",

@@ -67,8 +67,8 @@ Floats = NDArray[np.float64]
 # Coarse cells along each side of the rectangle.
 CELLS = 12
 
-# Distance of a smooth curve from the boundary, relative to a coordinate (see `boundary.trace`); of a curve that
-# could not be followed so closely it is said (see `Region.coarse`).
+# Distance of a smooth curve from the boundary, relative to a coordinate (see `boundary.trace`). Of a curve that
+# could not be followed so closely it is said, see `Region.coarse`.
 TOLERANCE = 1e-9
 
 # How near to 0 or π, in radians, an eigenvalue's angle may come before its turns are counted again.
@@ -146,8 +146,8 @@ class Region(Result):
     `stable_area` is in the product of the axes' units. `cell` are the sides of the cells the rectangle was
     looked at in, in SI; where values hinted at more, cells down to `finest` of them. `corner` says whether
     the corner of both lower ends is stable, `stepped` that the boundary is right to a cell only, as times
-    vary, `tolerance` how near smooth curves were to come (see `coarse`), `linearized` that the scene is not linear; `criterion` what stable means;
-    `left_out` says what of the scene the answer does not look at.
+    vary, `tolerance` how near smooth curves were to come (see `coarse`), `linearized` that the scene is not
+    linear; `criterion` what stable means; `left_out` says what of the scene the answer does not look at.
     """
 
     shown_by = "region:region"
