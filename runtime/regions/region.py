@@ -67,7 +67,7 @@ Floats = NDArray[np.float64]
 # Coarse cells along each side of the rectangle.
 CELLS = 12
 
-# Distance of a smooth curve from the boundary, relative to a coordinate (see `boundary.trace`). Of a curve that
+# Distance of a smooth curve from the boundary, relative to a coordinate (see `boundary.trace`). Of one that
 # could not be followed so closely it is said, see `Region.coarse`.
 TOLERANCE = 1e-9
 
