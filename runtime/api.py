@@ -335,7 +335,8 @@ def feel(
     """
     from apc.hands import feel as felt
 
-    return felt.feel(_model(model, set), frequencies, at=at, between=between, unstable=unstable)
+    listed = [frequencies] if isinstance(frequencies, int | float) else frequencies
+    return felt.feel(_model(model, set), listed, at=at, between=between, unstable=unstable)
 
 
 @checked

@@ -171,8 +171,8 @@ def critical(
             start = _at_start(system, prepared)
             found = search_delay(system, free, limits[0] or Fraction(0), limits[1], start, told=told)
         else:
-            start = None if reaches_start(system, free) else prepare_at_start(system, prepared)
-            found = search(system, free, low, high, start or prepared, told=told)
+            at_start = None if reaches_start(system, free) else prepare_at_start(system, prepared)
+            found = search(system, free, low, high, at_start or prepared, told=told)
 
         def stable_now() -> bool | None:
             return stable_of(system)
