@@ -19,8 +19,10 @@ from apc.analysis.methods import PAPER
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
+from apc.eigen.spectrum import UNSTABLE
 from apc.result import Result
-from apc.vary.margins import Margins, margins
+from apc.vary.margins import NOT_STABLE, Margins
+from apc.vary.margins import margins as margins_of
 from apc.vary.sensitivity import Sensitivities, sensitivities, varied
 
 if TYPE_CHECKING:
@@ -116,7 +118,7 @@ def answer(
     box: Sequence[Range] = (),
     cells: int | None = None,
     every_convention: bool = False,
-    every_margin: bool = False,
+    margins: bool | None = None,
     with_buzz: bool = False,
 ) -> Answer:
     """Analyse a system and look at what stands beside the verdict.
@@ -135,8 +137,9 @@ def answer(
         Of how many cells of the box that is tried at most, see `proved_box`.
     every_convention
         Repeat the analysis under every order of coincident events, however long it takes.
-    every_margin
-        Look for the margins of large systems too, however long it takes.
+    margins
+        Whether to look for margins: True, for all of them, however long it takes; False, for none; None, for
+        those that take no more than seconds together.
     with_buzz
         Predict the buzz of one-sided contacts, and play the scene to lay it beside.
 
@@ -152,11 +155,11 @@ def answer(
     if compared.not_repeated and not every_convention:
         notes = (*notes, compared.not_repeated)
     moved = sensitivities_of(system, prepared, found)
-    nominal = _margins(system, prepared, found, quick=not every_margin)
+    nominal = _margins(system, prepared, found, wanted=margins)
     buzz, no_buzz = _buzz(system, prepared, modes) if with_buzz else (None, "")
     return Answer(
         analysis=replace(found, notes=(*found.notes, *notes)),
-        network=_over_network(system, prepared, found, nominal, certify=certify, quick=not every_margin),
+        network=_over_network(system, prepared, found, nominal, certify=certify, wanted=margins),
         sensitivities=moved,
         margins=nominal,
         contact_modes=modes,
@@ -177,7 +180,7 @@ def _over_network(
     nominal: Margins,
     *,
     certify: bool,
-    quick: bool,
+    wanted: bool | None,
 ) -> NetworkAnswer | None:
     """Return the answer over the network as it is; imported here, as most scenes have an ideal one."""
     if all(link.channel is None for link in system.links):
@@ -191,7 +194,9 @@ def _over_network(
     if why := _too_large(system, prepared, found) or _too_many_products(system):
         return NetworkAnswer(verdict, _not_told(0.0, why), Margins((), why))
     moved = network_sensitivities(system, prepared)
-    return NetworkAnswer(verdict, moved, network_margins(system, prepared, nominal, quick=quick))
+    if wanted is False:
+        return NetworkAnswer(verdict, moved, nominal)
+    return NetworkAnswer(verdict, moved, network_margins(system, prepared, nominal, quick=not wanted))
 
 
 def _switching(system: CompiledSystem, prepared: Prepared, modes: ContactModes) -> Switching:
@@ -278,10 +283,8 @@ def _not_told(radius: float, why: str) -> Sensitivities:
 
 def _too_large(system: CompiledSystem, prepared: Prepared, found: Analysis) -> str:
     """Return why nothing is varied, "" unless the scene is more than few small matrices and short frames."""
-    complete = all(link.graph.shape == "complete" for link in system.links)
-    apart = found.method in ("determinant", "krylov") or not complete
-    if apart and system.peers > FEW_PEERS:
-        return "not looked for in so large a population"
+    if why := _too_many_peers(system, found):
+        return why
     ticks = max(sum(schedule.ticks) for schedule in prepared.schedules)
     if ticks > MOST_TICKS:
         return f"not looked for: {ticks:,} ticks in a frame take too long"
@@ -289,6 +292,13 @@ def _too_large(system: CompiledSystem, prepared: Prepared, found: Analysis) -> s
     if packets > MOST_TICKS:
         return f"not looked for: {packets:,} packets heard in a frame take too long"
     return ""
+
+
+def _too_many_peers(system: CompiledSystem, found: Analysis) -> str:
+    """Return why nothing is varied, "" unless very many peers differ or stand on a graph."""
+    complete = all(link.graph.shape == "complete" for link in system.links)
+    apart = found.method in ("determinant", "krylov") or not complete
+    return "not looked for in so large a population" if apart and system.peers > FEW_PEERS else ""
 
 
 def _too_many_products(system: CompiledSystem) -> str:
@@ -299,12 +309,16 @@ def _too_many_products(system: CompiledSystem) -> str:
     return ""
 
 
-def _margins(system: CompiledSystem, prepared: Prepared, found: Analysis, *, quick: bool) -> Margins:
+def _margins(system: CompiledSystem, prepared: Prepared, found: Analysis, *, wanted: bool | None) -> Margins:
     """Return the margins, or only why they couldn't be had."""
-    if why := _too_large(system, prepared, found):
+    if wanted is False:
+        return Margins((), "not looked for: they were not wanted")
+    if found.stable is None or found.verdict == UNSTABLE:
+        return Margins((), NOT_STABLE.format("proved stable" if found.stable is None else "stable"))
+    if why := _too_many_peers(system, found):
         return Margins((), why)
     try:
-        return margins(system, prepared=prepared, quick=quick, rigid=found.rigid_modes)
+        return margins_of(system, prepared=prepared, quick=not wanted)
     except ApcError as error:
         return Margins((), f"not looked for: {error.mistakes[0].what}")
 

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from apc.arguments import checked
 from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -46,6 +47,7 @@ Format = Literal["text", "json", "dot", "svg"]
 Criterion = Literal["mean-square", "nominal", "passive"]
 
 
+@checked
 def compile(path: str | Path) -> CompiledSystem:
     """Compile a topology file and check the result: one frame event by event against the lifted map.
 
@@ -72,11 +74,13 @@ def compile(path: str | Path) -> CompiledSystem:
     return system
 
 
+@checked
 def save(model: CompiledSystem, path: str | Path) -> None:
     """Write a compiled model to a .apc file, whole or not at all. Raises ApcError if it can't be written."""
     store.save(model, Path(path))
 
 
+@checked
 def load(path: str | Path) -> CompiledSystem:
     """Read a compiled model from a .apc file. Raises ApcError if it is damaged or older than its topology."""
     from apc.inputs import load_fresh
@@ -84,6 +88,7 @@ def load(path: str | Path) -> CompiledSystem:
     return load_fresh(Path(path))
 
 
+@checked
 def with_hands(model: CompiledSystem | str | Path, hands: str) -> CompiledSystem:
     """Return the model with hands at all devices.
 
@@ -105,6 +110,7 @@ def with_hands(model: CompiledSystem | str | Path, hands: str) -> CompiledSystem
     return devices.with_hands(_model(model, None), hands)
 
 
+@checked
 def set_parameters(model: CompiledSystem, values: Mapping[str, str]) -> CompiledSystem:
     """Return the model with other parameter values, without compiling again.
 
@@ -126,6 +132,7 @@ def set_parameters(model: CompiledSystem, values: Mapping[str, str]) -> Compiled
     return apply(model, overrides)
 
 
+@checked
 def analyze(
     model: CompiledSystem | str | Path,
     *,
@@ -165,6 +172,7 @@ def analyze(
     return judge(_model(model, set), method=method, certify=certify)
 
 
+@checked
 def analyze_many(
     model: CompiledSystem | str | Path, values: Mapping[str, Any], *, set: Mapping[str, str] | None = None
 ) -> Analyses:
@@ -194,6 +202,7 @@ def analyze_many(
     return many.analyze_many(_model(model, set), values)
 
 
+@checked
 def critical(
     model: CompiledSystem | str | Path,
     parameter: str,
@@ -228,6 +237,7 @@ def critical(
     return crossings.critical(_model(model, set), parameter, lower=lower, upper=upper, criterion=criterion)
 
 
+@checked
 def compare(
     models: _Scene | Sequence[_Scene],
     *,
@@ -268,6 +278,7 @@ def compare(
     return comparison.compare([_model(one, set) for one in listed], over=over, criterion=criterion, at=at)
 
 
+@checked
 def passive_hands(
     model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None
 ) -> PassiveHands:
@@ -288,9 +299,10 @@ def passive_hands(
     return passivity.passive_hands(_model(model, set))
 
 
+@checked
 def feel(
     model: CompiledSystem | str | Path,
-    frequencies: Sequence[float],
+    frequencies: Sequence[float] | float,
     *,
     set: Mapping[str, str] | None = None,
     at: str = "",
@@ -323,9 +335,11 @@ def feel(
     """
     from apc.hands import feel as felt
 
-    return felt.feel(_model(model, set), frequencies, at=at, between=between, unstable=unstable)
+    listed = [frequencies] if isinstance(frequencies, int | float) else frequencies
+    return felt.feel(_model(model, set), listed, at=at, between=between, unstable=unstable)
 
 
+@checked
 def describe_network(recording: str | Path, *, interval: str | None = None) -> NetworkRecording:
     """Say what a recorded network amounts to, as a link's own keys.
 
@@ -354,6 +368,7 @@ def describe_network(recording: str | Path, *, interval: str | None = None) -> N
     return recorded.describe(recording, None if between is None else float(between))
 
 
+@checked
 def judge_network(
     model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None, certify: bool = False
 ) -> NetworkVerdict | None:
@@ -380,6 +395,7 @@ def judge_network(
     return network.judge_network(_model(model, set), certify=certify)
 
 
+@checked
 def margins(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Margins:
     """Say how far each coupler's stiffness and damping and each delay may grow, all else as it is.
 
@@ -393,6 +409,7 @@ def margins(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None
     return growth.margins(_model(model, set))
 
 
+@checked
 def sensitivities(
     model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None
 ) -> Sensitivities:
@@ -408,6 +425,7 @@ def sensitivities(
     return sensitivity.sensitivities(_model(model, set))
 
 
+@checked
 def conventions(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Conventions:
     """Repeat the analysis under every order of coincident events and both readings of the start.
 
@@ -421,6 +439,7 @@ def conventions(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | 
     return orders.conventions(_model(model, set))
 
 
+@checked
 def contact_modes(
     model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None
 ) -> ContactModes:
@@ -436,6 +455,7 @@ def contact_modes(
     return switched.contact_modes(_model(model, set))
 
 
+@checked
 def switching(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Switching:
     """Say whether a scene is proved stable however its contacts open and close, or as they do by themselves.
 
@@ -451,6 +471,7 @@ def switching(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | No
     return at_will.switching(system, switched.contact_modes(system))
 
 
+@checked
 def buzz(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Buzz:
     """Predict the buzz of a scene's one-sided contacts, and play it beside.
 
@@ -469,6 +490,7 @@ def buzz(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = 
     return cycles.buzz(_model(model, set))
 
 
+@checked
 def prove_box(
     model: CompiledSystem | str | Path,
     box: Mapping[str, str],
@@ -495,6 +517,7 @@ def prove_box(
     return proved_box(system, ranges, cells=cells)
 
 
+@checked
 def parameters(model: CompiledSystem | str | Path) -> Parameters:
     """List what may be set of a scene: its names, values, units and limits.
 
@@ -508,6 +531,7 @@ def parameters(model: CompiledSystem | str | Path) -> Parameters:
     return settable.parameters(_model(model, None))
 
 
+@checked
 def paper_route(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> PaperRoute:
     """Return the lifted matrices of Rakhsha and Constantinescu, eqs. (18) to (20), rows and columns named.
 
@@ -526,6 +550,7 @@ def paper_route(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | 
     return paper.paper_route(_model(model, set))
 
 
+@checked
 def region(
     model: CompiledSystem | str | Path,
     *,
@@ -563,6 +588,7 @@ def region(
     return stable_region.region(system, parse_axes(system, x, y), criterion=criterion)
 
 
+@checked
 def sweep(
     model: CompiledSystem | str | Path,
     over: Mapping[str, str | Sequence[str]],
@@ -640,6 +666,7 @@ def _check_out(model: CompiledSystem | str | Path, system: CompiledSystem, path:
         check_outputs(Path(model), (name for name, _ in system.origin.texts), {"out=": path})
 
 
+@checked
 def simulate(
     model: CompiledSystem | str | Path,
     *,
@@ -705,6 +732,7 @@ def simulate(
     )
 
 
+@checked
 def bench(
     model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None, rounds: int | None = None
 ) -> Bench:
@@ -729,6 +757,7 @@ def bench(
     return measuring.bench(_model(model, set), rounds=measuring.ROUNDS if rounds is None else rounds)
 
 
+@checked
 def export(
     model: CompiledSystem | str | Path,
     to: str | None = None,
@@ -786,6 +815,7 @@ def export(
     return handing.export(system, chosen, asked, path)
 
 
+@checked
 def report(
     files: str | Path | Sequence[str | Path],
     out: str | Path | None = None,
@@ -829,6 +859,7 @@ def report(
     return found
 
 
+@checked
 def show(path: str | Path, *, format: Format = "text") -> str:
     """Tell what a scene is made of: its graph, its equations, and what happens in one frame.
 
@@ -860,6 +891,7 @@ def show(path: str | Path, *, format: Format = "text") -> str:
             return listing.show_svg(path)
 
 
+@checked
 def schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of topologies, generated from the language and the library."""
     from apc.compiler.components.library import Library

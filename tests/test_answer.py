@@ -123,3 +123,30 @@ def test_derivatives_of_a_matrix_whose_digits_are_lost_are_not_told() -> None:
     told = sensitivities_of(system, prepared, other)
     assert told.rows == ()
     assert told.note.startswith("what moves it most: not told: floats lose the digits")
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize(
+    "name", ["three-users-mesh", "three-users-average", "two-users-waves", "lossy-average"]
+)
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"coordination.stiffness": "1e12 N/m"},
+        {"contact.stiffness": "0 N/m", "contact.damping": "0 N*s/m"},
+        {"device.mass": "1e-12 kg"},
+        {"device.damping": "1e9 N*s/m"},
+        {"lan.delay": "1 s"},
+    ],
+    ids=str,
+)
+def test_a_table_that_is_empty_says_why(name: str, values: dict[str, str]) -> None:
+    system = compile_topology(SCENES / f"{name}.yaml")
+    known = {one.name for one in (*system.parameters, *system.timings)}
+    overrides = [parse_override(system, f"{one}={value}") for one, value in values.items() if one in known]
+    found = answer(apply(system, overrides))
+    listed = [found, *([found.network] if found.network else [])]
+    for one in listed:
+        for table in (one.sensitivities, one.margins):
+            assert table.rows or table.note
+            assert str(table).strip()

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import inspect
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
 import apc
+from apc.arguments import _hints, _is
 from tests.topologies import SCENES, told
 
 PATH = SCENES / "three-users-average.yaml"
@@ -129,3 +134,55 @@ def test_what_tells_of_texts_refuses_a_compiled_model(model: apc.CompiledSystem)
     for function, given in ((apc.report, model), (apc.report, [model]), (apc.show, model)):
         [mistake] = told(function, given)
         assert mistake.startswith("three-users-average.apc: E615 is a compiled model")
+
+
+FUNCTIONS = [name for name in apc.__all__ if inspect.isfunction(getattr(apc, name))]
+GIVEN = {"values": {"contact.stiffness": [1.0]}, "parameter": "contact.stiffness", "hands": "held"}
+GIVEN |= {"over": {"contact.stiffness": ["1 N/m"]}, "ranges": {"contact.stiffness": "±1%"}}
+GIVEN |= {"frequencies": [1.0], "box": {"contact.stiffness": "±1%"}, "to": "json", "file": str(PATH)}
+WRONG = [None, 7, ("contact.stiffness", "10 N/m", "3000 N/m"), {"a": 1}, [3], object(), b"x"]
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_an_argument_of_a_wrong_type_is_said_to_be_one(
+    name: str, model: apc.CompiledSystem, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Each argument of each function; what is of a right type, as None for an option, is left out."""
+    monkeypatch.chdir(tmp_path)
+    function = getattr(apc, name)
+    parameters = inspect.signature(function).parameters
+    needed = {
+        one: GIVEN.get(one, model if one in ("model", "models") else str(PATH))
+        for one, parameter in parameters.items()
+        if parameter.default is inspect.Parameter.empty
+    }
+    for one in parameters:
+        for wrong in WRONG:
+            if _is(wrong, _hints(inspect.unwrap(function))[one]):
+                continue
+            with pytest.raises((TypeError, apc.ApcError)) as raised:
+                function(**{**needed, one: wrong})
+            assert isinstance(raised.value, apc.ApcError) or f"apc.{name}: {one} wants" in str(raised.value)
+
+
+def test_a_range_that_is_no_text_is_refused(model: apc.CompiledSystem) -> None:
+    wants = r"apc.region: x wants str \| None, got tuple: \('contact.stiffness', '10 N/m', '3000 N/m'\)"
+    with pytest.raises(TypeError, match=wants):
+        apc.region(model, x=("contact.stiffness", "10 N/m", "3000 N/m"))  # type: ignore[arg-type] # it is wrong
+
+
+@pytest.mark.parametrize("wrong", [7, None, ("1 N/m", "2 N/m"), {"a": "b"}, [3]], ids=repr)
+@pytest.mark.parametrize("call", ["set", "critical", "sweep", "analyze_many", "prove_box"])
+def test_of_a_value_of_a_wrong_type_nothing_else_is_raised(
+    call: str, wrong: object, model: apc.CompiledSystem
+) -> None:
+    values: dict[str, Any] = {"contact.stiffness": wrong}
+    calls: dict[str, Callable[[], object]] = {
+        "set": lambda: apc.analyze(model, set=values),
+        "critical": lambda: apc.critical(model, "contact.stiffness", lower="1 N/m", upper=cast(Any, wrong)),
+        "sweep": lambda: apc.sweep(model, values),
+        "analyze_many": lambda: apc.analyze_many(model, values),
+        "prove_box": lambda: apc.prove_box(model, values),
+    }
+    with contextlib.suppress(TypeError, apc.ApcError):  # a number in SI is a value of `analyze_many`
+        calls[call]()

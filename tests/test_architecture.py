@@ -105,7 +105,7 @@ HOUSE = (
         "apc.vary",
         """
         wiring batch slopes crossings plane bracket counting loops evaluator ports leading many bends marginal
-        one_gain delays lags search counts growth critical locus margins sensitivity over_network
+        delays lags search counts growth critical locus effort margins sensitivity over_network
         """,
     ),
     ("apc.sweeps", "grid quantities work store cluster sweep"),
@@ -123,7 +123,7 @@ HOUSE = (
     (
         "apc.regions",
         """
-        passivity overlay eigenpairs peaks surrogate cells curves boundary_points boundary axes strips region
+        passivity overlay eigenpairs peaks rectangle cells curves boundary_points boundary axes strips region
         panels
         """,
     ),
@@ -135,7 +135,7 @@ HOUSE = (
         """,
     ),
     ("apc.benchmark", "timing truth bench hard scale"),
-    ("apc", "inputs"),
+    ("apc", "inputs arguments"),
     ("apc.reports", "contents"),
     (
         "apc.present",

@@ -10,11 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 
 import apc
 from apc.__main__ import run
-from tests.topologies import AVERAGE, MESH
+from apc.present.forms import document, json_text
+from tests.topologies import AVERAGE, MESH, SCENES
 
 COMMANDS = (
     *(
@@ -251,3 +253,37 @@ def test_a_reader_who_leaves_early_is_no_error(tmp_path: Path) -> None:
     script = f"set -o pipefail; {command} | true; exit $?"
     ran = subprocess.run(["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (ran.returncode, ran.stderr) == (0, "")
+
+
+def _finite(word: str) -> float:
+    pytest.fail(f"{word} is no JSON")
+
+
+@pytest.mark.few(6)
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["analyze"],
+        ["critical", "contact.stiffness"],
+        ["feel"],
+        ["region", "--x", "contact.stiffness=1 N/m:100 N/m", "--y", "device.mass=1 g:1 kg"],
+        ["simulate", "--duration", "16 ms"],
+    ],
+    ids=lambda command: str(command[0]),
+)
+@pytest.mark.parametrize(
+    "value", ["device.damping=1e30 N*s/m", "device.mass=1e-300 kg", "device.mass=1e300 kg"]
+)
+def test_json_has_no_number_that_is_not_finite(
+    command: list[str], value: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = run([*command, str(SCENES / "three-users-average.yaml"), "--set", value, "--json"])
+    assert code in (0, 1)
+    if not code:
+        json.loads(capsys.readouterr().out, parse_constant=_finite)
+
+
+def test_what_is_not_finite_is_null_wherever_it_stands() -> None:
+    values = {"a": float("nan"), "b": [float("inf"), 1.0], "c": np.array([1.0, -np.inf])}
+    assert json.loads(json_text(document(values))) == {"a": None, "b": [None, 1.0], "c": [1.0, None]}
+    assert json.loads(json_text({"a": [float("nan")]})) == {"a": [None]}

@@ -447,3 +447,15 @@ def test_the_function_does_what_the_command_does(
     assert capsys.readouterr().out.rstrip("\n") == str(found)
     pytest.importorskip("pandas")
     assert found.to_dataframe()["stiffness parameter"].tolist() == ["contact.stiffness"] * 2
+
+
+def test_a_duration_that_nobody_waits_for_is_not_played(tmp_path: Path) -> None:
+    """Only what is not linear is played: a finger that pushes against a wall."""
+    text = (SCENES / "finger.yaml").read_text(encoding="utf-8").replace("duration: 2 s", "duration: 1e12 s")
+    assert "1e12 s" in text
+    (tmp_path / "finger.yaml").write_text(text, encoding="utf-8")
+    found = apc.compare([tmp_path / "finger.yaml", SCENES / "limited-motor.yaml"])
+    why = dict(found.schemes[0].missing)["played"]
+    assert why.startswith("apc simulate: the duration wants at most 1e+06 s")
+    with pytest.raises(ApcError, match="E915 the duration wants at most"):
+        apc.simulate(tmp_path / "finger.yaml")

@@ -20,8 +20,7 @@ from apc.frame.names import Free
 from apc.threads import single_threaded
 from apc.vary.critical import critical
 from apc.vary.delays import borders, system_with_delay
-from apc.vary.lags import LateStretch, _LateSheet, _of_powers, late_stretches
-from apc.vary.one_gain import response_of
+from apc.vary.lags import LateStretch, _LateSheet, _of_powers, late_stretches, response_of
 from tests.bench.growing import row
 from tests.topologies import AVERAGE, MESH, compiled, replaced
 

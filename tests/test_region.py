@@ -14,7 +14,9 @@ import apc
 from apc.analysis.analysis import analyze
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.pipeline import compile_topology
 from apc.frame.overrides import Override, apply
+from apc.present.region import region_document
 from apc.regions import region as regions
 from apc.regions.axes import parse_axes
 from apc.regions.curves import between
@@ -24,7 +26,7 @@ from apc.vary.evaluator import PointEvaluator
 from tests.bench.region import true_error
 from tests.paper_limit import limit
 from tests.reference import CONTACT_LIMITS, LIMITS
-from tests.topologies import AVERAGE, MESH, ROOT, compiled, replaced
+from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced
 
 X = "contact.stiffness=10 N/m:3000 N/m"
 Y = "coordination.stiffness=10 N/m:3000 N/m"
@@ -368,3 +370,31 @@ def test_a_range_in_which_nothing_moves_by_more_than_rounding_is_refused(
 def test_a_range_is_wide_enough_for_floats(average: CompiledSystem) -> None:
     with pytest.raises(ApcError, match=r"--y: E903 .* at least 1.5e-05 N/m, got 1e-07 N/m"):
         parse_axes(average, X, "contact.stiffness=1000 N/m:1000.0000001 N/m")
+
+
+OTHER = "coordination.stiffness"
+
+
+@pytest.mark.parametrize(
+    ("name", "x", "y", "coarse"),
+    [
+        (
+            "mixed-clocks",
+            "contact.stiffness=20 N/m:4000 N/m",
+            "coordination.stiffness=10 N/m:2000 N/m",
+            False,
+        ),
+        ("three-users-mesh", "contact.delay=0 ms:3 ms", "contact.stiffness=10 N/m:4000 N/m", False),
+        ("ring-of-eight", "contact.delay=0 ms:3 ms", "contact.stiffness=10 N/m:4000 N/m", False),
+        ("star-lecture", "contact.delay=0 ms:3 ms", "contact.stiffness=10 N/m:4000 N/m", False),
+        ("three-users-scheduled", "contact.stiffness=10 N/m:4000 N/m", f"{OTHER}=10 N/m:3000 N/m", True),
+    ],
+)
+def test_curves_are_as_near_as_is_promised_or_said_not_to_be(name: str, x: str, y: str, coarse: bool) -> None:
+    system = compile_topology(SCENES / f"{name}.yaml")
+    found = regions.region(system, parse_axes(system, x, y))
+    assert found.curves and bool(found.coarse) == coarse
+    near = [one for one in found.curves if one.smooth and one not in found.coarse]
+    assert all(one.error <= regions.TOLERANCE for one in near)
+    assert ("could not be followed to 1e-09 of a coordinate" in str(found)) == coarse
+    assert bool(region_document(found)["coarse"]) == coarse

@@ -13,7 +13,8 @@ from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.vary.batch import BatchEvaluator
 from apc.vary.evaluator import evaluator
-from apc.vary.sensitivity import sensitivities
+from apc.vary.sensitivity import _differentiate, sensitivities
+from apc.vary.slopes import moved_systems
 from tests.bench.sensitivity_truth import check_sensitivities
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
@@ -171,3 +172,23 @@ def test_what_is_linearized_where_it_starts_is_differentiated_as_closely_as_what
     )
     # Off by step²/6 of the third derivative, some 1e-8, and by the roundings of ρ over the step.
     assert abs((high - low) / (2 * step) - row.derivative) <= 1e-5 * abs(row.derivative)
+
+
+def test_where_the_radius_is_large_it_is_differentiated_all_the_same() -> None:
+    """A full mesh of 1,000: radius 6e7, of which a distance of 1e-10 is no float; by central differences."""
+    system = compiled(replaced(MESH, ("count: 3", "count: 1000")))
+    found = sensitivities(system)
+    assert found.radius > 1e7 and found.active
+    rows = {one.parameter: one for one in found.rows}
+    for name in ("contact.stiffness", "coordination.stiffness", "cube.mass"):
+        step = Fraction(rows[name].value) / 10**6
+        ends = [Fraction(rows[name].value) + side * step for side in (-1, 1)]
+        low, high = (analyze(apply(system, [Override(Free(name), end)])).spectral_radius for end in ends)
+        assert rows[name].derivative == pytest.approx((high - low) / (2 * float(step)), rel=1e-6)
+
+
+def test_without_parameters_it_is_said_that_there_is_none() -> None:
+    system = compiled(AVERAGE)
+    found = _differentiate(system, [], moved_systems(evaluator(system, []), np.empty(0)))
+    assert found.rows == ()
+    assert found.note == "what moves it most: not told: there is no parameter to vary"

@@ -75,11 +75,10 @@ SECONDS_A_PEER = 1e-4
     help="Repeat the analysis under every order of events that coincide.",
 )
 @click.option(
-    "--margins",
-    "every_margin",
-    is_flag=True,
-    help="Look for margins of large systems too, which takes seconds: how far stiffnesses, dampings and "
-    "delays may grow.",
+    "--margins/--no-margins",
+    default=None,
+    help="Look for all margins, however long it takes, or for none: how far stiffnesses, dampings and delays "
+    "may grow. Without either, for those that take no more than seconds together.",
 )
 @click.option(
     "--buzz",
@@ -98,7 +97,7 @@ def analyze_command(
     box: tuple[str, ...],
     cells: int | None,
     every_convention: bool,
-    every_margin: bool,
+    margins: bool | None,
     with_buzz: bool,
     hands: str,
     plot: Path | None,
@@ -122,7 +121,7 @@ def analyze_command(
     system = open_scene(file, settings, {"--plot": plot}, hands=hands, told=note_aside)
     if hands == PASSIVE:
         asked = {"--method": method != AUTO, "--conventions": every_convention, "--buzz": with_buzz}
-        asked |= {"--margins": every_margin, "--plot": plot is not None}
+        asked |= {"--margins": bool(margins), "--plot": plot is not None}
         refused = [name for name, given in asked.items() if given]
         _judge_passive(system, refused, box, cells, certify=certify, as_json=as_json)
         return
@@ -142,7 +141,7 @@ def analyze_command(
             box=ranges,
             cells=cells,
             every_convention=every_convention,
-            every_margin=every_margin,
+            margins=margins,
             with_buzz=with_buzz,
         )
     if plot is not None:

@@ -118,7 +118,6 @@ def simulate_command(
     """
     from apc.inputs import open_scene
     from apc.simulation.settings import DEFAULT, Settings, parse_method
-    from apc.simulation.simulation import check_length
     from apc.simulation.trajectory import duration_of, parse_duration
 
     if runs is not None and (signals or out or plot or error):
@@ -131,8 +130,7 @@ def simulate_command(
         from apc.moments.worst import trace_of_worst
 
         system = trace_of_worst(system)
-    seconds = duration_of(system, asked)
-    check_length(system, seconds, runs=runs or 1)
+    seconds = duration_of(system, asked, runs=runs or 1)
     if still is not None:
         from apc.present.still import save_still
 

@@ -53,7 +53,7 @@ def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
         return {name: document(own[name] if name in own else getattr(value, name)) for name in _names(kind)}
     if isinstance(value, Mapping):
         return {key: document(one) for key, one in value.items()}
-    return value.tolist()  # of an array
+    return document(value.tolist())  # of an array
 
 
 @functools.cache
@@ -63,8 +63,14 @@ def _names(kind: Any) -> tuple[str, ...]:
 
 
 def json_text(found: Any, *, indent: int | None = 2) -> str:
-    """Return plain data as one JSON document, on one line if `indent` is None."""
-    return json.dumps(found, ensure_ascii=False, allow_nan=False, indent=indent)
+    """Return plain data as one JSON document, on one line if `indent` is None.
+
+    JSON has no word for what is no finite number: null stands in its place, as in `document`.
+    """
+    try:
+        return json.dumps(found, ensure_ascii=False, allow_nan=False, indent=indent)
+    except ValueError:
+        return json.dumps(document(found), ensure_ascii=False, allow_nan=False, indent=indent)
 
 
 def note(text: str) -> list[str]:

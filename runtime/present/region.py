@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.files import write_text
 from apc.compiler.timings import part
-from apc.compiler.words import known_digits, measured, with_unit
+from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
 from apc.distribution import program_version
 from apc.optional import need
 from apc.present.analysis import range_document
@@ -63,6 +63,10 @@ def region_text(found: Region) -> str:
         left = len(found.curves) - MOST_CURVES
         if left > 0:
             lines.append(f"  and {left} more (--json lists all)")
+    if coarse := found.coarse:
+        most, many = max(one.error for one in coarse), counted(len(coarse), "curve")
+        what = f"{many} could not be followed to {found.tolerance:.0e} of a coordinate, but to {most:.0e}"
+        lines += ["", *wrapped(what, "  ", "  ")]
     cell = " × ".join(
         with_unit(f"{size:.4g}", axis.unit) for size, axis in zip(found.cell, (found.x, found.y), strict=True)
     )
@@ -104,6 +108,8 @@ def region_document(found: Region) -> dict[str, Any]:
         "topology": found.topology,
         "x": range_document(found.x),
         "y": range_document(found.y),
+        "tolerance": found.tolerance,
+        "coarse": [number for number, one in enumerate(found.curves) if one in found.coarse],
         "boundary": [_curve_document(curve) for curve in found.curves],
         "stable_area": found.stable_area,
         "stable_area_error": found.stable_area_error,

@@ -33,7 +33,7 @@ from apc.hands.feel import Feel
 from apc.optional import missing, need
 from apc.present.comparison_picture import comparison_picture
 from apc.present.eigenvalues import eigenvalues_picture, locus_picture
-from apc.present.forms import document
+from apc.present.forms import document, json_text
 from apc.present.graph import graph_picture
 from apc.present.hands import feel_picture
 from apc.present.pictures import svg_text
@@ -126,7 +126,7 @@ def report_page(found: Report) -> str:
     """Return a report as one HTML document."""
     named = ", ".join(one.name for one in found.scenes)
     draw = _Pictures()
-    kept = json.dumps(report_document(found), ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
+    kept = json_text(report_document(found), indent=None).replace("<", "\\u003c")
     policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
     parts = [
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',

@@ -70,7 +70,8 @@ def critical_text(found: Critical) -> str:
     lines += ["", f"  scanned from {low} to {high}"]
     if found.stretches:
         counts = f"within each of {counted(found.stretches, 'piece', ',d')} nothing depends on it: "
-        analysed = ", and those beside a jump were analysed" if found.crossings else ""
+        beside = "those beside a jump, and " if found.crossings else ""
+        analysed = f"; {beside}those that the count left open, were analysed"
         lines += wrapped(f"{counts}what grows there was counted in floats{analysed}", "  ", "  ")
     elif found.known:
         lines.append(f"  two crossings nearer than {found.cell:.0e} of the value could hide")
@@ -78,6 +79,10 @@ def critical_text(found: Critical) -> str:
         values = counted(found.looked, "value")
         what = f"{values} were looked at; what the equations do between two of them is not known: "
         lines += wrapped(f"{what}a narrow change of the verdict could hide there", "  ", "  ")
+    if found.left_open:
+        parts = [" to ".join(with_unit(f"{end:.6g}", found.unit) for end in one) for one in found.left_open]
+        rest = f" and {len(parts) - SHOWN} more" if len(parts) > SHOWN else ""
+        lines += wrapped(f"the verdict is left open from {', '.join(parts[:SHOWN])}{rest}", "  ", "  ")
     if not found.whole:
         lines.append("  an eigenvalue keeps near to the boundary: more crossings could hide")
     return "\n".join(lines)
@@ -125,8 +130,7 @@ def critical_document(found: Critical) -> dict[str, Any]:
 def margins_text(found: Margins) -> str:
     """Return the table of the margins, of at most 80 columns."""
     if not found.rows:
-        text = f"margins {found.note or 'none: there is nothing to vary'}"
-        return "\n".join(note(text))
+        return "\n".join(note(f"margins {found.note}"))
     width = max(len(one.parameter) for one in found.rows)
     lines = [f"  {'may grow':<{width}}  from           to               times  at"]
     for one in found.rows:

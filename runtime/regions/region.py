@@ -33,8 +33,8 @@ from apc.regions.cells import survey
 from apc.regions.curves import between
 from apc.regions.eigenpairs import Deciding, Eigenvalues, Family, largest
 from apc.regions.peaks import Peaks
+from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
 from apc.regions.strips import BRANCHES, Striped, trace_strips
-from apc.regions.surrogate import DirectFamily, Rectangle, rectangle_of, resolve_family
 from apc.result import Look, Result
 from apc.threads import single_threaded
 from apc.vary.batch import BatchEvaluator
@@ -67,7 +67,8 @@ Floats = NDArray[np.float64]
 # Coarse cells along each side of the rectangle.
 CELLS = 12
 
-# Distance of a curve from the boundary, relative to a coordinate (see `boundary.trace`).
+# Distance of a smooth curve from the boundary, relative to a coordinate (see `boundary.trace`). Of one that
+# could not be followed so closely it is said, see `Region.coarse`.
 TOLERANCE = 1e-9
 
 # How near to 0 or π, in radians, an eigenvalue's angle may come before its turns are counted again.
@@ -145,8 +146,8 @@ class Region(Result):
     `stable_area` is in the product of the axes' units. `cell` are the sides of the cells the rectangle was
     looked at in, in SI; where values hinted at more, cells down to `finest` of them. `corner` says whether
     the corner of both lower ends is stable, `stepped` that the boundary is right to a cell only, as times
-    vary, `linearized` that the scene is not linear; `criterion` what stable means;
-    `left_out` says what of the scene the answer does not look at.
+    vary, `tolerance` how near smooth curves were to come (see `coarse`), `linearized` that the scene is not
+    linear; `criterion` what stable means; `left_out` says what of the scene the answer does not look at.
     """
 
     shown_by = "region:region"
@@ -161,10 +162,16 @@ class Region(Result):
     finest: float
     corner: bool
     stepped: bool
+    tolerance: float
     linearized: bool
     criterion: str
     left_out: tuple[str, ...]
     system: CompiledSystem
+
+    @property
+    def coarse(self) -> tuple[Curve, ...]:
+        """The smooth curves that could not be followed to the tolerance, as their errors say."""
+        return tuple(one for one in self.curves if one.smooth and not one.error <= self.tolerance)
 
     @property
     def rectangle(self) -> Rectangle:
@@ -234,7 +241,8 @@ def region(
     cells
         Into how many cells each side of the rectangle is divided to begin with.
     tolerance
-        Largest distance between curves and boundary, relative to a coordinate.
+        Largest distance between curves and boundary, relative to a coordinate; curves that could not be
+        followed so closely are `Region.coarse`.
     criterion
         "mean-square" or "nominal", see `critical.critical`.
     prepared
@@ -307,6 +315,7 @@ def region(
         finest=found.finest,
         corner=found.corner,
         stepped=stepped,
+        tolerance=tolerance,
         linearized=not affine,
         criterion=meant,
         left_out=(
@@ -383,12 +392,12 @@ def _surveyed(
 
 def _family(source: Source, rectangle: Rectangle, *, timed: bool) -> Family:
     """Return the closed systems over the unit square."""
-    if isinstance(source, GrowthEvaluator | PortEvaluator):  # a series would take more points than it saves
+    if isinstance(source, GrowthEvaluator | PortEvaluator):  # one point's bounds are enough, and dear
         errors = tuple(one[0] for one in source.errors(rectangle.values(np.array([[0.5, 0.5]]))))
         return DirectFamily(source, rectangle, tuple(len(one) for one in errors), errors)
     if timed:  # each point has a schedule of its own: there are no slopes, and no one size
         return DirectFamily(source, rectangle, (), ())
-    return resolve_family(source, rectangle, source.errors)
+    return family_over(source, rectangle, source.errors)
 
 
 def _samples(deciding: Deciding, source: Source, rectangle: Rectangle, points: Floats) -> Floats:

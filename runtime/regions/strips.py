@@ -19,19 +19,21 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared
+from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.frozen import dataclass
+from apc.eigen.relative import relative_bounded
 from apc.frame.names import Range, parameter_of
 from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, relative_to, stable_area, trace
 from apc.regions.cells import HALVINGS, survey
 from apc.regions.curves import between, refined
 from apc.regions.eigenpairs import Eigenvalues, largest, log_magnitudes
-from apc.regions.surrogate import DirectFamily, Rectangle, rectangle_of, resolve_family
+from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
+from apc.vary.batch import batch_evaluator
 from apc.vary.counts import count_pieces
 from apc.vary.delays import Piece, delay_pieces, pace, system_with_delay
-from apc.vary.evaluator import PointEvaluator, evaluator_of_many, reaches_count
+from apc.vary.evaluator import PointEvaluator, evaluator_of_many, generic, reaches_count
 from apc.vary.marginal import marginal_motion, with_rigid
 from apc.vary.search import SPAN, Line, proved_crossing
 
@@ -46,6 +48,9 @@ SAME = 8.0
 
 # The share of the tolerance that drawing a strip's curves in units of the whole range may take.
 RESTATED = 0.25
+
+# The share that a strip's own curves may take: distances count for more where they are relative to the whole.
+WITHIN = 0.4
 
 # Pieces an interval is cut into for it at most; each doubling makes it 16 times better.
 MOST_PIECES = 64
@@ -242,11 +247,11 @@ def _moving(
     low = np.array([float(piece.low), float(other.low)])
     high = np.array([float(min(piece.high, delay.high)), float(other.high)])
     rectangle = Rectangle(low, high - low)
-    family = resolve_family(source, rectangle, source.errors)
-    if isinstance(family, DirectFamily):
+    family = _within(source, piece, rectangle)
+    if family is None:
         return None
     found = survey(lambda points: log_magnitudes(family.matrices(points), BRANCHES), cells=cells)
-    arcs = trace(Eigenvalues(family), found, tolerance=tolerance * (1 - RESTATED), offset=rectangle.offset)
+    arcs = trace(Eigenvalues(family), found, tolerance=tolerance * WITHIN, offset=rectangle.offset)
     area, off = stable_area(arcs, found)
     offset = rectangle_of(delay, other).offset
     restated = [_restated(arc, ends, tolerance, offset) for arc in arcs]
@@ -254,6 +259,25 @@ def _moving(
         return None
     kept = tuple(arc for arc in restated if arc is not None)
     return _Strip(ends[0], ends[1], kept, (found.corners[0], found.corners[1]), area, off)
+
+
+def _within(source: PointEvaluator, piece: Piece, rectangle: Rectangle) -> DirectFamily | None:
+    """Return the matrices over a strip, each step linear in the delay; None where other motions are free."""
+    assert piece.evaluator is not None, "something depends on the delay"
+    groups, exchange = lifted_groups(generic(piece.inside, source.free[1:]), prepared=source.prepared)
+    family = batch_evaluator(piece.inside, source.free, groups, exchange, durations=piece.evaluator.durations)
+
+    def errors(values: Floats) -> tuple[Floats, ...]:
+        """Return those of analyses at values, in the coordinates of the evaluator."""
+        closed = [source.closed_at(value) for value in values.tolist()]
+        return tuple(
+            np.stack([relative_bounded(one[k].matrix, one[k].error, wiring.relative)[1] for one in closed])
+            for k, wiring in enumerate(family.wirings)
+        )
+
+    if any(wiring.moving for wiring in family.wirings):
+        return None
+    return family_over(family, rectangle, errors)
 
 
 def _restated(arc: Arc, ends: Sequence[float], tolerance: float, offset: Floats) -> Arc | None:

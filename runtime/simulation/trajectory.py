@@ -28,7 +28,7 @@ from apc.simulation.blocks import Block, blocks
 from apc.simulation.flow import Tolerance
 from apc.simulation.settings import DEFAULT, Method, Settings
 from apc.simulation.signals import Signal
-from apc.simulation.simulation import Simulation, prepare
+from apc.simulation.simulation import Simulation, check_length, prepare
 from apc.simulation.summary import Summary, Watch
 
 Floats = NDArray[np.float64]
@@ -280,8 +280,23 @@ def parse_duration(text: str) -> Fraction:
     return option_value("--duration", text, what="duration", unit="s")
 
 
-def duration_of(system: CompiledSystem, duration: Fraction | None) -> Fraction:
-    """Return how long to simulate. Raises ApcError (E877) if neither call nor scene says it."""
+def duration_of(system: CompiledSystem, duration: Fraction | None, *, runs: int = 1) -> Fraction:
+    """Return how long to play a scene, the experiment's duration unless one is given.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    duration
+        How long, in seconds, if the call says it.
+    runs
+        How often.
+
+    Raises
+    ------
+    ApcError
+        E877 neither call nor scene says it; E915 nobody will wait for it.
+    """
     found = system.experiment.duration if duration is None else duration
     if found is None:
         what = "the scene says no duration"
@@ -292,4 +307,5 @@ def duration_of(system: CompiledSystem, duration: Fraction | None) -> Fraction:
         raise ApcError(
             Mistake("E877", Place(system.origin.topology), "the duration", expected=expected, got=got)
         )
+    check_length(system, found, runs=runs)
     return found

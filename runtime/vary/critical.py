@@ -32,7 +32,7 @@ from apc.threads import single_threaded
 from apc.vary.counts import search_counts
 from apc.vary.crossings import CELL
 from apc.vary.delays import delay_now
-from apc.vary.evaluator import reaches_count, reaches_time
+from apc.vary.evaluator import reaches_count, reaches_start, reaches_time
 from apc.vary.growth import (
     BY_GROWTH,
     MEAN_SQUARE,
@@ -58,8 +58,8 @@ class Critical(Result):
     whether the equations are enclosed between the `looked` values that were looked at: what could hide then
     are crossings nearer than `cell` to one another. `enters` says whether
     anything that decides depends on the parameter: on a start value of a linear scene nothing does.
-    `stretches` are those of `search.Search`. `counted` says that it is a number of peers: a crossing's value
-    is then the number on its stable side.
+    `stretches` and `left_open` are those of `search.Search`. `counted` says that it is a number of peers: a
+    crossing's value is then the number on its stable side.
     `left_out` says what of the scene the answer does not look at. `groups` are the groups' present values
     (None where their peers differ) of a parameter that is set for all groups though they have not all the
     same. `system` is the scene.
@@ -89,6 +89,7 @@ class Critical(Result):
     groups: tuple[tuple[str, float | None], ...] = ()
     stretches: int = 0
     counted: bool = False
+    left_open: tuple[tuple[float, float], ...] = ()
 
     def plot(self, ax: Any = None, **look: Unpack[Look]) -> Any:
         """Draw where the eigenvalues go (root locus), as `look` says; return the matplotlib Axes.
@@ -169,7 +170,8 @@ def critical(
             start = _at_start(system, prepared)
             found = search_delay(system, free, limits[0] or Fraction(0), limits[1], start, told=told)
         else:
-            found = search(system, free, low, high, prepared, told=told)
+            at_start = None if reaches_start(system, free) else prepare_at_start(system, prepared)
+            found = search(system, free, low, high, at_start or prepared, told=told)
 
         def stable_now() -> bool | None:
             return stable_of(system)
@@ -201,6 +203,7 @@ def critical(
         groups=values_by_group(system, free),
         stretches=found.stretches,
         counted=counted,
+        left_open=found.left_open,
     )
 
 

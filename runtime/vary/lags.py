@@ -1,7 +1,7 @@
 """Whether a scene is stable for every delay of its links in a range: all of them at once.
 
 Takes: a `CompiledSystem` and a parameter or timing that reaches nothing but how late packets are.
-Gives: `LateStretch`, `late_stretches`.
+Gives: `LateStretch`, `late_stretches`; `Response`, `response_of`.
 Guarantees: stretches join on without a gap; within one, nothing depends on the delay.
 Does not: vary what is held late, or what a force depends on (see `delays`); prove what it says of a stretch,
 a count in floats as in `plane`.
@@ -38,7 +38,6 @@ from apc.frame.schedule import Schedule, Selected, tick_by_tick
 from apc.frame.scheduling import build_schedules, newest
 from apc.vary.delays import INSIDE, reaches_parameters, system_with_delay, timing_slopes
 from apc.vary.evaluator import Asked
-from apc.vary.one_gain import Response, response_of
 from apc.vary.plane import count_beyond
 
 Floats = NDArray[np.float64]
@@ -61,6 +60,25 @@ LARGE, WORST = 64, 1e8
 
 # Ranges of delays whose loops are kept for the next question: each may be tens of megabytes.
 KEPT = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Response:
+    """A matrix taken apart: its eigenvalues (n,), their vectors, and the inverse of these."""
+
+    values: Complexes
+    right: Complexes
+    inverse: Complexes
+
+
+def response_of(matrix: Floats) -> Response | None:
+    """Take a loop's matrix (n, n) apart, None where its vectors are no basis."""
+    values, right = np.linalg.eig(matrix)
+    try:
+        inverse = np.linalg.inv(right)
+    except np.linalg.LinAlgError:
+        return None
+    return Response(values.astype(np.complex128), right.astype(np.complex128), inverse.astype(np.complex128))
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,7 +32,7 @@ from apc.network.nominal import channel_numbers
 from apc.threads import single_threaded
 from apc.vary.evaluator import free_parameters
 from apc.vary.growth import BOUNDED, MEAN_SQUARE, FirstLost, allowed, first_lost, growth_at
-from apc.vary.margins import GROWTH, IN_PASSING, Margin, Margins, coupler_parameters
+from apc.vary.margins import GROWTH, NOT_STABLE, Margin, Margins, coupler_parameters, not_looked
 from apc.vary.search import SAMPLES
 from apc.vary.sensitivity import Sensitivities, Sensitivity, varied
 
@@ -79,21 +79,28 @@ def network_margins(
         free = [*coupler_parameters(system), *_of_channels(system)]
         states = max(len(kind.states) for kind in system.kinds)
         if quick and len(free) * states > MOST_IN_PASSING:
-            return Margins((), IN_PASSING.format(f"{len(free)} numbers of {states}"))
+            count = f"{len(free)} numbers of {states} states"
+            return Margins((), f"not looked for in passing: {count} (apc analyze --margins does)")
         if why := _too_many(len(free)):
             return Margins((), f"not looked for: {why}")
         here = growth(system, prepared)
         if not here.why and not here.stable:
             known = "stable" if here.stable is False else "proved stable"
-            return Margins((), f"none: the scene is not {known} in mean square as it is")
+            return Margins((), NOT_STABLE.format(f"{known} in mean square"))
         if why := _not_varied(here):
             return Margins((), f"not looked for: {why}")
         scales = {one.parameter: one.value or one.scanned / GROWTH for one in nominal.rows}
+        open_rows = {one.parameter for one in nominal.rows if one.note}
+        unscaled = {one.label for one in free if not nominal.rows or one.label in open_rows}
         rows: list[Margin] = []
         notes, open_sides, looked = [], [], 0
         beyond: dict[str, list[str]] = {}
         for one in free:
-            found = first_lost(system, one, _samples(system, one, scales), prepared, PLACE, here)
+            samples = _samples(system, one, scales)
+            if one.label in unscaled and len(samples) == 1:
+                rows.append(not_looked(system, one, "from 0 nothing says how far"))
+                continue
+            found = first_lost(system, one, samples, prepared, PLACE, here)
             looked += found.looked
             if not found.enters:
                 continue

@@ -85,8 +85,11 @@ PIECE_SAMPLES = 3
 # events that coincide there.
 BESIDE = Fraction(1, 10**6)
 
-# What is said of a crossing that no bound holds.
+# What is said of a crossing that no bound holds, of one between two pieces that events part, and of one in
+# pieces that were left open.
 ESTIMATE = "estimated in floats"
+EVENTS = "events coincide there"
+BETWEEN = "analysed on either side; the verdict between them is left open"
 
 _PLACE = Place("critical value")
 
@@ -124,7 +127,8 @@ class Search:
     whether it is stable; it is empty when no sample told. `known` says whether the equations are enclosed
     between the `looked` values that were looked at, `enters` whether any matrix was seen to change along the
     way. Where a delay moves packets only, `stretches` is in how many stretches nothing depends on it; what
-    grows in each was counted in floats, and those beside a change were analysed.
+    grows in each was counted in floats, and those beside a change, or that the count left open, were
+    analysed. `left_open` are the parts of a delay's range that no analysis decides.
     """
 
     edges: tuple[Crossing, ...]
@@ -135,6 +139,7 @@ class Search:
     looked: int
     enters: bool
     stretches: int = 0
+    left_open: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -448,25 +453,32 @@ def search_delay(
     end = high or delay_reach(system, free, low, pieces=PIECES, further=FURTHER)[0]
     edges: list[Crossing] = []
     stable = [True] if from_stable else []
+    left_open: list[tuple[float, float]] = []
     before: Piece | None = None
     at, whole, known, looked = low, True, True, 0
     tell = pace(system, free, low, end, place=_PLACE, told=told)
     late = late_stretches(system, free, low, end, prepared, borders(system, free, place=_PLACE))
-    if late is not None:
-        tell(end)
-        return _late_search(system, free, late, end, prepared, from_stable=from_stable)
-    for piece in delay_pieces(system, free, low, prepared, place=_PLACE, high=end):
+    if late is None:
+        pieces = delay_pieces(system, free, low, prepared, place=_PLACE, high=end)
+    else:
+        pieces = (Piece(one.low, one.high, None, _inside(system, free, one)) for one in late)
+    counted = _counted(late or ())
+    for piece in pieces:
         at = min(piece.high, end)
         tell(at)
-        found, enclosed = _piece_scan(piece, float(piece.low), float(at), prepared)
+        found, enclosed = _piece_scan(
+            piece, float(piece.low), float(at), prepared, counted=counted.get(piece.low)
+        )
         whole, known, looked = whole and found.whole, known and enclosed, looked + len(found.points)
         if not len(found.points):
+            left_open += [] if found.whole else [(float(piece.low), float(at))]
             continue
         first = bool(found.stable[0])
         if stable and stable[-1] != first:
-            side, way = (piece, 1) if stable[-1] or before is None else (before, -1)
-            grows = system_with_delay(system, free, piece.low + way * BESIDE * (side.high - side.low))
-            edges.append(_jump(piece.low, analyze(grows, prepared=prepared), stable_below=stable[-1]))
+            start = before.high if before else low
+            edge = _jump(system, free, before, start, piece, prepared, stable_below=stable[-1])
+            whole &= edge.proof != ESTIMATE
+            edges.append(edge)
         if not stable or stable[-1] != first:
             stable.append(first)
         for root in found.roots:
@@ -478,40 +490,26 @@ def search_delay(
         if from_stable and edges:
             break
     scanned = float(low), float(at)
-    return Search(tuple(edges), tuple(stable), scanned, whole, known, looked, enters=True)
+    stretches, parts = len(late or ()), tuple(left_open)
+    return Search(tuple(edges), tuple(stable), scanned, whole, known, looked, True, stretches, parts)
 
 
-def _late_search(
-    system: CompiledSystem,
-    free: Free,
-    late: Sequence[LateStretch],
-    end: Fraction,
-    prepared: Prepared,
-    *,
-    from_stable: bool,
-) -> Search:
-    """Put the stretches of a delay together, each change of side told by analyses of both."""
-    known = [one for one in late if one.stable is not None]
-    edges: list[Crossing] = []
-    stable = [True] if from_stable else [bool(one.stable) for one in known[:1]]
-    whole, before = len(known) == len(late), None
+def _inside(system: CompiledSystem, free: Free, stretch: LateStretch) -> CompiledSystem:
+    """Return the scene at a delay within a stretch."""
+    return system_with_delay(system, free, stretch.low + INSIDE * (stretch.high - stretch.low))
 
-    def inside(some: LateStretch) -> CompiledSystem:
-        return system_with_delay(system, free, some.low + INSIDE * (some.high - some.low))
 
-    for one in known:
-        if one.stable != stable[-1]:
-            grows, settles = (one, before) if stable[-1] else (before, one)
-            assert grows is not None, "the first stretch is on the side that the search begins on"
-            there = analyze(inside(grows), prepared=prepared)
-            whole &= there.stable is False and (settles is None or _settles(inside(settles), prepared))
-            edges.append(_jump(one.low, there, stable_below=stable[-1]))
-            stable.append(bool(one.stable))
-            if from_stable:
-                break
-        before = one
-    scanned = float(late[0].low), float(end)
-    return Search(tuple(edges), tuple(stable), scanned, whole, True, len(known), True, len(late))
+def _counted(late: Sequence[LateStretch]) -> dict[Fraction, bool]:
+    """Return which stretches are stable, by their low ends, where a count in floats may say so.
+
+    Those that it left open and those beside a change are not among them: an analysis judges them.
+    """
+    sides = [one.stable for one in late]
+    return {
+        one.low: one.stable
+        for place, one in enumerate(late)
+        if one.stable is not None and set(sides[max(place - 1, 0) : place + 2]) == {one.stable}
+    }
 
 
 def delay_reach(
@@ -536,9 +534,16 @@ def delay_reach(
     return at, count
 
 
-def _piece_scan(piece: Piece, low: float, high: float, prepared: Prepared) -> tuple[Scan, bool]:
-    """Scan one piece, its ends as limits from within; say whether the equations are known all over it."""
+def _piece_scan(
+    piece: Piece, low: float, high: float, prepared: Prepared, *, counted: bool | None = None
+) -> tuple[Scan, bool]:
+    """Scan one piece, its ends as limits from within; say whether the equations are known all over it.
+
+    Where nothing depends on the delay within it, `counted` says whether it is stable, None if nobody did yet.
+    """
     family = piece.evaluator
+    if counted is not None:
+        return Scan(np.array([low]), np.array([counted]), (), whole=True), True
     if family is None:
         if _settles(piece.inside, prepared):
             return Scan(np.array([low]), np.array([True]), (), whole=True), True
@@ -568,15 +573,40 @@ def _settles(system: CompiledSystem, prepared: Prepared) -> bool:
     return True
 
 
-def _jump(at: Fraction, grows: Analysis, *, stable_below: bool) -> Crossing:
-    """Describe a change of side where events coincide, exactly; `grows` is of the unstable side."""
+def _jump(
+    system: CompiledSystem,
+    free: Free,
+    before: Piece | None,
+    start: Fraction,
+    after: Piece,
+    prepared: Prepared,
+    *,
+    stable_below: bool,
+) -> Crossing:
+    """Describe a change of side between two pieces, exactly where analyses just inside both hold it there.
+
+    `start` is where the piece before ends; where pieces from there on were left open, the change lies
+    anywhere in these. Without a piece `before`, the scene is known to be stable at `start`.
+    """
+
+    def analysis_at(value: Fraction) -> Analysis:
+        return analyze(system_with_delay(system, free, value), prepared=prepared)
+
+    value, error = (start + after.low) / 2, (after.low - start) / 2
+    proof = EVENTS if not error else BETWEEN
+    above = analysis_at(after.low + BESIDE * (after.high - after.low))
+    below = above if before is None else analysis_at(start - BESIDE * (start - before.low))
+    held = above.stable is (not stable_below) and (before is None or below.stable is stable_below)
+    if not held:
+        error, proof = max(error, after.high - after.low), ESTIMATE
+    grows = above if stable_below or before is None else below
     return Crossing(
-        value=float(at),
-        error=0.0,
+        value=float(value),
+        error=float(error),
         stable_side="below" if stable_below else "above",
-        frequency_hz=grows.modes[0].frequency_hz,
+        frequency_hz=grows.modes[0].frequency_hz if grows.modes else float("nan"),
         kind="jump",
-        proof="events coincide there",
+        proof=proof,
     )
 
 

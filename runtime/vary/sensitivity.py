@@ -153,7 +153,9 @@ def _differentiate(system: CompiledSystem, free: Sequence[Free], listed: Sequenc
             0.0, (), (), "what moves it most: nothing, as every motion dies out to 0 within a frame"
         )
     leading = [
-        one for one in clusters if np.abs(one.values).max() > radius - SHARED - np.ptp(np.abs(one.values))
+        one
+        for one in clusters
+        if np.abs(one.values).max() >= radius - SHARED * max(1.0, radius) - np.ptp(np.abs(one.values))
     ]
     leading.sort(key=lambda one: -float(np.abs(one.values).max()))
     rows: list[Sensitivity] = []
@@ -195,6 +197,9 @@ def _differentiate(system: CompiledSystem, free: Sequence[Free], listed: Sequenc
     if untied:
         are = "are" if len(untied) > 1 else "is"
         notes.append(f"{', '.join(untied)} would move what was left out, and {are} not among these")
+    if not rows and not notes:
+        why = "no derivative is finite" if free else "there is no parameter to vary"
+        notes.append(f"what moves it most: not told: {why}")
     rows.sort(key=lambda row: (-abs(row.relative), row.parameter, row.mode))
     return Sensitivities(radius, tuple(active), tuple(rows), "; ".join(notes))
 
@@ -233,7 +238,8 @@ def _clusters(moved: Moved) -> list[_Cluster]:
     values = pairs.values
     largest = float(np.abs(values).max())
     clusters = []
-    seen = (values.imag < 0) | (np.abs(values) < largest - SHARED - 2 * CLOSE * max(largest, CLOSE))
+    least = largest - SHARED * max(1.0, largest) - 2 * CLOSE * max(largest, CLOSE)
+    seen = (values.imag < 0) | (np.abs(values) < least)
     for place in np.argsort(-np.abs(values), kind="stable"):
         if seen[place]:
             continue

@@ -1,0 +1,80 @@
+"""What is given to a public function, checked against its annotations before anything is done.
+
+Takes: a function whose parameters are annotated.
+Gives: `checked`.
+Guarantees: of a wrong type a TypeError says which argument it is, what it wants and what it got.
+Does not: judge texts, or the keys and plain values of mappings: what reads them raises ApcError.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from numbers import Integral, Real
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from apc.compiler.compiled import CompiledSystem
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+# What stands for a type that is written: a number of NumPy is one, a path may be any that the system takes;
+# where a compiled model is given for a path, the function itself says what it needs.
+WIDER: Mapping[Any, tuple[type, ...]] = {
+    int: (Integral,),
+    float: (Real,),
+    Path: (os.PathLike, CompiledSystem),
+}
+
+
+def checked(function: Callable[P, T]) -> Callable[P, T]:
+    """Return the function, which raises a TypeError that says what is wrong of an argument of a wrong type.
+
+    Parameters
+    ----------
+    function
+        Its annotations name what its own module knows; of another module's `Literal` any text will do.
+    """
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        hints = _hints(function)
+        for name, value in signature.bind(*args, **kwargs).arguments.items():
+            if name in hints and not _is(value, hints[name]):
+                wants, got = signature.parameters[name].annotation, f"{type(value).__name__}: {value!r:.80}"
+                raise TypeError(f"apc.{function.__name__}: {name} wants {wants}, got {got}")
+        return function(*args, **kwargs)
+
+    return call
+
+
+@functools.cache
+def _hints(function: Callable[..., Any]) -> Mapping[str, Any]:
+    """Return the types of a function's parameters."""
+    names = {name: kind for name, kind in function.__annotations__.items() if name != "return"}
+    holder = type("Holder", (), {"__annotations__": names})
+    return get_type_hints(holder, globalns=function.__globals__, localns={"Method": str})
+
+
+def _is(value: Any, hint: Any) -> bool:
+    """Say whether a value is of a type."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return True
+    if origin in (Union, UnionType):
+        return any(_is(value, one) for one in inner)
+    if origin is Literal:
+        return isinstance(value, str)
+    if origin is Mapping:
+        return isinstance(value, Mapping) and all(
+            _is(one, inner[1]) for one in value.values() if isinstance(one, list | tuple)
+        )
+    if origin in (Sequence, Iterable):
+        listed = isinstance(value, Iterable) and not isinstance(value, Mapping | bytes)
+        return listed and (origin is Iterable or all(_is(one, inner[0]) for one in value))
+    return isinstance(value, WIDER.get(hint, hint if hint is not None else type(None)))

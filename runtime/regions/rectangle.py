@@ -1,0 +1,108 @@
+"""Frame matrices over a rectangle of two parameters, as points of the unit square.
+
+Takes: an `Evaluator` of two free parameters and their ranges.
+Gives: `Rectangle`, `rectangle_of`; `DirectFamily`, `family_over`.
+Guarantees: every point is computed anew; errors are bounds at points inside the rectangle.
+Does not: know what happens between points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.frozen import dataclass
+from apc.frame.names import Range
+from apc.vary.batch import MatrixSource
+
+Floats = NDArray[np.float64]
+
+# Bounds on the errors of each system's matrices (k, n, n) at values (k, 2).
+Errors = Callable[[Floats], tuple[Floats, ...]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rectangle:
+    """Two ranges in SI: `low` and `width` (2,)."""
+
+    low: Floats
+    width: Floats
+
+    def values(self, points: Floats) -> Floats:
+        """Return parameter values (k, 2) at points of the unit square."""
+        return self.low + points * self.width
+
+    def points(self, values: Floats) -> Floats:
+        """Return the points of the unit square (k, 2) of parameter values."""
+        return (values - self.low) / self.width
+
+    @property
+    def offset(self) -> Floats:
+        """What to add to points to have them count from a parameter's zero (2,)."""
+        return self.low / self.width
+
+
+def rectangle_of(x: Range, y: Range) -> Rectangle:
+    """Return the rectangle of two ranges."""
+    low = np.array([float(x.low), float(y.low)])
+    return Rectangle(low, np.array([float(axis.high - axis.low) for axis in (x, y)]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DirectFamily:
+    """A `Family` that asks the evaluator for every point."""
+
+    evaluator: MatrixSource
+    rectangle: Rectangle
+    sizes: tuple[int, ...]
+    errors: tuple[Floats, ...]
+
+    def matrices(self, points: Floats) -> tuple[Floats, ...]:
+        """Return each system's matrices (k, n, n) at points (k, 2)."""
+        return self.evaluator.matrices(self.rectangle.values(points))
+
+    def slopes(self, system: int, points: Floats) -> tuple[Floats, Floats]:
+        """Return one system's matrices (k, n, n) and their derivatives (2, k, n, n) over x and y."""
+        count = len(points)
+        values = np.concatenate([self.rectangle.values(points)] * 2)
+        along = np.zeros_like(values)
+        along[:count, 0], along[count:, 1] = self.rectangle.width
+        matrix, slope = (
+            _sized(one, self.sizes[system]) for one in self.evaluator.slopes(values, along)[system]
+        )
+        return matrix[:count], slope.reshape(2, count, *slope.shape[1:])
+
+
+def _sized(matrices: Floats, size: int) -> Floats:
+    """Return matrices (k, n, n) as (k, size, size): zeros are put on or left off, which moves nothing.
+
+    All of a matrix is NaN where there is none, or one with more states than that.
+    """
+    n = matrices.shape[1]
+    if n == size:
+        return matrices
+    found = np.zeros((len(matrices), size, size))
+    both = min(n, size)
+    found[:, :both, :both] = matrices[:, :both, :both]
+    lost = matrices[:, both:].any(axis=(1, 2)) | matrices[:, :, both:].any(axis=(1, 2))
+    found[lost | ~np.isfinite(matrices).all(axis=(1, 2))] = np.nan
+    return found
+
+
+def family_over(source: MatrixSource, rectangle: Rectangle, errors: Errors) -> DirectFamily:
+    """Return the matrices over a rectangle.
+
+    Parameters
+    ----------
+    source
+        Of two free parameters.
+    rectangle
+        Their ranges.
+    errors
+        Bounds (k, n, n) on the errors of each system's matrices at values (k, 2), entry by entry.
+    """
+    corners = rectangle.values(np.array([[0.1, 0.1], [0.1, 0.9], [0.9, 0.1], [0.9, 0.9]]))
+    wrong = tuple(one.max(axis=0) for one in errors(corners))
+    return DirectFamily(source, rectangle, tuple(map(len, wrong)), wrong)
