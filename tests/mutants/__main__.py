@@ -49,7 +49,7 @@ def main() -> None:
         reach = asked.reach or Path(folder) / "reach.json"
         if not reach.exists():
             copy = copies.get()
-            _run(copy, ["watched", str(copy / "lib" / "apc"), str(reach.resolve()), *words], limit=None)
+            _run(copy, ["watched", str(copy), str(reach.resolve()), *words], limit=None)
             copies.put(copy)
         known = json.loads(reach.read_text(encoding="utf-8"))
 
@@ -124,10 +124,9 @@ def _run(copy: Path, words: list[str], limit: float | None) -> int | None:
 
 def _concerned(mutant: Mutant, known: dict[str, object], seconds: float) -> tuple[list[str], float]:
     """Return the tests to run, in order, and how long (s) they take unchanged."""
-    path = mutant.path.removeprefix("runtime/")
     tests, durations, lines = known["tests"], known["durations"], known["lines"]
     assert isinstance(tests, list) and isinstance(durations, list) and isinstance(lines, dict)
-    there = lines.get(path, {})
+    there = lines.get(mutant.path, {})
     reached = set(there.get(str(mutant.line), ()))
     files = {tests[place].partition("::")[0] for place in reached}
     beside = {place for place, name in enumerate(tests) if name.partition("::")[0] in files} - reached

@@ -45,12 +45,12 @@ class Chosen:
         )
 
 
-def watched(product: Path, out: Path, words: list[str]) -> int:
-    """Run pytest with these words in this process; write who ran what to `out` as JSON."""
+def watched(root: Path, out: Path, words: list[str]) -> int:
+    """Run pytest with these words in this process; write which test ran which line to `out` as JSON."""
     import coverage
 
     measured = coverage.Coverage(
-        data_file=None, source=[str(product)], config_file=False, check_preimported=False
+        data_file=None, source=[str(root / name) for name in ("compiler", "runtime")], config_file=False
     )
     watch = Watch(measured)
     measured.start()
@@ -62,7 +62,7 @@ def watched(product: Path, out: Path, words: list[str]) -> int:
     lines: dict[str, dict[int, list[int]]] = {}
     for file in data.measured_files():
         by_line = data.contexts_by_lineno(file)
-        lines[str(Path(file).relative_to(product))] = {
+        lines[str(Path(file).relative_to(root))] = {
             line: [number[name] for name in sorted(contexts) if name in number]
             for line, contexts in by_line.items()
         }

@@ -37,6 +37,9 @@ _SWAPPED_COMPARISON = {
 # A term whose text has one of these words charges an error: leaving it out must make some bound too small.
 _CHARGES = ("radius", "radii", "error", "round", "eps", "ulp", "unit")
 
+# Functions whose arguments may stand in any order.
+_SYMMETRIC = ("max", "min", "math.gcd", "math.lcm", "np.maximum", "np.minimum", "np.allclose")
+
 
 @dataclass(frozen=True, slots=True)
 class Mutant:
@@ -119,8 +122,9 @@ def _changes(tree: ast.Module) -> Iterator[tuple[ast.expr, str, str]]:
                 yield node, str(value + 1), "constant"
             case ast.Constant(value=float(value)):
                 yield node, repr(value * 1.5 if value else 1.0), "constant"
-            case ast.Call(func=func, args=[first, second, *rest]) if not any(
-                isinstance(value, ast.Starred) for value in (first, second)
+            case ast.Call(func=func, args=[first, second, *rest]) if not (
+                ast.unparse(func) in _SYMMETRIC
+                or any(isinstance(value, ast.Starred) for value in (first, second))
             ):
                 swapped = [ast.unparse(value) for value in (second, first, *rest, *node.keywords)]
                 yield node, f"{ast.unparse(func)}({', '.join(swapped)})", "swapped arguments"
