@@ -25,7 +25,7 @@ from apc.eigen.balls import precision
 from tests.bruteforce import Scene, as_ball, frame_matrix
 from tests.fifty_digits.truth import RIGID, spectral_truth
 from tests.reference import OPERATORS, RADII
-from tests.topologies import ONE_MASS, ROOT, compiled
+from tests.topologies import ONE_MASS, OSCILLATOR, ROOT, compiled
 
 TRANSLATING = "stable up to a common translation"
 STORED: dict[str, dict[str, Any]] = json.loads((ROOT / "tests" / "hard" / "truths.json").read_text("utf-8"))
@@ -104,13 +104,6 @@ def _closed(name: str, text: str, radius: Callable[[], Any], rigid: int, verdict
     return Case(name, "closed", lambda: compiled(text), tell)
 
 
-OSCILLATOR = """\
-topology: oscillator
-peers: {user: {count: 1}}
-masses: {device: {mass: 1 kg}}
-couplers: {s: {type: SpringDamper, a: device, b: ground, stiffness: STIFFNESS N/m, damping: DAMPING N*s/m}}
-"""
-
 CLOSED = [
     # m dv/dt = −b v over the frame of 1 s of a scene without clocks; a position that nothing holds.
     _closed("a damped mass", ONE_MASS, lambda: (-flint.arb(3) / 2).exp(), 1, TRANSLATING),
@@ -124,14 +117,14 @@ CLOSED = [
     # m x″ + d x′ + k x = 0: |e^{sT}| = e^{−dT/(2m)} where it swings, critically damped or not.
     _closed(
         "a swing",
-        OSCILLATOR.replace("STIFFNESS", "40000").replace("DAMPING", "3"),
+        OSCILLATOR.format(stiffness=40000, damping=3),
         lambda: (-flint.arb(3) / 2).exp(),
         0,
         "stable",
     ),
     _closed(
         "critically damped",
-        OSCILLATOR.replace("STIFFNESS", "4").replace("DAMPING", "4"),
+        OSCILLATOR.format(stiffness=4, damping=4),
         lambda: flint.arb(-2).exp(),
         0,
         "stable",
@@ -139,7 +132,7 @@ CLOSED = [
     # An undamped swing lies on the circle, exactly: nobody can tell.
     _closed(
         "on the circle",
-        OSCILLATOR.replace("STIFFNESS", "9").replace("DAMPING", "0"),
+        OSCILLATOR.format(stiffness=9, damping=0),
         lambda: flint.arb(1),
         0,
         "undecided: |ρ−1| below the error bound",

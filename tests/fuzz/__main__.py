@@ -53,7 +53,7 @@ def main() -> int:
     if options.models:
         wrong |= _forged(options.models, options.seed, options.out)
     if options.scenes:
-        from tests.test_properties import check_scenes
+        from tests.lifting.test_frame import check_scenes
 
         check_scenes(options.scenes)
         print(f"{options.scenes} scenes agree with brute force")

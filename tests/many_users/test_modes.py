@@ -1,0 +1,216 @@
+"""Many users as few small systems, by groups, graphs, columns: against all of them stepped by hand."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+
+from apc.analysis.analysis import lifted_groups
+from apc.compiler.compiled import CompiledSystem
+from apc.eigen.closing import close_loop
+from apc.eigen.modes import dense, dense_loop, split, split_exchangeable
+from tests.bruteforce import Scene, frame_matrix
+from tests.pairing import apart
+from tests.sites import MS, columned, grouped, linked, paper
+
+PAIRS = {("left", "right"): 12 * MS, ("right", "left"): 3 * MS, ("right", "right"): 8 * MS}
+
+
+def _split(system: CompiledSystem) -> np.ndarray:
+    """Return all eigenvalues of the split system, each as often as it counts."""
+    systems = split(*lifted_groups(system)).systems
+    return np.concatenate([np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in systems])
+
+
+def _check(system: CompiledSystem, scene: Scene, bound: float = 1e-11) -> None:
+    """Assert that the split system and the whole have the spectrum of the peers stepped one by one."""
+    expected = np.linalg.eigvals(np.array(frame_matrix(scene)))
+    assert apart(_split(system), expected) < bound
+    assert apart(np.linalg.eigvals(dense(*lifted_groups(system)).matrix), expected) < bound
+
+
+@pytest.mark.parametrize("peers", [2, 3, 8, 20])
+def test_common_and_difference_modes_are_the_whole_spectrum(peers: int) -> None:
+    operator = "mean" if peers % 2 else "sum"
+    gains = GAINS if operator == "mean" else {**GAINS, "kt": 800.0 / peers, "bt": 2.0 / peers}
+    _check(paper(operator, peers=peers, **gains), Scene(operator, peers, **gains))
+
+
+GAINS = {"kt": 800.0, "bt": 2.0, "kc": 1500.0, "bc": 2.0}
+
+
+def _arcs(name: str, peers: int) -> list[tuple[int, int, float]]:
+    """Return graphs as (sender, receiver, weight): by hand what `ring` and `star` mean, and others."""
+    both = {
+        "ring": [(i, (i + 1) % peers, 1.0) for i in range(peers)],
+        "star": [(0, i, 1.0) for i in range(1, peers)],
+        "path": [(i, i + 1, 0.5 + i) for i in range(peers - 1)],
+        "two pairs": [(0, 1, 1.0), (2, 3, 1.0)],
+    }
+    if name in both:
+        return sorted({arc for i, j, w in both[name] for arc in ((i, j, w), (j, i, w))})
+    return {
+        "cycle": [(i, (i + 1) % peers, 0.7) for i in range(peers)],
+        "one way": [(i, i + 1, 1.0) for i in range(peers - 1)],
+        "apart": [(0, 1, 2.0), (1, 0, 2.0), (0, 2, -0.5), (3, 2, 1.5), (2, 3, 1.0)],
+    }[name]
+
+
+def test_groups_that_differ_in_nothing_that_moves_are_one() -> None:
+    system = grouped(paper(), ("left", 2, {"device.x.start": 0.1}), ("right", 1, {"hand.force": 2.0}))
+    [group], exchange = lifted_groups(system)
+    assert (group.name, group.count) == ("left+right", 3)
+    assert [one.name for one in split([group], exchange).systems] == ["common", "difference"]
+
+
+@pytest.mark.few(6)
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+@pytest.mark.parametrize("peers", [2, 3, 4, 5])
+@pytest.mark.parametrize("shape", ["ring", "star"])
+def test_equal_peers_on_a_ring_or_star_are_one_small_system_an_eigenvalue(
+    shape: str, peers: int, operator: str
+) -> None:
+    gains = {**GAINS, "kt": 300.0}
+    system = linked(paper(operator, peers=peers, **gains), shape)
+    found = split(*lifted_groups(system))
+    assert (found.method, {len(one.matrix) for one in found.systems}) == ("modes", {8})
+    _check(system, Scene(operator, peers, weights={(i, j): w for i, j, w in _arcs(shape, peers)}, **gains))
+
+
+@pytest.mark.parametrize(
+    ("name", "operator", "method"),
+    [
+        ("path", "mean", "modes"),
+        ("two pairs", "mean", "modes"),
+        ("cycle", "sum", "modes"),
+        ("apart", "mean", "modes"),
+        ("one way", "sum", "dense"),  # nilpotent: no full set of eigenvectors
+    ],
+)
+def test_equal_peers_on_any_graph_have_the_spectrum_of_all_of_them(
+    name: str, operator: str, method: str
+) -> None:
+    arcs = _arcs(name, 4)
+    system = linked(paper(operator, peers=4, **GAINS), arcs)
+    assert split(*lifted_groups(system)).method == method
+    # A defective eigenvalue scatters by the root of its rounding, four peers deep.
+    scene = Scene(operator, 4, weights={(i, j): weight for i, j, weight in arcs}, **GAINS)
+    _check(system, scene, 1e-10 if method == "modes" else 2e-3)
+
+
+@pytest.mark.parametrize(
+    ("masses", "modes"),
+    [
+        ([0.1, 0.2, 0.15, 0.3], [("dense", 1)]),
+        ([0.1, 0.2, 0.1, 0.3], [("common", 1), ("difference user[1,3]", 1)]),  # who hear the same two
+    ],
+)
+def test_different_peers_on_a_ring_move_alike_or_apart_where_they_can_change_places(
+    masses: list[float], modes: list[tuple[str, int]]
+) -> None:
+    system = columned(linked(paper(peers=4, **GAINS), "ring"), device__mass=masses)
+    weights = {(i, j): weight for i, j, weight in _arcs("ring", 4)}
+    _check(system, Scene(peers=4, weights=weights, users=tuple({"device": m} for m in masses), **GAINS))
+    found = split(*lifted_groups(system))
+    assert [(one.name, one.multiplicity) for one in found.systems] == modes
+
+
+def test_peers_that_differ_one_by_one_are_grouped_by_what_they_share() -> None:
+    masses = [0.1, 0.2, 0.1, 0.1, 0.2]
+    system = columned(
+        paper(peers=5, **GAINS),
+        device__mass=masses,
+        contact__damping=[2.0] * 5,
+        hand__force=[1.0, 2, 3, 4, 5],
+    )
+    groups, exchange = lifted_groups(system)
+    assert [(one.name, one.count, one.peers.tolist()) for one in groups] == [
+        ("user[1,3,4]", 3, [0, 2, 3]),
+        ("user[2,5]", 2, [1, 4]),
+    ]
+    assert [one.multiplicity for one in split(groups, exchange).systems] == [1, 2, 1]
+    _check(system, Scene(peers=5, users=tuple({"device": mass} for mass in masses), **GAINS))
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+@pytest.mark.parametrize("graph", ["complete", "ring"])
+@pytest.mark.parametrize(
+    "delays",
+    [PAIRS, {("left", "left"): Fraction(0), ("left", "right"): 4 * MS}, {("left", "right"): 8 * MS}],
+)
+def test_pairs_of_groups_may_have_delays_of_their_own(
+    operator: str, graph: str, delays: dict[tuple[str, str], Fraction]
+) -> None:
+    gains = {**GAINS, "kt": 200.0}
+    base = grouped(paper(operator, **gains), ("left", 2, {}), ("right", 2, {}))
+    system = linked(base, graph, delays=delays)
+    names = ["left", "left", "right", "right"]
+    late = {(i, j): delays.get((names[i], names[j]), 8 * MS) for i in range(4) for j in range(4)}
+    weights = {(i, j): w for i, j, w in _arcs("ring", 4)} if graph == "ring" else None
+    # A delay equal to the usual one is none of its own.
+    assert len(lifted_groups(system)[0]) == (1 if set(delays.values()) == {8 * MS} else 2)
+    _check(system, Scene(operator, 4, weights=weights, late=late, **gains))
+
+
+# A path of four with a fork at either end: 0 and 1 are twins, and 4 and 5.
+FORKED = [(0, 2), (1, 2), (2, 3), (3, 4), (3, 5)]
+
+
+ARCS = [(a, b, 1.0) for pair in FORKED for a, b in (pair, pair[::-1])]
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+@pytest.mark.parametrize(
+    ("graph", "sizes"), [("star", [2, 1]), (ARCS, [4, 1, 1]), ("ring", [6]), ("complete", [2, 1])]
+)
+def test_the_loops_have_together_the_spectrum_of_the_whole(
+    operator: str, graph: Any, sizes: list[int]
+) -> None:
+    first = ("first", 1, {"device.mass": 0.25}) if graph in ("star", "complete") else ("first", 1, {})
+    base = grouped(paper(operator, kt=300.0, bt=1.0, kc=800.0), first, ("others", 5, {}))
+    groups, exchange = lifted_groups(linked(base, graph))
+    whole = dense_loop(groups, exchange)
+    loops = split_exchangeable(whole, exchange)
+    assert [len(loop.sites) for loop in loops] == sizes
+    together = [
+        np.linalg.eigvals(close_loop(loop).matrix) for loop in loops for _ in range(loop.multiplicity)
+    ]
+    expected, found = np.linalg.eigvals(close_loop(whole).matrix), np.concatenate(together)
+    assert len(found) == len(expected)
+    for value in expected[np.abs(expected) > 0.1]:
+        near = np.abs(found - value) < 1e-9
+        assert near.sum() == (np.abs(expected - value) < 1e-9).sum()
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize("peers", [2, 3, 5, 20])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"comp": Fraction(0), "comm": Fraction(0)},
+        {"comm": 11 * MS, "comp": MS * 2 / 5},
+        {"own_delay": True},
+    ],
+)
+def test_full_mesh_is_the_average_with_gains_times_the_others(peers: int, values: dict[str, Any]) -> None:
+    others = peers - 1
+    gains = {"kc": 1500.0, "bc": 2.0}
+    mesh = paper("sum", peers=peers, kt=900.0 / others, bt=3.0 / others, **gains, **values)
+    mean = paper("mean", peers=peers, kt=900.0, bt=3.0, **gains, **values)
+    for one, other in zip(
+        split(*lifted_groups(mesh)).systems, split(*lifted_groups(mean)).systems, strict=True
+    ):
+        size = np.abs(other.matrix).max()
+        np.testing.assert_allclose(one.matrix, other.matrix, rtol=1e-12, atol=1e-12 * size)
+        assert apart(np.linalg.eigvals(one.matrix), np.linalg.eigvals(other.matrix)) < 1e-12
+
+
+def test_minus_zero_and_zero_are_one_number() -> None:
+    groups, _ = lifted_groups(columned(paper(), contact__damping=[0.0, -0.0, 1.0]))
+    assert [one.count for one in groups] == [2, 1]

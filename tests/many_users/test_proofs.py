@@ -1,0 +1,128 @@
+"""What is called proved is proved: in balls, with as many bits as it takes, or left open."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import casadi
+import flint
+import numpy as np
+import pytest
+
+from apc.analysis.analysis import Analysis, analyze, lifted_groups
+from apc.compiler.compiled import CompiledSystem
+from apc.eigen.balls import (
+    Dual,
+    frame_balls,
+    precision,
+    step_duals,
+    unprovable,
+)
+from apc.eigen.modes import dense, split
+from tests.sites import MS, alone, columned, grouped, linked, paper
+
+TRANSLATING = "stable up to a common translation"
+
+
+def _certified(system: CompiledSystem) -> Analysis:
+    return analyze(system, certify=True)
+
+
+@pytest.mark.parametrize(
+    ("system", "verdict", "proof"),
+    [
+        (paper(), TRANSLATING, "proved stable with 256 bits"),
+        (paper(kt=1200.0), "unstable", "proved unstable with 256 bits"),
+        (paper(peers=1, operator="sum"), TRANSLATING, "proved stable with 256 bits"),
+        (linked(paper(peers=8), "ring"), TRANSLATING, "proved stable with 256 bits"),  # cos 45° is irrational
+        (linked(paper(peers=6), "star"), TRANSLATING, "proved stable with 256 bits"),
+        (alone(), "stable", "proved stable with 256 bits"),
+    ],
+)
+def test_a_verdict_that_floats_know_is_proved_when_asked_for(
+    system: CompiledSystem, verdict: str, proof: str
+) -> None:
+    plain, certified = analyze(system), _certified(system)
+    assert plain.proof == ""
+    assert plain.verdict == certified.verdict == verdict
+    assert certified.proof == proof
+    assert abs(plain.spectral_radius - certified.spectral_radius) <= plain.spectral_radius_error
+    assert certified.spectral_radius_error < 1e-15
+
+
+def _undamped(**values: Any) -> CompiledSystem:
+    system = paper(**values)
+    return grouped(system, ("user", system.peers, {"device.damping": 0.0, "cube.damping": 0.0}))
+
+
+def test_a_drift_is_told_from_a_translation_by_proof() -> None:
+    found = _certified(_undamped(kt=0.0, bt=0.0, kc=0.0))
+    assert found.verdict == "drifts"
+    assert found.proof.startswith("proved to drift")
+    assert found.rigid_modes == 6
+
+
+def test_what_is_rounded_is_not_called_proved() -> None:
+    found = _certified(alone(lambda x, u: -casadi.sin(x)))
+    assert found.proof == ""
+    assert found.notes == (
+        "single: not proved, as the equations of peer hold functions whose values are rounded",
+    )
+
+
+def test_more_bits_are_taken_as_long_as_they_decide() -> None:
+    """At the last float below a boundary, 1 − ρ is 1e-16 or less: too near for floats, not for a proof."""
+    low, high = 900.0, 1200.0
+    while np.nextafter(low, high) < high:
+        middle = (low + high) / 2
+        low, high = (middle, high) if analyze(paper(kc=1000.0, kt=middle)).stable else (low, middle)
+    below, above = (analyze(paper(kc=1000.0, kt=kt)) for kt in (low, high))
+    assert (below.stable, above.stable) == (True, False)
+    assert below.proof.startswith("decided with") or below.proof.startswith("proved stable")
+    assert above.proof.startswith("proved unstable")
+    assert abs(low - 1096.411) < 6e-4  # the reference limit of K_T at K_C = 1000
+
+
+SCENES = [
+    paper(),
+    paper("sum", own_delay=True, comp=MS * 5 / 2, comm=11 * MS, bt=1.0, bc=2.0),
+    paper(comp=Fraction(0), comm=Fraction(0)),
+    paper(network=3 * MS, haptic=2 * MS, haptic_phase=MS / 3, network_phase=MS / 2, comm=5 * MS),
+    grouped(paper(), ("left", 2, {"device.mass": 0.2}), ("right", 3, {"contact.stiffness": 100.0})),
+    linked(paper(peers=7), "ring"),
+    linked(paper(peers=4), [(0, 1, 0.5), (1, 2, 2.0), (2, 3, 1.0), (3, 0, 0.25), (1, 0, 0.75)]),
+    columned(paper(), device__mass=[0.1, 0.2, 0.15]),
+]
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize("system", SCENES)
+def test_the_matrix_in_balls_is_the_matrix_in_floats_within_its_error(system: CompiledSystem) -> None:
+    groups, exchange = lifted_groups(system)
+    for closed in (*split(groups, exchange).systems, dense(groups, exchange)):
+        assert unprovable(closed) == ""
+        with precision(200):
+            matrix = frame_balls(closed)
+            middle = [
+                float(abs((flint.arb(entry) - value).mid()))
+                for entry, value in zip(matrix.ravel(), closed.matrix.ravel().tolist(), strict=True)
+            ]
+            known = not any(way not in closed.surds for way in closed.doubts if closed.doubts[way])
+            radii = max(float(flint.arb(entry).rad()) for entry in matrix.ravel())
+        assert np.all(np.array(middle).reshape(closed.matrix.shape) <= closed.error + 1e-300)
+        assert radii < (1e-45 if known else 1e-9)
+
+
+def test_the_slope_over_a_ball_holds_every_parameter_s_slope() -> None:
+    """F = e^(−b T) over b from 2 to 4: −T e^(−b T) of each."""
+    with precision(150):
+        b, t = flint.arb(3, 1), flint.arb(flint.fmpq(1, 10))
+        step = step_duals(
+            np.array([[Dual(-b, flint.arb(-1))]], dtype=object),
+            np.zeros((1, 0), dtype=object),
+            Fraction(1, 10),
+        )
+        for one in (2, 2.5, 3.75, 4):
+            exact = -t * (-flint.arb(one) * t).exp()
+            assert step[0, 0].slope.contains(exact)

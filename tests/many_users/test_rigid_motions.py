@@ -1,0 +1,147 @@
+"""What nothing holds back and what drifts: told exactly, whatever the numbers, and never by a tolerance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+
+from apc.analysis.analysis import analyze, lifted_groups
+from apc.compiler.compiled import CompiledSystem
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.modes import dense, split
+from apc.eigen.rigid import find_rigid_modes, rigid_modes_before
+from apc.eigen.spectrum import solve_spectrum
+from apc.large.translation import count_translations
+from tests.populations import crowded, different
+from tests.sites import MS, columned, grouped, paper
+
+
+def _closed(system: CompiledSystem) -> Sequence[ClosedSystem]:
+    return split(*lifted_groups(system)).systems
+
+
+def _undamped(**values: Any) -> CompiledSystem:
+    system = paper(**values)
+    return grouped(system, ("user", system.peers, {"device.damping": 0.0, "cube.damping": 0.0}))
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"kt": 0.0, "bt": 0.0}, [1, 1]),  # nothing ties the peers
+        ({"kt": 0.0, "bt": 2.0}, [1, 1]),  # a damper holds no position
+        ({"kt": 0.0, "bt": 2.0, "kc": 0.0}, [2, 2]),  # device and cube apart
+        ({"kt": 1e-300}, [1, 0]),  # the weakest spring holds
+        ({"kc": 1e-300}, [1, 0]),
+        ({"kc": 0.0}, [2, 1]),
+    ],
+)
+def test_a_stiffness_of_exactly_zero_frees_what_it_held(
+    values: dict[str, float], expected: list[int]
+) -> None:
+    found = [find_rigid_modes(system).directions.shape[1] for system in _closed(paper(**values))]
+    assert found == expected
+
+
+FREED: list[dict[str, Any]] = [
+    {},
+    {"kt": 0.0, "bt": 2.0},
+    {"kt": 0.0, "bt": 2.0, "kc": 0.0},
+    {"kc": 0.0},
+    {"operator": "sum"},
+    {"kt": 1e-300},
+]
+
+
+@pytest.mark.few(7)
+@pytest.mark.parametrize("then", FREED, ids=str)
+@pytest.mark.parametrize("first", FREED, ids=str)
+def test_what_was_rigid_before_is_only_taken_where_it_stands_still(
+    first: dict[str, Any], then: dict[str, Any]
+) -> None:
+    """Whatever was analysed before: nothing is removed that moves, and all is that stands still."""
+    for one in _closed(paper(**first)):
+        rigid_modes_before(one)
+    for one in _closed(paper(**then)):
+        taken = rigid_modes_before(one)
+        there = find_rigid_modes(one, with_drifts=False).exact
+        assert set(taken.exact) <= set(there) or _spans(there, taken.exact)
+    told = solve_spectrum(_closed(paper(**then)))
+    assert told.rigid_modes == sum(
+        one.multiplicity * find_rigid_modes(one).directions.shape[1] for one in _closed(paper(**then))
+    )
+
+
+def _spans(there: Sequence[Sequence[Fraction]], some: Sequence[Sequence[Fraction]]) -> bool:
+    columns = np.array(there, dtype=float), np.array([*there, *some], dtype=float)
+    return bool(np.linalg.matrix_rank(columns[0]) == np.linalg.matrix_rank(columns[1]))
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"kt": 0.0, "bt": 0.0}, [1, 1]),
+        ({"kt": 0.0, "bt": 2.0}, [1, 0]),  # apart, the damper brakes
+        ({"kt": 0.0, "bt": 2.0, "own_delay": True, "comp": MS}, [1, 0]),
+        ({"kt": 0.0, "bt": 2.0, "operator": "sum", "comm": 11 * MS}, [1, 0]),
+        ({"kt": 100.0, "bt": 2.0}, [0, 0]),  # the late network brakes, see Facts: K_eff((T_n − T_c)/2 + T_d)
+        ({"kt": 0.0, "bt": 0.0, "kc": 0.0}, [2, 2]),
+    ],
+)
+def test_undamped_peers_drift_as_far_as_nothing_brakes_them(
+    values: dict[str, Any], expected: list[int]
+) -> None:
+    for system, drifts in zip(_closed(_undamped(**values)), expected, strict=True):
+        rigid = find_rigid_modes(system)
+        assert rigid.drifts == drifts
+        # A Jordan pair: M w − w lies in the span of the directions and does not vanish.
+        for vector in rigid.generalized.T:
+            step = system.matrix @ vector - vector
+            part = np.linalg.lstsq(rigid.directions, step, rcond=None)[0]
+            assert np.abs(rigid.directions @ part - step).max() < 1e-12
+            assert np.abs(step).max() > 1e-4
+
+
+def test_groups_and_the_dense_system_have_the_same_rigid_modes() -> None:
+    system = grouped(
+        paper(kt=0.0), ("left", 2, {"device.mass": 0.2}), ("right", 3, {"contact.stiffness": 0.0})
+    )
+    groups, exchange = lifted_groups(system)
+    counted = sum(
+        one.multiplicity * find_rigid_modes(one).directions.shape[1]
+        for one in split(groups, exchange).systems
+    )
+    assert counted == find_rigid_modes(dense(groups, exchange)).directions.shape[1] == 2 + 3 * 2
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+@pytest.mark.parametrize(
+    ("values", "expected"), [({}, 1), ({"kt": 0.0}, 6), ({"kc": 0.0}, 7), ({"kc": 0.0, "kt": 0.0}, 12)]
+)
+def test_motions_are_counted_as_for_the_whole_matrix(
+    operator: str, values: dict[str, float], expected: int
+) -> None:
+    system = different(6, operator, **values)
+    whole = find_rigid_modes(dense(*lifted_groups(system)))
+    assert count_translations(*crowded(system)) == expected == whole.directions.shape[1]
+
+
+def test_a_motion_that_one_peer_does_not_share_is_not_told() -> None:
+    contacts = [1000.0] * 5
+    free = columned(paper(peers=5), contact__stiffness=[0.0, *contacts[1:]])
+    assert count_translations(*crowded(free)) is None
+
+
+def test_every_verdict_says_what_it_says() -> None:
+    assert analyze(paper()).verdict == "stable up to a common translation"
+    assert analyze(paper(kc=2500.0)).verdict == "unstable"
+    drifting = analyze(_undamped(kt=0.0, bt=2.0, bc=2.0, comp=Fraction(0)))
+    assert (drifting.verdict, drifting.stable) == ("drifts", False)
+    assert drifting.spectral_radius < 1
+    shaking = analyze(_undamped(kt=0.0, bt=0.0, kc=3000.0))
+    assert (shaking.verdict, shaking.stable) == ("unstable", False)
