@@ -7,15 +7,11 @@ from fractions import Fraction
 from typing import Any
 
 import casadi
-import flint
 import numpy as np
 import pytest
 
 from apc.compiler import plain
-from apc.eigen.balls import precision, rational_ball
-from apc.eigen.ratios import Ratios
-from apc.frame.exact import ROWS, evaluate_exact, is_rational
-from apc.frame.residues import PRIMES, residues_of
+from apc.frame.exact import ROWS, evaluate_exact
 
 
 def _function(build: Any, size: int = 2) -> casadi.Function:
@@ -49,15 +45,6 @@ def test_every_operation_is_the_same_in_every_kind_of_number(word: str) -> None:
             assert np.imag(found)[0] / 1e-60 == pytest.approx(derivative, rel=1e-14)
 
 
-def test_what_is_rounded_over_rationals_is_told() -> None:
-    assert is_rational(_function(lambda x: casadi.if_else(x[0] < 2, x[0] ** 3 / x[1], x[0] ** -2)))
-    assert not is_rational(_function(lambda x: x[0] ** 0.3 + x[1]))
-    assert not is_rational(_function(lambda x: x[0] ** x[1]))
-    assert not is_rational(_function(lambda x: casadi.sqrt(x[0]) + x[1]))
-    x = casadi.MX.sym("x", 2)
-    assert not is_rational(casadi.Function("f", [x], [x * x]))
-
-
 def _squared(x: Any, times: int) -> Any:
     return x if times == 0 else _squared(x * x, times - 1)
 
@@ -73,41 +60,3 @@ def _squared(x: Any, times: int) -> Any:
 def test_a_number_of_digits_without_end_is_no_number(build: Any) -> None:
     with pytest.raises(OverflowError, match="a number of more than 1048576 bits"):
         evaluate_exact(_function(build), [[Fraction(1, 3), Fraction(2)]])
-
-
-def test_a_ratio_is_the_function_at_every_point() -> None:
-    """(a + 2b)³/(a − b) − 1/b, its value and slopes, by hand in fractions at a few points."""
-    field = Ratios.of(2)
-    a, b = field.parameter(0), field.parameter(1)
-    ratio = (a + 2 * b) ** 3 / (a - b) - 1 / b
-    with precision(200):
-        for x, y in (
-            (Fraction(3), Fraction(1, 7)),
-            (Fraction(-5, 2), Fraction(4)),
-            (Fraction(1, 3), Fraction(-2)),
-        ):
-            s, d = x + 2 * y, x - y
-            by_a = 3 * s**2 / d - s**3 / d**2
-            by_b = 6 * s**2 / d + s**3 / d**2 + 1 / y**2
-            point = [rational_ball(x) + flint.arb(0), rational_ball(y) + flint.arb(0)]
-            for found, exact in ((ratio, s**3 / d - 1 / y), (ratio.slope(0), by_a), (ratio.slope(1), by_b)):
-                assert found.at(point).contains(flint.fmpq(exact.numerator, exact.denominator))
-
-
-FIRST = np.array([0.1, -2.5, 1e-300, 1e300, 3.0, 0.0])
-
-
-SECOND = np.array([0.3, 1e-17, -7.0, 0.125, 1 / 3, 5.0])
-
-
-def _reduced(value: Fraction, prime: int) -> int:
-    return value.numerator * pow(value.denominator, -1, prime) % prime
-
-
-@pytest.mark.parametrize("prime", PRIMES)
-def test_residues_are_those_of_the_exact_rationals(prime: int) -> None:
-    a, b = residues_of(FIRST, prime), residues_of(SECOND, prime)
-    found = ((a + b) * 3 - a / b + 1 / b - (Fraction(1, 7) - a)).column
-    for value, one, other in zip(found.tolist(), FIRST.tolist(), SECOND.tolist(), strict=True):
-        x, y = Fraction(one), Fraction(other)
-        assert value == _reduced((x + y) * 3 - x / y + 1 / y - (Fraction(1, 7) - x), prime)

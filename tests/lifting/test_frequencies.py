@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from fractions import Fraction
 
-import numpy as np
 import pytest
 
 from apc.analysis.analysis import analyze
-from apc.frame.course import followed_closely
 from tests.sites import paper
 from tests.topologies import OSCILLATOR, compiled
 
@@ -63,19 +61,6 @@ def test_what_is_gone_within_a_frame_has_no_frequency_rather_than_a_wrong_one() 
     found = analyze(compiled(OSCILLATOR.format(**numbers(10.0, 0.5))))
     assert all(math.isnan(mode.frequency_hz) and math.isnan(mode.damping_ratio) for mode in found.modes)
     assert [mode["frequency_hz"] for mode in found.to_dict()["modes"]] == [None, None]
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0])
-@pytest.mark.parametrize(("distance", "known"), [(0.1, True), (1e-3, True), (1e-9, False)])
-def test_a_course_that_rounding_may_lead_past_zero_on_either_side_is_not_known(
-    side: float, distance: float, known: bool
-) -> None:
-    """From −1 to 1 past 0, and on by half a turn; a vector of an eigenvalue is hardly right to 1e-9."""
-    time = np.linspace(-1, 1, 17)[:, None]
-    course = time + 1j * side * distance * (1 - time**2)
-    angle, told = followed_closely(course, np.array([1.0 + 1e-12j]))
-    assert told == [known]
-    assert angle == pytest.approx([-side * math.pi], rel=1e-12)
 
 
 def test_modes_of_a_directed_graph_that_are_real_but_for_rounding_have_no_frequency() -> None:

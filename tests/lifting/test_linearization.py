@@ -10,27 +10,10 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.eigen.modes import dense, split
 from tests.bruteforce import Scene, frame_matrix
-from tests.pairing import apart
+from tests.pairing import apart, arcs_of
 from tests.sites import columned, edged, linked, paper
 
 GAINS = {"kt": 800.0, "bt": 2.0, "kc": 1500.0, "bc": 2.0}
-
-
-def _arcs(name: str, peers: int) -> list[tuple[int, int, float]]:
-    """Return graphs as (sender, receiver, weight): by hand what `ring` and `star` mean, and others."""
-    both = {
-        "ring": [(i, (i + 1) % peers, 1.0) for i in range(peers)],
-        "star": [(0, i, 1.0) for i in range(1, peers)],
-        "path": [(i, i + 1, 0.5 + i) for i in range(peers - 1)],
-        "two pairs": [(0, 1, 1.0), (2, 3, 1.0)],
-    }
-    if name in both:
-        return sorted({arc for i, j, w in both[name] for arc in ((i, j, w), (j, i, w))})
-    return {
-        "cycle": [(i, (i + 1) % peers, 0.7) for i in range(peers)],
-        "one way": [(i, i + 1, 1.0) for i in range(peers - 1)],
-        "apart": [(0, 1, 2.0), (1, 0, 2.0), (0, 2, -0.5), (3, 2, 1.5), (2, 3, 1.0)],
-    }[name]
 
 
 def _cubic_pairs(starts: list[float], cubic: float) -> dict[tuple[int, int], float]:
@@ -50,7 +33,7 @@ def _cubic_pairs(starts: list[float], cubic: float) -> dict[tuple[int, int], flo
 @pytest.mark.parametrize("starts", [[0.0, 0.0, 0.0, 0.0], [0.01, 0.02, 0.05, 0.02]])
 def test_an_edge_function_is_linearized_pair_by_pair(operator: str, graph: str, starts: list[float]) -> None:
     base = edged(paper(operator, peers=4, **GAINS), operator, cubic=2e5)
-    arcs = None if graph == "complete" else _arcs(graph, 4)
+    arcs = None if graph == "complete" else arcs_of(graph, 4)
     system = columned(linked(base, arcs or "complete"), cube__x__start=starts)
     scene = Scene(
         operator,

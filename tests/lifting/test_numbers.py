@@ -8,20 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apc.__main__ import run
 from apc.compiler.compiled import PEERS, CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
 from apc.frame.names import (
     Free,
     find,
-    notes_for_all_groups,
 )
 from apc.frame.overrides import Override, apply, parse_override
 from apc.frame.parameters import resolve
-from apc.regions.axes import parse_axes
-from apc.regions.region import region
-from apc.vary.many import analyze_many
 from tests.sites import NAMES, columned, derived, grouped, paper
 from tests.topologies import SCENES, compiled, library
 
@@ -208,18 +203,3 @@ def test_what_depends_on_a_column_is_worked_out_peer_by_peer() -> None:
 def test_a_name_may_start_with_its_group_or_its_section(written: str, meant: Free) -> None:
     system = grouped(paper(), ("left", 1, {}), ("right", 2, {}))
     assert find(system, written) == meant
-
-
-def test_what_is_set_for_all_groups_says_what_each_of_them_has(capsys: pytest.CaptureFixture[str]) -> None:
-    """The star's teacher holds on with 400 N/m of its own, its students with the part's 100 N/m."""
-    told = (
-        "arm.stiffness is one value for all groups here; the scene has 400 N/m at teacher, 100 N/m at student"
-    )
-    star = compile_topology(SCENES / "star-lecture.yaml")
-    assert notes_for_all_groups(star, [Free("arm.stiffness"), Free("arm.damping")]) == [told]
-    assert not notes_for_all_groups(star, [Free("arm.stiffness", "student")])
-    assert told in analyze_many(star, {"arm.stiffness": [100.0, 400.0]}).left_out
-    axes = parse_axes(star, "arm.stiffness=90 N/m:110 N/m", "student.contact.stiffness=700 N/m:900 N/m")
-    assert told in region(star, axes, cells=2).left_out
-    assert run(["analyze", str(SCENES / "star-lecture.yaml"), "--set", "arm.stiffness=100 N/m"]) == 0
-    assert capsys.readouterr().err == f"note: {told}\n"

@@ -10,9 +10,8 @@ import pytest
 from scipy.linalg import expm
 
 from apc.analysis.paper import analyze_paper, paper_route
-from apc.compiler.errors import ApcError
 from tests.sites import paper
-from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced, told
+from tests.topologies import AVERAGE, MESH, compiled, replaced, told
 
 
 def test_the_shapes_are_the_papers() -> None:
@@ -44,28 +43,6 @@ def test_rows_and_columns_are_named() -> None:
     assert route.closed.columns[-1] == "user[3].mean(others.coordination.v)(-8 ms)"
     assert "B_D      96 × 51" in str(route)
     assert str(route.a).startswith("12 × 12: user[1].device.x … ")
-
-
-def test_the_blocks_are_the_exponentials_they_stand_for() -> None:
-    """x at tick j + 1 of the frame is e^{A(j+1)T} x(0) and, of a force at tick i, e^{A(j−i)T} ∫e^{As}ds B."""
-    route = paper_route(compiled(AVERAGE))
-    a, b, step = route.a.values, route.b.values, 0.001
-    block = expm(np.block([[a, b], [np.zeros((9, 21))]]) * step)[:12]
-    advance, force = block[:, :12], block[:, 12:]
-    powers = [np.linalg.matrix_power(advance, j) for j in range(9)]
-    for j in range(8):
-        rows = route.b_d.values[12 * j : 12 * j + 12]
-        assert route.a_d.values[12 * j : 12 * j + 12, 84:] == pytest.approx(powers[j + 1], abs=1e-14)
-        assert not route.a_d.values[12 * j : 12 * j + 12, :84].any()
-        for i in range(8):
-            expected = powers[j - i] @ force[:, :6] if i <= j else np.zeros((12, 6))
-            assert rows[:, 6 * i : 6 * i + 6] == pytest.approx(expected, abs=1e-14)
-        slow = sum((powers[i] for i in range(j + 1)), np.zeros((12, 12))) @ force[:, 6:]
-        assert rows[:, 48:] == pytest.approx(slow, abs=1e-14)
-    # Outputs are before inputs: tick 0 sees no force of its frame, and what is heard none at all.
-    assert not route.d_d.values[:12].any()
-    assert not route.d_d.values[96:].any()
-    assert route.d_d.values[12:24] == pytest.approx(route.b_d.values[:12], abs=0)
 
 
 def test_the_feedback_is_eqs_3_10_and_11_with_b_t_in_its_place() -> None:
@@ -104,12 +81,18 @@ def test_a_scene_of_another_form_is_told_what_is_missing(old: str, new: str, mis
     assert missing in message
 
 
-def test_a_scene_that_is_not_linear_or_has_two_clocks_of_forces_is_told_so() -> None:
-    [message] = told(paper_route, compiled((SCENES / "experiment-average.yaml").read_text()))
-    assert "E861" in message
-    assert "missing: linear equations (right and left is not linear)" in message
-    with pytest.raises(ApcError, match=r"one clock of forces \(here are haptic and slow\)"):
-        paper_route(compiled((SCENES / "mixed-clocks.yaml").read_text()))
-    alone = paper("sum", peers=1)
-    with pytest.raises(ApcError, match=r"one network clock \(here is none\)"):
-        paper_route(alone)
+def test_the_stacked_matrices_do_what_the_ticks_of_a_frame_do_one_by_one() -> None:
+    """Whatever the state and the forces, A_D x + B_D u holds the states after each tick in order."""
+    route = paper_route(compiled(AVERAGE))
+    step = expm(np.block([[route.a.values, route.b.values], [np.zeros((9, 21))]]) * 0.001)[:12]
+    generator = np.random.default_rng(3)
+    x, fast, slow = generator.normal(size=12), generator.normal(size=(8, 6)), generator.normal(size=3)
+    stacked = route.a_d.values[:, 84:] @ x + route.b_d.values @ np.concatenate([fast.ravel(), slow])
+    assert not route.a_d.values[:, :84].any()
+    for tick, forces in enumerate(fast):
+        x = step @ np.concatenate([x, forces, slow])
+        assert stacked[12 * tick : 12 * tick + 12] == pytest.approx(x, abs=1e-14)
+    # Outputs are before inputs: tick 0 sees no force of its frame, and what is heard none at all.
+    assert not route.d_d.values[:12].any()
+    assert not route.d_d.values[96:].any()
+    assert route.d_d.values[12:24] == pytest.approx(route.b_d.values[:12], abs=0)

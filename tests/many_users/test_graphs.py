@@ -24,10 +24,6 @@ def _graph(shape: str) -> Graph:
     return Graph(shape, COMPLETE.arcs, COMPLETE.weights)
 
 
-def _given(*listed: tuple[int, int, float]) -> Graph:
-    return Graph("arcs", np.array([arc[:2] for arc in listed]), np.array([arc[2] for arc in listed]))
-
-
 def _matrix(graph: Graph, peers: int, *, mean: bool) -> np.ndarray:
     matrix = np.zeros((peers, peers))
     for (sender, receiver), weight in zip(*arcs(graph, peers), strict=True):

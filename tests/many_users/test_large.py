@@ -24,12 +24,9 @@ from apc.eigen.graph_modes import ring_mode, ring_values
 from apc.eigen.modes import arrange, dense
 from apc.eigen.peer_group import used_ways
 from apc.eigen.spectrum import Spectrum
-from apc.frame.lift import BoundedMap, FrameMap
-from apc.large.characteristic import characteristic_ball
 from apc.large.determinant import of_populations
 from apc.large.determinant_spectrum import solve_populations
 from apc.large.rings import find_extremes
-from apc.large.transfer import build_transfer, respond
 from apc.large.translation import count_translations
 from apc.large.zeros import find_zeros
 from tests.populations import crowded, different
@@ -67,17 +64,6 @@ def test_different_peers_have_the_spectral_radius_of_their_whole_matrix(
     values = dict(values)
     system = different(peers, values.pop("operator", "mean"), **values)
     _agree(_solved(system), analyze(system, method="dense"))
-
-
-def test_the_function_stays_within_its_ball() -> None:
-    function, _ = of_populations(*crowded(different(6)))
-    points, reach = np.array([1.05, 0.9 + 0.6j, -1.0]), np.full(3, 1e-3)
-    centre = characteristic_ball(function, points, reach)
-    random = np.random.default_rng(0)
-    for _ in range(20):
-        there = points + reach * np.exp(2j * np.pi * random.random(3))
-        turned = characteristic_ball(function, there, np.zeros(3)).direction / centre.direction
-        assert np.all(np.abs(np.angle(turned)) <= np.arcsin(np.minimum(centre.change, 1.0)))
 
 
 def test_what_is_said_to_be_rigid_and_is_not_leaves_the_verdict_open() -> None:
@@ -185,57 +171,6 @@ def test_a_ring_of_a_hundred_thousand_peers_solves_a_handful_of_systems() -> Non
         "50,001 systems, one an eigenvalue of the graph of lan (ring): 2 of them are solved, "
         "all others are shown to die out faster",
     )
-
-
-def _sites(seed: int, *, error: float = 0.0, chain: int = 2) -> BoundedMap:
-    """Return sites with two slow pairs and a chain that runs empty, in units far apart."""
-    random = np.random.default_rng(seed)
-    k, n = 7, 4 + chain
-    m = np.zeros((k, n, n))
-    for site in m:
-        for place, angle in ((0, 0.3), (2, 1.1)):
-            size = 0.8 + 0.19 * random.random()
-            turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-            site[place : place + 2, place : place + 2] = size * turn
-        site[4 + np.arange(1, chain), 4 + np.arange(chain - 1)] = 1.0
-        mix = np.eye(n) + 0.2 * random.standard_normal((n, n))
-        site[:] = np.linalg.inv(mix) @ site @ mix
-    units = 10.0 ** random.integers(-3, 4, n)
-    m = m / units[:, None] * units
-    b, s = random.standard_normal((k, n, 2)) / units[:, None], random.standard_normal((k, 2, n)) * units
-    d = random.standard_normal((k, 2, 2))
-    maps = FrameMap(m, b, s, d)
-    return BoundedMap(*maps.blocks, maps.mapped(lambda block: error * np.abs(block)))
-
-
-def _answer(maps: FrameMap, counts: np.ndarray, point: complex) -> np.ndarray:
-    n = maps.p.shape[-1]
-    one = maps.d + maps.s @ np.linalg.solve(point * np.eye(n) - maps.p, maps.q.astype(complex))
-    return np.tensordot(counts, one, 1)
-
-
-POINTS = np.array([1.02, 0.9 + 0.5j, -1.1j, 3.0, 0.995 * np.exp(0.31j)])
-
-
-COUNTS = np.array([1.0, 2.0, 1.0, 5.0, 1.0, 1.0, 3.0])
-
-
-@pytest.mark.few(5)
-@pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize("reach", [0.0, 1e-4, 1e-3])
-def test_the_answer_is_within_its_bound_anywhere_in_the_disc(seed: int, reach: float) -> None:
-    maps = _sites(seed)
-    random = np.random.default_rng(seed)
-    transfer = build_transfer(maps, COUNTS)
-    found = respond([transfer], POINTS, np.full(len(POINTS), reach))
-    value, doubt = found.value, found.doubt
-    for point, centre, slope, bound in zip(POINTS, value, found.slope, doubt, strict=True):
-        for _ in range(6):
-            inside = point + reach * np.sqrt(random.random()) * np.exp(2j * np.pi * random.random())
-            # The truth itself is computed in floats, far better than the bound but for reach 0.
-            straight = centre + (inside - point) * slope
-            assert np.all(np.abs(_answer(maps, COUNTS, inside) - straight) <= bound + 1e-12 * np.abs(centre))
-    assert np.all(doubt <= 1e-7 * np.abs(value).max()) or reach
 
 
 LATE = replaced(AVERAGE, ("delay: 8 ms}", "delay: 40 ms}"))

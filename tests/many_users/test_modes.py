@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.analysis.analysis import lifted_groups
+from apc.analysis.analysis import analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import close_loop
 from apc.eigen.modes import dense, dense_loop, split, split_exchangeable
 from tests.bruteforce import Scene, frame_matrix
-from tests.pairing import apart
+from tests.pairing import apart, arcs_of
 from tests.sites import MS, columned, grouped, linked, paper
 
 PAIRS = {("left", "right"): 12 * MS, ("right", "left"): 3 * MS, ("right", "right"): 8 * MS}
@@ -42,23 +42,6 @@ def test_common_and_difference_modes_are_the_whole_spectrum(peers: int) -> None:
 GAINS = {"kt": 800.0, "bt": 2.0, "kc": 1500.0, "bc": 2.0}
 
 
-def _arcs(name: str, peers: int) -> list[tuple[int, int, float]]:
-    """Return graphs as (sender, receiver, weight): by hand what `ring` and `star` mean, and others."""
-    both = {
-        "ring": [(i, (i + 1) % peers, 1.0) for i in range(peers)],
-        "star": [(0, i, 1.0) for i in range(1, peers)],
-        "path": [(i, i + 1, 0.5 + i) for i in range(peers - 1)],
-        "two pairs": [(0, 1, 1.0), (2, 3, 1.0)],
-    }
-    if name in both:
-        return sorted({arc for i, j, w in both[name] for arc in ((i, j, w), (j, i, w))})
-    return {
-        "cycle": [(i, (i + 1) % peers, 0.7) for i in range(peers)],
-        "one way": [(i, i + 1, 1.0) for i in range(peers - 1)],
-        "apart": [(0, 1, 2.0), (1, 0, 2.0), (0, 2, -0.5), (3, 2, 1.5), (2, 3, 1.0)],
-    }[name]
-
-
 def test_groups_that_differ_in_nothing_that_moves_are_one() -> None:
     system = grouped(paper(), ("left", 2, {"device.x.start": 0.1}), ("right", 1, {"hand.force": 2.0}))
     [group], exchange = lifted_groups(system)
@@ -77,7 +60,7 @@ def test_equal_peers_on_a_ring_or_star_are_one_small_system_an_eigenvalue(
     system = linked(paper(operator, peers=peers, **gains), shape)
     found = split(*lifted_groups(system))
     assert (found.method, {len(one.matrix) for one in found.systems}) == ("modes", {8})
-    _check(system, Scene(operator, peers, weights={(i, j): w for i, j, w in _arcs(shape, peers)}, **gains))
+    _check(system, Scene(operator, peers, weights={(i, j): w for i, j, w in arcs_of(shape, peers)}, **gains))
 
 
 @pytest.mark.parametrize(
@@ -93,7 +76,7 @@ def test_equal_peers_on_a_ring_or_star_are_one_small_system_an_eigenvalue(
 def test_equal_peers_on_any_graph_have_the_spectrum_of_all_of_them(
     name: str, operator: str, method: str
 ) -> None:
-    arcs = _arcs(name, 4)
+    arcs = arcs_of(name, 4)
     system = linked(paper(operator, peers=4, **GAINS), arcs)
     assert split(*lifted_groups(system)).method == method
     # A defective eigenvalue scatters by the root of its rounding, four peers deep.
@@ -112,7 +95,7 @@ def test_different_peers_on_a_ring_move_alike_or_apart_where_they_can_change_pla
     masses: list[float], modes: list[tuple[str, int]]
 ) -> None:
     system = columned(linked(paper(peers=4, **GAINS), "ring"), device__mass=masses)
-    weights = {(i, j): weight for i, j, weight in _arcs("ring", 4)}
+    weights = {(i, j): weight for i, j, weight in arcs_of("ring", 4)}
     _check(system, Scene(peers=4, weights=weights, users=tuple({"device": m} for m in masses), **GAINS))
     found = split(*lifted_groups(system))
     assert [(one.name, one.multiplicity) for one in found.systems] == modes
@@ -150,7 +133,7 @@ def test_pairs_of_groups_may_have_delays_of_their_own(
     system = linked(base, graph, delays=delays)
     names = ["left", "left", "right", "right"]
     late = {(i, j): delays.get((names[i], names[j]), 8 * MS) for i in range(4) for j in range(4)}
-    weights = {(i, j): w for i, j, w in _arcs("ring", 4)} if graph == "ring" else None
+    weights = {(i, j): w for i, j, w in arcs_of("ring", 4)} if graph == "ring" else None
     # A delay equal to the usual one is none of its own.
     assert len(lifted_groups(system)[0]) == (1 if set(delays.values()) == {8 * MS} else 2)
     _check(system, Scene(operator, 4, weights=weights, late=late, **gains))
@@ -163,54 +146,29 @@ FORKED = [(0, 2), (1, 2), (2, 3), (3, 4), (3, 5)]
 ARCS = [(a, b, 1.0) for pair in FORKED for a, b in (pair, pair[::-1])]
 
 
-@pytest.mark.few(4)
-@pytest.mark.parametrize("operator", ["mean", "sum"])
-@pytest.mark.parametrize(
-    ("graph", "sizes"), [("star", [2, 1]), (ARCS, [4, 1, 1]), ("ring", [6]), ("complete", [2, 1])]
-)
-def test_the_loops_have_together_the_spectrum_of_the_whole(
-    operator: str, graph: Any, sizes: list[int]
-) -> None:
-    first = ("first", 1, {"device.mass": 0.25}) if graph in ("star", "complete") else ("first", 1, {})
-    base = grouped(paper(operator, kt=300.0, bt=1.0, kc=800.0), first, ("others", 5, {}))
-    groups, exchange = lifted_groups(linked(base, graph))
-    whole = dense_loop(groups, exchange)
-    loops = split_exchangeable(whole, exchange)
-    assert [len(loop.sites) for loop in loops] == sizes
-    together = [
-        np.linalg.eigvals(close_loop(loop).matrix) for loop in loops for _ in range(loop.multiplicity)
-    ]
-    expected, found = np.linalg.eigvals(close_loop(whole).matrix), np.concatenate(together)
-    assert len(found) == len(expected)
-    for value in expected[np.abs(expected) > 0.1]:
-        near = np.abs(found - value) < 1e-9
-        assert near.sum() == (np.abs(expected - value) < 1e-9).sum()
-
-
-@pytest.mark.few(4)
-@pytest.mark.parametrize("peers", [2, 3, 5, 20])
-@pytest.mark.parametrize(
-    "values",
-    [
-        {},
-        {"comp": Fraction(0), "comm": Fraction(0)},
-        {"comm": 11 * MS, "comp": MS * 2 / 5},
-        {"own_delay": True},
-    ],
-)
-def test_full_mesh_is_the_average_with_gains_times_the_others(peers: int, values: dict[str, Any]) -> None:
-    others = peers - 1
-    gains = {"kc": 1500.0, "bc": 2.0}
-    mesh = paper("sum", peers=peers, kt=900.0 / others, bt=3.0 / others, **gains, **values)
-    mean = paper("mean", peers=peers, kt=900.0, bt=3.0, **gains, **values)
-    for one, other in zip(
-        split(*lifted_groups(mesh)).systems, split(*lifted_groups(mean)).systems, strict=True
-    ):
-        size = np.abs(other.matrix).max()
-        np.testing.assert_allclose(one.matrix, other.matrix, rtol=1e-12, atol=1e-12 * size)
-        assert apart(np.linalg.eigvals(one.matrix), np.linalg.eigvals(other.matrix)) < 1e-12
-
-
 def test_minus_zero_and_zero_are_one_number() -> None:
     groups, _ = lifted_groups(columned(paper(), contact__damping=[0.0, -0.0, 1.0]))
     assert [one.count for one in groups] == [2, 1]
+
+
+@pytest.mark.parametrize(
+    ("graph", "sizes"), [("star", [2, 1]), (ARCS, [4, 1, 1]), ("ring", [6]), ("complete", [2, 1])]
+)
+def test_peers_that_can_change_places_on_a_graph_are_few_loops(graph: Any, sizes: list[int]) -> None:
+    own = ("first", 1, {"device.mass": 0.25 if graph in ("star", "complete") else 0.1})
+    system = linked(grouped(paper(kt=300.0, bt=1.0, kc=800.0), own, ("others", 5, {})), graph)
+    groups, exchange = lifted_groups(system)
+    whole = dense_loop(groups, exchange)
+    loops = split_exchangeable(whole, exchange)
+    assert [len(loop.sites) for loop in loops] == sizes
+    values = [np.linalg.eigvals(close_loop(loop).matrix) for loop in loops for _ in range(loop.multiplicity)]
+    assert apart(np.concatenate(values), np.linalg.eigvals(close_loop(whole).matrix)) < 1e-9
+
+
+@pytest.mark.parametrize("peers", [2, 5, 20])
+def test_full_mesh_is_the_average_with_gains_times_the_others(peers: int) -> None:
+    others = peers - 1
+    mesh = analyze(paper("sum", peers=peers, kt=900.0 / others, bt=3.0 / others, comm=11 * MS))
+    mean = analyze(paper("mean", peers=peers, kt=900.0, bt=3.0, comm=11 * MS))
+    assert mesh.spectral_radius == pytest.approx(mean.spectral_radius, abs=1e-12)
+    assert len(mesh.modes) == len(mean.modes)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from fractions import Fraction
 from typing import Any
 
-import casadi
 import flint
 import numpy as np
 import pytest
@@ -13,10 +12,8 @@ import pytest
 from apc.analysis.analysis import Analysis, analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.balls import (
-    Dual,
     frame_balls,
     precision,
-    step_duals,
     unprovable,
 )
 from apc.eigen.modes import dense, split
@@ -63,14 +60,6 @@ def test_a_drift_is_told_from_a_translation_by_proof() -> None:
     assert found.rigid_modes == 6
 
 
-def test_what_is_rounded_is_not_called_proved() -> None:
-    found = _certified(alone(lambda x, u: -casadi.sin(x)))
-    assert found.proof == ""
-    assert found.notes == (
-        "single: not proved, as the equations of peer hold functions whose values are rounded",
-    )
-
-
 def test_more_bits_are_taken_as_long_as_they_decide() -> None:
     """At the last float below a boundary, 1 − ρ is 1e-16 or less: too near for floats, not for a proof."""
     low, high = 900.0, 1200.0
@@ -112,17 +101,3 @@ def test_the_matrix_in_balls_is_the_matrix_in_floats_within_its_error(system: Co
             radii = max(float(flint.arb(entry).rad()) for entry in matrix.ravel())
         assert np.all(np.array(middle).reshape(closed.matrix.shape) <= closed.error + 1e-300)
         assert radii < (1e-45 if known else 1e-9)
-
-
-def test_the_slope_over_a_ball_holds_every_parameter_s_slope() -> None:
-    """F = e^(−b T) over b from 2 to 4: −T e^(−b T) of each."""
-    with precision(150):
-        b, t = flint.arb(3, 1), flint.arb(flint.fmpq(1, 10))
-        step = step_duals(
-            np.array([[Dual(-b, flint.arb(-1))]], dtype=object),
-            np.zeros((1, 0), dtype=object),
-            Fraction(1, 10),
-        )
-        for one in (2, 2.5, 3.75, 4):
-            exact = -t * (-flint.arb(one) * t).exp()
-            assert step[0, 0].slope.contains(exact)

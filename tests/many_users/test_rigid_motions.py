@@ -13,8 +13,7 @@ from apc.analysis.analysis import analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import dense, split
-from apc.eigen.rigid import find_rigid_modes, rigid_modes_before
-from apc.eigen.spectrum import solve_spectrum
+from apc.eigen.rigid import find_rigid_modes
 from apc.large.translation import count_translations
 from tests.populations import crowded, different
 from tests.sites import MS, columned, grouped, paper
@@ -45,40 +44,6 @@ def test_a_stiffness_of_exactly_zero_frees_what_it_held(
 ) -> None:
     found = [find_rigid_modes(system).directions.shape[1] for system in _closed(paper(**values))]
     assert found == expected
-
-
-FREED: list[dict[str, Any]] = [
-    {},
-    {"kt": 0.0, "bt": 2.0},
-    {"kt": 0.0, "bt": 2.0, "kc": 0.0},
-    {"kc": 0.0},
-    {"operator": "sum"},
-    {"kt": 1e-300},
-]
-
-
-@pytest.mark.few(7)
-@pytest.mark.parametrize("then", FREED, ids=str)
-@pytest.mark.parametrize("first", FREED, ids=str)
-def test_what_was_rigid_before_is_only_taken_where_it_stands_still(
-    first: dict[str, Any], then: dict[str, Any]
-) -> None:
-    """Whatever was analysed before: nothing is removed that moves, and all is that stands still."""
-    for one in _closed(paper(**first)):
-        rigid_modes_before(one)
-    for one in _closed(paper(**then)):
-        taken = rigid_modes_before(one)
-        there = find_rigid_modes(one, with_drifts=False).exact
-        assert set(taken.exact) <= set(there) or _spans(there, taken.exact)
-    told = solve_spectrum(_closed(paper(**then)))
-    assert told.rigid_modes == sum(
-        one.multiplicity * find_rigid_modes(one).directions.shape[1] for one in _closed(paper(**then))
-    )
-
-
-def _spans(there: Sequence[Sequence[Fraction]], some: Sequence[Sequence[Fraction]]) -> bool:
-    columns = np.array(there, dtype=float), np.array([*there, *some], dtype=float)
-    return bool(np.linalg.matrix_rank(columns[0]) == np.linalg.matrix_rank(columns[1]))
 
 
 @pytest.mark.parametrize(

@@ -67,21 +67,6 @@ def test_a_multiple_root_is_found_from_scattered_guesses(count: int) -> None:
     assert (np.abs(np.abs(centres[:count]) - 0.875) + radii[:count]).max() < 2.0**-40
 
 
-def test_coefficients_that_may_be_zero_are_roots_about_zero() -> None:
-    """z⁶ (z − 3/4), each lower coefficient known to 2⁻²⁰⁰ only: roots up to the sixth root of that."""
-    with precision(256):
-        low = flint.arb(0, 2.0**-200)
-        polynomial = flint.arb_poly([low] * 6 + [flint.arb(-0.75), flint.arb(1)])
-        centres, radii = root_discs(
-            polynomial, approach_roots(polynomial, np.zeros(7, dtype=complex), 256), 256
-        )
-    small = np.abs(centres) < 0.1
-    assert small.sum() == 6
-    reach = (np.abs(centres[small]) + radii[small]).max()
-    assert 2.0 ** (-200 / 6) <= reach < 100 * 2.0 ** (-200 / 6)
-    assert radii[~small][0] < 1e-15
-
-
 def _bounded(zeros: Sequence[complex]) -> Bounded:
     """Return Π (ζ − z) with the bound Π (1 + reach/|ζ − z|) − 1."""
 
