@@ -54,17 +54,6 @@ def _split(system: CompiledSystem) -> np.ndarray:
     return np.concatenate([np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in systems])
 
 
-@pytest.mark.parametrize("operator", ["mean", "sum"])
-def test_an_affine_edge_function_says_the_same_as_the_formula_it_stands_for(operator: str) -> None:
-    gains = {"kt": 700.0, "bt": 2.0, "kc": 1500.0, "bc": 2.0}
-    edge, plain = edged(paper(operator, **gains), operator), paper(operator, **gains)
-    one, other = analyze(edge), analyze(plain)
-    assert not one.linearized
-    assert one.spectral_radius == pytest.approx(other.spectral_radius, abs=1e-12)
-    assert (one.verdict, one.rigid_modes) == (other.verdict, other.rigid_modes)
-    assert analyze(edged(paper(**gains), cubic=1.0)).linearized
-
-
 def test_the_largest_of_equal_peers_has_no_linearization() -> None:
     message = r"E803 pull of user\[1\]: max over equal peers has no linearization"
     with pytest.raises(ApcError, match=message):

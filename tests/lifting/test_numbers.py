@@ -8,17 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apc.compiler.compiled import PEERS, CompiledSystem
+from apc.__main__ import run
+from apc.compiler.compiled import PEERS, CompiledSystem, counts_peers
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
 from apc.frame.names import (
     Free,
     find,
+    is_named,
 )
 from apc.frame.overrides import Override, apply, parse_override
 from apc.frame.parameters import resolve
+from apc.vary.many import analyze_many
+from apc.vary.margins import margins
 from tests.sites import NAMES, columned, derived, grouped, paper
-from tests.topologies import SCENES, compiled, library
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
 
 
 def _value(system: CompiledSystem, name: str, group: int = 0) -> float:
@@ -203,3 +207,28 @@ def test_what_depends_on_a_column_is_worked_out_peer_by_peer() -> None:
 def test_a_name_may_start_with_its_group_or_its_section(written: str, meant: Free) -> None:
     system = grouped(paper(), ("left", 1, {}), ("right", 2, {}))
     assert find(system, written) == meant
+
+
+def test_what_is_set_for_all_groups_says_what_each_of_them_has(capsys: pytest.CaptureFixture[str]) -> None:
+    """The star's teacher holds on with 400 N/m of its own, its students with the part's 100 N/m."""
+    told = (
+        "arm.stiffness is one value for all groups here; the scene has 400 N/m at teacher, 100 N/m at student"
+    )
+    star = compile_topology(SCENES / "star-lecture.yaml")
+    assert told in analyze_many(star, {"arm.stiffness": [100.0, 400.0]}).left_out
+    assert run(["analyze", str(SCENES / "star-lecture.yaml"), "--set", "arm.stiffness=100 N/m"]) == 0
+    assert capsys.readouterr().err == f"note: {told}\n"
+
+
+def test_what_the_compiler_counts_or_adds_is_nobody_s_to_set() -> None:
+    """A hold without delay, one by an expression, and how many are heard have names that mean nothing."""
+    own = compiled(replaced(AVERAGE, ("link: lan}", "link: lan, delays: own}")))
+    star = compiled(replaced(MESH, ("delay: 8 ms}", "delay: 8 ms, graph: star}")))
+    for system in (own, star):
+        names = [one.name for one in (*system.parameters, *system.timings)]
+        unnamed = [name for name in names if not is_named(name)]
+        assert unnamed
+        for name in unnamed:
+            with pytest.raises(ApcError, match="E623" if counts_peers(name) else "E622"):
+                find(system, name)
+        assert all(is_named(row.parameter) for row in margins(system).rows)

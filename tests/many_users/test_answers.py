@@ -9,14 +9,12 @@ import pytest
 
 from apc.analysis.analysis import analyze, prepare
 from apc.analysis.box import parse_range
-from apc.analysis.plan import Plan, make_plan
+from apc.analysis.needs import needs
 from apc.answer import answer, judge
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.frame.exchange import build_exchange
 from apc.frame.overrides import apply, parse_override
-from apc.frame.parameters import resolve
 from tests.populations import different
 from tests.sites import MS, columned, edged, linked, paper
 from tests.topologies import ROOT, SCENES
@@ -60,24 +58,6 @@ def test_prepared_work_serves_other_numbers_and_other_times() -> None:
         assert analyze(changed, prepared=prepared) == analyze(changed)
 
 
-def test_a_graph_that_splits_and_one_that_does_not_say_so() -> None:
-    ring = analyze(linked(paper(peers=8), "ring"))
-    assert (ring.method, ring.notes) == (
-        "modes",
-        ("5 systems, one an eigenvalue of the graph of lan (ring)",),
-    )
-    assert ring.to_dict()["notes"] == list(ring.notes)
-    alike = analyze(columned(linked(paper(), "ring"), device__mass=[0.1, 0.2, 0.1]))
-    assert (alike.method, alike.notes) == (
-        "modes",
-        ("2 systems, as peers that can change places move alike or apart",),
-    )
-    different = analyze(columned(linked(paper(), "ring"), device__mass=[0.1, 0.2, 0.3]))
-    assert different.method == "dense"
-    assert different.notes == ("all peers as one system: the peers on lan (ring) differ",)
-    assert analyze(paper()).notes == ()
-
-
 def test_peers_that_differ_only_at_the_start_are_equal_however_many() -> None:
     many = 10_000
     moved = columned(paper(peers=many), device__x__start=1e-6 * np.arange(many))
@@ -100,27 +80,15 @@ def test_a_matrix_too_large_is_refused_and_so_is_a_method_that_cannot_serve() ->
         analyze(many, method="determinant")
 
 
-def _plan(system: CompiledSystem, method: str = "auto") -> Plan:
-    prepared, numbers = prepare(system), resolve(system)
-    exchange = build_exchange(system, numbers.timings)
-    return make_plan(system, prepared.jacobians, prepared.schedules, numbers, exchange, method)
-
-
-PATH = [(i, i + 1, 1.0) for i in range(1599)] + [(i + 1, i, 1.0) for i in range(1599)]
-
-
 @pytest.mark.parametrize(
     ("system", "method", "systems"),
     [
-        (paper(), "modes", ((2, 8),)),
         (paper(peers=1_000_000), "modes", ((2, 8),)),
         (columned(paper(), device__mass=[0.1, 0.2, 0.3]), "modes", ((1, 24),)),
         (different(60), "determinant", ((1, 2),)),
         (different(3, graph="ring"), "dense", ((1, 24),)),
         (different(60, graph="ring"), "krylov", ((1, 480),)),
-        (linked(paper(peers=8), "ring"), "modes", ((5, 8),)),
         (linked(paper(peers=100_000), "ring"), "modes", ((50_001, 8),)),
-        (linked(paper("sum", peers=1600), PATH), "krylov", ((1, 12_800),)),
         (paper(comm=8000 * MS), "determinant", ((2, 2),)),
         (paper(comm=80 * MS), "modes", ((2, 26),)),
     ],
@@ -128,8 +96,7 @@ PATH = [(i, i + 1, 1.0) for i in range(1599)] + [(i + 1, i, 1.0) for i in range(
 def test_the_method_is_chosen_by_what_differs(
     system: CompiledSystem, method: str, systems: tuple[tuple[int, int], ...]
 ) -> None:
-    found = _plan(system)
-    assert (found.method, found.systems) == (method, systems)
+    assert (analyze(system).method, needs(system).systems) == (method, systems)
 
 
 FLIPS = ROOT / "tests" / "scenes" / "verdict-hangs-on-the-order.yaml"

@@ -50,11 +50,6 @@ def test_a_loop_of_one_state_has_its_least_real_part_where_its_closed_form_says(
     near = 1e-9 / (1 - abs(pole)) ** 2
     assert is_proved(system, np.array([[0.5 - least + near]]))
     assert not is_proved(system, np.array([[0.5 - least - near]]))
-    # −1/(z − a) is least at θ = 0: −1/(1 − a).
-    turned = (system[0], -system[1], system[2], np.array([[0.0]]))
-    least, angle = least_real(*turned, np.zeros((1, 1)))
-    assert least == pytest.approx(-1 / (1 - pole), rel=1e-12)
-    assert angle == pytest.approx(0.0)
 
 
 @pytest.mark.few(1)

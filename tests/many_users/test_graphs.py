@@ -9,51 +9,12 @@ import numpy as np
 import pytest
 
 from apc.analysis.analysis import analyze
-from apc.compiler.compiled import Graph
 from apc.compiler.errors import ApcError
 from apc.compiler.weights import sum_weights
 from apc.eigen.balls import precision
-from apc.eigen.graph_modes import GraphMode, graph_modes
-from apc.frame.exchange import arcs
 from tests.bench.random_scenes import check, truth
-from tests.sites import COMPLETE, linked, paper
+from tests.sites import linked, paper
 from tests.topologies import MESH, compiled, library, replaced
-
-
-def _graph(shape: str) -> Graph:
-    return Graph(shape, COMPLETE.arcs, COMPLETE.weights)
-
-
-def _matrix(graph: Graph, peers: int, *, mean: bool) -> np.ndarray:
-    matrix = np.zeros((peers, peers))
-    for (sender, receiver), weight in zip(*arcs(graph, peers), strict=True):
-        matrix[receiver, sender] += weight
-    return matrix / matrix.sum(axis=1)[:, None] if mean else matrix
-
-
-def _values(modes: tuple[GraphMode, ...]) -> list[complex]:
-    pairs = [[one.value] if not one.imaginary else [one.value, one.value.conjugate()] for one in modes]
-    return [value for one, pair in zip(modes, pairs, strict=True) for value in pair * one.multiplicity]
-
-
-@pytest.mark.few(9)
-@pytest.mark.parametrize("peers", [2, 3, 4, 5, 6, 9, 12])
-@pytest.mark.parametrize("shape", ["ring", "star", "complete"])
-@pytest.mark.parametrize("mean", [True, False])
-def test_closed_forms_are_the_eigenvalues_of_the_matrix(shape: str, peers: int, mean: bool) -> None:
-    found = graph_modes(_graph(shape), peers, mean=mean)
-    assert found is not None
-    expected = np.sort(np.linalg.eigvals(_matrix(_graph(shape), peers, mean=mean)).real)
-    np.testing.assert_allclose(np.sort(np.array(_values(found)).real), expected, atol=1e-12)
-
-
-def test_a_ring_hears_two_neighbours_and_a_star_its_centre() -> None:
-    assert sorted(map(tuple, arcs(_graph("ring"), 3)[0].tolist())) == [
-        (i, j) for i in range(3) for j in range(3) if i != j
-    ]
-    assert sorted(map(tuple, arcs(_graph("star"), 3)[0].tolist())) == [(0, 1), (0, 2), (1, 0), (2, 0)]
-    assert [len(arcs(_graph(shape), n)[0]) for shape in ("ring", "star") for n in (1, 2)] == [0, 2, 0, 2]
-
 
 # A mean whose weights are those of the graph as they stand, for rows that add up to 1.
 STOCHASTIC = """\
