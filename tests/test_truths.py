@@ -127,7 +127,13 @@ REFUSED = {
 USEFUL = 1e-6
 WIDE = {
     "determinant": {"coasting": 1, "defective": 1e-2, "nearly-defective": 1e-2, "ninety-hertz": 1e-4}
-    | {"a damped mass": 1, "a light one": 1, "critically damped": 1e-5, "1/90 s": 1e-4},
+    | {
+        "a frame of 1 s without clocks": 1,
+        "a damped mass": 1,
+        "a light one": 1,
+        "critically damped": 1e-5,
+        "1/90 s": 1e-4,
+    },
     "krylov": {"coasting": 1, "client-server": 1},
     "export": {"coasting": 2, "defective": 1e-5},
 }

@@ -2,8 +2,8 @@
 
 Takes: nothing. Gives: `Case`, `CASES`, `Truth`; `model`, `truth` of a case, each made once.
 Guarantees: no number here was computed by what it judges. `hard` are the stored fifty digits of tests/hard,
-`library` the scenes that come with apc, followed in fifty digits when they are asked for; `reference` the
-numbers of `tests.reference`; `closed` formulas, by hand; `stepped` all peers stepped one by one in balls.
+`library` the scenes that come with apc and `stiff` ones, followed in fifty digits when they are asked for;
+`reference` the numbers of `tests.reference`; `closed` formulas, by hand; `stepped` all peers, one by one.
 Does not: say anything of the modes but the largest (see `many_users/test_bounds.py`).
 """
 
@@ -76,13 +76,14 @@ def _stored(path: Path) -> Case:
     return Case(path.stem, "hard", lambda: apc.compile(path), tell)
 
 
-def _followed(path: Path) -> Case:
+def _followed(name: str, source: str, build: Callable[[], apc.CompiledSystem]) -> Case:
     def tell() -> Truth:
-        found = spectral_truth(apc.compile(path))
+        found = spectral_truth(build())
         assert not isinstance(found, str), found
-        return Truth(found.radius, found.rigid)
+        with precision(256):  # where nothing ticks a frame is 1 s, and there it is 1 ms
+            return Truth(found.radius if build().clocks else found.radius**1000, found.rigid)
 
-    return Case(path.stem, "library", lambda: apc.compile(path), tell)
+    return Case(name, source, build, tell)
 
 
 def _reference(scheme: str, peers: int, delayed: bool, radius: float) -> Case:
@@ -102,6 +103,31 @@ def _closed(name: str, text: str, radius: Callable[[], Any], rigid: int, verdict
             return Truth(radius(), rigid, 1e-45, verdict)
 
     return Case(name, "closed", lambda: compiled(text), tell)
+
+
+# What moves fast within a frame, or dies out far sooner.
+STIFF = {
+    "a frame of 1 s without clocks": """
+topology: no-clock
+peers: {left: {count: 1}}
+masses:
+  device: {mass: 0.0345 kg, damping: 5.05 N*s/m}
+  cube: {mass: 0.0533 kg}
+couplers:
+  pad: {type: SpringDamper, a: device, b: cube, stiffness: 87.8 N/m, damping: 0.84 N*s/m}
+""",
+    "what dies out 10^5 times faster than the frame": """
+topology: stiff
+clocks: {haptic: 8 ms}
+peers: {user: {count: 1}}
+masses:
+  device: {mass: 0.0009 kg, damping: 0.08 N*s/m}
+  cube: {mass: 0.0086 kg, damping: 100 N*s/m}
+couplers:
+  pad: {type: SpringDamper, a: device, b: cube, stiffness: 5000 N/m, damping: 5 N*s/m}
+  wall: {type: SampledSpringDamper, a: cube, b: ground, stiffness: 10 N/m, clock: haptic}
+""",
+}
 
 
 CLOSED = [
@@ -245,7 +271,12 @@ CASES: dict[str, Case] = {
     str(case): case
     for case in (
         *(_stored(path) for path in sorted((ROOT / "tests" / "hard").glob("*.yaml"))),
-        *(_followed(path) for path in LIBRARY if path.stem not in UNTOLD),
+        *(
+            _followed(path.stem, "library", functools.partial(apc.compile, path))
+            for path in LIBRARY
+            if path.stem not in UNTOLD
+        ),
+        *(_followed(name, "stiff", functools.partial(compiled, text)) for name, text in STIFF.items()),
         *(_reference(*row) for row in RADII),
         *CLOSED,
         *STEPPED,

@@ -24,7 +24,6 @@ from apc.frame.site import every_matrix
 from apc.large.populations import Population
 from tests.populations import crowded, different
 from tests.sites import MS, grouped, paper
-from tests.topologies import compiled
 
 
 def _fractions(matrix: Any) -> Any:
@@ -142,48 +141,11 @@ def test_a_frame_stepped_and_lifted_agrees_to_rounding(values: dict[str, Any]) -
     assert check_frame(system) < 1e-13
 
 
-STIFF = {
-    "a frame of 1 s without clocks": """
-topology: no-clock
-peers: {left: {count: 1}}
-masses:
-  device: {mass: 0.0345 kg, damping: 5.05 N*s/m}
-  cube: {mass: 0.0533 kg}
-couplers:
-  pad: {type: SpringDamper, a: device, b: cube, stiffness: 87.8 N/m, damping: 0.84 N*s/m}
-""",
-    "what dies out 10^5 times faster than the frame": """
-topology: stiff
-clocks: {haptic: 8 ms}
-peers: {user: {count: 1}}
-masses:
-  device: {mass: 0.0009 kg, damping: 0.08 N*s/m}
-  cube: {mass: 0.0086 kg, damping: 100 N*s/m}
-couplers:
-  pad: {type: SpringDamper, a: device, b: cube, stiffness: 5000 N/m, damping: 5 N*s/m}
-  wall: {type: SampledSpringDamper, a: cube, b: ground, stiffness: 10 N/m, clock: haptic}
-""",
-    "10^4 periods of a swing in a frame, pushed with 1e8 N": """
-topology: swing
-peers: {user: {count: 1}}
-masses: {device: {mass: 0.1 g}, cube: {mass: 0.2 g}}
-couplers: {pad: {type: SpringDamper, a: device, b: cube, stiffness: 100000 N/m}}
-hands: {hand: {type: ConstantForce, flange: device, force: 1e8 N}}
-""",
-}
-
-
-@pytest.mark.parametrize("text", STIFF.values(), ids=STIFF)
-def test_what_moves_fast_within_a_frame_agrees_and_a_wrong_lift_of_it_is_found(
-    text: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    system = compiled(text)
-    assert check_frame(system) < 1e-15
-
+def test_a_wrong_lift_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     def spoiled(*arguments: Any, **options: Any) -> LiftedSite:
         lifted = lift(*arguments, **options)
-        return replace(lifted, p=lifted.p * (1 + 1e-12))
+        return replace(lifted, p=lifted.p * (1 + 1e-9))
 
     monkeypatch.setattr(selfcheck, "lift", spoiled)
-    with pytest.raises(AssertionError, match="stepped and lifted, differ by"):
-        check_frame(system)
+    with pytest.raises(AssertionError, match="one frame of user, stepped and lifted, differ by"):
+        check_frame(paper())

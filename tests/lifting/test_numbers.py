@@ -232,3 +232,7 @@ def test_what_the_compiler_counts_or_adds_is_nobody_s_to_set() -> None:
             with pytest.raises(ApcError, match="E623" if counts_peers(name) else "E622"):
                 find(system, name)
         assert all(is_named(row.parameter) for row in margins(system).rows)
+    with pytest.raises(ApcError, match=r"E623 user.count is a number of peers, which doesn't vary here"):
+        find(own, "user.count")
+    five = apply(own, [parse_override(own, "user.count=5")])
+    assert five.groups[0].count == 5

@@ -117,9 +117,8 @@ def _matrices(seed: int) -> list[tuple[str, Floats, Floats, list[Floats]]]:
         signs = generator.choice([-1, 1], size=matrix.shape)
         along = np.ones(matrix.shape)
         values, right = np.linalg.eig(matrix)
-        if (
-            np.linalg.cond(right) < 1e12
-        ):  # along its own vectors an error moves an eigenvalue as far as it can
+        if np.linalg.cond(right) < 1e12:
+            # Along its own vectors an error moves an eigenvalue as far as it can.
             first = int(np.argmax(np.abs(values)))
             along = np.sign(np.outer(np.linalg.inv(right)[first].real, right[:, first].real))
         moved = [matrix + share * one * error for share, one in ((0, signs), (0.999, signs), (0.999, along))]
