@@ -50,7 +50,7 @@ def scenes(draw: st.DrawFn) -> dict[str, Any]:
     }
 
 
-@settings(max_examples=15, derandomize=True)
+@settings(max_examples=12, derandomize=True)
 @given(scenes())
 @example(
     {

@@ -94,6 +94,15 @@ def _agree(found: Spectrum | Analysis, whole: Analysis) -> None:
         assert abs(same.eigenvalue - mode.eigenvalue) <= mode.error + same.error
         assert mode.frequency_hz == pytest.approx(same.frequency_hz, abs=1e-8)
         assert mode.damping_ratio == pytest.approx(same.damping_ratio, abs=1e-9)
+    if found.modes:  # the shares of all peers together
+        shares: dict[str, float] = {}
+        first = min(whole.modes, key=lambda one: abs(one.eigenvalue - found.modes[0].eigenvalue))
+        for name, share in first.participation:
+            name = name.split("].")[-1]
+            name = name.partition("(")[0] if "sent(" in name else name
+            shares[name] = shares.get(name, 0.0) + share
+        for name, share in found.modes[0].participation:
+            assert share == pytest.approx(shares[name.split("user.")[-1]], abs=1e-7), name
 
 
 @pytest.mark.few(2)
@@ -209,3 +218,11 @@ def test_every_simple_eigenvalue_is_held_in_a_ball(text: str) -> None:
                 ball = proved_zero(map_balls(loop), wire_balls(loop), value)
                 assert ball is not None and ball.rel_accuracy_bits() > 80
             assert complex(ball) == pytest.approx(value, abs=1e-11)
+
+
+def test_a_site_that_passes_on_what_it_hears_in_a_frame_is_estimated_and_says_so() -> None:
+    clocks = {"haptic": 3 * MS, "network": 2 * MS, "comp": Fraction(0), "comm": Fraction(0)}
+    found = analyze(linked(paper(peers=300, **clocks), "ring"))
+    few = analyze(linked(paper(peers=200, **clocks), "ring"))
+    assert "all others are estimated to die out faster" in found.notes[0]
+    assert found.spectral_radius > few.spectral_radius

@@ -32,7 +32,7 @@ def _check(system: CompiledSystem, scene: Scene, bound: float = 1e-11) -> None:
     assert apart(np.linalg.eigvals(dense(*lifted_groups(system)).matrix), expected) < bound
 
 
-@pytest.mark.parametrize("peers", [2, 3, 8, 20])
+@pytest.mark.parametrize("peers", [2, 3, 8, 12])
 def test_common_and_difference_modes_are_the_whole_spectrum(peers: int) -> None:
     operator = "mean" if peers % 2 else "sum"
     gains = GAINS if operator == "mean" else {**GAINS, "kt": 800.0 / peers, "bt": 2.0 / peers}
