@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import mpmath
@@ -13,6 +14,7 @@ import pytest
 
 from apc.analysis import selfcheck
 from apc.analysis.selfcheck import check_frame
+from apc.compiler.components.library import Library
 from apc.frame import batch_lift
 from apc.frame.lift import FrameMap, LiftedSite, compose, lift
 from apc.frame.linearize import linearize_exact
@@ -22,8 +24,10 @@ from apc.frame.radius import FLOATS, RADII, radius_of, value_of, with_radius
 from apc.frame.schedule import Propagate
 from apc.frame.site import every_matrix
 from apc.large.populations import Population
+from tests.bench.growing import equations
 from tests.populations import crowded, different
 from tests.sites import MS, grouped, paper
+from tests.topologies import compiled
 
 
 def _fractions(matrix: Any) -> Any:
@@ -149,3 +153,9 @@ def test_a_wrong_lift_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(selfcheck, "lift", spoiled)
     with pytest.raises(AssertionError, match="one frame of user, stepped and lifted, differ by"):
         check_frame(paper())
+
+
+def test_many_masses_in_a_row_stepped_and_lifted_agree_to_rounding(tmp_path: Path) -> None:
+    """Their steps are sums of a series, ball by ball, and of no matrix."""
+    text = equations(150, tmp_path)
+    assert check_frame(compiled(text, Library((tmp_path / "parts",)))) < 1e-15

@@ -33,7 +33,12 @@ from tests.populations import crowded, different
 from tests.sites import MS, columned, grouped, linked, paper
 from tests.topologies import AVERAGE, compiled, replaced
 
-VARIED_RINGS: list[dict[str, Any]] = [{}, {"kc": 2400.0}, {"kc": 1500.0, "kt": 5000.0}, {"comm": 16 * MS}]
+VARIED_RINGS: list[dict[str, Any]] = [
+    {},
+    {"comp": Fraction(0), "comm": Fraction(0), "kt": 2000.0},
+    {"kc": 2400.0},
+    {"kc": 1500.0, "kt": 5000.0},
+]
 
 
 VARIED: list[dict[str, Any]] = [
@@ -63,6 +68,13 @@ def test_different_peers_have_the_spectral_radius_of_their_whole_matrix(
 ) -> None:
     values = dict(values)
     system = different(peers, values.pop("operator", "mean"), **values)
+    _agree(_solved(system), analyze(system, method="dense"))
+
+
+@pytest.mark.parametrize("delays", [{}, {("left", "right"): 12 * MS, ("right", "left"): 3 * MS}])
+def test_groups_with_delays_of_their_own_are_one_determinant(delays: dict[tuple[str, str], Fraction]) -> None:
+    base = grouped(paper(kt=300.0), ("left", 3, {"device.mass": 0.3}), ("right", 2, {"cube.mass": 0.1}))
+    system = linked(base, delays=delays)
     _agree(_solved(system), analyze(system, method="dense"))
 
 
