@@ -36,6 +36,10 @@ class Said:
 
 def _point(name: str, **asked: object) -> Said:
     one = apc.analyze(model(name), **asked)  # type: ignore[arg-type] # a method or a proof
+    if asked.get("certify"):
+        # Floats that decided stay where balls do not; of determinants there is no proof.
+        said = ("proved", "decided with") if one.stable is not None else "undecided at"
+        assert one.proof.startswith(said) or one.method == "determinant"
     return Said(
         one.spectral_radius, one.spectral_radius_error, one.rigid_modes, one.stable, one.verdict, one.notes
     )

@@ -23,7 +23,7 @@ from tests.fifty_digits import events
 from tests.fifty_digits import truth as fifty_digits
 from tests.fifty_digits.truth import Truth, exact_course, spectral_truth
 from tests.sites import MS, paper
-from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced
+from tests.topologies import ROOT, SCENES, compiled
 
 
 def _radius(scene: Scene, rigid: int) -> flint.arb:
@@ -95,13 +95,6 @@ def test_a_course_is_that_of_stepping_by_hand() -> None:
         assert names[0] == "right[1].device.x"
         by_hand = np.array(play(experiment(operator), Fraction(1, 5)))[:, 1:].reshape(len(rows), 3, 6)
         np.testing.assert_allclose(rows.reshape(len(rows), 3, 4), by_hand[:, :, :4], rtol=0, atol=1e-12)
-
-
-def test_the_mesh_is_the_average_with_twice_the_gain() -> None:
-    """Three peers: (N − 1) K_T in the one is K_T in the other, to every digit."""
-    mesh = compiled(replaced(MESH, ("stiffness: 500 N/m", "stiffness: 250 N/m")))
-    with precision(600):
-        assert float(abs(_truth(mesh).radius - _truth(compiled(AVERAGE)).radius)) < 1e-50
 
 
 def test_the_reference_shares_with_the_runtime_what_it_says_and_no_more() -> None:

@@ -49,23 +49,11 @@ def test_groups_that_differ_in_nothing_that_moves_are_one() -> None:
     assert [one.name for one in split([group], exchange).systems] == ["common", "difference"]
 
 
-@pytest.mark.few(6)
-@pytest.mark.parametrize("operator", ["mean", "sum"])
-@pytest.mark.parametrize("peers", [2, 3, 4, 5])
-@pytest.mark.parametrize("shape", ["ring", "star"])
-def test_equal_peers_on_a_ring_or_star_are_one_small_system_an_eigenvalue(
-    shape: str, peers: int, operator: str
-) -> None:
-    gains = {**GAINS, "kt": 300.0}
-    system = linked(paper(operator, peers=peers, **gains), shape)
-    found = split(*lifted_groups(system))
-    assert (found.method, {len(one.matrix) for one in found.systems}) == ("modes", {8})
-    _check(system, Scene(operator, peers, weights={(i, j): w for i, j, w in arcs_of(shape, peers)}, **gains))
-
-
 @pytest.mark.parametrize(
     ("name", "operator", "method"),
     [
+        ("ring", "sum", "modes"),
+        ("star", "mean", "modes"),
         ("path", "mean", "modes"),
         ("two pairs", "mean", "modes"),
         ("cycle", "sum", "modes"),

@@ -71,18 +71,6 @@ def test_undamped_peers_drift_as_far_as_nothing_brakes_them(
             assert np.abs(step).max() > 1e-4
 
 
-def test_groups_and_the_dense_system_have_the_same_rigid_modes() -> None:
-    system = grouped(
-        paper(kt=0.0), ("left", 2, {"device.mass": 0.2}), ("right", 3, {"contact.stiffness": 0.0})
-    )
-    groups, exchange = lifted_groups(system)
-    counted = sum(
-        one.multiplicity * find_rigid_modes(one).directions.shape[1]
-        for one in split(groups, exchange).systems
-    )
-    assert counted == find_rigid_modes(dense(groups, exchange)).directions.shape[1] == 2 + 3 * 2
-
-
 @pytest.mark.few(4)
 @pytest.mark.parametrize("operator", ["mean", "sum"])
 @pytest.mark.parametrize(
