@@ -24,8 +24,7 @@ from apc.vary.evaluator import free_parameters
 from apc.vary.many import Analyses, analyze_many
 from tests.bench.map import BITS, truth
 from tests.fifty_digits.truth import spectral_truth
-from tests.test_course import OSCILLATOR
-from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced, told
+from tests.topologies import AVERAGE, MESH, OSCILLATOR, ROOT, SCENES, compiled, replaced, told
 
 
 def scene(path: Path) -> CompiledSystem:

@@ -36,6 +36,16 @@ masses:
   device: {mass: 2 kg, damping: 3 N*s/m}
 """
 
+# Textbook: m x″ + d x′ + k x = 0.
+OSCILLATOR = """\
+topology: oscillator
+peers: {{user: {{count: 1}}}}
+masses:
+  device: {{mass: 1 kg}}
+couplers:
+  s: {{type: SpringDamper, a: device, b: ground, stiffness: {stiffness} N/m, damping: {damping} N*s/m}}
+"""
+
 
 def source(text: str) -> Source:
     return parse_source(text.encode(), file="scene.yaml")

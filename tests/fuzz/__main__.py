@@ -59,7 +59,7 @@ def main() -> int:
     if options.packets:
         wrong |= _packets(options.packets, options.seed)
     if options.scenes:
-        from tests.test_properties import check_scenes
+        from tests.lifting.test_frame import check_scenes
 
         check_scenes(options.scenes)
         print(f"{options.scenes} scenes agree with brute force")

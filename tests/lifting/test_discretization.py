@@ -1,0 +1,128 @@
+"""The exact exponential of a continuous motion, against closed forms in 60 digits and against balls."""
+
+from __future__ import annotations
+
+import itertools
+from fractions import Fraction
+
+import mpmath
+import numpy as np
+import pytest
+
+import apc.frame.discretize as discretizing
+from apc.compiler.errors import ApcError
+from apc.frame.discretize import (
+    FEW_TOGETHER,
+    UNIT,
+    Step,
+    discretize,
+    exponential_rows,
+)
+
+DAMPINGS = (0.0, 1e-12, 1e-6, 5.0, 1e6)
+
+
+MASSES = (1e-6, 0.1, 1e3)
+
+
+TIME = Fraction(1, 1000)
+
+
+def mass(m: float, b: float) -> tuple[np.ndarray, np.ndarray]:
+    """A point mass with damping, pushed by a force; exact entries."""
+    exact = np.array([[Fraction(0), Fraction(1)], [Fraction(0), -Fraction(b) / Fraction(m)]], dtype=object)
+    return exact, np.array([[Fraction(0)], [1 / Fraction(m)]], dtype=object)
+
+
+def closed_form(m: float, b: float) -> list[list[mpmath.mpf]]:
+    """[F G] of a point mass by its series or its closed form, whichever loses nothing in 60 digits."""
+    with mpmath.workdps(120):
+        t, a, m_ = mpmath.mpf(TIME.numerator) / TIME.denominator, mpmath.mpf(b) / mpmath.mpf(m), mpmath.mpf(m)
+        if b == 0:
+            return [[mpmath.mpf(1), t, t**2 / 2 / m_], [mpmath.mpf(0), mpmath.mpf(1), t / m_]]
+        e = mpmath.exp(-a * t)
+        return [
+            [mpmath.mpf(1), (1 - e) / a, (t - (1 - e) / a) / a / m_],
+            [mpmath.mpf(0), e, (1 - e) / a / m_],
+        ]
+
+
+@pytest.mark.parametrize(("b", "m"), list(itertools.product(DAMPINGS, MASSES)))
+def test_a_damped_mass_is_right_to_one_part_in_1e15_and_within_its_bound(b: float, m: float) -> None:
+    (step,) = discretize(*mass(m, b), [TIME])
+    for row, sizes, truth in zip(step.matrix, step.size, closed_form(m, b), strict=True):
+        for value, size, true in zip(row, sizes, truth, strict=True):
+            apart = abs(mpmath.mpf(float(value)) - true)
+            # e^{-bT/m} underflows a float where b/m is large; nothing can be said relative to it there.
+            assert apart <= mpmath.mpf("1e-15") * abs(true) + mpmath.mpf("1e-300")
+            assert apart <= UNIT * float(size)
+
+
+def test_a_stiff_oscillator_keeps_its_phase() -> None:
+    # x'' = -w²x: cos(wT) after some 10⁵ turns, from the exact w² and T.
+    w2, time = Fraction(10**14), Fraction(1, 10)
+    a = np.array([[Fraction(0), Fraction(1)], [-w2, Fraction(0)]], dtype=object)
+    (step,) = discretize(a, np.zeros((2, 0), dtype=object), [time])
+    with mpmath.workdps(60):
+        assert abs(step.matrix[0, 0] - float(mpmath.cos(mpmath.mpf(10) ** 7 / 10))) < 1e-15
+
+
+def test_growth_beyond_a_float_is_refused() -> None:
+    a = np.array([[Fraction(10**7)]], dtype=object)
+    with pytest.raises(ApcError, match="E806"):
+        discretize(a, np.zeros((1, 0), dtype=object), [Fraction(1)])
+
+
+def chain(masses: int, *, stiffness: int = 1000, damping: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Masses of 10 g in a row between two walls, springs and dampers between them, the ends pushed."""
+    a, b = (np.full((2 * masses, n), Fraction(0), dtype=object) for n in (2 * masses, 2))
+    for i in range(masses):
+        a[2 * i, 2 * i + 1] = Fraction(1)
+        for j, share in ((i - 1, -1), (i, 2), (i + 1, -1)):
+            if 0 <= j < masses:
+                a[2 * i + 1, 2 * j : 2 * j + 2] = [Fraction(-100 * k * share) for k in (stiffness, damping)]
+    b[1, 0] = b[-1, 1] = Fraction(100)
+    return a, b
+
+
+def in_balls(
+    matrices: tuple[np.ndarray, np.ndarray], time: Fraction, monkeypatch: pytest.MonkeyPatch
+) -> Step:
+    with monkeypatch.context() as only:
+        only.setattr(discretizing, "_balanced_steps", lambda *_: None)
+        (step,) = discretize(*matrices, [time])
+    return step
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize(
+    ("stiffness", "damping", "milliseconds"), [(1000, 1, 1), (1000, 0, 1), (20, 3, 1), (1000, 4, 1)]
+)
+def test_a_chain_of_many_masses_is_had_in_floats_within_its_bound(
+    stiffness: int, damping: int, milliseconds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matrices = chain(FEW_TOGETHER, stiffness=stiffness, damping=damping)
+    time = Fraction(milliseconds, 1000)
+    truth = in_balls(matrices, time, monkeypatch)
+    (step,) = discretize(*matrices, [time])
+    assert step.roundings > 1 == truth.roundings
+    bound = UNIT * step.roundings * step.size
+    assert (np.abs(step.matrix - truth.matrix) <= bound + UNIT * truth.size).all()
+    # In units of length in which velocities are as large as ways, no entry is off by more than composing it
+    # rounds: 130 states and holds.
+    units = np.tile([1.0, np.sqrt(stiffness * 100.0)], FEW_TOGETHER)
+    pushed = np.full(2, 1 / 100.0)
+    scaled = bound / units[:, None] * np.concatenate([units, pushed])
+    assert scaled.max() <= 4 * 130 * UNIT
+
+
+@pytest.mark.parametrize("decay", [0.0, 1e-9, 1.0, 50.0, 4000.0])
+def test_exponentials_are_within_their_bound_of_ball_arithmetic(decay: float) -> None:
+    """A mass with damping and a spring to a held input, slow and stiff."""
+    a = np.array([[0.0, 1.0], [-30.0, -decay]])
+    b = np.array([[0.0], [2.0]])
+    [truth] = discretize(a, b, [Fraction(1, 100)])
+    step = exponential_rows(a[None], b[None], 0.01)
+    off = step.roundings * UNIT * step.size[0]
+    assert np.all(np.abs(step.matrix[0] - truth.matrix) <= off + UNIT * truth.size)
+    assert np.all(off < 1e-10)

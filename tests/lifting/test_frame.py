@@ -1,0 +1,173 @@
+"""One frame as a map, of any scene: the text, compiled and lifted, against N full peers stepped one by one.
+
+`bruteforce` propagates the peers event by event with none of the code that is judged. What an instant means
+(section 3 of the design) is among the examples. `python -m tests.fuzz --scenes 1000` tries more of them.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import casadi
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, example, given, settings
+from hypothesis import strategies as st
+
+from apc.analysis.analysis import analyze, lifted_groups
+from apc.compiler.errors import ApcError
+from apc.eigen.modes import dense, split
+from apc.frame.lift import LiftedSite
+from tests.bruteforce import Scene, common_period, frame_matrix
+from tests.sites import MS, alone, paper
+from tests.topologies import compiled
+from tests.truths import text_of
+
+MOST_TICKS = 24  # a frame, so that stepping stays quick
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> Scene:
+    """Draw a scene whose frame holds at most `MOST_TICKS` ticks: users, gains, periods, phases, delays."""
+    periods = st.builds(Fraction, st.integers(1, 6), st.sampled_from([1, 1, 1, 2, 3]))
+    haptic = draw(periods)
+    network = draw(
+        periods.filter(lambda period: common_period(haptic, period) / min(haptic, period) <= MOST_TICKS)
+        | st.integers(1, 8).map(lambda times: times * haptic)
+    )
+    parts = st.sampled_from([Fraction(0), Fraction(0), Fraction(1, 2), Fraction(1, 3), Fraction(7, 10)])
+    delays = st.sampled_from([Fraction(tenths, 10) for tenths in (0, 4, 10, 10, 15, 20)])
+    masses = draw(st.lists(st.sampled_from([0.1, 0.2, 0.15]), min_size=2, max_size=5))
+    stiffness = draw(st.integers(0, 20)) * 100.0
+    return Scene(
+        draw(st.sampled_from(["mean", "sum"])),
+        len(masses),
+        draw(st.integers(0, 10)) * 50.0,
+        float(draw(st.integers(0, 3))),
+        bc=float(draw(st.integers(0, 3))),
+        kc=stiffness,
+        comp=draw(delays) * haptic * MS,
+        comm=draw(delays) * network * MS,
+        own_delay=draw(st.booleans()),
+        haptic=haptic * MS,
+        network=network * MS,
+        haptic_phase=draw(parts) * haptic * MS,
+        network_phase=draw(parts) * network * MS,
+        users=tuple({"device": mass} for mass in masses) if draw(st.booleans()) else (),
+    )
+
+
+def at(comp: float, comm: float, phase: float = 0, first: float = 0, own: bool = False) -> Scene:
+    """Return a scene of the convention: delays and phases in ms, ticks of 2 ms, packets of 8 ms."""
+    times = [Fraction(str(one)) * MS for one in (comp, comm, phase, first)]
+    return Scene(
+        "mean",
+        2,
+        700.0,
+        3.0,
+        comp=times[0],
+        comm=times[1],
+        haptic=2 * MS,
+        haptic_phase=times[2],
+        network_phase=times[3],
+        own_delay=own,
+    )
+
+
+def check(scene: Scene) -> None:
+    """Compare the split and the dense spectrum of a scene's text with that of peers stepped one by one."""
+    groups, exchange = lifted_groups(compiled(text_of(scene)))
+    systems = split(groups, exchange).systems
+    modes = np.concatenate([np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in systems])
+    whole = np.linalg.eigvals(dense(groups, exchange).matrix)
+    expected = np.linalg.eigvals(np.array(frame_matrix(scene)))
+    largest = max(1.0, float(np.abs(expected).max()))
+    for found in (modes, whole):
+        # The sums of their powers are smooth where eigenvalues scatter.
+        for power in range(1, 7):
+            one, other = ((values / largest) ** power for values in (found, expected))
+            bound = 1e-9 * max(1.0, float(np.abs(other).sum()))
+            assert abs(one.sum() - other.sum()) < bound, f"trace of power {power}: {scene}"
+        apart = abs(np.abs(found).max() - np.abs(expected).max())
+        assert apart < 1e-6 * largest, f"the largest differ by {apart}: {scene}"
+
+
+QUIET = [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large]
+
+
+# Everything at once; a packet that arrives exactly at a tick, just after, between two; delays within a tick's
+# interval, two of one force, of several periods; phases.
+@settings(max_examples=25, derandomize=True, suppress_health_check=QUIET)
+@given(scenes())
+@example(at(0, 0))
+@example(at(2, 8))
+@example(at(0, 4))
+@example(at(0, 4.001))
+@example(at(0, 3))
+@example(at(0.4, 11))
+@example(at(0.4, 11, own=True))
+@example(at(5, 20))
+@example(at(1, 5, 0.5, 3))
+@example(at(1, 9.5, 0.5, 3, own=True))
+@example(at(0.375, 2.625, 0.125, 0.625))
+def test_any_scene_has_the_spectrum_of_its_peers_stepped_one_by_one(scene: Scene) -> None:
+    check(scene)
+
+
+def check_scenes(count: int) -> None:
+    """Check that many random scenes; raises AssertionError with the smallest one that differs."""
+
+    @settings(
+        max_examples=count,
+        deadline=None,  # run without pytest too
+        database=None,
+        suppress_health_check=QUIET,
+        phases=[Phase.generate, Phase.shrink],
+    )
+    @given(scenes())
+    def run(scene: Scene) -> None:
+        check(scene)
+
+    run()
+
+
+PHI = float(np.exp(-0.001))
+
+
+GAMMA = float(-np.expm1(-0.001))
+
+
+def _alone(**values: Any) -> LiftedSite:
+    [group], _ = lifted_groups(alone(lambda x, u: -x + u, **values))
+    return group.lifted
+
+
+def test_a_remembered_sample_is_a_delay_of_one_tick() -> None:
+    """u[k] = −3 x[k−1], by previous() or by a computational delay of one tick."""
+    remembered = _alone(
+        tick=lambda x, u, m: casadi.vertcat(-3 * m[0], x), outputs=("f", "seen"), memories=(1,)
+    )
+    delayed = _alone(tick=lambda x, u, m: -3 * x, delay=MS)
+    assert remembered.z_names == ("x", "seen(-1 ms)")
+    np.testing.assert_allclose(remembered.p, [[PHI, -3 * GAMMA], [1, 0]], rtol=1e-14)
+    np.testing.assert_allclose(delayed.p, [[PHI, GAMMA], [-3, 0]], rtol=1e-14)
+
+
+def test_a_memory_that_nothing_reads_is_no_state() -> None:
+    lifted = _alone(
+        tick=lambda x, u, m: casadi.vertcat(-3 * x, m[0] + x), outputs=("f", "sum"), memories=(1,)
+    )
+    assert lifted.z_names == ("x",)
+
+
+def test_a_tick_that_reads_a_hold_reads_it_before_it_switches() -> None:
+    """f[k] = 0.5 u(t⁻) + 2 x with u(t⁻) = f[k−1]; then x[k+1] = Φ x + Γ f[k]."""
+    lifted = _alone(tick=lambda x, u, m: 0.5 * u[0] + 2 * x)
+    assert lifted.z_names == ("x", "f(-1 ms)")
+    np.testing.assert_allclose(lifted.p, [[PHI + 2 * GAMMA, 0.5 * GAMMA], [2, 0.5]], rtol=1e-14)
+
+
+def test_clocks_that_hardly_ever_stand_as_before_are_refused_with_their_periods() -> None:
+    with pytest.raises(ApcError, match=r"E805 all clocks stand as before only after .*haptic 1.00003 ms"):
+        analyze(paper(haptic=Fraction(100003, 10**8)))

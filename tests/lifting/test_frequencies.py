@@ -1,0 +1,102 @@
+"""The frequency and damping a mode has, however long the frame: against textbook oscillators."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import pytest
+
+from apc.analysis.analysis import analyze
+from tests.sites import paper
+from tests.topologies import OSCILLATOR, compiled
+
+
+def numbers(hertz: float, ratio: float) -> dict[str, str]:
+    natural = 2 * math.pi * hertz
+    return {"stiffness": repr(natural**2), "damping": repr(2 * ratio * natural)}
+
+
+# The same with a clock that makes the frame, and a force too small to matter.
+CLOCKED = OSCILLATOR.replace("peers:", "clocks: {{haptic: {frame}}}\npeers:") + (
+    "  t: {{type: SampledSpringDamper, a: device, b: ground, stiffness: 1e-9 N/m, clock: haptic}}\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("hertz", "ratio"),
+    [(0.3, 0.1), (10.3, 0.05), (40, 0.02), (40, 0.0), (700, 0.001), (0.4999, 0.3), (5000, 1e-4)],
+)
+def test_an_oscillator_without_clocks_has_its_own_frequency(hertz: float, ratio: float) -> None:
+    """The frame is one second, so that all of them fold but the first."""
+    found = analyze(compiled(OSCILLATOR.format(**numbers(hertz, ratio))))
+    expected = hertz * math.sqrt(1 - ratio**2)
+    for mode in found.modes:
+        assert mode.frequency_hz == pytest.approx(expected, rel=1e-9)
+        assert mode.damping_ratio == pytest.approx(ratio, rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.few(6)
+@pytest.mark.parametrize("frame", ["1 ms", "7/3 ms", "20 ms", "100 ms", "1 s"])
+@pytest.mark.parametrize(("hertz", "ratio"), [(3.3, 0.2), (40, 0.02), (700, 0.001)])
+def test_the_frame_does_not_matter(frame: str, hertz: float, ratio: float) -> None:
+    found = analyze(compiled(CLOCKED.format(frame=frame, **numbers(hertz, ratio))))
+    mode = found.modes[0]
+    assert mode.frequency_hz == pytest.approx(hertz * math.sqrt(1 - ratio**2), rel=1e-6)
+    assert mode.damping_ratio == pytest.approx(ratio, rel=1e-4)
+
+
+@pytest.mark.parametrize("halves", [1, 2, 79, 80, 1400])
+def test_what_folds_onto_the_real_axis_is_told_by_its_changes_of_sign(halves: int) -> None:
+    """So many half turns in a frame: e^{sT} is real, twice, up to the rounding of the numbers."""
+    damped = math.pi * halves
+    text = OSCILLATOR.format(stiffness=repr(damped**2 + 0.25), damping="1.0")
+    for mode in analyze(compiled(text)).modes:
+        assert mode.frequency_hz == pytest.approx(halves / 2, rel=1e-6)
+        assert mode.damping_ratio == pytest.approx(0.5 / math.hypot(damped, 0.5), rel=1e-6)
+
+
+def test_what_is_gone_within_a_frame_has_no_frequency_rather_than_a_wrong_one() -> None:
+    """e^(−31) of it is left after a frame: 3e-14, which rounding hides."""
+    found = analyze(compiled(OSCILLATOR.format(**numbers(10.0, 0.5))))
+    assert all(math.isnan(mode.frequency_hz) and math.isnan(mode.damping_ratio) for mode in found.modes)
+    assert [mode["frequency_hz"] for mode in found.to_dict()["modes"]] == [None, None]
+
+
+def test_modes_of_a_directed_graph_that_are_real_but_for_rounding_have_no_frequency() -> None:
+    """Followed with 320 bits the pair turns once a frame, 1,000 Hz; in floats the last digit chooses."""
+    text = """\
+topology: weights
+clocks: {haptic: {period: 0.5 ms}, network: 1 ms}
+peers: {user: {count: 3}}
+masses:
+  device: {mass: 7.131 g}
+  cube: {mass: 0.1156 g, damping: 1.859 mN*s/m, shared: true}
+couplers:
+  contact:
+    {type: SampledSpringDamper, a: device, b: cube, stiffness: 2196 N/m, damping: 0.745 N*s/m, clock: haptic}
+  coordination:
+    {type: AveragePosition, object: cube, stiffness: 0.864 N/m, damping: 1.82 N*s/m, clock: haptic, link: lan}
+links:
+  lan:
+    clock: network
+    delay: 7/3 ms
+    graph: {arcs: [[1, 2, 0.233], [1, 3, 0.999], [2, 3, 0.248], [2, 1, 1.262], [3, 1, 0.904], [3, 2, 0.698]]}
+hands:
+  arm: {type: SpringDamperArm, flange: device, stiffness: 80 N/m, damping: 1 N*s/m}
+"""
+    common, one, other = analyze(compiled(text)).modes[:3]
+    assert common.frequency_hz == pytest.approx(1000)
+    assert one.eigenvalue == other.eigenvalue.conjugate()
+    assert one.magnitude == pytest.approx(common.magnitude, rel=1e-6)
+    assert math.isnan(one.frequency_hz) and math.isnan(other.frequency_hz)
+
+
+def test_shares_name_the_states_that_take_part_and_add_up() -> None:
+    found = analyze(paper(kt=800.0, bt=2.0, kc=1500.0, bc=2.0))
+    for mode in found.modes:
+        assert sum(share for _, share in mode.participation) == pytest.approx(1, abs=1e-12)
+        assert [name for name, _ in mode.participation][:2] == ["device.x", "device.v"]
+    free = analyze(paper(kc=0.0, kt=0.0, comp=Fraction(0)))
+    slow = next(mode for mode in free.modes if abs(mode.eigenvalue - math.exp(-0.2)) < 1e-9)  # b/m_O = 25/s
+    assert dict(slow.participation)["cube.v"] == pytest.approx(1, abs=1e-9)

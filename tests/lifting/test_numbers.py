@@ -1,0 +1,238 @@
+"""Other values of what is compiled: names, what depends on them, groups, columns, and what is refused."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from apc.__main__ import run
+from apc.compiler.compiled import PEERS, CompiledSystem, counts_peers
+from apc.compiler.errors import ApcError
+from apc.compiler.pipeline import compile_topology
+from apc.frame.names import (
+    Free,
+    find,
+    is_named,
+)
+from apc.frame.overrides import Override, apply, parse_override
+from apc.frame.parameters import resolve
+from apc.vary.many import analyze_many
+from apc.vary.margins import margins
+from tests.sites import NAMES, columned, derived, grouped, paper
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
+
+
+def _value(system: CompiledSystem, name: str, group: int = 0) -> float:
+    return float(resolve(system).parameters[group][0, NAMES.index(name)])
+
+
+def _message(system: CompiledSystem, text: str) -> str:
+    with pytest.raises(ApcError) as caught:
+        apply(system, [parse_override(system, text)])
+    [mistake] = caught.value.mistakes
+    return f"{mistake.code} {mistake.sentence}"
+
+
+def _column(system: CompiledSystem, name: str) -> list[float]:
+    """Return a parameter's value of each peer of the first group."""
+    numbers = resolve(system)
+    return [float(value) for value in numbers.parameters[0][numbers.rows[0], NAMES.index(name)]]
+
+
+@pytest.mark.parametrize("name", ["contact.stiffness", "couplers.contact.stiffness"])
+def test_an_override_reaches_every_group(name: str) -> None:
+    system = grouped(paper(), ("left", 1, {"contact.stiffness": 7.0}), ("right", 1, {}))
+    override = parse_override(system, f"{name}=0.8 N/mm")
+    assert override == Override(Free("contact.stiffness"), Fraction(800))
+    changed = apply(system, [override])
+    assert [_value(changed, "contact.stiffness", group) for group in (0, 1)] == [800.0, 800.0]
+
+
+def test_what_depends_on_a_parameter_follows_it() -> None:
+    system = derived(paper(), coordination__stiffness="kt/(peers - 1)", lan__delay="2*wait")
+    changed = apply(system, [Override(Free("kt"), Fraction(3000)), Override(Free("wait"), Fraction(1, 90))])
+    assert _value(changed, "coordination.stiffness") == 1500.0
+    assert resolve(changed).timings["lan.delay"] == Fraction(1, 45)
+
+
+def test_mistakes_say_what_to_write() -> None:
+    system = paper()
+    assert _message(system, "contact.stifness=8 N/m") == (
+        "E622 contact.stifness is no parameter of paper. Write: contact.stiffness"
+    )
+    assert _message(system, "contact.stiffness") == (
+        "E621 an override wants NAME=VALUE, got contact.stiffness. Write: contact.stiffness=800 N/m"
+    )
+    assert _message(system, "contact.stiffness=800") == (
+        "E204 contact.stiffness wants N/m, got 800 (no unit). Write: contact.stiffness=800 N/m"
+    )
+    assert _message(system, "peers=4").startswith("E623 peers is the number of all peers")
+    assert _message(system, "cube.mass=0 kg") == "E624 cube.mass wants more than 0 kg, got 0 kg."
+    assert _message(system, "contact.damping=-1 N*s/m") == (
+        "E624 contact.damping wants at least 0 N*s/m, got -1 N*s/m."
+    )
+    assert _message(system, "haptic.period=0 s") == "E625 haptic.period wants a time above 0 s, got 0.0 s."
+    assert _message(system, "lan.delay=-1 ms") == "E625 lan.delay wants a time of 0 s or more, got -0.001 s."
+
+
+def test_a_timing_has_one_value_for_all_groups() -> None:
+    system = grouped(paper(), ("left", 1, {}), ("right", 1, {}))
+    assert _message(system, "left.lan.delay=1 ms").startswith("E622 left.lan.delay is no parameter of paper")
+
+
+@pytest.mark.parametrize("name", ["device.mass", "user.device.mass"])
+def test_an_override_replaces_a_column(name: str) -> None:
+    system = columned(paper(), device__mass=[0.1, 0.2, 0.1])
+    changed = apply(system, [parse_override(system, f"{name}=0.5 kg")])
+    assert _column(changed, "device.mass") == [0.5, 0.5, 0.5]
+    kept = apply(system, [parse_override(system, "contact.stiffness=5 N/m")])
+    assert _column(kept, "device.mass") == [0.1, 0.2, 0.1]
+
+
+THIRDS = """\
+topology: thirds
+clocks: {haptic: 1 ms, network: 8 ms}
+parameters: {ratio: 5/3, base: 4.8 ms}
+peers: {user: {count: 3}}
+masses:
+  device: {mass: 0.1 kg, damping: 5 N*s/m}
+  cube: {mass: 0.6 kg, damping: 5 N*s/m, shared: true}
+couplers:
+  contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic, delay: 1 ms}
+  coordination: {type: AveragePosition, object: cube, stiffness: 500 N/m, clock: haptic, link: lan}
+links: {lan: {clock: network, delay: base*ratio}}
+"""
+
+
+@pytest.mark.parametrize("setting", ["base=4.8 ms", "ratio=5/3"])
+def test_a_time_that_depends_on_a_third_stays_the_very_tick(setting: str) -> None:
+    """4.8 ms · 5/3 is 8 ms: a packet that came 2e-19 s later would miss its tick."""
+    system = compiled(THIRDS)
+    changed = apply(system, [parse_override(system, setting)])
+    assert resolve(changed).timings["lan.delay"] == Fraction(8, 1000)
+
+
+def _own_values(system: CompiledSystem) -> list[Override]:
+    """Return every number and time of a scene as an override that sets it to what it is."""
+    own = {value.name for group in system.groups for value in group.values}
+    own |= {column.name for group in system.groups for column in group.columns}
+    found = [Override(Free(one.name), one.number) for one in system.parameters if one.name not in own]
+    found += [Override(Free(one.name), one.value) for one in system.timings]
+    found += [
+        Override(Free(one.name, group.name), one.number)
+        for group in system.groups
+        for one in group.values
+        if one.formula is None
+    ]
+    return [one for one in found if one.free.name != PEERS]
+
+
+@pytest.mark.few(8)
+@pytest.mark.parametrize("scene", sorted(path.name for path in SCENES.glob("*.yaml")))
+def test_setting_a_number_to_what_it_is_changes_nothing(scene: str) -> None:
+    system = compile_topology(SCENES / scene)
+    before = resolve(system)
+    for override in _own_values(system):
+        after = resolve(apply(system, [override]))
+        assert after.timings == before.timings, override
+        for one, other in zip(after.parameters, before.parameters, strict=True):
+            assert np.array_equal(one, other), override
+
+
+OUTER = """\
+component: Outer
+connectors: {a: Flange, b: Flange}
+parameters: {k: {unit: N/m}, lag: {unit: s, default: 1 ms}, slack: {unit: s, default: 0 s}, clock: clock}
+parts:
+  inner: {type: SampledSpringDamper, a: a, b: b, stiffness: 2*k, clock: clock, delay: lag + slack}
+"""
+
+
+NESTED = """\
+topology: nested
+clocks: {haptic: 1 ms, slow: 2 ms}
+peers: {one: {count: 1}, two: {count: 2, set: {o.k: 7 N/m, o.lag: 2 ms, o.clock: slow}}}
+masses: {device: {mass: 0.1 kg}, cube: {mass: 0.1 kg}}
+couplers: {o: {type: Outer, a: device, b: cube, k: 1 N/m, clock: haptic}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("settings", "stiffness", "delays"),
+    [
+        ([], (2, 14), (1, 2)),
+        (["o.k=3 N/m"], (6, 6), (1, 2)),
+        (["two.o.k=3 N/m"], (2, 6), (1, 2)),
+        (["o.lag=5 ms"], (2, 14), (5, 2)),
+        (["two.o.lag=5 ms"], (2, 14), (1, 5)),
+        (["o.lag=5 ms", "two.o.lag=3 ms"], (2, 14), (5, 3)),
+        (["o.slack=1 ms"], (2, 14), (2, 3)),
+    ],
+)
+def test_what_a_group_sets_of_a_part_reaches_the_parts_inside(
+    tmp_path: Path, settings: list[str], stiffness: tuple[int, int], delays: tuple[int, int]
+) -> None:
+    system = compiled(NESTED, library(tmp_path, OUTER))
+    changed = apply(system, [parse_override(system, text) for text in settings])
+    numbers = resolve(changed)
+    kinds = [changed.kinds[group.kind] for group in changed.groups]
+    rows = zip(kinds, numbers.parameters, strict=True)
+    assert [row[0, kind.parameters.index("o.inner.stiffness")] for kind, row in rows] == list(stiffness)
+    assert [numbers.timings[kind.holds[0].delay] * 1000 for kind in kinds] == list(delays)
+    assert [kind.holds[0].clock for kind in kinds] == ["haptic", "slow"]
+
+
+def test_what_depends_on_a_column_is_worked_out_peer_by_peer() -> None:
+    text = (
+        "if device.mass > 0.15 and peers == 3 then kt*max(device.mass, 0.3) else -(-sqrt(kt)^2)/(peers - 1)"
+    )
+    system = columned(derived(paper(), coordination__stiffness=text), device__mass=[0.1, 0.2, 0.4])
+    assert _column(system, "coordination.stiffness") == pytest.approx([250.0, 150.0, 200.0], rel=1e-15)
+    doubled = apply(system, [Override(Free("kt"), Fraction(1000))])
+    assert _column(doubled, "coordination.stiffness") == pytest.approx([500.0, 300.0, 400.0], rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [
+        ("contact.stiffness", Free("contact.stiffness")),
+        ("couplers.contact.stiffness", Free("contact.stiffness")),
+        ("links.lan.delay", Free("lan.delay")),
+        ("left.contact.stiffness", Free("contact.stiffness", "left")),
+    ],
+)
+def test_a_name_may_start_with_its_group_or_its_section(written: str, meant: Free) -> None:
+    system = grouped(paper(), ("left", 1, {}), ("right", 2, {}))
+    assert find(system, written) == meant
+
+
+def test_what_is_set_for_all_groups_says_what_each_of_them_has(capsys: pytest.CaptureFixture[str]) -> None:
+    """The star's teacher holds on with 400 N/m of its own, its students with the part's 100 N/m."""
+    told = (
+        "arm.stiffness is one value for all groups here; the scene has 400 N/m at teacher, 100 N/m at student"
+    )
+    star = compile_topology(SCENES / "star-lecture.yaml")
+    assert told in analyze_many(star, {"arm.stiffness": [100.0, 400.0]}).left_out
+    assert run(["analyze", str(SCENES / "star-lecture.yaml"), "--set", "arm.stiffness=100 N/m"]) == 0
+    assert capsys.readouterr().err == f"note: {told}\n"
+
+
+def test_what_the_compiler_counts_or_adds_is_nobody_s_to_set() -> None:
+    """A hold without delay, one by an expression, and how many are heard have names that mean nothing."""
+    own = compiled(replaced(AVERAGE, ("link: lan}", "link: lan, delays: own}")))
+    star = compiled(replaced(MESH, ("delay: 8 ms}", "delay: 8 ms, graph: star}")))
+    for system in (own, star):
+        names = [one.name for one in (*system.parameters, *system.timings)]
+        unnamed = [name for name in names if not is_named(name)]
+        assert unnamed
+        for name in unnamed:
+            with pytest.raises(ApcError, match="E623" if counts_peers(name) else "E622"):
+                find(system, name)
+        assert all(is_named(row.parameter) for row in margins(system).rows)
+    with pytest.raises(ApcError, match=r"E623 user.count is a number of peers, which doesn't vary here"):
+        find(own, "user.count")
+    five = apply(own, [parse_override(own, "user.count=5")])
+    assert five.groups[0].count == 5

@@ -1,0 +1,160 @@
+"""What each scene of the library keeps, and that what it does not use costs nothing."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from apc.analysis.analysis import analyze
+from apc.analysis.needs import needs
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.pipeline import compile_topology
+from tests.topologies import AVERAGE, SCENES, compiled, replaced
+
+# Of every scene: motion, delayed forces and packets of a peer of each kind. Counted by hand: two masses or a
+# device with a finger move in one axis (4); a force with a delay of one tick is remembered (one each); a
+# packet of a delay of k frames is kept k times, for position and velocity each.
+KEPT = {
+    "client-server": [(2, 2, 3), (4, 3, 3)],  # forces are held to be sent, and sent as well
+    "experiment-average": [(4, 0, 2)],
+    "experiment-mesh": [(4, 0, 2)],
+    "finger": [(4, 2, 0)],  # the wall's force, and its position at the tick before
+    "lifted-box": [(4, 2, 2)],
+    "lossy-average": [(4, 2, 2)],
+    "mixed-clocks": [(4, 2, 10), (4, 2, 10)],  # 40 ms are five frames
+    "planar-users": [(8, 4, 4)],  # the paper's, along either axis
+    "ring-of-eight": [(4, 2, 2)],
+    "star-lecture": [(4, 2, 4)],  # 20 ms are two frames
+    "template": [(4, 2, 2)],
+    "three-users-average": [(4, 2, 2)],
+    "three-users-mesh": [(4, 2, 2)],
+    "three-users-predicted": [(4, 2, 2)],
+    "three-users-scheduled": [(4, 2, 1)],  # no velocity is sent
+    "two-handed-tool": [(6, 2, 2)],  # two devices and a copy; the tool is midway
+    "two-users-damped": [(4, 2, 2)],
+    "two-users-proxies": [(4, 2, 2)],
+    "two-users-reported": [(4, 5, 1)],  # the mean as it grows, and what was told, at either clock
+    "two-users-filtered-waves": [(4, 5, 2)],  # as below, and the filter
+    "two-users-waves": [(4, 4, 2)],  # the outgoing wave until it is sent, and the point that moves
+    "unlike-devices": [(4, 2, 2)],
+    "users-table": [(4, 2, 2)],
+}
+
+
+# Schemes that remember what their laws need, which are played by hand in test_schemes_in_time.
+IN_TIME = (
+    "god-object",
+    "limited-motor",
+    "stiff-wall-passivity",
+    "two-users-dead-reckoning",
+    "two-users-passivity",
+    "two-users-set-position",
+)
+
+
+def functions(system: CompiledSystem) -> list[Any]:
+    """Return all functions of a model."""
+    return [
+        function
+        for kind in system.kinds
+        for function in (
+            kind.derivative,
+            *(clock.tick for clock in kind.clocks),
+            *(sending.send for sending in kind.sends),
+        )
+    ]
+
+
+def test_every_scene_is_listed() -> None:
+    assert sorted([*KEPT, *IN_TIME]) == sorted(path.stem for path in SCENES.glob("*.yaml"))
+
+
+@pytest.mark.parametrize("name", KEPT)
+def test_a_scene_keeps_what_it_needs_and_no_more(name: str) -> None:
+    system = compile_topology(SCENES / f"{name}.yaml")
+    found = needs(system)
+    assert [(site.motion, site.remembered, site.packets) for site in found.sites] == KEPT[name]
+    assert system.dropped == ()
+    # As many equations as states, outputs and channels, and each of them is read.
+    for kind in system.kinds:
+        assert kind.derivative.numel_out(0) == len(kind.states)
+        for clock in kind.clocks:
+            read = {hold.output for hold in kind.holds if hold.clock == clock.clock} | set(clock.memories)
+            assert read == set(range(len(clock.outputs)))
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize("name", KEPT)
+def test_unused_parts_change_nothing_and_cost_nothing_in_any_scene(name: str, tmp_path: Path) -> None:
+    path = SCENES / f"{name}.yaml"
+    text = path.read_text(encoding="utf-8")
+    spare = {
+        "clocks": "spare_clock: 3 ms",
+        "parameters": "spare_number: 3 N/m",
+        "links": "spare_link: {clock: haptic, delay: 80 s}",
+        "couplers": "spare_force: {type: SampledSpringDamper, a: ground, b: ground, stiffness: 1 N/m, "
+        "clock: haptic, delay: 5 ms}",
+    }
+    for section, entry in spare.items():
+        text = _with(text, section, entry)
+    for table in SCENES.glob("*.csv"):
+        shutil.copy(table, tmp_path)
+    (tmp_path / path.name).write_text(text, encoding="utf-8")
+    more = compile_topology(tmp_path / path.name)
+    _same(compile_topology(path), more)
+    assert sorted({reason for _, reason in more.dropped}) == [
+        "nobody hears what it would carry",
+        "nobody reads this held value",
+        "nothing ticks with it",
+    ]
+
+
+def _with(text: str, section: str, entry: str) -> str:
+    """Return a topology with one more entry in a section, there or not, on one line or several."""
+    found = re.search(rf"^{section}:( *{{)?", text, re.MULTILINE)
+    if found is None:
+        return f"{text}\n{section}:\n  {entry}\n"
+    end = found.end()
+    if found.group(1):
+        return f"{text[:end]}{entry}, {text[end:]}"
+    end = text.index("\n", end)
+    return f"{text[:end]}\n  {entry}{text[end:]}"
+
+
+def _same(plain: CompiledSystem, more: CompiledSystem) -> None:
+    """Assert that two models are the same functions, states and buffers, and the same answer."""
+    assert [one.serialize() for one in functions(more)] == [one.serialize() for one in functions(plain)]
+    assert needs(more) == needs(plain)
+    assert [kind.states for kind in more.kinds] == [kind.states for kind in plain.kinds]
+    assert analyze(more).to_dict() == analyze(plain).to_dict()
+
+
+CONTACT, COORDINATION, LINK = "haptic, delay: 1 ms}", "haptic, delay: 1 ms, link", "network, delay: 8 ms}"
+
+
+@pytest.mark.parametrize(
+    ("changes", "counts"),
+    [
+        ((), (4, 2, 2)),
+        (((CONTACT, "haptic}"),), (4, 1, 2)),
+        (((COORDINATION, "haptic, link"),), (4, 1, 2)),
+        (((LINK, "network}"),), (4, 2, 0)),
+        (((CONTACT, "haptic}"), (COORDINATION, "haptic, link"), (LINK, "network}")), (4, 0, 0)),
+        (((LINK, "network, delay: 16 ms}"),), (4, 2, 4)),
+        (((LINK, "network, delay: 4 ms}"),), (4, 2, 2)),
+        (((CONTACT, "haptic, delay: 3 ms}"),), (4, 4, 2)),
+        (((CONTACT, "haptic, delay: 2.5 ms}"),), (4, 4, 2)),
+        (((COORDINATION, "haptic, delay: 1 ms, delays: own, link"),), (4, 2, 2)),
+    ],
+)
+def test_a_peer_keeps_its_motion_its_delayed_forces_and_its_packets_on_their_way(
+    changes: tuple[tuple[str, str], ...], counts: tuple[int, int, int]
+) -> None:
+    system = compiled(replaced(AVERAGE, *changes))
+    (site,) = needs(system).sites
+    assert (site.motion, site.remembered, site.packets) == counts
+    assert site.states == sum(counts) == analyze(system).states_per_peer

@@ -1,0 +1,187 @@
+"""Eigenvalues of matrices known up to an error lie within the bounds that any way tells of them."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import flint
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from apc.eigen.apart import pairs_apart, pairs_by_discs
+from apc.eigen.balls import precision
+from apc.eigen.dominant import all_within, enclosed, largest_pairs, misses_one
+from apc.eigen.enclosure import enclose_eigenvalues
+from apc.eigen.pseudospectrum import pseudospectral_radius
+
+Floats = NDArray[Any]
+
+# What a way says of a matrix: eigenvalues, a bound of each, the radius from below and above; or nothing.
+Told = tuple[Floats, Floats, float, float] | None
+
+
+def _enclosed(matrix: Floats, error: Floats) -> Told:
+    pairs, found = enclose_eigenvalues(matrix, error)
+    assert np.isfinite([*found.errors, found.high]).all()
+    return pairs.values, found.errors, found.low, found.high
+
+
+def _pairs_apart(matrix: Floats, error: Floats) -> Told:
+    pairs, (bound,) = pairs_apart(matrix[None], error[None])
+    return None if bound is None else (pairs.values[0], bound.near, bound.low, bound.high)
+
+
+def _discs(matrix: Floats, error: Floats) -> Told:
+    ((pairs, bound),) = pairs_by_discs([(matrix, error)])
+    return None if bound is None else (pairs.values, bound.near + 1e-25, bound.low, bound.high)
+
+
+def _largest(matrix: Floats, error: Floats) -> Told:
+    found = enclosed(matrix[None], error[None], *largest_pairs(matrix[None]))
+    if np.isnan(found.error[0]):
+        return None
+    size, off = abs(found.value[0]), found.error[0]
+    return found.value, found.error, size - off, size + off
+
+
+def _pseudospectrum(matrix: Floats, error: Floats) -> Told:
+    high = pseudospectral_radius(matrix, float(np.linalg.norm(error)))
+    return np.zeros(0), np.zeros(0), 0.0, high
+
+
+WAYS = {
+    "enclosure": _enclosed,
+    "apart": _pairs_apart,
+    "discs": _discs,
+    "largest": _largest,
+    "pseudospectrum": _pseudospectrum,
+}
+
+
+def _drawn(generator: np.random.Generator) -> dict[str, Floats]:
+    """Return random, graded, repeated, triangular and defective matrices, queues and unlike units."""
+    n = int(generator.integers(2, 10))
+    plain = generator.normal(size=(n, n)) / np.sqrt(n)
+    grades = 10.0 ** generator.integers(-5, 6, size=n)
+    queue = np.eye(n, k=-1)
+    queue[0] = generator.normal(size=n) * 10.0 ** generator.integers(-6, 1, size=n)
+    units = 2.0 ** generator.integers(-12, 12, n + 2)
+    nearly_empty = np.zeros((n + 2, n + 2))
+    nearly_empty[:n, :n], nearly_empty[n:, n:] = plain, 1e-3 * np.eye(2, k=-1)
+    nearly_empty[n:, :n] = nearly_empty[:n, n:].T
+    near = np.zeros((n + 1, n + 1))
+    near[1:, 1:], near[0, 0] = plain, np.abs(np.linalg.eigvals(plain)).max() * (1 + 1e-7)
+    return {
+        "plain": plain,
+        "graded": plain * grades[:, None] / grades,
+        "queue": queue,
+        "twin": np.kron(np.eye(2), generator.normal(size=(2, 2))),
+        "triangular": np.triu(plain),
+        "defective": plain @ (0.9 * np.eye(n) + np.eye(n, k=1)) @ np.linalg.inv(plain),
+        "nearly empty": nearly_empty * units[:, None] / units,
+        "nearly double": near,
+        "chain of masses": _chain(4, 3),
+        "block": np.eye(n, k=1),
+    }
+
+
+def _chain(n: int, count: int) -> Floats:
+    """Return the frame of so many masses in a row, and a ring of queues that nearly stand still."""
+    spring = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    still = np.zeros((n, n))
+    matrix = np.eye(2 * n) + 0.05 * np.block([[still, np.eye(n)], [-spring, -0.3 * np.eye(n) - 0.5 * spring]])
+    whole = np.zeros((2 * n + count, 2 * n + count))
+    whole[: 2 * n, : 2 * n], whole[2 * n :, 2 * n :] = matrix, 1e-3 * np.eye(count, k=-1)
+    whole[2 * n :, 0] = whole[1, 2 * n :] = 1e-6
+    return whole
+
+
+def _true(matrix: Floats) -> Floats:
+    """Return the eigenvalues, of which 120 digits leave those of a block of ten a dozen."""
+    with precision(400):
+        rows = [[flint.acb(float(one)) for one in row] for row in matrix]
+        return np.array([complex(one) for one in flint.acb_mat(rows).eig(algorithm="approx")])
+
+
+@functools.cache
+def _matrices(seed: int) -> list[tuple[str, Floats, Floats, list[Floats]]]:
+    """Return matrices with errors, and the true eigenvalues of some that lie within these."""
+    generator = np.random.default_rng(seed)
+    found = []
+    for name, matrix in _drawn(generator).items():
+        error = np.abs(matrix) * 10.0 ** generator.integers(-16, -7)
+        if name == "block":
+            error[-1, 0] = 1e-12  # moves its eigenvalues to the n-th roots of that
+        signs = generator.choice([-1, 1], size=matrix.shape)
+        along = np.ones(matrix.shape)
+        values, right = np.linalg.eig(matrix)
+        if np.linalg.cond(right) < 1e12:
+            # Along its own vectors an error moves an eigenvalue as far as it can.
+            first = int(np.argmax(np.abs(values)))
+            along = np.sign(np.outer(np.linalg.inv(right)[first].real, right[:, first].real))
+        moved = [matrix + share * one * error for share, one in ((0, signs), (0.999, signs), (0.999, along))]
+        found.append((name, matrix, error, [_true(one) for one in moved]))
+    return found
+
+
+@pytest.mark.parametrize(
+    "seed", [*range(3), *(pytest.param(k, marks=pytest.mark.whole) for k in range(3, 15))]
+)
+@pytest.mark.parametrize("way", WAYS)
+def test_every_matrix_within_the_error_has_its_eigenvalues_within_the_bounds(way: str, seed: int) -> None:
+    told = 0
+    for name, matrix, error, truths in _matrices(seed):
+        said = WAYS[way](matrix, error)
+        if said is None:
+            continue
+        told += 1
+        values, errors, low, high = said
+        for true in truths:
+            size = np.abs(true).max()
+            assert low * (1 - 1e-15) <= size + 1e-11 * (name == "block"), name
+            assert size <= high * (1 + 1e-15), name
+            for value, bound in zip(values, errors, strict=True):
+                assert np.abs(true - value).min() <= bound + 1e-15 * abs(value) + 1e-25, name
+    assert told >= 3
+
+
+@pytest.mark.parametrize(("n", "error"), [(2, 1e-12), (6, 1e-12), (60, 1e-13)])
+def test_a_jordan_block_s_bound_is_within_reach_of_its_root(n: int, error: float) -> None:
+    """An entry ε in the corner moves the eigenvalues to the n-th roots of ε."""
+    assert error ** (1 / n) <= pseudospectral_radius(np.eye(n, k=1), error) < 3 * error ** (1 / n)
+
+
+@pytest.mark.parametrize(("masses", "count"), [(20, 6), (60, 3)])
+def test_what_stands_alone_is_as_sure_as_first_order_has_it(masses: int, count: int) -> None:
+    """An eigenvalue far from others is off by little more than its own vectors say, however many states."""
+    matrix = _chain(masses, count)
+    error = 1e-9 * np.abs(matrix)
+    pairs, found = enclose_eigenvalues(matrix, error)
+    assert found.high - found.low < 4 * pairs.errors(error)[0] + 1e-12
+    generator = np.random.default_rng(5)
+    moved = np.linalg.eigvals(matrix + error * generator.choice([-1.0, 1.0], size=matrix.shape))
+    assert found.low <= np.abs(moved).max() <= found.high
+    assert (np.abs(pairs.values[:, None] - moved).min(axis=1) <= found.errors + 1e-13).all()
+
+
+def test_two_that_hardly_differ_keep_their_common_disc_and_equal_ones_are_left_open() -> None:
+    """Nothing tells a pair apart that the error mixes: each may be anywhere the pair may."""
+    pair, mixed = np.diag([0.9, 0.9 + 1e-9, 0.5]), np.full((3, 3), 1e-9)
+    _, errors, _, _ = _enclosed(pair, mixed)
+    assert errors[:2].min() >= 1e-9
+    assert [way(pair, mixed) for way in (_pairs_apart, _discs, _largest)] == [None] * 3
+    assert _largest(np.diag([0.9, -0.9, 0.1]), 1e-13 * np.eye(3)) is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_shown_to_be_small_or_not_to_be_one_is_so(seed: int) -> None:
+    for _, matrix, error, truths in _matrices(seed):
+        for true in truths:
+            radius = np.array([np.abs(true).max() * 0.999])
+            assert not all_within(matrix[None], error[None], radius).any()
+            assert (
+                not misses_one(matrix[None] + (1 - true[0].real) * np.eye(len(matrix)), error[None])
+                or true[0].imag
+            )
