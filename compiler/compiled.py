@@ -1,7 +1,7 @@
 """The compiled model: CasADi functions of one site per kind, and the exchange between sites as structure.
 
 Takes: nothing (these are the data types the stage `functions` fills and the runtime reads).
-Gives: `CompiledSystem` and its parts; `PEERS`, `count_of`, `group_count`, `counts_peers`.
+Gives: `CompiledSystem` and its parts; `PEERS`, `count_of`, `group_count`, `counts_peers`; `LENGTH`, `ANGLES`.
 Guarantees: plain frozen data; numbers in SI; periods, phases and delays exact rationals of a second.
 Does not: evaluate anything, or read or write files (see `store`).
 
@@ -25,6 +25,8 @@ from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
 
+# The units of positions: a length; an angle, or what stands for one where a body turns in space.
+LENGTH, ANGLES = "m", ("rad", "1")
 PEERS = "peers"  # the parameter that holds the number of peers
 LARGEST_COUNT = 10**9  # of peers in one group
 MOST_GROUPS = 1000  # of a scene: who hears whom is worked out for each two of them

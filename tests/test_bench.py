@@ -139,7 +139,7 @@ def test_what_rests_is_moved_by_its_own_scale_in_its_own_unit(tmp_path: Path) ->
     turning = replaced(PUSHED, ("{mass: 0.25 kg, damping: 2 N*s/m}", wheel))
     found = bench_simulation(compiled(turning, library(tmp_path, ROTOR)), Fraction(1, 50), rounds=1)
     assert found.notes == (
-        "nothing moves in this scene: device.angle of its first peer starts 0.001 elsewhere",
+        "nothing moves in this scene: device.angle of its first peer starts 0.001 rad elsewhere",
     )
     wide = replaced(PUSHED, ("{count: 1}", "{count: 2, set: {device.x: [20 mm, 30 mm]}}"))
     still = compiled(replaced(wide, ("9 N/m", "0 N/m")))

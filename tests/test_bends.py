@@ -137,11 +137,18 @@ def test_steps_kinks_and_other_functions_hide_nothing_either(
     assert found.known
 
 
-def test_a_scene_linearized_at_its_start_says_how_often_it_was_looked_at() -> None:
+def test_what_reaches_where_a_scene_is_linearized_says_how_often_it_was_looked_at() -> None:
     bent_scene = replaced(
-        AVERAGE, ("SampledSpringDamper", "OneSidedContact"), ("b: cube,", "b: cube, half_width: 20 mm,")
+        AVERAGE,
+        ("SampledSpringDamper", "OneSidedContact"),
+        ("b: cube,", "b: cube, half_width: 20 mm,"),
+        ("stiffness: 1000", "stiffness: 3000"),
+        ("count: 3", "count: 3, set: {device.x: -15 mm}"),
     )
-    found = critical(compiled(bent_scene), "coordination.stiffness", upper="2000 N/m")
+    # The contact closes where its half width is how far the device begins from the cube: a free device less.
+    found = critical(compiled(bent_scene), "contact.half_width", upper="40 mm")
+    (edge,) = found.crossings
+    assert abs(edge.value - 0.015) <= 1e-14 and edge.stable_side == "below" and found.scanned == (0.0, 0.04)
     assert not found.known
     assert f"{found.looked} values were looked at; what the equations do between two" in str(found)
-    assert "the scene is not linear" in str(found).splitlines()[1]
+    assert "the scene is not linear" in str(found)

@@ -193,7 +193,7 @@ def test_a_trace_that_is_not_there_is_told_where_it_is_named() -> None:
         ("loss: -1 %", ["44: E261 loss wants PROBABILITY, got -1 %."]),
         ("loss: 2", ["44: E261 loss wants PROBABILITY, got 2. Write: loss: 2 %"]),
         ("loss: peers", ["44: E261 loss wants PROBABILITY, got peers."]),
-        ("loss: 2 ms", ["44: E204 loss wants %, got 2 ms. Write: loss: 2 %"]),
+        ("loss: 2 ms", ["44: E204 loss wants %, got 2 ms."]),
         ("loss: nan", ["44: E221 loss wants %, got nan. Write: loss: 1 %"]),
         ("loss: rare", ["44: E206 loss names rare, which is no parameter here; there are: peers."]),
         ("loss: [1 %]", ["44: E203 loss wants a single value, got a list. Write: loss: 1 %"]),

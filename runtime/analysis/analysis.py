@@ -19,7 +19,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from apc.analysis.plan import cannot_serve, make_plan, refuse_varying
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import LENGTH, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
@@ -28,7 +28,7 @@ from apc.eigen.modes import arrange
 from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of, used_ways
 from apc.eigen.peers import group_of_row, peer_groups
 from apc.eigen.rest import unrest
-from apc.eigen.rigid import LENGTH, Standing, what_stands
+from apc.eigen.rigid import Standing, what_stands
 from apc.eigen.spectrum import (
     DRIFTS,
     STABLE_TRANSLATING,

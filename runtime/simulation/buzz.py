@@ -24,12 +24,11 @@ from apc.analysis.contact_modes import EVERYONE, ContactModes, contact_modes
 from apc.analysis.describing import Predicted, predict
 from apc.analysis.opened import contact_groups
 from apc.analysis.pushes import Push
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import LENGTH, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.peer_group import PeerGroup
-from apc.eigen.rigid import LENGTH
 from apc.frame.exchange import build_exchange
 from apc.frame.parameters import resolve
 from apc.result import Result

@@ -16,6 +16,7 @@ import hmac
 import io
 import json
 import os
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -69,9 +70,15 @@ class Parts:
         return _unpacked(read_arrays(body, _ARRAYS, _LARGEST))
 
     def there(self) -> set[int]:
-        """Return the numbers of the parts that have a file, damaged or not."""
-        names = (path.name.split("-")[1] for path in self.folder.glob(self._path("*").name))
-        return {int(name) for name in names if name.isdecimal()}
+        """Return the numbers of the parts that have a file, damaged or not. Raises ApcError E601."""
+        try:
+            listed = [path.name for path in self.folder.iterdir()]
+        except FileNotFoundError:
+            return set()
+        except OSError as error:
+            raise unwritable(self.folder, error) from error
+        named = (re.fullmatch(self._path("([0-9]{1,9})").name, name) for name in listed)
+        return {int(name[1]) for name in named if name}
 
     def remove(self) -> None:
         """Remove the parts, as the sweep is done. Raises ApcError E601 if they can't be."""

@@ -172,6 +172,9 @@ def critical(
         else:
             at_start = None if reaches_start(system, free) else prepare_at_start(system, prepared)
             found = search(system, free, low, high, at_start or prepared, told=told)
+            if at_start is not None and not found.sided:
+                # Contacts close or open along the way, and other motions are left out of the verdict.
+                found = search(system, free, low, high, prepared, told=told)
 
         def stable_now() -> bool | None:
             return stable_of(system)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -128,7 +129,8 @@ class Search:
     between the `looked` values that were looked at, `enters` whether any matrix was seen to change along the
     way. Where a delay moves packets only, `stretches` is in how many stretches nothing depends on it; what
     grows in each was counted in floats, and those beside a change, or that the count left open, were
-    analysed. `left_open` are the parts of a delay's range that no analysis decides.
+    analysed. `left_open` are the parts of a delay's range that no analysis decides. `sided` says whether each
+    value that the search began with, but the least, lies on a side: on none lies what frees a motion.
     """
 
     edges: tuple[Crossing, ...]
@@ -140,6 +142,7 @@ class Search:
     enters: bool
     stretches: int = 0
     left_open: tuple[tuple[float, float], ...] = ()
+    sided: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -276,7 +279,9 @@ def search(
             told(f"proving crossing {number + 1} of {len(found.roots)}")
         crossing = proved_crossing(root, line, found)
         edges += [crossing] if crossing else []
-    return _search(edges, found, (bottom, top), known=known, enters=enters)
+    lost = points[1:-1][~np.isin(points[1:-1], found.points)]
+    sided = bool((np.abs(lost) <= scale / SPAN).all())
+    return replace(_search(edges, found, (bottom, top), known=known, enters=enters), sided=sided)
 
 
 def spread(bottom: float, top: float, scale: float) -> Floats:
