@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import scipy.optimize
 
-from apc.compiler import store
 from apc.simulation.trajectory import parse_duration, simulate
 from tests.topologies import compiled, library, replaced, told
 
@@ -143,13 +142,3 @@ def test_limits_and_grips_that_are_none(tmp_path: Path, change: tuple[str, str],
     text = replaced(FALCON, ("type: Falcon", "type: Limited"))
     [found] = told(compiled, text, library(tmp_path, replaced(part, change)))
     assert found.partition(" ")[2] == line
-
-
-def test_a_model_file_keeps_its_limits(tmp_path: Path) -> None:
-    made = compiled(replaced(PRESSED, ("limits: on", "limits: off")))
-    store.save(made, tmp_path / "pressed.apc")
-    again = store.load(tmp_path / "pressed.apc")
-    assert [(one.name, one.limit) for one in again.kinds[0].limits] == [
-        ("device.x", "device.position_limit"),
-        ("device.asked", "device.force_limit"),
-    ]

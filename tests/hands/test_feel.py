@@ -238,22 +238,6 @@ def test_multiples_of_the_frame_rate_are_as_their_neighbours() -> None:
             assert abs(one - np.mean(two)) < abs(one) * (1e-5 + found.bound.max())
 
 
-def test_a_push_at_a_device_moves_a_copy_as_one_there_moves_the_device() -> None:
-    """A copy is a third of the mass of all, and what holds it to its device pulls both alike."""
-    sampled = "SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic, delay: 1 ms"
-    text = replaced(AVERAGE, ("stiffness: 500", "stiffness: 0"), (sampled, "SpringDamper, a: device, b: cube, stiffness: 1000 N/m"))  # noqa: E501 # fmt: skip
-    ends = "user[1].device", "user[1].cube"
-    there, back = (
-        feel(compiled(text), [1.0, 7.0], at=a, between=b, quick=True) for a, b in (ends, ends[::-1])
-    )
-    s = 2j * np.pi * np.array([1.0, 7.0])
-    device, copy, spring = 0.1 * s + 5, 0.2 * s + 5, 1000 / s
-    np.testing.assert_allclose(back.impedance, copy + device * spring / (device + spring), rtol=1e-9)
-    for one in (there, back):
-        arrives = spring / (device * copy + spring * (device + copy))
-        np.testing.assert_allclose(one.transmitted_admittance, arrives, rtol=1e-9)
-
-
 # Of hands and of sensors, at the first of either group: error and velocity, by an independent program, which
 # adds up the answers to each tick's noise.
 @pytest.mark.parametrize(

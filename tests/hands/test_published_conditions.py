@@ -10,7 +10,7 @@ import pytest
 import apc
 from apc.frame.names import Free, Range
 from apc.regions.overlay import overlay_points, parse_overlay, symbol_values
-from apc.regions.passivity import CONDITIONS, abbott_limit, colgate_limit, diolaiti_limit, gil_limit
+from apc.regions.passivity import CONDITIONS, colgate_limit, diolaiti_limit, gil_limit
 from tests.topologies import AVERAGE, compiled, told, wall
 
 
@@ -45,12 +45,6 @@ def test_the_linear_condition_is_within_4_percent_of_a_walls_exact_limit(
     found = apc.critical(wall(mass, damping, delay, 100.0, virtual), "it.stiffness", upper="20 kN/m").value
     assert linear == pytest.approx(found, rel=0.04)
     assert exact is None or found == pytest.approx(exact, abs=5e-4)  # printed to three decimals
-
-
-def test_quantization_sets_a_ceiling_that_friction_raises() -> None:
-    # Encoder step 61.4 µm, friction 0.02 N: 2·0.02/61.4e-6 = 651.5 N/m is below 2·0.8/1e-3 = 1600 N/m.
-    assert abbott_limit(0.8, 0.001, 0.02, 6.14e-5) == pytest.approx(651.4657980456026, rel=1e-12)
-    assert abbott_limit(0.8, 0.001, 0.2, 6.14e-5) == pytest.approx(1600, rel=1e-15)
 
 
 @pytest.mark.parametrize("name", CONDITIONS)

@@ -13,7 +13,7 @@ from apc.frame.radius import RADII
 from apc.moments.almost_sure import AlmostSure, Chance, almost_sure, exponent, unplayed
 from apc.moments.held import HeldLoop
 from apc.network.channel import ChannelLaw
-from tests.held_scenes import frames, scene, system_of
+from tests.held_scenes import scene, system_of
 from tests.lossy import BURSTS, RELIABLE
 from tests.networks.test_loss import judged
 
@@ -62,32 +62,6 @@ def test_exponents_are_those_of_the_reference(
     low, high = found.interval
     assert low < found.exponent < high < low + 1e-4
     assert low - half <= known <= high + half
-
-
-@pytest.mark.parametrize(("loss", "p", "r"), [("10 %", 0.1, 0.9), ("{p: 5 %, r: 20 %}", 0.05, 0.2)])
-def test_exponents_are_those_of_frames_multiplied_by_hand(loss: str, p: float, r: float) -> None:
-    found = estimate(scene(2, 900.0, loss=loss))
-    own = frames(2, 900.0)
-    size, luck = len(own.a), np.random.default_rng(3)
-    choices = np.array([[own.matrix(np.array([one, other])) for other in (0.0, 1.0)] for one in (0.0, 1.0)])
-    # The translation of all, and what every channel holds of it, is taken out.
-    values, vectors = np.linalg.eig(choices[1, 1])
-    rigid = vectors[:, np.argmin(np.abs(values - 1))].real
-    rigid /= rigid[0]
-    courses, skipped, length = 200, 500, 1200
-    x, total = luck.standard_normal((courses, size + 4)), np.zeros(courses)
-    bad = luck.random((courses, 2)) < p / (p + r)
-    for frame in range(skipped + length):
-        hears = (~bad).astype(np.intp)
-        x = np.einsum("cij,cj->ci", choices[hears[:, 0], hears[:, 1]], x)
-        x -= x[:, :1] * rigid
-        sizes = np.linalg.norm(x, axis=1)
-        x /= sizes[:, None]
-        total += np.log(sizes) * (frame >= skipped)
-        bad = np.where(bad, luck.random(bad.shape) >= r, luck.random(bad.shape) < p)
-    each = total / length
-    room = 1.97 * each.std(ddof=1) / math.sqrt(courses) + (found.interval[1] - found.interval[0]) / 2
-    assert abs(each.mean() - found.exponent) <= room
 
 
 @pytest.mark.parametrize(("loss", "known"), [("0 %", math.log(0.9161770691168368) / 2), ("100 %", 0.0)])

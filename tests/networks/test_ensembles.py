@@ -76,14 +76,6 @@ def test_runs_side_by_side_are_to_the_bit_those_played_alone(peers: int, more: s
         np.testing.assert_array_equal(together[:, :, number - 2], rows_of_runs(system, 1, number)[:, :, 0])
 
 
-@machine_code
-def test_machine_code_judges_the_runs_as_the_virtual_machine_does() -> None:
-    for one, other in zip(runs(SHAKY, 20, "1/2").runs, runs(SHAKY, 20, "1/2", jit=False).runs, strict=True):
-        assert (one.number, one.verdict, one.settled) == (other.number, other.verdict, other.settled)
-        assert one.largest_force == pytest.approx(other.largest_force, rel=1e-12)
-        assert one.copies_apart == pytest.approx(other.copies_apart, abs=1e-15)
-
-
 def test_runs_that_diverge_are_told_from_those_beside_them() -> None:
     """So stiff a coupling grows until the numbers end, however the packets come."""
     found = runs(replaced(SHAKY, ("stiffness: 500 N/m", "stiffness: 500 kN/m")), 3, "20").runs

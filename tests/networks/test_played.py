@@ -108,15 +108,39 @@ def scattered(system: CompiledSystem) -> CompiledSystem:
     return replace(system, groups=tuple(groups))
 
 
+# Weights, a slow clock and a delay of its own between two groups.
+GROUPS = replaced(
+    AVERAGE,
+    ("user: {count: 3}", "near: {count: 2}\n  far: {count: 1, set: {coordination.clock: slow}}"),
+    ("  haptic: 1 ms", "  haptic: 1 ms\n  slow: {period: 2 ms, phase: 1 ms}"),
+    (
+        "delay: 8 ms}",
+        "delay: 8 ms, graph: {arcs: [[1, 2, 0.5], [2, 1], [3, 1], [1, 3]]}, delays: {far: {near: 20 ms}}}",
+    ),
+)
+
+
 @pytest.mark.few(4)
 @pytest.mark.parametrize("more", ["loss: 0 %", "jitter: 0 ms, reorder: all", "loss: 0 %, on_loss: zero"])
 @pytest.mark.parametrize(
-    "name", ["mixed-clocks", "ring-of-eight", "star-lecture", "experiment-average", "0 ms", "1/3 ms", "20 ms"]
+    "name",
+    [
+        "mixed-clocks",
+        "groups",
+        "star-lecture",
+        "experiment-average",
+        "0 ms",
+        "1/3 ms",
+        "20 ms",
+        "ring-of-eight",
+    ],
 )
 def test_a_perfect_channel_plays_as_a_reliable_link_whatever_graph_clocks_and_delay(
     name: str, more: str
 ) -> None:
-    if name.endswith(" ms"):
+    if name == "groups":
+        text = GROUPS
+    elif name.endswith(" ms"):
         text = AVERAGE.replace("delay: 8 ms}", f"delay: {name}}}")
     else:
         text = (SCENES / f"{name}.yaml").read_text(encoding="utf-8")

@@ -91,13 +91,6 @@ def draw(generator: random.Random, *, quick: bool = False) -> tuple[str, dict[st
     links = (
         f"links:\n  lan: {{clock: network, delay: {late_now}{graph}{pairs}{_said(laws['lan'], generator)}}}\n"
     )
-    if generator.random() < 0.2:
-        laws["wan"] = _law(generator, network, haptic, plain=True) if generator.random() < 0.6 else Law()
-        second = generator.choice(["network", "network", "haptic"]) if "8 ms" not in network else "network"
-        couplers += f"  second: {{type: FullMesh, object: device, stiffness: {generator.uniform(20, 150):.1f} N/m, clock: haptic, delay: 0 s, link: wan}}\n"
-        links += (
-            f"  wan: {{clock: {second}, delay: {generator.choice(late)}{_said(laws['wan'], generator)}}}\n"
-        )
     hands = ""
     if generator.random() < 0.25:
         hands = (
@@ -106,11 +99,11 @@ def draw(generator: random.Random, *, quick: bool = False) -> tuple[str, dict[st
     return (f"topology: network\n{clocks}peers:\n  {groups}\n{masses}{couplers}{links}{hands}", laws)
 
 
-def _law(generator: random.Random, network: str, haptic: str, *, plain: bool = False) -> Law:
+def _law(generator: random.Random, network: str, haptic: str) -> Law:
     zero = generator.random() < 0.4
     kind = generator.random()
     loss = generator.choice([0.01, 0.1, 0.2, 0.4, 0.7])
-    if kind < 0.5 or plain:
+    if kind < 0.5:
         return Law(loss, 1 - loss, zero=zero)
     if kind < 0.75:
         r = 1 / generator.choice([1.5, 3, 10, 50])
