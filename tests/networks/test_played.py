@@ -180,6 +180,7 @@ def test_the_same_seed_gives_the_same_rows_however_long_the_chunks_are() -> None
     assert short.length != long.length
     one, other = rows_of(long), rows_of(short)
     assert one[: len(other)].tolist() == other.tolist()
+    assert rows_of(replace(short, length=3)).tolist() == other.tolist()
     assert np.abs(played(system, duration=Fraction(3), seed=2) - one).max() > 1e-3
     assert np.abs(rows_of(long, run=1) - one).max() > 1e-3
 
