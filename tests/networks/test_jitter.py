@@ -36,7 +36,7 @@ def test_within_a_tick_nobody_hears_the_difference() -> None:
     assert radius(late(3, 500.0, "0.3 ms", "7.5 ms")) == pytest.approx(0.9161770691168368, rel=1e-12)
 
 
-@pytest.mark.few(1)
+@pytest.mark.whole
 @pytest.mark.parametrize("delay", [7, 8])
 def test_what_would_arrive_before_it_was_sent_arrives_at_once(delay: int) -> None:
     """A jitter of 8 ms about 8 ms reaches back to 0; about 7 ms one packet in sixteen would be too early."""
