@@ -199,7 +199,7 @@ def test_next_to_no_loss_gives_the_square_of_the_nominal_radius(peers: int, nomi
     assert apc.judge_network(system_of(scene(peers, 500.0, loss="0 %"))) is None
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("loss", "stiffness", "proved"),
     [

@@ -102,6 +102,7 @@ def test_a_mesh_is_an_average_of_so_many_times_the_stiffness_and_a_million_users
     assert losses(scene(1_000_000, 100.0)).certified is not None
 
 
+@pytest.mark.whole
 def test_groups_rings_and_stars_are_what_is_written_peer_by_peer_and_edge_by_edge() -> None:
     heavy = "  left: {count: 1, set: {device.mass: 0.2 kg}}\n"
     groups, single = (

@@ -57,6 +57,7 @@ def test_other_questions_say_in_their_second_line_what_is_left_out(
     assert json.loads(capsys.readouterr().out)["left_out"] == [LEFT_OUT]
 
 
+@pytest.mark.whole
 def test_an_analysis_answers_for_the_network_first(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["analyze", "s.yaml", "--method", "paper"]) == 0
     told, _, nominal = capsys.readouterr().out.partition("\n\nthree-users-average: ")
