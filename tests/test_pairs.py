@@ -19,8 +19,8 @@ from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import simulate
 from tests.eventwise import MS, coast
+from tests.lossy import effective
 from tests.sites import edged, paper
-from tests.test_selection import effective
 from tests.topologies import MESH, compiled, replaced
 
 DURATION = Fraction(3, 10)

@@ -50,7 +50,7 @@ from tests.bench.paper_scene import (
     user_plant,
 )
 from tests.eventwise import experiment, play
-from tests.test_selection import APART, LINK, STARTS
+from tests.lossy import APART, LINK, STARTS
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
 MOVED = replaced(AVERAGE, ("{count: 3}", f"{{count: 3, set: {{device.x: [{START} m, 0 m, 0 m]}}}}"))

@@ -1,0 +1,165 @@
+"""The buzz of one-sided contacts: the describing function, the paper's experiment, lines of a spectrum."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import apc
+from apc.__main__ import run
+from apc.analysis.describing import gain_of, load_of
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.simulation.buzz import LET_GO, _lines
+from tests.topologies import AVERAGE, SCENES, compiled, replaced
+
+AT_ONCE = ("delay: 8 ms}            # negligible", "delay: 0 ms}            # negligible")
+TEXT = {
+    name: (SCENES / f"experiment-{name}.yaml").read_text(encoding="utf-8") for name in ("average", "mesh")
+}
+
+
+def experiment(name: str, *pairs: tuple[str, str]) -> CompiledSystem:
+    return compiled(replaced(TEXT[name], *pairs))
+
+
+@pytest.mark.parametrize("bias", [-0.95, -0.4, 0.0, 0.8, 0.99])
+def test_the_describing_function_is_the_first_terms_of_a_fourier_series(bias: float) -> None:
+    turn = np.linspace(0, 2 * np.pi, 200_001)[:-1]
+    push = np.maximum(0.0, bias + np.cos(turn))
+    assert gain_of(bias) == pytest.approx(float(2 * (push * np.cos(turn)).mean()), abs=1e-8)
+    assert load_of(bias) == pytest.approx(float(push.mean()), abs=1e-8)
+
+
+def test_the_buzz_of_the_experiment_is_predicted_and_played() -> None:
+    """An independent program: predicted 47.10 Hz, 2.437 mm, 80.5 %; played 46.95 Hz, 2.545 mm, 79.3 %."""
+    found = apc.buzz(experiment("average", AT_ONCE))
+    known = found.predicted
+    assert known is not None and known.attracts
+    assert known.frequency_hz == pytest.approx(47.10, abs=0.005)
+    assert known.in_contact == pytest.approx(0.805, abs=5e-4)
+    right, left, other = found.contacts
+    assert right.name == "right[1].contact.push"
+    assert right.predicted_depth_m == pytest.approx(2.437e-3, abs=5e-7)
+    assert left.predicted_depth_m == pytest.approx(2.437e-3 / 2, abs=5e-7)
+    # What hands push with, contacts bear on the mean.
+    assert [one.load_n for one in found.contacts] == pytest.approx([4.0, 2.0, 2.0], rel=1e-6)
+    # Three seconds hold 141 swings: they tell the frequency to some hundredths of 1 Hz, and it still grew
+    # then by two parts in a thousand.
+    assert len(found.lines) == 1 and found.steady and not found.notes
+    assert found.lines[0].frequency_hz == pytest.approx(46.95, abs=0.05)
+    assert right.depth_m == pytest.approx(2.545e-3, rel=2e-3)
+    assert left.depth_m == other.depth_m == pytest.approx(1.273e-3, rel=2e-3)
+    assert right.in_contact == pytest.approx(0.793, abs=5e-4)
+    assert "right[1].contact.push: depth         2.437 mm    2.549 mm" in str(found)
+    # Contacts that never let go, weaker by the part of a swing in which these push, are marginal there.
+    gain = gain_of(-math.cos(math.pi * known.in_contact))
+    spring = (
+        FORCE[:-6],
+        f"SampledSpringDamper, a: device, b: cube, stiffness: {3900 * gain!r} N/m, damping: {0.05 * gain!r}",
+    )
+    sides = [(f"contact.side: {side}, ", "") for side in ("right", "left")]
+    marginal = apc.analyze(experiment("average", AT_ONCE, spring, *sides))
+    assert marginal.spectral_radius == pytest.approx(1.0, abs=1e-9)
+    assert marginal.modes[0].frequency_hz == pytest.approx(known.frequency_hz, rel=1e-7)
+
+
+def test_what_is_not_one_cycle_that_motions_come_to_is_told() -> None:
+    """Stable with contacts closed, unstable with weaker ones: from its start the scene settles."""
+    leave = apc.buzz(experiment("average"))
+    assert leave.predicted is not None and not leave.predicted.attracts
+    assert leave.lines == () and leave.steady and leave.bounded and leave.settles
+    assert any("one that motions leave" in text for text in leave.notes)
+    mesh = apc.buzz(experiment("mesh"))
+    slow, fast = sorted(line.frequency_hz for line in mesh.lines)
+    assert 37 < slow < 38 and 50 < fast < 51
+    assert any("one sinusoid says nothing" in text for text in mesh.notes)
+    grows = apc.buzz(experiment("mesh", AT_ONCE))
+    assert grows.predicted is None and not grows.steady and grows.lines == ()
+    assert grows.reason == "no buzz: with contacts of any part of their stiffness it is unstable"
+
+
+def test_lines_are_told_from_multiples_and_mixtures_of_others() -> None:
+    time = np.arange(8000) * 1e-3
+    waves = (
+        (1e-3, 46.97, 0.3),
+        (3e-4, 93.94, 1.0),
+        (1e-4, 140.91, 2.0),
+        (4e-4, 37.3, 1.0),
+        (2e-4, 9.67, 0.0),
+    )
+    each = [size * np.cos(2 * np.pi * hertz * time + phase) for size, hertz, phase in waves]
+    [line] = _lines(time, sum(each[:3]) + 5e-3)
+    assert (line.frequency_hz, line.amplitude_m) == (
+        pytest.approx(46.97, abs=1e-3),
+        pytest.approx(1e-3, rel=1e-3),
+    )
+    assert [one.frequency_hz for one in _lines(time, sum(each))] == pytest.approx([46.97, 37.3], abs=2e-3)
+
+
+WALL = """\
+topology: pressed
+clocks: {tick: 1 ms}
+peers: {user: {count: 1}}
+masses: {device: {mass: 0.1 kg, damping: 2 N*s/m}}
+couplers:
+  it: {type: VirtualWall, flange: device, stiffness: 1500 N/m, clock: tick, delay: 1 ms}
+hands: {hand: {type: ConstantForce, flange: device, force: 3 N}}
+"""
+
+
+def test_a_wall_buzzes_under_the_hand_that_presses_it_and_a_hand_that_pulls_lets_go() -> None:
+    found = apc.buzz(compiled(WALL))
+    assert found.predicted is not None and found.predicted.attracts
+    # Alone: m s² + b s + g K e^{−s (T/2 + delay)} = 0 on the axis, but for what a hold is beside a delay.
+    assert found.contacts[0].load_n == pytest.approx(3.0, rel=1e-6)
+    assert found.lines[0].frequency_hz == pytest.approx(found.predicted.frequency_hz, rel=0.05)
+    omega = 2 * math.pi * found.predicted.frequency_hz
+    assert math.tan(omega * 1.5e-3) == pytest.approx(2 / (0.1 * omega), rel=0.02)
+    away = apc.buzz(compiled(WALL.replace("3 N}", "-1 N}").replace("N*s/m}", "N*s/m, x: 1 mm}")))
+    assert (away.notes, away.lines, away.settles) == ((LET_GO,), (), False)
+
+
+FORCE = "OneSidedContact, a: device, b: cube, half_width: 20 mm, stiffness: 3900 N/m, damping: 0.05 N*s/m"
+
+
+@pytest.mark.parametrize(
+    ("instead", "why"),
+    [
+        ("SampledHuntCrossleyContact, stiffness: 3900 N/m^(3/2), clock: haptic", "is not linear"),
+        ("ForceSaturation, limit: 2 N, stiffness: 3900 N/m, clock: haptic", "pulls, too"),
+        ("HuntCrossleyContact, stiffness: 3900 N/m^(3/2)", "contact acts at every moment"),
+    ],
+)
+def test_what_is_no_one_sided_spring_from_tick_to_tick_is_refused_by_name(instead: str, why: str) -> None:
+    sides = [(f"contact.side: {side}, ", "") for side in ("right", "left")]
+    with pytest.raises(ApcError, match=r"E864 .*contact") as caught:
+        apc.buzz(experiment("average", *sides, (f"{FORCE}, clock: haptic", f"{instead}, a: device, b: cube")))
+    assert why in str(caught.value)
+
+
+def test_what_cannot_be_played_is_refused_and_lost_packets_are_named() -> None:
+    with pytest.raises(ApcError, match="nothing touches"):
+        apc.buzz(compiled(AVERAGE))
+    with pytest.raises(ApcError, match="1,000,000 peers are too many to play for 8 s"):
+        apc.buzz(compiled(replaced(WALL, ("count: 1", "count: 1000000"))))
+
+
+def test_it_is_shown_where_it_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("scene.yaml").write_text(replaced(TEXT["average"], AT_ONCE), encoding="utf-8")
+    for words, note in (([], "not predicted and played: --buzz"), (["--buzz"], "")):
+        assert run(["analyze", "--json", *words]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert (bool(found["buzz"]), found["buzz_note"]) == (bool(words), note)
+    assert found["buzz"]["predicted"]["frequency_hz"] == pytest.approx(47.10, abs=0.005)
+    assert found["switching"]["stable"] is False
+    Path("scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    assert run(["analyze", "--buzz"]) == 0
+    assert capsys.readouterr().out.endswith("no buzz to predict: nothing touches.\n")

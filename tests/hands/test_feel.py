@@ -1,0 +1,364 @@
+"""What a hand feels: against a dense system of all users, closed forms, numbers of independent programs."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+
+import mpmath
+import numpy as np
+import pytest
+
+import apc
+from apc.__main__ import run
+from apc.compiler.errors import ApcError
+from apc.hands import answers
+from apc.hands.feel import NO_NORMS, Feel, feel
+from tests.hands.handled import responses
+from tests.populations import different
+from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, replaced
+
+
+def users(count: int, stiffness: float) -> str:
+    """Return the paper's scene of so many users."""
+    return replaced(AVERAGE, ("count: 3", f"count: {count}"), ("stiffness: 500", f"stiffness: {stiffness}"))
+
+
+def unlike(masses: np.ndarray, text: str) -> str:
+    """Return a scene whose devices weigh so much, one after the other."""
+    listed = ", ".join(f"{mass!r} kg" for mass in masses.tolist())
+    return re.sub(r"count: \d+", f"set: {{device.mass: [{listed}]}}", text, count=1)
+
+
+@pytest.mark.parametrize(
+    ("count", "ring", "together"),
+    [
+        (2, False, None),
+        (3, False, None),
+        (5, True, None),
+        (3, False, 1),
+        (100, False, 1000),
+        (4, False, 2000),
+    ],
+)
+def test_responses_are_those_of_one_dense_system_of_all_users(
+    count: int, ring: bool, together: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Equal users by modes; users who all differ as one system up to some states, peer by peer beyond."""
+    text = users(count, 300)
+    if ring:
+        text = replaced(text, ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
+    masses = np.full(count, 0.1)
+    if together is not None:
+        monkeypatch.setattr(answers, "MOST_TOGETHER", together)
+        masses = np.linspace(0.08, 0.13, count)
+        text = unlike(masses, text)
+    hertz = (7.3,) if count > 50 else (0.7, 2.9, 9.7, 21.7, 58.3)
+    found = feel(compiled(text), hertz, quick=True)
+    for place, one in enumerate(hertz):
+        here, there, apart = responses(masses, 300.0, one, ring=ring)
+        assert found.impedance[place] == pytest.approx(1 / here, rel=1e-9)
+        assert found.transmitted_admittance[place] == pytest.approx(there, rel=1e-7)
+        assert found.error_per_force[place] == pytest.approx(apart, rel=1e-8)
+    assert (found.bound < 1e-6).all()
+
+
+# By an independent program, which follows harmonics and takes norms by bisection and fast sampling: impedance
+# at 1 Hz and 20 Hz; at 20 Hz velocity arriving, error (mm), alias; H∞ of velocity (common, difference) and of
+# the error, on ticks and sampled-data, H2 of the error.
+PUBLISHED = (
+    (
+        2,
+        (31.421742168544554 - 3.3876062890766288j, 2.8592040243375085 + 2.501112875788781j),
+        0.0021133002420831992 + 0.023942180696575152j,
+        0.5703125704277588 + 0.35294215416033314j,
+        5.694904214390054e-06,
+        (0.299461433180675, 0.4729889334388661, 0.0044765666646593835),
+        (0.2992905102319901, 0.47273015454639244, 0.004476973205710274),
+        0.0005390507317470898,
+    ),
+    (
+        3,
+        (39.655654182833935 - 15.869521752731785j, 2.453730629411063 + 0.3608592678348613j),
+        -0.07244933505096336 + 0.01377432068631149j,
+        0.6092476744197959 + 2.1403332416937313j,
+        1.7167909309578182e-05,
+        (0.2572214868033621, 0.4963166390275006, 0.0030187083157676695),
+        (0.2570494795651829, 0.49599920916108703, 0.0030189582169522842),
+        0.0004575212195884317,
+    ),
+)
+
+
+@pytest.mark.parametrize(("count", "felt", "arrives", "apart", "alias", "ticks", "sampled", "rms"), PUBLISHED)
+def test_numbers_of_an_independent_program(
+    count: int,
+    felt: tuple[complex, ...],
+    arrives: complex,
+    apart: complex,
+    alias: float,
+    ticks: tuple[float, ...],
+    sampled: tuple[float, ...],
+    rms: float,
+) -> None:
+    found = apc.feel(compiled(users(count, 500)), [1.0, 20.0])
+    assert found.impedance.tolist() == pytest.approx(felt, rel=1e-11)
+    assert found.transmitted_admittance[1] == pytest.approx(arrives, rel=1e-11)
+    assert found.error_per_force[1] * 1e3 == pytest.approx(apart, rel=1e-11)
+    assert found.alias[1] == pytest.approx(alias, rel=1e-8)
+    # Its norms are good to 3e-10 (on ticks) and 5e-10 of themselves.
+    assert [one.on_ticks.norm for one in found.hinf] == pytest.approx(ticks, rel=1e-9)
+    assert [one.sampled_data.norm for one in found.hinf] == pytest.approx(sampled, rel=1e-9)
+    error, off = found.h2[0].error_m, found.h2[0].errors[0]
+    assert error is not None and off is not None and abs(error - rms) <= off < 1e-10 * rms
+
+
+def test_a_lone_mass_feels_like_itself() -> None:
+    """No tick, no network: Z = b + jωm."""
+    idle = "{type: SampledSpringDamper, a: device, b: ground, stiffness: 0 N/m, clock: tick}"
+    found = apc.feel(
+        compiled(f"{ONE_MASS}clocks: {{tick: 1 ms}}\ncouplers: {{idle: {idle}}}\n"), [0.5, 50.0, 400.0]
+    )
+    np.testing.assert_allclose(found.impedance, 3 + 2j * np.pi * found.frequency_hz * 2, rtol=1e-13)
+    assert (found.alias < 1e-13).all()
+    slow = found.low_frequency
+    assert slow is not None
+    for value, expected, off in zip(
+        (slow.mass, slow.damping, slow.stiffness), (2, 3, 0), slow.errors, strict=True
+    ):
+        assert value == pytest.approx(expected, abs=off)
+    # |v/F| = 1/|b + jωm| is largest at rest, where it is 1/b.
+    assert found.hinf[0].sampled_data.norm == pytest.approx(1 / 3, rel=1e-9)
+    # Each tick's 1 N rms: v⁺ = e^{−bT/m} v + (1 − e^{−bT/m})/b F, whose variance is (1 − a)²/(b²(1 − a²)).
+    with mpmath.workdps(50):
+        decay = mpmath.exp(mpmath.mpf(-3) / 2000)
+        truth = (1 - decay) / 3 / mpmath.sqrt(1 - decay**2)
+        hands = next(one for one in found.h2 if one.source == "hands")
+        assert hands.velocity_m_s is not None and hands.errors[1] is not None
+        assert abs(mpmath.mpf(hands.velocity_m_s) - truth) <= hands.errors[1] < 1e-11 * truth
+
+
+RING = replaced(MESH, ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize("count", [2, 3, 5])
+@pytest.mark.parametrize(("text", "heard"), [(AVERAGE, 1), (MESH, 4), (RING, 2)])
+def test_a_network_feels_viscous_by_as_much_as_dampers_lack(text: str, heard: int, count: int) -> None:
+    """Copies lag what they hear by half the network's hold and its delay: K ((T_n − T_c)/2 + T_d) of damping.
+
+    Each user has 5 N·s/m at the device and 5 at the copy, and 150 N/m to each other that is heard or to their
+    mean. The formula is the first order in the age of what is heard; the rest is some 0.3 %.
+    """
+    system = compiled(replaced(text, ("count: 3", f"count: {count}"), ("stiffness: 500", "stiffness: 150")))
+    found = apc.feel(system, [1.0])
+    assert found.low_frequency is not None and found.network_viscosity is not None
+    network, off = found.network_viscosity.network, found.network_viscosity.error
+    assert abs(found.low_frequency.damping - 10.0 * count - network) <= off + found.low_frequency.errors[1]
+    formula = count * 150.0 * min(heard, count - 1) * ((0.008 - 0.001) / 2 + 0.008)
+    assert found.network_viscosity.formula == pytest.approx(formula, rel=1e-12)
+    assert network == pytest.approx(formula, rel=0.02)
+
+
+# Groups that differ inside, unlike each other, with a delay of their own between two of them.
+SIDES = replaced(
+    AVERAGE,
+    (
+        "user: {count: 3}",
+        "left: {count: 3, set: {device.mass: [0.1 kg, 0.12 kg, 0.1 kg]}}\n"
+        "  right: {count: 2, set: {device.damping: [4 N*s/m, 6 N*s/m], contact.stiffness: 800 N/m}}",
+    ),
+    ("delay: 8 ms}", "delay: 8 ms, delays: {right: {left: 11 ms}}}"),
+    ("stiffness: 500", "stiffness: 300"),
+)
+
+
+def check_alike(one: Feel, other: Feel) -> None:
+    """Check that two ways agree, and no farther apart than they say."""
+    for name, bound in (
+        ("impedance", "bound"),
+        ("transmitted_admittance", "transmitted_bound"),
+        ("error_per_force", "error_bound"),
+    ):
+        size, off = np.abs(getattr(one, name)), np.abs(getattr(one, name) - getattr(other, name))
+        assert (off <= 1e-9 * size).all(), name
+        assert (off <= 1.1 * size * (getattr(one, bound) + getattr(other, bound))).all(), name
+    np.testing.assert_allclose(one.alias, other.alias, rtol=1e-6)
+    assert one.low_frequency is not None and other.low_frequency is not None
+    for name, place in (("mass", 0), ("damping", 1), ("stiffness", 2)):
+        near = one.low_frequency.errors[place] + other.low_frequency.errors[place]
+        assert abs(getattr(one.low_frequency, name) - getattr(other.low_frequency, name)) <= near
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize(
+    ("system", "at", "between"),
+    [
+        (different(3), "user[2]", "user[3]"),
+        (compiled(SIDES), "left[3]", "right[2]"),
+        (different(4, "sum"), "user[2]", "user[3]"),
+        (compiled(SIDES), "left[1]", "left[3]"),
+        (compiled(SIDES), "right[1]", "left[2]"),
+        (compiled(SIDES), "left[2]", "left[2]"),
+        (different(10), "user[2]", "user[3]"),
+    ],
+)
+def test_peer_by_peer_it_is_what_one_system_of_all_says(
+    system: apc.CompiledSystem, at: str, between: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = []
+    for most in (10**6, 1):
+        monkeypatch.setattr(answers, "MOST_TOGETHER", most)
+        found.append(feel(system, (0.7, 2.9, 9.7, 58.3), at=at, between=between))
+    check_alike(*found)
+    assert [NO_NORMS in one.notes for one in found] == [False, True]
+    assert [bool(one.hinf) and bool(one.h2) for one in found] == [True, False]
+
+
+def test_groups_are_as_right_as_all_peers_in_one_and_a_million_users_are_served() -> None:
+    """Two groups of two: classes and differences against one loop of all four, on the same graph as arcs."""
+    groups = "left: {count: 2, set: {device.mass: 0.2 kg}}\n  right: {count: 2}"
+    edges = "graph: {edges: [[1, 2], [1, 3], [1, 4], [2, 3], [2, 4], [3, 4]]}"
+    text = replaced(AVERAGE, ("user: {count: 3}", groups))
+    arcs = replaced(text, ("delay: 8 ms}", f"delay: 8 ms, {edges}}}"))
+    for at, between in (("left[1]", "left[2]"), ("left[2]", "right[1]"), ("right[1]", "left[1]")):
+        check_alike(*(feel(compiled(one), [1.0, 17.0], at=at, between=between) for one in (text, arcs)))
+    many = feel(compiled(users(1_000_000, 500)), [1.0], quick=True)
+    assert abs(many.transmitted_admittance[0]) < 1e-5 and many.bound[0] < 1e-4
+
+
+def test_multiples_of_the_frame_rate_are_as_their_neighbours() -> None:
+    """The scene may rest anywhere: e^{sT} = 1 is a pole of its frames, and none of its responses."""
+    for system in (compiled(AVERAGE), different(4)):
+        found = feel(system, [125.0, 125.0 - 0.01, 125.0 + 0.01], quick=True)
+        for name in ("impedance", "transmitted_admittance", "error_per_force"):
+            one, *two = getattr(found, name)
+            assert abs(one - np.mean(two)) < abs(one) * (1e-5 + found.bound.max())
+
+
+# Of hands and of sensors, at the first of either group: error and velocity, by an independent program, which
+# adds up the answers to each tick's noise.
+@pytest.mark.parametrize(
+    ("at", "known"),
+    [
+        ("left[1]", ((0.0006186312153860953, 0.024083674107722355), (0.7540385753605653, 47.12558066384142))),
+        (
+            "right[1]",
+            ((0.0005761712228761279, 0.03485259984618143), (0.41276535974762935, 51.980325413245716)),
+        ),
+    ],
+)
+def test_noise_of_groups_whose_forces_switch_at_other_times(
+    at: str, known: tuple[tuple[float, float], ...]
+) -> None:
+    late = "contact.delay: 1.5 ms, device.mass: 0.2 kg"
+    groups = f"left: {{count: 2, set: {{{late}}}}}\n  right: {{count: 2}}"
+    text = replaced(AVERAGE, ("stiffness: 500", "stiffness: 200"), ("user: {count: 3}", groups))
+    for one, (error, velocity) in zip(apc.feel(compiled(text), [1.0], at=at).h2, known, strict=True):
+        assert one.error_m == pytest.approx(error, rel=1e-8)
+        assert one.velocity_m_s == pytest.approx(velocity, rel=1e-8)
+
+
+def test_an_unstable_scene_has_no_response_in_time_but_its_map_has_one() -> None:
+    with pytest.raises(ApcError, match="E934"):
+        apc.feel(compiled(users(3, 1200)), [1.0])
+    found = apc.feel(compiled(users(3, 1200)), [1.0], unstable=True)
+    assert found.notes and not found.hinf
+    below = apc.feel(compiled(users(3, 1090)), [1.0])
+    assert abs(found.impedance[0] / below.impedance[0] - 1) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("frequency", "at", "why"),
+    [
+        ([501.0], "", "E935"),
+        ([0.0], "", "E935"),
+        ([], "", "E935"),
+        ([math.nan], "", "E935"),
+        ([1.0], "nobody[1]", "E936"),
+        ([1.0], "user[0].device", "E936"),
+        ([1.0], "user[1].cub", "E936"),
+        ([1.0], "contact", "E936"),
+        ([1.0], "user[4].device", r'--at "user\[3\].device"'),
+        ([1.0], "usr[2].device", r'--at "user\[2\].device"'),
+    ],
+)
+def test_what_can_t_be_felt_is_refused(frequency: list[float], at: str, why: str) -> None:
+    with pytest.raises(ApcError, match=why):
+        apc.feel(compiled(AVERAGE), frequency, at=at)
+
+
+def test_a_scene_in_which_nothing_ticks_and_a_peer_without_a_device_are_refused_by_name() -> None:
+    with pytest.raises(
+        ApcError, match=r"E935 the scene has nothing that ticks, .* Write: a coupler with a clock"
+    ):
+        apc.feel(compiled(ONE_MASS), [1.0])
+    text = "topology: bare\nclocks: {tick: 8 ms, fast: 1 ms}\npeers: {user: {count: 2}}\n" + (
+        "masses: {cube: {mass: 1 kg, damping: 1 N*s/m, shared: true}}\n"
+        "couplers: {c: {type: AveragePosition, object: cube, stiffness: 9 N/m, clock: fast, link: lan}}\n"
+        "links: {lan: {clock: tick, delay: 8 ms}}\n"
+    )
+    with pytest.raises(ApcError, match="E931"):
+        apc.feel(compiled(text), [1.0])
+    assert apc.feel(compiled(text), [1.0], at="user[1].cube").at == "user[1].cube"
+
+
+@pytest.mark.parametrize("name", ["planar-users", "god-object", "client-server"])
+def test_where_it_is_open_what_is_held_the_line_to_write_is_one_that_works(name: str) -> None:
+    scene = apc.compile(SCENES / f"{name}.yaml")
+    with pytest.raises(ApcError) as told:
+        feel(scene, [1.0], quick=True)
+    option, at = (told.value.mistakes[0].hint or "").split(" ", 1)
+    assert option == "--at" and feel(scene, [1.0], at=at.strip('"'), quick=True).at == at.strip('"')
+
+
+def test_where_no_part_can_be_held_alone_it_says_why_and_names_no_line() -> None:
+    told = "E931 left moves with masses that move otherwise, and a hand may hold any of them (user)."
+    with pytest.raises(ApcError, match=re.escape(told) + "$"):
+        apc.feel(SCENES / "two-handed-tool.yaml", [1.0])
+
+
+def test_in_a_plane_a_hand_feels_along_each_axis_what_it_feels_on_a_line() -> None:
+    plane, line = apc.compile(SCENES / "planar-users.yaml"), feel(compiled(AVERAGE), [1.0, 10.0], quick=True)
+    for axis in ("x[1]", "x[2]"):
+        found = feel(plane, [1.0, 10.0], at=f"user[1].device.{axis}", quick=True)
+        assert (found.between, found.copy) == (f"user[2].device.{axis}", "cube")
+        for name in ("impedance", "transmitted_admittance", "error_per_force"):
+            np.testing.assert_allclose(getattr(found, name), getattr(line, name), rtol=1e-9, atol=1e-12)
+
+
+def test_the_command_line_says_what_python_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("three.yaml").write_text(AVERAGE, encoding="utf-8")
+
+    def said(*words: str, code: int = 0) -> str:
+        assert run(["feel", "three.yaml", *words]) == code
+        return "".join(capsys.readouterr())
+
+    words = ["--between", "user[1].device:user[3].device", "--frequencies", "1 Hz, 5 Hz"]
+    document = json.loads(said(*words, "--json"))
+    found = apc.feel("three.yaml", [1.0, 5.0], between="user[3]")
+    assert document["frequency_hz"] == [1.0, 5.0]
+    assert complex(*document["impedance"][1]) == found.impedance[1]
+    assert document["between"] == "user[3].device"
+    assert {"transmitted_admittance", "error_per_force", "alias", "bound", "hinf", "h2"} < set(document)
+    assert all(len(line) <= 80 for line in said(*words, "--out", "table.csv").splitlines())
+    rows = Path("table.csv").read_text(encoding="utf-8").splitlines()
+    assert float(rows[2].split(",")[1]) == found.impedance[1].real
+    for code, why, *wrong in (
+        (1, "E935", "--to", "600 Hz"),
+        (1, "E935", "--from", "2 Hz", "--to", "1 Hz"),
+        (1, "E878", "--out", "bode.txt"),
+        (1, "got none. Write: --out /dev/stdout\n", "--out", "-"),
+        (2, "names every frequency there is: no --from with it", "--frequencies", "1 Hz", "--from", "1 Hz"),
+        (2, "", "--at", "user[3]", "--between", "user[1]:user[2]"),
+        (2, "", "--nyquist", "--out", "table.csv"),
+    ):
+        assert why in said(*wrong, code=code)
+    assert "noise" in said("--frequencies", "1 Hz", "--set", "haptic.phase=0.3 ms").splitlines()[1]
+    lossy = feel(apc.compile(SCENES / "lossy-average.yaml"), [1.0], quick=True)
+    assert "packet loss" in str(lossy).splitlines()[1]

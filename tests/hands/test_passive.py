@@ -1,0 +1,372 @@
+"""Every passive hand: against Colgate and Schenkel, independent numbers, hands drawn or tuned."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+
+import apc
+from apc.__main__ import run
+from apc.analysis.box import parse_range
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.hands.box import prove_box
+from apc.hands.passivity import STABLE, UNSTABLE, PassiveHands, passive_hands
+from apc.regions.axes import parse_axes
+from apc.regions.region import region
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced, wall
+
+PULL = "coordination.stiffness"
+
+
+def users(count: int, stiffness: float, text: str = AVERAGE, *changes: tuple[str, str]) -> CompiledSystem:
+    """Return the paper's scene of so many users."""
+    own = ("count: 3", f"count: {count}"), ("stiffness: 500", f"stiffness: {stiffness}")
+    return compiled(replaced(text, *own, *changes))
+
+
+def sampled_wall(ticks: float, stiffness: float = 800) -> CompiledSystem:
+    """Return a device on a fixed spring whose force is so many ticks of 1 ms late."""
+    return compiled(
+        "topology: wall\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
+        "masses: {device: {mass: 0.3 kg, damping: 1 N*s/m}}\n"
+        "couplers: {it: {type: SampledSpringDamper, a: device, b: ground, clock: tick, "
+        f"stiffness: {stiffness} N/m, delay: {ticks} ms}}}}\n"
+    )
+
+
+def half_a_tick_later(ticks: int) -> float:
+    """Return the damping needed where forces switch in the middle of a tick.
+
+    By A and B in the halves of a tick, steadily, S = A + B, a hand loses b (A² + B²)/τ and gains K S ((n + ½)
+    S + A): the best A = S/2 + K S τ/(4 b) leaves b/(2τ) = K (n + 1) + K² τ/(8 b).
+    """
+    half = 0.5e-3
+    return float(np.roots([1 / (2 * half), -800 * (ticks + 1), -(800.0**2) * half / 8]).max())
+
+
+@pytest.mark.parametrize(
+    ("system", "needed"),
+    [
+        # b = K (T/2 + delay), for any delay in ticks; b > K T/2 + |B| (Colgate and Schenkel, 1997).
+        *((sampled_wall(ticks), 800 * (0.5e-3 + ticks * 1e-3)) for ticks in (0, 1, 2, 5, 17)),
+        *((sampled_wall(ticks + 0.5), half_a_tick_later(ticks)) for ticks in (0, 1, 4)),
+        *((wall(1.0, 0.8, 0.0, 500.0, virtual), 0.25 + virtual) for virtual in (0.0, 0.1, 0.3, 0.7)),
+    ],
+)
+def test_a_wall_needs_the_damping_of_its_closed_form(system: CompiledSystem, needed: float) -> None:
+    (mode,) = apc.passive_hands(system).modes
+    assert mode.needed == pytest.approx(needed, rel=1e-9)
+    assert mode.passive is (needed < mode.damping)
+
+
+# By an independent program: users, stiffness, needed damping of the common and the difference mode and where,
+# the spectral radius with devices clamped.
+@pytest.mark.parametrize(
+    ("count", "text", "needed", "hertz", "radius"),
+    [
+        (2, AVERAGE, (1.8555596700358232, 0.0), (22.720150681607873,), 1.031814805018594),
+        (
+            3,
+            AVERAGE,
+            (1.9125555577395834, 8.540418397892944),
+            (26.777314359819098, 14.895765047280076),
+            0.9956095975790132,
+        ),
+        (3, MESH, (1.8838394321612881, 0.0), (30.21696159521839,), 1.0458005599958966),
+    ],
+)  # fmt: skip
+def test_damping_that_an_independent_program_found(
+    count: int, text: str, needed: tuple[float, float], hertz: tuple[float, ...], radius: float
+) -> None:
+    found = apc.passive_hands(users(count, 500, text))
+    # Of a motion that shakes with devices clamped, no damping is told.
+    assert [mode.needed or 0.0 for mode in found.modes] == pytest.approx(needed, rel=1e-11)
+    for mode, at in zip(found.modes, hertz, strict=False):
+        assert mode.frequency_hz == pytest.approx(at, rel=1e-7)
+    assert found.clamped_radius == pytest.approx(radius, abs=1e-13)
+    assert found.stable is False and found.proof
+
+
+def random_users(luck: np.random.Generator) -> CompiledSystem:
+    """Return a few users with random numbers, delays and groups."""
+
+    def of(low: float, high: float) -> str:
+        return f"{10 ** luck.uniform(low, high):.4g}"
+
+    def late(*values: str) -> str:
+        return f"delay: {luck.choice(values)} ms"
+
+    groups = f"a: {{count: {luck.integers(2, 5)}}}"
+    if luck.random() < 0.5:
+        own = f"device.mass: {of(-2, 0)} kg, contact.delay: {luck.choice(['0', '1', '2'])} ms"
+        groups += f"\n  b: {{count: {luck.integers(1, 3)}, set: {{{own}}}}}"
+    return compiled(
+        replaced(
+            AVERAGE if luck.random() < 0.5 else MESH,
+            ("user: {count: 3}", groups),
+            ("haptic: 1 ms", f"haptic: {luck.choice(['1', '2'])} ms"),
+            ("mass: 0.1 kg, damping: 5", f"mass: {of(-1.5, 0)} kg, damping: {of(0, 1.3)}"),
+            ("mass: 0.6 kg, damping: 5", f"mass: {of(-1, 1)} kg, damping: {of(0, 1.5)}"),
+            ("1000 N/m", f"{of(2.5, 3.2)} N/m"),
+            ("500 N/m", f"{of(1.5, 2.5)} N/m"),
+            ("delay: 8 ms", late("0", "3", "8", "11")),
+            ("delay: 1 ms", late("0", "1", "1.5")),
+            ("delay: 1 ms", late("0", "1", "3")),
+        )
+    )
+
+
+def shaken(system: CompiledSystem, hands: np.ndarray) -> bool:
+    """Say whether a scene is unstable with any of these (mass, damping, stiffness) at every device."""
+    names = ("hand.mass", "hand.damping", "hand.stiffness")
+    many = apc.analyze_many(apc.with_hands(system, "held"), dict(zip(names, hands.T, strict=True)))
+    return bool((many.stable == 0).any())
+
+
+def tuned(found: PassiveHands) -> np.ndarray:
+    """Return heavy masses on springs which sway by themselves at the frequencies told."""
+    hertz = [one.frequency_hz for one in found.modes if one.passive is False and one.frequency_hz]
+    each = itertools.product((1000.0, 300.0, 10.0, 1.0, 0.1), (0.7, 0.99, 1.0, 1.01), hertz)
+    return np.array([(mass, 0.0, mass * (2 * np.pi * part * at) ** 2) for mass, part, at in each])
+
+
+@pytest.mark.parametrize(("seed", "scenes"), [(0, 8), pytest.param(1, 300, marks=pytest.mark.whole)])
+def test_no_passive_hand_shakes_what_is_called_passive_and_a_tuned_one_what_is_not(
+    seed: int, scenes: int
+) -> None:
+    luck, passive, tried, struck = np.random.default_rng(seed), 0, 0, 0
+    for _ in range(scenes):
+        system = random_users(luck)
+        found = passive_hands(system)
+        assert found.stable is not None
+        assert found.clamped_stable is apc.analyze(apc.with_hands(system, "clamped")).stable
+        if found.stable:
+            passive += 1
+            assert not shaken(system, 10 ** luck.uniform(-6, [3, 4, 7], size=(20, 3)))
+        elif found.worst is not None and found.worst.more is not None:
+            tried += 1
+            struck += shaken(system, tuned(found))
+            # With so much more damping at each device no hand can, with less some still do.
+            for part in (0.999, 1.001):
+                value = found.worst.damping + part * found.worst.more
+                more = apc.set_parameters(system, {"device.damping": f"{value!r} N*s/m"})
+                assert passive_hands(more).stable is (part > 1)
+    assert min(passive, tried) >= scenes // 8  # or the draws would say nothing
+    assert struck >= 0.7 * tried  # some need more than a mass and a spring
+
+
+@cache
+def three() -> CompiledSystem:
+    return users(3, 200)
+
+
+def by_critical(system: CompiledSystem, limit: float) -> None:
+    (crossing,) = apc.critical(system, PULL, criterion="passive").crossings
+    assert crossing.value == pytest.approx(limit, rel=5e-7)
+    assert crossing.error < 3e-9 * limit
+    assert crossing.proof == "what hands can draw bounded on either side"
+
+
+def by_certificate(system: CompiledSystem, limit: float) -> None:
+    for value, stable in ((limit - 1e-3, True), (limit + 1e-3, False)):
+        at = apc.set_parameters(system, {PULL: f"{value!r} N/m"})
+        found = passive_hands(at, certify=True)
+        assert (found.stable, found.proof) == (stable, "proved in ball arithmetic, 128 bits")
+
+
+def by_sweep(system: CompiledSystem, limit: float) -> None:
+    found = apc.sweep(system, {PULL: f"{limit - 1e-3},{limit + 1e-3} N/m"}, criterion="passive", jobs=1)
+    assert found.column("verdict").tolist() == [STABLE, UNSTABLE]
+
+
+def by_box(system: CompiledSystem, limit: float) -> None:
+    for low, high, verdict in ((limit - 30, limit - 20, STABLE), (limit - 9, limit + 0.1, UNSTABLE)):
+        found = prove_box(system, [parse_range(system, f"{PULL}={low} N/m:{high} N/m")])
+        assert found.verdict == verdict and found.stable is (verdict == STABLE)
+        assert verdict == STABLE or found.point[0] > limit - 1e-3
+
+
+@pytest.mark.parametrize("way", [by_critical, by_certificate, by_sweep, by_box])
+def test_every_way_to_ask_finds_what_an_independent_program_found(
+    way: Callable[[CompiledSystem, float], None],
+) -> None:
+    """Three users bear 458.24216 N/m with any passive hand."""
+    way(three(), 458.24216)
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize(("count", "limit"), [(2, 233.1357), (3, 458.242), (5, 895.643)])
+def test_the_boundary_of_a_region_is_where_verdicts_change(count: int, limit: float) -> None:
+    """The limits at 1000 N/m are of an independent program."""
+    system = users(count, 200)
+    axes = parse_axes(system, "contact.stiffness=600 N/m:1400 N/m", f"{PULL}=50 N/m:1500 N/m")
+    found = region(system, axes, criterion="passive", cells=4)
+    assert found.contains(1000.0, limit - 0.001) and not found.contains(1000.0, limit + 0.001)
+    assert "stable with every passive hand" in str(found)
+    (curve,) = found.curves
+    assert curve.smooth and curve.error < 1e-8
+    for contact, pull in curve.knots[1:-1:9].tolist():
+        for part in (1 - 1e-6, 1 + 1e-6):
+            at = {"contact.stiffness": f"{contact!r} N/m", PULL: f"{part * pull!r} N/m"}
+            assert apc.passive_hands(system, set=at).stable is (part < 1)
+
+
+TWO_KINDS = "a: {count: 1, set: {device.mass: 0.2 kg}}\n  b: {count: 2}"
+
+
+def test_a_region_that_begins_where_nothing_holds_the_copies_is_drawn_all_the_same() -> None:
+    """Without contact clamped devices hold no copy: there is no map at that edge, and there is beside it."""
+    axes = parse_axes(three(), "contact.stiffness=0 N/m:1200 N/m", f"{PULL}=0 N/m:600 N/m")
+    found = region(three(), axes, criterion="passive", cells=4)
+    assert found.contains(1000.0, 457.0) and not found.contains(1000.0, 459.0)
+
+
+@pytest.mark.parametrize(
+    ("system", "ranges"),
+    [
+        (users(3, 200), ("contact.stiffness=±1%", f"{PULL}=±1%")),
+        (users(3, 200), ("device.mass=±10%", "device.damping=±5%")),
+        # At so soft a contact it alone says what damping is needed, and the other range what can be proved.
+        (users(2, 75), ("contact.stiffness=100 N/m:120 N/m", f"{PULL}=73 N/m:83 N/m")),
+        (users(3, 200, AVERAGE, ("user: {count: 3}", TWO_KINDS)), ("contact.stiffness=±0.5%",)),
+    ],
+)
+def test_a_box_is_proved_where_the_boundary_is_far(system: CompiledSystem, ranges: tuple[str, ...]) -> None:
+    found = prove_box(system, [parse_range(system, one) for one in ranges])
+    assert found.stable and found.cells < 40
+
+
+def test_what_a_box_of_hands_leaves_out_or_cannot_prove_is_said() -> None:
+    lossy = users(3, 200, AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 10 %}"))
+    found = prove_box(lossy, [parse_range(lossy, "contact.stiffness=±1%")])
+    assert found.stable
+    assert str(found).splitlines()[1].startswith("left out: packet loss (10 %) of lan")
+    with pytest.raises(ApcError, match=r'E896 .* Write: apc analyze --box "lan.loss=0:0.2"'):
+        prove_box(lossy, [parse_range(lossy, "lan.loss=0:20 %")])
+    star = users(4, 100, AVERAGE, ("delay: 8 ms}", "delay: 8 ms, graph: star}"))
+    with pytest.raises(ApcError, match=r"E930.*unevenly"):
+        prove_box(star, [parse_range(star, "contact.stiffness=±1%")])
+
+
+@pytest.mark.parametrize(("count", "limit"), [(2, 276.5935041841296), (3, 539.93), (5, 1052.17)])
+def test_clamped_devices_bear_what_an_independent_program_found(count: int, limit: float) -> None:
+    found = apc.critical(apc.with_hands(users(count, 200), "clamped"), PULL)
+    assert found.value == pytest.approx(limit, rel=1e-11 if count == 2 else 1e-5)
+    assert "devices clamped" in str(found).splitlines()[0]
+
+
+def test_held_is_a_mass_a_damper_and_a_spring_and_clamped_a_very_heavy_hand() -> None:
+    """(m + m_h) s² + (b + b_h) s + k_h = 0 of one device alone, over a frame of 1 ms."""
+    numbers = {"hand.mass": "0.2 kg", "hand.damping": "3 N*s/m", "hand.stiffness": "250 N/m"}
+    found = apc.analyze(apc.with_hands(sampled_wall(0, 0), "held"), set=numbers)
+    root = np.exp(np.roots([0.5, 4.0, 250.0]) * 1e-3)[0]
+    assert next(abs(one.eigenvalue) for one in found.modes) == pytest.approx(abs(root), rel=1e-13)
+    # Two motions of each device are slower than anything else there is; the rest is as if it were held fast.
+    slow = apc.analyze(apc.with_hands(three(), "held"), set={"hand.mass": "1e9 kg"})
+    fast = apc.analyze(apc.with_hands(three(), "clamped"))
+    moving, known = (
+        sorted(abs(mode.eigenvalue) for mode in one.modes for _ in range(mode.multiplicity))
+        for one in (slow, fast)
+    )
+    assert [one for one in moving if one < 0.99999][-6:] == pytest.approx(known[-6:], abs=1e-8)
+
+
+def test_no_damping_helps_where_a_velocity_is_sampled() -> None:
+    text = replaced(AVERAGE, ("stiffness: 1000 N/m, clock", "stiffness: 1000 N/m, damping: 2 N*s/m, clock"))
+    for found in (
+        passive_hands(compiled(text)),
+        prove_box(compiled(text), [parse_range(compiled(text), "contact.stiffness=±1%")]),
+    ):
+        assert found.stable is False
+        assert "samples the velocity of device" in " ".join(str(found).split())
+
+
+def test_no_damping_helps_where_peers_feel_each_other_otherwise_than_springs_do() -> None:
+    """Each hears one other, in a circle: what devices feel at rest is no spring's, however it is weighed."""
+    graph = "delay: 8 ms, graph: {arcs: [[1, 2, 1], [2, 3, 1], [3, 1, 1]]}}"
+    system = users(3, 100, AVERAGE, ("delay: 8 ms}", graph))
+    for damping in ("5 N*s/m", "500 N*s/m"):
+        found = apc.passive_hands(system, set={"device.damping": damping})
+        assert (found.stable, found.clamped_stable) == (False, True)
+        assert found.worst is not None and found.worst.more is None
+        assert "not what springs give" in str(found)
+    answer = apc.critical(system, "device.damping", criterion="passive")
+    assert answer.verdict.startswith("unstable whatever its value: apc analyze --hands passive")
+
+
+UNEVEN = "a: {count: 1, set: {coordination.stiffness: 50 N/m}}\n  b: {count: 3}"
+
+
+@pytest.mark.parametrize(
+    "change", [("delay: 8 ms}", "delay: 8 ms, graph: star}"), ("user: {count: 4}", UNEVEN)]
+)
+def test_where_one_is_pulled_harder_than_it_pulls_hands_by_themselves_do_no_harm(
+    change: tuple[str, str],
+) -> None:
+    """What devices feel at rest is that of springs if energies are weighed: no hand alone gets any out."""
+    system = users(4, 100, AVERAGE, change)
+    found = apc.passive_hands(system)
+    assert found.stable and not found.joined
+    assert "each by itself" in " ".join(str(found).split())
+    assert not shaken(system, 10 ** np.random.default_rng(3).uniform(-6, [3, 4, 7], size=(60, 3)))
+
+
+def test_what_is_not_judged_is_refused_by_name() -> None:
+    text = AVERAGE + "hands: {grip: {type: SpringDamperArm, flange: device, stiffness: 100 N/m}}\n"
+    for hands in ("clamped", "held", "passive"):
+        with pytest.raises(ApcError, match=r"E932.*grip"):
+            apc.with_hands(compiled(text), hands)
+    with pytest.raises(ApcError, match="E930"):
+        apc.with_hands(compiled(AVERAGE), "claped")
+    text = replaced(AVERAGE, ("type: Sampled", "type: "), ("N/m, clock: haptic, delay: 1 ms}", "N/m}"))
+    with pytest.raises(ApcError, match=r"E933.*cube"):
+        apc.passive_hands(compiled(text))
+    mesh = passive_hands(compiled(MESH), certify=True)
+    assert mesh.proof.startswith("with its devices clamped it is unstable: proved unstable with ")
+
+
+def test_contacts_that_hands_may_close_are_named() -> None:
+    """A wall that the device starts beside decides nothing, and the answer says so first."""
+    found = apc.passive_hands(
+        compiled(
+            "topology: wall\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
+            "masses: {device: {mass: 0.1 kg, damping: 1 N*s/m}}\n"
+            "couplers:\n  wall: {type: VirtualWall, flange: device, stiffness: 20000 N/m, clock: tick}\n"
+            "hands: {push: {type: ConstantForce, flange: device, force: 1 N}}\n"
+        )
+    )
+    assert found.left_out[-1].startswith("left out: wall") and "as at the start" in found.left_out[-1]
+
+
+def test_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
+    scene = str(SCENES / "three-users-average.yaml")
+
+    def said(command: str, *words: str, code: int = 0) -> str:
+        assert run([*command.split(), scene, *words]) == code
+        return "".join(capsys.readouterr())
+
+    document = json.loads(said("analyze", "--hands", "passive", "--json"))
+    assert (document["hands"], document["stable"]) == ("passive", False)
+    assert document["modes"][1]["damping_needed"] == pytest.approx(8.540418397892944, rel=1e-11)
+    assert "devices clamped: stable" in said("analyze", "--hands", "clamped")
+    box = ("--box", "contact.stiffness=±1%")
+    gentle = said("analyze", "--hands", "passive", "--set", f"{PULL}=200 N/m", *box)
+    assert "proved stable with any passive hands for every value in the box" in gentle
+    for words, why in (
+        (["passive", "--buzz"], "E930"),
+        (["passive", "--certify", *box], "E930 --certify, --box and --hands passive don't go together"),
+        ([""], "E930 no hands are named (free, clamped,"),
+        (["claped"], "clamped"),
+    ):
+        assert why in said("analyze", "--hands", *words, code=1)
+    usual = "note: StylusArmForward by its usual values"
+    asked = ("critical contact.stiffness", "--upper", "900 N/m", "--hands")
+    assert usual in said(*asked, "StylusArmForward") and usual not in said(*asked, "clamped")
+    found = apc.critical(scene, PULL, lower="600 N/m", criterion="passive")
+    assert (found.value, found.verdict) == (None, "unstable at every value scanned")

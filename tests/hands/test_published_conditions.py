@@ -1,0 +1,125 @@
+"""Published conditions of passivity and stability: numbers, promises, and curves over a scene."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+import apc
+from apc.frame.names import Free, Range
+from apc.regions.overlay import overlay_points, parse_overlay, symbol_values
+from apc.regions.passivity import CONDITIONS, colgate_limit, diolaiti_limit, gil_limit
+from tests.topologies import AVERAGE, compiled, told, wall
+
+
+@pytest.mark.parametrize(("virtual", "limit"), [(0.0, 1600.0), (0.4, 800.0), (-0.4, 800.0), (0.9, 0.0)])
+def test_colgate_and_schenkel_allow_the_published_stiffness(virtual: float, limit: float) -> None:
+    """2 (0.8 − |B|)/0.001; nothing at all where the wall's damping exceeds the device's.
+
+    And so does their general condition, b > T/2 · Re((1 − 1/z) H(z))/(1 − cos ωT), z = e^{jωT}.
+    """
+    assert colgate_limit(0.8, virtual, 0.001) == pytest.approx(limit, rel=1e-15)
+    z = np.exp(1j * np.linspace(1e-3, np.pi, 4001))
+    for share in (0.98, 1.02) if limit else ():
+        impedance = share * limit + virtual * (1 - 1 / z) / 0.001
+        needed = 0.001 / 2 * ((1 - 1 / z) * impedance).real / (1 - z.real)
+        assert bool((needed < 0.8).all()) is (share < 1)
+        assert share > 1 or virtual < 0 or apc.analyze(wall(0.04, 0.8, 0.0, share * limit, virtual)).stable
+
+
+@pytest.mark.parametrize(
+    ("mass", "damping", "delay", "virtual", "linear", "exact"),
+    [
+        (0.1, 5.0, 0.001, 0.0, 3333.333, 3378.939),
+        (0.04, 0.8, 0.0, 0.0, 1600.0, 1605.351),
+        (0.4, 5.0, 0.001, 5.0, 6666.667, None),  # little damping for the mass: (b + B) T/m is 0.025
+    ],
+)
+def test_the_linear_condition_is_within_4_percent_of_a_walls_exact_limit(
+    mass: float, damping: float, delay: float, virtual: float, linear: float, exact: float | None
+) -> None:
+    assert gil_limit(damping, virtual, 0.001, delay) == pytest.approx(linear, abs=5e-4)
+    assert virtual or diolaiti_limit(damping, 0.001, delay) == gil_limit(damping, 0.0, 0.001, delay)
+    found = apc.critical(wall(mass, damping, delay, 100.0, virtual), "it.stiffness", upper="20 kN/m").value
+    assert linear == pytest.approx(found, rel=0.04)
+    assert exact is None or found == pytest.approx(exact, abs=5e-4)  # printed to three decimals
+
+
+@pytest.mark.parametrize("name", CONDITIONS)
+def test_a_margin_changes_sign_at_its_limit(name: str) -> None:
+    condition = CONDITIONS[name]
+    numbers = {"b": 0.8, "B": 0.1, "T": 0.001, "t_d": 0.002, "c": 0.02, "D": 6e-5}
+    rest = [numbers[symbol] for symbol in condition.symbols[1:]]
+    limit = float(condition.limit(*rest))
+    assert condition.margin(0.999 * limit, *rest) > 0 > condition.margin(1.001 * limit, *rest)
+    assert condition.formula in str(condition) and condition.source in str(condition)
+
+
+MODEL = wall(0.1, 5.0, 0.001, 900.0, 0.25)
+COLGATE = "colgate:K=it.stiffness,B=it.damping,b=device.damping,T=tick.period"
+GIL = "gil:K=it.stiffness,B=it.damping,b=device.damping,T=tick.period,t_d=it.delay"
+
+
+def curve(words: str, *axes: tuple[str, float, float]) -> np.ndarray:
+    """Return the curve of a condition over two numbers of the wall."""
+    ranges = [Range(Free(name), "", Fraction(low), Fraction(high)) for name, low, high in axes]
+    return overlay_points(MODEL, parse_overlay(MODEL, words), *ranges)
+
+
+def test_a_curve_runs_from_border_to_border_in_order() -> None:
+    stiffness, damping = ("it.stiffness", 0.0, 4000.0), ("it.damping", 0.0, 3.0)
+    rising = curve(GIL, stiffness, damping)
+    # K = (5 + B)/1.5e-3 from (3333.3, 0) to (4000, 1).
+    assert rising[[0, -1]].tolist() == [pytest.approx([5 / 1.5e-3, 0]), pytest.approx([4000, 1])]
+    assert rising[:, 0] == pytest.approx((5 + rising[:, 1]) / 1.5e-3, rel=1e-12)
+    assert (np.diff(rising, axis=0) >= 0).all()
+    assert curve(GIL, damping, stiffness)[:, ::-1] == pytest.approx(rising, rel=1e-12)
+    falling = curve(COLGATE, ("it.stiffness", 0.0, 20_000.0), ("it.damping", 0.0, 8.0))
+    assert falling[[0, -1]].tolist() == [pytest.approx([0, 5]), pytest.approx([10_000, 0])]
+    flat = curve(COLGATE, ("device.mass", 0.1, 1.0), ("it.stiffness", 0.0, 20_000.0))
+    assert flat[:, 1] == pytest.approx(2 * 4.75 / 1e-3, rel=1e-12) and flat[[0, -1], 0].tolist() == [0.1, 1.0]
+    assert not len(curve(COLGATE, ("it.stiffness", 0.0, 100.0), ("it.damping", 0.0, 1.0)))
+
+
+def test_symbols_follow_the_scene_its_expressions_and_groups() -> None:
+    overlay = parse_overlay(MODEL, GIL)
+    assert symbol_values(MODEL, overlay) == (900.0, 5.0, 0.25, 0.001, 0.001)
+    assert overlay.label == "Gil et al.: K < (b + B)/(T/2 + t_d)"
+    text = AVERAGE.replace("clocks:", "parameters: {kc: 900 N/m}\nclocks:", 1).replace("1000 N/m", "kc")
+    model = compiled(
+        text.replace("user: {count: 3}", "a: {count: 1, set: {device.damping: 7 N*s/m}}\n  b: {count: 2}")
+    )
+    words = "colgate:K=contact.stiffness,B=0 N*s/m,b=a.device.damping,T=haptic.period"
+    assert symbol_values(model, parse_overlay(model, words)) == (900.0, 7.0, 0.0, 0.001)
+    assert told(parse_overlay, model, words.replace("a.device", "device")) == [
+        "overlay: E886 device.damping differs between peers, and b is one number. Write: b=a.device.damping"
+    ]
+
+
+EXAMPLE = "colgate:K=contact.stiffness,B=contact.damping,b=device.damping,T=haptic.period"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("colgate", f"E886 an overlay wants CONDITION:SYMBOL=NAME,…, got colgate. Write: {EXAMPLE}"),
+        (
+            "colgat:K=it.stiffness",
+            "E886 colgat is no published condition known here (colgate, gil, diolaiti, abbott). "
+            "Write: colgate",
+        ),
+        ("colgate:K", f"E886 a symbol wants SYMBOL=NAME, got K. Write: {EXAMPLE}"),
+        ("colgate:Q=it.stiffness", "E886 b > K T/2 + |B| has no Q; it has K, b, B, T."),
+        ("colgate:K=it.stiffness,K=1 N/m", "E886 K is given twice."),
+        ("colgate:K=it.stifness", "E622 it.stifness is no parameter of wall. Write: it.stiffness"),
+        (
+            "colgate:K=it.damping",
+            "E204 K, the stiffness of the virtual wall, wants N/m, got it.damping in N*s/m.",
+        ),
+        ("colgate:T=1", "E204 T wants ms, got 1 (no unit). Write: T: 1 ms"),
+    ],
+)
+def test_a_faulty_overlay_gets_one_clear_message(text: str, message: str) -> None:
+    assert told(parse_overlay, MODEL, text) == [f"overlay: {message}"]

@@ -1,0 +1,93 @@
+"""The almost sure exponent: a closed form, courses multiplied by hand, reference numbers, equal seeds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from apc.analysis.analysis import prepare
+from apc.frame.radius import RADII
+from apc.moments.almost_sure import AlmostSure, Chance, almost_sure, exponent, unplayed
+from apc.moments.held import HeldLoop
+from apc.network.channel import ChannelLaw
+from tests.held_scenes import scene, system_of
+from tests.lossy import BURSTS, RELIABLE
+from tests.networks.test_loss import judged
+
+
+def estimate(text: str) -> AlmostSure:
+    system = system_of(text)
+    found = almost_sure(system, prepare(system))
+    assert found is not None
+    return found
+
+
+def of_one_number(law: ChannelLaw, heard: float, lost: float, *, seed: int, frames: int = 240) -> AlmostSure:
+    """Return the exponent of one number that is multiplied by one factor or another."""
+    zero, one, *factors = (RADII.exact(np.array([[value]])) for value in (0.0, 1.0, heard, lost))
+    loop = HeldLoop(zero, one, *factors)
+    return exponent(loop, [Chance(law, (0,))], seed=seed, courses=40, frames=frames)
+
+
+@pytest.mark.parametrize("law", [BURSTS, replace(RELIABLE, p=0.3, r=0.7)])
+def test_intervals_hold_the_exponent_of_one_number_95_times_in_a_hundred(law: ChannelLaw) -> None:
+    known = (1 - law.mean_loss) * math.log(0.7) + law.mean_loss * math.log(1.4)
+    found = [of_one_number(law, 0.7, 1.4, seed=seed) for seed in range(100)]
+    # 95 of 100 give or take three standard deviations of such a count
+    assert 88 <= sum(one.interval[0] <= known <= one.interval[1] for one in found) <= 100
+    assert found[1] == of_one_number(law, 0.7, 1.4, seed=1) != found[2]
+
+
+# Of an independent program, for the paper's users at 10 % loss: peers, stiffness, exponent per frame and half
+# of its 95 % interval.
+@pytest.mark.few(3)
+@pytest.mark.parametrize(
+    ("peers", "stiffness", "known", "half"),
+    [
+        (2, 500.0, -0.04764991465454064, 8.277265879859296e-05),
+        (2, 1100.0, -0.016408064819737413, 8.87988246462047e-05),
+        (3, 500.0, -0.04520607980044825, 3.0578907742632605e-05),
+        (3, 900.0, -0.01785369642242314, 4.550593369736907e-05),
+        (3, 1100.0, -0.003331590098791081, 6.348139654886742e-05),
+        (5, 900.0, -0.016734518916488996, 5.323732007715986e-05),
+    ],
+)
+def test_exponents_are_those_of_the_reference(
+    peers: int, stiffness: float, known: float, half: float
+) -> None:
+    found = estimate(scene(peers, stiffness))
+    low, high = found.interval
+    assert low < found.exponent < high < low + 1e-4
+    assert low - half <= known <= high + half
+
+
+@pytest.mark.parametrize(("loss", "known"), [("0 %", math.log(0.9161770691168368) / 2), ("100 %", 0.0)])
+def test_without_chance_the_exponent_is_that_of_a_radius(loss: str, known: float) -> None:
+    found = estimate(scene(3, 500.0, loss=loss))
+    assert found.exponent == pytest.approx(known, abs=1e-9)
+    assert found.interval[1] - found.interval[0] < 1e-6
+
+
+def test_what_grows_in_mean_square_is_told_almost_surely_too() -> None:
+    found = judged(scene(3, 1300.0))
+    assert found.verdict == "unstable in mean square" and found.almost_sure is not None
+    low, high = found.almost_sure.interval
+    assert 0 < low < found.almost_sure.exponent < high < math.log(found.mean_square_radius or 0.0) / 2
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (scene(3, 500.0, more=", jitter: 2 ms"), "lan has jitter"),
+        (scene(3, 500.0, more=", on_loss: zero"), "lan takes no difference where a packet is missed"),
+        (scene(1000, 500.0), "1,000 peers don't fit in one matrix of 180 states"),
+        (scene(20, 500.0), "20 peers and their channels have 500 states, and 180 are the most"),
+    ],
+)
+def test_what_is_not_estimated_is_named(text: str, why: str) -> None:
+    system = system_of(text)
+    assert almost_sure(system, prepare(system)) is None
+    assert unplayed(system, prepare(system)).startswith(why)

@@ -1,0 +1,157 @@
+"""Many runs of one scene, each by a luck of its own: they are the runs they say, and what is told of them."""
+
+from __future__ import annotations
+
+import json
+import math
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import apc
+from apc.__main__ import run
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.simulation import ensemble
+from apc.simulation.blocks import pushes
+from apc.simulation.ensemble import Ensemble, Run, play_many, share_interval
+from apc.simulation.native import compiler
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import prepare
+from apc.simulation.trajectory import play
+from tests.lossy import LINK, apart
+from tests.networks.test_played import ODD
+from tests.topologies import AVERAGE, SCENES, compiled, replaced
+
+SHAKY = apart(AVERAGE, "loss: {p: 10 %, r: 20 %}, jitter: 8 ms")
+
+machine_code = pytest.mark.skipif(compiler() is None, reason="there is no C compiler")
+
+
+def runs(text: str, count: int = 6, seconds: str = "3", *, jit: bool = True, jobs: int = 1) -> Ensemble:
+    return play_many(compiled(text), Settings(Fraction(seconds), seed=3, jit=jit), runs=count, jobs=jobs)
+
+
+def said(found: Ensemble) -> str:
+    assert max(map(len, str(found).splitlines())) <= 80
+    return " ".join(str(found).split())
+
+
+def test_a_run_does_not_depend_on_how_many_there_are_or_who_plays_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ensemble, "PART", 5)
+    few = runs(SHAKY, 4, "1/2", jit=False).runs
+    shared = runs(SHAKY, 9, "1/2", jit=False, jobs=2).runs
+    assert [one.number for one in shared] == [*range(9)]
+    assert shared[:4] == few
+    assert len({one.settled for one in shared}) > 3, "they are different runs"
+    alone, _ = play(prepare(compiled(SHAKY), Settings(Fraction(1, 2), seed=3, jit=False)), [])
+    assert alone.largest_force is not None
+    told = (few[0].verdict, few[0].settled, few[0].largest_force)
+    assert told == (alone.verdict, alone.settled, alone.largest_force[1])
+
+
+def rows_of_runs(system: CompiledSystem, count: int, first: int) -> NDArray[np.float64]:
+    """Return the rows of some runs that machine code plays side by side (rows, width, runs)."""
+    simulation = prepare(system, Settings(Fraction(1, 10), seed=3), runs=count)
+    player = simulation.player(count)
+    player.begin(first)
+    played = player.play(0, simulation.length, pushes(simulation, 0))
+    return played.rows.reshape(-1, simulation.population.width, count).copy()
+
+
+@pytest.mark.few(1)
+@machine_code
+@pytest.mark.parametrize(("peers", "more"), [*((3, more) for more in ("", *ODD)), (7, ""), (7, ODD[-1])])
+def test_runs_side_by_side_are_to_the_bit_those_played_alone(peers: int, more: str) -> None:
+    """Of 13, which are more than are added up at once, and no multiple of it."""
+    starts = ", ".join(f"{place} mm" for place in range(peers))
+    link = f"{LINK[:-1]}, {more}}}" if more else LINK
+    many = f"{{set: {{cube.x: [{starts}], device.x: [{starts}]}}}}"
+    system = compiled(replaced(AVERAGE, ("{count: 3}", many), (LINK, link)))
+    together = rows_of_runs(system, 13, 2)
+    for number in (2, 9, 14):
+        np.testing.assert_array_equal(together[:, :, number - 2], rows_of_runs(system, 1, number)[:, :, 0])
+
+
+def test_runs_that_diverge_are_told_from_those_beside_them() -> None:
+    """So stiff a coupling grows until the numbers end, however the packets come."""
+    found = runs(replaced(SHAKY, ("stiffness: 500 N/m", "stiffness: 500 kN/m")), 3, "20").runs
+    assert [one.verdict for one in found] == ["diverges"] * 3
+
+
+def test_statistics_are_those_of_the_runs_that_have_the_number() -> None:
+    listed = [Run(n, "moves on" if at is None else "settles", at, 2.0 * n, 1e-3) for n, at in enumerate((0.1, 0.4, None, 0.2))]  # noqa: E501 # fmt: skip
+    found = Ensemble("scene", Fraction(3), 7, tuple(listed))
+    one = found.statistics("settled")
+    assert one is not None
+    assert (one.count, one.low, one.high) == (3, 0.1, 0.4)
+    assert one.mean == pytest.approx(0.7 / 3)
+    assert one.standard_error == pytest.approx(math.sqrt((0.01 + 0.16 + 0.04 - 0.49 / 3) / 2 / 3))
+    assert one.quantiles[1] == pytest.approx(0.2)
+    assert Ensemble("scene", Fraction(3), 7, tuple(listed[2:3])).statistics("settled") is None
+    assert found.verdicts == (("settles", 3), ("moves on", 1))
+    assert "settles 3 75 % (95 % sure: 30.1 % to 95.4 %)" in said(found)
+
+
+def test_a_shares_interval_is_wilsons() -> None:
+    """Newcombe (1998, Statist. Med. 17), table I: 81 of 263, 0 of 20 and 1 of 29."""
+    for some, of, interval in ((81, 263, (0.2553, 0.3662)), (0, 20, (0, 0.1611)), (1, 29, (0.0061, 0.1718))):
+        assert share_interval(some, of) == pytest.approx(interval, abs=5e-5)
+
+
+def moved(stiffness: float) -> str:
+    """Return the three users apart at the start; a fifth of all packets lost, they are stable to 1205 N/m."""
+    return replaced(apart(AVERAGE, "loss: 20 %"), ("stiffness: 500 N/m", f"stiffness: {stiffness} N/m"))
+
+
+def test_runs_agree_with_the_judgedin_mean_square_and_take_the_time_of_its_growth() -> None:
+    stable, unstable = runs(moved(1000)), runs(moved(1300))
+    for found, verdict in ((stable, "stable in mean square"), (unstable, "unstable in mean square")):
+        assert found.mean_square is not None
+        assert found.mean_square.verdict == verdict and found.agrees
+    assert stable.calm == 6
+    assert "stable in mean square, and 6 of 6 runs settle or die away: they agree" in said(stable)
+    told = stable.mean_square
+    assert told is not None and told.settles_in is not None
+    # After this time the root of a mean square is a twentieth of what it was.
+    judged = apc.judge_network(compiled(moved(1000)))
+    assert judged is not None and judged.mean_square_radius is not None
+    assert judged.mean_square_radius ** (told.settles_in / 0.008 / 2) == pytest.approx(0.05, rel=1e-9)
+
+
+def test_runs_that_are_about_something_else_than_a_verdict_say_so() -> None:
+    short = runs(moved(1200), seconds="0.3")
+    assert short.agrees is False and "and the runs show how it begins" in said(short)
+    hand = "hands:\n  hand: {type: SineForce, flange: device, force: 1 N, frequency: 3 Hz}\n"
+    driven = runs(moved(500) + hand)
+    assert driven.agrees is False and "what moves the others is a force that goes on" in said(driven)
+    text = (SCENES / "experiment-average.yaml").read_text(encoding="utf-8")
+    pressed = runs(replaced(text, ("delay: 8 ms}", "delay: 8 ms, loss: 5 %}")), 2)
+    assert pressed.mean_square is not None and pressed.mean_square.linearized and pressed.agrees is None
+    assert "that verdict is of small motions about the start" in said(pressed)
+    unjudged = runs(SHAKY, 2, "0.1")
+    assert unjudged.agrees is None
+    assert "in mean square: not judged: jitter and bursts of lan together" in said(unjudged)
+
+
+def test_a_scene_without_chance_is_not_played_many_times() -> None:
+    with pytest.raises(ApcError, match="E894 nothing in three-users-average is left to chance"):
+        runs(AVERAGE)
+
+
+def test_the_command_prints_it_and_keeps_no_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The seed is the experiment's, if none is given."""
+    monkeypatch.chdir(tmp_path)
+    Path("scene.yaml").write_text(SHAKY + "experiment: {duration: 200 ms, seed: 5}\n", encoding="utf-8")
+    assert run(["simulate", "--runs", "3", "--no-jit"]) == 0
+    assert capsys.readouterr().out.startswith("three-users-average: 3 runs of 0.2 s, seed 5\n")
+    assert run(["simulate", "--runs", "3", "--seed", "4", "--no-jit", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (document["runs"], document["seed"]) == (3, 4)
+    assert run(["simulate", "--runs", "3", "--out", "rows.csv"]) == 2
+    assert "--runs keeps no rows" in capsys.readouterr().err

@@ -1,0 +1,161 @@
+"""Margins, sensitivities and boxes over an unreliable network: references and event-by-event moments."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from functools import partial
+
+import numpy as np
+import pytest
+
+import apc
+from apc.analysis.analysis import prepare
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.frame.names import Free
+from apc.frame.overrides import Override, apply
+from apc.vary import over_network
+from apc.vary.margins import Margins
+from apc.vary.over_network import network_margins, network_sensitivities
+from tests.held_scenes import scene, system_of
+from tests.networks.second_moments import Law, second_moment_radius
+from tests.networks.test_loss import STIFFNESS
+from tests.topologies import compiled
+
+
+def grown(system: CompiledSystem) -> Margins:
+    return network_margins(system, prepare(system), Margins((), ""))
+
+
+def test_over_another_network_a_margin_is_another() -> None:
+    """Of three users, brute force over all patterns: 1384 N/m at a loss of 40 %, to 0.5 N/m."""
+    system = system_of(scene(3, 500.0, loss="40 %"))
+    nominal, found = (
+        {row.parameter: row.value for row in one.rows} for one in (apc.margins(system), grown(system))
+    )
+    assert nominal[STIFFNESS] == pytest.approx(1096.41, abs=0.01)
+    assert found[STIFFNESS] == pytest.approx(1384, abs=1)
+
+
+def test_derivatives_are_those_of_moments_followed_event_by_event() -> None:
+    system = system_of(scene(2, 900.0))
+    found = {row.parameter: row for row in network_sensitivities(system, prepare(system)).rows}
+
+    def radius(stiffness: float = 900.0, loss: float = 0.1) -> float:
+        moved = system_of(scene(2, stiffness, loss=f"{100 * loss!r} %"))
+        return second_moment_radius(moved, {"lan": Law(loss, 1 - loss)})
+
+    for name, step, up, down in (
+        (STIFFNESS, 1.0, radius(901.0), radius(899.0)),
+        ("lan.loss", 1e-4, radius(loss=0.1001), radius(loss=0.0999)),
+    ):
+        row, expected = found[name], (up - down) / (2 * step)
+        # The program's own differences are right to some 1e-6 of them: 1e-10 of a radius over such a step.
+        assert abs(row.derivative - expected) <= row.error + 3e-6 * abs(expected)
+        assert row.error < 1e-3 * abs(row.derivative)
+
+
+@pytest.mark.parametrize("loss", ["{p: 1.1 %, r: 10 %}", "100 %"])
+def test_where_one_value_takes_long_or_is_not_judged_margins_say_so(loss: str) -> None:
+    system = system_of(scene(3, 500.0, loss=loss))
+    told = grown(system)
+    assert not told.rows and told.note.startswith("not looked for: over th")
+    why = network_sensitivities(system, prepare(system)).note
+    assert why.startswith("what moves it most: not looked for")
+
+
+def test_margins_that_take_long_are_looked_for_if_asked_and_never_of_an_unstable_scene(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    system = system_of(scene(3, 500.0))
+    monkeypatch.setattr(over_network, "MOST_IN_PASSING", 1)
+    in_passing = partial(network_margins, nominal=Margins((), ""), quick=True)
+    assert "(apc analyze --margins does)" in in_passing(system, prepare(system)).note
+    told = grown(system_of(scene(3, 1200.0)))
+    assert not told.rows and told.note == "none: the scene is not stable in mean square as it is"
+
+
+# Largest stiffness of three users by the share lost (brute force over all patterns, to 0.5 N/m): none
+# 1096.4, 5 % 1118, 10 % 1143.2, 40 % 1384.
+@pytest.mark.parametrize(
+    ("stiffness", "more", "box", "stable"),
+    [
+        (1098.0, "", {"lan.loss": "12 %:14 %"}, True),
+        (1098.0, "", {"lan.loss": "0 %:5 %"}, False),
+        (800.0, "", {"contact.stiffness": "±2%", "lan.loss": "0 %:1 %"}, True),
+        (800.0, "", {"device.mass": "±0.5%", "cube.damping": "±1%"}, True),
+        (500.0, "", {"contact.stiffness": "±10%", STIFFNESS: "±10%"}, True),
+        # Peers on a graph of their own are a site each; a ring of three is the complete graph.
+        (500.0, "{edges: [[1, 2], [2, 3], [1, 3]]}", {STIFFNESS: "±5%", "lan.loss": "5 %:10 %"}, True),
+        (500.0, "{arcs: [[1, 2], [2, 3, 0.7], [3, 1]]}", {STIFFNESS: "±5%", "lan.loss": "5 %:10 %"}, False),
+    ],
+)
+def test_a_box_in_mean_square_is_decided_as_references_say(
+    stiffness: float, more: str, box: dict[str, str], *, stable: bool
+) -> None:
+    found = apc.prove_box(system_of(scene(3, stiffness, more=more and f", graph: {more}")), box)
+    assert found.stable is stable
+    assert found.verdict == ("stable in mean square" if stable else "unstable in mean square")
+    assert not stable or (found.open_share == 0 and found.cells < 100)
+
+
+def test_what_is_left_open_of_a_box_is_said() -> None:
+    found = apc.prove_box(system_of(scene(3, 500.0)), {STIFFNESS: "1000 N/m:1143.2 N/m"}, cells=20)
+    assert (found.stable, found.cells) == (None, 20)
+    assert 0 < found.open_share <= 1 and 1000 < found.point[0] < 1143.2
+
+
+def test_of_an_ideal_link_a_box_is_nominal_until_it_may_lose_packets() -> None:
+    system = system_of(scene(3, 500.0, loss="0 %"))
+    assert apc.prove_box(system, {"contact.stiffness": "±1%"}).verdict == "stable up to a common translation"
+    assert apc.prove_box(system, {"lan.loss": "0 %:2 %"}).verdict == "stable in mean square"
+
+
+@pytest.mark.parametrize(
+    ("loss", "box", "why"),
+    [
+        ("10 %, on_loss: zero", "contact.stiffness", "losses of lan with on_loss: zero"),
+        ("{p: 1.1 %, r: 10 %}", "contact.stiffness", "over bursts of lan"),
+        ("{p: 0.3, r: 0.7}", "lan.loss.r", "over bursts of lan"),
+        ("100 %", "contact.stiffness", "no box is proved: lan loses everything"),
+    ],
+)
+def test_a_box_that_is_not_served_is_refused_by_name(loss: str, box: str, why: str) -> None:
+    with pytest.raises(ApcError, match="E898 no box is proved") as error:
+        apc.prove_box(system_of(scene(3, 500.0, loss=loss)), {box: "±1%"})
+    assert why in str(error.value)
+    assert error.value.mistakes[0].hint == f"apc critical {box} --in mean-square"
+
+
+ARMED = """\
+topology: armed
+clocks: {haptic: 1 ms, network: 8 ms}
+peers: {user: {count: 2}}
+masses:
+  device: {mass: 0.1 kg, damping: 5 N*s/m}
+  cube:   {mass: 0.6 kg, damping: 20 N*s/m, shared: true}
+couplers:
+  contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic}
+  coordination: {type: AveragePosition, object: cube, stiffness: 500 N/m, clock: haptic, link: lan}
+hands:
+  arm: {type: MassSpringDamperArm, flange: device, mass: 0.2 kg, stiffness: 100 N/m, damping: 5 N*s/m}
+links:
+  lan: {clock: network, delay: 20 ms, loss: 5 %}
+"""
+
+
+def test_a_wide_box_far_inside_is_proved_and_points_of_it_are_stable() -> None:
+    """Its cells are halved where that makes them easier to prove: the mass, which hardly moves the radius."""
+    system = compiled(ARMED)
+    box = {"arm.mass": "±20%", "coordination.stiffness": "500 N/m:600 N/m"}
+    found = apc.prove_box(system, box, cells=50)
+    assert (found.verdict, found.open_share) == ("stable in mean square", 0.0)
+    generator = np.random.default_rng(3)
+    names = ("arm.mass", "coordination.stiffness")
+    for point in generator.uniform([0.16, 500], [0.24, 600], (2, 2)).tolist():
+        at = [Override(Free(name), Fraction(value)) for name, value in zip(names, point, strict=True)]
+        judged = apc.judge_network(apply(system, at))
+        assert judged is not None
+        assert judged.stable
+    beyond = apc.prove_box(system, box | {"coordination.stiffness": "2500 N/m:2650 N/m"}, cells=4)
+    assert not beyond.stable, "the largest stable stiffness is 2569 N/m"

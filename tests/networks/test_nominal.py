@@ -1,0 +1,74 @@
+"""What is asked of the nominal network says first what it leaves out, and never answers for it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import apc
+from apc.__main__ import run
+from tests.lossy import unreliable
+from tests.topologies import compiled
+
+LEFT_OUT = "left out: packet loss (30 %) and jitter of lan; here every packet takes the nominal 8 ms"
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("s.yaml").write_text(unreliable("loss: 30 %, jitter: 1 ms"), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["critical", "lan.loss", "s.yaml"], "lan.loss"),
+        (["critical", "links.lan.jitter", "s.yaml"], "lan.jitter"),
+        (["region", "s.yaml", "--x", "lan.loss=0 %:5 %"], "lan.loss"),
+        (["sweep", "s.yaml", "--over", "lan.jitter=0,1 ms", "--out", "o.csv"], "lan.jitter"),
+    ],
+)
+def test_a_nominal_question_about_lost_or_late_packets_is_refused_by_name(
+    words: list[str], name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run([*words, "--in", "nominal"]) == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert f"E896 {name} can't be varied: this verdict is of the nominal network" in said.err
+    assert "Write: --in mean-square" in said.err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["critical", "contact.stiffness", "s.yaml"],
+        ["region", "s.yaml", "--cells", "4"],
+        ["sweep", "s.yaml", "--over", "contact.stiffness=1,2 N/m", "--out", "o.csv"],
+    ],
+)
+def test_other_questions_say_in_their_second_line_what_is_left_out(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run([*words, "--in", "nominal"]) == 0
+    assert capsys.readouterr().out.splitlines()[1].startswith(f"  {LEFT_OUT[:55]}")
+    assert run([*words, "--in", "nominal", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["left_out"] == [LEFT_OUT]
+
+
+@pytest.mark.whole
+def test_an_analysis_answers_for_the_network_first(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["analyze", "s.yaml", "--method", "paper"]) == 0
+    told, _, nominal = capsys.readouterr().out.partition("\n\nthree-users-average: ")
+    assert told.startswith("three-users-average: stable in mean square\n")
+    assert nominal.splitlines()[1].startswith(f"  {LEFT_OUT[:55]}")
+
+
+def test_no_nominal_derivative_is_given_with_respect_to_what_is_left_out() -> None:
+    """Nor one for a named parameter that a link's numbers follow from, unless something else does too."""
+    text = unreliable("loss: {p: drop/2, r: 25 %}, jitter: 1 ms")
+    found = apc.sensitivities(compiled(text.replace("clocks:", "parameters: {drop: 2 %}\nclocks:", 1)))
+    names = {row.parameter for row in found.rows}
+    assert "contact.stiffness" in names and "drop" not in names
+    assert not {name for name in names if name.startswith("lan.")}

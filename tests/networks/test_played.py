@@ -1,0 +1,191 @@
+"""What unreliable links do to a scene that is played: each packet looked at again by hand at each tick."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Column, CompiledSystem
+from apc.network.channel import PacketSource, channel_law
+from apc.simulation.blocks import blocks
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import Simulation, prepare
+from tests.eventwise import MS, Play, User, coast, contact, pull
+from tests.lossy import apart, effective
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
+
+USERS = tuple(User(device_x=x, cube_x=x) for x in (0.001, 0.005, -0.003))
+
+# A ring of three peers is complete.
+ODD = (
+    "loss: 30 %",
+    "loss: {p: 10 %, r: 30 %}, on_loss: zero",
+    "jitter: 6 ms",
+    "jitter: 25 ms, distribution: pareto, reorder: all",
+    "loss: 20 %, jitter: 9 ms, distribution: normal, on_loss: zero",
+    "loss: 20 %, jitter: 9 ms, distribution: normal, reorder: all, on_loss: zero",
+    "loss: 10 %, graph: ring",
+)
+
+
+def rows_of(simulation: Simulation, run: int = 0) -> NDArray[np.float64]:
+    return np.concatenate([block.values for block in blocks(simulation, run=run)])
+
+
+def played(system: CompiledSystem, *, duration: Fraction = Fraction(1), seed: int = 0) -> NDArray[np.float64]:
+    return rows_of(prepare(system, Settings(duration, jit=False, seed=seed)))
+
+
+def by_hand(
+    scene: Play, duration: Fraction, delays: Callable[[int, int], list[float]], *, newest: bool, zero: bool
+) -> list[list[float]]:
+    """Return x, v, x_O, v_O of every user at every haptic tick; forces act a tick after their computation."""
+    motion = [[one.device_x, 0.0, one.cube_x, 0.0] for one in scene.users]
+    n = len(motion)
+    late = {(i, j): delays(i, j) for i in range(n) for j in range(n) if i != j}
+    start = [(m[2], m[3]) for m in motion]
+    sent: list[list[tuple[float, float]]] = [[] for _ in motion]
+    acting = [(0.0, 0.0)] * n
+    rows = []
+    for tick in range(int(duration / MS) + 1):
+        rows.append([one for m in motion for one in m])
+        if tick % 8 == 0:
+            for i, m in enumerate(motion):
+                sent[i].append((m[2], m[3]))
+        computed = []
+        for j, (user, m) in enumerate(zip(scene.users, motion, strict=True)):
+            heard = [(0.0, *m[2:4])] * n
+            for i in range(n):
+                if i != j:
+                    number, missing = effective(late[i, j], tick, newest=newest)
+                    value = sent[i][number] if number >= 0 else start[i]
+                    heard[i] = (0.0, m[2], m[3]) if missing and zero else (0.0, *value)
+            computed.append((contact(scene, user, m), pull(scene, j, m, heard, n)))
+        for m, (f_c, f_t) in zip(motion, acting, strict=True):
+            m[0], m[1] = coast(m[0], m[1], -f_c, scene.device, scene.device_damping, 0.001)
+            m[2], m[3] = coast(m[2], m[3], f_c - f_t, scene.cube, scene.cube_damping, 0.001)
+        acting = computed
+    return rows
+
+
+@pytest.mark.few(3)
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+@pytest.mark.parametrize("more", ODD)
+def test_a_played_scene_is_what_looking_at_every_packet_gives(operator: str, more: str) -> None:
+    system = compiled(apart(AVERAGE if operator == "mean" else MESH, more))
+    law = channel_law(system, system.links[0], 8 * MS)
+    duration = Fraction(3, 10)
+    expected = by_hand(
+        Play(USERS, operator),
+        duration,
+        lambda i, j: PacketSource(law, "lan", [(i, j)], seed=3).take(45)[0].tolist(),
+        newest="all" not in more,
+        zero="zero" in more,
+    )
+    wanted = [f"user[{i}].{name}" for i in (1, 2, 3) for name in ("device.x", "device.v", "cube.x", "cube.v")]
+    for jit in (False, True):
+        simulation = prepare(system, Settings(duration, jit=jit, seed=3))
+        names = [signal.name for signal in simulation.signals]
+        found = rows_of(simulation)[:, [names.index(name) for name in wanted]]
+        # Velocities of some 0.1 m/s, 300 steps: what rounding leaves, 1e-12 of them.
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+
+
+def scattered(system: CompiledSystem) -> CompiledSystem:
+    """Return a system whose peers all start elsewhere."""
+    random = np.random.default_rng(1)
+    groups = []
+    for group in system.groups:
+        starts = [one.start for one in system.kinds[group.kind].states if one.unit == "m"]
+        columns = tuple(Column(name, random.uniform(-0.01, 0.01, group.count)) for name in starts)
+        kept = tuple(value for value in group.values if value.name not in starts)
+        groups.append(replace(group, values=kept, columns=columns))
+    return replace(system, groups=tuple(groups))
+
+
+# Weights, a slow clock and a delay of its own between two groups.
+GROUPS = replaced(
+    AVERAGE,
+    ("user: {count: 3}", "near: {count: 2}\n  far: {count: 1, set: {coordination.clock: slow}}"),
+    ("  haptic: 1 ms", "  haptic: 1 ms\n  slow: {period: 2 ms, phase: 1 ms}"),
+    (
+        "delay: 8 ms}",
+        "delay: 8 ms, graph: {arcs: [[1, 2, 0.5], [2, 1], [3, 1], [1, 3]]}, delays: {far: {near: 20 ms}}}",
+    ),
+)
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize("more", ["loss: 0 %", "jitter: 0 ms, reorder: all", "loss: 0 %, on_loss: zero"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "mixed-clocks",
+        "groups",
+        "star-lecture",
+        "experiment-average",
+        "0 ms",
+        "1/3 ms",
+        "20 ms",
+        "ring-of-eight",
+    ],
+)
+def test_a_perfect_channel_plays_as_a_reliable_link_whatever_graph_clocks_and_delay(
+    name: str, more: str
+) -> None:
+    if name == "groups":
+        text = GROUPS
+    elif name.endswith(" ms"):
+        text = AVERAGE.replace("delay: 8 ms}", f"delay: {name}}}")
+    else:
+        text = (SCENES / f"{name}.yaml").read_text(encoding="utf-8")
+    at = text.index("clock: ", text.index("\nlinks:"))
+    plain, same = (
+        played(scattered(compiled(one)), duration=Fraction(1, 2))
+        for one in (text, f"{text[:at]}{more}, {text[at:]}")
+    )
+    assert np.abs(plain).max() > 0.005
+    np.testing.assert_allclose(same, plain, rtol=0, atol=1e-12 * np.abs(plain).max())
+
+
+@pytest.mark.parametrize("jit", [False, True])
+def test_how_finely_time_is_counted_changes_nothing(jit: bool) -> None:
+    """A delay longer by 1e-13 s makes quanta of that, and 2 s of them more than a half of 2^63 parts hold."""
+    coarse = apart(AVERAGE, "jitter: 25 ms, reorder: all")
+    fine = replaced(coarse, ("delay: 8 ms, j", "delay: 8.0000000001 ms, j"))
+    scenes = [prepare(compiled(one), Settings(Fraction(2), jit=jit)) for one in (coarse, fine)]
+    assert [one.quantum for one in scenes] == [MS, Fraction(1, 10**13)]
+    np.testing.assert_array_equal(*map(rows_of, scenes))
+
+
+def test_a_link_that_loses_everything_leaves_every_copy_where_it_is_or_holds_the_start() -> None:
+    """Until the first packet is due nobody knows of a loss: the start values pull for 8 ms, nothing after."""
+    scenes = [compiled(apart(AVERAGE, f"loss: 100 %{more}")) for more in ("", ", on_loss: zero")]
+    hold, zero = (prepare(one, Settings(Fraction(4), jit=False)) for one in scenes)
+    columns = [[one.name for one in hold.signals].index(f"user[{i}].cube.x") for i in (1, 2, 3)]
+    assert np.abs(np.diff(rows_of(zero)[-200:, columns], axis=0)).max() < 1e-12
+    # Each settles at the mean of the others' start values.
+    means = [(5 - 3) / 2e3, (1 - 3) / 2e3, (1 + 5) / 2e3]
+    np.testing.assert_allclose(rows_of(hold)[-1, columns], means, atol=1e-6)
+
+
+def test_the_same_seed_gives_the_same_rows_however_long_the_chunks_are() -> None:
+    system = compiled(apart(AVERAGE, "loss: 20 %, jitter: 9 ms, distribution: pareto, reorder: all"))
+    long, short = (prepare(system, Settings(Fraction(time), jit=False, seed=1)) for time in ("3", "1/10"))
+    assert short.length != long.length
+    one, other = rows_of(long), rows_of(short)
+    assert one[: len(other)].tolist() == other.tolist()
+    assert rows_of(replace(short, length=3)).tolist() == other.tolist()
+    assert np.abs(played(system, duration=Fraction(3), seed=2) - one).max() > 1e-3
+    assert np.abs(rows_of(long, run=1) - one).max() > 1e-3
+
+
+def test_a_mesh_is_an_average_of_n_minus_one_times_the_stiffness_packet_by_packet() -> None:
+    more = "loss: {p: 10 %, r: 30 %}, jitter: 9 ms, distribution: normal"
+    mesh = compiled(apart(MESH, more).replace("stiffness: 500 N/m", "stiffness: 250 N/m"))
+    np.testing.assert_allclose(played(mesh), played(compiled(apart(AVERAGE, more))), rtol=0, atol=1e-12)

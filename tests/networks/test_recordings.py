@@ -1,0 +1,264 @@
+"""Recorded networks: each packet that ping or irtt wrote is read, and what is told of them is true."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import math
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpmath import betainc, workdps
+
+import apc
+from apc.__main__ import run
+from apc.compiler.errors import ApcError
+from apc.compiler.language.probes import read_probe
+from apc.network.channel import ChannelLaw, PacketSource
+from apc.network.recorded import CONFIDENCE, NetworkRecording, describe
+from tests.lossy import LINK
+from tests.topologies import AVERAGE, replaced
+
+LOST = math.inf
+
+IPUTILS = """\
+PING host.example (192.0.2.7) 56(84) bytes of data.
+64 bytes from 192.0.2.7: icmp_seq=1 ttl=57 time=16.4 ms
+64 bytes from 192.0.2.7: icmp_seq=3 ttl=57 time=18.2 ms
+64 bytes from 192.0.2.7: icmp_seq=2 ttl=57 time=31.0 ms
+64 bytes from 192.0.2.7: icmp_seq=3 ttl=57 time=40.0 ms (DUP!)
+From 192.0.2.1 icmp_seq=5 Destination Host Unreachable
+
+--- host.example ping statistics ---
+6 packets transmitted, 3 received, +1 duplicates, 50% packet loss, time 50ms
+rtt min/avg/max/mdev = 16.4/21.8/31.0/1.0 ms
+"""
+STAMPED = """\
+PING host.example (192.0.2.7) 56(84) bytes of data.
+[1600000000.016400] 64 bytes from 192.0.2.7: icmp_seq=1 ttl=57 time=16,4 ms
+no answer yet for icmp_seq=2
+[1600000000.032000] 64 bytes from 192.0.2.7: icmp_seq=3 ttl=57 time=16.0 ms
+no answer yet for icmp_seq=4
+[1600000000.064000] 64 bytes from 192.0.2.7: icmp_seq=4 ttl=57 time=40.0 ms
+"""
+GERMAN = """\
+PING host.example (192.0.2.7) 56(84) Bytes an Daten.
+64 Bytes von 192.0.2.7: icmp_seq=1 ttl=57 Zeit=16.4 ms
+Von 192.0.2.1 icmp_seq=2 Zielhost nicht erreichbar
+64 Bytes von 192.0.2.7: icmp_seq=3 ttl=57 Zeit=0,5 ms
+
+--- host.example Ping-Statistiken ---
+4 Pakete übertragen, 2 empfangen, 50% Paketverlust, Zeit 60ms
+"""
+JAPANESE = """\
+64 バイト応答 送信元 192.0.2.7: icmp_seq=1 ttl=57 時間=16.4ミリ秒
+64 バイト応答 送信元 192.0.2.7: icmp_seq=3 ttl=57 時間=2ミリ秒
+"""
+MACOS = """\
+PING host.example (192.0.2.7): 56 data bytes
+Request timeout for icmp_seq 0
+64 bytes from 192.0.2.7: icmp_seq=1 ttl=57 time=0.250 ms
+Request timeout for icmp_seq 2
+"""
+BUSYBOX = """\
+PING host.example (192.0.2.7): 56 data bytes
+64 bytes from 192.0.2.7: seq=0 ttl=57 time=12.345 ms
+64 bytes from 192.0.2.7: seq=2 ttl=57 time=1.000 s
+
+3 packets transmitted, 2 packets received, 33% packet loss
+"""
+WINDOWS = """\
+Pinging host.example [192.0.2.7] with 32 bytes of data:
+Reply from 192.0.2.7: bytes=32 time=12ms TTL=57
+Request timed out.
+Reply from 192.0.2.7: bytes=32 time<1ms TTL=57
+"""
+# More than 65,535 packets: their count begins again after sixteen bits.
+LONG = "\n".join(f"64 bytes: icmp_seq={n % 65536} time=2 ms" for n in range(1, 70_000) if n % 1000)
+
+
+def irtt(*trips: float | str) -> str:
+    """Return what `irtt client -o` writes of round trips in ms, or of how they were lost."""
+    found = [
+        {"seqno": count, "lost": "false", "delay": {"rtt": round(trip * 1e6), "send": 5, "receive": 5}}
+        if not isinstance(trip, str)
+        else {"seqno": count, "lost": trip, "delay": {}}
+        for count, trip in enumerate(trips)
+    ]
+    return json.dumps({"config": {"params": {"interval": 8_000_000}}, "round_trips": found})
+
+
+@pytest.mark.parametrize(
+    ("text", "delays", "interval"),
+    [
+        (IPUTILS, [8.2, 15.5, 9.1, LOST, LOST, LOST], 0.01),
+        (STAMPED, [8.2, LOST, 8.0, 20.0], 0.008),
+        (MACOS, [LOST, 0.125, LOST], math.nan),
+        (GERMAN, [8.2, LOST, 0.25, LOST], 0.02),
+        (JAPANESE, [8.2, LOST, 1.0], math.nan),
+        (BUSYBOX, [6.1725, LOST, 500.0], math.nan),
+        (WINDOWS, [6.0, LOST, 0.5], math.nan),
+        (LONG, [LOST if n % 1000 == 0 else 1.0 for n in range(1, 70_000)], math.nan),
+        (irtt(16.0, "true", 17.0, "true_up", "true_down"), [8.0, LOST, 8.5, LOST, LOST], 0.008),
+    ],
+    ids=["iputils", "stamped", "macOS", "German", "Japanese", "BusyBox", "Windows", "long", "irtt"],
+)
+def test_every_packet_has_its_delay_in_the_order_of_sending(
+    text: str, delays: list[float], interval: float
+) -> None:
+    found = read_probe(text)
+    assert found is not None
+    np.testing.assert_allclose(found.delays * 1e3, delays, rtol=1e-12)
+    # A stamp of 1.6e9 s has 2e-7 s left for digits.
+    assert found.interval == pytest.approx(interval, rel=1e-4, nan_ok=True)
+
+
+def test_no_text_is_taken_for_a_recording_that_is_none() -> None:
+    """Neither text with numbers, nor pieces of recordings in another order, nor other JSON."""
+    huge = "9" * 5000
+    for text in (
+        "",
+        "{}",
+        '{"round_trips": []}',
+        "seq=5",
+        "{" * 100_000,
+        "64 bytes from 192.0.2.7: icmp_seq=1 ttl=57\n16 bytes from 192.0.2.7: icmp_seq=2 ttl=57",  # untimed
+        f"icmp_seq=1 time={huge} ms\n{huge} packets transmitted, 1 received, 0% packet loss",
+        f"icmp_seq={huge} time=1 ms",
+        "icmp_seq=1 time=1 ms\nicmp_seq=999999999999 time=1 ms",
+        irtt("true").replace("0", "-1", 1),
+        irtt(-1.0),
+    ):
+        probe = read_probe(text)
+        assert probe is None or not np.isfinite(probe.delays).any()
+    luck = random.Random(1)
+    pieces = [*IPUTILS.split(" "), *WINDOWS.split(" "), *irtt(1.0, "true").split(" "), "\n"]
+    for _ in range(1000):
+        probe = read_probe(" ".join(luck.choices(pieces, k=luck.randrange(40))))
+        assert probe is None or (probe.delays.size and (probe.delays >= 0).all())
+
+
+def recorded(folder: Path, law: ChannelLaw, count: int, seed: int) -> NetworkRecording:
+    delays = PacketSource(law, "lan", [[0, 1]], seed=seed).take(count)[0]
+    rows = ("lost" if math.isinf(delay) else repr(delay * 1e3) for delay in delays.tolist())
+    (folder / "t.csv").write_text("\n".join(["delay [ms]", *rows]), encoding="utf-8")
+    return describe(folder / "t.csv", 0.008)
+
+
+@pytest.mark.parametrize("distribution", ["uniform", "normal", "pareto"])
+def test_the_keys_are_those_of_the_link_that_was_recorded(tmp_path: Path, distribution: str) -> None:
+    """Of a simulated link, whose law is known: shares in their intervals, delays to a few standard errors."""
+    law = ChannelLaw(0.02, 0.3, 1.0, 0.0, 0.02, 0.003, distribution, None)
+    found = recorded(tmp_path, law, 20_000, 3)
+    assert found.bursty
+    assert found.turns_bad.interval[0] < 0.02 < found.turns_bad.interval[1]
+    assert found.turns_good.interval[0] < 0.3 < found.turns_good.interval[1]
+    assert found.law is not None and found.law.distribution == distribution
+    # Of 20,000 the standard errors of a median and of a distance of quartiles are below 0.01 of the jitter.
+    assert found.law.delay == pytest.approx(0.02, abs=5 * 0.01 * 0.003)
+    assert found.law.jitter == pytest.approx(0.003, rel=5 * 0.01)
+    assert not any("distributions" in told or "follow one another" in told for told in found.left_out)
+
+
+def test_bursts_are_told_from_luck(tmp_path: Path) -> None:
+    """Of 100 recordings of independent losses at most one is called bursty (0.1 are to be expected)."""
+    law = ChannelLaw(0.05, 0.95, 1.0, 0.0, 0.02, 0.0, "uniform", None)
+    found = [recorded(tmp_path, law, 1000, seed) for seed in range(100)]
+    assert sum(one.bursty for one in found) <= 1
+    held = sum(one.lost.interval[0] <= 0.05 <= one.lost.interval[1] for one in found)
+    assert held >= 88  # 95 are to be expected at least; fewer than 88 of 100 come twice in a thousand times
+
+
+def test_an_interval_is_where_the_tails_hold_what_is_left_out(tmp_path: Path) -> None:
+    """By 30 digits: at its ends, as many losses or more (fewer) have the probability (1 − 0.95)/2."""
+    rest = (1 - CONFIDENCE) / 2
+    (tmp_path / "t.csv").write_text("delay [ms]\n" + "lost\n" * 7 + "8\n" * 93, encoding="utf-8")
+    low, high = describe(tmp_path / "t.csv").lost.interval
+    with workdps(30):  # P(7 or more of 100) = I(p; 7, 94), P(7 or fewer) = 1 − I(p; 8, 93)
+        assert abs(float(betainc(7, 94, 0, low, regularized=True)) - rest) < 1e-10
+        assert abs(float(1 - betainc(8, 93, 0, high, regularized=True)) - rest) < 1e-10
+    (tmp_path / "t.csv").write_text("delay [ms]\n" + "8\n" * 100, encoding="utf-8")
+    none = describe(tmp_path / "t.csv").lost.interval
+    assert none == (0.0, pytest.approx(1 - rest ** (1 / 100), rel=1e-12))
+
+
+def test_packets_overtaken_are_counted_by_their_arrivals(tmp_path: Path) -> None:
+    luck = np.random.default_rng(5)
+    delays = np.where(luck.random(300) < 0.1, np.inf, luck.uniform(5, 40, 300))
+    rows = ("" if math.isinf(one) else f"{one:.17g}" for one in delays)
+    text = "delay [ms],at\n" + "\n".join(f"{one}," for one in rows)
+    (tmp_path / "t.csv").write_text(text, encoding="utf-8")
+    arrival = [8 * count + one for count, one in enumerate(delays)]
+    by_hand = sum(math.isfinite(a) and any(b < a for b in arrival[i + 1 :]) for i, a in enumerate(arrival))
+    assert describe(tmp_path / "t.csv", 0.008).overtaken == by_hand > 0
+    assert describe(tmp_path / "t.csv").overtaken is None
+
+
+def test_what_the_keys_leave_out_is_said_first(tmp_path: Path) -> None:
+    slow = 20 + 5 * np.sin(np.arange(500) / 20)
+    (tmp_path / "t.csv").write_text("delay [ms]\n" + "\n".join(map(repr, slow.tolist())), encoding="utf-8")
+    text = str(apc.describe_network(tmp_path / "t.csv", interval="8 ms"))
+    head = " ".join(text.partition("  lost ")[0].split())
+    assert "delays follow one another (correlation 1.00" in head
+    assert "spread as none of the distributions" in head
+    (tmp_path / "p.txt").write_text(IPUTILS, encoding="utf-8")
+    assert "half of each stands for one way" in str(apc.describe_network(tmp_path / "p.txt"))
+
+
+def test_the_entry_is_a_links_and_a_trace_reads_the_same_file(tmp_path: Path) -> None:
+    (tmp_path / "lan.txt").write_text(irtt(*[16.0] * 40, "true", *[16.0] * 20), encoding="utf-8")
+    with gzip.open(tmp_path / "lan.json.gz", "wb") as packed:
+        packed.write((tmp_path / "lan.txt").read_bytes())
+    (tmp_path / "t.csv").write_text("delay [ms]\n" + "8\n" * 40 + "lost\n" + "8\n" * 20, encoding="utf-8")
+    entry = apc.describe_network(tmp_path / "lan.txt").to_dict()["entry"]
+    assert entry == "lan: {clock: network, delay: 8 ms, loss: 1.64 %}"
+    links = [f"  {entry}", *(f"{LINK[:-1]}, trace: {name}}}" for name in ("t.csv", "lan.txt", "lan.json.gz"))]
+    verdicts = []
+    for link in links:
+        (tmp_path / "s.yaml").write_text(replaced(AVERAGE, (LINK, link)), encoding="utf-8")
+        found = apc.judge_network(apc.compile(tmp_path / "s.yaml"))
+        assert found is not None
+        verdicts.append(found.to_dict())
+    assert verdicts[1] == verdicts[2] == verdicts[3]
+
+
+def test_the_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("p.txt").write_text(IPUTILS, encoding="utf-8")
+    assert run(["network", "p.txt", "--json", "--out", "t.csv"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["packets"], told["lost"]["count"], told["lost"]["share"], told["overtaken"]) == (
+        6,
+        3,
+        0.5,
+        0,
+    )
+    rows = Path("t.csv").read_text(encoding="utf-8").splitlines()
+    assert rows == ["delay [ms]", "8.2", "15.5", "9.1", "lost", "lost", "lost"]
+    Path("none.txt").write_text("root:x:0:0:secret\n", encoding="utf-8")
+    for words, message in {
+        "none.txt": "none.txt:1:1: E702 a recording wants packets as ping or irtt wrote them, or a",
+        "no.txt": "no.txt: E701 the table no.txt does not exist.",
+        "p.txt --out t.json": "t.json: E878 the suffix of --out wants .csv, got .json. Write: --out t.csv",
+        "p.txt --interval 0ms": "--interval: E207 the interval wants a time above 0, got 0ms.",
+    }.items():
+        assert run(["network", *words.split()]) == 1
+        told_wrong = " ".join(capsys.readouterr().err.split())
+        assert told_wrong.startswith(message)
+        assert "secret" not in told_wrong
+
+
+def test_a_packed_file_is_unpacked_within_bounds(tmp_path: Path) -> None:
+    with gzip.open(tmp_path / "bomb.csv.gz", "wb") as packed:
+        packed.write(b"delay [ms]\n" + b"8\n" * (1 << 25))
+    (tmp_path / "torn.json.gz").write_bytes((tmp_path / "bomb.csv.gz").read_bytes()[:100])
+    for name, words in (
+        ("bomb.csv.gz", "unpacks to more than 64 MiB"),
+        ("torn.json.gz", "no whole gzip file"),
+    ):
+        with pytest.raises(ApcError, match=words):
+            describe(tmp_path / name)

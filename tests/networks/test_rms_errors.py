@@ -1,0 +1,118 @@
+"""How far copies are from each other while every hand pushes at random, over all pushes and packets."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import pytest
+
+from tests.held_scenes import scene, system_of
+from tests.networks.second_moments import Law, rms_error
+from tests.networks.test_loss import judged
+from tests.topologies import replaced
+
+GROUPS = """\
+  left: {count: 1}
+  right: {count: 1, set: {device.mass: 0.25 kg, coordination.stiffness: 700 N/m, contact.stiffness: 800 N/m}}
+"""
+
+
+def metres(text: str) -> float:
+    found = judged(text)
+    assert found.rms_error_m is not None, found.notes
+    return found.rms_error_m
+
+
+# By independent programs: users, K_T in N/m, 1 N² a tick of 1 ms at each device, every packet on time.
+@pytest.mark.parametrize(
+    ("count", "stiffness", "expected"),
+    [
+        (3, 500.0, 0.00045741120952581685),
+        (3, 900.0, 0.00050968295673221),
+        (5, 900.0, 0.0004630448071397932),
+        (2, 900.0, 0.0006146994924749179),
+    ],
+)
+def test_with_next_to_no_loss_the_error_is_that_of_an_ideal_network(
+    count: int, stiffness: float, expected: float
+) -> None:
+    for more in ("", ", on_loss: zero"):
+        found = metres(scene(count, stiffness, loss="1e-9 %", more=more))
+        assert found == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "law"),
+    [
+        (scene(2, 500.0, loss="40 %"), Law(0.4, 0.6)),
+        (scene(2, 900.0, more=", on_loss: zero"), Law(0.1, 0.9, zero=True)),
+        (scene(2, 500.0, more=", on_loss: zero", delay="5 ms"), Law(0.1, 0.9, zero=True)),
+        (scene(2, 500.0, loss="{p: 3 %, r: 30 %}"), Law(0.03, 0.3)),
+        (scene(2, 500.0, loss="{p: 3 %, r: 30 %}", delay="13 ms"), Law(0.03, 0.3)),
+        (replaced(scene(2, 500.0), ("  user: {count: 2}\n", GROUPS)), Law(0.1, 0.9)),
+        pytest.param(
+            scene(3, 500.0, loss="20 %", more=", graph: {edges: [[1, 2], [2, 3]]}"),
+            Law(0.2, 0.8),
+            marks=pytest.mark.whole,
+        ),
+        pytest.param(scene(3, 500.0, loss="{p: 3 %, r: 30 %}"), Law(0.03, 0.3), marks=pytest.mark.whole),
+        pytest.param(
+            scene(2, 700.0, loss="0 %", more=", jitter: 6 ms"),
+            Law(jitter=Fraction(6, 1000)),
+            marks=pytest.mark.whole,
+        ),
+    ],
+)
+def test_it_is_that_of_moments_followed_event_by_event(text: str, law: Law) -> None:
+    """The largest of all copies; whatever the delay, it is looked at as packets are sent."""
+    assert metres(text) == pytest.approx(rms_error(system_of(text), {"lan": law}), rel=1e-9)
+
+
+def test_of_many_users_bursts_tell_an_estimate_that_is_called_one() -> None:
+    found = judged(scene(5, 500.0, loss="{p: 0.3 %, r: 30 %}"))
+    assert found.rms_error_m == pytest.approx(metres(scene(5, 500.0, loss="1e-9 %")), rel=0.01)
+    assert any("an estimate: moments of at most 3 channels' states together" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("more", ["", ", on_loss: zero"])
+def test_a_million_users_cost_what_three_do(more: str) -> None:
+    """Each then follows a mean that the others hardly move: the error is that of a user held by a spring."""
+    near, far = (
+        metres(replaced(scene(count, 500.0, more=more), ("0.6 kg", f"{0.2 * count:.1f} kg")))
+        for count in (10**3, 10**6)
+    )
+    assert near == pytest.approx(far, rel=1e-3)
+    assert near != far
+
+
+def test_a_force_moves_all_that_is_rigidly_connected_with_a_device() -> None:
+    geared = replaced(
+        scene(3, 500.0),
+        ("couplers:\n", "couplers:\n  gear: {type: Gear, a: device, b: motor, ratio: 1}\n"),
+        ("  cube:", "  motor: {mass: 80 g}\n  cube:"),
+    )
+    heavier = metres(replaced(scene(3, 500.0), ("mass: 0.1 kg", "mass: 0.18 kg")))
+    assert metres(geared) == pytest.approx(heavier, rel=1e-12)
+    found = judged(replaced(geared, ("ratio: 1", "ratio: 2")))
+    why = "device moves with masses that move otherwise, and a hand may hold any of them (user)"
+    assert found.rms_error_m is None and any(note.endswith(why) for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (
+            ("  cube:", "  glove: {mass: 1 kg, damping: 1 N*s/m}\n  cube:"),
+            "a hand may hold any of device, glove (user)",
+        ),
+        (
+            ("stiffness: 500.0", "stiffness: 0"),
+            "nothing holds the copies together: what they differ by grows for ever",
+        ),
+        (("stiffness: 500.0", "stiffness: 2000"), "only where second moments die out"),
+    ],
+)
+def test_where_there_is_none_it_says_why(change: tuple[str, str], why: str) -> None:
+    found = judged(replaced(scene(3, 500.0), change))
+    assert found.rms_error_m is None
+    assert f"root mean square error of copies: {why}" in found.notes

@@ -1,0 +1,57 @@
+"""Recorded delays: what motions grow by over them, against products of frames and nominal delays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import apc
+from apc.moments.network import NetworkVerdict
+from tests.held_scenes import frames, growth, scene
+from tests.topologies import replaced
+
+# The nominal spectral radii of three users with delays of 8 and 9 ms.
+NOMINAL = {"8": 0.9571713896251, "9": 0.9564057627899}
+
+
+def judged(folder: Path, rows: str, more: str = "", peers: int = 3) -> NetworkVerdict:
+    (folder / "t.csv").write_text(f"delay [ms]\n{rows}", encoding="utf-8")
+    text = replaced(scene(peers, 500.0), ("loss: 10 %", f"trace: t.csv{more}"))
+    (folder / "s.yaml").write_text(text, encoding="utf-8")
+    found = apc.judge_network(apc.compile(folder / "s.yaml"))
+    assert found is not None
+    return found
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize("delay", NOMINAL)
+@pytest.mark.parametrize("count", [1, 2, 3, 40])
+@pytest.mark.parametrize("more", ["", ", reorder: all"])
+def test_equal_recorded_delays_are_a_nominal_delay(tmp_path: Path, delay: str, count: int, more: str) -> None:
+    """A packet that takes 8 ms is there at the tick 8 ms later, though the float 0.008 is a little more."""
+    found = judged(tmp_path, f"{delay}\n" * count, more)
+    assert found.verdict == "stable in mean square"
+    assert found.mean_square_radius is not None and found.error is not None
+    assert abs(found.mean_square_radius - NOMINAL[delay] ** 2) <= 1e-12 + found.error
+
+
+@pytest.mark.parametrize("heard", [(1, 0), (1, 0, 0, 1, 0), (1, 1, 1, 0, 0, 0, 0)])
+def test_recorded_losses_are_frames_multiplied_by_hand(tmp_path: Path, heard: tuple[int, ...]) -> None:
+    found = judged(tmp_path, "".join("8\n" if one else "lost\n" for one in heard), peers=2)
+    own = frames(2, 500.0)
+    truth = growth([own.matrix(own.c[:2, 0] * 0 + one) for one in heard])
+    assert found.mean_square_radius is not None and found.error is not None
+    assert abs(found.mean_square_radius - truth**2) <= 1e-9 + found.error
+
+
+def test_many_recorded_delays_are_told_with_how_they_were_found_and_too_many_are_not(tmp_path: Path) -> None:
+    """Over 1000 frames bounds on roundings say nothing; one lost packet moves it by less than 0.1 %."""
+    found = judged(tmp_path, "8\n" * 999 + "lost\n")
+    assert (found.verdict, found.exact) == ("probably stable in mean square", False)
+    assert found.mean_square_radius == pytest.approx(NOMINAL["8"] ** 2, rel=1e-3)
+    assert any("1,000 frames" in note for note in found.notes)
+    assert found.rms_error_m is None
+    assert "root mean square error of copies: it is not worked out over recorded delays" in found.notes
+    found = judged(tmp_path, "8\n9\n" * 10_001)
+    assert found.verdict == "not judged" and "20,002 frames" in found.notes[0]
