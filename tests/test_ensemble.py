@@ -22,7 +22,7 @@ from apc.simulation.native import compiler
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import play
-from tests.test_pairs import FORCES, scene
+from tests.pairs import FORCES, scene
 from tests.test_selection import LINK, ODD, apart
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
 

@@ -1,4 +1,4 @@
-"""`recording`: what is in a file is what was simulated, and a file is whole or not there."""
+"""What is in a file is what was simulated, every digit of it; a disk that is full loses no finished part."""
 
 from __future__ import annotations
 
@@ -24,14 +24,17 @@ from apc.simulation.simulation import Simulation, prepare
 from apc.simulation.trajectory import simulate
 from tests.topologies import AVERAGE, compiled, replaced
 
-SYSTEM = compiled(replaced(AVERAGE, ("{count: 3}", "{count: 100, set: {device.x: 3 mm}}")))
+SYSTEM = compiled(replaced(AVERAGE, ("{count: 3}", "{count: 25, set: {device.x: 3 mm}}")))
 DURATION = Fraction(1)
-WHOLE = simulate(SYSTEM, duration=DURATION)
+WHOLE = simulate(SYSTEM, duration=DURATION, jit=False)
 
 
 @pytest.fixture(scope="module")
-def simulation() -> Simulation:
-    return prepare(SYSTEM, Settings(DURATION))
+def simulation() -> Iterator[Simulation]:
+    """Return a run in many blocks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("apc.simulation.simulation.CHUNK", 2**13)
+        yield prepare(SYSTEM, Settings(DURATION, jit=False))
 
 
 def written(simulation: Simulation, path: Path) -> Path:
@@ -91,29 +94,13 @@ def test_the_same_run_gives_the_same_bytes(simulation: Simulation, tmp_path: Pat
     assert one == two
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_of_a_run_cut_short_the_finished_part_is_kept(
-    simulation: Simulation, tmp_path: Path, suffix: str
+def test_what_cannot_be_written_is_refused_before_anything_runs(
+    simulation: Simulation, tmp_path: Path
 ) -> None:
-    recording = open_recording(tmp_path / f"run{suffix}", simulation)
-    first = next(blocks(simulation))
-    recording.take(first)
-    recording.close()
-    time, values, _, _ = read(tmp_path / f"run{suffix}")
-    assert (time == first.time).all()
-    assert (values == first.values).all()
-
-
-def test_an_unknown_suffix_is_refused_before_anything_runs(simulation: Simulation, tmp_path: Path) -> None:
-    with pytest.raises(
-        ApcError, match=r"E878 the suffix of --out wants one of .*, got \.xls\. Write: --out .*run\.csv"
-    ):
-        open_recording(tmp_path / "run.xls", simulation)
-
-
-def test_a_folder_that_isnt_there_is_told(simulation: Simulation, tmp_path: Path) -> None:
-    with pytest.raises(ApcError, match="E879 can't be written: No such file"):
-        open_recording(tmp_path / "nowhere" / "run.csv", simulation)
+    wanted = r"E878 the suffix of --out wants one of .*, got \.xls\. Write: --out .*run\.csv"
+    for name, said in (("run.xls", wanted), ("nowhere/run.csv", "E879 can't be written: No such file")):
+        with pytest.raises(ApcError, match=said):
+            open_recording(tmp_path / name, simulation)
 
 
 @contextmanager
@@ -156,7 +143,7 @@ def test_wherever_the_disk_is_full_the_blocks_before_are_kept(
     path = tmp_path / f"run{suffix}"
     whole = written(simulation, path).stat().st_size
     found = []
-    for share in (0.0, 0.5, 0.9):
+    for share in (0.0, 0.6, 0.9):
         path.unlink()
         path.with_name(f"{path.name}.json").unlink(missing_ok=True)
         with no_room_after(int(share * whole)):
@@ -171,7 +158,7 @@ def test_wherever_the_disk_is_full_the_blocks_before_are_kept(
     assert found == sorted(found) and found[0] == 0
     assert found[1] > 0
     if suffix in (".csv", ".npz"):  # what is packed needs room before it is known how small it gets
-        assert found[2] == pytest.approx(0.9 * len(WHOLE.time), rel=0.05)
+        assert found[2] == pytest.approx(0.9 * len(WHOLE.time), rel=0.1)
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".mat", ".npz"])
@@ -203,7 +190,7 @@ def test_on_a_small_disk_what_was_done_is_kept(simulation: Simulation, tmp_path:
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(disk)], capture_output=True, check=False
+        ["mount", "-t", "tmpfs", "-o", "size=512k", "tmpfs", str(disk)], capture_output=True, check=False
     )
     if mounted.returncode:
         pytest.skip("only root can make a disk")

@@ -1,4 +1,4 @@
-"""`accuracy`: the error that is told is about the error that is made."""
+"""The error that a run tells of itself is about the error that it makes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from apc.present.simulation import error_text
 from apc.simulation.settings import parse_method
 from apc.simulation.trajectory import simulate
-from tests.test_integrate import CROSSLEY
+from tests.time.test_contacts import CROSSLEY
 from tests.topologies import AVERAGE, compiled, replaced
 
 SPRING = """\
@@ -20,7 +20,7 @@ clocks: {haptic: 1 ms}
 peers: {user: {count: 1, set: {device.x: 10 mm}}}
 masses: {device: {mass: 0.1 kg, damping: 0.3 N*s/m}}
 couplers: {spring: {type: SampledSpringDamper, a: device, b: ground, stiffness: 200 N/m, clock: haptic}}
-experiment: {duration: 4 s}
+experiment: {duration: 2 s}
 """
 
 
@@ -42,7 +42,7 @@ def spring_in_50_digits(rows: int) -> list[tuple[mpmath.mpf, mpmath.mpf]]:
 
 
 def test_an_exact_scene_is_off_by_roundings_and_the_estimate_is_no_less() -> None:
-    found = simulate(compiled(SPRING), error=True)
+    found = simulate(compiled(SPRING), error=True, jit=False)
     true = spring_in_50_digits(len(found.time))
     assert found.error is not None
     assert found.error.kind == "rounding"
@@ -57,9 +57,9 @@ def test_an_exact_scene_is_off_by_roundings_and_the_estimate_is_no_less() -> Non
 @pytest.mark.parametrize("method", ["rk4:1ms", "semi-implicit:0.1ms", "cvodes:1e-7", "rk4:0.3ms"])
 def test_the_estimate_of_a_linear_scene_is_its_distance_from_the_exact_motion(method: str) -> None:
     system = compiled(replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: [9 mm, 0 mm, 0 mm]}}")))
-    duration = Fraction(1, 4)
-    exact = simulate(system, duration=duration)
-    found = simulate(system, duration=duration, method=parse_method(method), error=True)
+    duration = Fraction(1, 10)
+    exact = simulate(system, duration=duration, jit=False)
+    found = simulate(system, duration=duration, method=parse_method(method), error=True, jit=False)
     assert found.error is not None
     made = np.abs(found.values - exact.values).max(axis=0)
     told = np.array([one.error for one in found.error.signals])
@@ -68,9 +68,10 @@ def test_the_estimate_of_a_linear_scene_is_its_distance_from_the_exact_motion(me
 
 def test_the_estimate_of_a_contact_is_its_distance_from_a_far_tighter_run() -> None:
     system = compiled(CROSSLEY)
-    best = simulate(system, method=parse_method("cvodes:1e-12")).values
+    length = Fraction(1, 20)
+    best = simulate(system, duration=length, method=parse_method("cvodes:1e-12"), jit=False).values
     for method in ("cvodes:1e-7", "rk4:0.05ms"):
-        found = simulate(system, method=parse_method(method), error=True)
+        found = simulate(system, duration=length, method=parse_method(method), error=True, jit=False)
         assert found.error is not None
         made = np.abs(found.values - best).max(axis=0)
         told = np.array([one.error for one in found.error.signals])
@@ -79,7 +80,7 @@ def test_the_estimate_of_a_contact_is_its_distance_from_a_far_tighter_run() -> N
 
 
 def test_an_estimate_says_what_it_was_compared_with() -> None:
-    found = simulate(compiled(CROSSLEY), duration=Fraction(1, 10), error=True)
+    found = simulate(compiled(CROSSLEY), duration=Fraction(1, 50), error=True, jit=False)
     assert found.error is not None
     worst = found.error.worst
     assert worst is not None
