@@ -169,38 +169,36 @@ def matrices(found: StateSpace) -> list[list[list[float]]]:
     return [one.tolist() for one in found.matrices]
 
 
+def opened(path: Path) -> dict[str, Any]:
+    if path.suffix == ".py":
+        pytest.importorskip("control")
+        return runpy.run_path(str(path))
+    if path.suffix == ".mat":
+        return dict(pytest.importorskip("scipy.io").loadmat(path, squeeze_me=True))
+    with np.load(path, allow_pickle=False) as archive:
+        return dict(archive)
+
+
 @pytest.mark.parametrize("suffix", [".py", ".mat", ".npz"])
 def test_every_file_holds_the_same(
     suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
-    path = tmp_path / f"loop{suffix}"
-    assert run(["export", "--out", path.name, "--cut", "lan", "--json"]) == 0
+    assert run(["export", "--out", f"loop{suffix}", "--cut", "lan", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     found = state_space(compiled(AVERAGE), cut="lan")
+    read = opened(tmp_path / f"loop{suffix}")
     assert [told[name] for name in "abcd"] == matrices(found)
-    names = [port.name for port in found.states]
-    read: dict[str, Any]
-    if suffix == ".py":
-        pytest.importorskip("control")
-        read = runpy.run_path(str(path))
-        assert read["states"] == [(port.name, port.unit) for port in found.states]
-        assert read["system"].state_labels == found.to_control().state_labels
-        assert read["system"].A.tolist() == read["A"]
-        assert [read[name] for name in "ABCD"] == matrices(found)
-    elif suffix == ".mat":
-        read = pytest.importorskip("scipy.io").loadmat(path, squeeze_me=True)
-        assert read["states"].tolist() == names
-        assert read["state_units"].tolist() == [port.unit for port in found.states]
-        assert [read[name].tolist() for name in "ABCD"] == matrices(found)
-        assert json.loads(str(read["provenance"]))["topology"] == "three-users-average"
-    else:
-        with np.load(path, allow_pickle=False) as archive:
-            read = dict(archive)
-        assert read["states"].tolist() == names
-        assert [read[name].tolist() for name in "ABCD"] == matrices(found)
+    assert [np.asarray(read[name]).tolist() for name in "ABCD"] == matrices(found)
     assert float(read["dt"]) == 0.008
+    if suffix == ".py":
+        assert read["states"] == [(port.name, port.unit) for port in found.states]
+        assert read["system"].A.tolist() == read["A"]
+    else:
+        assert read["states"].tolist() == [port.name for port in found.states]
+        assert read["state_units"].tolist() == [port.unit for port in found.states]
+        assert json.loads(str(read["provenance"]))["topology"] == "three-users-average"
 
 
 def test_a_scenes_words_are_never_read_as_python(tmp_path: Path) -> None:

@@ -335,13 +335,6 @@ def test_god_object_slides_beyond_its_cone(sideways: float) -> None:
     assert x[-2] - stuck[-1] == pytest.approx(math.copysign(0.5 * 2 / 1000, sideways), abs=1e-9)
 
 
-def test_god_object_on_a_slope_holds_what_friction_can() -> None:
-    """Pressed straight down on a slope of angle θ, it sticks where tan θ < μ and slides where it is more."""
-    for slope, rests in ((0.45, True), (0.55, False)):
-        text = replaced(ROUGH, ("normal: [0, 1]", f"normal: [{slope}, 1]"), ("force: [0.8 N", "force: [0 N"))
-        run = run_of(text, "3 s", "*")
-        (stuck,) = of_all(run, "table.stuck")
-        assert bool(stuck[-1] == stuck[-200]) is rests
 
 
 # ---- remote proxies ----

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from apc.simulation.blocks import blocks
 from apc.simulation.settings import Method, Settings, parse_method
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import Trajectory, simulate
+from tests.eventwise import coast
 from tests.sites import alone
 from tests.topologies import AVERAGE, ONE_MASS, compiled, library, replaced
 
@@ -106,18 +106,6 @@ def test_tolerances_follow_the_scenes_scales_and_are_reported() -> None:
     absolute = {one.state: one.absolute for one in found.provenance.tolerances}
     assert absolute == pytest.approx({"device.x": 5e-13, "device.v": 5e-11})
     assert "absolute tolerances from 5e-13 m, 5e-11 m/s" in " ".join(str(found).split())
-
-
-def test_a_wall_without_damping_is_left_after_half_a_sine(tmp_path: Path) -> None:
-    found = simulate(compiled(IMPACT, library(tmp_path, STOP)), jit=False)
-    t, x, v = found.time, found["user[1].device.x"], found["user[1].device.v"]
-    begin, omega = 0.0053 / 0.5, np.sqrt(3000 / 0.1)
-    end = begin + np.pi / omega
-    inside, after = (t > begin) & (t < end), t > end
-    assert inside.sum() > 10
-    assert x[inside] == pytest.approx(0.5 / omega * np.sin(omega * (t[inside] - begin)), abs=1e-10)
-    assert x[after] == pytest.approx(-0.5 * (t[after] - end), abs=2e-10)
-    assert v[after] == pytest.approx(-0.5, abs=2e-8)
 
 
 def test_a_force_that_jumps_is_met_at_the_jump(tmp_path: Path) -> None:
@@ -269,21 +257,48 @@ def test_semi_implicit_takes_the_new_velocity_for_the_position() -> None:
             x += h * v
 
 
-def test_a_loop_that_newtons_method_solves_may_be_part_of_the_motion() -> None:
-    # x' = 10 y - x^2 with y = cos(x - y).
-    system = alone(lambda x, u: 0 * x)
-    [kind] = system.kinds
-    y, x = casadi.SX.sym("y"), casadi.SX.sym("x")
-    loop = {"x": y, "p": x, "g": y - casadi.cos(x - y)}
-    solver = casadi.rootfinder("loop", "newton", loop, {"abstol": 1e-14, "abstolStep": 0.0})
-    arguments = [casadi.MX.sym(f"a{i}", *kind.derivative.size_in(i)) for i in range(4)]
-    rate = 10 * solver(x0=0.5, p=arguments[0])["x"] - arguments[0] ** 2
-    moving = replace(kind, derivative=casadi.Function("derivative", arguments, [rate]))
-    found = simulate(replace(system, kinds=(moving,)), duration=Fraction(1, 5), jit=False)
+SOFT = """\
+component: SoftSpring
+about: A spring that gives way more the harder it is pulled.
+connectors: {flange: Flange}
+parameters: {stiffness: {unit: N/m}, soft: {unit: 1/N^2}CLOCK}
+variables: {f: {unit: N}}
+equations:
+  - f + soft*f^3 = stiffness*PLACE
+  - flange.f = FORCE
+"""
+SOFT_SCENE = """\
+topology: soft
+clocks: {tick: 1 ms}
+peers: {user: {count: 1, set: {device.x: 20 mm}}}
+masses: {device: {mass: 0.1 kg, damping: 1 N*s/m}}
+couplers: {it: {type: SoftSpring, flange: device, stiffness: 500 N/m, soft: 1 1/N^2}}
+"""
 
-    def law(t: float, x: np.ndarray) -> list[float]:
-        root = brentq(lambda y: y - np.cos(x[0] - y), -2, 2, xtol=1e-15)
-        return [10 * root - x[0] ** 2]
 
-    true = solve_ivp(law, (0, 0.2), [0.0], "DOP853", rtol=1e-12, atol=1e-13).y[0, -1]
-    assert found["peer[1].x"][-1] == pytest.approx(true, abs=1e-7)
+def soft(x: float) -> float:
+    return float(brentq(lambda f: f + f**3 - 500 * x, -20, 20, xtol=1e-15))
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_a_loop_that_newtons_method_solves_is_played(tmp_path: Path, sampled: bool) -> None:
+    """f + f³ = 500 x, at every moment, or at each tick and held from there."""
+    words = (", clock: clock", "sample(flange.x)", "hold(f)") if sampled else ("", "flange.x", "f")
+    text = SOFT
+    for name, word in zip(("CLOCK", "PLACE", "FORCE"), words, strict=True):
+        text = text.replace(name, word)
+    scene = SOFT_SCENE.replace("soft: 1 1/N^2", "soft: 1 1/N^2, clock: tick") if sampled else SOFT_SCENE
+    found = simulate(compiled(scene, library(tmp_path, text)), duration=MS * 50, jit=False)
+    if sampled:
+        x, v = 0.02, 0.0
+        for row in range(50):
+            x, v = coast(x, v, -soft(x), 0.1, 1.0, 1e-3)
+            assert found.values[row + 1, :2] == pytest.approx([x, v], rel=1e-9)
+    else:
+        true = solve_ivp(
+            lambda t, x: [x[1], (-x[1] - soft(x[0])) / 0.1],
+            *((0, 0.05), [0.02, 0.0], "DOP853", found.time),
+            rtol=1e-12,
+            atol=1e-14,
+        )
+        assert np.abs(found.values[:, :2] - true.y.T).max() < 1e-7

@@ -180,22 +180,5 @@ def test_a_picture_has_a_panel_a_quantity_and_no_label_over_another() -> None:
         assert box.x1 <= figure.bbox.x1 + 1
 
 
-def test_signals_of_one_unit_can_be_drawn_into_ones_own_axes() -> None:
-    from matplotlib.figure import Figure
-
-    ax = Figure().subplots()
-    two = replaced(
-        AVERAGE, ("user: {count: 3}", "one: {count: 1, set: {cube.x: 1 mm}}\n  others: {count: 2}")
-    )
-    found = apc.simulate(compiled(two), duration="10 ms", signals=["cube.x"], jit=False)
-    assert found.plot(ax) is ax.figure
-    assert len(ax.lines) == 2, "curves that are the same are one"
 
 
-def test_a_thinned_curve_keeps_every_peak() -> None:
-    time, values = np.arange(10**5) / 1000, np.zeros(10**5)
-    values[[17, 54321, 99_998]] = [3.0, -2.0, 1.0]
-    t, v = thinned(time, values)
-    assert len(t) < 5000
-    assert {3.0, -2.0, 1.0} <= set(v)
-    assert (np.diff(t) > 0).all()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -15,10 +14,9 @@ import numpy as np
 import pytest
 import scipy.io
 
-from apc import tables
 from apc.compiler.errors import ApcError
 from apc.present.recording import SUFFIXES, open_recording
-from apc.simulation.blocks import Block, blocks
+from apc.simulation.blocks import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 from apc.simulation.trajectory import simulate
@@ -159,46 +157,3 @@ def test_wherever_the_disk_is_full_the_blocks_before_are_kept(
     assert found[1] > 0
     if suffix in (".csv", ".npz"):  # what is packed needs room before it is known how small it gets
         assert found[2] == pytest.approx(0.9 * len(WHOLE.time), rel=0.1)
-
-
-@pytest.mark.parametrize("suffix", [".parquet", ".mat", ".npz"])
-def test_room_is_kept_for_what_comes_last(
-    simulation: Simulation, tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Once a block is written, nothing more is asked of the disk, whatever the numbers look like.
-    def cut(writer: tables.Writer) -> None:
-        assert writer.file.tell() <= writer._kept
-        rooms.append(writer._kept)
-        whole(writer)
-
-    whole, rooms = tables.Writer.cut, []
-    monkeypatch.setattr(tables.Writer, "cut", cut)
-    random = np.random.default_rng(1)
-    wide = len(simulation.signals)
-    noise = random.integers(0, 2**62, (1500, wide)).view(np.float64)
-    for values in (noise, np.tile(noise[:250], (6, 1)), np.zeros((1, wide))):
-        recording = open_recording(tmp_path / f"run{suffix}", simulation)
-        for _ in range(3):
-            blocked = Block(np.arange(len(values)) / 1000, values, np.zeros(0))
-            recording.take(blocked)
-        recording.close()
-    assert len(rooms) == 3
-
-
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_on_a_small_disk_what_was_done_is_kept(simulation: Simulation, tmp_path: Path, suffix: str) -> None:
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=512k", "tmpfs", str(disk)], capture_output=True, check=False
-    )
-    if mounted.returncode:
-        pytest.skip("only root can make a disk")
-    try:
-        message = told_of(simulation, disk / f"run{suffix}")
-        assert message.endswith("No space left on device.")
-        assert check_kept(disk / f"run{suffix}", message) > 0
-        beside = {f"run{suffix}", *([f"run{suffix}.json"] if suffix == ".csv" else [])}
-        assert {one.name for one in disk.iterdir()} == beside
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
