@@ -112,6 +112,9 @@ class Instance:
             instanceName="one",
         )
         self.unit.instantiate()
+        self.begin()
+
+    def begin(self) -> None:
         self.unit.setupExperiment(startTime=0.0)
         self.unit.enterInitializationMode()
         self.unit.exitInitializationMode()
@@ -176,33 +179,28 @@ def test_a_step_may_be_of_any_length_and_a_state_can_be_had_back(fmpy: Any, tmp_
     course = apc.simulate(compiled(PAPER), duration="0.2 s", jit=False)
     names = [one.name for one in course.signals]
     one = Instance(path, tmp_path / "unzipped")
-    at, steps = (
-        Fraction(0),
-        [Fraction(37, 100000), Fraction(63, 100000), Fraction(2, 1000), Fraction(7, 3000)],
-    )
-    for k in range(60):
-        if k == 30:
-            state = one.unit.getFMUState()
-            kept = one.unit.serializeFMUState(state)
-            begun, before = at, one.read(*names)
-        by = steps[k % 4] if k % 12 < 8 else Fraction(1, 1000) - at % Fraction(1, 1000)
-        one.step(float(at), float(by))
-        at += by
-        if at % Fraction(1, 1000) == 0:
-            assert one.read(*names) == pytest.approx(course.values[int(at * 1000)].tolist(), abs=1e-9)
+    steps = [Fraction(by, 100_000) for by in (37, 63, 200, 233)] * 2
+
+    def walk(at: Fraction) -> Fraction:
+        for by in [*steps, *steps, Fraction(1, 1000)]:
+            length = by if by in steps else by - at % by  # to the next tick in the end
+            one.step(float(at), float(length))
+            at += length
+            if at % Fraction(1, 1000) == 0:
+                expected = course.values[int(at * 1000)].tolist()
+                assert one.read(*names) == pytest.approx(expected, abs=1e-9)
+        return at
+
+    begun = walk(Fraction(0))
+    kept, before = one.unit.serializeFMUState(one.unit.getFMUState()), one.read(*names)
+    walk(begun)
     end = one.read(*names)
     one.unit.setFMUState(one.unit.deSerializeFMUstate(kept))
     assert one.read(*names) == before
-    at = begun
-    for k in range(30, 60):
-        by = steps[k % 4] if k % 12 < 8 else Fraction(1, 1000) - at % Fraction(1, 1000)
-        one.step(float(at), float(by))
-        at += by
+    walk(begun)
     assert one.read(*names) == end
     one.unit.reset()
-    one.unit.setupExperiment(startTime=0.0)
-    one.unit.enterInitializationMode()
-    one.unit.exitInitializationMode()
+    one.begin()
     assert one.read(*names) == course.values[0].tolist()
     one.end()
 

@@ -114,23 +114,6 @@ def test_disc_contact_and_sphere_contact_push_along_the_line_of_centres_and_neve
     assert pushed(system, *inside) == pytest.approx(-inside, rel=EXACT)
 
 
-def test_disc_contact_is_stiff_along_the_normal_and_gives_way_across_it() -> None:
-    """Linearized: K along the normal, −K depth/distance across; each a mass on a sampled spring by itself.
-
-    With x' = v, m v' = −b v − K x sampled each T: x and v at the next tick from those of this one.
-    """
-    m, b, stiffness, distance = 2.0, 3.0, 900.0, 0.04
-    text = radial(2).replace("damping: 2 N*s/m, ", "").replace("3 N*s/m}", "3 N*s/m, x: [24 mm, 32 mm]}")
-    assert "24 mm" in text
-    e = math.exp(-b / m * 1e-3)
-
-    def tick(k: float) -> np.ndarray:
-        held = 1e-3 / b - m * (1 - e) / b**2
-        step = np.array([[1, m * (1 - e) / b], [0, e]])
-        return np.abs(np.linalg.eigvals(step - k * np.array([[held, 0], [(1 - e) / b, 0]])))
-
-    expected = np.concatenate([tick(stiffness), tick(-stiffness * (0.05 - distance) / distance)])
-    assert sizes(text) == pytest.approx(np.sort(expected)[::-1], rel=1e-9)
 
 
 def test_coinciding_centres_have_no_direction_and_no_verdict() -> None:

@@ -178,7 +178,3 @@ def test_a_picture_has_a_panel_a_quantity_and_no_label_over_another() -> None:
         assert not any(box.overlaps(other) for other in boxes[:i])
         assert figure.bbox.x0 <= box.x0
         assert box.x1 <= figure.bbox.x1 + 1
-
-
-
-

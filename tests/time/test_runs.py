@@ -30,12 +30,24 @@ AVERAGE_RUN, MESH_RUN = (
 
 
 def test_the_mean_settles_and_the_mesh_shakes() -> None:
+    """As told, and as found row by row.
+
+    Within 5 % of the largest range among the peers for good; how it swings in the last fifth, turn by turn.
+    """
     average, mesh = AVERAGE_RUN.summary, MESH_RUN.summary
     assert (average.verdict, mesh.verdict) == ("settles", "shakes")
     assert average.settled is not None and mesh.swing is not None
-    assert average.settled < 1.5
-    x = np.array([AVERAGE_RUN[one.name] for one in AVERAGE_RUN.signals if one.local.endswith(".x")])
-    assert mesh.swing[1] > 1e-3 > np.ptp(x[:, AVERAGE_RUN.time >= average.settled], axis=1).max()
+    left = 0.0
+    for part in ("device.x", "cube.x"):
+        x = np.array([AVERAGE_RUN[one.name] for one in AVERAGE_RUN.signals if one.local == part])
+        away = np.abs(x - x[:, -1:]) > 0.05 * np.ptp(x, axis=1).max()
+        left = max(left, float(AVERAGE_RUN.time[np.flatnonzero(away.any(axis=0))[-1]]))
+    assert left <= average.settled <= left + 0.006, "looked at in some five hundred parts"
+    name, size, rate = mesh.swing
+    tail = MESH_RUN[name][MESH_RUN.time > 0.8 * MESH_RUN.time[-1]]
+    assert size == pytest.approx(np.ptp(tail), rel=0.02) and size > 1e-3
+    turns = np.count_nonzero(np.diff(np.sign(np.diff(tail))))
+    assert rate == pytest.approx(turns / 2 / 0.6, rel=0.03)
     assert str(AVERAGE_RUN).startswith("experiment-average: settles\n\n  From 0.8")
 
 
