@@ -15,7 +15,6 @@ import pytest
 import apc
 from apc.analysis.methods import Method
 from apc.compiler.compiled import CompiledSystem
-from tests.library.parts import listed, values
 from tests.schemes import ByHand, Law, everybody, magnitudes, mean
 from tests.topologies import SCENES, compiled, replaced
 
@@ -124,8 +123,6 @@ def test_an_average_is_its_law(name: str, delay: int) -> None:
     same(compiled(text), ByHand([[DEVICE, copy]] * peers, everybody(peers), pulling(pull), 1, late=delay))
 
 
-
-
 @pytest.mark.parametrize("delay", [0, 50])
 def test_a_remote_proxy_follows_the_others_device(delay: int) -> None:
     """Each device feels the proxy it touches; the proxy follows the other's device as heard."""
@@ -201,8 +198,6 @@ def test_a_wave_coupling_is_its_law(delay: int, cutoff: float | None, correction
     same(compiled(replaced(scene(name), change, ("delay: 8 ms", f"delay: {delay} ms"))), hand)
 
 
-
-
 @pytest.mark.parametrize("delay", [0, 10, 50])
 def test_waves_are_stable_for_any_constant_delay(delay: int) -> None:
     """Sent as continuously as forces are computed, they are passive at both ends; a spring alone is not."""
@@ -211,13 +206,6 @@ def test_waves_are_stable_for_any_constant_delay(delay: int) -> None:
     spring = ("stiffness: 500 N/m, injection: 5 N*s/m", "stiffness: 1500 N/m, injection: 0 N*s/m")
     text = replaced(scene("two-users-damped"), *each_tick, spring)
     assert apc.analyze(compiled(text)).stable is (delay == 0)
-
-
-
-
-
-
-
 
 
 # ---- a server, unlike devices, weights, a tool in two hands ----

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import apc
@@ -13,7 +12,7 @@ from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
 from apc.frame.start import start_values
 from apc.present.planar import Disc, Line, Spot, paths_of, spots_of
-from apc.present.simulation import save_picture, thinned
+from apc.present.simulation import save_picture
 from apc.present.still import Body, Wall, bodies_of, draw_still, save_still
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 
