@@ -261,6 +261,11 @@ def test_what_cannot_be_is_told_and_nothing_is_written(
     assert message in refused(BENT, "--out", *words)
 
 
+def test_more_ways_than_fit_a_text_are_refused() -> None:
+    with pytest.raises(ApcError, match="E960 200 peers hear each other on 39,800 ways; 20,000 fit"):
+        scene_unit(compiled(replaced(AVERAGE, ("count: 3", "count: 200"))))
+
+
 def test_where_all_peers_are_alike_one_serves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")

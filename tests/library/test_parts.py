@@ -16,7 +16,7 @@ import apc
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
 from tests.library.parts import CLOCK, TWO, coupled, held, pushes, rates, ticked, values
-from tests.topologies import AVERAGE, MESH, ONE_MASS, compiled, library, replaced, told
+from tests.topologies import MESH, ONE_MASS, SCENES, compiled, library, replaced, told
 
 EXACT = 1e-13  # a few roundings
 
@@ -223,14 +223,16 @@ def test_encoder_quantization_rounds_down_to_whole_steps_and_passes_forces(x: fl
 # ---- coordination ----
 
 
-@pytest.mark.parametrize("text", [AVERAGE, MESH])
-def test_with_delays_own_the_heard_part_of_a_force_acts_at_once(text: str) -> None:
+@pytest.mark.parametrize("scene", ["three-users-average", "three-users-mesh", "planar-users"])
+def test_with_delays_own_the_heard_part_of_a_force_acts_at_once(scene: str) -> None:
+    text = (SCENES / f"{scene}.yaml").read_text(encoding="utf-8")
     system = compiled(replaced(text, ("link: lan", "link: lan, delays: own")))
-    assert [(hold.name, hold.delay) for hold in system.kinds[0].holds[1:]] == [
-        ("coordination.own", "coordination.delay"),
-        ("coordination.received", "no delay"),
-    ]
-    assert rates(system, {}, [0.0, 1.0, 10.0])["cube.v"] == pytest.approx(-11 / 0.2, rel=EXACT)
+    holds = system.kinds[0].holds
+    assert {one.delay for one in holds if ".own" in one.name} == {"coordination.delay"}
+    assert {one.delay for one in holds if ".received" in one.name} == {"no delay"}
+    held = [1.0 if ".own" in one.name else 10.0 if ".received" in one.name else 0.0 for one in holds]
+    found = [value for name, value in rates(system, {}, held).items() if name.startswith("cube.v")]
+    assert found == pytest.approx([-11 / 0.2] * len(found), rel=EXACT)
 
 
 def test_a_saturated_mesh_is_a_full_mesh_below_its_limit() -> None:
