@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from fractions import Fraction
 
-import mpmath
 import numpy as np
 import pytest
 
 from apc.present.simulation import error_text
 from apc.simulation.settings import parse_method
 from apc.simulation.trajectory import simulate
+from tests.fifty_digits.truth import exact_course
 from tests.time.test_contacts import CROSSLEY
 from tests.topologies import AVERAGE, compiled, replaced
 
@@ -20,36 +20,20 @@ clocks: {haptic: 1 ms}
 peers: {user: {count: 1, set: {device.x: 10 mm}}}
 masses: {device: {mass: 0.1 kg, damping: 0.3 N*s/m}}
 couplers: {spring: {type: SampledSpringDamper, a: device, b: ground, stiffness: 200 N/m, clock: haptic}}
-experiment: {duration: 2 s}
+experiment: {duration: 1 s}
 """
 
 
-def spring_in_50_digits(rows: int) -> list[tuple[mpmath.mpf, mpmath.mpf]]:
-    with mpmath.workdps(50):
-        m, b, k = (mpmath.mpf(value) for value in (0.1, 0.3, 200.0))
-        h, a = mpmath.mpf(1) / 1000, b / m
-        decay = mpmath.exp(-a * h)
-        x, v = mpmath.mpf(0.01), mpmath.mpf(0)
-        found = []
-        for _ in range(rows):
-            found.append((x, v))
-            push = -k * x / m
-            x, v = (
-                x + v * (1 - decay) / a + push * (h / a - (1 - decay) / a**2),
-                v * decay + push * (1 - decay) / a,
-            )
-        return found
-
-
 def test_an_exact_scene_is_off_by_roundings_and_the_estimate_is_no_less() -> None:
-    found = simulate(compiled(SPRING), error=True, jit=False)
-    true = spring_in_50_digits(len(found.time))
+    system = compiled(SPRING)
+    found = simulate(system, error=True, jit=False)
     assert found.error is not None
     assert found.error.kind == "rounding"
-    for column, one in enumerate(found.error.signals[:2]):
-        pairs = zip(true, found.values[:, column], strict=True)
-        made = max(abs(float(row[column] - mpmath.mpf(float(value)))) for row, value in pairs)
-        assert made <= one.error <= 100 * made
+    followed = exact_course(system, Fraction(1))
+    assert not isinstance(followed, str), followed
+    made = np.abs(found.values[:, :2] - followed[1]).max(axis=0)
+    told = np.array([one.error for one in found.error.signals[:2]])
+    assert (made <= told).all() and (told <= 100 * made).all()
     assert error_text(found.error).startswith("none but rounding; about ")
 
 
