@@ -17,6 +17,7 @@ from apc.compiler.pipeline import compile_topology
 from apc.eigen.modes import dense
 from apc.frame.overrides import apply, parse_override
 from apc.simulation.blocks import blocks
+from apc.simulation.native import compiler
 from apc.simulation.propagate import MOST_EXACT
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
@@ -176,6 +177,7 @@ LIMITED = replaced(MESH, ("{count: 3}", MOVED), ("type: FullMesh", "type: Satura
 )
 def test_machine_code_and_the_virtual_machine_give_the_same(text: str) -> None:
     system = compiled(text)
+    assert compiler() is None or prepare(system, Settings(Fraction(1))).library is not None
     one, two = (simulate(system, jit=jit, duration=Fraction(1, 4)) for jit in (True, False))
     assert np.ptp(one.values, axis=0).max() > 1e-2
     assert np.abs(one.values - two.values).max() < 1e-12
