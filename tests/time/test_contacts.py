@@ -108,6 +108,18 @@ def test_tolerances_follow_the_scenes_scales_and_are_reported() -> None:
     assert "absolute tolerances from 5e-13 m, 5e-11 m/s" in " ".join(str(found).split())
 
 
+def test_a_wall_without_damping_is_left_after_half_a_sine(tmp_path: Path) -> None:
+    found = simulate(compiled(IMPACT, library(tmp_path, STOP)), jit=False)
+    t, x, v = found.time, found["user[1].device.x"], found["user[1].device.v"]
+    begin, omega = 0.0053 / 0.5, np.sqrt(3000 / 0.1)
+    end = begin + np.pi / omega
+    inside, after = (t > begin) & (t < end), t > end
+    assert inside.sum() > 10
+    assert x[inside] == pytest.approx(0.5 / omega * np.sin(omega * (t[inside] - begin)), abs=1e-10)
+    assert x[after] == pytest.approx(-0.5 * (t[after] - end), abs=2e-10)
+    assert v[after] == pytest.approx(-0.5, abs=2e-8)
+
+
 def test_a_force_that_jumps_is_met_at_the_jump(tmp_path: Path) -> None:
     text = IMPACT.replace("3000 N/m", "2000 N/m, damping: 2 N*s/m").replace("40 ms", "200 ms")
     text += "hands: {hand: {type: ConstantForce, flange: device, force: 2 N}}\n"
