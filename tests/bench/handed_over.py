@@ -22,7 +22,7 @@ from apc.exports.peer import peer_of
 from apc.simulation.settings import DEFAULT
 from apc.simulation.simulation import plan_of
 from tests.bench.judge import Judge, parser_of
-from tests.in_c import build
+from tests.hand_over.in_c import build
 from tests.topologies import SCENES
 
 NAMES = ("experiment-average", "three-users-mesh", "planar-users", "two-users-set-position", "star-lecture")

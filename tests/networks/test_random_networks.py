@@ -75,7 +75,7 @@ def draw(generator: random.Random, *, quick: bool = False) -> tuple[str, dict[st
         own = ", delays: own" if kind != "WeightedMean" and generator.random() < 0.2 else ""
         couplers += f"  coordination: {{type: {kind}, object: cube, stiffness: {stiffness:.1f} N/m, damping: {damping} N*s/m, clock: {clock}, delay: {delay}, link: lan{own}}}\n"
     if generator.random() < 0.2:
-        couplers += f"  own: {{type: SampledIntegrator, a: device, b: cube, kp: 20 N/m, ki: 3 N/(m*s), kd: 0.2 N*s/m, leak: {generator.choice([0.9, 0.99])}, alpha: 0.5, clock: haptic, delay: 0 s}}\n"
+        couplers += f"  own: {{type: SampledIntegrator, a: device, b: cube, kp: 20 N/m, ki: 3 N/(m*s), kd: 0.2 N*s/m, leak: {generator.choice([0.9, 0.99])}, alpha: 0.5, period: 1 ms, clock: haptic, delay: 0 s}}\n"
     laws = {"lan": _law(generator, network, haptic)}
     late_now = generator.choice(late)
     if laws["lan"].jitter:

@@ -1,4 +1,4 @@
-"""`exports.modelica`: a scene as a Modelica model, compiled and played by Rumoca beside `apc simulate`."""
+"""A scene as a Modelica model, compiled and played by Rumoca beside `apc simulate`."""
 
 from __future__ import annotations
 
@@ -88,6 +88,7 @@ def test_rumoca_plays_the_papers_scene_at_any_times_as_simulate_does(times: str)
 
 
 # Other groups, couplers that remember, a server, a graph, a plane, forces that change with time.
+@pytest.mark.few(7)
 @needs_rumoca
 @pytest.mark.parametrize(
     ("name", "settings"),
@@ -128,6 +129,7 @@ HANDS = {
 }
 
 
+@pytest.mark.few(3)
 @needs_rumoca
 @pytest.mark.parametrize("hand", HANDS)
 def test_rumoca_plays_hands_as_simulate_does(hand: str, tmp_path: Path) -> None:
@@ -166,28 +168,11 @@ def test_two_peers_that_differ_share_what_they_share() -> None:
     assert text.count("parameter Real 'cube.mass'") == 1
 
 
-@pytest.mark.parametrize(
-    ("name", "written"),
-    [
-        ("haptic", "haptic"),
-        ("left[2].x", "'left[2].x'"),
-        ("end", "'end'"),
-        ("a'b\\", r"'a\'b\\'"),
-    ],
-)
-def test_a_name_is_written_as_modelica_reads_it(name: str, written: str) -> None:
-    assert identifier(name) == written
-
-
-@pytest.mark.parametrize(
-    ("unit", "written"),
-    [("N*s/m", "N.s/m"), ("kg*m^2", "kg.m2"), ("N/m^(3/2)", ""), ("1", "1"), ("1/s", "1/s")],
-)
-def test_a_unit_is_written_as_modelica_reads_it(unit: str, written: str) -> None:
-    assert unit_of_modelica(unit) == written
-
-
-def test_numbers_are_read_back_to_the_last_bit() -> None:
+def test_names_units_and_numbers_are_written_as_modelica_reads_them() -> None:
+    names = {"haptic": "haptic", "left[2].x": "'left[2].x'", "end": "'end'", "a'b\\": r"'a\'b\\'"}
+    assert {name: identifier(name) for name in names} == names
+    units = {"N*s/m": "N.s/m", "kg*m^2": "kg.m2", "N/m^(3/2)": "", "1": "1", "1/s": "1/s"}
+    assert {unit: unit_of_modelica(unit) for unit in units} == units
     for value in (0.1, 1e-300, -2.5, 3.0, 1e22, 2 / 3):
         assert float(number(value).text) == value
 

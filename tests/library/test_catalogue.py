@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,11 +12,11 @@ import pytest
 
 import apc
 from apc.__main__ import run
+from apc.compiler.components.component import Reference
 from apc.compiler.components.library import Library
 from apc.compiler.view.catalogue import scenes
 from apc.frame.settable import parameters
-from apc.present.forms import json_text
-from tests.topologies import AVERAGE
+from tests.topologies import ROOT, SCENES, built_in
 
 Call = Callable[..., tuple[int, str, str]]
 
@@ -41,17 +43,30 @@ def test_every_component_has_one_line(call: Call) -> None:
 
 
 @pytest.mark.parametrize("name", Library().names)
-def test_every_component_is_shown_with_its_parameters_and_equations(call: Call, name: str) -> None:
+def test_every_component_is_shown_with_its_parameters_and_equations_and_tested(call: Call, name: str) -> None:
     code, out, _ = call("library", name)
     assert code == 0
     facts = json.loads(call("library", name, "--json")[1])
-    component = Library().component(name)
+    component = built_in().component(name)
     if component is not None:
+        assert component.about.endswith(".") and component.source
         own = {one.name.partition("[")[0] for one in component.parameters}
+        assert all(one.about or isinstance(one, Reference) for one in component.parameters)
         assert {one["name"] for one in facts["parameters"]} == own
         assert set(facts["equations"]) == {one.text for one in component.equations}
         for text in (*own, *(one.text for one in component.equations)):
             assert text in out
+        assert name in words_of_tests()
+
+
+@functools.cache
+def words_of_tests() -> set[str]:
+    """Return all words of the tests of components, and of the scenes that they play by hand."""
+    pages = [page for room in ("library", "time") for page in (ROOT / "tests" / room).glob("test_*.py")]
+    pages = [page for page in pages if page.name not in ("test_catalogue.py", "test_scenes.py")]
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    scenes = [path for path in SCENES.glob("*.yaml") if f'"{path.stem}' in text]
+    return set(re.findall(r"\w+", "\n".join([text, *(one.read_text(encoding="utf-8") for one in scenes)])))
 
 
 def test_a_parameter_is_told_with_unit_default_and_limits(call: Call) -> None:
@@ -61,10 +76,6 @@ def test_a_parameter_is_told_with_unit_default_and_limits(call: Call) -> None:
         if one["name"] == "force_limit"
     ]
     assert (force["unit"], force["value"], force["limits"]) == ("N", "3.3", "> 0")
-    facts = {one["name"]: one for one in json.loads(call("library", "GodObject", "--json")[1])["parameters"]}
-    assert facts["point"]["value"] == "[0, 0]"
-    assert facts["normal"]["value"] == "needed"
-    assert facts["clock"]["limits"] == "a clock"
 
 
 def test_a_misspelt_component_or_scene_is_told_with_the_nearest(call: Call) -> None:
@@ -109,15 +120,6 @@ def test_what_is_listed_is_what_may_be_set(call: Call) -> None:
             unit = "" if one.unit == "1" else one.unit
             value = max(one.low, one.minimum or 0.0)
             apc.set_parameters(model, {one.name: f"{value!r} {unit}".strip()})
-        known = {
-            one.name.removeprefix("trainee.").removeprefix("surgeon.").removeprefix("user.") for one in listed
-        }
-        assert {one.name for one in model.parameters if " " not in one.name} - known <= {
-            "peers",
-            "user.count",
-            "surgeon.count",
-            "trainee.count",
-        } | {one.name for one in model.parameters if one.name.startswith("count(")}
 
 
 def test_limits_are_those_that_are_kept() -> None:
@@ -137,22 +139,6 @@ def test_a_group_has_rows_of_its_own_and_a_fixed_count_says_why(call: Call) -> N
     out = call("show", "users-table.yaml", "--parameters")[1]
     assert "user.device.mass" in out and "0.08 to 0.25 kg" in out
     assert "not to be set: device.mass has a value for each peer" in " ".join(out.split())
-    call("show", "users-table.yaml", "--parameters", "--out", "p.json")
-    [mass] = [
-        one
-        for one in json.loads(Path("p.json").read_text(encoding="utf-8"))["rows"]
-        if one["name"] == "user.device.mass"
-    ]
+    rows = apc.parameters("users-table.yaml").to_dict()["rows"]
+    [mass] = [one for one in rows if one["name"] == "user.device.mass"]
     assert (mass["low"], mass["high"], mass["unit"], mass["minimum"]) == (0.08, 0.25, "kg", 0.0)
-    assert (
-        json_text(apc.parameters("users-table.yaml").to_dict()) == Path("p.json").read_text("utf-8").rstrip()
-    )
-
-
-def test_parameters_are_listed_of_a_compiled_model_too_and_in_no_picture(call: Call) -> None:
-    Path("scene.yaml").write_text(AVERAGE, encoding="utf-8")
-    call("compile")
-    assert call("show", "scene.apc", "--parameters")[1] == call("show", "scene.yaml", "--parameters")[1]
-    code, _, err = call("show", "--parameters", "--out", "p.svg")
-    assert (code, err.partition(".svg")[0]) == (1, "p") and "E878" in err
-    assert call("show", "--parameters", "--format", "dot")[0] == 2

@@ -1,9 +1,8 @@
-"""`integrate` and `flow`: what is not linear moves as it should, to the tolerance, and pays alone."""
+"""What is not linear moves as it should, to the tolerance or by the steps asked for; what is, stays exact."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,13 +15,15 @@ from scipy.optimize import brentq
 
 from apc.compiler.errors import ApcError
 from apc.simulation.blocks import blocks
-from apc.simulation.integrate import integrated
-from apc.simulation.propagate import nonlinear_rows
 from apc.simulation.settings import Method, Settings, parse_method
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import Trajectory, simulate
+from tests.eventwise import coast
 from tests.sites import alone
-from tests.topologies import compiled, library
+from tests.topologies import AVERAGE, ONE_MASS, compiled, library, replaced
+
+MS = Fraction(1, 1000)
+
 
 CROSSLEY = """\
 topology: impact
@@ -87,12 +88,12 @@ def test_hunt_and_crossleys_impact_is_that_of_an_independent_integration() -> No
         return law
 
     system = compiled(CROSSLEY)
-    found = simulate(system)
+    found = simulate(system, jit=False)
     true = dense_output(laws, [-0.005, 0.5], found.time)
     assert np.abs(found.values - true).max(axis=0) == pytest.approx([0, 0], abs=3e-7)
     assert np.abs(found.values[:, 0] - true[:, 0]).max() < 2e-9
     loose, tight = (
-        np.abs(simulate(system, method=Method("cvodes", tolerance=one)).values - true).max()
+        np.abs(simulate(system, method=Method("cvodes", tolerance=one), jit=False).values - true).max()
         for one in (1e-6, 1e-12)
     )
     assert 1e-5 < loose < 1e-2
@@ -100,7 +101,7 @@ def test_hunt_and_crossleys_impact_is_that_of_an_independent_integration() -> No
 
 
 def test_tolerances_follow_the_scenes_scales_and_are_reported() -> None:
-    found = simulate(compiled(CROSSLEY))
+    found = simulate(compiled(CROSSLEY), duration=MS, jit=False)
     assert found.provenance.method == "exact where linear, cvodes:1e-10 elsewhere"
     absolute = {one.state: one.absolute for one in found.provenance.tolerances}
     assert absolute == pytest.approx({"device.x": 5e-13, "device.v": 5e-11})
@@ -108,7 +109,7 @@ def test_tolerances_follow_the_scenes_scales_and_are_reported() -> None:
 
 
 def test_a_wall_without_damping_is_left_after_half_a_sine(tmp_path: Path) -> None:
-    found = simulate(compiled(IMPACT, library(tmp_path, STOP)))
+    found = simulate(compiled(IMPACT, library(tmp_path, STOP)), jit=False)
     t, x, v = found.time, found["user[1].device.x"], found["user[1].device.v"]
     begin, omega = 0.0053 / 0.5, np.sqrt(3000 / 0.1)
     end = begin + np.pi / omega
@@ -126,65 +127,34 @@ def test_a_force_that_jumps_is_met_at_the_jump(tmp_path: Path) -> None:
     def laws(inside: bool) -> object:
         return lambda t, x: [x[1], (2 - (2000 * x[0] + 2 * x[1] if inside else 0)) / 0.1]
 
-    found = simulate(compiled(text, library(tmp_path, STOP)))
+    found = simulate(compiled(text, library(tmp_path, STOP)), jit=False)
     true = dense_output(laws, [-0.0053, 0.5], found.time)
     assert np.abs(found.values - true).max() < 3e-7
-
-
-def test_between_two_walls_a_mass_goes_to_and_fro_with_the_period_of_the_closed_form(tmp_path: Path) -> None:
-    text = """\
-topology: cage
-peers: {user: {count: 1, set: {device.v: 0.5 m/s}}}
-masses: {device: {mass: 0.1 kg}}
-couplers:
-  right: {type: Stop, flange: device, stiffness: 1e5 N/m, place: 10 mm}
-  left:  {type: Left, flange: device, stiffness: 1e5 N/m, place: -10 mm}
-experiment: {duration: 1 s}
-"""
-    left = STOP.replace("component: Stop", "component: Left").replace("flange.x > place", "flange.x < place")
-    found = simulate(compiled(text, library(tmp_path, STOP, left)))
-    omega = 1e3
-    fly, press = 0.02 / 0.5, np.pi / omega
-    phase = (found.time + fly / 2) % (2 * (fly + press))  # from the left wall's surface, to the right
-    back = phase > fly + press
-    phase = np.where(back, phase - fly - press, phase)
-    way = np.where(
-        phase < fly, -0.01 + 0.5 * phase, 0.01 + 0.5 / omega * np.sin(omega * np.maximum(phase - fly, 0))
-    )
-    assert np.abs(found["user[1].device.x"] - np.where(back, -way, way)).max() < 1e-7
-
-
-def test_an_elastic_contact_keeps_the_energy() -> None:
-    # K d^1.5 over the depth d is 2/5 K d^2.5.
-    text = CROSSLEY.replace(", damping: 1e5 N*s/m^(5/2)", "").replace("force: 2 N", "force: 0 N")
-    found = simulate(compiled(text), duration=Fraction(1, 10))
-    x, v = found["user[1].device.x"], found["user[1].device.v"]
-    energy = 0.05 * v**2 + 0.4 * 2e5 * np.maximum(x, 0) ** 2.5
-    assert energy == pytest.approx(np.full(len(x), 0.0125), rel=1e-7)
-    assert v[-1] == pytest.approx(-0.5, abs=1e-7)
 
 
 def test_a_motion_that_is_not_linear_feels_held_forces_from_when_they_act() -> None:
     # With y = x - 1: y' = f - y^2, f = 1 from half a tick on. Until then 1/y grows by t, then y is a coth.
     system = alone(lambda x, u: u[0] - (x - 1) ** 2, lambda x, u, m: 0 * x + 1, delay=Fraction(1, 2000))
-    found = simulate(system, duration=Fraction(1, 100))
+    found = simulate(system, duration=Fraction(1, 100), jit=False)
     expected = 1 + 1 / np.tanh(found.time[1:] - 5e-4 + np.arctanh(-1 + 5e-4))
     assert found["peer[1].x"][1:] == pytest.approx(expected, rel=1e-8)
 
 
 def test_a_crossing_is_found_even_if_the_force_is_a_blow() -> None:
-    # x' = 1 until x = 0.3, then 1000: 2 ms later x is 0.3 + 1000 (2 ms - 0.3 ms).
-    x, u, p, t = (casadi.SX.sym(n, k) for n, k in (("x", 1), ("u", 0), ("p", 0), ("t", 1)))
-    blow = casadi.Function("rate", [x, u, p, t], [casadi.if_else(x < 0.3e-3, 1.0, 1000.0)])
-    move = integrated(blow, np.array([1e-3]), 1e-10, Fraction(2, 1000))
-    assert float(move(0.0, [], [], 0.0)) == pytest.approx(0.3e-3 + 1000 * 1.7e-3, rel=1e-9)
+    # x' = 1 until x = 0.3 mm, then 1000: after 2 ms x is 0.3 mm + 1000 (2 ms - 0.3 ms).
+    found = simulate(
+        alone(lambda x, u: casadi.if_else(x < 0.3e-3, 1.0, 1000.0)), duration=Fraction(2, 1000), jit=False
+    )
+    assert found["peer[1].x"][-1] == pytest.approx(0.3e-3 + 1000 * 1.7e-3, rel=1e-9)
 
 
-def test_a_switch_in_time_is_met_too() -> None:
-    x, u, p, t = (casadi.SX.sym(n, k) for n, k in (("x", 1), ("u", 0), ("p", 0), ("t", 1)))
-    step = casadi.Function("rate", [x, u, p, t], [casadi.if_else(t < 1.00037, 0.0, x)])
-    move = integrated(step, np.ones(1), 1e-10, Fraction(1, 1000))
-    assert float(move(1.0, [], [], 1.0)) == pytest.approx(np.exp(0.00063), rel=1e-9)
+@pytest.mark.parametrize(("method", "error"), [("rk4:1ms", 1e-12), ("cvodes:1e-10", 1e-8)])
+def test_every_method_reaches_the_closed_form(method: str, error: float) -> None:
+    """dy/dt = −y³ from −1, y = x − 1: −1/√(1 + 2t)."""
+    found = simulate(
+        alone(lambda x, u: -((x - 1) ** 3)), duration=Fraction(1, 2), method=parse_method(method), jit=False
+    )
+    assert found["peer[1].x"] == pytest.approx(1 - 1 / np.sqrt(1 + 2 * found.time), abs=error)
 
 
 MIXED = """\
@@ -210,18 +180,15 @@ def columns(trajectory: Trajectory, start: str) -> np.ndarray:
 
 def test_linear_peers_and_parts_keep_their_exact_motion() -> None:
     system = compiled(MIXED)
-    hard = system.kinds[system.groups[0].kind]
-    assert [hard.states[row].name for row in nonlinear_rows(hard)] == ["device.x", "device.v"]
-    found = simulate(system)
+    found = simulate(system, jit=False)
     assert [one.state for one in found.provenance.tolerances] == ["device.x", "device.v"]
     linear = MIXED.replace("  hard: {count: 1, set: {device.x: -1 mm, device.v: 0.5 m/s}}\n", "")
     linear = "".join(line for line in linear.splitlines(True) if "contact" not in line)
-    assert (columns(found, "free") == columns(simulate(compiled(linear)), "free")).all()
+    assert (columns(found, "free") == columns(simulate(compiled(linear), jit=False), "free")).all()
 
 
 def test_what_jumps_without_a_slope_is_not_linear() -> None:
     system = alone(lambda x, u: 1 - 2 * (x > 5e-3), None)
-    assert nonlinear_rows(system.kinds[0]) == (0,)
     with pytest.raises(ApcError, match="E870 the motion of x is not linear between the ticks: only"):
         prepare(system, Settings(Fraction(1, 10), method=Method("exact")))
 
@@ -237,7 +204,7 @@ def test_what_jumps_without_a_slope_is_not_linear() -> None:
 def test_what_cant_be_integrated_on_is_kept_until_there(
     law: Callable[[Any], Any], rows: int, last: float | None, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    played = blocks(prepare(alone(lambda x, u: law(x)), Settings(Fraction(1, 10))))
+    played = blocks(prepare(alone(lambda x, u: law(x)), Settings(MS * 100, jit=False)))
     block = next(played)
     assert len(block.time) == rows
     if last is not None:
@@ -247,31 +214,93 @@ def test_what_cant_be_integrated_on_is_kept_until_there(
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize(("method", "order"), [("rk4", 4), ("semi-implicit", 1)])
+def test_a_linear_scene_converges_to_the_exact_one_with_the_order_of_the_method(
+    method: str, order: int
+) -> None:
+    moved = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: [10 mm, 0 mm, -5 mm]}}"))
+    system = compiled(moved.replace("delay: 1 ms", "delay: 0.3 ms"))  # steps end at 0.3 ms of each tick
+
+    def error(step: str) -> float:
+        found = simulate(
+            system, duration=MS * 20, signals=["*.x"], method=parse_method(f"{method}:{step}"), jit=False
+        )
+        return float(np.abs(found.values - exact.values).max())
+
+    exact = simulate(system, duration=MS * 20, signals=["*.x"], jit=False)
+    assert exact.provenance.method == "exact"
+    assert np.log2(error("100us") / error("25us")) / 2 == pytest.approx(order, abs=0.15)
+
+
 def test_cvodes_moves_a_linear_scene_too_to_its_tolerance() -> None:
-    linear = MIXED.partition("couplers:")[0].replace("hard:", "first:")
-    linear += "couplers: {spring: {type: SpringDamper, a: device, b: tool, stiffness: 3000 N/m}}\n"
-    system = compiled(linear)
-    exact = simulate(system, duration=Fraction(1, 10))
+    system = compiled(SWING)
+    exact = simulate(system, duration=MS * 100, jit=False)
+    size = np.abs(exact.values).max()
     for tolerance in (1e-6, 1e-9):
-        found = simulate(system, duration=Fraction(1, 10), method=parse_method(f"cvodes:{tolerance:g}"))
-        assert 0.1 * tolerance < np.abs(found.values - exact.values).max() < 1000 * tolerance
+        method = parse_method(f"cvodes:{tolerance:g}")
+        found = simulate(system, duration=MS * 100, method=method, jit=False)
+        assert 0.1 * tolerance < np.abs(found.values - exact.values).max() / size < 1000 * tolerance
 
 
-def test_a_loop_that_newtons_method_solves_may_be_part_of_the_motion() -> None:
-    # x' = 10 y - x^2 with y = cos(x - y).
-    system = alone(lambda x, u: 0 * x)
-    [kind] = system.kinds
-    y, x = casadi.SX.sym("y"), casadi.SX.sym("x")
-    loop = {"x": y, "p": x, "g": y - casadi.cos(x - y)}
-    solver = casadi.rootfinder("loop", "newton", loop, {"abstol": 1e-14, "abstolStep": 0.0})
-    arguments = [casadi.MX.sym(f"a{i}", *kind.derivative.size_in(i)) for i in range(4)]
-    rate = 10 * solver(x0=0.5, p=arguments[0])["x"] - arguments[0] ** 2
-    moving = replace(kind, derivative=casadi.Function("derivative", arguments, [rate]))
-    found = simulate(replace(system, kinds=(moving,)), duration=Fraction(1, 5))
+SWING = ONE_MASS.replace("count: 1", "count: 1, set: {device.x: 1 m}") + (
+    "couplers: {tie: {type: SpringDamper, a: device, b: ground, stiffness: 900 N/m}}\n"
+)
 
-    def law(t: float, x: np.ndarray) -> list[float]:
-        root = brentq(lambda y: y - np.cos(x[0] - y), -2, 2, xtol=1e-15)
-        return [10 * root - x[0] ** 2]
 
-    true = solve_ivp(law, (0, 0.2), [0.0], "DOP853", rtol=1e-12, atol=1e-13).y[0, -1]
-    assert found["peer[1].x"][-1] == pytest.approx(true, abs=1e-7)
+def test_semi_implicit_takes_the_new_velocity_for_the_position() -> None:
+    """A step of 0.4 ms ends with the millisecond: two of 0.4 ms, one of 0.2 ms."""
+    method = parse_method("semi-implicit:0.4ms")
+    found = simulate(compiled(SWING), duration=MS * 50, method=method, jit=False)
+    x, v = 1.0, 0.0
+    for row in found.values:
+        assert row == pytest.approx([x, v], rel=1e-12)
+        for h in (0.4e-3, 0.4e-3, 0.2e-3):
+            v += h * (-900 * x - 3 * v) / 2
+            x += h * v
+
+
+SOFT = """\
+component: SoftSpring
+about: A spring that gives way more the harder it is pulled.
+connectors: {flange: Flange}
+parameters: {stiffness: {unit: N/m}, soft: {unit: 1/N^2}CLOCK}
+variables: {f: {unit: N}}
+equations:
+  - f + soft*f^3 = stiffness*PLACE
+  - flange.f = FORCE
+"""
+SOFT_SCENE = """\
+topology: soft
+clocks: {tick: 1 ms}
+peers: {user: {count: 1, set: {device.x: 20 mm}}}
+masses: {device: {mass: 0.1 kg, damping: 1 N*s/m}}
+couplers: {it: {type: SoftSpring, flange: device, stiffness: 500 N/m, soft: 1 1/N^2}}
+"""
+
+
+def soft(x: float) -> float:
+    return float(brentq(lambda f: f + f**3 - 500 * x, -20, 20, xtol=1e-15))
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_a_loop_that_newtons_method_solves_is_played(tmp_path: Path, sampled: bool) -> None:
+    """f + f³ = 500 x, at every moment, or at each tick and held from there."""
+    words = (", clock: clock", "sample(flange.x)", "hold(f)") if sampled else ("", "flange.x", "f")
+    text = SOFT
+    for name, word in zip(("CLOCK", "PLACE", "FORCE"), words, strict=True):
+        text = text.replace(name, word)
+    scene = SOFT_SCENE.replace("soft: 1 1/N^2", "soft: 1 1/N^2, clock: tick") if sampled else SOFT_SCENE
+    found = simulate(compiled(scene, library(tmp_path, text)), duration=MS * 50, jit=False)
+    if sampled:
+        x, v = 0.02, 0.0
+        for row in range(50):
+            x, v = coast(x, v, -soft(x), 0.1, 1.0, 1e-3)
+            assert found.values[row + 1, :2] == pytest.approx([x, v], rel=1e-9)
+    else:
+        true = solve_ivp(
+            lambda t, x: [x[1], (-x[1] - soft(x[0])) / 0.1],
+            *((0, 0.05), [0.02, 0.0], "DOP853", found.time),
+            rtol=1e-12,
+            atol=1e-14,
+        )
+        assert np.abs(found.values[:, :2] - true.y.T).max() < 1e-7

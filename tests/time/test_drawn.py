@@ -1,4 +1,4 @@
-"""`still`: how a scene begins, drawn from its equations alone."""
+"""How a scene begins, drawn from its equations alone, and how a run went, drawn from its rows."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
 from apc.frame.start import start_values
 from apc.present.planar import Disc, Line, Spot, paths_of, spots_of
+from apc.present.simulation import save_picture
 from apc.present.still import Body, Wall, bodies_of, draw_still, save_still
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 
@@ -149,3 +150,31 @@ def test_a_run_in_a_plane_is_drawn_as_paths_as_well(tmp_path: Path) -> None:
         "user[1].puck.x",
     ]
     assert plane.lines[0].get_xdata().tolist() == pytest.approx((1e3 * run.values[:, pairs[0][0]]).tolist())
+
+
+# ---- a run ----
+
+RUN = apc.simulate(SCENES / "experiment-mesh.yaml", duration="0.5 s", jit=False)
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
+def test_a_picture_is_written_and_the_same_run_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
+    one, two = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
+    save_picture(RUN, one)
+    save_picture(RUN, two)
+    assert one.stat().st_size > 5_000
+    assert one.read_bytes() == two.read_bytes()
+
+
+def test_a_picture_has_a_panel_a_quantity_and_no_label_over_another() -> None:
+    figure = RUN.plot()
+    assert [ax.get_ylabel() for ax in figure.axes] == ["position [mm]", "velocity [m/s]", "force [N]"]
+    figure.draw_without_rendering()
+    boxes = [ax.get_legend().get_window_extent() for ax in figure.axes]
+    boxes += [ax.yaxis.label.get_window_extent() for ax in figure.axes]
+    boxes += [ax.get_window_extent() for ax in figure.axes]
+    for i, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[:i])
+        assert figure.bbox.x0 <= box.x0
+        assert box.x1 <= figure.bbox.x1 + 1

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 
-import casadi
 import numpy as np
 import pytest
 
 import apc
-from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.compiler.view.listing import show_text
+from tests.library.parts import rates, ticked
 from tests.topologies import AVERAGE, ONE_MASS, SCENES, compiled, library, replaced
 
 PLANAR = (SCENES / "planar-users.yaml").read_text(encoding="utf-8").partition("\n")[2]
@@ -24,34 +21,21 @@ PLANE = f"{POINT}  device: {{type: PlanarMass, mass: 2 kg, damping: 3 N*s/m}}\n"
 SPACE = f"{POINT}  device: {{type: SpatialMass, mass: 2 kg, damping: 3 N*s/m}}\n"
 
 
-def values(system: CompiledSystem) -> dict[str, float]:
-    return {parameter.name: parameter.value for parameter in system.parameters}
-
-
-def rates(system: CompiledSystem, x: Mapping[str, float]) -> dict[str, float]:
-    """Return dx/dt by state, at x by state; what isn't named is 0, nothing is held."""
-    (kind,) = system.kinds
-    states = [state.name for state in kind.states]
-    p = [values(system)[name] for name in kind.parameters]
-    found = kind.derivative([x.get(n, 0.0) for n in states], [0.0] * len(kind.holds), p, 0)
-    return dict(zip(states, casadi.DM(found).full().ravel().tolist(), strict=True))
-
-
-def forces(system: CompiledSystem, x: Mapping[str, float]) -> dict[str, float]:
-    """Return what the only clock computes, at x by state."""
-    (kind,) = system.kinds
-    (clock,) = kind.clocks
-    p = [values(system)[name] for name in kind.parameters]
-    at = [x.get(state.name, 0.0) for state in kind.states]
-    found = clock.tick(at, [0.0] * len(kind.holds), [], [], p, 0)
-    return dict(zip(clock.outputs, casadi.DM(found).full().ravel().tolist(), strict=True))
-
-
 def sizes(text: str) -> np.ndarray:
     """Return the magnitudes of all eigenvalues of a scene, each as often as it comes, largest first."""
     found = apc.analyze(compiled(text))
     each = [abs(one.eigenvalue) for one in found.modes for _ in range(one.multiplicity)]
     return np.sort(each)[::-1]
+
+
+def state(place: np.ndarray, speed: np.ndarray) -> dict[str, float]:
+    found = {f"device.x[{k + 1}]": float(one) for k, one in enumerate(place)}
+    return found | {f"device.v[{k + 1}]": float(one) for k, one in enumerate(speed)}
+
+
+def pushed(system: apc.CompiledSystem, *held: float) -> list[float]:
+    """Return the force on the mass of 2 kg at rest, when these are held."""
+    return [2 * value for name, value in rates(system, {}, held).items() if name.startswith("device.v")]
 
 
 # ---- what a plane has twice ----
@@ -65,12 +49,6 @@ def test_the_scene_in_a_plane_has_each_eigenvalue_of_the_scene_on_a_line_twice()
     one, two = apc.analyze(compiled(AVERAGE)), apc.analyze(compiled(PLANAR))
     assert two.spectral_radius == pytest.approx(one.spectral_radius, rel=1e-12)
     assert two.rigid_modes == 2 * one.rigid_modes
-
-
-def test_planar_average_position_shakes_where_average_position_does() -> None:
-    known = [apc.critical(compiled(text), "contact.stiffness") for text in (AVERAGE, PLANAR)]
-    line, plane = ([c.value for c in one.crossings] for one in known)
-    assert plane == pytest.approx(line, rel=1e-9)
 
 
 @pytest.mark.parametrize(("mass", "spring", "size"), [("Planar", "Planar", 2), ("Spatial", "Spatial", 3)])
@@ -94,7 +72,7 @@ def test_sampled_planar_spring_damper_pulls_along_the_line_between_its_ends() ->
         "stiffness: 70 N/m, damping: 4 N*s/m}\n"
     )
     at = {"device.x[1]": 0.3, "device.x[2]": -0.4, "device.v[1]": 0.5, "device.v[2]": 2.0}
-    assert forces(system, at) == pytest.approx(
+    assert ticked(system, at) == pytest.approx(
         {"it.f[1]": 70 * 0.3 + 4 * 0.5, "it.f[2]": -70 * 0.4 + 4 * 2.0}, rel=EXACT
     )
 
@@ -103,8 +81,7 @@ def test_planar_constant_force_pushes_in_its_direction() -> None:
     system = compiled(
         f"{PLANE}hands: {{push: {{type: PlanarConstantForce, flange: device, force: [3 N, -4 N]}}}}\n"
     )
-    found = rates(system, {})
-    assert [found["device.v[1]"], found["device.v[2]"]] == pytest.approx([1.5, -2.0], rel=EXACT)
+    assert pushed(system) == pytest.approx([3.0, -4.0], rel=EXACT)
 
 
 # ---- contacts ----
@@ -128,32 +105,13 @@ def test_disc_contact_and_sphere_contact_push_along_the_line_of_centres_and_neve
         (inside, 1e3 * inside),
         (4 * inside, moving),
     ):
-        at = {f"device.x[{k + 1}]": float(v) for k, v in enumerate(place)}
-        at |= {f"device.v[{k + 1}]": float(v) for k, v in enumerate(speed)}
+        at = state(place, speed)
         away = place / np.linalg.norm(place)
         depth = 0.05 - np.linalg.norm(place)
         push = max(0.0, 900 * depth - 2 * float(away @ speed)) if depth > 0 else 0.0
-        found = forces(system, at)
+        found = ticked(system, at)
         assert [found[f"ball.f[{k + 1}]"] for k in range(size)] == pytest.approx(-push * away, rel=EXACT)
-
-
-def test_disc_contact_is_stiff_along_the_normal_and_gives_way_across_it() -> None:
-    """Linearized: K along the normal, −K depth/distance across; each a mass on a sampled spring by itself.
-
-    With x' = v, m v' = −b v − K x sampled each T: x and v at the next tick from those of this one.
-    """
-    m, b, stiffness, distance = 2.0, 3.0, 900.0, 0.04
-    text = radial(2).replace("damping: 2 N*s/m, ", "").replace("3 N*s/m}", "3 N*s/m, x: [24 mm, 32 mm]}")
-    assert "24 mm" in text
-    e = math.exp(-b / m * 1e-3)
-
-    def tick(k: float) -> np.ndarray:
-        held = 1e-3 / b - m * (1 - e) / b**2
-        step = np.array([[1, m * (1 - e) / b], [0, e]])
-        return np.abs(np.linalg.eigvals(step - k * np.array([[held, 0], [(1 - e) / b, 0]])))
-
-    expected = np.concatenate([tick(stiffness), tick(-stiffness * (0.05 - distance) / distance)])
-    assert sizes(text) == pytest.approx(np.sort(expected)[::-1], rel=1e-9)
+    assert pushed(system, *inside) == pytest.approx(-inside, rel=EXACT)
 
 
 def test_coinciding_centres_have_no_direction_and_no_verdict() -> None:
@@ -176,17 +134,10 @@ def test_line_contact_and_plane_contact_push_along_their_normal_and_never_pull(s
         across = np.zeros(size)
         across[:2] = [normal[1], -normal[0]]
         place, moving = point + away * unit + along * across, speed * unit
-        at = {f"device.x[{k + 1}]": float(v) for k, v in enumerate(place)}
-        at |= {f"device.v[{k + 1}]": float(v) for k, v in enumerate(moving)}
+        at = state(place, moving)
         push = max(0.0, 900 * -away - 2 * speed) if away < 0 else 0.0
-        assert forces(system, at)["wall.push"] == pytest.approx(push, rel=1e-11)
-    held = {hold.name: k for k, hold in enumerate(system.kinds[0].holds)}
-    assert list(held) == ["wall.push"]
-    (kind,) = system.kinds
-    p = [values(system)[one] for one in kind.parameters]
-    found = kind.derivative([0.0] * (2 * size), [5.0], p, 0)
-    by_name = dict(zip((s.name for s in kind.states), casadi.DM(found).full().ravel().tolist(), strict=True))
-    assert [by_name[f"device.v[{k + 1}]"] for k in range(size)] == pytest.approx(5 * unit / 2, rel=EXACT)
+        assert ticked(system, at)["wall.push"] == pytest.approx(push, rel=1e-11)
+    assert pushed(system, 5.0) == pytest.approx(5 * unit, rel=EXACT)
 
 
 # ---- numbers of vectors ----
@@ -286,28 +237,8 @@ def test_a_connector_may_have_several_pairs_vectors_among_them(tmp_path: Path) -
         "couplers: {tie: {type: Mount, a: one, b: two, stiffness: 70 N/m, twist: 9 N*m, clock: tick}}\n"
     )
     system = compiled(text, library(tmp_path, *SLAB))
-    found = forces(system, {"one.x[1]": 0.5, "two.x[2]": 0.25, "one.angle": 0.125})
+    found = ticked(system, {"one.x[1]": 0.5, "two.x[2]": 0.25, "one.angle": 0.125})
     assert found == pytest.approx({"tie.f[1]": 35.0, "tie.f[2]": -17.5, "tie.torque": 1.125}, rel=EXACT)
-    (kind,) = system.kinds
-    p = [values(system)[name] for name in kind.parameters]
-    u = {hold.name: 1.0 + k for k, hold in enumerate(kind.holds)}
-    x = [0.0] * len(kind.states)
-    rate = dict(
-        zip(
-            (state.name for state in kind.states),
-            casadi.DM(kind.derivative(x, list(u.values()), p, 0)).full().ravel().tolist(),
-            strict=True,
-        )
-    )
-    for pair, divided in (("x", 2.0), ("angle", 0.1)):
-        for name in u:
-            if (pair == "angle") == ("torque" in name):
-                index = name.removeprefix("tie.f").removeprefix("tie.torque")
-                state = "one.rate" if pair == "angle" else f"one.v{index}"
-                assert rate[state] == pytest.approx(-u[name] / divided, rel=EXACT)
-    # A port for each pair and end whose flow follows from what is held: x[1], x[2] and the angle, at a and b.
-    assert kind.ports is not None
-    assert len(kind.ports.parts) == 6
     run = apc.simulate(system, duration="20 ms", jit=False)
     work = dict(run.summary.work)["tie"]
     names = [signal.name for signal in run.signals]
@@ -347,15 +278,6 @@ def test_an_array_inside_a_component_is_the_row_that_a_topology_writes_out(tmp_p
     assert apc.analyze(found).spectral_radius == pytest.approx(known, rel=1e-9)
 
 
-def test_numbers_of_an_array_inside_a_component_are_set_for_all_or_one_by_one(tmp_path: Path) -> None:
-    group = "peers: {user: {count: 1, set: {%s}}}"
-    for one, all_ in (("chain.link.mass: 3 kg", [3, 3, 3]), ('"chain.link[2].mass": 3 kg', [2, 3, 2])):
-        text = replaced(ROW, ("peers: {user: {count: 1}}", group % one))
-        system = compiled(text, library(tmp_path, CHAIN))
-        found = {one.name: one.value for one in system.groups[0].values}
-        assert [found.get(f"chain.link[{k}].mass", 2.0) for k in (1, 2, 3)] == all_
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -383,43 +305,9 @@ def test_a_slip_with_an_array_inside_a_component_is_told(
     assert any(message in str(one) for one in caught.value.mistakes), str(caught.value)
 
 
-GYRO = """\
-component: Gyro
-about: A force across the velocity, as on a charge in a field.
-connectors: {a: SpatialFlange}
-parameters: {field: {unit: N*s/m, size: 3}}
-equations:
-  - a.f = cross(field, der(a.x))
-"""
-
-
-def test_a_force_across_the_velocity_turns_the_motion_in_its_plane(tmp_path: Path) -> None:
-    """With z = x₁ + i x₂ and B along x₃: m z'' + (b ± i B) z' + K z = 0; along x₃ the field does nothing."""
-    text = (
-        f"{SPACE}couplers:\n  gyro: {{type: Gyro, a: device, field: [0 N*s/m, 0 N*s/m, 8 N*s/m]}}\n"
-        "  tie: {type: SpatialSpringDamper, a: device, b: ground, stiffness: 70 N/m}\n"
-    )
-    found = apc.analyze(compiled(text, library(tmp_path, GYRO)))
-    across = np.exp([*np.roots([2, 3 + 8j, 70]), *np.roots([2, 3 - 8j, 70])])
-    along = np.exp(np.roots([2, 3, 70]))
-    known = np.sort(np.abs([*across, *along]))[::-1]
-    each = [abs(one.eigenvalue) for one in found.modes for _ in range(one.multiplicity)]
-    assert found.spectral_radius == pytest.approx(known[0], rel=1e-12)
-    assert set(np.round(each, 9)) == set(np.round(known, 9))
-
-
 def test_masses_joined_in_a_plane_move_as_one() -> None:
     text = PLANE + "  load: {type: PlanarMass, mass: 5 kg, flange: device}\n"
     text += "couplers: {tie: {type: PlanarSpringDamper, a: device, b: ground, stiffness: 70 N/m}}\n"
     found = apc.analyze(compiled(text))
     assert found.spectral_radius == pytest.approx(math.exp(-3 / (2 * 7)), rel=1e-12)
     assert len(compiled(text).kinds[0].states) == 4
-
-
-def test_what_is_shown_of_a_vector_is_a_list(tmp_path: Path) -> None:
-    (tmp_path / "scene.yaml").write_text(
-        PLANE.replace("3 N*s/m", "3 N*s/m, x: [3 mm, 0 m]"), encoding="utf-8"
-    )
-    text = " ".join(show_text(tmp_path / "scene.yaml").split())
-    assert "device: PlanarMass, in a plane, mass 2 kg, damping 3 N·s/m, x starts at [0.003 m, 0 m]" in text
-    assert "der(device.x[2]) = device.v[2]" in text

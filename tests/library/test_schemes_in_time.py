@@ -100,12 +100,6 @@ def test_a_passivity_controller_lets_no_more_out_than_a_step_takes() -> None:
     assert energies["0"].min() < -100 * -out
 
 
-def test_the_stiff_wall_settles_with_its_controller_and_shakes_without() -> None:
-    system = compiled(WALL)
-    assert apc.simulate(system, jit=False).summary.verdict == "settles"
-    assert apc.simulate(system, set={"watch.largest": "0 N*s/m"}, jit=False).summary.verdict == "shakes"
-
-
 # ---- two ports ----
 
 TWO = scene("two-users-passivity")
@@ -174,36 +168,19 @@ def test_ports_give_no_more_than_went_in(peers: int) -> None:
 
 
 def test_a_linearization_says_unstable_of_what_settles() -> None:
-    """`analyze` says of what its verdict is; the scene settles, and shakes without its controllers."""
+    """`analyze` says of what its verdict is."""
     system = compiled(TWO)
     found = apc.analyze(system)
     assert found.verdict == "unstable"
-    assert str(found).startswith(
-        "two-users-passivity: unstable, linearized at its start\n"
-        "  the start is not at rest: 2 N acts on pusher.device; what happens is played:\n    apc simulate\n"
-        "  left out: the scene is not linear, and this holds near its start values only\n\n"
-        "  To first order, some motion grows until the devices shake or hit their limits.\n"
-        "  What it does in time is played: apc simulate\n"
-    )
+    assert "\n  What it does in time is played: apc simulate\n" in str(found)
     settled = apc.simulate(system, jit=False).summary
     assert (settled.verdict, f"{settled.settled:.2f}") == ("settles", "1.52"), "as the README says"
-    without = apc.simulate(system, set={"coordination.largest": "0 N*s/m"}, duration="3 s", jit=False)
-    assert without.summary.verdict == "shakes"
-
-
-def test_the_linearization_is_of_the_average_without_its_brake() -> None:
-    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
-        push, pull = contact(x), 500 * (x[1][0] - mean(heard, 0))
-        return [-push, push - pull], memory, []
-
-    bodies = [[(0.1, 5.0 + 2.0, 100.0), (0.3, 1.0, 0.0)]] * 2
-    expected = magnitudes(ByHand(bodies, everybody(2), law, told=1, late=50))[1]
-    assert apc.analyze(compiled(TWO)).spectral_radius == pytest.approx(expected, abs=1e-10)
 
 
 # ---- set positions ----
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("delay", [0, 50, 200])
 @pytest.mark.parametrize("energy", [1e-5, 10.0])
 def test_set_position_modulation_gives_no_energy(delay: int, energy: float) -> None:
@@ -251,13 +228,6 @@ def test_set_position_modulation_with_energy_enough_is_a_spring_and_damper() -> 
     assert found.linearized
 
 
-def test_set_position_modulation_settles_where_its_spring_would_shake() -> None:
-    system = compiled(scene("two-users-set-position"))
-    assert apc.simulate(system, jit=False).summary.verdict == "settles"
-    free = {"coordination.energy": "1e6 J", "coordination.ceiling": "1e7 J"}
-    assert apc.simulate(system, set=free, jit=False).summary.verdict == "shakes"
-
-
 # ---- send on change ----
 
 RECKONED = scene("two-users-dead-reckoning")
@@ -274,18 +244,6 @@ hands: {push: {type: ConstantForce, flange: cube, force: 0 N}}
 """
 
 
-def test_a_constant_velocity_is_told_once_and_heard_as_it_is() -> None:
-    """It is told at the first tick; from the packet with it on nothing is wrong, and nothing more is told."""
-    text = replaced(ALONE, ("hearer: {count: 1}", "hearer: {count: 1, set: {it.stiffness: 1e-15 N/m}}"))
-    run = run_of(text.replace("MOTION", "cube.v: 0.3 m/s"), "2 s", "*")
-    (packets, _), (x, _) = of_all(run, "it.packets"), of_all(run, "cube.x")
-    assert packets[1:].tolist() == [1] * (len(packets) - 1)
-    ahead = -of_all(run, "it.f")[1] / 1e-15  # where the hearer, which hardly moves, takes the teller to be
-    # Told at 0, sent at 8 ms, here at 16 ms; a row has what was computed at the tick before.
-    assert ahead[18:] == pytest.approx(x[17:-1], abs=1e-12)
-    assert not ahead[:17].any()
-
-
 def test_a_constant_acceleration_is_told_every_root_of_twice_the_threshold_over_it() -> None:
     """Wrong by a s²/2 after s seconds, told at the first tick from √(2·0.5 mm/a) seconds on."""
     for acceleration in (0.5, 2.0, 11.0):
@@ -296,6 +254,7 @@ def test_a_constant_acceleration_is_told_every_root_of_twice_the_threshold_over_
         assert set(np.diff(told).tolist()) == {expected}
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("threshold", [0.0, 1e-4])
 @pytest.mark.parametrize("delay", [0, 8, 48])
 def test_dead_reckoning_is_its_law(delay: int, threshold: float) -> None:
@@ -326,102 +285,27 @@ def test_dead_reckoning_is_its_law(delay: int, threshold: float) -> None:
     same(run_of(text, "500 ms"), played(hand, starts, [[0.0] * 3] * 2, 500), "device", "cube")
 
 
-@pytest.mark.parametrize("delay", [0, 8, 50])
-def test_the_linearization_of_dead_reckoning_tells_all(delay: int) -> None:
-    """Whatever the threshold is: a prediction by the age of each packet at each tick."""
-
-    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
-        ((_, _, line, speed, age),) = heard.values()
-        pull = 200 * (x[1][0] - line - age * speed) + 5 * (x[1][1] - speed)
-        push = contact(x)
-        return [-push, push - pull], memory, [x[1][0] + TICK * x[1][1], x[1][1]]
-
-    bodies = [[(0.1, 5.0 + 2.0, 100.0), (0.3, 5.0, 0.0)]] * 2
-    expected = magnitudes(ByHand(bodies, everybody(2), law, told=1, out=2, late=delay))[1]
-    found = apc.analyze(compiled(replaced(RECKONED, ("late: 8 ms", f"late: {delay} ms"))))
-    assert found.spectral_radius == pytest.approx(expected, abs=1e-10)
-
-
 # ---- god-object ----
 
-ROUGH = scene("god-object")
+ROUGH, PLACE = scene("god-object"), "table.stuck"
 
 
-def test_god_object_holds_as_a_spring_each_way_while_it_sticks() -> None:
-    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
-        return [-1000 * x[0][0]], memory, []
+@pytest.mark.parametrize("sideways", [0.0, 0.8, -0.99, 1.3, -2.0])
+def test_a_god_object_sticks_within_its_cone_and_slides_beyond(sideways: float) -> None:
+    """|F_t| < μ |F_n|: the device rests F_t/K from where the god-object sticks, F_n/K deep.
 
-    expected = magnitudes(ByHand([[(0.1, 5.0, 0.0)]], [[]], law, told=0, ratio=1, late=0))[1]
-    assert apc.analyze(compiled(ROUGH)).spectral_radius == pytest.approx(expected, abs=1e-10)
-
-
-@pytest.mark.parametrize("sideways", [0.0, 0.8, -0.99])
-def test_god_object_sticks_within_its_cone(sideways: float) -> None:
-    """|F_t| < μ |F_n|: the device rests F_t/K from where the god-object sticks, F_n/K deep."""
-    text = replaced(ROUGH, ("force: [0.8 N, -2 N]", f"force: [{sideways} N, -2 N]"))
-    run = run_of(text, "2 s", "*")
-    (along,), (deep,), (stuck,) = (
-        of_all(run, "device.x[1]"),
-        of_all(run, "device.x[2]"),
-        of_all(run, "table.stuck"),
-    )
-    assert deep[-1] == pytest.approx(-2 / 1000, abs=1e-9)
-    assert along[-1] - stuck[-1] == pytest.approx(sideways / 1000, abs=1e-9)
-    assert stuck[-1] == stuck[-200]
-
-
-@pytest.mark.parametrize("sideways", [1.3, -2.0])
-def test_god_object_slides_beyond_its_cone(sideways: float) -> None:
-    """|F_t| > μ |F_n|: in the end at (|F_t| − μ |F_n|)/b, the god-object μ times the depth behind."""
-    text = replaced(ROUGH, ("force: [0.8 N, -2 N]", f"force: [{sideways} N, -2 N]"))
-    run = run_of(text, "2 s", "*")
-    (v,), (x,), (stuck,) = of_all(run, "device.v[1]"), of_all(run, "device.x[1]"), of_all(run, "table.stuck")
-    assert v[-1] == pytest.approx(math.copysign((abs(sideways) - 0.5 * 2) / 5, sideways), abs=1e-9)
-    assert x[-2] - stuck[-1] == pytest.approx(math.copysign(0.5 * 2 / 1000, sideways), abs=1e-9)
-
-
-def test_god_object_on_a_slope_holds_what_friction_can() -> None:
-    """Pressed straight down on a slope of angle θ, it sticks where tan θ < μ and slides where it is more."""
-    for slope, rests in ((0.45, True), (0.55, False)):
-        text = replaced(ROUGH, ("normal: [0, 1]", f"normal: [{slope}, 1]"), ("force: [0.8 N", "force: [0 N"))
-        run = run_of(text, "3 s", "*")
-        (stuck,) = of_all(run, "table.stuck")
-        assert bool(stuck[-1] == stuck[-200]) is rests
-
-
-# ---- remote proxies ----
-
-
-@pytest.mark.parametrize("delay", [0, 8, 50, 200])
-def test_remote_proxy_is_its_law(delay: int) -> None:
-    """Each device feels the proxy it touches; the proxy follows the other's device as heard."""
-
-    def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
-        push = 1000 * (x[0][0] - x[1][0])
-        follow = 300 * (x[1][0] - mean(heard, 0)) + 5 * (x[1][1] - mean(heard, 1))
-        return [-push, push - follow], memory, []
-
-    text = replaced(scene("two-users-proxies"), ("delay: 8 ms, loss", f"delay: {delay} ms, loss"))
-    bodies = [[(0.1, 5.0 + 2.0, 50.0), (0.1, 1.0, 0.0)]] * 2
-    rigid, radius = magnitudes(ByHand(bodies, everybody(2), law, told=0, late=delay))
-    found = apc.analyze(compiled(text))
-    assert found.rigid_modes == rigid == 0
-    assert found.spectral_radius == pytest.approx(radius, abs=1e-10)
-
-
-def test_users_rest_against_each_others_proxies() -> None:
-    """At rest the proxy is K_c d/K_p off, d deep, and the arm takes what of the push the contact leaves.
-
-    By symmetry the devices are at ±y, the proxies at ∓(y − p): F = 50 y + 1000 d, 1000 d = 300 p and
-    d = 20 mm + y + (y − p), y measured towards the other.
+    Beyond it slides in the end at (|F_t| − μ |F_n|)/b, the god-object μ times the depth behind.
     """
-    y, d, p = np.linalg.solve([[50.0, 1000, 0], [0, 1000, -300], [-2, 1, 1]], [2.0, 0, 0.02])
-    run = run_of(scene("two-users-proxies"), "3 s")
-    left, right = of_all(run, "device.x")
-    (near, _) = of_all(run, "proxy.x")
-    assert (left[-1], right[-1]) == (pytest.approx(y, abs=1e-8), pytest.approx(-y, abs=1e-8))
-    assert near[-1] == pytest.approx(-y + p, abs=1e-8)
-    assert d > 0
+    text = replaced(ROUGH, ("force: [0.8 N, -2 N]", f"force: [{sideways} N, -2 N]"))
+    run = run_of(text, "2 s", "*")
+    x, y, v, stuck = (run[f"user[1].{one}"] for one in ("device.x[1]", "device.x[2]", "device.v[1]", PLACE))
+    assert y[-1] == pytest.approx(-2 / 1000, abs=1e-9)
+    if abs(sideways) < 0.5 * 2:
+        assert x[-1] - stuck[-1] == pytest.approx(sideways / 1000, abs=1e-9)
+        assert stuck[-1] == stuck[-200]
+    else:
+        assert v[-1] == pytest.approx(math.copysign((abs(sideways) - 0.5 * 2) / 5, sideways), abs=1e-9)
+        assert x[-2] - stuck[-1] == pytest.approx(math.copysign(0.5 * 2 / 1000, sideways), abs=1e-9)
 
 
 # ---- a motor's limit ----
@@ -435,13 +319,3 @@ def test_limited_motor_holds_up_to_its_limit_and_gives_way_beyond() -> None:
     assert held["user[1].device.x"][-1] == pytest.approx(3 / 500, abs=1e-9)
     beyond = run_of(LIMITED, "2 s")
     assert beyond["user[1].device.v"][-1] == pytest.approx((5 - 3.3) / 1, abs=1e-8)
-
-
-def test_limited_motor_without_its_limit_is_not_there() -> None:
-    free = replaced(LIMITED, ("force_limit: 3.3 N", "force_limit: 3.3 N, limits: off"))
-    none = replaced(
-        LIMITED,
-        ("  motor: {type: LimitedMotor, flange: device, force_limit: 3.3 N}\n", ""),
-        ("flange: motor.port", "flange: device"),
-    )
-    assert run_of(free, "1 s").values == pytest.approx(run_of(none, "1 s").values, abs=1e-13)

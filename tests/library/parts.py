@@ -1,0 +1,68 @@
+"""A peer's equations with the numbers of its scene: what moves it, and what its only clock computes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import casadi
+
+from apc.compiler.compiled import CompiledSystem
+from tests.topologies import ONE_MASS, compiled
+
+CLOCK = "clocks: {tick: 1 ms}\n"
+TWO = ONE_MASS.replace("3 N*s/m}", "3 N*s/m}\n  load: {mass: 5 kg, damping: 1 N*s/m}")
+MASSES = {"device": (2.0, 3.0), "load": (5.0, 1.0)}
+
+
+def listed(result: Any) -> list[float]:
+    return [float(value) for value in casadi.DM(result).full().ravel()]
+
+
+def values(system: CompiledSystem) -> dict[str, float]:
+    return {parameter.name: parameter.value for parameter in system.parameters}
+
+
+def at(system: CompiledSystem, x: Mapping[str, float]) -> tuple[list[float], list[float], list[float]]:
+    """Return the states, with 0 for those not named, zeros for what is held, and the numbers."""
+    (kind,) = system.kinds
+    states = [state.name for state in kind.states]
+    assert set(x) <= set(states)
+    known = values(system)
+    return [x.get(one, 0.0) for one in states], [0.0] * len(kind.holds), [known[n] for n in kind.parameters]
+
+
+def rates(system: CompiledSystem, x: Mapping[str, float], held: Sequence[float] = ()) -> dict[str, float]:
+    """Return dx/dt by state."""
+    (kind,) = system.kinds
+    states, nothing, numbers = at(system, x)
+    found = listed(kind.derivative(states, list(held) or nothing, numbers, 0.0))
+    return dict(zip((state.name for state in kind.states), found, strict=True))
+
+
+def ticked(
+    system: CompiledSystem, x: Mapping[str, float], memory: Sequence[float] = (), heard: Sequence[float] = ()
+) -> dict[str, float]:
+    """Return what the only clock computes."""
+    ((clock,),) = (kind.clocks for kind in system.kinds)
+    states, nothing, numbers = at(system, x)
+    found = listed(clock.tick(states, nothing, list(memory), list(heard), numbers, 0))
+    return dict(zip(clock.outputs, found, strict=True))
+
+
+def pushes(system: CompiledSystem, x: Mapping[str, float], held: Sequence[float] = ()) -> list[float]:
+    """Return the force of all parts on each of `MASSES`: m dv/dt + b v."""
+    found = rates(system, x, held)
+    return [
+        mass * found[f"{name}.v"] + damping * x.get(f"{name}.v", 0.0)
+        for name, (mass, damping) in MASSES.items()
+        if f"{name}.v" in found
+    ]
+
+
+def coupled(part: str, *, base: str = TWO) -> CompiledSystem:
+    return compiled(f"{base}{CLOCK}couplers:\n  it: {{{part}}}\n")
+
+
+def held(part: str) -> CompiledSystem:
+    return compiled(f"{ONE_MASS}hands:\n  it: {{{part}}}\n")

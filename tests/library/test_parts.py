@@ -1,0 +1,348 @@
+"""Masses, springs, contacts, hands and devices of the library, each against its closed form.
+
+Hands whose force depends on time are integrated in `tests/time/test_forces.py`.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import apc
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.pipeline import compile_topology
+from tests.library.parts import CLOCK, TWO, coupled, held, pushes, rates, ticked, values
+from tests.topologies import MESH, ONE_MASS, SCENES, compiled, library, replaced, told
+
+EXACT = 1e-13  # a few roundings
+
+# ---- mechanics ----
+
+
+@pytest.mark.parametrize(
+    ("count", "more", "radius"),
+    [(1, "", math.exp(-3 / 2)), (4, ", shared: true", math.exp(-3 / (2 / 4)))],
+)
+def test_mass_coasts_to_rest_as_an_exponential(count: int, more: str, radius: float) -> None:
+    """v falls to exp(−b T/m) in T = 1 s; a shared mass is divided among its copies, its damping is not."""
+    text = replaced(ONE_MASS, ("count: 1", f"count: {count}"), ("3 N*s/m", f"3 N*s/m{more}"))
+    found = apc.analyze(compiled(text))
+    assert (found.frame_s, found.spectral_radius) == (1.0, pytest.approx(radius, rel=1e-14))
+    assert found.rigid_modes == count
+    assert apc.analyze(compiled(text.replace("damping: 3", "damping: 0"))).verdict == "drifts"
+
+
+def friction(x: float, v: float) -> float:
+    return 2 * math.tanh(v / 0.001) + 0.5 * v
+
+
+def limited(x: float, v: float) -> float:
+    return max(-9.0, min(9.0, 300 * x + 2 * v))
+
+
+# The words of what ties two masses, and its force over how far a is from b and how fast it moves away.
+TIES: dict[str, tuple[str, Callable[[float, float], float]]] = {
+    "SpringDamper": ("stiffness: 70 N/m, damping: 4 N*s/m", lambda x, v: 70 * x + 4 * v),
+    "Damper": ("damping: 4 N*s/m", lambda x, v: 4 * v),
+    "CoulombViscousFriction": ("coulomb: 2 N, viscous: 0.5 N*s/m, threshold: 1 mm/s", friction),
+    "SampledSpringDamper": ("stiffness: 70 N/m, damping: 4 N*s/m, clock: tick", lambda x, v: 70 * x + 4 * v),
+    "ForceSaturation": ("stiffness: 300 N/m, damping: 2 N*s/m, limit: 9 N, clock: tick", limited),
+    "ScaledSpringDamper": (
+        "stiffness: 70 N/m, damping: 4 N*s/m, position_scale: 1, force_scale: 1, clock: tick",
+        lambda x, v: 70 * x + 4 * v,
+    ),
+}
+
+
+@pytest.mark.parametrize(("x", "v"), [(0.3, -4.0), (0.01, 0.1), (-0.5, 0.002), (0.0, -30.0), (0.01, 0.0)])
+@pytest.mark.parametrize("name", TIES)
+def test_what_ties_two_masses_pulls_both_by_its_law(name: str, x: float, v: float) -> None:
+    words, law = TIES[name]
+    system = coupled(f"type: {name}, a: device, b: load, {words}")
+    moving = {"device.x": 0.2 + x, "device.v": 3.0 + v, "load.x": 0.2, "load.v": 3.0}
+    force = law(x, v)
+    if "clock" in words:
+        assert ticked(system, moving) == {"it.f": pytest.approx(force, rel=1e-11, abs=1e-12)}
+        assert pushes(system, {}, [6.0]) == pytest.approx([-6, 6], rel=EXACT)
+    else:
+        assert pushes(system, moving) == pytest.approx([-force, force], rel=1e-11, abs=1e-12)
+
+
+BAR = replaced(TWO, ("masses:\n", "masses:\n  pin: {mass: 4 kg}\n")) + (
+    "couplers:\n  bar: {type: RigidBar, a: device, b: load, middle: pin}\n"
+)
+
+
+def test_a_rigid_bar_halves_the_force_on_its_middle() -> None:
+    """With y = (x + z)/2 and R what the bar carries: 4 y'' = 7 − R, 2 x'' = R/2 − 3 x', 5 z'' = R/2 − z'."""
+    x, z = 0.5, -1.0
+    carried = (7 + 2 * (3 * x / 2 + z / 5)) / (1 + 2 * (1 / 4 + 1 / 10))
+    device, load = (carried / 2 - 3 * x) / 2, (carried / 2 - z) / 5
+    speeds = {"device.v": x, "load.v": z, "pin.v": (x + z) / 2}
+    expected = {"device.v": device, "load.v": load, "pin.v": (device + load) / 2}
+    system = compiled(BAR + "hands:\n  hand: {type: ConstantForce, flange: pin, force: 7 N}\n")
+    kept = [state.name for state in system.kinds[0].states if state.name in speeds]
+    assert len(kept) == 2, "three velocities, one constraint"
+    found = rates(system, {name: speeds[name] for name in kept})
+    assert [found[name] for name in kept] == pytest.approx([expected[name] for name in kept], rel=EXACT)
+    without = TWO + "couplers:\n  bar: {type: RigidBar, a: device, b: load}\n"
+    without += "hands:\n  hand: {type: ConstantForce, flange: bar.middle, force: 7 N}\n"
+    assert pushes(compiled(without), {}) == pytest.approx([3.5, 3.5], rel=EXACT)
+
+
+def test_a_gear_multiplies_displacement_and_divides_force() -> None:
+    """x_a = 4 x_b: seen at a, the load is 16 times lighter, (2 + 5/16) a'' + (3 + 1/16) a' = F."""
+    text = TWO + "couplers:\n  gear: {type: Gear, a: device, b: load, ratio: 4}\n"
+    system = compiled(text + "hands:\n  hand: {type: ConstantForce, flange: device, force: 7 N}\n")
+    speed = next(one.name for one in system.kinds[0].states if one.name.endswith(".v"))
+    factor = 1.0 if speed == "device.v" else 0.25
+    found = rates(system, {speed: 0.6 * factor})
+    assert len(found) == 2
+    expected = (7 - (3 + 1 / 16) * 0.6) / (2 + 5 / 16)
+    assert found[speed] == pytest.approx(expected * factor, rel=EXACT)
+
+
+def test_a_finger_is_two_masses_of_which_one_moves_with_the_device() -> None:
+    words = "tip_mass: 6 g, bone_mass: 30 g, stiffness: 500 N/m, damping: 2 N*s/m"
+    system = coupled(f"type: Finger, flange: device, {words}", base=ONE_MASS)
+    found = rates(system, {"device.x": 0.001, "device.v": 0.2, "it.bone.x": 0.004, "it.bone.v": -0.1})
+    force = 500 * (0.001 - 0.004) + 2 * (0.2 + 0.1)
+    assert (found["device.v"], found["it.bone.v"]) == (
+        pytest.approx((-force - 3 * 0.2) / (2 + 0.006), rel=EXACT),
+        pytest.approx(force / 0.03, rel=EXACT),
+    )
+
+
+# ---- contacts ----
+
+
+def one_sided(depth: float, rate: float) -> float:
+    return max(0.0, 3900 * depth + 0.5 * rate) if depth > 0 else 0.0
+
+
+def hunt_crossley(depth: float, rate: float) -> float:
+    return max(0.0, depth) ** 1.5 * max(0.0, 5e4 + 1000 * rate)
+
+
+CONTACTS: dict[str, tuple[str, Callable[[float, float], float]]] = {
+    "OneSidedContact": ("stiffness: 3900 N/m, damping: 0.5 N*s/m, clock: tick", one_sided),
+    "HuntCrossleyContact": ("stiffness: 5e4 N/m^(3/2), damping: 1000 N*s/m^(5/2)", hunt_crossley),
+    "SampledHuntCrossleyContact": (
+        "stiffness: 5e4 N/m^(3/2), damping: 1000 N*s/m^(5/2), clock: tick",
+        hunt_crossley,
+    ),
+}
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("name", CONTACTS)
+def test_a_contact_pushes_by_its_law_and_never_pulls(name: str, side: str) -> None:
+    """Over depth = half width ± (x − x_object) and its rate, which are the same on both sides."""
+    words, law = CONTACTS[name]
+    system = coupled(f"type: {name}, side: {side}, a: device, b: load, half_width: 20 mm, {words}")
+    sign = 1 if side == "left" else -1
+    for depth, rate in ((0.004, 0.1), (0.004, -0.1), (0.004, -90.0), (-0.001, 5.0), (0.0, 1.0)):
+        x = {"device.x": 0.05 + sign * (depth - 0.02), "load.x": 0.05}
+        x |= {"device.v": 0.5 + sign * rate, "load.v": 0.5}
+        push = pytest.approx(law(depth, rate), rel=1e-11, abs=1e-11)
+        if "clock" in words:
+            assert ticked(system, x) == {"it.push": push}
+            assert pushes(system, {}, [6.0]) == pytest.approx([-6 * sign, 6 * sign], rel=EXACT)
+        else:
+            assert [-sign * pushes(system, x)[0], sign * pushes(system, x)[1]] == [push, push]
+
+
+WALL = "type: VirtualWall, flange: device, stiffness: 900 N/m, clock: tick"
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize(("x", "before"), [(0.06, 0.059), (0.06, 0.07), (0.04, 0.041), (0.04, 0.05)])
+def test_a_virtual_wall_pushes_by_depth_and_backward_difference(side: str, x: float, before: float) -> None:
+    system = coupled(f"{WALL}, damping: 20 N*s/m, position: 50 mm, side: {side}", base=ONE_MASS)
+    sign = 1 if side == "left" else -1
+    depth, rate = sign * (x - 0.05), sign * (x - before) / 0.001
+    expected = max(0.0, 900 * depth + 20 * rate) if depth > 0 else 0.0
+    found = ticked(system, {"device.x": x, "device.v": 77.0}, [before])
+    assert found == {"it.push": pytest.approx(expected, rel=1e-11), "it.x": x}
+    assert pushes(system, {}, [6.0]) == pytest.approx([-sign * 6], rel=EXACT)
+
+
+@pytest.mark.parametrize(
+    ("mass", "damping", "delay", "critical"), [(0.1, 5.0, 1, 3378.939), (0.04, 0.8, 0, 1605.351)]
+)
+def test_a_virtual_wall_is_stable_up_to_its_critical_stiffness(
+    mass: float, damping: float, delay: int, critical: float
+) -> None:
+    """In contact, without wall damping; the exact step of the device over 1 ms, computed independently.
+
+    The critical stiffness is printed to three decimals. The linear rule of Gil et al., K < b/(T/2 + delay),
+    lies within 4 % of it.
+    """
+    text = (
+        "topology: wall\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
+        f"masses: {{device: {{mass: {mass} kg, damping: {damping} N*s/m, x: 1 mm}}}}\n"
+        f"couplers: {{it: {{{WALL.replace('900', '%r')}, delay: {delay} ms, x: 1 mm}}}}\n"
+    )
+    found = [apc.analyze(compiled(text % (critical * factor))) for factor in (1 - 1e-6, 1 + 1e-6)]
+    assert [one.verdict for one in found] == ["stable", "unstable"]
+    assert found[0].linearized
+    assert critical == pytest.approx(damping / (0.0005 + 0.001 * delay), rel=0.04)
+
+
+def test_enclosure_walls_push_inwards_from_both_ends() -> None:
+    words = "low: -30 mm, high: 30 mm, stiffness: 900 N/m, damping: 2 N*s/m, clock: tick"
+    system = coupled(f"type: EnclosureWalls, flange: device, {words}", base=ONE_MASS)
+    for x in (-0.05, -0.03, -0.02, 0.0, 0.029, 0.035):
+        found = ticked(system, {"device.x": x}, [x - 0.0001 * math.copysign(1, x)] * 2)
+        left, right = ((900 * depth + 2 * 0.1) * (depth > 0) for depth in (-0.03 - x, x - 0.03))
+        assert found["it.left.push"] == pytest.approx(left, rel=1e-11)
+        assert found["it.right.push"] == pytest.approx(right, rel=1e-11)
+        acting = [found[hold.name] for hold in system.kinds[0].holds]
+        assert pushes(system, {}, acting) == pytest.approx([left - right], rel=1e-11)
+
+
+@pytest.mark.parametrize("x", [0.0, 0.00213, -0.00213, 0.0999])
+def test_encoder_quantization_rounds_down_to_whole_steps_and_passes_forces(x: float) -> None:
+    wall = WALL.replace("device", "encoder.measured")
+    system = compiled(
+        f"{ONE_MASS}{CLOCK}couplers:\n"
+        "  encoder: {type: EncoderQuantization, flange: device, resolution: 0.5 mm}\n"
+        f"  wall: {{{wall}, position: -1 m}}\n"
+    )
+    seen = math.floor(x / 0.0005) * 0.0005
+    found = ticked(system, {"device.x": x}, [seen])
+    assert found == pytest.approx({"wall.x": seen, "wall.push": 900 * (seen + 1)}, rel=EXACT)
+    assert pushes(system, {}, [6.0]) == pytest.approx([-6], rel=EXACT)
+    assert apc.analyze(system).linearized
+
+
+# ---- coordination ----
+
+
+@pytest.mark.parametrize("scene", ["three-users-average", "three-users-mesh", "planar-users"])
+def test_with_delays_own_the_heard_part_of_a_force_acts_at_once(scene: str) -> None:
+    text = (SCENES / f"{scene}.yaml").read_text(encoding="utf-8")
+    system = compiled(replaced(text, ("link: lan", "link: lan, delays: own")))
+    holds = system.kinds[0].holds
+    assert {one.delay for one in holds if ".own" in one.name} == {"coordination.delay"}
+    assert {one.delay for one in holds if ".received" in one.name} == {"no delay"}
+    held = [1.0 if ".own" in one.name else 10.0 if ".received" in one.name else 0.0 for one in holds]
+    found = [value for name, value in rates(system, {}, held).items() if name.startswith("cube.v")]
+    assert found == pytest.approx([-11 / 0.2] * len(found), rel=EXACT)
+
+
+def test_a_saturated_mesh_is_a_full_mesh_below_its_limit() -> None:
+    """Linearized about a start at rest, the limit is far away: the same radius, by the road of N² pairs."""
+    limits = compiled(replaced(MESH, ("type: FullMesh", "type: SaturatedMesh, limit: 5 N")))
+    found, expected = apc.analyze(limits), apc.analyze(compiled(MESH))
+    assert found.spectral_radius == pytest.approx(expected.spectral_radius, rel=EXACT)
+    assert (expected.linearized, found.linearized) == (False, True)
+
+
+# ---- hands ----
+
+
+def test_constant_forces_on_one_flange_add_up() -> None:
+    two = "hands:\n  one: {type: ConstantForce, flange: device, force: 5 N}\n"
+    system = compiled(f"{ONE_MASS}{two}  two: {{type: ConstantForce, flange: device, force: -1 N}}\n")
+    assert pushes(system, {"device.v": 2.0}) == [4.0]
+
+
+def test_a_spring_damper_arm_holds_its_point() -> None:
+    words = "stiffness: 70 N/m, damping: 4 N*s/m, position: 20 mm"
+    system = held(f"type: SpringDamperArm, flange: device, {words}")
+    found = pushes(system, {"device.x": 0.05, "device.v": 0.3})
+    assert found == pytest.approx([-70 * (0.05 - 0.02) - 4 * 0.3], rel=EXACT)
+    assert apc.analyze(system).spectral_radius == pytest.approx(math.exp(-7 / 4), rel=1e-12)
+
+
+# Least, nominal and largest mass in kg, damping in N·s/m and stiffness in N/m of Fu and Cavusoglu's tables II
+# and III, M, b2 and k2.
+STYLUS_ARMS = {
+    "StylusArmSideways": ((0.14, 0.218, 0.57), (3.68, 4.645, 10.29), (63, 78.75, 151)),
+    "StylusArmForward": ((0.016, 0.204, 0.43), (13.1, 18.06, 27.6), (214, 271.7, 533)),
+}
+
+
+def swings(mass: float, damping: float, stiffness: float) -> list[complex]:
+    """Return exp(s 1 s) of both roots s of mass s² + damping s + stiffness."""
+    root = cmath.sqrt(damping**2 - 4 * mass * stiffness)
+    found = [cmath.exp((sign * root - damping) / (2 * mass)) for sign in (1, -1)]
+    return sorted(found, key=lambda z: (z.imag, z.real))
+
+
+def in_a_second(system: CompiledSystem) -> list[complex]:
+    """Return the eigenvalues of a frame of a second, which is what a scene without clocks has."""
+    return sorted((mode.eigenvalue for mode in apc.analyze(system).modes), key=lambda z: (z.imag, z.real))
+
+
+@pytest.mark.parametrize("stiffness", [70.0, 3.0])  # swings, creeps
+def test_a_mass_spring_damper_arm_moves_with_a_device_as_one_mass(stiffness: float) -> None:
+    words = f"mass: 500 g, damping: 4 N*s/m, stiffness: {stiffness} N/m, position: 20 mm"
+    system = held(f"type: MassSpringDamperArm, flange: device, {words}")
+    assert in_a_second(system) == pytest.approx(swings(2 + 0.5, 3 + 4, stiffness), rel=1e-12)
+    assert rates(system, {"device.x": 0.02}) == {"device.x": 0, "device.v": 0}
+
+
+@pytest.mark.parametrize("name", STYLUS_ARMS)
+def test_stylus_arms_have_the_published_values_and_keep_to_their_limits(name: str) -> None:
+    part = f"type: {name}, flange: device"
+    system = held(part)
+    units = {"mass": "kg", "damping": "N*s/m", "stiffness": "N/m"}
+    for (word, unit), (low, nominal, high) in zip(units.items(), STYLUS_ARMS[name], strict=True):
+        assert values(system)[f"it.{word}"] == nominal
+        for limit, beyond in ((low, 0.999 * low), (high, 1.001 * high)):
+            assert values(held(f"{part}, {word}: {limit} {unit}"))[f"it.{word}"] == limit
+            (line,) = told(held, f"{part}, {word}: {beyond} {unit}")
+            assert f" E207 {word} wants {limit:g} {unit} or " in line
+    (_, m, _), (_, b, _), (_, k, _) = STYLUS_ARMS[name]
+    assert in_a_second(system) == pytest.approx(swings(2 + m, 3 + b, k), rel=1e-12)
+
+
+# ---- devices ----
+
+# Force in N, stiffness in N/m, damping in N·s/m, radius of the workspace in m as chai3d 7c76b1f has them, in
+# src/devices/CDeltaDevices.cpp and CPhantomDevices.cpp; the first one's are given where it stands.
+GIVEN = ", force_limit: 1 N, stiffness_limit: 2 N/m, damping_limit: 3 N*s/m, position_limit: 4 m"
+DEVICES = {
+    f"HapticDevice{GIVEN}": (1.0, 2.0, 3.0, 4.0),
+    "Falcon": (8.0, 3000.0, 20.0, 0.04),
+    "Omega3": (12.0, 5000.0, 30.0, 0.075),
+    "Delta3": (20.0, 5000.0, 30.0, 0.15),
+    "Sigma7": (12.0, 4000.0, 30.0, 0.075),
+    "Lambda7": (12.0, 8000.0, 30.0, 0.1125),
+    "Touch": (3.3, 400.0, 4.0, 0.075),
+    "PhantomOmni": (3.3, 700.0, 5.0, 0.1),
+    "PhantomDesktop": (7.9, 1000.0, 5.0, 0.1),
+}
+
+
+@pytest.mark.parametrize("name", DEVICES)
+def test_devices_have_the_published_limits_and_move_as_a_mass(name: str) -> None:
+    system = compiled(replaced(ONE_MASS, ("{mass", f"{{type: {name}, mass")))
+    known = values(system)
+    limits = [known[f"device.{one}_limit"] for one in ("force", "stiffness", "damping", "position")]
+    assert tuple(limits) == DEVICES[name]
+    assert pushes(system, {"device.v": 0.3}) == pytest.approx([0], abs=1e-15)
+    if name == "Falcon":
+        assert known["device.resolution"] == pytest.approx(0.0254 / 400, rel=1e-15)  # 400 steps an inch
+
+
+def test_a_table_is_handed_on_to_a_part_inside(tmp_path: Path) -> None:
+    tabled = (
+        "component: Tabled\nconnectors: {flange: Flange}\nparameters: {push: {table: UNIT}}\n"
+        "parts: {hand: {type: TableForce, flange: flange, force: push}}\n"
+    )
+    (tmp_path / "force.csv").write_text("time [s],force [N]\n0,2\n1,2\n", encoding="utf-8")
+    library(tmp_path, tabled.replace("UNIT", "N"))
+    path = tmp_path / "scene.yaml"
+    hands = "library: ./\nhands:\n  it: {type: Tabled, flange: device, push: force.csv}\n"
+    path.write_text(ONE_MASS + hands, encoding="utf-8")
+    assert pushes(compile_topology(path), {}) == pytest.approx([2.0], rel=1e-14)
+    own = library(tmp_path, tabled.replace("UNIT", "mm"))
+    [line] = told(own.component, "Tabled")
+    assert "E204 force wants N, got mm." in line

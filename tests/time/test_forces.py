@@ -1,0 +1,232 @@
+"""Forces that change with time move a mass to rounding, wherever they bend, jump and switch.
+
+Against the convolution with the mass's response by quadrature in 40 digits, and against the course in balls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import mpmath
+import numpy as np
+import pytest
+
+import apc
+from apc.compiler.errors import ApcError
+from apc.compiler.pipeline import compile_topology
+from apc.frame.parameters import resolve
+from apc.simulation import forcing as forcings
+from apc.simulation.forcing import SiteForcing, forcing_of
+from apc.simulation.propagate import rates
+from apc.simulation.trajectory import simulate
+from tests.fifty_digits.truth import exact_course
+from tests.topologies import ONE_MASS, SCENES, replaced
+
+MASS, DAMPING = 0.25, 2.0  # kg, N·s/m: numbers of a few bits, so that text and closed form mean the same
+SCENE = """
+topology: pushed
+library: ./
+clocks: {haptic: 4 ms}
+peers: {user: {count: 1, set: {device.x: 0.5 m, device.v: 0.125 m/s}}}
+masses:
+  device: {mass: 0.25 kg, damping: 2 N*s/m}
+couplers:
+  idle: {type: SampledSpringDamper, a: device, b: ground, stiffness: 0 N/m, clock: haptic}
+hands:
+  push: {flange: device, PUSH}
+"""
+TABLE = "time [s],force [N]\n0.0,0\n0.0625,2\n0.078125,-1\n0.125,-1\n"
+OWN = (
+    "component: NAME\nabout: Pushes.\nconnectors: {flange: Flange}\nparameters: {f: {unit: N, default: 1 N},"
+    " T: {unit: s, default: 1 s}}\nequations:\n  - flange.f = -f*(LAW)\n"
+)
+LAWS = {
+    "Powers": "sqrt(time/T) + (time/T)^2.5 + exp(-time/T) + log(1 + time/T)/(1 + time/T) + cos(40*time/T)",
+    "Choices": "if time < 0.03125*T or (time > 0.0625*T and not time > 0.078125*T) then max(time/T, 0.015625)"
+    " else min(abs(time/T - 0.05078125), sign(time/T - 0.0546875)/16)",
+    "Tap": "if time < 0.0429*T then 0 else if time < 0.043*T then 100 else 0",
+    "Steps": "floor(64*time/T)/8",
+}
+
+
+def choices(t: Any) -> Any:
+    if t < 0.03125 or 0.0625 < t <= 0.078125:
+        return max(t, mpmath.mpf("0.015625"))
+    return min(abs(t - mpmath.mpf("0.05078125")), mpmath.sign(t - mpmath.mpf("0.0546875")) / 16)
+
+
+# What pushes, its force in N over seconds, and where it bends or jumps.
+PUSHES: dict[str, tuple[str, Callable[[Any], Any], list[float]]] = {
+    "a constant": ("type: ConstantForce, force: 3 N", lambda t: 3, []),
+    "a step at a tick": ("type: StepForce, force: 3 N, start: 32 ms", lambda t: 3 * (t > 0.032), [0.032]),
+    "a step between two ticks": (
+        "type: StepForce, force: 3 N, start: 0.03125 s",
+        lambda t: 3 * (t > 0.03125),
+        [0.03125],
+    ),
+    "a ramp with both corners between ticks": (
+        "type: RampForce, force: 2 N, start: 0.015625 s, rise: 0.0625 s",
+        lambda t: 2 * min(mpmath.mpf(1), max(mpmath.mpf(0), (t - mpmath.mpf("0.015625")) * 16)),
+        [0.015625, 0.078125],
+    ),
+    "a sine": (
+        "type: SineForce, force: 2 N, frequency: 8 Hz, phase: 0.5 rad",
+        lambda t: 2 * mpmath.sin(2 * mpmath.mpf(3.141592653589793) * 8 * t + mpmath.mpf("0.5")),
+        [0.03125, 0.0625],
+    ),
+    "a sine of many turns a tick": (
+        "type: SineForce, force: 2 N, frequency: 512 Hz",
+        lambda t: 2 * mpmath.sin(2 * mpmath.mpf(3.141592653589793) * 512 * t),
+        [k / 512 for k in range(1, 12)],
+    ),
+    "a table": (
+        "type: TableForce, force: push.csv",
+        lambda t: mpmath.mpf(
+            2 * t * 16 if t < 0.0625 else 2 - 192 * (t - mpmath.mpf("0.0625")) if t < 0.078125 else -1
+        ),
+        [0.0625, 0.078125, 0.125],
+    ),
+    "powers and functions": (
+        "type: Powers",
+        lambda t: mpmath.sqrt(t) + t**2.5 + mpmath.exp(-t) + mpmath.log(1 + t) / (1 + t) + mpmath.cos(40 * t),
+        [1e-6, 1e-4, 1e-3, 1e-2],
+    ),
+    "choices": ("type: Choices", choices, [k / 256 for k in range(1, 26)]),
+    "a tap within a tick": (
+        "type: Tap",
+        lambda t: 100 * (mpmath.mpf(0.0429) <= t < mpmath.mpf(0.043)),
+        [0.0429, 0.043],
+    ),
+    "steps of a staircase": (
+        "type: Steps",
+        lambda t: mpmath.floor(64 * t) / 8,
+        [k / 64 for k in range(1, 7)],
+    ),
+}
+
+
+def by_quadrature(force: Callable[[Any], Any], edges: list[float], end: Fraction) -> list[float]:
+    """Return x and v of the damped mass at `end`, from the convolution with its response to a force."""
+    with mpmath.workdps(40):
+        t, rate = mpmath.mpf(end.numerator) / end.denominator, mpmath.mpf(DAMPING) / MASS
+        panels = sorted({mpmath.mpf(0), t, *(mpmath.mpf(e) for e in edges if e < t)})
+
+        def fading(s: Any) -> Any:
+            return mpmath.exp(-rate * (t - s))
+
+        v = mpmath.mpf("0.125") * fading(0) + mpmath.quad(lambda s: force(s) * fading(s), panels) / MASS
+        x = mpmath.mpf("0.5") + mpmath.mpf("0.125") * (1 - fading(0)) / rate
+        x += mpmath.quad(lambda s: force(s) * (1 - fading(s)), panels) / DAMPING
+        return [float(x), float(v)]
+
+
+def pushed(words: str, folder: Path, scene: str = SCENE) -> apc.CompiledSystem:
+    """Compile the scene with a force, the files it names in a folder."""
+    (folder / "push.csv").write_text(TABLE, encoding="utf-8")
+    for name, law in LAWS.items():
+        text = OWN.replace("NAME", name).replace("LAW", law)
+        (folder / f"{name}.yaml").write_text(text, encoding="utf-8")
+    path = folder / "scene.txt"
+    path.write_text(scene.replace("PUSH", words), encoding="utf-8")
+    return compile_topology(path)
+
+
+@pytest.mark.parametrize("what", PUSHES)
+def test_a_force_of_time_moves_a_mass_as_its_integral_says(what: str, tmp_path: Path) -> None:
+    words, force, edges = PUSHES[what]
+    system = pushed(words, tmp_path)
+    length = Fraction(1, 10) if "many" not in what else Fraction(1, 50)
+    found = simulate(system, duration=length, jit=False)
+    assert found.provenance.method == "exact"
+    followed = exact_course(system, length)
+    # Balls follow no power that is not whole, and nothing that switches at more than an instant at once.
+    assert isinstance(followed, str) == (what in ("powers and functions", "steps of a staircase"))
+    for row in (1, 8, 11, 25) if "many" not in what else (1, 5):
+        expected = by_quadrature(force, edges, Fraction(row, 250))
+        assert found.values[row, :2] == pytest.approx(expected, rel=2e-14)
+        if not isinstance(followed, str):
+            np.testing.assert_array_max_ulp(followed[1][row], np.array(expected), maxulp=1)
+
+
+def test_a_scene_in_which_nothing_ticks_is_pushed_too(tmp_path: Path) -> None:
+    words, force, edges = PUSHES["a sine"]
+    scene = SCENE.replace("clocks: {haptic: 4 ms}\n", "")
+    head, _, rest = scene.partition("couplers:")
+    system = pushed(words, tmp_path, head + "hands:" + rest.partition("hands:")[2])
+    expected = by_quadrature(force, edges, Fraction(1, 20))
+    found = simulate(system, duration=Fraction(1, 20), jit=False)
+    assert found.values[50] == pytest.approx(expected, rel=2e-14)
+    followed = exact_course(system, Fraction(1, 20))
+    np.testing.assert_array_max_ulp(followed[1][50], np.array(expected), maxulp=1)
+
+
+# What pushes the finger's device, and how right its motion is, of the largest value of each state.
+ON_A_FINGER = {
+    "SineForce, force: 2 N, frequency: 3 Hz, phase: 0.3 rad": 1e-13,
+    # Of 435 rad, a rounding is a change of the force by 5e-14.
+    "SineForce, force: 2 N, frequency: 3456.7 Hz": 3e-13,
+    "RampForce, force: 2 N, start: 3.3 ms, rise: 11.123 ms": 1e-13,
+    "StepForce, force: 2 N, start: 3.3 ms": 1e-13,
+    "StepForce, force: 2 N, start: 3.99999 ms": 1e-13,
+    "StepForce, force: 2 N, start: 1 ns": 1e-13,
+}
+
+
+# The other device forgets a push within 2 ns: what moves it is all but over before a quadrature's first node.
+@pytest.mark.few(8)
+@pytest.mark.parametrize("device", ["mass: 0.1 kg, damping: 5 N*s/m", "mass: 1 mg, damping: 500 N*s/m"])
+@pytest.mark.parametrize("push", ON_A_FINGER)
+def test_a_finger_is_pushed_as_balls_follow_it(push: str, device: str, tmp_path: Path) -> None:
+    text = (SCENES / "finger.yaml").read_text(encoding="utf-8")
+    text = replaced(text, ("type: Falcon", f"type: Falcon, {device}"))
+    path = tmp_path / "scene.yaml"
+    ramp = "type: RampForce, flange: device, force: 2 N, rise: 0.5 s"
+    path.write_text(replaced(text, (ramp, f"flange: device, type: {push}")), encoding="utf-8")
+    system = compile_topology(path)
+    followed = exact_course(system, Fraction(1, 200))
+    assert not isinstance(followed, str), followed
+    names, rows = followed
+    found = simulate(system, duration=Fraction(1, 200), signals=names, jit=False)
+    assert tuple(one.name for one in found.signals) == names
+    off = np.abs(found.values - rows).max(axis=0)
+    assert (off <= ON_A_FINGER[push] * np.abs(rows).max(axis=0)).all(), off
+
+
+def test_a_force_that_changes_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(forcings, "MOST_HALVED", 1000)
+    system = pushed("type: SineForce, force: 1 N, frequency: 1e9 Hz", tmp_path)
+    with pytest.raises(ApcError, match=r"E871 a force changes too fast: .* more than 1,000 places"):
+        simulate(system, duration=Fraction(1, 10), jit=False)
+
+
+def test_a_long_table_is_looked_up_and_evaluated_once_a_row_however_many_intervals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    generator = np.random.default_rng(4)
+    times = np.cumsum(generator.uniform(1e-4, 3e-3, 60)) + 2.0
+    numbers = generator.normal(size=60)
+    rows = "".join(
+        f"{one!r},{other!r}\n" for one, other in zip(times.tolist(), numbers.tolist(), strict=True)
+    )
+    (tmp_path / "force.csv").write_text(f"time [s],force [N]\n{rows}", encoding="utf-8")
+    text = f"{ONE_MASS}hands: {{hand: {{type: TableForce, flange: device, force: force.csv}}}}\n"
+    (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
+    system = compile_topology(tmp_path / "scene.yaml")
+    seen: list[int] = []
+
+    def counting(function: Any, parameters: Any, instants: Any) -> Any:
+        seen.append(instants.size)
+        return walked(function, parameters, instants)
+
+    walked = forcings.at_instants
+    monkeypatch.setattr(forcings, "at_instants", counting)
+    simulate(system, duration=Fraction(3))
+    assert sum(seen) <= len(times) + 2
+    [kind] = system.kinds
+    site = SiteForcing(forcing_of(rates(kind)), resolve(system).parameters[0][0], ())
+    at = np.sort(generator.uniform(1.9, 2.3, (3, 200)))
+    expected = np.interp(at, times, numbers) / 2
+    assert np.abs(site.force(at)[0] - expected).max() <= 1e-13 * np.abs(expected).max()
