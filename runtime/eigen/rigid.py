@@ -42,8 +42,8 @@ from apc.frame.site import LinearSite
 
 Floats = NDArray[np.float64]
 
-# The units of what moves: a radian is 1, as are the parameters of what turns in space.
-LENGTH, ANGLE = "m", "1"
+# The units of what moves. An angle may be declared without one, as are the parameters of what turns in space.
+LENGTH, ANGLES = "m", ("rad", "1")
 
 # What most entries of forms are: to multiply by it is worth sparing.
 ONE = Fraction(1)
@@ -253,8 +253,8 @@ def what_stands(system: ClosedSystem | Loop, *, with_drifts: bool = True) -> Sta
         Whether to look for drifts, which is most of the work.
     """
     exact, numbering, still, vectors = _standing_motions(system)
-    turning = _places(system.sites, ANGLE)
-    moving = [*turning, *_places(system.sites, LENGTH)]  # what turns anything is a rotation
+    turning = _places(system.sites, ANGLES)
+    moving = [*turning, *_places(system.sites, (LENGTH,))]  # what turns anything is a rotation
     basis: dict[int, list[Fraction]] = {}
     unfelt = [left for vector in vectors if (left := _beyond(basis, vector, moving)) is not None]
     rates: dict[int, list[Fraction]] = {}
@@ -285,13 +285,13 @@ def _shifted(names: Sequence[str], vector: Sequence[Fraction]) -> str:
     return f"the common shift of {', '.join([*listed[:MOST_NAMED], *more])}"
 
 
-def _places(sites: Sequence[PeerGroup], unit: str) -> list[int]:
-    """Return where in the state that is of a unit which changes between the ticks."""
+def _places(sites: Sequence[PeerGroup], units: Sequence[str]) -> list[int]:
+    """Return the places in the state of what changes between the ticks and has one of some units."""
     found, start = [], 0
     ends = [states_of(group.schedule, group.jacobians) for group in sites]
     for group, size in zip(sites, ends, strict=True):
         states = group.jacobians.kind.states
-        found += [start + place for place, state in enumerate(states) if state.unit == unit]
+        found += [start + place for place, state in enumerate(states) if state.unit in units]
         start += size
     return found
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.frozen import dataclass
+from apc.eigen.rigid import ANGLES, LENGTH
 from apc.simulation.blocks import Block
 from apc.simulation.limits import Broken, LimitWatch
 from apc.simulation.signals import Signal
@@ -34,7 +35,7 @@ BAND = 0.05  # of the range: the 5 % of control engineering's settling time
 LATE = 0.9  # of the duration: what settles after that has not been seen to
 TAIL = 0.2  # of the duration: the end, where a motion that goes on is judged
 LEAST_WAY = 0.2  # of the range: a shorter way from first to last has no overshoot to speak of
-POSITIONS = ("m", "1")  # the units of what decides whether a motion settles: a radian is 1
+POSITIONS = (LENGTH, *ANGLES)  # the units of what decides whether a motion settles
 NOT_JUDGED = "not judged"
 FEWEST_TURNS = 4  # within the tail: two periods
 SMALLER = 0.9  # a swing of less than this part of that in the time before is dying away
