@@ -167,7 +167,8 @@ class Mistakes:
     def raise_if_any(self) -> None:
         """Raise `ApcError` with all mistakes in file order, if there is one."""
         if self._found:
-            named = re.compile(rf"(?<!\w)({'|'.join(map(re.escape, self.names)) or 'no name'})(?!\w)")
+            any_name = "|".join(map(re.escape, self.names)) or "(?!)"  # without names, nothing
+            named = re.compile(rf"(?<!\w)({any_name})(?!\w)")
             once = {(one.place, one.code, named.sub("…", one.sentence)): one for one in reversed(self._found)}
             raise ApcError(sorted(once.values(), key=lambda mistake: (mistake.place, mistake.code)))
 

@@ -1,7 +1,7 @@
 """The words of messages and reports: numbers with their nouns and units, and lines that fit a terminal.
 
 Takes: numbers and texts.
-Gives: `WIDTH`, `cut`, `counted`, `measured`, `known_digits`, `with_unit`, `in_hertz`,
+Gives: `WIDTH`, `cut`, `enumerated`, `counted`, `measured`, `known_digits`, `with_unit`, `in_hertz`,
 `time_left`, `wrapped`, `beside`.
 Guarantees: no digit is shown that its number's error leaves open; a line is at most `WIDTH` columns wide, but
 for a word that has no place to break it at.
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from decimal import ROUND_UP, Context, Decimal
 
 WIDTH = 80  # columns of a terminal as it opens
@@ -28,6 +29,11 @@ _PIECE = re.compile(r"[^*/(,]+[*/(,]*|[*/(,]+")  # of a word, broken behind an o
 def cut(text: str) -> str:
     """Return a text short enough for a message."""
     return text if len(text) <= 40 else text[:37] + "…"
+
+
+def enumerated(names: Sequence[str]) -> str:
+    """Return names as a sentence has them: `a`, `a and b`, `a, b and c`."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def counted(number: int, noun: str, form: str = "d") -> str:

@@ -45,7 +45,7 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         hints = _hints(function)
         for name, value in signature.bind(*args, **kwargs).arguments.items():
-            if name in hints and not _is(value, hints[name]):
+            if name in hints and not _fits(value, hints[name]):
                 wants, got = signature.parameters[name].annotation, f"{type(value).__name__}: {value!r:.80}"
                 raise TypeError(f"apc.{function.__name__}: {name} wants {wants}, got {got}")
         return function(*args, **kwargs)
@@ -61,20 +61,20 @@ def _hints(function: Callable[..., Any]) -> Mapping[str, Any]:
     return get_type_hints(holder, globalns=function.__globals__, localns={"Method": str})
 
 
-def _is(value: Any, hint: Any) -> bool:
-    """Say whether a value is of a type."""
+def _fits(value: Any, hint: Any) -> bool:
+    """Say whether a value is of a type, or stands for one: see `WIDER`."""
     origin, inner = get_origin(hint), get_args(hint)
     if hint is Any:
         return True
     if origin in (Union, UnionType):
-        return any(_is(value, one) for one in inner)
+        return any(_fits(value, one) for one in inner)
     if origin is Literal:
         return isinstance(value, str)
     if origin is Mapping:
         return isinstance(value, Mapping) and all(
-            _is(one, inner[1]) for one in value.values() if isinstance(one, list | tuple)
+            _fits(one, inner[1]) for one in value.values() if isinstance(one, list | tuple)
         )
     if origin in (Sequence, Iterable):
         listed = isinstance(value, Iterable) and not isinstance(value, Mapping | bytes)
-        return listed and (origin is Iterable or all(_is(one, inner[0]) for one in value))
+        return listed and (origin is Iterable or all(_fits(one, inner[0]) for one in value))
     return isinstance(value, WIDER.get(hint, hint if hint is not None else type(None)))

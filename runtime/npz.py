@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from apc.compiler.cache import DAMAGE, DamageError, unzipped
 
-# How NumPy begins an array of numbers in a file (format 1.0): type, order, shape.
+# How NumPy begins an array of numbers in a file (format 1.0): type, order, shape. NumPy's own reader of it
+# warns of what is nearly one, and raises what its parser does: here either it is one or it is not.
 _HEAD = re.compile(
     rb"\x93NUMPY\x01\x00..\{'descr': '([<|][a-z][0-9]{1,2})', 'fortran_order': (False|True), "
     rb"'shape': \(((?:[0-9]{1,15}, ?)*(?:[0-9]{1,15})?)\), \} *\n",
@@ -59,6 +60,7 @@ def read_arrays(data: bytes, expected: Mapping[str, tuple[str, int]], most: int)
 
 
 def _array(name: str, content: bytes, kind: str, dimensions: int) -> NDArray[Any]:
+    """Return the array of a member of a file."""
     head = _HEAD.match(content)
     if head is None or head[1].decode() != kind:
         raise DamageError(f"its {name} is no array of {kind}")

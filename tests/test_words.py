@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apc.compiler.words import WIDTH, counted, known_digits, measured, with_unit, wrapped
+from apc.compiler.words import WIDTH, counted, enumerated, known_digits, measured, with_unit, wrapped
 
 
 @pytest.mark.parametrize(("number", "expected"), [(0, "0 peers"), (1, "1 peer"), (2, "2 peers")])
@@ -90,3 +90,10 @@ def test_digits_that_an_error_leaves_open_are_not_shown() -> None:
 def test_nothing_is_measured_as_nothing() -> None:
     assert measured(0.0, 0.0) == "0 ± 0"
     assert measured(0.0, 5e-307) == "0 ± 5e-307"
+
+
+@pytest.mark.parametrize(
+    ("names", "sentence"), [("a", "a"), ("ab", "a and b"), ("abc", "a, b and c"), ("abcd", "a, b, c and d")]
+)
+def test_names_stand_as_a_sentence_has_them(names: str, sentence: str) -> None:
+    assert enumerated(tuple(names)) == sentence

@@ -22,6 +22,7 @@ from apc.compiler.language.vectors import entries, entry, sizes_of, whole_and_in
 from apc.compiler.source.nodes import Mapping as MappingNode
 from apc.compiler.source.nodes import Node, Scalar
 from apc.compiler.source.reading import add_unknown, brief, check_keys, form, listed, read_text, whole_number
+from apc.compiler.words import enumerated
 
 GROUND = "ground"
 LARGEST_ARRAY = 500
@@ -237,10 +238,9 @@ class _EntryReader:
     def tell_missing(self) -> None:
         """Record what is left out: one mistake, whose line has all of it."""
         if self.missing:
-            *most, last = self.missing
-            listed = f"{', '.join(most)} and {last}" if most else last
             hint = ", ".join(f"{key}: {value}" for key, value in self.missing.items())
-            self.mistakes.add("E201", self.place, f"{self.name} has no {listed}", hint=hint)
+            what = f"{self.name} has no {enumerated(tuple(self.missing))}"
+            self.mistakes.add("E201", self.place, what, hint=hint)
 
     def parameters(self, component: Component) -> _Told:
         """Read the component's parameters, each by what it is."""

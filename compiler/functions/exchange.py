@@ -13,7 +13,6 @@ from fractions import Fraction
 from graphlib import TopologicalSorter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apc.compiler.compiled import (
     PEERS,
@@ -44,9 +43,10 @@ from apc.compiler.language.values import Value, renamed
 from apc.compiler.scene.channels import SceneChannel
 from apc.compiler.scene.links import SceneLink
 from apc.compiler.scene.scene import Scene, SceneGroup
+from apc.compiler.words import enumerated
 
 NO_DELAY = "no delay"
-MOST_DEAF = 3  # names of peers that hear nobody
+MOST_DEAF = 3  # names of peers that hear nobody in one message
 LOSS_ABOUT = (
     "probability that a good link turns bad after a packet",
     "probability that a bad link turns good after a packet",
@@ -199,27 +199,22 @@ def check_heard(scene: Scene, kinds: Mapping[str, Kind]) -> None:
                 for group, start in zip(scene.groups, starts, strict=False)
                 if deaf[start : start + group.count].all()
             ]
-            places = np.flatnonzero(deaf)
-            named = [
-                f"{scene.groups[of].name}[{one - starts[of] + 1}]"
-                for one in places[:MOST_DEAF].tolist()
-                for of in (_group_of(one, starts),)
+            places = np.flatnonzero(deaf).tolist()
+            owners = (np.searchsorted(starts, places, "right") - 1).tolist()
+            names = [
+                f"{scene.groups[owner].name}[{place - starts[owner] + 1}]"
+                for place, owner in zip(places[:MOST_DEAF], owners, strict=False)
             ]
-            more = [f"{len(places) - MOST_DEAF} more"] if len(places) > MOST_DEAF else []
-            names = " and ".join(filter(None, (", ".join((*named, *more)[:-1]), (*named, *more)[-1])))
-            hear, operator = "hears" if len(places) == 1 else "hear", taken[_group_of(int(places[0]), starts)]
-            what = f"{names} {hear} nobody over {link.name}: there is no {operator} over nobody"
+            if len(places) > MOST_DEAF:
+                names.append(f"{len(places) - MOST_DEAF} more")
+            hear = f"{enumerated(names)} {'hears' if len(places) == 1 else 'hear'} nobody over {link.name}"
+            what = f"{hear}: there is no {taken[owners[0]]} over nobody"
             others = [group.name for group in scene.groups if group.name not in alone]
-            hint = f"an arc to {'each' if len(places) > 1 else named[0]} in its graph"
+            hint = f"an arc to {'each' if len(places) > 1 else names[0]} in its graph"
             if alone and others:
                 hint += f", or at: [{', '.join(others)}] in what uses {link.name}"
             mistakes.add("E801", link.place, what, hint=hint)
     mistakes.raise_if_any()
-
-
-def _group_of(peer: int, starts: NDArray[np.int64]) -> int:
-    """Return the place of the group that a peer is of, counted from 0 over the groups in order."""
-    return int(np.searchsorted(starts, peer, "right")) - 1
 
 
 def _taken(kind: Kind, link: str) -> str:

@@ -54,7 +54,7 @@ from apc.compiler.language.recordings import TimeTable
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.vectors import whole_and_index
 from apc.compiler.scene.instances import Part
-from apc.compiler.scene.oddities import told
+from apc.compiler.scene.oddities import warning_texts
 from apc.compiler.scene.scene import Scene
 
 WORK = Dimension((("kg", 1), ("m", 2), ("s", -2)))  # the joule
@@ -93,7 +93,7 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
         scene.experiment,
         scene.region,
         followers_of(parameters, timings.found, groups),
-        told(scene.warnings),
+        warning_texts(scene.warnings),
     )
 
 

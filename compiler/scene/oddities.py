@@ -1,6 +1,6 @@
 """What a topology may say and seldom means: a link nobody uses, a mass joined to nothing, lone copies.
 
-Takes: parts and links as they were read. Gives: `oddities`, the warnings; `told`, their texts.
+Takes: parts and links as they were read. Gives: `oddities`, the warnings; `warning_texts`.
 Guarantees: nothing here is a mistake: the scene is compiled as it stands; each warning has its place.
 Does not: look into equations, or decide what was meant.
 """
@@ -13,9 +13,8 @@ from apc.compiler.components.parts import GROUND
 from apc.compiler.errors import Mistake, Place
 from apc.compiler.scene.instances import Part, PartEntry
 
-Joined = Mapping[
-    str, frozenset[str]
-]  # of each part, those it is joined to by any number of others, itself too
+# Of each part, those it is joined to, by any number of others too, and itself.
+Joined = Mapping[str, frozenset[str]]
 
 
 def oddities(
@@ -110,13 +109,14 @@ def _unshared(
     outer: Sequence[Part],
     set_by_groups: Collection[str],
 ) -> Iterator[Mistake]:
+    """Yield a warning for a mass that is taken for a copy, see `_copies`, and is not shared."""
     followed = [one for one in hearing if [other for _, other, _ in one.connections] == [part.name]]
     divided = [number.name for number in part.component.numbers if number.divided]
-    own = {f"{part.name}.{name}" for name in divided}
-    own |= {f"{one.name}.{name}" for one in followed for name, _ in one.options}
+    divides = {f"{part.name}.{name}" for name in divided}
+    divides |= {f"{one.name}.{name}" for one in followed for name, _ in one.options}
     masses = {one.name for one in outer if one.section == "masses"} - {part.name}
     touched = any(apart[group][part.name] & masses for group in part.groups)
-    if followed and divided and touched and own.isdisjoint(set_by_groups):
+    if followed and divided and touched and divides.isdisjoint(set_by_groups):
         what = (
             f"{part.name} follows the other peers' by {followed[0].name} and is not shared: its "
             f"{divided[0]} counts once a peer"
@@ -125,7 +125,7 @@ def _unshared(
         yield Mistake("W274", part.place, what, hint=hint)
 
 
-def told(warnings: Collection[Mistake]) -> tuple[str, ...]:
+def warning_texts(warnings: Collection[Mistake]) -> tuple[str, ...]:
     """Return warnings as texts, each with its place in the topology, whose folder is left out."""
     return tuple(
         f"{Place(one.place.file.rpartition('/')[2], one.place.line, one.place.column)}: "

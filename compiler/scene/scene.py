@@ -188,11 +188,9 @@ def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene |
     settable = settable_names(parts)
     varied = settable | _of_losses(read_links)
     groups = _read_groups(bodies, settable, parts, clocks, sections, numbers)
-    if mistakes:
-        odd: tuple[Mistake, ...] = ()  # what is missing would be told a second time
-    else:
-        own = {name for group in groups for name, _ in (*group.values, *group.words, *group.columns)}
-        odd = oddities(parts, sections.entries, counts, own)
+    set_by_groups = {name for group in groups for name, _ in (*group.values, *group.words, *group.columns)}
+    # Where there are mistakes, what is missing for one would be told a second time.
+    warnings = () if mistakes else oddities(parts, sections.entries, counts, set_by_groups)
     return Scene(
         title,
         about,
@@ -205,7 +203,7 @@ def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene |
         read_region(root.get("studies"), varied, sections.is_reported, numbers.read_for, mistakes),
         tuple(sorted(files.digests.items())),
         root.place,
-        odd,
+        warnings,
     )
 
 

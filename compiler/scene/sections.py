@@ -86,17 +86,18 @@ class PartSections:
         keys = {key.text for key, _ in body.entries} - {"at", "shared", "count"}
         usual = _TYPE_EXAMPLES.get(section, "Mass")
         fitting = []
-        for name in (usual, *self.library.component_names):
+        for name in dict.fromkeys((usual, *self.library.component_names)):
             try:
                 component = self.library.component(name)
             except ApcError:
                 continue  # told where it is asked for
-            own = {name for name, _ in component.connectors} if component is not None else set()
-            if component is not None and (section != "hands" or own == {"flange"}):
-                known = own | {one.name for one in (*component.parameters, *component.variables)}
-                fitting.append((len(known), known >= keys, name))
-        named = {name: fits for _, fits, name in fitting}
-        return usual if named.get(usual) else next((n for _, fits, n in sorted(fitting) if fits), usual)
+            if component is None:
+                continue
+            connectors = {connector for connector, _ in component.connectors}
+            known = connectors | {one.name for one in (*component.parameters, *component.variables)}
+            if known >= keys and (section != "hands" or connectors == {"flange"}):
+                fitting.append((name != usual, len(known), name))
+        return min(fitting)[-1] if fitting else usual
 
     def is_reported(self, name: str) -> bool:
         """Return whether `part.parameter` is of a part that is missing for a fault that was reported."""
@@ -122,7 +123,8 @@ class PartSections:
                 return None
             known: Collection[str] = clocks if role == "clock" else links
             if not word:  # what to propose: first what nothing has named yet
-                known = sorted(known, key=lambda name: name in self._words())
+                said = self._words()
+                known = sorted(known, key=lambda name: name in said)
             reported = word not in known and not (isinstance(node, Mapping) and node.get(word) is None)
             return None if reported else known
 

@@ -283,8 +283,8 @@ def _shifted(names: Sequence[str], vector: Sequence[Fraction]) -> str:
     return f"the common shift of {', '.join([*listed[:MOST_NAMED], *more])}"
 
 
-def _places(sites: Sequence[PeerGroup], units: tuple[str, ...]) -> list[int]:
-    """Return where in the state that is of these units which changes between the ticks."""
+def _places(sites: Sequence[PeerGroup], units: Sequence[str]) -> list[int]:
+    """Return the places in the state of what changes between the ticks and has one of some units."""
     found, start = [], 0
     ends = [states_of(group.schedule, group.jacobians) for group in sites]
     for group, size in zip(sites, ends, strict=True):

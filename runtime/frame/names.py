@@ -95,8 +95,8 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE, *, counts: 
     if first in SECTIONS and name not in known:
         name = rest
     first, _, rest = name.partition(".")
-    group = None
-    if name not in known and first in groups and rest in {parameter.name for parameter in system.parameters}:
+    group, parameters = None, {parameter.name for parameter in system.parameters}
+    if name not in known and first in groups and rest in parameters:
         name, group = rest, first
     if group is not None and name in times:
         what = f"{written} is no parameter of {system.name}: {name} is one time for all groups"
@@ -114,11 +114,7 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE, *, counts: 
         what = f"{written} is of the hand that --hands held puts on each device"
         raise ApcError(Mistake("E622", place, what, hint=f"--hands held --set {name}=…"))
     one_peer = _ONE_PEER.fullmatch(name)
-    if (
-        one_peer is not None
-        and one_peer["group"] in groups
-        and one_peer["rest"] in {one.name for one in system.parameters}
-    ):
+    if one_peer is not None and one_peer["group"] in groups and one_peer["rest"] in parameters:
         raise _of_one_peer(system, one_peer, place)
     if name not in known:
         near = nearest(name, sorted(known))

@@ -25,15 +25,14 @@ from apc.compiler.frozen import dataclass
 from apc.compiler.words import counted
 from apc.loop.packets import DROPPED
 from apc.loop.peer import live_scene
-from apc.loop.run import ARRAYS, SCENE, PeerRun, Run
+from apc.loop.run import ARRAYS, PLAIN, SCENE, PeerRun, Run
 from apc.network.timetable import START, Route
 from apc.npz import read_arrays
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 
-LARGEST = (
-    1 << 30
-)  # bytes of a peer's file, and of what it unpacks to: three hours of a thousand ticks a second
+# Bytes of a peer's file, and of what it unpacks to: three hours of a thousand ticks a second.
+LARGEST = 1 << 30
 LONGEST = 1 << 24  # bytes of what is told in words
 MOST_PACKETS = 10**7  # of a way, the lost ones between the first and the last included
 LATEST = 1 << 62  # nanoseconds: what any two differ by can be told as well
@@ -117,9 +116,10 @@ def _read_peer(path: Path, scene: _Scene) -> PeerRun:
     return peer
 
 
-def _want(right: bool | np.bool_, otherwise: str) -> None:
+def _want(right: bool | np.bool_, fault: str) -> None:
+    """Raise DamageError with a fault unless something is right."""
     if not right:
-        raise DamageError(otherwise)
+        raise DamageError(fault)
 
 
 def _peer(found: dict[str, NDArray[Any]]) -> PeerRun:
@@ -134,9 +134,7 @@ def _peer(found: dict[str, NDArray[Any]]) -> PeerRun:
         raise DamageError("what it tells is not what apc play writes") from None
     routed = {f"{name}{at}" for name in ("packets", "missing") for at in range(min(told.routes, len(found)))}
     _want(found.keys() == {"told", *ARRAYS, *routed}, "its links are not those it tells of")
-    plain: dict[str, Any] = {
-        name: getattr(told, name) for name in _Told.__dataclass_fields__ if name != "routes"
-    }
+    plain: dict[str, Any] = {name: getattr(told, name) for name in PLAIN}
     plain["dropped"] = dict(told.dropped)
     plain["sent"] = {(link, other): count for link, other, count in told.sent}
     plain["offsets"] = {other: (trip, ahead) for other, trip, ahead in told.offsets}

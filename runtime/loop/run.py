@@ -91,7 +91,9 @@ def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
         for i in range(2)
     )
     kept = kept.astype(bool) & np.isfinite(rows).all(axis=1)
-    log = np.maximum(np.array(player.log, np.int64).reshape(-1, 3), 0)  # where a clock was set back
+    log = np.maximum(
+        np.array(player.log, np.int64).reshape(-1, 3), 0
+    )  # told to end, it did not wait for the last instant
     return PeerRun(
         name=loop.name,
         number=loop.own,

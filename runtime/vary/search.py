@@ -13,7 +13,6 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -279,9 +278,9 @@ def search(
             told(f"proving crossing {number + 1} of {len(found.roots)}")
         crossing = proved_crossing(root, line, found)
         edges += [crossing] if crossing else []
-    lost = points[1:-1][~np.isin(points[1:-1], found.points)]
-    sided = bool((np.abs(lost) <= scale / SPAN).all())
-    return replace(_search(edges, found, (bottom, top), known=known, enters=enters), sided=sided)
+    lost = {*points[1:-1].tolist()} - {*found.points.tolist()}
+    sided = all(abs(value) <= scale / SPAN for value in lost)
+    return _search(edges, found, (bottom, top), known=known, enters=enters, sided=sided)
 
 
 def spread(bottom: float, top: float, scale: float) -> Floats:
@@ -304,18 +303,24 @@ def spread(bottom: float, top: float, scale: float) -> Floats:
 
 
 def _search(
-    edges: Sequence[Crossing], found: Scan, asked: tuple[float, float], *, known: bool, enters: bool
+    edges: Sequence[Crossing],
+    found: Scan,
+    asked: tuple[float, float],
+    *,
+    known: bool,
+    enters: bool,
+    sided: bool = True,
 ) -> Search:
     """Put the crossings together with the stretches between them."""
     points = found.points
     if not len(points):
-        return Search((), (), asked, whole=False, known=known, looked=0, enters=enters)
+        return Search((), (), asked, whole=False, known=known, looked=0, enters=enters, sided=sided)
     ends = [-np.inf, *(one.value for one in edges), np.inf]
     stable = tuple(
         bool(found.stable[(points > low) & (points < high)][0]) for low, high in itertools.pairwise(ends)
     )
     scanned = (float(points[0]), float(points[-1]))
-    return Search(tuple(edges), stable, scanned, found.whole, known, len(points), enters)
+    return Search(tuple(edges), stable, scanned, found.whole, known, len(points), enters, sided=sided)
 
 
 def proved_crossing(root: Root, line: Line, found: Scan, *, in_balls: bool = True) -> Crossing | None:

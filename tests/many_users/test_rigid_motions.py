@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 from apc.analysis.analysis import analyze, lifted_groups
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import ANGLES, CompiledSystem
+from apc.compiler.errors import Place
+from apc.compiler.language.unit_text import format_dimension
+from apc.compiler.language.units import parse_unit
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import dense, split
 from apc.eigen.rigid import find_rigid_modes
@@ -154,6 +157,11 @@ equations:
 
 def _wheels(folder: Path, twist: str, stiffness: str = "0 N/m") -> CompiledSystem:
     return compiled(WHEELS.replace("TWIST", twist).replace("K,", f"{stiffness},"), library(folder, WHEEL))
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg", "turn", "1"])
+def test_an_angle_is_known_by_its_unit_as_models_have_it(unit: str) -> None:
+    assert format_dimension(parse_unit(unit, Place("a test")).dimension) in ANGLES
 
 
 def test_what_turns_freely_is_a_rotation_and_what_shifts_freely_a_translation(tmp_path: Path) -> None:
