@@ -61,6 +61,7 @@ def test_without_errors_there_is_no_front() -> None:
     assert not any(one.front for one in pareto_front([_one("a", 1.0, None), _one("b", 2.0, None)]))
 
 
+@pytest.mark.whole
 def test_every_method_that_serves_the_scene_is_measured_beside_its_error(found: Bench) -> None:
     analysis, simulation = found.comparisons
     names = {"modes", "dense", "determinant", "krylov", "certified", "paper"}

@@ -496,6 +496,7 @@ def test_whoever_sees_no_pictures_and_has_no_mouse_finds_everything_by_name(tab:
     tab.check(link)
 
 
+@pytest.mark.whole
 def test_a_scene_without_two_axes_is_shown_without_a_region(browser: Any, tmp_path: Path) -> None:
     (tmp_path / "none.yaml").write_text(NOTHING, encoding="utf-8")
     with served(tmp_path / "none.yaml") as link:
@@ -510,6 +511,7 @@ def test_a_scene_without_two_axes_is_shown_without_a_region(browser: Any, tmp_pa
         tab.close(link)
 
 
+@pytest.mark.whole
 def test_a_scene_may_name_its_numbers_as_the_link_does(browser: Any, tmp_path: Path) -> None:
     text = AVERAGE.replace("clocks:", "parameters: {x: 1000 N/m, y: 500 N/m, token: 5 N*s/m}\nclocks:", 1)
     text = text.replace("stiffness: 1000 N/m", "stiffness: x").replace("stiffness: 500 N/m", "stiffness: y")
@@ -591,6 +593,7 @@ def test_connections_that_ask_for_nothing_keep_nobody_out(left: int) -> None:
     assert (ended.stdout, ended.stderr) == ("200\n" * 3, "")
 
 
+@pytest.mark.whole
 def test_a_region_that_takes_long_keeps_nothing_waiting(browser: Any) -> None:
     path = SCENES / "experiment-average.yaml"
     system = apc.compile(path)

@@ -121,6 +121,7 @@ def test_where_the_word_has_no_room_the_title_says_what_is_hatched() -> None:
     assert "hatched: stable" in ax.get_title()
 
 
+@pytest.mark.whole
 def test_numbers_in_bars_stand_beside_them_and_frames_are_compared_in_seconds() -> None:
     systems = alike(7)
     found = compare(systems)

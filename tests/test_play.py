@@ -404,6 +404,7 @@ def free_ports(count: int) -> list[int]:
     return ports
 
 
+@pytest.mark.whole
 def test_a_peer_that_is_killed_and_started_again_joins_the_others(tmp_path: Path) -> None:
     (tmp_path / "three.yaml").write_text(replaced(MOVING, ("{count: 3,", "{count: 2,")), encoding="utf-8")
     one, two = free_ports(2)
@@ -736,6 +737,7 @@ def test_what_ends_a_loop_leaves_what_was_done(scene: CompiledSystem, tmp_path: 
         assert told.trouble is None
 
 
+@pytest.mark.whole
 def test_ctrl_c_ends_a_peer_and_what_it_did_is_kept(tmp_path: Path) -> None:
     """While it waits for others nothing is written; while it plays, alone or all, what was done is."""
     (tmp_path / "three.yaml").write_text(replaced(MOVING, ("{count: 3,", "{count: 2,")), encoding="utf-8")

@@ -125,6 +125,7 @@ def test_a_cluster_without_workers_is_told(monkeypatch: pytest.MonkeyPatch) -> N
         ]
 
 
+@pytest.mark.whole
 def test_a_cluster_lost_on_the_way_keeps_what_is_finished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

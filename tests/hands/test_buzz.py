@@ -68,6 +68,7 @@ def test_the_buzz_of_the_experiment_is_predicted_and_played() -> None:
     assert marginal.modes[0].frequency_hz == pytest.approx(known.frequency_hz, rel=1e-7)
 
 
+@pytest.mark.whole
 def test_what_is_not_one_cycle_that_motions_come_to_is_told() -> None:
     """Stable with contacts closed, unstable with weaker ones: from its start the scene settles."""
     leave = apc.buzz(experiment("average"))
@@ -149,6 +150,7 @@ def test_what_cannot_be_played_is_refused_and_lost_packets_are_named() -> None:
         apc.buzz(compiled(replaced(WALL, ("count: 1", "count: 1000000"))))
 
 
+@pytest.mark.whole
 def test_it_is_shown_where_it_is_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -217,6 +217,7 @@ def test_peer_by_peer_it_is_what_one_system_of_all_says(
     assert [bool(one.hinf) and bool(one.h2) for one in found] == [True, False]
 
 
+@pytest.mark.whole
 def test_groups_are_as_right_as_all_peers_in_one_and_a_million_users_are_served() -> None:
     """Two groups of two: classes and differences against one loop of all four, on the same graph as arcs."""
     groups = "left: {count: 2, set: {device.mass: 0.2 kg}}\n  right: {count: 2}"

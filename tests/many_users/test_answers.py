@@ -140,7 +140,7 @@ def test_a_delay_of_a_thousand_frames_has_its_verdict_and_says_what_it_has_not()
     assert all(len(line) <= 80 for line in text.splitlines())
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "name", ["three-users-mesh", "three-users-average", "two-users-waves", "lossy-average"]
 )
