@@ -119,17 +119,17 @@ FORM = "--over contact.stiffness='100 N/m:3000 N/m:30'"
         (
             "contact.stiffness",
             "1 kg:2 kg",
-            "sweep: E204 contact.stiffness wants N/m, got 1 kg. Write: contact.stiffness: 1 N/m",
+            "sweep: E204 contact.stiffness wants N/m, got 1 kg. Write: 1 N/m",
         ),
         (
             "contact.stiffness",
             "1:2",
-            "sweep: E204 contact.stiffness wants N/m, got 1 (no unit). Write: contact.stiffness: 1 N/m",
+            "sweep: E204 contact.stiffness wants N/m, got 1 (no unit). Write: 1 N/m",
         ),
         (
             "contact.stiffness",
             "5 N/m,",
-            "sweep: E221 contact.stiffness wants N/m, got nothing. Write: contact.stiffness: 1 N/m",
+            "sweep: E221 contact.stiffness wants N/m, got nothing. Write: 1 N/m",
         ),
         (
             "peers",

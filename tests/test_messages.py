@@ -1247,6 +1247,7 @@ HARMLESS = [
     ("haptic: 1 ms", "haptic: 1 m", "4:11: E204", {"haptic: 1 ms": ("haptic.period", 0.001)}),
     ("haptic: 1 ms", "haptic: 8 Ms", "4:13: E223", {"ms": ("haptic.period", 0.008)}),
     ("haptic: 1 ms", "haptic 1 ms", "4:3: E109", {"haptic: 1 ms": ("haptic.period", 0.001)}),
+    ("haptic: 1 ms", "haptic 1 ms    # forces", "4:3: E109", {"haptic: 1 ms": ("haptic.period", 0.001)}),
     ("network: 8 ms", "network 8 ms", "5:3: E109", {"network: 8 ms": ("network.period", 0.008)}),
     ("haptic: 1 ms", "haptic = 1 ms", "4:3: E109", {"haptic: 1 ms": ("haptic.period", 0.001)}),
     ("haptic: 1 ms", "haptic:1 ms", "4:3: E109", {"haptic: 1 ms": ("haptic.period", 0.001)}),

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from apc.eigen.bordered import Logarithm
-from apc.vary.plane import cross, over_all
+from apc.vary.plane import MOST_OPEN, count_beyond, cross, over_all
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -101,3 +101,20 @@ def test_what_is_unstable_all_along_has_no_crossing() -> None:
 def test_what_is_stable_all_along_has_no_crossing() -> None:
     found = cross([Pull(300, pole=0.5)], np.geomspace(1e-3, 0.49, 20), 1e-3)
     assert found.whole and not found.roots and found.stable.all()
+
+
+@dataclass(frozen=True)
+class Noise(Pull):
+    """A loop of which rounding leaves nothing at the first value: its F there is drawn anew each time."""
+
+    def at(self, values: Floats, rows: NDArray[np.intp], points: Complexes) -> Logarithm:
+        """Return log F and its derivatives, those of the first value by chance."""
+        assert len(points) <= 2 * MOST_OPEN, "arcs of noise are divided for ever"
+        found = super().at(values, rows, points)
+        chance = np.random.default_rng(len(points)).uniform(-3, 3, len(points)) * (1 + 1j)
+        return Logarithm(np.where(rows == 0, chance, found.value), found.turning, found.moving)
+
+
+def test_a_count_among_noise_is_given_up_and_others_are_not() -> None:
+    found = count_beyond(Noise(3), np.array([0.1, 0.1]))
+    assert np.isnan(found[0]) and found[1] == 0

@@ -296,6 +296,7 @@ def test_peers_do_what_is_simulated_with_the_packets_they_heard(
     assert not beside.why_not
     assert max(far for far, _ in beside.apart.values()) <= 1e-12  # 250 ticks of roundings
     assert beside.apart["N"][1] > 1
+    assert "signals differ by at most\n" in str(beside)
     assert len(beside.ways) == 6
     for way in beside.ways:
         # Nothing is lost by us: what did not come by the end was still on its way.

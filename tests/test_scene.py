@@ -403,6 +403,8 @@ def test_who_takes_part_is_said_by_what_uses_a_link() -> None:
         "11:13: E211 lan is a link, which joins all peers: who takes part is said by what uses it. "
         "Write: coordination: {at: [left]}"
     )
+    [line] = messages(("lan: {clock", "lan: {at: [], clock"), text=KINDS)
+    assert line.endswith("Write: coordination: {at: [left, right]}")
     assert not messages(("link: lan}", "link: lan, at: [left]}"), text=KINDS)
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.vary.batch import BatchEvaluator
 from apc.vary.evaluator import evaluator
-from apc.vary.sensitivity import _differentiate, sensitivities
+from apc.vary.sensitivity import _Cluster, _defective, _differentiate, sensitivities
 from apc.vary.slopes import moved_systems
 from tests.bench.sensitivity_truth import check_sensitivities
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
@@ -192,3 +194,10 @@ def test_without_parameters_it_is_said_that_there_is_none() -> None:
     found = _differentiate(system, [], moved_systems(evaluator(system, []), np.empty(0)))
     assert found.rows == ()
     assert found.note == "what moves it most: not told: there is no parameter to vary"
+
+
+def test_a_magnitude_without_a_derivative_is_told_in_six_digits() -> None:
+    moved = SimpleNamespace(name="difference")
+    values = np.array([4.6595006390654115e112 + 0j])
+    told = _defective(cast(_Cluster, SimpleNamespace(values=values, moved=moved)))
+    assert told.startswith("1 eigenvalue of difference at magnitude 4.6595e+112 shares")

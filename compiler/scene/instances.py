@@ -225,7 +225,8 @@ class PartReader:
             return tuple(self.counts)
         if entry.section == "links":
             what = f"{name} is a link, which joins all peers: who takes part is said by what uses it"
-            told = form(node) if not isinstance(node, Sequence) else ", ".join(map(form, node.items))
+            groups = map(form, node.items) if isinstance(node, Sequence) else [form(node)]
+            told = ", ".join(groups) or ", ".join(self.counts)
             hint = f"{self._user_of(name)}: {{at: [{told}]}}"
             self.mistakes.add("E211", node.place, what, hint=hint)
             return tuple(self.counts)

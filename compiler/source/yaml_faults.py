@@ -124,6 +124,8 @@ def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Mistake:
         for line in (mark.line, opening):
             if (found := _item_among_keys(line, lines)) is not None:
                 return found
+        if (found := _without_colon(_line_above(mark.line, lines), lines)) is not None:
+            return found
     for part, sentence, hint in _PROBLEMS:
         if part in told:
             opened = sentence.startswith("this ") and error.context_mark is not None

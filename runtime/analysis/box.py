@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -95,7 +96,11 @@ def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Ran
         first, colon, last = (part.strip() for part in value.partition(":"))
         if not (colon and first and last):
             raise _malformed(text, place)
-        low, high = (quantity(one, place, what=name, unit=parameter.unit).value for one in (first, last))
+        try:
+            low, high = (quantity(one, place, what=name, unit=parameter.unit).value for one in (first, last))
+        except ApcError as error:  # what is to be written is an end of a range
+            mistakes = [replace(one, hint=one.hint.removeprefix(f"{name}: ")) for one in error.mistakes]
+            raise ApcError(mistakes) from None
     _check_limits(parameter, low, high, name, place)
     return Range(free, parameter.unit, low, high)
 

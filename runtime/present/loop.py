@@ -30,7 +30,7 @@ def run_comparison_text(found: RunComparison) -> str:
     if found.why_not:
         lines += [*note(f"not simulated beside it: {found.why_not}"), ""]
     else:
-        lines += note("beside simulate, fed with the packets that each tick had, signals differ by at most")
+        lines += note("beside simulate with the same packets at each tick, signals differ by at most")
         for unit, (far, large) in found.apart.items():
             lines.append(f"    {far:.0e} {unit}".ljust(18) + f" of up to {large:.4g} {unit}")
         if not any(large for _, large in found.apart.values()):

@@ -204,7 +204,12 @@ def _quantities(label: str, unit: str, texts: Sequence[str]) -> tuple[Fraction, 
     """Read quantities; one without a unit takes that of the last."""
     from apc.compiler.language.units import quantity
 
-    return tuple(quantity(text, PLACE, what=label, unit=unit).value for text in with_last_unit(texts))
+    try:
+        return tuple(quantity(text, PLACE, what=label, unit=unit).value for text in with_last_unit(texts))
+    except ApcError as error:
+        # A hint of a key and its value is no range: what is to be written differently is the value.
+        mistakes = [replace(one, hint=one.hint.removeprefix(f"{label}: ")) for one in error.mistakes]
+        raise ApcError(mistakes) from None
 
 
 def with_last_unit(texts: Sequence[str]) -> list[str]:

@@ -48,7 +48,8 @@ FIRST_ANGLE, RATIO, APART, TURNED = 1e-3, 1.6, 0.25, np.pi / 2
 # Newton's steps in a cell, and how far, relative to it, the last one may go, and a zero beyond its edge lie.
 STEPS, SETTLED, EDGE = 12, 1e-9, 1e-6
 
-# Cells looked at at a time, and levels: what follows the circle would be divided for ever.
+# Cells looked at at a time, arcs at a value, and levels: what follows the circle would be divided
+# for ever, and what is nothing but rounding too.
 MOST_OPEN, MOST_LEVELS = 20_000, 60
 
 # A cell is divided aside of its middle, so that no angle is 0, where F may be 0/0.
@@ -295,6 +296,8 @@ def _counted(sheet: Sheet, grid: _Grid) -> Floats:
         np.add.at(turned, row[good], (share * steps)[good])
         lost = ~good & ~((width > least) & np.isfinite(apart))
         turned[row[lost]] = np.nan
+        crowded = np.bincount(row[~good], minlength=len(values)) > MOST_OPEN
+        turned[crowded] = np.nan
         cut = ~good & ~np.isnan(turned[row])
         if not cut.any():
             break

@@ -207,7 +207,7 @@ def _differentiate(system: CompiledSystem, free: Sequence[Free], listed: Sequenc
 def _defective(one: _Cluster) -> str:
     """Say which eigenvalues have no derivative."""
     size, many = float(np.abs(one.values).max()), len(one.values) > 1
-    what = f"{counted(len(one.values), 'eigenvalue')} of {one.moved.name} at magnitude {size:.6f}"
+    what = f"{counted(len(one.values), 'eigenvalue')} of {one.moved.name} at magnitude {size:.6g}"
     return f"{what} {'share' if many else 'shares'} one motion: there the radius has no derivative"
 
 
