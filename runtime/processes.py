@@ -12,6 +12,7 @@ Does not: keep results, or decide which tasks are wanted.
 
 from __future__ import annotations
 
+import hashlib
 import multiprocessing
 import os
 import signal
@@ -240,6 +241,11 @@ def model_bytes(system: CompiledSystem) -> bytes:
         path = Path(folder) / "model.apc"
         store.save(system, path)
         return path.read_bytes()
+
+
+def digest_of(system: CompiledSystem) -> bytes:
+    """Return the SHA-256 of a compiled model, its numbers included."""
+    return hashlib.sha256(model_bytes(system)).digest()
 
 
 def model_of_bytes(model: bytes) -> CompiledSystem:

@@ -12,7 +12,7 @@ from typing import Any, cast
 import pytest
 
 import apc
-from apc.arguments import _hints, _is
+from apc.arguments import _fits, _hints
 from tests.topologies import SCENES, told
 
 PATH = SCENES / "three-users-average.yaml"
@@ -158,7 +158,7 @@ def test_an_argument_of_a_wrong_type_is_said_to_be_one(
     }
     for one in parameters:
         for wrong in WRONG:
-            if _is(wrong, _hints(inspect.unwrap(function))[one]):
+            if _fits(wrong, _hints(inspect.unwrap(function))[one]):
                 continue
             with pytest.raises((TypeError, apc.ApcError)) as raised:
                 function(**{**needed, one: wrong})

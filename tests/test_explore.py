@@ -459,9 +459,10 @@ def test_a_click_in_the_region_sets_both_sliders(tab: Tab, link: str) -> None:
         }})()"""
     )
     tab.page.mouse.click(*inner)
-    tab.page.wait_for_function("location.search.includes('contact.stiffness')")
-    chosen = parse_qs(urlsplit(tab.page.url).query)
-    x, y = (float(chosen[name][0].split()[0]) for name in ("contact.stiffness", "coordination.stiffness"))
+    names = ("contact.stiffness", "coordination.stiffness")
+    tab.page.wait_for_function(f"{[*names]}.every(name => location.search.includes(name))")
+    chosen = parse_qs(tab.page.evaluate("location.search.slice(1)"))
+    x, y = (float(chosen[name][0].split()[0]) for name in names)
     assert x == pytest.approx(0.8 * 5000, abs=50) and y == pytest.approx(0.6 * 1500, abs=15)
     tab.check(link)
 

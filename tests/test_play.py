@@ -46,7 +46,7 @@ from apc.loop.run import delays_of, run_of, write_run
 from apc.loop.start import Part, Play, play_all
 from apc.network.recorded import describe
 from apc.present.loop import ticks_text
-from apc.processes import Workers
+from apc.processes import Workers, digest_of
 from tests.fuzz.arrays import recorded
 from tests.fuzz.packets import run_packets
 from tests.topologies import AVERAGE, replaced, told
@@ -170,7 +170,13 @@ def loops(system: CompiledSystem, duration: str, *, emulate: bool = False) -> It
     for name in names:
         others = {other: at for other, at in where.items() if other != name}
         yield Loop(
-            system, name, sockets[name], others, digest=DIGEST, duration=Fraction(duration), emulate=emulate
+            system,
+            name,
+            sockets[name],
+            others,
+            digest=digest_of(system),
+            duration=Fraction(duration),
+            emulate=emulate,
         )
 
 
@@ -289,7 +295,7 @@ def test_peers_do_what_is_simulated_with_the_packets_they_heard(
         one.start()
     for one in threads:
         one.join()
-    write_run(tmp_path, lossy, [run_of(loop, DIGEST, ()) for loop in every])
+    write_run(tmp_path, lossy, [run_of(loop, digest_of(lossy), ()) for loop in every])
     found = read_run(tmp_path)
     assert [one.name for one in found.peers] == ["user[1]", "user[2]", "user[3]"]
     beside = compare_run(found)
@@ -443,7 +449,7 @@ def test_a_device_outside_is_measured_and_pushed(scene: CompiledSystem, tmp_path
         "user[1]",
         every[0].socket,
         dict(zip(("user[2]", "user[3]"), every[0].others.values(), strict=True)),
-        digest=DIGEST,
+        digest=digest_of(scene),
         duration=Fraction(1, 10),
         device=device,
     )
@@ -453,7 +459,7 @@ def test_a_device_outside_is_measured_and_pushed(scene: CompiledSystem, tmp_path
         one.start()
     for one in threads:
         one.join()
-    found = run_of(own, DIGEST, ())
+    found = run_of(own, digest_of(scene), ())
     column = {name.removeprefix("user[1]."): at for at, name in enumerate(found.signals)}
     assert (found.values[1:, column["device.x"]] == 0.002).all()
     assert (found.values[2:, column["device.v"]] == 0).all()
@@ -601,6 +607,13 @@ def test_what_no_peer_of_the_scene_can_have_done_is_refused(
     assert message.startswith(f"{kept / 'user-1.npz'}: E973 is no peer of this run: {why}")
 
 
+def test_a_run_beside_another_scene_is_refused(kept: Path) -> None:
+    """One of the same structure, whose numbers differ: what happened would be laid beside its motion."""
+    found = apc.load(kept / "scene.apc")
+    apc.save(apc.set_parameters(found, {"coordination.stiffness": "600 N/m"}), kept / "scene.apc")
+    assert "E973 its scene.apc is not the scene that was played" in told(lambda: read_run(kept))[0]
+
+
 def test_what_is_no_file_of_a_peer_is_refused_at_once(kept: Path) -> None:
     path, bomb = kept / "user-1.npz", io.BytesIO()
     np.savez_compressed(bomb, told=np.zeros((8 << 20) - 128, np.uint8))
@@ -720,16 +733,28 @@ def test_what_ends_a_loop_leaves_what_was_done(scene: CompiledSystem, tmp_path: 
         others = dict(zip(("user[2]", "user[3]"), every[0].others.values(), strict=True))
         device = device_function(tmp_path / "device.py")
         own = Loop(
-            scene, "user[1]", every[0].socket, others, digest=DIGEST, duration=Fraction(1, 10), device=device
+            scene,
+            "user[1]",
+            every[0].socket,
+            others,
+            digest=digest_of(scene),
+            duration=Fraction(1, 10),
+            device=device,
         )
         own.begins = 1  # long ago: every tick is late
         own.run()
         assert message in str(own.trouble)
-        found = run_of(own, DIGEST, ())
+        found = run_of(own, digest_of(scene), ())
         assert found.time[-1] == pytest.approx(0.047)  # of whole frames
         stop, end = multiprocessing.Pipe(duplex=False)
         told = Loop(
-            scene, "user[1]", every[0].socket, others, digest=DIGEST, duration=Fraction(1, 10), stop=stop
+            scene,
+            "user[1]",
+            every[0].socket,
+            others,
+            digest=digest_of(scene),
+            duration=Fraction(1, 10),
+            stop=stop,
         )
         told.begins = 1
         end.close()
@@ -764,7 +789,7 @@ def test_a_peer_that_is_lost_or_silent_takes_nothing_of_the_others_along(
     scene: CompiledSystem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One ends at once with what it did, one is killed, one does not end when all are told to."""
-    whole = run_of(next(loops(scene, "1")), DIGEST, ())
+    whole = run_of(next(loops(scene, "1")), digest_of(scene), ())
     ended: dict[str, Future[Part]] = {f"user[{at}]": Future() for at in (1, 2, 3)}
     ended["user[1]"].set_result(Part(whole))
     ended["user[2]"].set_exception(BrokenProcessPool())
@@ -800,7 +825,7 @@ def test_a_run_is_put_in_place_whole_or_not_at_all(
 ) -> None:
     """On a disk that is full after one of two peers the older run stays, and where none was, none is."""
     folder, save = tmp_path / "a.run", np.savez_compressed
-    one, two, three = (run_of(loop, DIGEST, ()) for loop in loops(scene, "1"))
+    one, two, three = (run_of(loop, digest_of(scene), ()) for loop in loops(scene, "1"))
     one = replace(one, arrivals=np.array([[0, 1, 5, 40, 50]]))
     write_run(folder, scene, [one, two, three], whole=True)
     before = written(folder)

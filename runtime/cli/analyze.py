@@ -118,6 +118,8 @@ def analyze_command(
     from apc.inputs import open_scene
 
     check_plot(plot)
+    if cells is not None and not box and hands in (*HANDS, PASSIVE):  # hands of the library make a box
+        raise click.UsageError("--cells wants a --box to divide")
     system = open_scene(file, settings, {"--plot": plot}, hands=hands, told=note_aside)
     if hands == PASSIVE:
         asked = {"--method": method != AUTO, "--conventions": every_convention, "--buzz": with_buzz}

@@ -8,6 +8,7 @@ Does not: ask whether it was so.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from fractions import Fraction
@@ -97,6 +98,9 @@ def read_run(folder: Path) -> Run:
     peers = tuple(sorted((_read_peer(path, scene) for path in files), key=lambda one: one.number))
     if len({(one.digest, one.session) for one in peers}) > 1:
         what = "holds peers that did not play together: of other runs, of other scenes, or with another --set"
+        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
+    if peers[0].digest != hashlib.sha256(read_file(folder / SCENE, LARGEST)).hexdigest():
+        what = f"its {SCENE} is not the scene that was played"
         raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
     if len({one.number for one in peers}) < len(peers):
         what = "holds a peer twice"

@@ -9,7 +9,6 @@ Does not: step (see `peer`), or write (see `run`).
 
 from __future__ import annotations
 
-import hashlib
 import ipaddress
 import multiprocessing
 import signal
@@ -30,7 +29,7 @@ from apc.loop.packets import Address
 from apc.loop.peer import Loop, StoppedError
 from apc.loop.realtime import claim
 from apc.loop.run import PeerRun, run_of
-from apc.processes import Workers, local_processes, model_bytes, model_of_bytes
+from apc.processes import Workers, digest_of, local_processes, model_bytes, model_of_bytes
 
 MOST_PEERS = 64  # processes of one machine
 LOOPBACK = "127.0.0.1"
@@ -141,7 +140,7 @@ def _play(
     stop: Connection,
     device: DeviceFunction | None,
 ) -> Part:
-    digest = hashlib.sha256(model_bytes(system)).digest()
+    digest = digest_of(system)
     loop = Loop(
         system,
         peer,

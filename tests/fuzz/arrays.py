@@ -27,6 +27,7 @@ from apc.loop.beside import compare_run
 from apc.loop.peer import Loop
 from apc.loop.reading import read_run
 from apc.loop.run import run_of, write_run
+from apc.processes import digest_of
 from apc.sweeps.store import open_parts
 from tests.fuzz.models import zipped
 from tests.topologies import AVERAGE, replaced
@@ -67,7 +68,7 @@ def recorded() -> dict[str, bytes]:
         for one in sockets.values():
             one.bind(("127.0.0.1", 0))
         loops = [
-            Loop(system, peer, sockets[peer], others, digest=bytes(32), duration=Fraction(1, 20))
+            Loop(system, peer, sockets[peer], others, digest=digest_of(system), duration=Fraction(1, 20))
             for peer in names
             for others in [{one: to.getsockname() for one, to in sockets.items() if one != peer}]
         ]
@@ -76,7 +77,7 @@ def recorded() -> dict[str, bytes]:
             thread.start()
         for thread in threads:
             thread.join()
-        write_run(folder / RUN, system, [run_of(loop, bytes(32), ()) for loop in loops])
+        write_run(folder / RUN, system, [run_of(loop, digest_of(system), ()) for loop in loops])
         return {path.name: path.read_bytes() for path in sorted((folder / RUN).iterdir())}
 
 
