@@ -203,6 +203,12 @@ def test_a_unit_is_bounded_in_every_direction(text: str) -> None:
             "s",
             "E204 stiffness wants s, got 1 MS (MS is megasiemens: case matters). Write: stiffness: 1 ms",
         ),
+        (
+            "5 MS^(1/2)",
+            "N/m",
+            "E204 stiffness wants N/m, got 5 MS^(1/2).",
+        ),  # no root of what is meant is a unit
+        ("5 (mm^2)^(1/2)", "N/m", "E204 stiffness wants N/m, got 5 (mm^2)^(1/2)."),
         ("stiff", "N/m", "E221 stiffness wants N/m, got stiff. Write: stiffness: 1 N/m"),
         ("", "N/m", "E221 stiffness wants N/m, got nothing. Write: stiffness: 1 N/m"),
     ],

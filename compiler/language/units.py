@@ -146,7 +146,7 @@ def _meant(unit: Unit, wanted: Unit) -> str:
     for name in NAME.findall(unit.text):
         longer = (other for other in COMMON if other.startswith(name) and len(other) == len(name) + 1)
         texts += [re.sub(rf"\b{re.escape(name)}\b", other, unit.text) for other in longer]
-    fitting = (text for text in texts if _unit(text).dimension == wanted.dimension)
+    fitting = (text for text in texts if _is_of(text, wanted.dimension))
     return next(fitting, wanted.text if unit.scale == wanted.scale else "")
 
 
@@ -167,9 +167,17 @@ def _confused(unit: Unit, wanted: Dimension) -> tuple[str, str] | None:
         for other in COMMON:
             if other != name and other.lower() == name.lower():
                 text = unit.text.replace(name, other)
-                if _unit(text).dimension == wanted:
+                if _is_of(text, wanted):
                     return name, text
     return None
+
+
+def _is_of(text: str, wanted: Dimension) -> bool:
+    """Say whether a text is a unit of a dimension; made from another unit it may be none, as a root of mm."""
+    try:
+        return _unit(text).dimension == wanted
+    except FaultError:
+        return False
 
 
 @lru_cache(maxsize=4096)

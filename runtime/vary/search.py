@@ -473,6 +473,10 @@ def search_delay(
     else:
         pieces = (Piece(one.low, one.high, None, _inside(system, free, one)) for one in late)
     counted = _counted(late or ())
+    if not from_stable:  # where events coincide at `low`, its verdict is not that of the delays above it
+        before = Piece(low, low, None, system_with_delay(system, free, low))
+        begins = analyze(before.inside, prepared=prepared)
+        stable = [] if begins.stable is None or begins.verdict == DRIFTS else [begins.stable]
     for piece in pieces:
         at = min(piece.high, end)
         tell(at)
