@@ -307,7 +307,7 @@ def _tables(function: Any, calls: Sequence[int]) -> dict[int, tuple[str, Interpo
     found: dict[int, tuple[str, Interpolation]] = {}
     read: dict[int, Interpolation] = {}  # of each function, which may be called many times
     known: dict[tuple[bytes, bytes], Interpolation] = {}  # of equal rows, which are one table
-    expressions = function.instructions_sx() if calls else None
+    expressions: Any = function.instructions_sx() if calls else None
     for k in calls:
         one = expressions[k].which_function()
         if one.__hash__() not in read:

@@ -130,7 +130,8 @@ def forcing_of(rates: Rates) -> Forcing:
     p, t = type_.sym("p", rates.rate.numel_in(0)), type_.sym("t")
     g = rates.rate(p, t)
     pushed, found, affine = tuple(range(g.numel())), [], True
-    tables, clocks = (), None
+    tables: tuple[Interpolation, ...] = ()
+    clocks = None
     if type_ is casadi.SX:  # a nonlinear loop has no switches but those halving finds
         pushed = tuple(row for row in pushed if not g[row].is_zero())
         lookups = lookups_of(g)
@@ -205,7 +206,7 @@ def _rows(forcing: Forcing, numbers: bytes) -> Floats:
             (table.times - one) / fast for table, one, fast in zip(forcing.tables, begun, pace, strict=True)
         ]
     rows = np.unique(np.concatenate(found))
-    return rows[np.isfinite(rows)]
+    return np.asarray(rows[np.isfinite(rows)])
 
 
 def at_instants(function: Any, parameters: Floats, instants: Floats) -> Floats:
