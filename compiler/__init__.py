@@ -22,6 +22,7 @@ equations                   connections: where connectors meet; flatten
 functions                   casadi_writer, reached: what is written; exchange: what lies beside;
                             functions
 compiled, plain, formula    the compiled model; its functions as data; numbers that follow from others
+interpolation               tables over time in these functions
 crowd                       how many peers there are, and how many each hears
 store                       the compiled model on disk
 seal, cache                 what this user's apc wrote; whether it still is what its texts compile to

@@ -37,7 +37,7 @@ from apc.compiler.files import RefusedError, files_below, read_file
 from apc.compiler.frozen import dataclass
 from apc.compiler.seal import is_sealed
 
-FORMAT = 11  # of NAME.apc
+FORMAT = 12  # of NAME.apc
 MEMBER = "model.json"  # of the archive: structure, numbers and the digests of the other members
 FIELDS = {"format", "system", "members"}  # of the document
 SEAL = "seal"  # of the archive: who wrote the document, see `seal`

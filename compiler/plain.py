@@ -11,8 +11,9 @@ Does not: know what a function is for.
 
 CasADi's serialization can hold compilers to call and libraries to load, with options, and CasADi trusts it.
 
-Values are numbered: first the entries of the inputs in order, then the constants, then the operations, each
-of which names the values before it that it takes. With loops, `given[k]` takes the inputs and what the loops
+Values are numbered: first the entries of the inputs in order, then the constants, the tables, and then the
+operations, each of which names the values before it that it takes; "interpolate" and "slope" take a table and
+where in it. With loops, `given[k]` takes the inputs and what the loops
 before the k-th found, and gives where its iteration begins and what it depends on; the result takes the
 inputs and what all the loops found.
 """
@@ -28,8 +29,10 @@ from fractions import Fraction
 from typing import Any
 
 import casadi
+import numpy as np
 
 from apc.compiler.frozen import dataclass
+from apc.compiler.interpolation import TABLE, Interpolation, function_of, table_of
 
 _UNARY = {
     name: getattr(casadi, f"OP_{name.upper()}")
@@ -46,6 +49,7 @@ _BINARY = {
     )
 }
 _NAMES = {code: name for name, code in (_UNARY | _BINARY).items()}
+LOOK = "interpolate"  # in a table, whose number comes first; "slope" is in what is derived from a function
 
 
 def _quotient(above: Any, below: Any) -> Any:
@@ -79,6 +83,8 @@ RULES: dict[str, Callable[..., Any]] = {
     "or": lambda a, b: int(a != 0 or b != 0),
     # The product with a condition: zero whatever b is, when the condition is false.
     "if_else_zero": lambda a, b: b if a != 0 else 0 * b,
+    "interpolate": lambda table, at: table.value(at, float),
+    "slope": lambda table, at: table.slope(at, float),
 }
 
 # Those that have no rational value of a rational number.
@@ -102,7 +108,8 @@ _Columns = tuple[tuple[str, int], ...]  # of each: its name and how many entries
 class PlainFunction:
     """A function of columns to columns.
 
-    `operations` are (name, value) or (name, value, value); `results` the values that make up each output.
+    `operations` are (name, value) or (name, value, value); `results` the values that make up each output;
+    `tables` what some of them look up.
     `loops` are pairs (given, residual), each without loops; with them the constants, operations and results
     are those of the result, whose further inputs are what the loops find.
     """
@@ -114,6 +121,7 @@ class PlainFunction:
     operations: tuple[tuple[Any, ...], ...]
     results: tuple[tuple[int, ...], ...]
     loops: tuple[tuple[PlainFunction, PlainFunction], ...] | None
+    tables: tuple[Interpolation, ...] = ()
 
     @property
     def sizes(self) -> tuple[list[int], list[int]]:
@@ -131,6 +139,7 @@ class PlainFunction:
             "operations": [list(one) for one in self.operations],
             "results": [list(one) for one in self.results],
             "loops": None if loops is None else [[one.document() for one in loop] for loop in loops],
+            "tables": [[one.times.tolist(), one.numbers.tolist()] for one in self.tables],
         }
 
     def build(self) -> Any:
@@ -162,11 +171,11 @@ def walk(
     function
         A function without loops.
     values
-        The entries of its inputs, then its constants.
+        The entries of its inputs, then its constants; its tables follow as they are.
     rule
         What an operation is in this kind of number.
     """
-    found = list(values)
+    found = [*values, *function.tables]
     for word, *places in function.operations:
         found.append(rule(word)(*(found[place] for place in places)))
     return found
@@ -175,6 +184,8 @@ def walk(
 @functools.cache
 def symbolic(word: str) -> Callable[..., Any]:
     """Return what an operation is of CasADi's expressions."""
+    if word == LOOK:
+        return lambda table, at: function_of(table)(at)
     unary = word in _UNARY
     return functools.partial(
         casadi.SX.unary if unary else casadi.SX.binary, (_UNARY if unary else _BINARY)[word]
@@ -239,6 +250,7 @@ def plain(function: Any) -> PlainFunction:
         result.operations,
         result.results,
         tuple(loops),
+        result.tables,
     )
 
 
@@ -252,6 +264,10 @@ def straight(function: Any) -> PlainFunction:
     ]
     numbers = [function.instruction_constant(k) for code, _, _, k in instructions if code == casadi.OP_CONST]
     constants = {number: first[-1] + place for place, number in enumerate(dict.fromkeys(map(_key, numbers)))}
+    called = _tables(function, [k for code, _, _, k in instructions if code == casadi.OP_CALL])
+    tables = tuple(dict.fromkeys(table for _, table in called.values()))
+    places = {table: first[-1] + len(constants) + place for place, table in enumerate(tables)}
+    before = first[-1] + len(constants) + len(tables)
     work = [0] * function.sz_w()
     operations: list[tuple[Any, ...]] = []
     results = [[0] * function.nnz_out(i) for i in range(function.n_out())]
@@ -262,20 +278,44 @@ def straight(function: Any) -> PlainFunction:
             results[given[0]][given[1]] = work[taken[0]]
         elif code == casadi.OP_CONST:
             work[given[0]] = constants[_key(function.instruction_constant(k))]
+        elif code == casadi.OP_CALL:
+            name, table = called[k]
+            at, by = work[taken[0]], work[taken[-1]]
+            operations.append((LOOK if name == TABLE else "slope", places[table], at))
+            if name != TABLE:  # a derivative, of any order, is the slope times what it is taken by
+                operations.append(("mul", before + len(operations) - 1, by))
+            work[given[0]] = before + len(operations) - 1
         elif code not in _NAMES:
             raise ValueError(f"CasADi's operation {code} of {function.name()} is none of ours")
         else:
             operations.append((_NAMES[code], *(work[place] for place in taken)))
-            work[given[0]] = first[-1] + len(constants) + len(operations) - 1
+            work[given[0]] = before + len(operations) - 1
     return PlainFunction(
         function.name(),
         inputs,
         tuple(function.name_out()),
         tuple(float(number) for number in constants),
         tuple(operations),
-        tuple(tuple(places) for places in results),
+        tuple(tuple(listed) for listed in results),
         None,
+        tables,
     )
+
+
+def _tables(function: Any, calls: Sequence[int]) -> dict[int, tuple[str, Interpolation]]:
+    """Return what an SX function's calls, by their instructions, call, and the table that is looked up."""
+    found: dict[int, tuple[str, Interpolation]] = {}
+    read: dict[int, Interpolation] = {}  # of each function, which may be called many times
+    known: dict[tuple[bytes, bytes], Interpolation] = {}  # of equal rows, which are one table
+    expressions: Any = function.instructions_sx() if calls else None
+    for k in calls:
+        one = expressions[k].which_function()
+        if one.__hash__() not in read:
+            table = table_of(one)
+            rows = table.times.tobytes(), table.numbers.tobytes()
+            read[one.__hash__()] = known.setdefault(rows, table)
+        found[k] = one.name(), read[one.__hash__()]
+    return found
 
 
 def _key(number: float) -> str:
@@ -305,20 +345,36 @@ def _read(document: Any, found: _Columns, loops: tuple[Any, ...] | None = None) 
     outputs = tuple(map(_word, document["outputs"]))
     constants = tuple(document["constants"])
     _must(all(type(one) is float for one in constants))
-    count = sum(rows for _, rows in (*inputs, *found)) + len(constants)
+    tables = tuple(map(_table, document["tables"]))
+    first = sum(rows for _, rows in (*inputs, *found)) + len(constants)
+    count = first + len(tables)
+    listed = range(first, count)
     operations = tuple(map(tuple, document["operations"]))
     for word, *places in operations:
-        known = _UNARY if len(places) == 1 else _BINARY
-        _must(len(places) in (1, 2) and word in known)
+        if word == LOOK:
+            _must(len(places) == 2 and places[0] in listed)
+            del places[0]
+        else:
+            known = _UNARY if len(places) == 1 else _BINARY
+            _must(len(places) in (1, 2) and word in known)
         for place in places:
-            _must(type(place) is int and 0 <= place < count)
+            _must(type(place) is int and 0 <= place < count and place not in listed)
         count += 1
     results = tuple(map(tuple, document["results"]))
-    _must(all(type(place) is int and 0 <= place < count for places in results for place in places))
+    values = (place for places in results for place in places)
+    _must(all(type(place) is int and 0 <= place < count and place not in listed for place in values))
     names = [*outputs, *(name for name, _ in (*inputs, *found))]
     _must(len(outputs) == len(results) and len(set(names)) == len(names))
     _must(loops is not None or document["loops"] is None)
-    return PlainFunction(_word(document["name"]), inputs, outputs, constants, operations, results, loops)
+    name = _word(document["name"])
+    return PlainFunction(name, inputs, outputs, constants, operations, results, loops, tables)
+
+
+def _table(rows: Any) -> Interpolation:
+    _must(len(rows) == 2 and all(type(one) is float for column in rows for one in column))
+    table = Interpolation(*map(np.array, rows))
+    _must(table.is_consistent)
+    return table
 
 
 def _columns(listed: Any) -> _Columns:

@@ -260,6 +260,7 @@ def _is_formula(formula: Formula) -> bool:
         function.loops is None
         and function.sizes == (given, [1])
         and not function.constants
+        and not function.tables
         and all(word in EXACT for word, *_ in function.operations)
         and len(formula.spans) == sum(given) + len(function.operations)
         and all(0 <= start <= end <= len(formula.text) for start, end in formula.spans)

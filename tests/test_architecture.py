@@ -27,7 +27,8 @@ from tests.topologies import AVERAGE, ROOT
 HOUSE = (
     (
         "apc.compiler",
-        "frozen errors digits timings files words multiples weights plain compiled crowd formula seal cache",
+        "frozen errors digits timings files words multiples weights interpolation plain compiled crowd "
+        "formula seal cache",
     ),
     ("apc.compiler.source", "nodes yaml_faults reading compose source"),
     (

@@ -12,7 +12,6 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from itertools import pairwise
 from typing import Any, TypeAlias
 
 import casadi
@@ -31,6 +30,7 @@ from apc.compiler.equations.terms import (
     terms_of,
 )
 from apc.compiler.frozen import dataclass
+from apc.compiler.interpolation import Interpolation, function_of
 from apc.compiler.language.expression import SMOOTH
 from apc.compiler.language.recordings import TimeTable
 from apc.compiler.plain import Loop, composed
@@ -227,20 +227,8 @@ class Writer:
     def _interpolated(self, table: Term, time: Term) -> Any:
         """Return a table's value, linear between its rows and constant beyond its ends."""
         assert isinstance(table, Symbol)
-        found, at = self.tables[table.name], self._build(time)
-        times, numbers = found.times.tolist(), found.numbers.tolist()
-        pieces = [casadi.SX(numbers[0])]
-        for (start, end), (low, high) in zip(pairwise(times), pairwise(numbers), strict=True):
-            pieces.append(low + (high - low) / (end - start) * (at - start))
-        pieces.append(casadi.SX(numbers[-1]))
-        # A balanced tree: CasADi's own chain adds all pieces up, and rounds as often.
-        while len(pieces) > 1:
-            joined = [
-                casadi.if_else(at < end, one, other)
-                for one, other, end in zip(pieces[::2], pieces[1::2], times[::2], strict=False)
-            ]
-            pieces, times = [*joined, *pieces[len(pieces) & ~1 :]], times[1::2]
-        return pieces[0]
+        rows = self.tables[table.name]
+        return function_of(Interpolation(rows.times, rows.numbers))(self._build(time))
 
     def _scaled(self, term: Term, factor: Ratio, taken: Any) -> Any:
         """Return a number times a term, dividing by what has a negative power: a*(1/b) rounds twice."""

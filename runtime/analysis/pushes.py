@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from apc.analysis.switches import SwitchedKind, SwitchingPart
 from apc.compiler.frozen import dataclass
+from apc.compiler.interpolation import jacobian
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.start import start_values
 
@@ -91,7 +92,7 @@ def push_of(
     everything = casadi.vertcat(opened.output[row], *guards)
     if casadi.depends_on(everything, heard) or casadi.depends_on(everything, t):
         return f"{part.name} depends on what is heard or on time"
-    slopes = casadi.jacobian(everything, moving)
+    slopes = jacobian(everything, moving)
     if casadi.depends_on(slopes, moving):
         return f"{part.name} is not linear where it pushes"
     others = [one.symbol for place, one in enumerate(switched.decisions) if place not in part.decisions]

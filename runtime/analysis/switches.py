@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
-from apc.compiler.plain import straight, symbolic, walk
+from apc.compiler.interpolation import Interpolation, jacobian
+from apc.compiler.plain import LOOK, straight, symbolic, walk
 from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.start import start_values
 
@@ -127,10 +128,19 @@ class _Walk:
             _Step(casadi.SX(value), self.number(("constant", value)), False, False)
             for value in known.constants
         ]
-        found = walk(known, steps, lambda word: functools.partial(self.apply, word))
+        found = walk(
+            known,
+            steps,
+            lambda word: self.look if word == LOOK else functools.partial(self.apply, word),
+        )
         results = [found[place].expression for place in known.results[0]]
         column = casadi.SX(function.sparsity_out(0), casadi.vertcat(*results)) if results else casadi.SX(0, 1)
         return inputs, casadi.densify(column)
+
+    def look(self, table: Interpolation, at: _Step) -> _Step:
+        """Return what a table says: a value like another, that of no decision."""
+        number = self.number((LOOK, table, at.number))
+        return _Step(symbolic(LOOK)(table, at.expression), number, at.moves, at.decided)
 
     def apply(self, word: str, *operands: _Step) -> _Step:
         """Return an operation of the function, or what a decision makes of it."""
@@ -182,7 +192,7 @@ def varying_slopes(site: SiteJacobians) -> tuple[str, ...]:
     found: dict[str, None] = {}
     for one in find_switches(kind).functions:
         *moving, _, t = one.inputs
-        slopes = casadi.jacobian(one.output, casadi.vertcat(*moving))
+        slopes = jacobian(one.output, casadi.vertcat(*moving))
         rows = [row for row in range(slopes.size1()) if casadi.depends_on(slopes[row, :], t)]
         what, p, place = one.where
         if what == "edge" and rows:

@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from apc.compiler.frozen import dataclass
+from apc.compiler.interpolation import Interpolation
 from apc.compiler.plain import straight, walk
 
 # How tightly a text binds, loosest first.
@@ -174,6 +175,28 @@ def _not(a: Text) -> Text:
     return Text(f"not {_truth(a).within(NOT + 1)}", NOT, truth=True)
 
 
+def _interpolated(table: Interpolation, at: Text) -> Text:
+    """Return a table's value as branches, each chosen by so many conditions as halve the rows to one.
+
+    A simulator stops at conditions on time, and so at each row that it reaches.
+    """
+    at, rows = _real(at), (table.times.tolist(), table.numbers.tolist(), table.rates.tolist())
+    starts, lows, rates = rows[0][:1] + rows[0], rows[1][:1] + rows[1], rows[2]
+    since = [_RULES["sub"](at, number(start)) for start in starts]
+    pieces = [
+        _RULES["add"](number(low), _RULES["mul"](number(rate), one)) if rate else number(low)
+        for low, rate, one in zip(lows, rates, since, strict=True)
+    ]
+    ends = rows[0]
+    while len(pieces) > 1:
+        joined = [
+            Text(f"if {at.within(SUM)} < {number(end).within(SUM)} then {one.text} else {other.text}", IF)
+            for one, other, end in zip(pieces[::2], pieces[1::2], ends[::2], strict=False)
+        ]
+        pieces, ends = [*joined, *pieces[len(pieces) & ~1 :]], ends[1::2]
+    return pieces[0]
+
+
 _RULES: dict[str, Callable[..., Text]] = {
     **{word: _call(name) for word, name in _CALLED.items()},
     **{word: _relation(sign) for word, sign in _RELATIONS.items()},
@@ -193,4 +216,5 @@ _RULES: dict[str, Callable[..., Text]] = {
     "or": lambda a, b: Text(f"{_truth(a).within(OR)} or {_truth(b).within(OR)}", OR, truth=True),
     "not": _not,
     "if_else_zero": _branch,
+    "interpolate": _interpolated,
 }

@@ -25,6 +25,7 @@ import numpy as np
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.frozen import dataclass
+from apc.compiler.interpolation import jacobian
 from apc.compiler.language.vectors import whole_and_index
 from apc.frame import schedule as frames
 from apc.frame.devices import Device, find_device
@@ -364,7 +365,7 @@ def _forces(
         return ()
     unit_of = {one.name: one.unit for one in system.parameters}
     x, u, p, t = kind.derivative.sx_in()
-    slopes = casadi.jacobian(kind.derivative(x, u, p, t), u)
+    slopes = jacobian(kind.derivative(x, u, p, t), u)
     varying = casadi.vertcat(x, u, t)
     numbers = start_arguments(site, exact_numbers(kind, vector), Fraction, None)
     found = []

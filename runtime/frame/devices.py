@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import PEERS, CompiledSystem, Kind, Parameter, Ports, Receive
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.frozen import dataclass
+from apc.compiler.interpolation import jacobian
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.overrides import apply, parse_override
@@ -249,7 +250,7 @@ def find_push(
 def _column(kind: Kind, velocity: int, mass: int, at: int, peers: int | None) -> tuple[Any, tuple[int, ...]]:
     """Return what a force at a velocity does to others' rates, from how slopes change with its mass."""
     x, u, p, t = kind.derivative.sx_in()
-    rates = casadi.jacobian(kind.derivative(x, u, p, t), casadi.vertcat(x, u))[:, at]
+    rates = jacobian(kind.derivative(x, u, p, t), casadi.vertcat(x, u))[:, at]
     changes = casadi.jacobian(rates, p[mass])
     moved = tuple(changes.sparsity().row())
     copies = 1 if peers is None else p[peers]
@@ -273,7 +274,7 @@ def _rates(kind: Kind, velocity: int, masses: Sequence[int]) -> tuple[Any, list[
     """Return the same as expressions, and the symbols they are of."""
     x, u, p, t = kind.derivative.sx_in()
     rate = kind.derivative(x, u, p, t)[velocity]
-    slopes = casadi.jacobian(rate, casadi.vertcat(x, u)).T
+    slopes = jacobian(rate, casadi.vertcat(x, u)).T
     return slopes, [casadi.jacobian(slopes, p[mass]) for mass in masses], [x, u, p, t]
 
 

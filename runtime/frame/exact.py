@@ -97,6 +97,8 @@ ROWS: dict[str, Callable[..., Any]] = {
     "and": _of_real(np.logical_and),
     "or": _of_real(np.logical_or),
     "if_else_zero": lambda a, b: np.where(np.real(a), b, 0.0),
+    "interpolate": lambda table, at: table.values(at),
+    "slope": lambda table, at: table.slopes(at),
     "pow": _row_power,
     "constpow": _row_power,
     **{
@@ -194,6 +196,8 @@ def _rules_of(
     """Return the operations of a kind of number that computes as Python's do."""
     power = functools.partial(_power, number)
     found: dict[str, Callable[..., Any]] = {**_SHORT, "pow": power, "constpow": power}
+    found["interpolate"] = lambda table, at: table.value(at, number)
+    found["slope"] = lambda table, at: table.slope(at, number)
     for name, of_float in ROUNDED.items():
         own = functools.partial(_rounded, number, of_float)
         found[name] = own if rounded is None else functools.partial(rounded, name)

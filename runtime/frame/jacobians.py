@@ -2,10 +2,10 @@
 
 Takes: a kind of a `CompiledSystem`; CasADi expressions.
 Gives: `SiteJacobians` (built once a kind), `jacobians`; `Edge`, `edge_name`;
-`structural_pattern`; `guards_of`.
+`structural_pattern`; `guards_of`, `lookups_of`.
 Guarantees: structural patterns come from CasADi, whatever the numbers; a kind that is called affine has the
-same Jacobians everywhere. Every comparison, max, min, abs, sign, floor and ceil that hangs on what moves is
-found, each once.
+same Jacobians everywhere. Every comparison, max, min, abs, sign, floor, ceil and table that hangs on what
+moves is found, each once.
 Does not: evaluate Jacobians (see `linearize`); find when a guard changes sign (see `forcing`, `integrate`).
 
 A receive over an edge function, r = op_j e(x, u, m, s_j), is linear in what the site hears and in its own x,
@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import casadi
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import ClockPartition, Kind, Receive
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
+from apc.compiler.interpolation import Interpolation, function_of, jacobian, table_of
 from apc.frame.site import LinearSite, Matrix, assemble, with_own_parts
 
 # Kinds whose Jacobians are remembered.
@@ -37,7 +38,7 @@ _UNARY = {casadi.OP_FABS, casadi.OP_SIGN}
 _STEPS = {casadi.OP_FLOOR, casadi.OP_CEIL}
 
 
-def guards_of(expression: Any, moving: Any) -> list[Any]:
+def guards_of(expression: Any, moving: Any, *, tables: bool = True) -> list[Any]:
     """Return what changes sign where an expression is not smooth.
 
     Parameters
@@ -46,17 +47,12 @@ def guards_of(expression: Any, moving: Any) -> list[Any]:
         A column, `casadi.SX`.
     moving
         The symbols that change; what hangs on none of them is left out.
+    tables
+        Whether the rows of tables are told, too.
     """
-    found, seen = [], set()
-    work = [expression[i] for i in range(expression.numel())]
-    while work:
-        node = work.pop()
-        known = node.element_hash()
-        if known in seen:
-            continue
-        seen.add(known)
+    found = []
+    for node in _nodes(expression):
         parts = [node.dep(i) for i in range(node.n_dep())]
-        work += parts
         code = node.op()
         if code in _BINARY:
             found.append(parts[0] - parts[1])
@@ -64,8 +60,34 @@ def guards_of(expression: Any, moving: Any) -> list[Any]:
             found.append(parts[0])
         elif code in _STEPS:
             # Changes sign at each whole number, and again half-way, where nothing is split in vain.
-            found.append(casadi.sin(np.pi * parts[0]))
+            found.append(_whole(parts[0]))
+    if tables:
+        found += [_whole(function_of(table.positions())(at)) for table, at in lookups_of(expression)]
     return [one for one in found if casadi.depends_on(one, moving)]
+
+
+def lookups_of(expression: Any) -> list[tuple[Interpolation, Any]]:
+    """Return each table that is looked up in an expression, with where in it, `casadi.SX`."""
+    calls = [node for node in _nodes(expression) if node.op() == casadi.OP_CALL]
+    return [(table_of(one.which_function()), one.dep(0)) for one in calls]
+
+
+def _whole(expression: Any) -> Any:
+    """Return what changes sign where an expression is a whole number."""
+    return casadi.sin(np.pi * expression)
+
+
+def _nodes(expression: Any) -> Iterator[Any]:
+    """Yield all that an expression is made of, each once."""
+    seen = set()
+    work = [expression[i] for i in range(expression.numel())]
+    while work:
+        node = work.pop()
+        known = node.element_hash()
+        if known not in seen:
+            seen.add(known)
+            work += [node.dep(i) for i in range(node.n_dep())]
+            yield node
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,15 +155,15 @@ def jacobians(kind: Kind) -> SiteJacobians:
 
     derivative = kind.derivative(x, u, p, t)
     values = [derivative]
-    blocks = [casadi.jacobian(derivative, x), casadi.jacobian(derivative, u)]
+    blocks = [jacobian(derivative, x), jacobian(derivative, u)]
     for partition, m, r in zip(kind.clocks, memories, heard, strict=True):
         outputs = partition.tick(x, u, m, r, p, t)
         values.append(outputs)
-        blocks += [casadi.jacobian(outputs, of) for of in (x, u, m, r)]
+        blocks += [jacobian(outputs, of) for of in (x, u, m, r)]
     for sending in kind.sends:
         sent = sending.send(x, u, p, t)
         values.append(sent)
-        blocks += [casadi.jacobian(sent, of) for of in (x, u)]
+        blocks += [jacobian(sent, of) for of in (x, u)]
 
     m_all, r_all = casadi.vertcat(*memories), casadi.vertcat(*heard)
     # Of many states most entries are zero by structure: they are no operations and no outputs.
@@ -239,7 +261,7 @@ def _edge(kind: Kind, partition: ClockPartition, receive: Receive) -> Edge:
     s = symbol("s", receive.edge.numel_in(3) if receive.edge is not None else channels)
     p, t = symbol("p", len(kind.parameters)), symbol("t")
     value = s[receive.channel] if receive.edge is None else receive.edge(x, u, m, s, p, t)
-    slopes = casadi.densify(casadi.jacobian(value, casadi.vertcat(x, u, m, s)).T)
+    slopes = casadi.densify(jacobian(value, casadi.vertcat(x, u, m, s)).T)
     smooth = receive.operator in ("sum", "mean") and not guards_of(value, casadi.vertcat(x, u, m, s))
     moves = _depends(slopes, casadi.vertcat(x, u, m, s, t))
     function = casadi.Function("edge", [x, u, m, s, p, t], [casadi.vertcat(casadi.densify(value), slopes)])
@@ -262,7 +284,7 @@ def _listening(
         function = edges[p, place].function
         symbols = function.sx_in()
         moving = casadi.vertcat(*symbols[:4])
-        depends = structural_pattern(casadi.jacobian(function(*symbols)[0], moving))[0]
+        depends = structural_pattern(jacobian(function(*symbols)[0], moving))[0]
         own.append(depends[:inside])
         channels.append(tuple(np.flatnonzero(depends[inside:]).tolist()))
     return own, tuple(channels)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.frozen import dataclass
+from apc.compiler.interpolation import jacobian
 from apc.compiler.language.vectors import entry, whole_and_index
 from apc.frame.jacobians import guards_of
 from apc.optional import need
@@ -216,7 +217,7 @@ def _probed(kind: Kind, vector: Sequence[float]) -> list[tuple[Floats, Floats, F
     found = []
     points = np.random.default_rng(1).uniform(-1, 1, (PROBES, len(kind.states)))
     for x, p, column in deciding(kind):
-        at = casadi.Function("at", [x, p], [column, casadi.densify(casadi.jacobian(column, x))])
+        at = casadi.Function("at", [x, p], [column, casadi.densify(jacobian(column, x))])
         numbers = [[np.asarray(one, dtype=np.float64) for one in at(point, vector)] for point in points]
         for row in range(column.numel()):
             values = np.array([value[row, 0] for value, _ in numbers])

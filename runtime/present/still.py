@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.frozen import dataclass
+from apc.compiler.interpolation import jacobian
 from apc.compiler.timings import part
 from apc.frame.jacobians import jacobians
 from apc.frame.parameters import resolve
@@ -107,7 +108,7 @@ def _distances(kind: Kind, vector: Sequence[float]) -> list[tuple[Floats, float]
     """Return the slopes (n_x,) and the value at the origin of what decides, where that is linear."""
     found = []
     for x, p, column in deciding(kind):
-        slopes = casadi.jacobian(column, x)
+        slopes = jacobian(column, x)
         at = casadi.Function("at", [x, p], [casadi.densify(slopes), column])
         numbers = [np.asarray(one, dtype=np.float64) for one in at(np.zeros(x.shape), vector)]
         found += [

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.frozen import dataclass
+from apc.compiler.interpolation import jacobian
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.start import start_values
 from apc.simulation.integrate import integrated
@@ -190,7 +191,7 @@ def integrals(rate: Any) -> tuple[tuple[int, int], ...]:
     type_: Any = casadi.SX if rate.is_a("SXFunction") else casadi.MX
     arguments = [type_.sym(f"a{i}", rate.numel_in(i)) for i in range(4)]
     speed = rate(*arguments)
-    blocks = [casadi.jacobian(speed, one) for one in arguments]
+    blocks = [jacobian(speed, one) for one in arguments]
     rows, columns = blocks[0].sparsity().get_triplet()
     others = {row for block in blocks[1:] for row in block.sparsity().get_triplet()[0]}
     found = {i: j for i, j in zip(rows, columns, strict=True) if rows.count(i) == 1 and i not in others}

@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
+from apc.compiler.interpolation import Interpolation
 from apc.frame.exact import ROWS, evaluate_exact
-from apc.frame.jacobians import guards_of
+from apc.frame.jacobians import guards_of, lookups_of
 from apc.simulation.propagate import Rates
 from apc.simulation.quadrature import AGREE, Kernel, Panels, integrate, magnitude, panels, whole
 
@@ -56,8 +57,10 @@ class Forcing:
 
     `force(p, t)` is their rows of g, `drift(p, t)` those of t dg/dt: a rounding of t changes g by so many.
     Not smooth is g at sign changes of `switches(p, t)`; `affine` says that all of them are linear in time.
-    Where g is straight between these, `line(p, t)` tells what `switches` and `force` are at t and then how
-    fast each changes, else it is None.
+    Nor is it where a clock of `clocks(p, t)` passes a row of its table in `tables`: these clocks go evenly,
+    and how fast stands below them.
+    Where g is straight between all these, `line(p, t)` tells what `switches` and `force` are at t and then
+    how fast each changes, else it is None.
     """
 
     pushed: tuple[int, ...]
@@ -66,6 +69,8 @@ class Forcing:
     switches: Any  # casadi.Function
     affine: bool
     line: Any | None = None  # casadi.Function
+    tables: tuple[Interpolation, ...] = ()
+    clocks: Any | None = None  # casadi.Function
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,14 +94,6 @@ class Lines:
         """Return what a rounding of the instants changes it by so many times."""
         return np.asarray(self.slopes[:, np.searchsorted(self.breaks, instants, side="right")] * instants)
 
-    def within(self, starts: Floats, length: float) -> tuple[Integers, Floats]:
-        """Return the intervals (k,) in which it breaks, and how long after their beginning."""
-        first = np.searchsorted(self.breaks, starts, side="right")
-        many = np.maximum(np.searchsorted(self.breaks, starts + length) - first, 0)
-        rows = np.repeat(np.arange(len(starts)), many)
-        place = np.arange(len(rows)) - np.repeat(np.cumsum(many) - many, many) + first[rows]
-        return rows, self.breaks[place] - starts[rows]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteForcing:
@@ -110,6 +107,11 @@ class SiteForcing:
     def lines(self) -> Lines | None:
         """The forces in pieces, None where they are not straight between switches."""
         return _lines(self.forcing, self.parameters.tobytes()) if self.forcing.line else None
+
+    @property
+    def rows(self) -> Floats:
+        """The instants, in order, at which tables have their rows."""
+        return _rows(self.forcing, self.parameters.tobytes())
 
     def force(self, instants: Floats) -> Floats:
         """Return the forces at instants, as `at_instants`."""
@@ -128,9 +130,17 @@ def forcing_of(rates: Rates) -> Forcing:
     p, t = type_.sym("p", rates.rate.numel_in(0)), type_.sym("t")
     g = rates.rate(p, t)
     pushed, found, affine = tuple(range(g.numel())), [], True
+    tables: tuple[Interpolation, ...] = ()
+    clocks = None
     if type_ is casadi.SX:  # a nonlinear loop has no switches but those halving finds
         pushed = tuple(row for row in pushed if not g[row].is_zero())
-        found = guards_of(g, t)
+        lookups = lookups_of(g)
+        read = casadi.vertcat(*(at for _, at in lookups))
+        pace = casadi.jacobian(read, t)
+        if lookups and not casadi.depends_on(pace, t):
+            tables = tuple(table for table, _ in lookups)
+            clocks = casadi.Function("clocks", [p, t], [casadi.densify(casadi.vertcat(read, pace))])
+        found = guards_of(g, t, tables=not tables)
     g = g[list(pushed)]
     if found:
         slopes = casadi.jacobian(casadi.vertcat(*found), t)
@@ -147,6 +157,8 @@ def forcing_of(rates: Rates) -> Forcing:
         switches=casadi.Function("switches", [p, t], [casadi.densify(column)]),
         affine=affine,
         line=line,
+        tables=tables,
+        clocks=clocks,
     )
 
 
@@ -161,7 +173,8 @@ def _moves(expression: Any, time: Any) -> bool:
         seen.add(node.element_hash())
         if node.element_hash() == time.element_hash():
             return True
-        work += [node.dep(place) for place in range(node.n_dep())]
+        row = node.op() == casadi.OP_CALL  # of a table, the first
+        work += [node.dep(place) for place in range(row, node.n_dep())]
     return False
 
 
@@ -174,11 +187,26 @@ def _lines(forcing: Forcing, numbers: bytes) -> Lines:
     changing = start[switches + pushed : 2 * switches + pushed]
     with np.errstate(all="ignore"):
         breaks = -start[:switches] / changing
-    breaks = np.array(sorted(set(breaks[np.isfinite(breaks)].tolist())))
+    breaks = np.union1d(breaks[np.isfinite(breaks)], _rows(forcing, numbers))
     ends = np.concatenate([breaks[:1] - 1, breaks, breaks[-1:] + 1]) if len(breaks) else np.zeros(2)
     at = (ends[1:] + ends[:-1]) / 2
     found = at_instants(forcing.line, parameters, at)
     return Lines(breaks, at, found[switches : switches + pushed], found[2 * switches + pushed :])
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _rows(forcing: Forcing, numbers: bytes) -> Floats:
+    """Return the instants at which tables have their rows, of a site of such parameters."""
+    if not forcing.tables:
+        return np.empty(0)
+    told = at_instants(forcing.clocks, np.frombuffer(numbers), np.zeros(1))[:, 0]
+    begun, pace = np.split(told, 2)
+    with np.errstate(all="ignore"):
+        found = [
+            (table.times - one) / fast for table, one, fast in zip(forcing.tables, begun, pace, strict=True)
+        ]
+    rows = np.unique(np.concatenate(found))
+    return np.asarray(rows[np.isfinite(rows)])
 
 
 def at_instants(function: Any, parameters: Floats, instants: Floats) -> Floats:
@@ -312,21 +340,35 @@ def _between(again: Integers, rows: Integers, at: Floats, duration: float) -> tu
 
 def _switched(site: SiteForcing, kernel: Kernel, starts: Floats) -> tuple[Integers, Floats]:
     """Return the intervals within which something switches, and how long after their beginning."""
-    forcing, length = site.forcing, float(kernel.duration)
+    length = float(kernel.duration)
+    row, at = _within(site.lines.breaks if site.lines else site.rows, starts, length)
+    if not site.lines:
+        other, looked = _looked(site, length, starts)
+        row, at = np.append(row, other), np.append(at, looked)
+    inside = (at > PLACED * length) & (at < length)
+    return row[inside], at[inside]
+
+
+def _within(breaks: Floats, starts: Floats, length: float) -> tuple[Integers, Floats]:
+    """Return the intervals in which any of some instants in order lie, and how long after their beginning."""
+    first = np.searchsorted(breaks, starts, side="right")
+    many = np.maximum(np.searchsorted(breaks, starts + length) - first, 0)
+    rows = np.repeat(np.arange(len(starts)), many)
+    place = np.arange(len(rows)) - np.repeat(np.cumsum(many) - many, many) + first[rows]
+    return rows, breaks[place] - starts[rows]
+
+
+def _looked(site: SiteForcing, length: float, starts: Floats) -> tuple[Integers, Floats]:
+    """Return the intervals in which a switch changes sign between two looks, and where."""
+    forcing = site.forcing
     if not forcing.switches.numel_out(0):
         return np.empty(0, np.int64), np.empty(0)
-    if site.lines:
-        row, at = site.lines.within(starts, length)
-        inside = (at > PLACED * length) & (at < length)
-        return row[inside], at[inside]
     looks = np.linspace(0.0, length, 2 if forcing.affine else LOOKS)
     values = at_instants(forcing.switches, site.parameters, starts[:, None] + looks)
     switch, row, gap = np.nonzero(np.sign(values[:, :, 1:]) != np.sign(values[:, :, :-1]))
     low, high = looks[gap], looks[gap + 1]
     ends = values[switch, row, gap], values[switch, row, gap + 1]
-    at = _placed(site, starts[row], switch, low, high, ends, PLACED * length)
-    inside = (at > PLACED * length) & (at < length)
-    return row[inside], at[inside]
+    return row, _placed(site, starts[row], switch, low, high, ends, PLACED * length)
 
 
 def _placed(

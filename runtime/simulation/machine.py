@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.frozen import dataclass
+from apc.compiler.interpolation import table_of
 from apc.compiler.plain import PlainFunction, straight
 from apc.network.channel import luck_key
 from apc.network.timetable import START, Luck
@@ -33,7 +34,8 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-# More operations than this in one kernel: optimizing straight code costs more than linear time.
+# More operations and rows of tables than this in one kernel: to optimize straight code takes more than linear
+# time.
 MOST_OPERATIONS = 20_000
 MANY = 32  # peers of a member from which on their loop is put into lanes
 KINDS = ("total", "complete", "weighed", "deliver", "on ways", "copy", "copy ways", "look", "move", "work")
@@ -100,6 +102,20 @@ EXPRESSIONS = {
     "and": "{0} && {1}",
     "or": "{0} || {1}",
     "if_else_zero": "{0} ? {1} : 0.0",
+}
+# In the table t with its last row: the row before `at`, by halving, and what is made of it.
+SOUGHT = """\
+int low{k} = 0, high{k} = {last};
+while (high{k} - low{k} > 1) {{
+  const int middle = low{k} + (high{k} - low{k}) / 2;
+  if ({at} < times{t}[middle]) high{k} = middle; else low{k} = middle;
+}}
+const double rate{k} = (numbers{t}[high{k}] - numbers{t}[low{k}]) / (times{t}[high{k}] - times{t}[low{k}]);
+"""
+LOOKED_UP = {
+    "interpolate": "const double {v} = {at} < times{t}[0] ? numbers{t}[0] : {at} >= times{t}[{last}] ? "
+    "numbers{t}[{last}] : numbers{t}[low{k}] + rate{k} * ({at} - times{t}[low{k}]);",
+    "slope": "const double {v} = {at} < times{t}[0] || {at} >= times{t}[{last}] ? 0.0 : rate{k};",
 }
 
 
@@ -237,8 +253,20 @@ def straight_lines(function: PlainFunction, inputs: Sequence[str]) -> tuple[list
         if place in used:
             lines.append(f"const double v{place} = {text};")
     names += [_number(one) for one in function.constants]
+    for table in function.tables:
+        names.append(f"{len(names)}")
+        for what, column in (("times", table.times), ("numbers", table.numbers)):
+            listed = ", ".join(map(_number, column.tolist()))
+            lines.append(f"static const double {what}{names[-1]}[{len(column)}] = {{{listed}}};")
     for word, *places in function.operations:
         name = f"v{len(names)}"
+        if word in LOOKED_UP:
+            table, at = (names[place] for place in places)
+            rows = len(function.tables[places[0] - len(inputs) - len(function.constants)].times)
+            text = SOUGHT + LOOKED_UP[word]
+            lines += text.format(v=name, k=len(names), at=at, t=table, last=rows - 1).splitlines()
+            names.append(name)
+            continue
         form = EXPRESSIONS.get(word, f"{word}({', '.join(f'{{{k}}}' for k in range(len(places)))})")
         lines.append(f"const double {name} = {form.format(*(names[place] for place in places))};")
         names.append(name)
@@ -285,7 +313,10 @@ def library_of(population: Population, runs: int = 1) -> Library | None:
 
 
 def _is_worth_it(function: Any) -> bool:
-    return bool(function.is_a("SXFunction") and function.n_instructions() <= MOST_OPERATIONS)
+    if not function.is_a("SXFunction"):
+        return False
+    rows = sum(len(table_of(one).times) for one in function.find_functions(0))
+    return bool(function.n_instructions() + rows <= MOST_OPERATIONS)
 
 
 class Machine:

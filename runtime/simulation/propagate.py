@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.frozen import dataclass
+from apc.compiler.interpolation import jacobian
 from apc.frame.discretize import UNIT, discretize, exponential_rows
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import guards_of, structural_pattern
@@ -98,7 +99,7 @@ def rates(kind: Kind, moved: Sequence[int] = ()) -> Rates:
     curved = sorted(set(_curved(speed, moving, t)) & set(rest))
     if curved:
         raise _nonlinear(kind, curved, speed, moving, p)
-    slopes = casadi.jacobian(speed, moving)
+    slopes = jacobian(speed, moving)
     type_ = type(moving)
     at_rest = kind.derivative(type_.zeros(n_x), type_.zeros(len(kind.holds)), p, t)
     still = type_.zeros(n_x, 1)
@@ -246,7 +247,7 @@ def _symbols(kind: Kind) -> tuple[Any, Any, Any, Any]:
 
 def _curved(speed: Any, moving: Any, t: Any) -> list[int]:
     """Return the rates that are not linear in what moves: their slopes change, or they jump."""
-    slopes = casadi.jacobian(speed, moving)
+    slopes = jacobian(speed, moving)
     varies = casadi.vertcat(moving, t)
     return [
         row

@@ -1,0 +1,127 @@
+"""Tables over time as CasADi functions, and back; a table's value and slope of any kind of number.
+
+Takes: the rows of a table. Gives: `Interpolation`; `function_of`, `table_of`, `TABLE`;
+`jacobian`.
+Guarantees: straight lines between rows, the first and the last number before and after; a row is found by
+halving, and what a function holds of a table is as long as the table. A derivative of any order is the slope
+of the line times what it is a derivative by.
+Does not: know where a table came from (see `recordings`), or when it is read.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Callable
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.frozen import dataclass
+
+Floats = NDArray[np.float64]
+
+TABLE = "table"  # what the function of a table is called; CasADi calls its derivatives fwd1_table and so on
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Interpolation:
+    """Straight lines between rows: `times` (n,), rising, and `numbers` (n,) at them, n two or more."""
+
+    times: Floats
+    numbers: Floats
+
+    @property
+    def rates(self) -> Floats:
+        """The slopes of its lines, 0 before the first row and after the last (n + 1,)."""
+        return np.pad(np.diff(self.numbers) / np.diff(self.times), 1)
+
+    @property
+    def is_consistent(self) -> bool:
+        """Whether its rows are finite numbers at rising times."""
+        rows = np.concatenate([self.times, self.numbers])
+        rising = len(self.times) > 1 and bool((np.diff(self.times) > 0).all())
+        return rising and len(self.times) == len(self.numbers) and bool(np.isfinite(rows).all())
+
+    def value(self, at: Any, number: Callable[[float], Any]) -> Any:
+        """Return what the table says at a number of some kind, which a float is turned into by `number`."""
+        place = self._place(at)
+        if place in (0, len(self.times)):
+            return number(float(self.numbers[0 if place == 0 else -1]))
+        start, low = number(float(self.times[place - 1])), number(float(self.numbers[place - 1]))
+        return low + self.slope(at, number) * (at - start)
+
+    def slope(self, at: Any, number: Callable[[float], Any]) -> Any:
+        """Return how fast that changes with it."""
+        place = self._place(at)
+        if place in (0, len(self.times)):
+            return number(0.0)
+        start, end = (number(float(one)) for one in self.times[place - 1 : place + 1])
+        low, high = (number(float(one)) for one in self.numbers[place - 1 : place + 1])
+        return (high - low) / (end - start)
+
+    def values(self, at: Any) -> Any:
+        """Return what the table says at floats, or at complex steps from them."""
+        real = np.real(at)
+        place = self._places(real)
+        last = np.maximum(place - 1, 0)
+        found = self.numbers[last] + self.rates[place] * (real - self.times[last])
+        return found + 1j * self.rates[place] * np.imag(at) if np.iscomplexobj(at) else found
+
+    def slopes(self, at: Any) -> Any:
+        """Return how fast that changes with them."""
+        return self.rates[self._places(np.real(at))]
+
+    def _place(self, at: Any) -> int:
+        return bisect.bisect_right(self.times, float(at))
+
+    def _places(self, at: Any) -> Any:
+        return np.searchsorted(self.times, at, side="right")
+
+    def positions(self) -> Interpolation:
+        """Return the table that says how many rows have passed: whole at each row, and nowhere else."""
+        gaps = np.diff(self.times)[[0, -1]]
+        times = np.concatenate([self.times[:1] - gaps[:1], self.times, self.times[-1:] + gaps[1:]])
+        count = len(self.times)
+        return Interpolation(times, np.concatenate([[-0.5], np.arange(count), [count - 0.5]]))
+
+
+def function_of(table: Interpolation) -> Any:
+    """Return a table as the CasADi function of one number, which stays a call wherever it is used."""
+    at = casadi.MX.sym("at")
+    rows = casadi.MX(casadi.DM(np.array([table.times, table.numbers])))
+    place = casadi.low(casadi.DM(table.times), at, {"lookup_mode": "binary"})
+    start, end, low, high = (rows[i, place + k] for i in (0, 1) for k in (0, 1))
+    within = casadi.fmin(casadi.fmax(at, table.times[0]), table.times[-1])
+    value = low + (high - low) / (end - start) * (within - start)
+    return casadi.Function(TABLE, [at], [value], {"never_inline": True})
+
+
+def table_of(function: Any) -> Interpolation:
+    """Return the table that a function of CasADi's looks up: one of `function_of`, or a derivative of it."""
+    work = [function]
+    while work:
+        one = work.pop()
+        for k in range(one.n_instructions()):
+            code = one.instruction_id(k)
+            if code == casadi.OP_CONST:
+                constant = one.instruction_MX(k).to_DM()
+                if constant.size1() == 2:
+                    times, numbers = np.asarray(constant)
+                    return Interpolation(times, numbers)
+            elif code == casadi.OP_CALL:
+                work.append(one.instruction_MX(k).which_function())
+    raise ValueError(f"{function.name()} is no table of ours")
+
+
+def jacobian(values: Any, symbols: Any) -> Any:
+    """Return the Jacobian of a column over symbols, where no table that hangs on none of them is left.
+
+    From the inputs to the values CasADi asks every call for its derivative, by 0 too, and does not know that
+    this is 0; from the values to the inputs it asks those alone that it needs.
+    """
+    tabled = isinstance(values, casadi.SX) and casadi.Function(
+        "every", casadi.symvar(values), [values]
+    ).find_functions(0)
+    return casadi.jacobian(values, symbols, {"helper_options": {"ad_weight": 1.0}} if tabled else {})
