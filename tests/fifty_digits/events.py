@@ -29,6 +29,7 @@ import flint
 import numpy as np
 
 from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.interpolation import jacobian
 from apc.eigen.balls import rational_ball
 from apc.frame.exact import evaluate_exact, is_rational
 from apc.frame.jacobians import guards_of
@@ -121,7 +122,7 @@ def refusal(system: CompiledSystem, *, in_time: bool) -> str:
 def _is_affine(function: Any, arguments: slice = slice(-2)) -> bool:
     """Say whether a function's slopes change with neither the time nor these arguments."""
     symbols = function.sx_in()
-    slopes = casadi.jacobian(function(*symbols), casadi.vertcat(*symbols[:-2]))
+    slopes = jacobian(function(*symbols), casadi.vertcat(*symbols[:-2]))
     return not (slopes.nnz() and casadi.depends_on(slopes, casadi.vertcat(*symbols[arguments], symbols[-1])))
 
 
@@ -130,7 +131,7 @@ def _has_exact_slopes(function: Any) -> bool:
     symbols = function.sx_in()
     if not function.is_a("SXFunction"):
         return False
-    slopes = casadi.jacobian(function(*symbols), casadi.vertcat(*symbols[:-2]))
+    slopes = jacobian(function(*symbols), casadi.vertcat(*symbols[:-2]))
     return is_rational(casadi.Function("slopes", symbols, [slopes]))
 
 
@@ -180,7 +181,7 @@ def _slopes(
 ) -> Callable[..., list[Number]]:
     """Return the product with a function's slopes at a point."""
     symbols = function.sx_in()
-    slopes = casadi.densify(casadi.jacobian(function(*symbols), casadi.vertcat(*symbols[:-2])))
+    slopes = casadi.densify(jacobian(function(*symbols), casadi.vertcat(*symbols[:-2])))
     flat = evaluate_exact(
         casadi.Function("slopes", symbols, [slopes]), [*start, list(parameters), [Fraction(0)]]
     )[0]
