@@ -269,4 +269,5 @@ def test_ordinary_scenes_keep_all_their_margins_in_passing(path: Path) -> None:
     pieces = 4 * effort.of_delay(PIECES, late=False)
     much = len(free) * effort.of_parameter() + pieces > 2 * MOST_IN_PASSING
     large = ("non-commensurate", "long-delay", "very-long-delay", "directed-chain", "chain-of-masses")
-    assert not much or path.stem in large
+    # The last is unstable as it is and has no margins.
+    assert not much or path.stem in (*large, "two-users-passivity")
