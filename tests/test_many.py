@@ -47,7 +47,7 @@ def alone(system: CompiledSystem, found: Analyses, names: list[Free], point: int
     assert found.rigid_modes[point] == one.rigid_modes
     off = abs(found.spectral_radius[point] - one.spectral_radius)
     assert off <= found.spectral_radius_error[point] + one.spectral_radius_error
-    # A point whose bound is more than four times the others' has an analysis of its own.
+    # Points share the largest of what their frames round, so that a bound may be some times an own one's.
     assert found.spectral_radius_error[point] <= 4 * one.spectral_radius_error + 1e-15
     assert np.isnan(found.frequency_hz[point]) == np.isnan(one.modes[0].frequency_hz)
     if not np.isnan(one.modes[0].frequency_hz):
