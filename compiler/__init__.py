@@ -1,6 +1,6 @@
 """Text to CasADi, a folder a stage; a module imports only what stands before it.
 
-frozen errors words digits  what all are written in; timings: how long it takes
+errors words digits  what all are written in; timings: how long it takes
 files                       what is read and written, whoever named it
 multiples                   common multiples and divisors of exact times
 weights                     exact sums of the decimals by which peers weigh one another

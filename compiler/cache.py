@@ -30,11 +30,11 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
 
 from apc.compiler.files import RefusedError, files_below, read_file
-from apc.compiler.frozen import dataclass
 from apc.compiler.seal import is_sealed
 
 FORMAT = 12  # of NAME.apc

@@ -17,13 +17,12 @@ Every function of a kind takes some of these vectors, in this order:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from apc.compiler.frozen import dataclass
 
 # The units of positions: a length; an angle, or what stands for one where a body turns in space.
 LENGTH, ANGLES = "m", ("rad", "1")

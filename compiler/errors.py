@@ -11,9 +11,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterable
-from dataclasses import replace
-
-from apc.compiler.frozen import dataclass
+from dataclasses import dataclass, replace
 
 SHOWN = 75  # characters of a source line, so that it fits a terminal of 80 with its indent
 

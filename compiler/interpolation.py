@@ -12,13 +12,12 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import casadi
 import numpy as np
 from numpy.typing import NDArray
-
-from apc.compiler.frozen import dataclass
 
 Floats = NDArray[np.float64]
 

@@ -25,13 +25,13 @@ import math
 import operator
 import re
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import casadi
 import numpy as np
 
-from apc.compiler.frozen import dataclass
 from apc.compiler.interpolation import TABLE, Interpolation, function_of, table_of
 
 _UNARY = {

@@ -13,12 +13,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
-
-from apc.compiler.frozen import dataclass
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

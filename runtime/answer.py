@@ -9,7 +9,7 @@ Does not: compute any of it itself.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
@@ -18,7 +18,6 @@ from apc.analysis.conventions import Conventions, conventions
 from apc.analysis.methods import PAPER
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.eigen.spectrum import UNSTABLE
 from apc.result import Result
 from apc.vary.margins import NOT_STABLE, Margins

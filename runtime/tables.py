@@ -20,6 +20,7 @@ import json
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, Literal
@@ -29,7 +30,6 @@ from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import check_target, write_file
-from apc.compiler.frozen import dataclass
 from apc.distribution import install_line
 from apc.optional import need
 from apc.suffixes import check_suffix

@@ -27,7 +27,7 @@ from tests.topologies import AVERAGE, ROOT
 HOUSE = (
     (
         "apc.compiler",
-        "frozen errors digits timings files words multiples weights interpolation plain compiled crowd "
+        "errors digits timings files words multiples weights interpolation plain compiled crowd "
         "formula seal cache",
     ),
     ("apc.compiler.source", "nodes yaml_faults reading compose source"),
@@ -318,12 +318,6 @@ def test_no_module_is_imported_under_two_names(tmp_path: Path) -> None:
     code += "assert len(files) == len(set(files))\n"
     code += "assert not [n for n in ('apc.runtime', 'apc.apc') if importlib.util.find_spec(n)]"
     python(code, tmp_path)
-
-
-def test_classes_are_cheap_to_make() -> None:
-    for name, path in modules().items():
-        own = re.search(r"^from dataclasses import .*\bdataclass\b", path.read_text(encoding="utf-8"), re.M)
-        assert not own, f"{name}: dataclass comes from apc.compiler.frozen"
 
 
 class Known(dict[str, Any]):

@@ -8,10 +8,10 @@ Does not: read or check text (see `library`).
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from fractions import Fraction
 
 from apc.compiler.errors import Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import FUNCTIONS, KEYWORDS, Compare, Equation, Expr, Name, walk
 from apc.compiler.language.units import Unit

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from apc.compiler.components.component import Component, Entry, Number, Option, Reference
 from apc.compiler.errors import ApcError, Mistakes, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.grammar import parse_expression

@@ -19,7 +19,7 @@ first packet arrives a receiver holds the sender's start values; before the firs
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from apc.compiler.compiled import count_of
@@ -35,7 +35,6 @@ from apc.compiler.equations.flatten import (
 )
 from apc.compiler.equations.reductions import Of, affine_in_others, hears_others, of_others
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.expression import (
     Binary,
     Call,

@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from apc.compiler.equations.solution import Assignment
 from apc.compiler.equations.symbolic import LinearForm
 from apc.compiler.equations.terms import ZERO, Number, Symbol, Term, add, symbol
 from apc.compiler.equations.zero_test import Vanishing, ZeroTest
-from apc.compiler.frozen import dataclass
 
 # An entry with more nodes than this gets a name of its own: substituted into one another, the entries of a
 # chain of a thousand equations would grow without end.

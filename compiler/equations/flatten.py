@@ -9,7 +9,7 @@ Does not: put a number in the place of a parameter, or look at clocks beyond nam
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import count
 
@@ -18,7 +18,6 @@ from apc.compiler.components.component import Number as NumberParameter
 from apc.compiler.components.component_check import ComponentNames
 from apc.compiler.equations.connections import connection_equations
 from apc.compiler.errors import Mistakes, Place, place_in
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import (
     INTERVAL,

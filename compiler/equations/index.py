@@ -18,6 +18,7 @@ start value of a chosen state counts; the variables that depend on it follow, wh
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence, Set
+from dataclasses import dataclass
 
 from apc.compiler.equations.derivatives import TIME, Derivative, Derivatives
 from apc.compiler.equations.matching import match_columns
@@ -26,7 +27,6 @@ from apc.compiler.equations.symbolic import NoDerivativeError, linear_form
 from apc.compiler.equations.terms import ZERO, Number, Symbol, Term
 from apc.compiler.equations.zero_test import NOTHING_VANISHES, Vanishing, ZeroTest
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.frozen import dataclass
 
 # More derivatives than this of one variable: no mechanical model needs them (a constraint on a position
 # needs two), so the equations do not end.

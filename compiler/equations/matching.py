@@ -13,8 +13,7 @@ of Modelica compilers (Cellier and Kofman, Continuous System Simulation, ch. 7).
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-
-from apc.compiler.frozen import dataclass
+from dataclasses import dataclass
 
 # ---- matching ----
 

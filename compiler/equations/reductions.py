@@ -11,11 +11,10 @@ such a form is that of each by itself, so that N peers cost N, not N².
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from apc.compiler.components.component import OTHERS
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.expression import (
     Binary,
     Call,

@@ -8,12 +8,12 @@ Does not: solve anything.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.matching import leftovers
 from apc.compiler.equations.terms import Term
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.words import counted
 
 SCENE = Place("topology")

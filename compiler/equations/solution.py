@@ -7,8 +7,9 @@ Does not: solve anything (see `blocks`).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from apc.compiler.equations.terms import Symbol, Term, symbol
-from apc.compiler.frozen import dataclass
 
 Assignment = tuple[str, Term]  # an unknown, and the expression that gives it
 

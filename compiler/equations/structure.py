@@ -13,6 +13,7 @@ variables with a start value the one named first; those of the others are not lo
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence, Set
+from dataclasses import dataclass
 from fractions import Fraction
 
 from apc.compiler.equations.aliases import Aliases
@@ -34,7 +35,6 @@ from apc.compiler.equations.symbolic import NoDerivativeError, is_no_number, no_
 from apc.compiler.equations.terms import ZERO, Symbol, Term, symbol
 from apc.compiler.equations.zero_test import NOTHING_VANISHES, Given, Vanishing
 from apc.compiler.errors import Mistakes
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.expression import Expr, Name, names
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.scene.scene import Scene

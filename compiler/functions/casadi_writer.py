@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -29,7 +30,6 @@ from apc.compiler.equations.terms import (
     symbol,
     terms_of,
 )
-from apc.compiler.frozen import dataclass
 from apc.compiler.interpolation import Interpolation, function_of
 from apc.compiler.language.expression import SMOOTH
 from apc.compiler.language.recordings import TimeTable

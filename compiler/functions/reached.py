@@ -9,6 +9,7 @@ Does not: write functions (see `functions`).
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 
 from apc.compiler.components.component import OTHERS
 from apc.compiler.equations.clocks import HEARD_AGE, HoldCrossing, PreviousCrossing, ReceiveCrossing
@@ -16,7 +17,6 @@ from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.structure import SortedKind, SortedSend
 from apc.compiler.equations.symbolic import derivative_symbol, no_derivative, to_term
 from apc.compiler.equations.terms import Symbol, Term, symbol
-from apc.compiler.frozen import dataclass
 from apc.compiler.functions.casadi_writer import Definition
 
 

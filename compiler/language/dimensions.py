@@ -7,10 +7,8 @@ Does not: know units, which have a scale as well (see `units`), or their text (s
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 from fractions import Fraction
-
-from apc.compiler.frozen import dataclass
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ Does not: know units, or values that change with time or with the peers.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import reduce
 from typing import Any, NoReturn
@@ -17,7 +18,6 @@ from typing import Any, NoReturn
 from apc.compiler.compiled import Formula
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.formula import FaultError, exactly
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.expression import (
     SMOOTH,
     Binary,

@@ -10,13 +10,12 @@ Does not: read text (see `grammar`), or know what a name means, or its unit.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from fractions import Fraction
 from typing import TypeVar
 
 from apc.compiler.errors import Place
-from apc.compiler.frozen import dataclass
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

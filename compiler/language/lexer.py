@@ -11,10 +11,10 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import NoReturn
 
 from apc.compiler.errors import ApcError, Mistake, Place, place_in
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.expression import (
     KEYWORDS,
 )

@@ -17,12 +17,11 @@ import json
 import math
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from apc.compiler.frozen import dataclass
 
 HALVED = (
     "round trips were recorded: half of each stands for one way, as if both took as long, and a packet "

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.probes import read_probe
 from apc.compiler.language.tables import MOST_MISTAKES, Headings, open_table, read_bytes, read_table

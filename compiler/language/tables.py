@@ -18,7 +18,7 @@ import zlib
 from array import array
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.files import RefusedError, read_file
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.units import NO_UNIT, Unit, parse_unit
 from apc.compiler.source.reading import brief
 

@@ -14,12 +14,11 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.expression import PI
 from apc.compiler.language.unit_grammar import NAME, FaultError, parse_factor

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from fractions import Fraction
 from graphlib import CycleError, TopologicalSorter
 
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, place_in
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.evaluation import evaluate
 from apc.compiler.language.expression import Expr, Name, format_expression, names, transform

@@ -14,6 +14,7 @@ one turns bad with the probability p, a bad one good with r. Its defaults are ne
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -21,7 +22,6 @@ from numpy.typing import NDArray
 
 from apc.compiler.components.component import Number as Parameter
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import DIMENSIONLESS
 from apc.compiler.language.expression import Binary, Name, Number
 from apc.compiler.language.recordings import read_trace

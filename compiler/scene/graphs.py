@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping as MappingType
+from dataclasses import dataclass
 
 import numpy as np
 
 from apc.compiler.compiled import MOST_PLACED, Graph
 from apc.compiler.errors import Mistakes
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.tables import NamedFiles, Table, read_table
 from apc.compiler.language.values import Value
 from apc.compiler.source.nodes import Node, Scalar, Sequence

@@ -14,7 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from collections.abc import Sequence as SequenceType
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import LARGEST_COUNT, MOST_GROUPS
 from apc.compiler.components.component import Number, Option, Reference, Settable, Variable
 from apc.compiler.errors import ApcError, Mistakes, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.evaluation import evaluate
 from apc.compiler.language.expression import names
 from apc.compiler.language.tables import Column, NamedFiles, Table, read_table

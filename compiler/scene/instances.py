@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from collections.abc import Mapping as MappingType
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 from itertools import product
@@ -19,7 +19,6 @@ from itertools import product
 from apc.compiler.components.component import Component, Inner, Reference, Settable
 from apc.compiler.components.parts import GROUND, MOST_PARTS, Scope, read_entry
 from apc.compiler.errors import ApcError, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.recordings import TimeTable, read_time_table
 from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.values import (

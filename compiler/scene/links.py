@@ -8,11 +8,11 @@ Does not: know what is sent.
 from __future__ import annotations
 
 from collections.abc import Mapping as MappingType
+from dataclasses import dataclass
 
 from apc.compiler.compiled import Graph
 from apc.compiler.components.component import Reference
 from apc.compiler.errors import Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND
 from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.values import Value

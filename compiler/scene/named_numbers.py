@@ -11,12 +11,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Container, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from apc.compiler.components.component import RESERVED, Component, Number, Option, Settable
 from apc.compiler.errors import ApcError, Mistakes
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import names
 from apc.compiler.language.values import (

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from collections.abc import Mapping as MappingType
+from dataclasses import dataclass
 from pathlib import Path
 
 from apc.compiler.cache import SUFFIX
@@ -20,7 +21,6 @@ from apc.compiler.components.component import Settable
 from apc.compiler.components.library import Library, definition_of
 from apc.compiler.errors import Mistake, Mistakes, Place, visible
 from apc.compiler.files import RefusedError, files_below
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.values import Value
 from apc.compiler.scene.channels import PROBABILITY

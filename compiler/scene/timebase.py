@@ -8,10 +8,10 @@ Does not: know what ticks with a clock (see `clocks`).
 from __future__ import annotations
 
 from collections.abc import Container
+from dataclasses import dataclass
 from fractions import Fraction
 
 from apc.compiler.errors import Mistakes
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.values import Value
 from apc.compiler.scene.named_numbers import NamedNumbers, read_new_name

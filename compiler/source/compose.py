@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
 import yaml
 
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, nearest
-from apc.compiler.frozen import dataclass
 from apc.compiler.source.nodes import Lines, Mapping, Node, Scalar, Sequence
 from apc.compiler.source.reading import either_comma
 from apc.compiler.source.yaml_faults import NO_COLON, not_yaml, with_colon

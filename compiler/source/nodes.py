@@ -8,10 +8,10 @@ Does not: read YAML (see `compose`), or know what any key means.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import Any
 
 from apc.compiler.errors import Place
-from apc.compiler.frozen import dataclass
 
 MAX_BYTES = 1 << 20  # 1 MiB; the largest scene we know of is a hundredth of it
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 import hashlib
 import re
 import unicodedata
+from dataclasses import dataclass
 from pathlib import Path
 
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.files import RefusedError, read_file
-from apc.compiler.frozen import dataclass
 from apc.compiler.source.compose import compose
 from apc.compiler.source.nodes import MAX_BYTES, Lines, Node
 

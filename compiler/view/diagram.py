@@ -8,11 +8,11 @@ Does not: place anything on a page: `picture` does, or Graphviz.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 
 from apc.compiler.components.component import Number, Reference
 from apc.compiler.components.parts import GROUND
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.dimensions import SECOND, Dimension
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.unit_text import format_si

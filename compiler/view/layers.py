@@ -14,9 +14,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-from apc.compiler.frozen import dataclass
 from apc.compiler.view.diagram import Diagram, Vertex
 from apc.compiler.view.svg import FAINT, INK, SIZE, SMALL, Line, text_width
 

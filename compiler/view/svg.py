@@ -10,9 +10,8 @@ Does not: place anything (see `layers`, `picture`).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from html import escape
-
-from apc.compiler.frozen import dataclass
 
 SIZE, SMALL, TITLE = 12.0, 10.5, 18.0
 INK, FAINT, FILL, EDGE = "#1f2933", "#6b7785", "#e8eff8", "#2b4a72"

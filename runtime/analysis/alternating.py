@@ -11,12 +11,12 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.opened import Matrix, OpenLoop, negated
-from apc.compiler.frozen import dataclass
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.frame.discretize import UNIT
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of

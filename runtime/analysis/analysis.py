@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any, Unpack
 
@@ -21,7 +21,6 @@ import numpy as np
 from apc.analysis.plan import cannot_serve, make_plan, refuse_varying
 from apc.compiler.compiled import LENGTH, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.closing import Loop, close_loop
 from apc.eigen.modes import arrange

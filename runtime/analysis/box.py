@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -23,7 +23,6 @@ from apc.compiler.compiled import CompiledSystem, Formula, Group, Parameter
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.formula import FaultError, carrying, exactly
-from apc.compiler.frozen import dataclass
 from apc.compiler.plain import RULES
 from apc.compiler.words import with_unit
 from apc.eigen.closing import ClosedSystem

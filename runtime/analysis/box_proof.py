@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 from typing import Any
@@ -27,7 +28,6 @@ from numpy.typing import NDArray
 from apc.analysis.box import Box, open_box
 from apc.analysis.cells import Cell, OpenSystem, change_of_basis, look, open_system
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.balls import (
     Balls,

@@ -16,14 +16,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem, Feedback, bounded_weight, close, feedback_of
 from apc.eigen.pseudospectrum import balance
 from apc.eigen.ratios import Ratio

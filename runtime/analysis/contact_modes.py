@@ -13,13 +13,12 @@ several parts switch, each part alone on at every peer.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.analysis.switches import SwitchedKind, SwitchingPart, bind, find_switches, switching_parts
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.spectrum import UNSTABLE
 from apc.frame.jacobians import SiteJacobians

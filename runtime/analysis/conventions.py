@@ -17,7 +17,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi
@@ -26,7 +26,6 @@ import numpy as np
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.frame.ages import at_timings
 from apc.frame.jacobians import SiteJacobians

@@ -18,12 +18,12 @@ loop with linear contacts is marginal, ω its frequency, and Y m(β) the load.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from fractions import Fraction
 
 from apc.analysis.opened import with_gain
 from apc.analysis.pushes import Push
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import close_loop
 from apc.eigen.modes import arrange
 from apc.eigen.peer_group import PeerGroup

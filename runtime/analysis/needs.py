@@ -7,6 +7,7 @@ Does not: analyse.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -15,7 +16,6 @@ from apc.analysis.analysis import prepare
 from apc.analysis.plan import make_plan
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.compiler.frozen import dataclass
 from apc.finite_equations import finite_equations
 from apc.frame.exchange import build_exchange
 from apc.frame.jacobians import edge_name

@@ -17,7 +17,7 @@ coordinates ξ:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -29,7 +29,6 @@ from apc.analysis.contact_modes import parts_of_kinds, settings
 from apc.analysis.pushes import Push, push_of
 from apc.analysis.switches import bind, find_switches
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Loop, StateLayout, close_loop, close_outside, lay_out
 from apc.eigen.modes import loops_at_right_angles
 from apc.eigen.peer_group import PeerGroup

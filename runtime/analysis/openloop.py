@@ -17,6 +17,7 @@ A force that has both parts counts as two inputs, through one column of B each.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -26,7 +27,6 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import dense
 from apc.eigen.peer_group import PeerGroup

@@ -21,7 +21,7 @@ nilpotent: a force moves later samples only.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,6 @@ from apc.analysis.analysis import Analysis
 from apc.analysis.methods import PAPER
 from apc.analysis.openloop import Input, OpenLoop, open_loop, over, whole_system
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem, Feedback, StateLayout, close
 from apc.eigen.relative import Relative, independent_places, relative_bounded
 from apc.eigen.rigid import RigidModes, find_rigid_modes

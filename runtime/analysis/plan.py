@@ -9,12 +9,12 @@ Does not: analyse (see `analysis`).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from apc.analysis.methods import METHODS, PAPER
 from apc.analysis.switches import varying_slopes
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Loop
 from apc.eigen.graph_loops import common_graph
 from apc.eigen.modes import arrange, dense_loop

@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import casadi
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.switches import SwitchedKind, SwitchingPart
-from apc.compiler.frozen import dataclass
 from apc.compiler.interpolation import jacobian
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.start import start_values

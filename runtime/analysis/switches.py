@@ -19,7 +19,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi
@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.interpolation import Interpolation, jacobian
 from apc.compiler.plain import LOOK, straight, symbolic, walk
 from apc.frame.jacobians import SiteJacobians, jacobians

@@ -13,7 +13,7 @@ from __future__ import annotations
 import platform
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 from os import cpu_count
@@ -30,7 +30,6 @@ from apc.benchmark.timing import spread_of, take_turns, timed
 from apc.benchmark.truth import Truth, spectral_truth
 from apc.compiler.compiled import Column, CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.compiler.frozen import dataclass
 from apc.compiler.words import with_unit
 from apc.distribution import versions
 from apc.frame.discretize import UNIT

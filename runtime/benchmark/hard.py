@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -22,7 +23,6 @@ from apc.benchmark.timing import median_time
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, read_file
-from apc.compiler.frozen import dataclass
 from apc.compiler.pipeline import compile_topology
 from apc.compiler.source.nodes import MAX_BYTES
 from apc.result import Result

@@ -11,6 +11,7 @@ order of events or in how a scene falls into systems is the truth's too. What it
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -18,7 +19,6 @@ import flint
 
 from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.frozen import dataclass
 from apc.eigen.balls import frame_balls, precision, square, unprovable
 from apc.eigen.closing import ClosedSystem, Loop, close_loop
 from apc.eigen.modes import arrange, dense_loop

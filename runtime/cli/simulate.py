@@ -9,6 +9,7 @@ Does not: compute.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,7 +32,6 @@ from apc.cli.options import (
 from apc.cli.progress import progress_bar
 from apc.compiler.errors import ApcError
 from apc.compiler.files import partial_name
-from apc.compiler.frozen import dataclass
 from apc.suffixes import check_suffix
 
 if TYPE_CHECKING:

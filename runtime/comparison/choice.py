@@ -10,10 +10,10 @@ Does not: vary them (see `vary.critical`).
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.frame.names import Free, find, named_times, unit_of
 from apc.frame.parameters import scope_of
 from apc.network.nominal import channel_numbers

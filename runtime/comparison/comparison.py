@@ -10,6 +10,7 @@ Does not: compute any of it itself, or say which scheme is the better one.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
@@ -18,7 +19,6 @@ from apc.comparison.choice import DELAY, LOSS, STIFFNESS, Choice, check_over, ch
 from apc.comparison.effort import Effort, effort
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.hands.answers import held_names
 from apc.hands.feel import Feel, feel

@@ -9,11 +9,12 @@ Does not: measure time (see `benchmark`), or count the headers of packets.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind, Link, Receive
-from apc.compiler.frozen import dataclass
 from apc.compiler.plain import PlainFunction, plain
 from apc.frame.exchange import arcs
 from apc.frame.parameters import resolve

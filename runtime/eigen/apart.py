@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.dominant import resolvents
 from apc.eigen.eigenpairs import Eigenpairs, eigenpairs
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, pseudospectral_radius

@@ -19,13 +19,13 @@ number.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.balls import frame_steps, site_balls, weight_balls
 from apc.eigen.closing import Coupling, Loop, bounded_weight
 from apc.eigen.peer_group import PeerGroup

@@ -14,13 +14,13 @@ decides without an eigenvalue being known.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.balls import Balls, frame_balls, precision, rational_ball, reduced_balls, square
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.eigenpairs import components

@@ -16,14 +16,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.graph_modes import Surd
 from apc.eigen.peer_group import PeerGroup, states_of
 from apc.frame.discretize import UNIT

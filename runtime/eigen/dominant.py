@@ -27,12 +27,12 @@ radius |w| |R v|, and of the second order again what the pair does to one anothe
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.eigenpairs import eigenpairs
 from apc.frame.discretize import UNIT
 

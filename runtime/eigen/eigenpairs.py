@@ -11,13 +11,13 @@ dλ = w dM v / (w v).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]

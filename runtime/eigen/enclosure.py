@@ -18,12 +18,12 @@ their eigenvalues stand apart (see `apart`), and one by one where that leaves th
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.apart import GROWN, SMALL, Apart, padded, pairs_apart, pairs_by_discs
 from apc.eigen.eigenpairs import LARGE, Eigenpairs, components, eigenpairs
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance, norms, pseudospectral_radius

@@ -12,12 +12,11 @@ real system of two sites, r = [α −β; β α] s.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
 
-from apc.compiler.frozen import dataclass
 from apc.compiler.weights import sum_weights
 from apc.eigen.closing import Coupling, Loop
 from apc.eigen.graph_modes import GraphMode, Surd

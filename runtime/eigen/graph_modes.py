@@ -10,6 +10,7 @@ Does not: know what is sent over the graph, or close a loop (see `graph_loops`).
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from fractions import Fraction
 
 import flint
@@ -17,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Graph
-from apc.compiler.frozen import dataclass
 from apc.compiler.weights import exact_weight, sum_weights
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import arcs

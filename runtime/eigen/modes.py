@@ -27,13 +27,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
-from apc.compiler.frozen import dataclass
 from apc.compiler.weights import exact_weight
 from apc.eigen.closing import ClosedSystem, Coupling, Loop, close_loop
 from apc.eigen.graph_loops import common_graph, graph_loop, graph_scale

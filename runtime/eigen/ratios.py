@@ -8,12 +8,12 @@ Does not: compare what depends on the parameters, or take a root of it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import flint
 
-from apc.compiler.frozen import dataclass
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.linearize import site_of_entries

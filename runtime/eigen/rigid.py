@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from operator import mul
 from typing import Any
@@ -31,7 +31,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import ANGLES, LENGTH
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem, Coupling, Loop
 from apc.eigen.dominant import misses_one
 from apc.eigen.graph_modes import QUICK_PRIME

@@ -15,14 +15,13 @@ import functools
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.apart import SMALL
 from apc.eigen.balls import unprovable
 from apc.eigen.certify import MOST_PROVED, prove

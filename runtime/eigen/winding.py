@@ -15,11 +15,11 @@ differences is the change of the argument along the circle.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS
 from apc.frame.discretize import UNIT
 

@@ -15,10 +15,9 @@ from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
-from dataclasses import field
+from dataclasses import dataclass, field
 
 from apc.compiler.errors import Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.explore.sections import Task, Told, compute
 from apc.processes import Workers, local_processes
 

@@ -10,7 +10,7 @@ Does not: draw.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Column, CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.vectors import entry, whole_and_index
 from apc.present.planar import Disc, moves_in_plane, spots_of
 from apc.present.still import bodies_of, rows_of

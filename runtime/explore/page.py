@@ -11,6 +11,7 @@ Does not: compute.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
 from typing import Any
@@ -24,7 +25,6 @@ from bokeh.models import Slider as Handle
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.compiler.frozen import dataclass
 from apc.distribution import program_version
 from apc.explore.desk import Desk
 from apc.explore.figures import FOCUS, FeelFigure, MotionFigure, RegionFigure, RootsFigure, Words

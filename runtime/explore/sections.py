@@ -10,6 +10,7 @@ Does not: know the browser, or keep an answer.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from typing import Any
@@ -20,7 +21,6 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.words import in_hertz
 from apc.eigen.spectrum import Mode
 from apc.explore.motion import motion_of

@@ -13,14 +13,13 @@ from __future__ import annotations
 import sys
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from math import ceil, floor, lcm, log10
 from typing import Any
 
 from apc.compiler.compiled import CompiledSystem, group_count
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.words import with_unit
 from apc.frame.names import Free, Range, named_times, parameter_of, unit_of
 from apc.frame.overrides import Override, parse_override

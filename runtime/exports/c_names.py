@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
-from apc.compiler.frozen import dataclass
 from apc.distribution import program_version
 from apc.exports.peer import Peer
 

@@ -13,9 +13,9 @@ it, as the link says), and what got lost is missed from when it should have come
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from fractions import Fraction
 
-from apc.compiler.frozen import dataclass
 from apc.exports.c_names import CLOSE, OPEN, number
 from apc.exports.peer import group_of, lines_of
 from apc.network.channel import luck_key

@@ -9,13 +9,13 @@ Does not: compile what is written as C.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.files import write_texts
-from apc.compiler.frozen import dataclass
 from apc.exports.c_driver import driver
 from apc.exports.c_header import header
 from apc.exports.c_names import CPeer, c_peer

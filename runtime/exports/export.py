@@ -13,12 +13,12 @@ that makes a result of a compiled scene and what is asked, and one that writes i
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.compiler.frozen import dataclass
 from apc.result import Result
 from apc.suffixes import check_suffix
 

@@ -13,9 +13,9 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from apc.compiler.frozen import dataclass
 from apc.compiler.interpolation import Interpolation
 from apc.compiler.plain import straight, walk
 

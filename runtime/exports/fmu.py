@@ -16,13 +16,13 @@ import tempfile
 import xml.etree.ElementTree as xml
 import zipfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import write_file
-from apc.compiler.frozen import dataclass
 from apc.distribution import program_version
 from apc.exports.c_header import header
 from apc.exports.c_text import source

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, lifted_groups, near_start, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.compiler.frozen import dataclass
 from apc.distribution import versions
 from apc.eigen.closing import Feedback, Loop, close, feedback_of, lay_out_loop
 from apc.eigen.modes import dense_loop

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,6 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import ClockPartition, CompiledSystem, Kind, Receive
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import write_text
-from apc.compiler.frozen import dataclass
 from apc.compiler.weights import exact_weight
 from apc.distribution import program_version
 from apc.exports.expressions import (

@@ -13,9 +13,9 @@ What a scene remembers is one struct, `model`, that can be copied: no pointer is
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 
-from apc.compiler.frozen import dataclass
 from apc.exports.c_names import CLOSE, OPEN, CPeer, c_peer, identifier, in_order, number
 from apc.exports.chance_text import Chance, chance_begin, chance_of, chance_source, chance_types
 from apc.exports.peer import MOST_HEARD, Line, first_packet, group_of, lines_of, peer_of, refused, sites_of

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Graph, Link
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -9,11 +9,11 @@ Does not: say what happens at an instant (see `scheduling`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 
 from apc.compiler.compiled import Clock, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.multiples import common_divisor, common_multiple
 from apc.frame.liveness import Hearing, live_holds
 from apc.frame.site import LinearSite

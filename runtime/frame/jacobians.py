@@ -18,6 +18,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import casadi
@@ -26,7 +27,6 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import ClockPartition, Kind, Receive
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.interpolation import Interpolation, function_of, jacobian, table_of
 from apc.frame.site import LinearSite, Matrix, assemble, with_own_parts
 

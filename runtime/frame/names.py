@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass
 from fractions import Fraction
 
 from apc.compiler.compiled import (
@@ -23,7 +24,6 @@ from apc.compiler.compiled import (
     group_count,
 )
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.compiler.frozen import dataclass
 from apc.compiler.words import with_unit
 
 # The sections of a topology, which a name may start with.

@@ -11,7 +11,7 @@ Does not: change what was compiled as structure (which parts there are).
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import TypeVar
 
@@ -21,7 +21,6 @@ from apc.compiler.compiled import CompiledSystem, Group, Parameter, Timing, grou
 from apc.compiler.crowd import peers_of, recounted
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.formula import exact_value
-from apc.compiler.frozen import dataclass
 from apc.compiler.words import with_unit
 from apc.frame.names import GIVEN, OVERRIDE, Free, find, unit_of
 from apc.frame.parameters import Scope, columns_of, scope_of

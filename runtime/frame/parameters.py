@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, TypeVar
 
@@ -22,7 +23,6 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem, Formula, Group, Kind, Parameter, Timing
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.formula import computed
-from apc.compiler.frozen import dataclass
 from apc.frame.exact import ROWS
 from apc.frame.names import OVERRIDE, Free
 

@@ -13,14 +13,13 @@ value of a clock of its own, as `schedule` has them. What is read stays until th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import ClockPartition, Hold, Kind
-from apc.compiler.frozen import dataclass
 from apc.frame.schedule import Act, Event, Heard, Propagate, Schedule, Sent, Tick, Value, Way
 from apc.frame.site import LinearSite, LinearTick
 

@@ -19,12 +19,12 @@ zero don't round.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.frame.discretize import UNIT
 
 Matrix = NDArray[Any]

@@ -10,13 +10,12 @@ Does not: compare, or take roots.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from apc.compiler.frozen import dataclass
 
 Integers = NDArray[np.int64]
 

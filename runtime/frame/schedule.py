@@ -13,10 +13,8 @@ tick `index`, counted from the frame's first tick of that clock; a negative inde
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
-
-from apc.compiler.frozen import dataclass
 
 # The order of coincident events. Continuous variables are continuous, so sampling needs no place in it.
 ORDER = ("send", "deliver", "tick", "act")

@@ -12,14 +12,13 @@ from __future__ import annotations
 import decimal
 import functools
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
 import numpy as np
 
 from apc.compiler.compiled import Clock, CompiledSystem, Kind, Link
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.hyperperiod import ClockGrid, Times, times_in_use
 from apc.frame.liveness import Hearing, hearing_of, live_holds, live_outputs, live_receives

@@ -10,6 +10,7 @@ scene is compiled.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import ClassVar
 
 from apc.compiler.compiled import (
@@ -21,7 +22,6 @@ from apc.compiler.compiled import (
     counts_peers,
     group_count,
 )
-from apc.compiler.frozen import dataclass
 from apc.frame.names import Free, is_named, named_times, parameter_of, values_by_group
 from apc.frame.parameters import columns_of
 from apc.result import Result

@@ -15,7 +15,7 @@ the spectrum.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
-from apc.compiler.frozen import dataclass
 
 Matrix = NDArray[Any]
 

@@ -9,7 +9,7 @@ Does not: ask who hears whom (see `peers`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
 from typing import Any
@@ -18,7 +18,6 @@ import casadi
 import numpy as np
 
 from apc.compiler.compiled import PEERS
-from apc.compiler.frozen import dataclass
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians
 

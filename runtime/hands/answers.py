@@ -16,6 +16,7 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,6 @@ from apc.analysis.analysis import Prepared, lifted_groups, timed
 from apc.analysis.plan import not_populations
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.vectors import whole_and_index
 from apc.eigen.closing import Loop
 from apc.eigen.modes import arrange, dense_loop

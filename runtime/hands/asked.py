@@ -9,6 +9,7 @@ Does not: ask whether the part named is a device.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -16,7 +17,6 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.vectors import whole_and_index
 from apc.frame.parameters import resolve
 from apc.option_value import option_value

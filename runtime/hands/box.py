@@ -14,7 +14,7 @@ proves the cell. A cell where that fails is halved.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 from typing import Any
@@ -28,7 +28,6 @@ from apc.analysis.box_proof import BITS, TOGETHER, BoxProof, Looked, middle, sea
 from apc.analysis.cells import Cell, OpenLoop, closed_over, open_loop
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.compiler.words import with_unit
 from apc.eigen.balls import precision

@@ -10,6 +10,7 @@ Does not: look at how a hand answers back (see `passivity`), or at packets that 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, Unpack
 
@@ -20,7 +21,6 @@ from apc.analysis.analysis import Prepared, near_start, prepare
 from apc.analysis.analysis import analyze as judge
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
 from apc.frame.discretize import UNIT

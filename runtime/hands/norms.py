@@ -16,12 +16,12 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.dissipation import peak_gain
 from apc.eigen.relative import relative, relative_coordinates, relative_rows, with_doubt
 from apc.frame.discretize import UNIT, exponential_values

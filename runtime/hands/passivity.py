@@ -12,6 +12,7 @@ Does not: say with which hand it shakes: which motion of the devices takes energ
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,6 @@ from apc.analysis.analysis import Prepared, analyze, lifted_groups, near_start, 
 from apc.analysis.contact_modes import contact_modes
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.dissipation import least_real, proves_positive
 from apc.finite_equations import finite_equations

@@ -20,7 +20,7 @@ remains has the motions of the scene with devices clamped, and no others.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.eigen.balls import BALLS
 from apc.eigen.closing import Loop, close_loop
 from apc.eigen.modes import arrange, dense_loop

@@ -19,13 +19,13 @@ s' = s + 2πjk/T, the ends cancel, and the motion at s' is (s' − A)⁻¹ (B û
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Loop, close_loop
 from apc.eigen.peer_group import PeerGroup
 from apc.frame.devices import Device

@@ -13,14 +13,13 @@ T_n apart, heard by ticks T_c apart after T_d, that is (T_n − T_c)/2 + T_d at 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
 
 from apc.analysis.analysis import lifted_groups, prepare
 from apc.compiler.compiled import CompiledSystem, Link, Timing, count_of
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.vectors import whole_and_index
 from apc.eigen.peer_group import PeerGroup
 from apc.frame.ages import aged

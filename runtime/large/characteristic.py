@@ -17,11 +17,11 @@ poles of the sites outside of a circle are the negative of how often f goes arou
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS
 from apc.eigen.winding import Ball, determinant_ball, wind
 from apc.frame.discretize import UNIT

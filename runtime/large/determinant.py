@@ -14,12 +14,12 @@ other by weights, r_g = Σ_h W_gh ζ^(−lag) s_h, are det(I − T W) = 0, T = d
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.bordered import wires_of
 from apc.eigen.closing import Coupling
 from apc.eigen.peer_group import PeerGroup

@@ -10,12 +10,11 @@ Does not: list more than the largest modes.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Loop, without_packets
 from apc.eigen.eigenpairs import eigenpairs
 from apc.eigen.rigid import find_rigid_modes

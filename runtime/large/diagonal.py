@@ -9,10 +9,11 @@ Does not: choose what is large.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, norms
 from apc.frame.discretize import UNIT
 

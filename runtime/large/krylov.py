@@ -22,12 +22,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.spectrum import Mode, Spectrum, judge
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange

@@ -11,14 +11,13 @@ Does not: merge equal peers of different groups (see `peers`), or take sites tha
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Closed, Feedback, StateLayout, close, lay_out
 from apc.eigen.peer_group import states_of
 from apc.eigen.spectrum import Mode, Motion, oscillation

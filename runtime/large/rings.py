@@ -19,12 +19,11 @@ for the bounds of what dies out long before the few that decide.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.graph_loops import graph_loop, graph_scale
 from apc.eigen.graph_modes import ring_mode, ring_values
 from apc.eigen.modes import Arrangement

@@ -17,12 +17,12 @@ are ℓ frames old and somebody still hears, and E_ℓ the rows of s that grow s
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.compiler.weights import sum_weights
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange

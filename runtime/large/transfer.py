@@ -17,11 +17,11 @@ short power series of 1/ζ, added up over all sites before any ζ is known.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance
 from apc.frame.discretize import UNIT
 from apc.frame.lift import BoundedMap, FrameMap

@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.compiler.weights import exact_weight
 from apc.eigen.closing import Loop
 from apc.eigen.modes import complete_loops

@@ -16,12 +16,12 @@ finds nothing. A count around the pole tells.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.winding import FIRST_ARCS
 from apc.large.characteristic import (
     FARTHEST,

@@ -8,7 +8,7 @@ Does not: write (see `run`).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import ClassVar
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import Channel, CompiledSystem
-from apc.compiler.frozen import dataclass
 from apc.loop.peer import live_scene
 from apc.loop.run import PeerRun, Run, delays_of, trace_name
 from apc.moments.network import NetworkVerdict, judge_network

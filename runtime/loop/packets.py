@@ -31,8 +31,7 @@ import secrets
 import struct
 from collections import Counter
 from collections.abc import Mapping
-
-from apc.compiler.frozen import dataclass
+from dataclasses import dataclass
 
 MAGIC, VERSION = b"apc", 2
 DATA, HELLO, ANSWER = range(3)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,6 @@ from apc.compiler import store
 from apc.compiler.cache import DAMAGE, DamageError
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, read_file
-from apc.compiler.frozen import dataclass
 from apc.compiler.words import counted
 from apc.loop.packets import DROPPED
 from apc.loop.peer import live_scene

@@ -11,6 +11,7 @@ import json
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,6 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import check_target, same_file, unwritable
-from apc.compiler.frozen import dataclass
 from apc.loop.peer import NANO, Loop
 from apc.processes import model_bytes
 from apc.simulation.blocks import instants_of

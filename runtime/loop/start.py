@@ -16,12 +16,12 @@ import socket
 from collections.abc import Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass
 from fractions import Fraction
 from multiprocessing.connection import Connection
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.frame.exchange import build_exchange
 from apc.frame.parameters import resolve
 from apc.loop.device import DeviceFunction

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 from typing import Any
@@ -31,7 +31,6 @@ from apc.analysis.box_proof import BITS, TOGETHER, UNDECIDED, BoxProof, Looked, 
 from apc.analysis.cells import Cell, OpenFrames, contracted, frames_over, open_frames
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.balls import precision
 from apc.eigen.closing import Loop, without_packets

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 from typing import Any
@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.frozen import dataclass
 from apc.eigen.pseudospectrum import balance
 from apc.eigen.relative import relative_places
 from apc.moments.crowd import Hearing

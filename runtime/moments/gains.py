@@ -16,12 +16,12 @@ eigenvalue of G is 1, or by ρ(A)² where it is smaller than 1 all the way down.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.dissipation import is_positive
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.pseudospectrum import balance

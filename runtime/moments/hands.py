@@ -13,7 +13,7 @@ tick of the fastest clock to the next (see `ports`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
-from apc.compiler.frozen import dataclass
 from apc.eigen.peer_group import PeerGroup
 from apc.frame.devices import Device, find_device
 from apc.frame.ports import with_holds, with_ports

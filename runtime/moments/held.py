@@ -18,7 +18,7 @@ and every tick hears the η of the packet that it would hear if none got lost.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, lifted_groups, timed
 from apc.compiler.compiled import CompiledSystem, Link
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import (
     Feedback,
     Loop,

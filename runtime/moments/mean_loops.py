@@ -19,13 +19,13 @@ its own luck ξ, and reaches the receiver:
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Feedback, Loop, StateLayout, bounded_weight, close
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, relative_coordinates

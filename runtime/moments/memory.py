@@ -20,12 +20,12 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.frame.discretize import UNIT
 from apc.network.channel import LATEST, PARETO_SHAPE, ChannelLaw
 

@@ -9,6 +9,7 @@ Does not: look at the nominal network (see `analysis`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 
@@ -16,7 +17,6 @@ import numpy as np
 
 from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem, Link
-from apc.compiler.frozen import dataclass
 from apc.compiler.multiples import common_multiple
 from apc.finite_equations import finite_equations
 from apc.frame.exchange import arcs

@@ -15,7 +15,7 @@ A_b; second moments X_s, of the frames that begin in pattern s, move by
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Feedback, StateLayout, close
 from apc.eigen.modes import dense_loop
 from apc.eigen.pseudospectrum import balance

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
 from typing import Any
@@ -33,7 +33,6 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, prepare
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Loop
 from apc.eigen.dissipation import peak_gain, proves_gain
 from apc.eigen.enclosure import enclose_eigenvalues

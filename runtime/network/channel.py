@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -29,7 +30,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.network.philox import words
 
 Floats = NDArray[np.float64]

@@ -14,6 +14,7 @@ from (Kolmogorov and Smirnov's distance), with their median and quartiles.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
@@ -21,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.language.probes import HALVED
 from apc.compiler.language.recordings import read_trace
 from apc.network.channel import LATEST, deviates

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind, Link
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.frame.exchange import Exchange
 from apc.memory import refuse_beyond
 from apc.network.channel import ChannelLaw, PacketSource, channel_law

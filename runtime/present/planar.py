@@ -12,7 +12,7 @@ Does not: play the scene, or know what a part is called; draw bodies that move a
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Any
 
 import casadi
@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
-from apc.compiler.frozen import dataclass
 from apc.compiler.interpolation import jacobian
 from apc.compiler.language.vectors import entry, whole_and_index
 from apc.frame.jacobians import guards_of

@@ -14,7 +14,7 @@ sent to the others, or else the second, is drawn with a half width of w, the oth
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
-from apc.compiler.frozen import dataclass
 from apc.compiler.interpolation import jacobian
 from apc.compiler.timings import part
 from apc.frame.jacobians import jacobians

@@ -16,13 +16,13 @@ Between the corners of a cell of size h a smooth g differs from its bilinear int
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 
 Floats = NDArray[np.float64]
 Node = tuple[int, int]  # lattice coordinates

@@ -12,12 +12,12 @@ Does not: know what the two coordinates are.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.eigenpairs import Eigenpairs, refined
 
 Floats = NDArray[np.float64]

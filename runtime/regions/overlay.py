@@ -11,6 +11,7 @@ Does not: find a boundary that a line of the plane crosses twice; draw.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -18,7 +19,6 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Group
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.compiler.frozen import dataclass
 from apc.frame.names import Free, Range, find, unit_of, value_now
 from apc.frame.overrides import Override, apply
 from apc.regions.passivity import CONDITIONS, MEANINGS, UNITS, PublishedCondition

@@ -9,7 +9,7 @@ Does not: draw.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any, Unpack
 
@@ -17,7 +17,6 @@ import numpy as np
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.frame.ages import linear_sites
 from apc.frame.exchange import build_exchange
 from apc.frame.linearize import linearize_rows, site_of_row

@@ -9,11 +9,10 @@ Does not: know scenes (see `overlay`), or prove that one has the form a conditio
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from apc.compiler.frozen import dataclass
 
 Floats = NDArray[np.float64]
 

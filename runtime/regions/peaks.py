@@ -18,13 +18,12 @@ and T = F − F C X, S is 2 b T − 1, and dS = −2 b [F C (z − A + B F C)⁻
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.frame.discretize import UNIT
 from apc.regions.eigenpairs import ALIKE, Family, Pairs, by_system
 

@@ -9,11 +9,11 @@ Does not: know what happens between points.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.frame.names import Range
 from apc.vary.batch import MatrixSource
 

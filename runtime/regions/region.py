@@ -11,7 +11,7 @@ Does not: draw, or write files (see `present`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, analyze, near_start, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.finite_equations import finite_equations

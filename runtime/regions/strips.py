@@ -14,14 +14,13 @@ with the delay: the boundary is a straight line at a critical value of the other
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.frozen import dataclass
 from apc.eigen.relative import relative_bounded
 from apc.frame.names import Range, parameter_of
 from apc.regions.axes import PLACE

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,6 @@ from apc.comparison.comparison import Comparison, compare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.files import files_below
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.compiler.words import counted, with_unit
 from apc.distribution import versions

@@ -15,13 +15,12 @@ difference is what roundings of this size amount to.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.simulation.blocks import Block, blocks
 from apc.simulation.settings import finer
 from apc.simulation.signals import Signal

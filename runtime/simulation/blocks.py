@@ -9,12 +9,12 @@ Does not: keep, write or judge what comes out (see `trajectory`, `recording`, `s
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.simulation.forcing import impulses
 from apc.simulation.population import Player
 from apc.simulation.simulation import Simulation

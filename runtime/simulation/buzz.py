@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -26,7 +26,6 @@ from apc.analysis.opened import contact_groups
 from apc.analysis.pushes import Push
 from apc.compiler.compiled import LENGTH, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.eigen.peer_group import PeerGroup
 from apc.frame.exchange import build_exchange

@@ -13,7 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
 
@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from apc.analysis import analysis
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
 from apc.memory import refuse_beyond

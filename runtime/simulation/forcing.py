@@ -16,6 +16,7 @@ rounding, a panel is halved.
 from __future__ import annotations
 
 import functools
+from dataclasses import dataclass
 from typing import Any
 
 import casadi
@@ -23,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.interpolation import Interpolation
 from apc.frame.exact import ROWS, evaluate_exact
 from apc.frame.jacobians import guards_of, lookups_of

@@ -16,12 +16,12 @@ after the other. Packets of as many frames are kept as any may be heard after.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.compiler.weights import sum_weights
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.schedule import Heard, Schedule, Selected, Sent, Way

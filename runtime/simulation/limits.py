@@ -8,12 +8,12 @@ Does not: keep a motion within them; that is for equations (`limits: on` of a de
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Group
-from apc.compiler.frozen import dataclass
 from apc.simulation.signals import Signal
 
 Floats = NDArray[np.float64]

@@ -15,13 +15,13 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.compiler.interpolation import table_of
 from apc.compiler.plain import PlainFunction, straight
 from apc.network.channel import luck_key

@@ -11,12 +11,12 @@ Does not: say when anything is sent or heard (see `scheduling`), or who hears wh
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import casadi
 
 from apc.compiler.compiled import CompiledSystem, Kind
-from apc.compiler.frozen import dataclass
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import edge_name
 

@@ -12,6 +12,7 @@ A member is a group of the scene, or those of its peers that are recorded, or th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Protocol
 
@@ -20,7 +21,6 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.frame.exchange import Exchange
 from apc.frame.schedule import Propagate, Schedule, Tick
 from apc.network.timetable import Route

@@ -16,13 +16,13 @@ at each other pair by pair:
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
-from apc.compiler.frozen import dataclass
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.schedule import Schedule, Value
 from apc.frame.start import start_values

@@ -13,6 +13,7 @@ Does not: integrate what is not linear (see `flow`), or know what changes with t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -22,7 +23,6 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.interpolation import jacobian
 from apc.frame.discretize import UNIT, discretize, exponential_rows
 from apc.frame.exact import evaluate_exact

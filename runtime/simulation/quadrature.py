@@ -20,13 +20,13 @@ than what the rounding of the instant leaves at which the part begins or ends.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.frame.discretize import UNIT, discretize
 
 Floats = NDArray[np.float64]

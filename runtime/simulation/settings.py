@@ -18,13 +18,12 @@ moves exactly, and what is not by CVODES.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.compiler.frozen import dataclass
 
 EXACT, RK4, SEMI_IMPLICIT, CVODES = "exact", "rk4", "semi-implicit", "cvodes"
 WHERE_NEEDED = "exact where linear"

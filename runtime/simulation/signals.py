@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import casadi
 import numpy as np
@@ -20,7 +21,6 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.compiler.frozen import dataclass
 from apc.frame.schedule import Act, Propagate, Schedule, Tick
 
 EXAMPLE = "'cube.x', 'left[2].*' or '*.v'"

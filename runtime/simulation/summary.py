@@ -17,12 +17,12 @@ flanges and v that flange's velocity: exact, as f is constant between events. Po
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import ANGLES, LENGTH, CompiledSystem
-from apc.compiler.frozen import dataclass
 from apc.simulation.blocks import Block
 from apc.simulation.limits import Broken, LimitWatch
 from apc.simulation.signals import Signal

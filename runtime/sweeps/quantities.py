@@ -10,6 +10,7 @@ Does not: choose points, or hold results.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.compiler.frozen import dataclass
 from apc.eigen.spectrum import finite
 from apc.frame.names import find, unit_of
 from apc.frame.overrides import apply

@@ -19,6 +19,7 @@ import os
 import re
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,6 @@ from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, read_file, unlink_link, unwritable, write_file
-from apc.compiler.frozen import dataclass
 from apc.compiler.seal import seal
 from apc.npz import read_arrays
 from apc.sweeps.quantities import Cells

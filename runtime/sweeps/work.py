@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import hashlib
 import threading
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 
 from apc.compiler.cache import program_digest
-from apc.compiler.frozen import dataclass
 from apc.distribution import versions
 from apc.processes import model_of_bytes
 from apc.sweeps.grid import Grid

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.balls import frame_balls, precision, reduced_balls, square, unprovable
 from apc.eigen.certify import MOST_PROVED, schur_cohn
 from apc.eigen.closing import ClosedSystem, Loop

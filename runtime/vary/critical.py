@@ -11,7 +11,7 @@ Does not: prove that there are no others, or find two nearer to each other than 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any, Unpack
 
@@ -20,7 +20,6 @@ import numpy as np
 from apc.analysis.analysis import Prepared, analyze, hangs_on_heard, near_start, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.compiler.words import with_unit
 from apc.finite_equations import finite_equations

@@ -15,12 +15,11 @@ Several lines are scanned in step: a call for many small matrices takes hardly l
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.eigenpairs import eigenvalues
 
 Floats = NDArray[np.float64]

@@ -17,6 +17,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache, partial
 
@@ -25,7 +26,6 @@ import numpy as np
 from apc.analysis.analysis import Prepared, lifted_groups, prepared_at
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.multiples import common_divisor
 from apc.compiler.words import time_left
 from apc.eigen.peer_group import states_of

@@ -13,10 +13,10 @@ with rows of 34 to 200 masses; half of them are to spare.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.frozen import dataclass
 from apc.eigen.modes import arrange
 from apc.eigen.peer_group import states_of
 

@@ -10,7 +10,7 @@ Does not: vary times (see `delays`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.compiler.compiled import CompiledSystem, Group, Parameter, group_count
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem, Loop
 from apc.eigen.modes import arrange, split
 from apc.eigen.peer_group import PeerGroup

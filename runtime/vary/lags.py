@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
 
@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.frozen import dataclass
 from apc.compiler.multiples import common_divisor
 from apc.eigen.bordered import TOGETHER, Bordered, Logarithm, bordered, logarithm, side_by_side
 from apc.eigen.closing import Loop, without_packets

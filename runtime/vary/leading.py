@@ -10,11 +10,11 @@ Does not: say anything of the points where that is not clear.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.apart import SMALL
 from apc.eigen.dominant import all_within, enclosed, largest_pairs, misses_one
 from apc.eigen.eigenpairs import components

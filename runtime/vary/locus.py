@@ -8,6 +8,7 @@ Does not: prove anything; the crossings are those of `critical`.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +17,6 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import analyze, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.frame.names import Free, find
 from apc.frame.overrides import apply

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.frozen import dataclass
 from apc.eigen.bordered import Logarithm, Wires, bordered, logarithm, side_by_side, wires_of
 from apc.eigen.closing import Loop, without_packets
 from apc.eigen.peer_group import PeerGroup

@@ -14,7 +14,7 @@ matrices come with their bounds (`BatchEvaluator.bounded`), the largest eigenval
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field, fields
+from dataclasses import dataclass, field, fields
 from fractions import Fraction
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
@@ -26,7 +26,6 @@ from apc.analysis.analysis import Analysis, Prepared, analyze, near_start, prepa
 from apc.analysis.plan import make_plan
 from apc.compiler.compiled import CompiledSystem, Parameter
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.frozen import dataclass
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.rigid import what_stands
 from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE, judge

@@ -10,10 +10,10 @@ Does not: find the point (see `search`).
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.eigenpairs import LARGE, eigenpairs, pair_near
 from apc.eigen.relative import relative, relative_coordinates

@@ -18,13 +18,12 @@ agree in the same way; with crossings in between, each in its direction, neighbo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.bordered import Logarithm
 from apc.vary.crossings import Root, Scan, extremes, narrowest
 

@@ -10,7 +10,7 @@ Does not: vary a time, or ask what hands can draw (see `regions.peaks`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import Feedback, Loop, StateLayout, close, feedback_of, lay_out_loop
 from apc.frame.devices import refuse_hands
 from apc.frame.discretize import exponential_rows, exponential_values

@@ -13,6 +13,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -22,7 +23,6 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Analysis, Prepared, analyze, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import Place
-from apc.compiler.frozen import dataclass
 from apc.compiler.words import counted
 from apc.eigen.closing import ClosedSystem, Loop, close_loop
 from apc.eigen.dominant import all_within

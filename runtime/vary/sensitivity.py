@@ -14,13 +14,13 @@ equal eigenvalues with a full set of vectors moves as the eigenvalues of W dM V,
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.frozen import dataclass
 from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.eigen.eigenpairs import Eigenpairs, eigenpairs

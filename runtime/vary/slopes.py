@@ -14,14 +14,13 @@ sites. A product of dM and a vector is a few products of one site.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem, Feedback, close, feedback_of
 from apc.eigen.dominant import misses_one
 from apc.eigen.peer_group import PeerGroup

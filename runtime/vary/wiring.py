@@ -12,13 +12,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.frozen import dataclass
 from apc.eigen.closing import ClosedSystem, Feedback, close, feedback_of
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import Relative, relative, relative_coordinates, relative_places

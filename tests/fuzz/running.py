@@ -28,7 +28,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import apc
-from apc.compiler import frozen, pipeline
+from apc.compiler import pipeline
 from apc.compiler.components.library import Library
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.language import unit_names
@@ -135,7 +135,6 @@ def _warm_up() -> None:
     for name in _WarmLibrary.builtin.component_names:
         _WarmLibrary.builtin.component(name)
     pipeline.Library = _WarmLibrary  # type: ignore[misc] # for the fuzzer's own processes
-    frozen.OFTEN = -1  # nor does a class of many objects get written methods there, which are compiled
     # What is loaded when it is first needed, and compiles text then: for a hint, for a large scene.
     loaded = (
         "numpy.ma",

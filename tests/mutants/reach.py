@@ -21,6 +21,11 @@ class Watch:
     def __init__(self, coverage: Any) -> None:
         self.coverage = coverage
         self.durations: dict[str, float] = {}
+        self.failed: set[str] = set()
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed:
+            self.failed.add(report.nodeid)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
@@ -57,7 +62,8 @@ def watched(root: Path, out: Path, words: list[str]) -> int:
     code = pytest.main(["-n", "0", "-q", "-p", "no:cacheprovider", *words], plugins=[watch])
     measured.stop()
     data = measured.get_data()
-    names = list(watch.durations)
+    # A test that fails on the unchanged product can't catch anything.
+    names = [name for name in watch.durations if name not in watch.failed]
     number = {name: place for place, name in enumerate(names)}
     lines: dict[str, dict[int, list[int]]] = {}
     for file in data.measured_files():
