@@ -34,7 +34,7 @@ HOUSE = (
     (
         "apc.compiler.language",
         """
-        expression lexer grammar evaluation dimensions si_forms unit_grammar unit_names units unit_text
+        expression parsing lexer grammar evaluation dimensions si_forms units unit_text
         unit_check vectors values tables probes recordings
         """,
     ),

@@ -2,8 +2,6 @@
 
 import math
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from fractions import Fraction
 
@@ -12,14 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apc.compiler.errors import ApcError, Place
-from apc.compiler.language import unit_names, units
+from apc.compiler.language import units
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.si_forms import is_si
 from apc.compiler.language.unit_text import format_dimension, format_si
 from apc.compiler.language.units import NO_UNIT, parse_quantity, parse_unit, quantity
 from apc.compiler.language.values import is_quantity
-from apc.compiler.pipeline import run_stages
-from tests.topologies import ROOT
 
 HERE = Place("a.yaml", 1, 1)
 LENGTH, TIME = Dimension((("m", 1),)), Dimension((("s", 1),))
@@ -141,9 +137,7 @@ def test_a_gram_is_no_grain() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    "name", [*unit_names.COMMON, "lbf", "ozf", "gf", "psi", "bar", "mbar", "mil", "slug"]
-)
+@pytest.mark.parametrize("name", [*units.COMMON, "lbf", "ozf", "gf", "psi", "bar", "mbar", "mil", "slug"])
 def test_what_a_haptics_engineer_writes_is_a_unit(name: str) -> None:
     assert parse_unit(name, HERE).scale > 0
 
@@ -279,31 +273,6 @@ def test_any_text_is_a_quantity_or_refused_and_nothing_else(text: str) -> None:
             parser(text, HERE)
         except ApcError as error:
             assert len(error.mistakes) == 1
-
-
-def test_pint_is_imported_only_when_a_rare_unit_is_read() -> None:
-    code = (
-        "import sys; from apc.compiler.errors import Place;"
-        " from apc.compiler.language.units import parse_quantity;"
-        " parse_quantity('500 N*s/m', Place('x', 1, 1)); assert 'pint' not in sys.modules;"
-        " parse_quantity('1 inch', Place('x', 1, 1)); assert 'pint' in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_no_scene_that_comes_with_the_program_has_a_rare_unit(monkeypatch: pytest.MonkeyPatch) -> None:
-    def rare() -> None:
-        raise AssertionError("pint is asked")
-
-    monkeypatch.setattr(unit_names, "_registry", rare)
-    units._unit.cache_clear()
-    for path in sorted((ROOT / "models" / "scenes").glob("*.yaml")):
-        run_stages(path, until="flat")
-
-
-@pytest.mark.parametrize("name", sorted(unit_names._OF_HAPTICS))
-def test_a_unit_known_without_pint_is_what_pint_says(name: str) -> None:
-    assert unit_names._scaled(name) == unit_names._OF_HAPTICS[name]
 
 
 @pytest.mark.parametrize(

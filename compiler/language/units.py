@@ -1,13 +1,12 @@
 """The text of a unit or of a quantity to exact SI numbers.
 
 Takes: a text (`N*s/m`, `500 N/m`), and where it stands.
-Gives: `Unit`, `Quantity`; `parse_unit`, `parse_quantity`, and `quantity`, which has to fit a unit.
-Guarantees: values are exact rationals (0.1 kg is 1/10); the cost of a text is bounded.
+Gives: `Unit`, `Quantity`; `parse_unit`, `parse_quantity`, and `quantity`, which has to fit a unit; `COMMON`.
+Guarantees: values are exact rationals (0.1 kg is 1/10, an angle in degrees uses π to 50 digits); the cost of
+a text is bounded; a unit that is not in units.txt, as a grain, is not taken for one that is meant.
 Does not: know which quantity wants which unit, or check expressions (see `unit_check`).
 
-The grammar of a quantity, whose unit is that of `unit_grammar`:
-
-    quantity = number ["/" number] [unit]
+A quantity is `number ["/" number] [unit]`; unit.lark is the grammar of a unit, Pint knows what its names are.
 """
 
 from __future__ import annotations
@@ -16,19 +15,84 @@ import math
 import re
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import lru_cache
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any, NoReturn
 
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
+import pint
+from lark import Lark, Token
+from lark.exceptions import UnexpectedCharacters, UnexpectedToken
+
+from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension, product
 from apc.compiler.language.expression import PI
-from apc.compiler.language.unit_grammar import NAME, FaultError, parse_factor
-from apc.compiler.language.unit_names import COMMON, look_up, spelled, turning
+from apc.compiler.language.parsing import TREE, FaultError, exponent_of, kind_of, parser, unclosed
 from apc.compiler.words import cut
 
 TURN = 2 * PI  # a cycle in radians
 MAX_LENGTH = 200  # characters of a quantity
 MAX_NUMBER_EXPONENT = 300  # of 1e300: still a float
+MAX_EXPONENT = 9  # of a unit: m^9
+MAX_BITS = 4096  # of a unit's scale; 10^300 has 997
 
+# What a scene is likely to use: proposed for a misspelt name, and told apart by case.
+COMMON = (
+    "N",
+    "mN",
+    "kN",
+    "kg",
+    "g",
+    "m",
+    "mm",
+    "cm",
+    "um",
+    "s",
+    "ms",
+    "us",
+    "min",
+    "Hz",
+    "kHz",
+    "rad",
+    "deg",
+    "A",
+    "mA",
+    "V",
+    "W",
+    "kW",
+    "J",
+    "K",
+    "Pa",
+    "mol",
+    "cd",
+    "lb",
+    "inch",
+    "ft",
+    "kgf",
+    "rpm",
+    "percent",
+    "newton",
+    "meter",
+    "second",
+    "gram",
+    "kilogram",
+    "hertz",
+    "radian",
+    "degree",
+    "millisecond",
+    "millimeter",
+)
+_BASES = {
+    "gram": "kg",
+    "meter": "m",
+    "second": "s",
+    "ampere": "A",
+    "kelvin": "K",
+    "mole": "mol",
+    "candela": "cd",
+}
+_ANGLES = ("radian", "degree", "arcminute", "arcsecond", "turn", "_per_minute", "_per_second")
+_LONG = ("hecto", "kilo", "mega", "giga", "tera")  # no prefix of a second
+NAME = re.compile(r"[^\W\d_²³][^\W²³]*|[%°]")  # as in the grammar
 _NUMBER = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _QUANTITY_START = re.compile(rf"\s*[+-]?{_NUMBER}(?:\s*/\s*{_NUMBER})?")
 _EXPONENT = re.compile(r"\^-?[0-9]+|\*\*-?[0-9]+|[²³]")
@@ -51,6 +115,13 @@ class Quantity:
     value: Fraction
     unit: Unit
     text: str
+
+    @property
+    def number(self) -> str:
+        """The number as written, without its unit."""
+        found = _QUANTITY_START.match(self.text)
+        assert found is not None
+        return found.group().strip()
 
 
 NO_UNIT = Unit("1", Fraction(1), DIMENSIONLESS)
@@ -109,10 +180,10 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
     try:
         found = _quantity(text)
     except FaultError as fault:
-        if fault.code == "E221" and not fault.hint:
-            example = "1" if wanted.text == "1" else f"1 {unit}"
-            got = cut(text) or "nothing"
-            raise ApcError(Mistake("E221", place, what, named, got, f"{what}: {example}")) from None
+        if fault.code == "E221" and not fault.words[-1]:
+            example = f"{what}: 1 {unit}".removesuffix(" 1 1") + " 1" * (unit == "1")
+            mistake = Mistake("E221", place, what, named, cut(text) or "nothing", example)
+            raise ApcError(mistake) from None
         raise fault.placed(text, place) from None
     if found.unit.dimension == wanted.dimension and (
         found.unit != NO_UNIT or wanted.dimension == DIMENSIONLESS
@@ -120,18 +191,15 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
         if found.unit.dimension.clashes(wanted.dimension):
             raise ApcError(_other_turning(found, wanted, place, what))
         return found
-    number = _QUANTITY_START.match(text.strip())
-    assert number is not None
     got, right = cut(text.strip()), unit
     if found.unit == NO_UNIT:
         got += " (no unit)"
     elif (confused := _confused(found.unit, wanted.dimension)) is not None:
         name, right = confused
-        got += f" ({name} is {spelled(name)}: case matters)"
+        got += f" ({name} is {_long_name(name)}: case matters)"
     else:
         right = _meant(found.unit, wanted)
-    shown = number.group().strip()
-    hint = f"{what}: {shown} {right}".removesuffix(" 1") if right else ""
+    hint = f"{what}: {found.number} {right}".removesuffix(" 1") if right else ""
     raise ApcError(Mistake("E204", place, what, named, got, hint))
 
 
@@ -151,13 +219,12 @@ def _meant(unit: Unit, wanted: Unit) -> str:
 
 def _other_turning(found: Quantity, wanted: Unit, place: Place, what: str) -> Mistake:
     """Return what is told of cycles where radians are due, or the reverse: 20 Hz are 125.66 rad/s."""
-    number = _QUANTITY_START.match(found.text.strip())
-    assert number is not None
     turns = TURN if wanted.dimension.turning == "rad" else 1 / TURN
     same = f"{float(found.value * turns / wanted.scale):.9g} {wanted.text}"
     got = f"{cut(found.text.strip())}, which is {same}"
-    hint = f"{what}: {same}, or {what}: {number.group().strip()} {wanted.text}"
-    return Mistake("E204", place, what, wanted.text, got, hint)
+    return Mistake(
+        "E204", place, what, wanted.text, got, f"{what}: {same}, or {what}: {found.number} {wanted.text}"
+    )
 
 
 def _confused(unit: Unit, wanted: Dimension) -> tuple[str, str] | None:
@@ -182,64 +249,208 @@ def _is_of(text: str, wanted: Dimension) -> bool:
 @lru_cache(maxsize=4096)
 def _quantity(text: str) -> Quantity:
     if len(text) > MAX_LENGTH:
-        raise FaultError(
-            "E221", 0, "a quantity", expected=f"at most {MAX_LENGTH} characters", got=f"{len(text)}"
-        )
+        raise FaultError("E221", 0, "a quantity", f"at most {MAX_LENGTH} characters", f"{len(text)}")
     if _NOT_FINITE.match(text.strip()):
-        raise FaultError("E221", 0, "a quantity", expected="a finite number", got=cut(text.strip()))
+        raise FaultError("E221", 0, "a quantity", "a finite number", cut(text.strip()))
     found = _QUANTITY_START.match(text)
     if found is None:
         hint = text.strip().replace("−", "-") if text.strip().startswith("−") else ""
-        got = cut(text.strip()) or "nothing"
-        raise FaultError("E221", 0, "a quantity", expected="a number and its unit", got=got, hint=hint)
-    value = _number(found.group(), len(found.group()) - len(found.group().lstrip()))
-    rest = text[found.end() :]
-    if re.match(r",[0-9]", rest):
-        hint = f"{found.group().strip()}.{rest[1:].strip()}"
-        raise FaultError("E221", found.end(), "a number has a decimal point, not a comma", hint=cut(hint))
-    if re.match(r"\s*/", rest):
-        hint = f"{found.group().strip()} 1{rest.strip()}"
         raise FaultError(
-            "E222", found.end(), "a unit", expected="something above the /", got="nothing", hint=hint
+            "E221", 0, "a quantity", "a number and its unit", cut(text.strip()) or "nothing", hint
         )
+    number, rest = found.group().strip(), text[found.end() :]
+    value = _number(number, found.group().index(number))
+    if re.match(r",[0-9]", rest):
+        hint = cut(f"{number}.{rest[1:].strip()}")
+        raise FaultError("E221", found.end(), "a number has a decimal point, not a comma", hint=hint)
+    if re.match(r"\s*/", rest):
+        hint = f"{number} 1{rest.strip()}"
+        raise FaultError("E222", found.end(), "a unit", "something above the /", "nothing", hint)
     try:
         unit = _unit(rest) if rest.strip() else NO_UNIT
     except FaultError as fault:
         fault.offset += found.end()
         raise
-    return Quantity(_finite(value * unit.scale), unit, text)
+    try:
+        float(value * unit.scale)
+    except OverflowError:
+        raise FaultError("E226", 0, "this quantity is too large for a number") from None
+    return Quantity(value * unit.scale, unit, text)
 
 
 def _number(text: str, offset: int) -> Fraction:
     """Return the exact value of a number or of a quotient of two."""
-    above, _, below = text.strip().partition("/")
-    values = []
-    for part in filter(None, (above.strip(), below.strip())):
-        mantissa, _, exponent = part.lower().partition("e")
-        if exponent and abs(int(exponent)) > MAX_NUMBER_EXPONENT:
+    for exponent in re.findall(r"[eE]([+-]?[0-9]+)", text):
+        if abs(int(exponent)) > MAX_NUMBER_EXPONENT:
             limit = f"an exponent from -{MAX_NUMBER_EXPONENT} to {MAX_NUMBER_EXPONENT}"
-            raise FaultError("E226", offset, "a number", expected=limit, got=cut(exponent))
-        values.append(Fraction(mantissa) * Fraction(10) ** int(exponent or 0))
-    if len(values) == 1:
-        return values[0]
-    if values[1] == 0:
-        raise FaultError("E221", offset, f"{cut(text.strip())} divides by zero")
-    return values[0] / values[1]
-
-
-def _finite(value: Fraction) -> Fraction:
+            raise FaultError("E226", offset, "a number", limit, cut(exponent))
+    above, _, below = text.partition("/")
     try:
-        rounded = float(value)
-    except OverflowError:
-        rounded = math.inf
-    if math.isinf(rounded):
-        raise FaultError("E226", 0, "this quantity is too large for a number")
-    return value
+        return Fraction(above) / Fraction(below or "1")
+    except ZeroDivisionError:
+        raise FaultError("E221", offset, f"{cut(text)} divides by zero") from None
 
 
 @lru_cache(maxsize=1024)
 def _unit(text: str) -> Unit:
+    """Return a unit: what its names come to by Pint, as long as its scale is rational."""
     if len(text) > MAX_LENGTH:
-        raise FaultError("E222", 0, "a unit", expected=f"at most {MAX_LENGTH} characters", got=f"{len(text)}")
-    scale, dimension = parse_factor(text, look_up)
-    return Unit(text.strip(), scale, replace(dimension, turning=turning(text)))
+        raise FaultError("E222", 0, "a unit", f"at most {MAX_LENGTH} characters", f"{len(text)}")
+    try:
+        powers: dict[str, Fraction] = dict(_grammar().parse(text))
+    except UnexpectedCharacters as fault:
+        expected = "names joined by * and /, with exponents such as ^2"
+        raise FaultError("E222", fault.pos_in_stream, "a unit", expected, repr(fault.char)) from None
+    except UnexpectedToken as fault:
+        _refuse(text, fault)
+    squared, factors = Fraction(1), []  # the scale's square, so that roots of squares are exact
+    too_large = f"{cut(text.strip())} is no unit of this world: an exponent or its scale is too large"
+    bits = 0
+    for name, power in powers.items():
+        scale, base = registry().get_root_units(name)
+        scale = Fraction(scale) / Fraction(1000) ** int(base._units["gram"])
+        bits += abs(power) * max(scale.numerator.bit_length(), scale.denominator.bit_length()) * (scale != 1)
+        if bits > MAX_BITS:
+            raise FaultError("E225", 0, too_large)
+        if scale != 1 and 2 % power.denominator:
+            _refuse_root(text)
+        squared *= scale ** int(2 * power) if scale != 1 else 1
+        factors += [(_BASES[one], exponent * power) for one, exponent in base._units.items() if one in _BASES]
+    scale = Fraction(math.isqrt(squared.numerator), math.isqrt(squared.denominator))
+    if scale**2 != squared:
+        _refuse_root(text)
+    dimension = product(tuple(factors))
+    if any(abs(power) > MAX_EXPONENT for _, power in dimension.exponents):
+        raise FaultError("E225", 0, too_large)
+    return Unit(text.strip(), scale, replace(dimension, turning=_turning(text)))
+
+
+def _refuse_root(text: str) -> NoReturn:
+    expected = "a root whose scale is a rational number"
+    raise FaultError("E222", len(text.rstrip()), "a unit", expected, "its end")
+
+
+def _refuse(text: str, fault: UnexpectedToken) -> NoReturn:
+    """Raise E222 for what cannot follow in a unit."""
+    token, stack, hint = fault.token, fault.state.value_stack, ""
+    ended = token.type == "$END"
+    if "NAME" in fault.expected:
+        expected = "a name such as N, m or s"
+    elif "$END" not in fault.expected and "NUMBER" in fault.expected:
+        expected = f"a whole exponent up to {MAX_EXPONENT}"
+    elif unclosed(stack) >= 0:
+        expected = ")"
+    else:
+        expected = "* or / between two names"
+        hint = re.sub(r"(\w)\s+(?=\w)", r"\1*", text.strip())
+    offset = len(text.rstrip()) if ended else token.start_pos
+    got = "its end" if ended else str(token)
+    raise FaultError("E222", offset, "a unit", expected, got, hint if hint != text.strip() else "")
+
+
+def _turning(text: str) -> str:
+    """Return whether a unit counts cycles ("Hz") or radians ("rad"); an empty text if it tells of neither."""
+    for name in map(_long_name, NAME.findall(text)):
+        if name.endswith("hertz"):
+            return "Hz"
+        if name.endswith(_ANGLES):
+            return "rad"
+    return ""
+
+
+class _Units(TREE):
+    """What the rules of unit.lark come to: Pint's products of powers of names."""
+
+    def NAME(self, token: Token) -> Any:
+        return registry().UnitsContainer({_looked_up(token): Fraction(1)})
+
+    def one(self, parts: list[Token]) -> Any:
+        if parts[0] != "1":
+            raise FaultError(
+                "E222", parts[0].start_pos or 0, "a unit", "a name such as N, m or s", str(parts[0])
+            )
+        return registry().UnitsContainer()
+
+    def times(self, parts: list[Any]) -> Any:
+        return parts[0] * parts[2]
+
+    def over(self, parts: list[Any]) -> Any:
+        return parts[0] / parts[1]
+
+    def raised(self, parts: list[Any]) -> Any:
+        exponent = parts[-1]
+        return parts[0] ** (Fraction(2 + "²³".index(exponent)) if kind_of(exponent) else exponent)
+
+    def exponent(self, parts: list[Token]) -> Fraction:
+        for part in parts:
+            if part.type == "NUMBER" and int(part) > MAX_EXPONENT:
+                expected = f"a whole exponent up to {MAX_EXPONENT}"
+                raise FaultError("E222", part.start_pos or 0, "a unit", expected, str(part))
+        try:
+            return exponent_of(parts)
+        except ZeroDivisionError:
+            expected = "an exponent that does not divide by zero"
+            raise FaultError("E222", (parts[-1].end_pos or 0), "a unit", expected, ")") from None
+
+
+@cache
+def _grammar() -> Lark:
+    return parser("unit.lark", "unit", _Units())
+
+
+@cache
+def registry() -> Any:
+    """Return Pint's registry of the units there are, with exact numbers."""
+    return pint.UnitRegistry(str(Path(__file__).with_name("units.txt")), non_int_type=Fraction)
+
+
+@cache
+def _everything() -> Any:
+    """Return Pint's registry of every unit it knows, for messages: it takes a third of a second to build."""
+    return pint.UnitRegistry(non_int_type=Fraction)
+
+
+def _long_name(name: str) -> str:
+    """Return Pint's long name of a unit: `megasiemens` for MS; an empty text if there is none."""
+    for prefix, unit, _ in registry().parse_unit_name(name)[:1]:
+        prefixed = unit in registry().get_group("Prefixed").members
+        if not prefix or (prefixed and not (unit == "second" and prefix in _LONG)):
+            return str(registry().get_name(name))
+    return ""
+
+
+def _looked_up(name: Token) -> str:
+    """Return the long name of a unit. Raises FaultError: E223 no such unit, E224 no multiple of an SI unit."""
+    if found := _long_name(name):
+        return found
+    every = _everything()
+    # Nm is a yarn count to Pint, and a slip for N*m to everyone else.
+    others = [(prefix, unit) for prefix, unit, _ in every.parse_unit_name(name) if unit != "number_meter"]
+    offset = name.start_pos or 0
+    if not others:
+        raise FaultError("E223", offset, f"there is no unit {cut(name)}", hint=_proposal(name))
+    spelled = "".join(others[0])
+    dimension = every.get_dimensionality(others[0][1])
+    multiplied = every._units[others[0][1]].is_multiplicative
+    if not multiplied or {*every.get_root_units(others[0][1])[1]._units} - {*_BASES, "radian"}:
+        what = f"{name} ({spelled}) is no multiple of an SI unit"
+        raise FaultError("E224", offset, what, hint="K" if "degree_" in spelled else "")
+    like = [other for other in COMMON if registry().get_dimensionality(other) == dimension]
+    told = f"; there are {', '.join(like[:3])}" if like else ""
+    what = f"there is no unit {name} here: {spelled.replace('_', ' ')} is out of use{told}"
+    alike = [other for other in like if other.lower() == name.lower()]
+    alike += [other for other in like if name.lower().startswith(other)]
+    raise FaultError("E223", offset, what, hint=next(iter(alike), ""))
+
+
+def _proposal(name: str) -> str:
+    """Return what was probably meant: another case, an exponent, a product, or the nearest common name."""
+    for other in COMMON:
+        if other.lower() == name.lower():
+            return other
+    if (power := re.fullmatch(r"([^\W\d_]+)([2-9])", name)) and power.group(1) in COMMON:
+        return f"{power.group(1)}^{power.group(2)}"
+    for at in range(1, len(name)):
+        if name[:at] in COMMON and name[at:] in COMMON:
+            return f"{name[:at]}*{name[at:]}"
+    return nearest(name, COMMON)
