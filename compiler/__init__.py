@@ -5,8 +5,8 @@ files                       what is read and written, whoever named it
 multiples                   common multiples and divisors of exact times
 weights                     exact sums of the decimals by which peers weigh one another
 source                      nodes, yaml_faults, compose: YAML to nodes; reading: typed values out of nodes
-language                    expression, parsing, lexer, grammar: text to trees; evaluation: trees to formulas
-                            and values
+language                    expression, parsing, grammar: text to trees; evaluation: trees to formulas and
+                            values
                             dimensions, si_forms, units, unit_text, unit_check
                             vectors; values, tables, recordings: numbers of a scene, and in CSV files
                             probes: of what ping and irtt wrote

@@ -34,7 +34,7 @@ HOUSE = (
     (
         "apc.compiler.language",
         """
-        expression parsing lexer grammar evaluation dimensions si_forms units unit_text
+        expression parsing grammar evaluation dimensions si_forms units unit_text
         unit_check vectors values tables probes recordings
         """,
     ),
@@ -254,7 +254,7 @@ def test_the_compiler_never_imports_the_runtime() -> None:
 
 
 def test_no_expression_is_read_after_compiling() -> None:
-    read = {f"apc.compiler.language.{name}" for name in ("lexer", "grammar", "expression", "evaluation")}
+    read = {f"apc.compiler.language.{name}" for name in ("grammar", "expression", "evaluation")}
     assert not {name: wrong for name in {*ORDER} - COMPILER if (wrong := imports()[name] & read)}
 
 

@@ -89,6 +89,7 @@ _BASES = {
     "kelvin": "K",
     "mole": "mol",
     "candela": "cd",
+    "radian": "",  # a ratio of two lengths: the number 1
 }
 _ANGLES = ("radian", "degree", "arcminute", "arcsecond", "turn", "_per_minute", "_per_second")
 _LONG = ("hecto", "kilo", "mega", "giga", "tera")  # no prefix of a second
@@ -176,25 +177,28 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
         E204 a unit that does not fit, or none; and those of `parse_quantity`.
     """
     wanted = parse_unit(unit, place)
-    named = "a plain number" if wanted.text == "1" else unit
+    named = "a plain number" if unit == "1" else unit
     try:
         found = _quantity(text)
     except FaultError as fault:
-        if fault.code == "E221" and not fault.words[-1]:
-            example = f"{what}: 1 {unit}".removesuffix(" 1 1") + " 1" * (unit == "1")
-            mistake = Mistake("E221", place, what, named, cut(text) or "nothing", example)
-            raise ApcError(mistake) from None
+        if fault.code == "E221" and not fault.hint:
+            example = f"{what}: 1 {unit}".removesuffix(" 1") if unit == "1" else f"{what}: 1 {unit}"
+            raise ApcError(Mistake("E221", place, what, named, cut(text) or "nothing", example)) from None
         raise fault.placed(text, place) from None
-    if found.unit.dimension == wanted.dimension and (
-        found.unit != NO_UNIT or wanted.dimension == DIMENSIONLESS
-    ):
-        if found.unit.dimension.clashes(wanted.dimension):
-            raise ApcError(_other_turning(found, wanted, place, what))
-        return found
+    its, due = found.unit.dimension, wanted.dimension
     got, right = cut(text.strip()), unit
+    if its == due and (found.unit != NO_UNIT or due == DIMENSIONLESS):
+        if not its.clashes(due):
+            return found
+        # 20 Hz are 125.66 rad/s.
+        turns = TURN if due.turning == "rad" else 1 / TURN
+        same = f"{float(found.value * turns / wanted.scale):.9g} {unit}"
+        got, right = f"{got}, which is {same}", f"{unit}"
+        hint = f"{what}: {same}, or {what}: {found.number} {unit}"
+        raise ApcError(Mistake("E204", place, what, named, got, hint))
     if found.unit == NO_UNIT:
         got += " (no unit)"
-    elif (confused := _confused(found.unit, wanted.dimension)) is not None:
+    elif (confused := _confused(found.unit, due)) is not None:
         name, right = confused
         got += f" ({name} is {_long_name(name)}: case matters)"
     else:
@@ -215,16 +219,6 @@ def _meant(unit: Unit, wanted: Unit) -> str:
         texts += [re.sub(rf"\b{re.escape(name)}\b", other, unit.text) for other in longer]
     fitting = (text for text in texts if _is_of(text, wanted.dimension))
     return next(fitting, wanted.text if unit.scale == wanted.scale else "")
-
-
-def _other_turning(found: Quantity, wanted: Unit, place: Place, what: str) -> Mistake:
-    """Return what is told of cycles where radians are due, or the reverse: 20 Hz are 125.66 rad/s."""
-    turns = TURN if wanted.dimension.turning == "rad" else 1 / TURN
-    same = f"{float(found.value * turns / wanted.scale):.9g} {wanted.text}"
-    got = f"{cut(found.text.strip())}, which is {same}"
-    return Mistake(
-        "E204", place, what, wanted.text, got, f"{what}: {same}, or {what}: {found.number} {wanted.text}"
-    )
 
 
 def _confused(unit: Unit, wanted: Dimension) -> tuple[str, str] | None:
@@ -250,29 +244,26 @@ def _is_of(text: str, wanted: Dimension) -> bool:
 def _quantity(text: str) -> Quantity:
     if len(text) > MAX_LENGTH:
         raise FaultError("E221", 0, "a quantity", f"at most {MAX_LENGTH} characters", f"{len(text)}")
-    if _NOT_FINITE.match(text.strip()):
-        raise FaultError("E221", 0, "a quantity", "a finite number", cut(text.strip()))
     found = _QUANTITY_START.match(text)
     if found is None:
-        hint = text.strip().replace("−", "-") if text.strip().startswith("−") else ""
-        raise FaultError(
-            "E221", 0, "a quantity", "a number and its unit", cut(text.strip()) or "nothing", hint
-        )
-    number, rest = found.group().strip(), text[found.end() :]
-    value = _number(number, found.group().index(number))
+        bare = text.strip()
+        expected = "a finite number" if _NOT_FINITE.match(bare) else "a number and its unit"
+        hint = bare.replace("−", "-") if bare.startswith("−") else ""
+        raise FaultError("E221", 0, "a quantity", expected, cut(bare) or "nothing", hint=hint)
+    number, rest, end = found.group().strip(), text[found.end() :], found.end()
     if re.match(r",[0-9]", rest):
         hint = cut(f"{number}.{rest[1:].strip()}")
-        raise FaultError("E221", found.end(), "a number has a decimal point, not a comma", hint=hint)
+        raise FaultError("E221", end, "a number has a decimal point, not a comma", hint=hint)
+    value = _number(number, end - len(number))
     if re.match(r"\s*/", rest):
         hint = f"{number} 1{rest.strip()}"
-        raise FaultError("E222", found.end(), "a unit", "something above the /", "nothing", hint)
+        raise FaultError("E222", end, "a unit", "something above the /", "nothing", hint=hint)
     try:
         unit = _unit(rest) if rest.strip() else NO_UNIT
-    except FaultError as fault:
-        fault.offset += found.end()
-        raise
-    try:
         float(value * unit.scale)
+    except FaultError as fault:
+        fault.offset += end
+        raise
     except OverflowError:
         raise FaultError("E226", 0, "this quantity is too large for a number") from None
     return Quantity(value * unit.scale, unit, text)
@@ -293,59 +284,50 @@ def _number(text: str, offset: int) -> Fraction:
 
 @lru_cache(maxsize=1024)
 def _unit(text: str) -> Unit:
-    """Return a unit: what its names come to by Pint, as long as its scale is rational."""
+    """Return a unit: what its names come to by Pint."""
     if len(text) > MAX_LENGTH:
         raise FaultError("E222", 0, "a unit", f"at most {MAX_LENGTH} characters", f"{len(text)}")
     try:
-        powers: dict[str, Fraction] = dict(_grammar().parse(text))
+        powers = _grammar().parse(text)
     except UnexpectedCharacters as fault:
         expected = "names joined by * and /, with exponents such as ^2"
         raise FaultError("E222", fault.pos_in_stream, "a unit", expected, repr(fault.char)) from None
     except UnexpectedToken as fault:
         _refuse(text, fault)
-    squared, factors = Fraction(1), []  # the scale's square, so that roots of squares are exact
-    too_large = f"{cut(text.strip())} is no unit of this world: an exponent or its scale is too large"
-    bits = 0
+    scales: list[tuple[Fraction, Fraction]] = []
+    factors: list[tuple[str, Fraction]] = []
     for name, power in powers.items():
-        scale, base = registry().get_root_units(name)
-        scale = Fraction(scale) / Fraction(1000) ** int(base._units["gram"])
-        bits += abs(power) * max(scale.numerator.bit_length(), scale.denominator.bit_length()) * (scale != 1)
-        if bits > MAX_BITS:
-            raise FaultError("E225", 0, too_large)
-        if scale != 1 and 2 % power.denominator:
-            _refuse_root(text)
-        squared *= scale ** int(2 * power) if scale != 1 else 1
-        factors += [(_BASES[one], exponent * power) for one, exponent in base._units.items() if one in _BASES]
-    scale = Fraction(math.isqrt(squared.numerator), math.isqrt(squared.denominator))
-    if scale**2 != squared:
-        _refuse_root(text)
-    dimension = product(tuple(factors))
-    if any(abs(power) > MAX_EXPONENT for _, power in dimension.exponents):
-        raise FaultError("E225", 0, too_large)
+        scale, bases = registry().get_root_units(name)
+        scales.append((Fraction(scale) / Fraction(1000) ** int(bases._units["gram"]), power))
+        factors += [(_BASES[base], power * exponent) for base, exponent in bases._units.items()]
+    dimension = product(tuple(factor for factor in factors if factor[0]))
+    bits = sum(abs(power) * max(s.numerator.bit_length(), s.denominator.bit_length()) for s, power in scales)
+    if bits > MAX_BITS or any(abs(power) > MAX_EXPONENT for _, power in dimension.exponents):
+        what = f"{cut(text.strip())} is no unit of this world: an exponent or its scale is too large"
+        raise FaultError("E225", 0, what)
+    square = math.prod((scale ** int(2 * power) for scale, power in scales), start=Fraction(1))
+    scale = Fraction(math.isqrt(square.numerator), math.isqrt(square.denominator))
+    if scale**2 != square or any(scale != 1 and 2 % power.denominator for scale, power in scales):
+        expected = "a root whose scale is a rational number"
+        raise FaultError("E222", len(text.rstrip()), "a unit", expected, "its end")
     return Unit(text.strip(), scale, replace(dimension, turning=_turning(text)))
-
-
-def _refuse_root(text: str) -> NoReturn:
-    expected = "a root whose scale is a rational number"
-    raise FaultError("E222", len(text.rstrip()), "a unit", expected, "its end")
 
 
 def _refuse(text: str, fault: UnexpectedToken) -> NoReturn:
     """Raise E222 for what cannot follow in a unit."""
-    token, stack, hint = fault.token, fault.state.value_stack, ""
+    token, text, hint = fault.token, text.rstrip(), ""
     ended = token.type == "$END"
     if "NAME" in fault.expected:
         expected = "a name such as N, m or s"
     elif "$END" not in fault.expected and "NUMBER" in fault.expected:
         expected = f"a whole exponent up to {MAX_EXPONENT}"
-    elif unclosed(stack) >= 0:
+    elif unclosed(fault.state.value_stack) >= 0:
         expected = ")"
     else:
-        expected = "* or / between two names"
-        hint = re.sub(r"(\w)\s+(?=\w)", r"\1*", text.strip())
-    offset = len(text.rstrip()) if ended else token.start_pos
-    got = "its end" if ended else str(token)
-    raise FaultError("E222", offset, "a unit", expected, got, hint if hint != text.strip() else "")
+        expected, joined = "* or / between two names", re.sub(r"(\w)\s+(?=\w)", r"\1*", text.strip())
+        hint = joined if joined != text.strip() else ""
+    at, got = (len(text), "its end") if ended else (token.start_pos, str(token))
+    raise FaultError("E222", at, "a unit", expected, got, hint=hint)
 
 
 def _turning(text: str) -> str:
@@ -366,9 +348,8 @@ class _Units(TREE):
 
     def one(self, parts: list[Token]) -> Any:
         if parts[0] != "1":
-            raise FaultError(
-                "E222", parts[0].start_pos or 0, "a unit", "a name such as N, m or s", str(parts[0])
-            )
+            expected = "a name such as N, m or s"
+            raise FaultError("E222", parts[0].start_pos, "a unit", expected, str(parts[0]))
         return registry().UnitsContainer()
 
     def times(self, parts: list[Any]) -> Any:
@@ -385,17 +366,17 @@ class _Units(TREE):
         for part in parts:
             if part.type == "NUMBER" and int(part) > MAX_EXPONENT:
                 expected = f"a whole exponent up to {MAX_EXPONENT}"
-                raise FaultError("E222", part.start_pos or 0, "a unit", expected, str(part))
+                raise FaultError("E222", part.start_pos, "a unit", expected, str(part))
         try:
             return exponent_of(parts)
         except ZeroDivisionError:
             expected = "an exponent that does not divide by zero"
-            raise FaultError("E222", (parts[-1].end_pos or 0), "a unit", expected, ")") from None
+            raise FaultError("E222", parts[-1].end_pos, "a unit", expected, ")") from None
 
 
 @cache
 def _grammar() -> Lark:
-    return parser("unit.lark", "unit", _Units())
+    return parser("unit.lark", ["unit"], _Units())
 
 
 @cache
@@ -420,27 +401,26 @@ def _long_name(name: str) -> str:
 
 
 def _looked_up(name: Token) -> str:
-    """Return the long name of a unit. Raises FaultError: E223 no such unit, E224 no multiple of an SI unit."""
+    """Return the long name of a unit. Raises FaultError: E223 no such unit, E224 no multiple of SI."""
     if found := _long_name(name):
         return found
     every = _everything()
     # Nm is a yarn count to Pint, and a slip for N*m to everyone else.
     others = [(prefix, unit) for prefix, unit, _ in every.parse_unit_name(name) if unit != "number_meter"]
-    offset = name.start_pos or 0
     if not others:
-        raise FaultError("E223", offset, f"there is no unit {cut(name)}", hint=_proposal(name))
-    spelled = "".join(others[0])
-    dimension = every.get_dimensionality(others[0][1])
-    multiplied = every._units[others[0][1]].is_multiplicative
-    if not multiplied or {*every.get_root_units(others[0][1])[1]._units} - {*_BASES, "radian"}:
-        what = f"{name} ({spelled}) is no multiple of an SI unit"
-        raise FaultError("E224", offset, what, hint="K" if "degree_" in spelled else "")
+        raise FaultError("E223", name.start_pos, f"there is no unit {cut(name)}", hint=_proposal(name))
+    (prefix, unit), *_ = others
+    spelled = f"{prefix}{unit}".replace("_", " ")
+    if not every._units[unit].is_multiplicative or every.get_root_units(unit)[1]._units.keys() - _BASES:
+        what = f"{name} ({prefix}{unit}) is no multiple of an SI unit"
+        raise FaultError("E224", name.start_pos, what, hint="K" if "degree_" in unit else "")
+    dimension = every.get_dimensionality(unit)
     like = [other for other in COMMON if registry().get_dimensionality(other) == dimension]
     told = f"; there are {', '.join(like[:3])}" if like else ""
-    what = f"there is no unit {name} here: {spelled.replace('_', ' ')} is out of use{told}"
-    alike = [other for other in like if other.lower() == name.lower()]
-    alike += [other for other in like if name.lower().startswith(other)]
-    raise FaultError("E223", offset, what, hint=next(iter(alike), ""))
+    what = f"there is no unit {name} here: {spelled} is out of use{told}"
+    lower = name.lower()
+    alike = (other for other in like if lower == other.lower() or lower.startswith(other))
+    raise FaultError("E223", name.start_pos, what, hint=next(alike, ""))
 
 
 def _proposal(name: str) -> str:
