@@ -11,13 +11,14 @@ The grammar is expression.lark; Lark reads it.
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache, lru_cache
-from itertools import accumulate
+from itertools import accumulate, takewhile
 from typing import Any, NoReturn
 
-from lark import Lark, Token
+from lark import Token
 from lark.exceptions import UnexpectedCharacters, UnexpectedToken
 
 from apc.compiler.errors import Place, nearest
@@ -47,6 +48,7 @@ from apc.compiler.words import cut
 ALIKE = 0.8  # of the letters of a function's name, for another to be the one that was meant
 MAX_LENGTH = 10_000  # characters of an expression
 MAX_DEPTH = 100  # levels of the tree; Python's own stack allows about 300
+TOO_DEEP = f"this is nested or chained more than {MAX_DEPTH} deep: give a part of it a name"
 MAX_DIGITS = 1000  # characters of a number: Python refuses an integer of 4300 digits
 MAX_NUMBER_EXPONENT = 300  # of 1e300: still a float
 MAX_POWER = 100  # of x^100
@@ -67,6 +69,12 @@ _UNEXPECTED = {
     "%": "there is no % in an expression; write a hundredth as 0.01",
 }
 _CLOSERS = {"LPAR": ")", "LBRACE": "}", "IF": "then", "ELSEIF": "then", "THEN": "else"}
+_STRAY = {
+    ")": "this ) closes nothing",
+    "}": "this } closes nothing",
+    ",": "commas stand between arguments, or entries of a vector, only",
+    "=": "an expression wants one value, got an equation",
+}
 _OPENED = {"LPAR": "an opened (", "LBRACE": "an opened {", "THEN": "an if … then"}
 
 
@@ -87,7 +95,7 @@ def parse_expression(text: str, place: Place) -> Expr:
         E326 an exponent, E327 a condition where a number is due or the reverse, E328 too long or too deep.
     """
     try:
-        [expr] = _parsed(text, "expression")
+        expr: Expr = _parsed(text, "expression")[0]
         _check(expr, text)
         return expr
     except FaultError as fault:
@@ -120,25 +128,20 @@ def _parsed(text: str, start: str) -> list[Any]:
         expected = f"at most {MAX_LENGTH} characters"
         raise FaultError("E328", 0, "an expression", expected, f"{len(text)}")
     nesting = accumulate((c in "({") - (c in ")}") for c in text)
-    for at, depth in enumerate(nesting):
-        if depth >= MAX_DEPTH:
-            _refuse_depth(at)
+    if (deep := next((at for at, depth in enumerate(nesting) if depth >= MAX_DEPTH), None)) is not None:
+        raise FaultError("E328", deep, TOO_DEEP)
     try:
-        return _grammar().parse(text, start)
+        sides: list[Any] = _grammar()(text, start)
     except UnexpectedCharacters as fault:
-        _refuse_character(text, fault.pos_in_stream)
+        _refuse_character(text, fault.pos_in_stream or 0)
     except UnexpectedToken as fault:
         _refuse_token(text, fault)
+    return sides
 
 
 @cache
-def _grammar() -> Lark:
+def _grammar() -> Callable[[str, str], Any]:
     return parser("expression.lark", ["expression", "equation"], _Trees())
-
-
-def _refuse_depth(at: int) -> NoReturn:
-    what = f"this is nested or chained more than {MAX_DEPTH} deep: give a part of it a name"
-    raise FaultError("E328", at, what)
 
 
 def _refuse_character(text: str, at: int) -> NoReturn:
@@ -156,50 +159,43 @@ def _refuse_character(text: str, at: int) -> NoReturn:
 
 def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
     """Raise the mistake of a token that cannot follow what the parser has on its stack."""
-    token, stack, expected = fault.token, fault.state.value_stack, fault.expected
-    ended = token.type == "$END"
-    at = len(text) if ended else token.start_pos or 0
-    got = "the end of the text" if ended else cut(token)
-    last = stack[-1] if stack else None
-    open_at = unclosed(stack)
-    opener = kind_of(stack[open_at]) if open_at >= 0 else ""
-    behind = next((k for k in reversed(range(len(stack))) if not kind_of(stack[k])), -1) + 1
-    power = next((k for k in range(behind, len(stack)) if kind_of(stack[k]) == "POWER"), None)
-    if power is not None and "$END" not in expected:
-        start = stack[power + 1].start_pos if power + 1 < len(stack) else at
+    token, stack = fault.token, fault.state.value_stack
+    if token.type == "$END":
+        token = Token("$END", "the end of the text", len(text))
+    got, at = cut(token), unclosed(stack)
+    opener = kind_of(stack[at]) if at >= 0 else ""
+    called = f"{stack[at - 1]}(" if at > 0 and kind_of(stack[at - 1]) == "FUNCTION" else ""
+    tail = [token, *takewhile(kind_of, reversed(stack))]  # the tokens that are no part of a node yet
+    kinds = [kind_of(value) for value in tail]
+    if "POWER" in kinds[1:] and "$END" not in fault.expected:
+        start = tail[kinds.index("POWER", 1) - 1]
         raise FaultError("E326", start, "an exponent", "a number written out, as in x^2 or x^(1/2)", got)
-    if "NAME" in expected:
+    if "NAME" in fault.expected:
         if token.type in ("IF", "NOT"):
-            raise FaultError("E322", at, f"{token} … needs parentheses here")
-        if kind_of(last) == "COMMA" and got == _CLOSERS[opener]:
-            each = f"an argument of {stack[open_at - 1]}" if opener == "LPAR" else "an entry of a vector"
-            raise FaultError("E322", at, f"{each} is missing behind the comma")
-        raise FaultError("E322", at, "a number, a name or ( was expected", "", f"here, not {got}")
+            raise FaultError("E322", token, f"{token} … needs parentheses here")
+        if kinds[1:2] == ["COMMA"] and got == _CLOSERS[opener]:
+            each = f"an argument of {called[:-1]}" if called else "an entry of a vector"
+            raise FaultError("E322", token, f"{each} is missing behind the comma")
+        raise FaultError("E322", token, f"a number, a name or ( was expected here, not {got}")
     if token.type == "POWER":
-        raise FaultError("E326", at, "a power of a power needs parentheses", hint="(x^2)^3")
-    words = token.type in ("NAME", "FUNCTION", "NUMBER")
-    if words and power is None and kind_of(last) == "NUMBER" and not text[last.end_pos : at].strip(" "):
-        said = cut(text[last.start_pos : token.end_pos])
-        what = f"{said} is not a number, and units stand on parameters only"
-        hint = str(last)  # nothing is nothing in any unit
-        if Fraction(hint):
-            hint = f"a parameter, with default: {last} {token}; of a name, {last}*name"
-        raise FaultError("E323", last.start_pos, what, hint="" if token.type == "NUMBER" else hint)
+        raise FaultError("E326", token, "a power of a power needs parentheses", hint="(x^2)^3")
+    if kinds[1:2] == ["NUMBER"] and "POWER" not in kinds and kinds[0] in ("NAME", "FUNCTION", "NUMBER"):
+        number = tail[1]
+        said = text[number.start_pos : token.end_pos]
+        if not text[number.end_pos : token.start_pos].strip(" "):
+            what = f"{cut(said)} is not a number, and units stand on parameters only"
+            hint = f"a parameter, with default: {number} {token}; of a name, {number}*name"
+            hint = hint if Fraction(number) else str(number)  # nothing is nothing in any unit
+            raise FaultError("E323", number, what, hint="" if kinds[0] == "NUMBER" else hint)
     if token.type == "COMPARISON":
-        raise FaultError("E322", at, "a comparison has two sides", hint="a < b and b < c")
+        raise FaultError("E322", token, "a comparison has two sides", hint="a < b and b < c")
     if opener:
-        called = open_at and kind_of(stack[open_at - 1]) == "FUNCTION"
-        inside = f"{stack[open_at - 1]}(" if called else _OPENED.get(opener, "an if")
-        raise FaultError("E322", at, inside, _CLOSERS[opener], got)
-    if token.type == "EQUAL":
-        raise FaultError("E322", at, "an expression", "one value", "an equation")
-    if got in (")", "}"):
-        raise FaultError("E322", at, f"this {got} closes nothing")
-    if got == ",":
-        raise FaultError("E322", at, "commas stand between arguments, or entries of a vector, only")
-    if got in KEYWORDS:
-        raise FaultError("E322", at, f"{got} belongs to an if … then … else, and none is open here")
-    raise FaultError("E322", at, "an operator was expected", "", f"here, not {got}")
+        inside = called or _OPENED.get(opener, "an if")
+        raise FaultError("E322", token, inside, _CLOSERS[opener], got)
+    what = _STRAY.get(token, f"an operator was expected here, not {got}")
+    if token in KEYWORDS:
+        what = f"{token} belongs to an if … then … else, and none is open here"
+    raise FaultError("E322", token, what)
 
 
 def _check(expr: Expr, text: str) -> None:
@@ -209,7 +205,7 @@ def _check(expr: Expr, text: str) -> None:
     while waiting:
         node, depth, conditional = waiting.pop()
         if depth > MAX_DEPTH:
-            _refuse_depth(node.start)
+            raise FaultError("E328", node.start, TOO_DEEP)
         condition = isinstance(node, Compare | Logic | Not)
         # A name may stand for a condition; what it is, only its declaration can tell.
         if condition != conditional and not isinstance(node, Name):
@@ -229,23 +225,23 @@ class _Trees(TREE):
     def NUMBER(self, token: Token) -> Token:
         if len(token) > MAX_DIGITS:
             expected = f"at most {MAX_DIGITS} characters"
-            raise FaultError("E323", token.start_pos, "a number", expected, f"{len(token)}")
+            raise FaultError("E323", token, "a number", expected, f"{len(token)}")
         exponent = token.lower().partition("e")[2]
         if abs(int(exponent or 0)) > MAX_NUMBER_EXPONENT:
             limit = f"an exponent from -{MAX_NUMBER_EXPONENT} to {MAX_NUMBER_EXPONENT}"
-            raise FaultError("E323", token.start_pos, "a number", limit, cut(exponent))
+            raise FaultError("E323", token, "a number", limit, cut(exponent))
         return token
 
     def NAME(self, token: Token) -> Token:
         for segment in token.split("."):
             word, _, index = segment.rstrip("]").partition("[")
             if word.startswith("_"):
-                raise FaultError("E324", token.start_pos, "a name", "a letter first", cut(token))
+                raise FaultError("E324", token, "a name", "a letter first", cut(token))
             if segment in KEYWORDS:
-                raise FaultError("E324", token.start_pos, f"{word} is a word of the language, not a name")
+                raise FaultError("E324", token, f"{word} is a word of the language, not a name")
             if index.startswith("0") or len(index) > 9:
                 expected = "a whole number counted from 1"
-                raise FaultError("E324", token.start_pos, "an index", expected, cut(index))
+                raise FaultError("E324", token, "an index", expected, cut(index))
         return token
 
     def FUNCTION(self, token: Token) -> Token:
@@ -254,7 +250,7 @@ class _Trees(TREE):
             what = f"there is no function {cut(token)}"
             if not close:
                 what += f"; there are: {', '.join(sorted(FUNCTIONS))}"
-            raise FaultError("E325", token.start_pos, what, hint=f"{close}(…)" if close else "")
+            raise FaultError("E325", token, what, hint=f"{close}(…)" if close else "")
         return token
 
     def expression(self, parts: list[Any]) -> list[Any]:
@@ -275,30 +271,30 @@ class _Trees(TREE):
         try:
             value = exponent_of(parts)
         except ZeroDivisionError:
-            raise FaultError("E326", parts[0].start_pos, "this exponent divides by zero") from None
+            raise FaultError("E326", parts[0], "this exponent divides by zero") from None
         if abs(value) > MAX_POWER or value.denominator > MAX_POWER:
             limit = f"-{MAX_POWER} to {MAX_POWER}, or a fraction of such numbers"
-            raise FaultError("E326", parts[0].start_pos, "an exponent", limit, cut(str(value)))
+            raise FaultError("E326", parts[0], "an exponent", limit, cut(str(value)))
         return Number(value, **_span(*parts))
 
-    def binary(self, parts: list[Any]) -> Expr:
+    def binary(self, parts: list[Any]) -> Any:
         left, operator, right = parts
         kinds = {"COMPARISON": Compare, "AND": Logic, "OR": Logic}
         word = "^" if operator.type == "POWER" else str(operator)
         return kinds.get(operator.type, Binary)(word, left, right, **_span(left, right))
 
-    def unary(self, parts: list[Any]) -> Expr:
+    def unary(self, parts: list[Any]) -> Any:
         if parts[0] == "+":
             return parts[1]
         return (Negate if parts[0] == "-" else Not)(parts[1], **_span(*parts))
 
-    def parenthesis(self, parts: list[Any]) -> Expr:
+    def parenthesis(self, parts: list[Any]) -> Any:
         return replace(parts[1], **_span(*parts))
 
     def vector(self, parts: list[Any]) -> Expr:
         if len(parts) == 2:
             what = "a vector has entries; one of zeros is {0, 0}"
-            raise FaultError("E322", parts[0].start_pos, what)
+            raise FaultError("E322", parts[0], what)
         return Vector(tuple(parts[1:-1]), **_span(*parts))
 
     def call(self, parts: list[Any]) -> Expr:
@@ -307,7 +303,7 @@ class _Trees(TREE):
         if not least <= len(arguments) <= most:
             wanted = f"{least}" if least == most else f"{least} to {most}"
             plural = "argument" if most == 1 else "arguments"
-            raise FaultError("E325", function.start_pos, function, f"{wanted} {plural}", f"{len(arguments)}")
+            raise FaultError("E325", function, function, f"{wanted} {plural}", f"{len(arguments)}")
         if function != "interval":
             return Call(str(function), tuple(arguments), **_span(*parts))
         [clock] = arguments
@@ -316,7 +312,7 @@ class _Trees(TREE):
             raise FaultError("E325", clock.start, function, "the name of a clock", got)
         return Name((interval_of(clock.parts[0]),), **_span(*parts))
 
-    def conditional(self, parts: list[Any]) -> Expr:
+    def conditional(self, parts: list[Any]) -> Any:
         otherwise = parts[-1]
         for at in reversed(range(0, len(parts) - 2, 4)):
             condition, then = parts[at + 1], parts[at + 3]

@@ -8,7 +8,8 @@ Does not: bound a text: whoever parses it does, before.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -25,19 +26,25 @@ _OPENERS = ("LPAR", "LBRACE", "IF", "THEN", "ELSEIF")
 class FaultError(Exception):
     """A mistake that does not know yet where its text stands, so that results can be kept by text."""
 
-    def __init__(self, code: str, offset: int | None, *words: str, hint: str = "") -> None:
-        super().__init__(*words)
-        self.code, self.offset, self.words, self.hint = code, offset or 0, words, hint
+    def __init__(
+        self, code: str, at: int | Token | None, what: str, expected: str = "", got: str = "", hint: str = ""
+    ) -> None:
+        super().__init__(what)
+        self.offset = (at.start_pos if isinstance(at, Token) else at) or 0
+        self.mistake = Mistake(code, Place(""), what, expected, got, hint)
 
     def placed(self, text: str, place: Place) -> ApcError:
         """Return the mistake of a text that starts at `place`."""
-        return ApcError(Mistake(self.code, place_in(place, text, self.offset), *self.words, hint=self.hint))
+        return ApcError(replace(self.mistake, place=place_in(place, text, self.offset)))
 
 
-def parser(grammar: str, starts: list[str], builder: TREE) -> Lark:
-    """Return the parser of a grammar's file, whose rules and tokens call the methods of `builder`."""
+def parser(grammar: str, starts: list[str], builder: TREE) -> Callable[[str, str], Any]:
+    """Return what parses a text by a grammar's file, from one of several starts.
+
+    Its rules and tokens call the methods of `builder`.
+    """
     text = Path(__file__).with_name(grammar).read_text(encoding="utf-8")
-    return Lark(text, start=starts, parser="lalr", lexer="basic", transformer=builder)
+    return Lark(text, start=starts, parser="lalr", lexer="basic", transformer=builder).parse
 
 
 def kind_of(value: object) -> str:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache, lru_cache
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import pint
-from lark import Lark, Token
+from lark import Token
 from lark.exceptions import UnexpectedCharacters, UnexpectedToken
 
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
@@ -181,7 +182,7 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
     try:
         found = _quantity(text)
     except FaultError as fault:
-        if fault.code == "E221" and not fault.hint:
+        if fault.mistake.code == "E221" and not fault.mistake.hint:
             example = f"{what}: 1 {unit}".removesuffix(" 1") if unit == "1" else f"{what}: 1 {unit}"
             raise ApcError(Mistake("E221", place, what, named, cut(text) or "nothing", example)) from None
         raise fault.placed(text, place) from None
@@ -288,7 +289,7 @@ def _unit(text: str) -> Unit:
     if len(text) > MAX_LENGTH:
         raise FaultError("E222", 0, "a unit", f"at most {MAX_LENGTH} characters", f"{len(text)}")
     try:
-        powers = _grammar().parse(text)
+        powers = _grammar()(text, "unit")
     except UnexpectedCharacters as fault:
         expected = "names joined by * and /, with exponents such as ^2"
         raise FaultError("E222", fault.pos_in_stream, "a unit", expected, repr(fault.char)) from None
@@ -326,7 +327,7 @@ def _refuse(text: str, fault: UnexpectedToken) -> NoReturn:
     else:
         expected, joined = "* or / between two names", re.sub(r"(\w)\s+(?=\w)", r"\1*", text.strip())
         hint = joined if joined != text.strip() else ""
-    at, got = (len(text), "its end") if ended else (token.start_pos, str(token))
+    at, got = (len(text), "its end") if ended else (token, str(token))
     raise FaultError("E222", at, "a unit", expected, got, hint=hint)
 
 
@@ -349,7 +350,7 @@ class _Units(TREE):
     def one(self, parts: list[Token]) -> Any:
         if parts[0] != "1":
             expected = "a name such as N, m or s"
-            raise FaultError("E222", parts[0].start_pos, "a unit", expected, str(parts[0]))
+            raise FaultError("E222", parts[0], "a unit", expected, str(parts[0]))
         return registry().UnitsContainer()
 
     def times(self, parts: list[Any]) -> Any:
@@ -366,7 +367,7 @@ class _Units(TREE):
         for part in parts:
             if part.type == "NUMBER" and int(part) > MAX_EXPONENT:
                 expected = f"a whole exponent up to {MAX_EXPONENT}"
-                raise FaultError("E222", part.start_pos, "a unit", expected, str(part))
+                raise FaultError("E222", part, "a unit", expected, str(part))
         try:
             return exponent_of(parts)
         except ZeroDivisionError:
@@ -375,7 +376,7 @@ class _Units(TREE):
 
 
 @cache
-def _grammar() -> Lark:
+def _grammar() -> Callable[[str, str], Any]:
     return parser("unit.lark", ["unit"], _Units())
 
 
@@ -408,19 +409,19 @@ def _looked_up(name: Token) -> str:
     # Nm is a yarn count to Pint, and a slip for N*m to everyone else.
     others = [(prefix, unit) for prefix, unit, _ in every.parse_unit_name(name) if unit != "number_meter"]
     if not others:
-        raise FaultError("E223", name.start_pos, f"there is no unit {cut(name)}", hint=_proposal(name))
+        raise FaultError("E223", name, f"there is no unit {cut(name)}", hint=_proposal(name))
     (prefix, unit), *_ = others
     spelled = f"{prefix}{unit}".replace("_", " ")
     if not every._units[unit].is_multiplicative or every.get_root_units(unit)[1]._units.keys() - _BASES:
         what = f"{name} ({prefix}{unit}) is no multiple of an SI unit"
-        raise FaultError("E224", name.start_pos, what, hint="K" if "degree_" in unit else "")
+        raise FaultError("E224", name, what, hint="K" if "degree_" in unit else "")
     dimension = every.get_dimensionality(unit)
     like = [other for other in COMMON if registry().get_dimensionality(other) == dimension]
     told = f"; there are {', '.join(like[:3])}" if like else ""
     what = f"there is no unit {name} here: {spelled} is out of use{told}"
     lower = name.lower()
     alike = (other for other in like if lower == other.lower() or lower.startswith(other))
-    raise FaultError("E223", name.start_pos, what, hint=next(alike, ""))
+    raise FaultError("E223", name, what, hint=next(alike, ""))
 
 
 def _proposal(name: str) -> str:
