@@ -183,7 +183,7 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
         found = _quantity(text)
     except FaultError as fault:
         if fault.mistake.code == "E221" and not fault.mistake.hint:
-            example = f"{what}: 1 {unit}".removesuffix(" 1") if unit == "1" else f"{what}: 1 {unit}"
+            example = f"{what}: 1" if unit == "1" else f"{what}: 1 {unit}"
             raise ApcError(Mistake("E221", place, what, named, cut(text) or "nothing", example)) from None
         raise fault.placed(text, place) from None
     its, due = found.unit.dimension, wanted.dimension
@@ -194,17 +194,17 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
         # 20 Hz are 125.66 rad/s.
         turns = TURN if due.turning == "rad" else 1 / TURN
         same = f"{float(found.value * turns / wanted.scale):.9g} {unit}"
-        got, right = f"{got}, which is {same}", f"{unit}"
+        got += f", which is {same}"
         hint = f"{what}: {same}, or {what}: {found.number} {unit}"
-        raise ApcError(Mistake("E204", place, what, named, got, hint))
-    if found.unit == NO_UNIT:
-        got += " (no unit)"
-    elif (confused := _confused(found.unit, due)) is not None:
-        name, right = confused
-        got += f" ({name} is {_long_name(name)}: case matters)"
     else:
-        right = _meant(found.unit, wanted)
-    hint = f"{what}: {found.number} {right}".removesuffix(" 1") if right else ""
+        if found.unit == NO_UNIT:
+            got += " (no unit)"
+        elif confused := _confused(found.unit, due):
+            name, right = confused
+            got += f" ({name} is {_long_name(name)}: case matters)"
+        else:
+            right = _meant(found.unit, wanted)
+        hint = f"{what}: {found.number} {right}".removesuffix(" 1") if right else ""
     raise ApcError(Mistake("E204", place, what, named, got, hint))
 
 
@@ -302,8 +302,10 @@ def _unit(text: str) -> Unit:
         scales.append((Fraction(scale) / Fraction(1000) ** int(bases._units["gram"]), power))
         factors += [(_BASES[base], power * exponent) for base, exponent in bases._units.items()]
     dimension = product(tuple(factor for factor in factors if factor[0]))
-    bits = sum(abs(power) * max(s.numerator.bit_length(), s.denominator.bit_length()) for s, power in scales)
-    if bits > MAX_BITS or any(abs(power) > MAX_EXPONENT for _, power in dimension.exponents):
+    bits = (max(s.numerator.bit_length(), s.denominator.bit_length()) * abs(power) for s, power in scales)
+    if sum(bits, Fraction(0)) > MAX_BITS or any(
+        abs(power) > MAX_EXPONENT for _, power in dimension.exponents
+    ):
         what = f"{cut(text.strip())} is no unit of this world: an exponent or its scale is too large"
         raise FaultError("E225", 0, what)
     square = math.prod((scale ** int(2 * power) for scale, power in scales), start=Fraction(1))
