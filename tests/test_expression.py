@@ -31,6 +31,7 @@ from apc.compiler.language.expression import (
     walk,
 )
 from apc.compiler.language.grammar import parse_equation, parse_expression
+from tests.topologies import ROOT
 
 A, B, C, X = (Name((letter,)) for letter in "abcx")
 TWO = Number(Fraction(2))
@@ -386,3 +387,9 @@ def test_pi_is_a_number_of_the_language() -> None:
     assert parse("pie") == Name(("pie",))
     assert "E325 there is no function pi" in refusal("pi(x)")
     assert "E326" in refusal("x^pi")
+
+
+def test_the_reference_shows_the_grammar() -> None:
+    rules = (ROOT / "compiler" / "language" / "expression.lark").read_text(encoding="utf-8")
+    shown = rules[rules.index("expression: ") : rules.index("NUMBER: /")].strip()
+    assert shown in (ROOT / "models" / "README.md").read_text(encoding="utf-8")

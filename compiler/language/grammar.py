@@ -129,7 +129,7 @@ def _parsed(text: str, start: str) -> list[Any]:
         raise FaultError("E328", 0, "an expression", expected, f"{len(text)}")
     nesting = accumulate((c in "({") - (c in ")}") for c in text)
     if (deep := next((at for at, depth in enumerate(nesting) if depth >= MAX_DEPTH), None)) is not None:
-        raise FaultError("E328", deep, TOO_DEEP)
+        raise FaultError("E328", deep + 1, TOO_DEEP)
     try:
         sides: list[Any] = _grammar()(text, start)
     except UnexpectedCharacters as fault:
@@ -162,7 +162,7 @@ def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
     token, stack = fault.token, fault.state.value_stack
     if token.type == "$END":
         token = Token("$END", "the end of the text", len(text))
-    got, at = cut(token), unclosed(stack)
+    got, at = "^" if token.type == "POWER" else cut(token), unclosed(stack)
     opener = kind_of(stack[at]) if at >= 0 else ""
     called = f"{stack[at - 1]}(" if at > 0 and kind_of(stack[at - 1]) == "FUNCTION" else ""
     tail = [token, *takewhile(kind_of, reversed(stack))]  # the tokens that are no part of a node yet

@@ -199,38 +199,32 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
     else:
         if found.unit == NO_UNIT:
             got += " (no unit)"
-        elif confused := _confused(found.unit, due):
-            name, right = confused
-            got += f" ({name} is {_long_name(name)}: case matters)"
         else:
-            right = _meant(found.unit, wanted)
+            right, slip = _meant(found.unit, wanted)
+            got += f" ({slip} is {_long_name(slip)}: case matters)" if slip else ""
         hint = f"{what}: {found.number} {right}".removesuffix(" 1") if right else ""
     raise ApcError(Mistake("E204", place, what, named, got, hint))
 
 
-def _meant(unit: Unit, wanted: Unit) -> str:
+def _meant(unit: Unit, wanted: Unit) -> tuple[str, str]:
     """Return a unit of the dimension that is wanted in which the number as written may be meant.
 
-    That is the unit without one of its exponents, or with a letter more, or failing that the one that is
-    wanted, if a value in it is as large: 5 N/mm^2 are not proposed as 5 N/m, a millionth of it.
+    That is the unit with a name in another case, which is returned as well, MS for ms; without one of its
+    exponents, or with a letter more; or failing that the one that is wanted, if a value in it is as large:
+    5 N/mm^2 are not proposed as 5 N/m, a millionth of it.
     """
-    texts = [unit.text[: one.start()] + unit.text[one.end() :] for one in _EXPONENT.finditer(unit.text)]
-    for name in NAME.findall(unit.text):
-        longer = (other for other in COMMON if other.startswith(name) and len(other) == len(name) + 1)
-        texts += [re.sub(rf"\b{re.escape(name)}\b", other, unit.text) for other in longer]
-    fitting = (text for text in texts if _is_of(text, wanted.dimension))
-    return next(fitting, wanted.text if unit.scale == wanted.scale else "")
-
-
-def _confused(unit: Unit, wanted: Dimension) -> tuple[str, str] | None:
-    """Return a name of the unit that fits in another case, and the unit written with it: MS for ms."""
-    for name in NAME.findall(unit.text):
-        for other in COMMON:
-            if other != name and other.lower() == name.lower():
-                text = unit.text.replace(name, other)
-                if _is_of(text, wanted):
-                    return name, text
-    return None
+    others = [(name, other) for name in NAME.findall(unit.text) for other in COMMON if other != name]
+    texts = [
+        *((unit.text.replace(name, other), name) for name, other in others if other.lower() == name.lower()),
+        *((unit.text[: one.start()] + unit.text[one.end() :], "") for one in _EXPONENT.finditer(unit.text)),
+        *(
+            (re.sub(rf"\b{re.escape(name)}\b", other, unit.text), "")
+            for name, other in others
+            if other[:-1] == name
+        ),
+    ]
+    fitting = (found for found in texts if _is_of(found[0], wanted.dimension))
+    return next(fitting, (wanted.text if unit.scale == wanted.scale else "", ""))
 
 
 def _is_of(text: str, wanted: Dimension) -> bool:
@@ -318,8 +312,7 @@ def _unit(text: str) -> Unit:
 
 def _refuse(text: str, fault: UnexpectedToken) -> NoReturn:
     """Raise E222 for what cannot follow in a unit."""
-    token, text, hint = fault.token, text.rstrip(), ""
-    ended = token.type == "$END"
+    token, bare, hint = fault.token, text.strip(), ""
     if "NAME" in fault.expected:
         expected = "a name such as N, m or s"
     elif "$END" not in fault.expected and "NUMBER" in fault.expected:
@@ -327,10 +320,11 @@ def _refuse(text: str, fault: UnexpectedToken) -> NoReturn:
     elif unclosed(fault.state.value_stack) >= 0:
         expected = ")"
     else:
-        expected, joined = "* or / between two names", re.sub(r"(\w)\s+(?=\w)", r"\1*", text.strip())
-        hint = joined if joined != text.strip() else ""
-    at, got = (len(text), "its end") if ended else (token, str(token))
-    raise FaultError("E222", at, "a unit", expected, got, hint=hint)
+        expected, joined = "* or / between two names", re.sub(r"(\w)\s+(?=\w)", r"\1*", bare)
+        hint = joined if joined != bare else ""
+    at = len(text.rstrip()) if token.type == "$END" else token
+    got = {"$END": "its end", "POWER": "^"}.get(token.type, str(token))
+    raise FaultError("E222", at, "a unit", expected, got, hint)
 
 
 def _turning(text: str) -> str:

@@ -216,16 +216,16 @@ class _Writer:
         def binary(operator: str, one: Expr, two: Expr) -> Expr:
             return Binary(operator, one, two, start=expr.start, end=expr.end)
 
-        def turned(i: int, j: int) -> Expr:
-            return binary("-", binary("*", a[i], b[j]), binary("*", a[j], b[i]))
-
         a, b = vectors[0], vectors[-1]
-        if expr.function == "norm":
-            squares = reduce(partial(binary, "+"), (binary("^", one, Number(Fraction(2))) for one in a))
-            return replace(expr, function="sqrt", arguments=(squares,))
-        if expr.function == "dot":
-            return reduce(partial(binary, "+"), (binary("*", x, y) for x, y in zip(a, b, strict=True)))
-        return turned(0, 1) if len(a) == 2 else (turned(1, 2), turned(2, 0), turned(0, 1))
+        if expr.function == "cross":
+            pairs = ((0, 1),) if len(a) == 2 else ((1, 2), (2, 0), (0, 1))
+            turned = (binary("-", binary("*", a[i], b[j]), binary("*", a[j], b[i])) for i, j in pairs)
+            first, *others = turned
+            return (first, *others) if others else first
+        norm, two = expr.function == "norm", Number(Fraction(2))
+        terms = (binary("^", x, two) if norm else binary("*", x, y) for x, y in zip(a, b, strict=True))
+        total = reduce(partial(binary, "+"), terms)
+        return replace(expr, function="sqrt", arguments=(total,)) if norm else total
 
     def number(self, expr: Expr, hint: str = "") -> Expr:
         """Return an expression that has to be a number."""
