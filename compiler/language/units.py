@@ -34,7 +34,6 @@ TURN = 2 * PI  # a cycle in radians
 MAX_LENGTH = 200  # characters of a quantity
 MAX_NUMBER_EXPONENT = 300  # of 1e300: still a float
 MAX_EXPONENT = 9  # of a unit: m^9
-MAX_BITS = 4096  # of a unit's scale; 10^300 has 997
 
 # What a scene is likely to use: proposed for a misspelt name, and told apart by case.
 COMMON = (
@@ -83,14 +82,13 @@ COMMON = (
     "millimeter",
 )
 _BASES = {
-    "gram": "kg",
-    "meter": "m",
-    "second": "s",
-    "ampere": "A",
-    "kelvin": "K",
-    "mole": "mol",
-    "candela": "cd",
-    "radian": "",  # a ratio of two lengths: the number 1
+    "[mass]": "kg",
+    "[length]": "m",
+    "[time]": "s",
+    "[current]": "A",
+    "[temperature]": "K",
+    "[substance]": "mol",
+    "[luminosity]": "cd",
 }
 _ANGLES = ("radian", "degree", "arcminute", "arcsecond", "turn", "_per_minute", "_per_second")
 _LONG = ("hecto", "kilo", "mega", "giga", "tera")  # no prefix of a second
@@ -289,24 +287,21 @@ def _unit(text: str) -> Unit:
         raise FaultError("E222", fault.pos_in_stream, "a unit", expected, repr(fault.char)) from None
     except UnexpectedToken as fault:
         _refuse(text, fault)
-    scales: list[tuple[Fraction, Fraction]] = []
-    factors: list[tuple[str, Fraction]] = []
-    for name, power in powers.items():
-        scale, bases = registry().get_root_units(name)
-        scales.append((Fraction(scale) / Fraction(1000) ** int(bases._units["gram"]), power))
-        factors += [(_BASES[base], power * exponent) for base, exponent in bases._units.items()]
-    dimension = product(tuple(factor for factor in factors if factor[0]))
-    bits = (max(s.numerator.bit_length(), s.denominator.bit_length()) * abs(power) for s, power in scales)
-    if sum(bits, Fraction(0)) > MAX_BITS or any(
-        abs(power) > MAX_EXPONENT for _, power in dimension.exponents
-    ):
+    dimensions = registry().get_dimensionality(powers)
+    if any(abs(power) > MAX_EXPONENT for power in (*powers.values(), *dimensions.values())):
         what = f"{cut(text.strip())} is no unit of this world: an exponent or its scale is too large"
         raise FaultError("E225", 0, what)
-    square = math.prod((scale ** int(2 * power) for scale, power in scales), start=Fraction(1))
-    scale = Fraction(math.isqrt(square.numerator), math.isqrt(square.denominator))
-    if scale**2 != square or any(scale != 1 and 2 % power.denominator for scale, power in scales):
+    square: Fraction | float = Fraction(1)  # of the scale, so that the root of a square is exact
+    for name, power in powers.items():
+        grams = Fraction(1000) ** int(registry().get_dimensionality(name)["[mass]"])  # Pint's unit of mass
+        its = Fraction(registry().get_root_units(name)[0]) / grams
+        square *= 1 if its == 1 else its ** (2 * power)
+    rational = Fraction(square)
+    scale = Fraction(math.isqrt(rational.numerator), math.isqrt(rational.denominator))
+    if isinstance(square, float) or scale**2 != square:
         expected = "a root whose scale is a rational number"
         raise FaultError("E222", len(text.rstrip()), "a unit", expected, "its end")
+    dimension = product(tuple((_BASES[base], power) for base, power in dimensions.items()))
     return Unit(text.strip(), scale, replace(dimension, turning=_turning(text)))
 
 
@@ -408,7 +403,8 @@ def _looked_up(name: Token) -> str:
         raise FaultError("E223", name, f"there is no unit {cut(name)}", hint=_proposal(name))
     (prefix, unit), *_ = others
     spelled = f"{prefix}{unit}".replace("_", " ")
-    if not every._units[unit].is_multiplicative or every.get_root_units(unit)[1]._units.keys() - _BASES:
+    roots = every.get_root_units(unit)[1]._units
+    if not every._units[unit].is_multiplicative or any(root not in registry() for root in roots):
         what = f"{name} ({prefix}{unit}) is no multiple of an SI unit"
         raise FaultError("E224", name, what, hint="K" if "degree_" in unit else "")
     dimension = every.get_dimensionality(unit)

@@ -219,9 +219,8 @@ class _Writer:
         a, b = vectors[0], vectors[-1]
         if expr.function == "cross":
             pairs = ((0, 1),) if len(a) == 2 else ((1, 2), (2, 0), (0, 1))
-            turned = (binary("-", binary("*", a[i], b[j]), binary("*", a[j], b[i])) for i, j in pairs)
-            first, *others = turned
-            return (first, *others) if others else first
+            turned = [binary("-", binary("*", a[i], b[j]), binary("*", a[j], b[i])) for i, j in pairs]
+            return tuple(turned) if len(a) > 2 else turned[0]
         norm, two = expr.function == "norm", Number(Fraction(2))
         terms = (binary("^", x, two) if norm else binary("*", x, y) for x, y in zip(a, b, strict=True))
         total = reduce(partial(binary, "+"), terms)
