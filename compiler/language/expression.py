@@ -202,11 +202,7 @@ def _format(expr: Expr) -> tuple[str, int]:
         case Negate():
             return "-" + _inside(expr.operand, Level.SIGN), Level.SIGN
         case Binary("^", base, exponent):
-            text = _format(exponent)[0]
-            wrapped = (
-                text if isinstance(exponent, Number) and _format(exponent)[1] == Level.ATOM else f"({text})"
-            )
-            return f"{_inside(base, Level.ATOM)}^{wrapped}", Level.POWER
+            return f"{_inside(base, Level.ATOM)}^{_inside(exponent, Level.ATOM)}", Level.POWER
         case Binary() | Logic() | Compare():
             level = LEVELS[expr.operator]
             # Both sides of a comparison bind tighter than it: a < b < c is not in the language.

@@ -285,6 +285,9 @@ class _Trees(TREE):
 
     def unary(self, parts: list[Any]) -> Any:
         if parts[0] == "+":
+            if isinstance(parts[1], Compare | Logic | Not):
+                what = f"{cut(format_expression(parts[1]))} is a condition, and a number is due here"
+                raise FaultError("E327", parts[1].start, what)
             return parts[1]
         return (Negate if parts[0] == "-" else Not)(parts[1], **_span(*parts))
 
