@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,11 +17,10 @@ from apc.network.channel import PacketSource, channel_law
 from apc.simulation.blocks import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
-from tests.eventwise import MS, Play, User, coast, contact, pull
 from tests.lossy import apart, effective
+from tests.schemes import ByHand, course, everybody
+from tests.sites import MS
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
-
-USERS = tuple(User(device_x=x, cube_x=x) for x in (0.001, 0.005, -0.003))
 
 # A ring of three peers is complete.
 ODD = (
@@ -41,36 +42,16 @@ def played(system: CompiledSystem, *, duration: Fraction = Fraction(1), seed: in
     return rows_of(prepare(system, Settings(duration, jit=False, seed=seed)))
 
 
-def by_hand(
-    scene: Play, duration: Fraction, delays: Callable[[int, int], list[float]], *, newest: bool, zero: bool
-) -> list[list[float]]:
-    """Return x, v, x_O, v_O of every user at every haptic tick; forces act a tick after their computation."""
-    motion = [[one.device_x, 0.0, one.cube_x, 0.0] for one in scene.users]
-    n = len(motion)
-    late = {(i, j): delays(i, j) for i in range(n) for j in range(n) if i != j}
-    start = [(m[2], m[3]) for m in motion]
-    sent: list[list[tuple[float, float]]] = [[] for _ in motion]
-    acting = [(0.0, 0.0)] * n
-    rows = []
-    for tick in range(int(duration / MS) + 1):
-        rows.append([one for m in motion for one in m])
-        if tick % 8 == 0:
-            for i, m in enumerate(motion):
-                sent[i].append((m[2], m[3]))
-        computed = []
-        for j, (user, m) in enumerate(zip(scene.users, motion, strict=True)):
-            heard = [(0.0, *m[2:4])] * n
-            for i in range(n):
-                if i != j:
-                    number, missing = effective(late[i, j], tick, newest=newest)
-                    value = sent[i][number] if number >= 0 else start[i]
-                    heard[i] = (0.0, m[2], m[3]) if missing and zero else (0.0, *value)
-            computed.append((contact(scene, user, m), pull(scene, j, m, heard, n)))
-        for m, (f_c, f_t) in zip(motion, acting, strict=True):
-            m[0], m[1] = coast(m[0], m[1], -f_c, scene.device, scene.device_damping, 0.001)
-            m[2], m[3] = coast(m[2], m[3], f_c - f_t, scene.cube, scene.cube_damping, 0.001)
-        acting = computed
-    return rows
+def by_hand(operator: str, late: Callable[[int, int, int], tuple[int, bool]], zero: bool) -> ByHand:
+    """Return the scene of three users whose packets count as `late` says."""
+
+    def law(i: int, motion: Sequence[tuple[Any, Any]], heard: Any, memory: Any) -> tuple[Any, Any, Any]:
+        (x, _), (x_o, _) = motion
+        contact = 1000 * (x - x_o)
+        pull = sum(500 * (x_o - packet[0]) for packet in heard.values())
+        return [-contact, contact - (pull / 2 if operator == "mean" else pull)], memory, []
+
+    return ByHand([[(0.1, 5.0, 0.0), (0.2, 5.0, 0.0)]] * 3, everybody(3), law, told=1, late=late, zero=zero)
 
 
 @pytest.mark.few(3)
@@ -80,13 +61,13 @@ def test_a_played_scene_is_what_looking_at_every_packet_gives(operator: str, mor
     system = compiled(apart(AVERAGE if operator == "mean" else MESH, more))
     law = channel_law(system, system.links[0], 8 * MS)
     duration = Fraction(3, 10)
-    expected = by_hand(
-        Play(USERS, operator),
-        duration,
-        lambda i, j: PacketSource(law, "lan", [(i, j)], seed=3).take(45)[0].tolist(),
-        newest="all" not in more,
-        zero="zero" in more,
+    ways = itertools.permutations(range(3), 2)
+    late = {way: PacketSource(law, "lan", [way], seed=3).take(45)[0].tolist() for way in ways}
+    hand = by_hand(
+        operator, lambda i, j, tick: effective(late[i, j], tick, newest="all" not in more), "zero" in more
     )
+    rows = itertools.islice(course(hand, [[(x, 0.0)] * 2 for x in (0.001, 0.005, -0.003)]), 301)
+    expected = [[one for motion in now.motion for body in motion for one in body] for now in rows]
     wanted = [f"user[{i}].{name}" for i in (1, 2, 3) for name in ("device.x", "device.v", "cube.x", "cube.v")]
     for jit in (False, True):
         simulation = prepare(system, Settings(duration, jit=jit, seed=3))

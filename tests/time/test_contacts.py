@@ -18,7 +18,7 @@ from apc.simulation.blocks import blocks
 from apc.simulation.settings import Method, Settings, parse_method
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import Trajectory, simulate
-from tests.eventwise import coast
+from tests.schemes import coast
 from tests.sites import alone
 from tests.topologies import AVERAGE, ONE_MASS, compiled, library, replaced
 
@@ -294,7 +294,7 @@ def test_a_loop_that_newtons_method_solves_is_played(tmp_path: Path, sampled: bo
     if sampled:
         x, v = 0.02, 0.0
         for row in range(50):
-            x, v = coast(x, v, -soft(x), 0.1, 1.0, 1e-3)
+            x, v = coast(x, v, -soft(x), 0.1, 1.0, 0.0, 1e-3)
             assert found.values[row + 1, :2] == pytest.approx([x, v], rel=1e-9)
     else:
         true = solve_ivp(

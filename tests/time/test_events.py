@@ -5,6 +5,7 @@ A `Link` brings each packet after its delay; forces act when they are due; betwe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from fractions import Fraction
 
@@ -22,23 +23,19 @@ from apc.simulation.propagate import MOST_EXACT
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import Trajectory, simulate
-from tests.eventwise import MS, Play, User, experiment, play
-from tests.sites import alone, columned, linked, paper
+from tests.bruteforce import Scene, frame_matrix
+from tests.schemes import experiment
+from tests.sites import MS, alone, columned, linked, paper
 from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, replaced
 
 MOVED = "{count: 3, set: {device.x: [10 mm, 0 mm, -5 mm], cube.x: [2 mm, 0 mm, 1 mm]}}"
-USERS = (User(0.01, cube_x=0.002), User(), User(-0.005, cube_x=0.001))
+STARTS = [(0.01, 0.002), (0.0, 0.0), (-0.005, 0.001)]
 
 
 def users(trajectory: Trajectory, n: int) -> np.ndarray:
     """Return the rows as (rows, users, [x, v, x_O, v_O, F_C, F_T])."""
     kept = [i for i, one in enumerate(trajectory.signals) if not one.local.endswith(" acting")]
     return trajectory.values[:, kept].reshape(len(trajectory.time), n, 6)
-
-
-def by_hand(scene: Play, duration: Fraction) -> tuple[np.ndarray, np.ndarray]:
-    rows = np.array(play(scene, duration))
-    return rows[:, 0], rows[:, 1:].reshape(len(rows), len(scene.users), 6)
 
 
 def scene_file(name: str) -> str:
@@ -54,9 +51,9 @@ def test_the_papers_experiment_is_what_stepping_it_by_hand_gives(
     # The mesh shakes: each contact made or lost multiplies the roundings.
     length = Fraction(4, 5)
     found = simulate(compiled(scene_file(f"experiment-{name}.yaml")), duration=length, jit=False)
-    time, expected = by_hand(experiment(operator), length)
+    expected = experiment(operator, 801)
     expected[:, 0, 4] *= -1  # a push is positive on either side
-    assert (found.time == time).all()
+    assert found.time.tolist() == [tick / 1000 for tick in range(801)]
     assert np.abs(users(found, 3) - expected).max() < tolerance
 
 
@@ -80,10 +77,19 @@ def test_delays_of_any_length_act_when_they_should(
     text = text.replace("stiffness: 500 N/m", "stiffness: 200 N/m, damping: 1 N*s/m")
     text = text.replace("stiffness: 1000 N/m,", "stiffness: 300 N/m, damping: 0.5 N*s/m,")
     found = simulate(compiled(text), duration=Fraction(1, 10), jit=False)
-    scene = Play(USERS, operator, kc=300.0, bc=0.5, kt=200.0, bt=1.0, comp=comp, comm=comm)
-    time, expected = by_hand(scene, Fraction(1, 10))
-    assert (found.time == time).all()
-    assert np.abs(users(found, 3) - expected).max() < 1e-12
+    scene = Scene(operator, 3, kc=300.0, bc=0.5, kt=200.0, bt=1.0, comp=comp, comm=comm)
+    frame = np.array(frame_matrix(scene))
+    size = len(frame) // 3
+    forces = 3 * (math.ceil(comp / MS) + 1)
+    packets = (size - 4 - forces) // 2
+    state = np.concatenate([[x, 0, x_o, 0, *[0.0] * forces, *[x_o, 0] * packets] for x, x_o in STARTS])
+    for row in users(found, 3)[::8]:
+        user = state.reshape(3, size)
+        assert row[:, :4] == pytest.approx(user[:, :4], abs=1e-12)
+        # Of the tick before: the contact, and both parts of the coordination.
+        assert row[:, 4] == pytest.approx(user[:, 4], abs=1e-12)
+        assert row[:, 5] == pytest.approx(user[:, 5] + user[:, 6], abs=1e-12)
+        state = frame @ state
 
 
 def check_powers(
