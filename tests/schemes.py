@@ -24,8 +24,8 @@ Law = Callable[
 ]
 
 
-# (sender, receiver, tick) → which packet counts, and whether a newer one is missing. The number 0 is the first
-# that was sent, −1 stands for the start values.
+# (sender, receiver, tick) → which packet counts, and whether a newer one is missing. The number 0 is the
+# first that was sent, −1 stands for the start values.
 Late = Callable[[int, int, int], tuple[int, bool]]
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import json
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import flint
@@ -18,8 +16,6 @@ from apc.compiler.pipeline import compile_topology
 from apc.eigen.balls import precision
 from tests.bench.random_scenes import run
 from tests.bruteforce import Scene, as_ball, frame_matrix
-from tests.fifty_digits import events
-from tests.fifty_digits import truth as fifty_digits
 from tests.fifty_digits.truth import Truth, exact_course, spectral_truth
 from tests.schemes import experiment
 from tests.sites import MS, paper
@@ -95,19 +91,6 @@ def test_a_course_is_that_of_stepping_by_hand() -> None:
         assert names[0] == "right[1].device.x"
         by_hand = experiment(operator, len(rows))[:, :, :4]
         np.testing.assert_allclose(rows.reshape(by_hand.shape), by_hand, rtol=0, atol=1e-12)
-
-
-def test_the_reference_shares_with_the_runtime_what_it_says_and_no_more() -> None:
-    shared = set()
-    for module in (events, fifty_digits):
-        tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
-        for node in ast.walk(tree):
-            module_name = (node.module or "") if isinstance(node, ast.ImportFrom) else ""
-            if module_name.startswith("apc.") and "apc.compiler" not in module_name:
-                shared |= {alias.name for alias in node.names}  # type: ignore[attr-defined] # it is an import
-    functions = {"evaluate_exact", "is_rational", "guards_of", "rational_ball", "precision"}
-    assert shared == functions | {"resolve", "exact_numbers", "arcs", "ROW"}
-    assert all(name in str(events.__doc__) for name in shared)
 
 
 @pytest.mark.few(1)

@@ -17,7 +17,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.simulation import ensemble
 from apc.simulation.blocks import pushes
-from apc.simulation.ensemble import Ensemble, Run, play_many, share_interval
+from apc.simulation.ensemble import Ensemble, play_many, share_interval
 from apc.simulation.native import compiler
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
@@ -47,6 +47,13 @@ def test_a_run_does_not_depend_on_how_many_there_are_or_who_plays_it(monkeypatch
     assert [one.number for one in shared] == [*range(9)]
     assert shared[:4] == few
     assert len({one.settled for one in shared}) > 3, "they are different runs"
+    settled = [one.settled for one in shared if one.settled is not None]
+    told = play_many(compiled(SHAKY), Settings(Fraction(1, 2), seed=3, jit=False), runs=9).statistics(
+        "settled"
+    )
+    assert told is not None and told.count == len(settled)
+    assert (told.low, told.high, told.mean) == (min(settled), max(settled), pytest.approx(np.mean(settled)))
+    assert told.standard_error == pytest.approx(np.std(settled, ddof=1) / math.sqrt(len(settled)))
     alone, _ = play(prepare(compiled(SHAKY), Settings(Fraction(1, 2), seed=3, jit=False)), [])
     assert alone.largest_force is not None
     told = (few[0].verdict, few[0].settled, few[0].largest_force)
@@ -74,26 +81,6 @@ def test_runs_side_by_side_are_to_the_bit_those_played_alone(peers: int, more: s
     together = rows_of_runs(system, 13, 2)
     for number in (2, 9, 14):
         np.testing.assert_array_equal(together[:, :, number - 2], rows_of_runs(system, 1, number)[:, :, 0])
-
-
-def test_runs_that_diverge_are_told_from_those_beside_them() -> None:
-    """So stiff a coupling grows until the numbers end, however the packets come."""
-    found = runs(replaced(SHAKY, ("stiffness: 500 N/m", "stiffness: 500 kN/m")), 3, "20").runs
-    assert [one.verdict for one in found] == ["diverges"] * 3
-
-
-def test_statistics_are_those_of_the_runs_that_have_the_number() -> None:
-    listed = [Run(n, "moves on" if at is None else "settles", at, 2.0 * n, 1e-3) for n, at in enumerate((0.1, 0.4, None, 0.2))]  # noqa: E501 # fmt: skip
-    found = Ensemble("scene", Fraction(3), 7, tuple(listed))
-    one = found.statistics("settled")
-    assert one is not None
-    assert (one.count, one.low, one.high) == (3, 0.1, 0.4)
-    assert one.mean == pytest.approx(0.7 / 3)
-    assert one.standard_error == pytest.approx(math.sqrt((0.01 + 0.16 + 0.04 - 0.49 / 3) / 2 / 3))
-    assert one.quantiles[1] == pytest.approx(0.2)
-    assert Ensemble("scene", Fraction(3), 7, tuple(listed[2:3])).statistics("settled") is None
-    assert found.verdicts == (("settles", 3), ("moves on", 1))
-    assert "settles 3 75 % (95 % sure: 30.1 % to 95.4 %)" in said(found)
 
 
 def test_a_shares_interval_is_wilsons() -> None:

@@ -53,12 +53,6 @@ def test_certified_losses_and_patterns_that_shake_are_those_of_the_reference(
     assert found.growth > 1
 
 
-def test_five_users_that_survive_chance_are_shaken_by_two_losses_in_a_row() -> None:
-    found = losses(scene(5, 900.0, loss="40 %"))
-    assert found.unstable_pattern == (True, False, True, True, False)
-    assert found.growth == pytest.approx(1.0151, abs=5e-5)
-
-
 def test_who_shakes_or_drifts_anyhow_is_told_so() -> None:
     found = losses(scene(3, 1100.0))
     assert (found.certified, found.unstable_pattern) == (None, (False,))

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Column, CompiledSystem
-from apc.network.channel import PacketSource, channel_law
 from apc.simulation.blocks import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
-from tests.lossy import apart, effective
-from tests.schemes import ByHand, course, everybody
+from tests.lossy import apart
 from tests.sites import MS
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
 
@@ -40,41 +35,6 @@ def rows_of(simulation: Simulation, run: int = 0) -> NDArray[np.float64]:
 
 def played(system: CompiledSystem, *, duration: Fraction = Fraction(1), seed: int = 0) -> NDArray[np.float64]:
     return rows_of(prepare(system, Settings(duration, jit=False, seed=seed)))
-
-
-def by_hand(operator: str, late: Callable[[int, int, int], tuple[int, bool]], zero: bool) -> ByHand:
-    """Return the scene of three users whose packets count as `late` says."""
-
-    def law(i: int, motion: Sequence[tuple[Any, Any]], heard: Any, memory: Any) -> tuple[Any, Any, Any]:
-        (x, _), (x_o, _) = motion
-        contact = 1000 * (x - x_o)
-        pull = sum(500 * (x_o - packet[0]) for packet in heard.values())
-        return [-contact, contact - (pull / 2 if operator == "mean" else pull)], memory, []
-
-    return ByHand([[(0.1, 5.0, 0.0), (0.2, 5.0, 0.0)]] * 3, everybody(3), law, told=1, late=late, zero=zero)
-
-
-@pytest.mark.few(3)
-@pytest.mark.parametrize("operator", ["mean", "sum"])
-@pytest.mark.parametrize("more", ODD)
-def test_a_played_scene_is_what_looking_at_every_packet_gives(operator: str, more: str) -> None:
-    system = compiled(apart(AVERAGE if operator == "mean" else MESH, more))
-    law = channel_law(system, system.links[0], 8 * MS)
-    duration = Fraction(3, 10)
-    ways = itertools.permutations(range(3), 2)
-    late = {way: PacketSource(law, "lan", [way], seed=3).take(45)[0].tolist() for way in ways}
-    hand = by_hand(
-        operator, lambda i, j, tick: effective(late[i, j], tick, newest="all" not in more), "zero" in more
-    )
-    rows = itertools.islice(course(hand, [[(x, 0.0)] * 2 for x in (0.001, 0.005, -0.003)]), 301)
-    expected = [[one for motion in now.motion for body in motion for one in body] for now in rows]
-    wanted = [f"user[{i}].{name}" for i in (1, 2, 3) for name in ("device.x", "device.v", "cube.x", "cube.v")]
-    for jit in (False, True):
-        simulation = prepare(system, Settings(duration, jit=jit, seed=3))
-        names = [signal.name for signal in simulation.signals]
-        found = rows_of(simulation)[:, [names.index(name) for name in wanted]]
-        # Velocities of some 0.1 m/s, 300 steps: what rounding leaves, 1e-12 of them.
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
 
 
 def scattered(system: CompiledSystem) -> CompiledSystem:

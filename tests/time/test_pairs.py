@@ -57,10 +57,20 @@ def of_memory_and_time(x: float, v: float, f: float, t: float, heard: Heard) -> 
     return sum(w * max(-LIMIT, min(LIMIT, pull)) for w, pull in pulls)
 
 
+def of_linear_sum(x: float, v: float, f: float, t: float, heard: Heard) -> float:
+    return sum(w * (K * (x - x_j) + B * (v - v_j)) for w, x_j, v_j in heard)
+
+
+def of_linear_mean(x: float, v: float, f: float, t: float, heard: Heard) -> float:
+    return of_linear_sum(x, v, f, t, heard) / sum(w for w, *_ in heard)
+
+
 LIMITED = "max(-limit, min(limit, stiffness*(x - others.x) + damping*(v - others.v)))"
 # Without words of its own the component is the library's.
 FORCES: dict[str, tuple[str, Force]] = {
     "SaturatedMesh": ("", of_sum),
+    "AveragePosition": ("", of_linear_mean),
+    "FullMesh": ("", of_linear_sum),
     "sum": (f"sum({LIMITED})", of_sum),
     "mean": (f"mean({LIMITED})", of_mean),
     "max": ("stiffness*(x - max(others.x))", of_largest),
@@ -98,10 +108,12 @@ equations:
 X = (0.01, -0.004, 0.007, -0.012)
 
 
-def scene(folder: Path, force: str, link: str = "delay: 8 ms") -> CompiledSystem:
+def scene(folder: Path, name: str, link: str) -> CompiledSystem:
     """Return two near and two far peers whose bodies pull each other."""
     (folder / "parts").mkdir(exist_ok=True)
+    force, _ = FORCES[name]
     (folder / "parts" / "odd.yaml").write_text(COMPONENT.replace("FORCE", force), encoding="utf-8")
+    limit = "limit: 1.5 N" if force or name == "SaturatedMesh" else ""
     text = f"""\
 topology: pairs
 clocks: {{haptic: 1 ms, network: 8 ms}}
@@ -113,11 +125,11 @@ masses:
   body: {{mass: 0.1 kg, damping: 5 N*s/m}}
 couplers:
   pull:
-    type: {"Odd" if force else "SaturatedMesh"}
+    type: {"Odd" if force else name}
     object: body
     stiffness: 500 N/m
     damping: 2 N*s/m
-    limit: 1.5 N
+    {limit}
     clock: haptic
     delay: 1 ms
     link: lan
@@ -150,8 +162,8 @@ def punctual(delays: Callable[[int, int], int]) -> Late:
     return lambda i, j, tick: (max(-1, (tick - delays(i, j)) // 8), False)
 
 
-def check(system: CompiledSystem, expected: NDArray[np.float64], seed: int = 0) -> None:
-    found = simulate(system, duration=DURATION, signals=["body.*"], jit=False, seed=seed)
+def check(system: CompiledSystem, expected: NDArray[np.float64], *, seed: int = 0, jit: bool = False) -> None:
+    found = simulate(system, duration=DURATION, signals=["body.*"], jit=jit, seed=seed)
     assert np.abs(expected).max() > 0.01
     # 300 steps: what rounding leaves, 1e-12 of the largest velocity.
     np.testing.assert_allclose(found.values, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
@@ -175,8 +187,8 @@ def test_each_pair_is_what_looking_at_every_packet_gives(
     tmp_path: Path, name: str, graph: str, delay: str
 ) -> None:
     """With one delay for all, or pairs of groups with delays of their own; only who is tied is looked at."""
-    text, force = FORCES[name]
-    system = scene(tmp_path, text, f"delay: {delay}" + (f", graph: {graph}" if graph else ""))
+    _, force = FORCES[name]
+    system = scene(tmp_path, name, f"delay: {delay}" + (f", graph: {graph}" if graph else ""))
 
     def late(i: int, j: int) -> int:
         own = delay == OWN and i // 2 != j // 2
@@ -185,19 +197,22 @@ def test_each_pair_is_what_looking_at_every_packet_gives(
     check(system, by_hand(force, GRAPHS[graph], punctual(late)))
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(8)
 @pytest.mark.parametrize("name", FORCES)
 @pytest.mark.parametrize(
     ("more", "graph"),
     [
         ("loss: {p: 10 %, r: 30 %}", "ring"),
         ("loss: 30 %, on_loss: zero", ""),
+        ("jitter: 6 ms", ""),
+        ("jitter: 25 ms, distribution: pareto, reorder: all", ""),
+        ("loss: 20 %, jitter: 9 ms, distribution: normal, on_loss: zero", ""),
         ("loss: 20 %, jitter: 9 ms, distribution: normal, reorder: all, on_loss: zero", "star"),
     ],
 )
 def test_a_lost_packet_is_missed_by_its_pair_alone(tmp_path: Path, name: str, more: str, graph: str) -> None:
-    text, force = FORCES[name]
-    system = scene(tmp_path, text, f"delay: 8 ms, {more}" + (f", graph: {graph}" if graph else ""))
+    _, force = FORCES[name]
+    system = scene(tmp_path, name, f"delay: 8 ms, {more}" + (f", graph: {graph}" if graph else ""))
     law = channel_law(system, system.links[0], 8 * MS)
     ways = GRAPHS[graph]
     late = {way: PacketSource(law, "lan", [way], seed=3).take(50)[0].tolist() for way in ways}
@@ -205,7 +220,9 @@ def test_a_lost_packet_is_missed_by_its_pair_alone(tmp_path: Path, name: str, mo
     def packet(i: int, j: int, tick: int) -> tuple[int, bool]:
         return effective(late[i, j], tick, newest="all" not in more)
 
-    check(system, by_hand(force, ways, packet, zero="zero" in more), seed=3)
+    expected = by_hand(force, ways, packet, zero="zero" in more)
+    for jit in (False, True):
+        check(system, expected, seed=3, jit=jit)
 
 
 def test_a_mesh_whose_limit_is_never_reached_is_a_full_mesh() -> None:
@@ -220,7 +237,7 @@ def test_a_mesh_whose_limit_is_never_reached_is_a_full_mesh() -> None:
 
 def test_nobody_has_no_maximum(tmp_path: Path) -> None:
     with pytest.raises(ApcError, match=r"E801 far\[2\] hears nobody over lan: there is no max over nobody"):
-        scene(tmp_path, FORCES["max"][0], "delay: 8 ms, graph: {arcs: [[1, 2], [2, 1], [1, 3]]}")
+        scene(tmp_path, "max", "delay: 8 ms, graph: {arcs: [[1, 2], [2, 1], [1, 3]]}")
 
 
 SOME_SEND = """\
