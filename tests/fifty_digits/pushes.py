@@ -29,6 +29,7 @@ import casadi
 import flint
 
 from apc.compiler.compiled import Kind
+from apc.eigen.balls import precision
 from apc.frame.exact import evaluate_exact, is_rational
 from apc.frame.jacobians import guards_of
 
@@ -172,9 +173,11 @@ def impulse(push: Push, start: Fraction, length: Fraction, depth: int = 0) -> li
 @functools.cache
 def _points(bits: int) -> tuple[list[Any], Any]:
     """Return points of Chebyshev within 0 and 1, and what makes coefficients of values there."""
-    angles = [flint.arb.pi() * (2 * k + 1) / (2 * ORDER) for k in range(ORDER)]
-    points = [(1 + angle.cos()) / 2 for angle in angles]
-    return points, flint.arb_mat([[point**k for k in range(ORDER)] for point in points]).inv()
+    with precision(3 * bits):  # the inverse of powers loses digits
+        angles = [flint.arb.pi() * (2 * k + 1) / (2 * ORDER) for k in range(ORDER)]
+        points = [((1 + angle.cos()) / 2).mid() for angle in angles]
+        solving = flint.arb_mat([[point**k for k in range(ORDER)] for point in points]).inv()
+        return points, flint.arb_mat([[one.mid() for one in row] for row in solving.tolist()])
 
 
 def _forces(push: Push, time: Any) -> list[Any]:

@@ -69,7 +69,7 @@ def _truth(system: CompiledSystem) -> Truth:
         {"operator": "sum", "peers": 2, "bt": 2.0, "bc": 1.0},
         {"comp": MS / 7, "comm": MS * 22 / 7},
         {"comp": Fraction(0), "comm": Fraction(0), "own_delay": True},
-        {"peers": 1, "operator": "sum", "network": Fraction(1, 90), "comm": Fraction(1, 45)},
+        {"peers": 2, "operator": "sum", "network": Fraction(1, 90), "comm": Fraction(1, 45)},
         {"haptic_phase": MS / 2, "network_phase": MS * 3},
     ],
 )

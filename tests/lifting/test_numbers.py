@@ -21,18 +21,21 @@ from apc.frame.overrides import Override, apply, parse_override
 from apc.frame.parameters import resolve
 from apc.vary.many import analyze_many
 from apc.vary.margins import margins
-from tests.sites import NAMES, columned, derived, grouped, paper
+from tests.sites import columned, derived, grouped, paper
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
 
 
 def _value(system: CompiledSystem, name: str, group: int = 0) -> float:
-    return float(resolve(system).parameters[group][0, NAMES.index(name)])
+    return float(resolve(system).parameters[group][0, system.kinds[0].parameters.index(name)])
 
 
 def _column(system: CompiledSystem, name: str) -> list[float]:
     """Return a parameter's value of each peer of the first group."""
     numbers = resolve(system)
-    return [float(value) for value in numbers.parameters[0][numbers.rows[0], NAMES.index(name)]]
+    return [
+        float(value)
+        for value in numbers.parameters[0][numbers.rows[0], system.kinds[0].parameters.index(name)]
+    ]
 
 
 @pytest.mark.parametrize("name", ["contact.stiffness", "couplers.contact.stiffness"])

@@ -61,7 +61,7 @@ def test_prepared_work_serves_other_numbers_and_other_times() -> None:
 
 def test_peers_that_differ_only_at_the_start_are_equal_however_many() -> None:
     many = 10_000
-    moved = columned(paper(peers=many), device__x__start=1e-6 * np.arange(many))
+    moved = columned(paper(peers=many), device__x=1e-6 * np.arange(many))
     found = analyze(moved)
     assert (found.method, found.spectral_radius) == ("modes", analyze(paper(peers=many)).spectral_radius)
 

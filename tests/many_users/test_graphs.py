@@ -87,13 +87,3 @@ def test_a_mean_whose_weights_add_up_to_nothing_is_refused() -> None:
         with pytest.raises(ApcError, match=r"E801 user\[1\] hears nobody over lan"):
             analyze(linked(paper(), arcs[:2]), method=method)
     assert analyze(linked(paper("sum"), arcs)).method in ("modes", "dense")
-
-
-def test_a_mean_over_nobody_is_refused_and_a_sum_over_nobody_is_nothing() -> None:
-    with pytest.raises(ApcError, match=r"E801 user\[1\] hears nobody over lan: there is no mean over nobody"):
-        analyze(paper(peers=1))
-    alone_in_a_sum = analyze(paper("sum", peers=1, kc=500.0))
-    nobody_to_hear = analyze(paper("mean", peers=2, kc=500.0, kt=0.0))
-    # Without a network the frame is one tick of the force clock, an eighth of the other.
-    assert alone_in_a_sum.frame_s == 0.001
-    assert alone_in_a_sum.spectral_radius**8 == pytest.approx(nobody_to_hear.spectral_radius, abs=1e-12)

@@ -43,7 +43,7 @@ GAINS = {"kt": 800.0, "bt": 2.0, "kc": 1500.0, "bc": 2.0}
 
 
 def test_groups_that_differ_in_nothing_that_moves_are_one() -> None:
-    system = grouped(paper(), ("left", 2, {"device.x.start": 0.1}), ("right", 1, {"hand.force": 2.0}))
+    system = grouped(paper(), ("left", 2, {"device.x": 0.1}), ("right", 1, {"cube.x": 2.0}))
     [group], exchange = lifted_groups(system)
     assert (group.name, group.count) == ("left+right", 3)
     assert [one.name for one in split([group], exchange).systems] == ["common", "difference"]

@@ -7,7 +7,6 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import casadi
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -132,21 +131,22 @@ def test_a_force_that_jumps_is_met_at_the_jump(tmp_path: Path) -> None:
     assert np.abs(found.values - true).max() < 3e-7
 
 
+F = ", f: {unit: 1, start: 0}"
+
+
 def test_a_motion_that_is_not_linear_feels_held_forces_from_when_they_act() -> None:
     # With y = x - 1: y' = f - y^2, f = 1 from half a tick on. Until then 1/y grows by t, then y is a coth.
-    system = alone(lambda x, u: u[0] - (x - 1) ** 2, lambda x, u, m: 0 * x + 1, delay=Fraction(1, 2000))
+    system = alone("hold(f, delay) - (x - 1)^2", "f = 0*sample(x) + 1", variables=F, delay="0.5 ms")
     found = simulate(system, duration=Fraction(1, 100), jit=False)
     expected = 1 + 1 / np.tanh(found.time[1:] - 5e-4 + np.arctanh(-1 + 5e-4))
-    assert found["peer[1].x"][1:] == pytest.approx(expected, rel=1e-8)
+    assert found["peer[1].it.x"][1:] == pytest.approx(expected, rel=1e-8)
 
 
 @pytest.mark.parametrize(("method", "error"), [("rk4:1ms", 1e-12), ("cvodes:1e-10", 1e-8)])
 def test_every_method_reaches_the_closed_form(method: str, error: float) -> None:
     """dy/dt = −y³ from −1, y = x − 1: −1/√(1 + 2t)."""
-    found = simulate(
-        alone(lambda x, u: -((x - 1) ** 3)), duration=Fraction(1, 2), method=parse_method(method), jit=False
-    )
-    assert found["peer[1].x"] == pytest.approx(1 - 1 / np.sqrt(1 + 2 * found.time), abs=error)
+    found = simulate(alone("-(x - 1)^3"), duration=Fraction(1, 2), method=parse_method(method), jit=False)
+    assert found["peer[1].it.x"] == pytest.approx(1 - 1 / np.sqrt(1 + 2 * found.time), abs=error)
 
 
 MIXED = """\
@@ -182,20 +182,22 @@ def test_linear_peers_and_parts_keep_their_exact_motion() -> None:
 @pytest.mark.parametrize(
     ("law", "rows", "last"),
     [  # the rows of whole frames: here a frame is a millisecond
-        (lambda x: 50 * (x + 1) ** 2, 19, 9.0),  # 1/(1 - 50 t) - 1: a pole at 20 ms; 18 ms is the last row
-        (lambda x: -20 * casadi.sqrt(x + 0.01) - 1, 4, None),  # the root has no value after 4.2 ms
-        (lambda x: 1 - 2 * casadi.sign(x - 5e-3), 1, None),  # pushed to and fro at 5 mm, after 1.7 ms
+        ("50*(x + 1)^2", 19, 9.0),  # 1/(1 - 50 t) - 1: a pole at 20 ms; 18 ms is the last row
+        ("-20*sqrt(x + 0.01) - 1", 4, None),  # the root has no value after 4.2 ms
+        ("1 - 2*sign(x - 5e-3)", 1, None),  # pushed to and fro at 5 mm, after 1.7 ms
     ],
 )
 def test_what_cant_be_integrated_on_is_kept_until_there(
-    law: Callable[[Any], Any], rows: int, last: float | None, capfd: pytest.CaptureFixture[str]
+    law: str, rows: int, last: float | None, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    played = blocks(prepare(alone(lambda x, u: law(x)), Settings(MS * 100, jit=False)))
+    played = blocks(prepare(alone(law), Settings(MS * 100, jit=False)))
     block = next(played)
     assert len(block.time) == rows
     if last is not None:
         assert block.values[-1, 0] == pytest.approx(last, rel=1e-6)
-    with pytest.raises(ApcError, match=r"E871 the motion of x can't be integrated after 0\.0\d+ s: it grows"):
+    with pytest.raises(
+        ApcError, match=r"E871 the motion of it.x can't be integrated after 0\.0\d+ s: it grows"
+    ):
         next(played)
     assert capfd.readouterr() == ("", "")
 

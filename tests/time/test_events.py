@@ -141,12 +141,13 @@ def test_a_clock_with_a_phase_ticks_late_and_the_first_row_is_at_time_0() -> Non
 
 def test_what_is_remembered_starts_at_its_start_value_and_acts_as_zero_before_it_is_computed() -> None:
     # y counts up by one a tick from its start value; what is held is y, late by one tick and a half.
-    system = alone(lambda x, u: 0 * x + u[0], lambda x, u, m: m + 1, memories=(0,), delay=Fraction(3, 2) * MS)
+    count = ", f: {unit: 1, start: 0}"
+    system = alone("hold(f, delay)", "f = previous(f) + 1", variables=count, delay="1.5 ms")
     found = simulate(system, duration=5 * MS, jit=False)
-    assert found["peer[1].f"].tolist() == [0, 1, 2, 3, 4, 5]
-    assert found["peer[1].f acting"].tolist() == [0, 0, 1, 2, 3, 4]
+    assert found["peer[1].it.f"].tolist() == [0, 1, 2, 3, 4, 5]
+    assert found["peer[1].it.f acting"].tolist() == [0, 0, 1, 2, 3, 4]
     expected = np.array([0, 0, 0.5, 2, 4.5, 8]) * 1e-3
-    assert found["peer[1].x"] == pytest.approx(expected, abs=1e-18)
+    assert found["peer[1].it.x"] == pytest.approx(expected, abs=1e-18)
 
 
 def test_a_long_run_comes_in_blocks_of_bounded_size_tick_by_tick(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -139,7 +139,7 @@ def test_pandas_and_xarray_hold_the_same_numbers() -> None:
 def test_signals_are_chosen_by_pattern_and_are_those_of_a_whole_run(
     patterns: list[str], names: list[str]
 ) -> None:
-    system = grouped(paper(), ("left", 2, {"cube.x.start": 0.01}), ("right", 1, {}))
+    system = grouped(paper(), ("left", 2, {"cube.x": 0.01}), ("right", 1, {}))
     found, whole = (
         simulate(system, duration=Fraction(1, 20), signals=asked, jit=False) for asked in (patterns, [])
     )
