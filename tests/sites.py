@@ -100,7 +100,8 @@ def alone(rate: str, *ticks: str, variables: str = "", delay: str = "0 s") -> Co
     clock = ", clock: clock, delay: {unit: s, default: 0 s}" if ticks else ""
     part = (
         "component: Alone\nabout: A number that moves by itself.\n"
-        f"parameters: {{T: {{unit: s, default: 1 s}}{clock}}}\nvariables: {{x: {{unit: 1, start: 0}}{variables}}}\n"
+        f"parameters: {{T: {{unit: s, default: 1 s}}{clock}}}\n"
+        f"variables: {{x: {{unit: 1, start: 0}}{variables}}}\n"
         f"equations: {[f'T*der(x) = {rate}', *ticks]}\n"
     )
     ticking = f", clock: haptic, delay: {delay}" if ticks else ""

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
-from pathlib import Path
 
 import pytest
 
 import apc
-from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
@@ -120,20 +117,3 @@ def test_what_cannot_be_played_is_refused_and_lost_packets_are_named() -> None:
         apc.buzz(compiled(AVERAGE))
     with pytest.raises(ApcError, match="1,000,000 peers are too many to play for 8 s"):
         apc.buzz(compiled(replaced(WALL, ("count: 1", "count: 1000000"))))
-
-
-@pytest.mark.whole
-def test_it_is_shown_where_it_is_asked_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("scene.yaml").write_text(replaced(TEXT["average"], AT_ONCE), encoding="utf-8")
-    for words, note in (([], "not predicted and played: --buzz"), (["--buzz"], "")):
-        assert run(["analyze", "--json", *words]) == 0
-        found = json.loads(capsys.readouterr().out)
-        assert (bool(found["buzz"]), found["buzz_note"]) == (bool(words), note)
-    assert found["buzz"]["predicted"]["frequency_hz"] == pytest.approx(47.10, abs=0.005)
-    assert found["switching"]["stable"] is False
-    Path("scene.yaml").write_text(AVERAGE, encoding="utf-8")
-    assert run(["analyze", "--buzz"]) == 0
-    assert capsys.readouterr().out.endswith("no buzz to predict: nothing touches.\n")

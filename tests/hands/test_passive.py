@@ -214,24 +214,6 @@ def test_two_and_five_users_bear_what_an_independent_program_found(count: int, l
         assert found.stable is (part < 1)
 
 
-TWO_KINDS = "a: {count: 1, set: {device.mass: 0.2 kg}}\n  b: {count: 2}"
-
-
-@pytest.mark.parametrize(
-    ("system", "ranges"),
-    [
-        (users(3, 200), ("contact.stiffness=±1%", f"{PULL}=±1%")),
-        (users(3, 200), ("device.mass=±10%", "device.damping=±5%")),
-        # At so soft a contact it alone says what damping is needed, and the other range what can be proved.
-        (users(2, 75), ("contact.stiffness=100 N/m:120 N/m", f"{PULL}=73 N/m:83 N/m")),
-        (users(3, 200, AVERAGE, ("user: {count: 3}", TWO_KINDS)), ("contact.stiffness=±0.5%",)),
-    ],
-)
-def test_a_box_is_proved_where_the_boundary_is_far(system: CompiledSystem, ranges: tuple[str, ...]) -> None:
-    found = prove_box(system, [parse_range(system, one) for one in ranges])
-    assert found.stable and found.cells < 40
-
-
 def test_what_a_box_of_hands_leaves_out_or_cannot_prove_is_said() -> None:
     lossy = users(3, 200, AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 10 %}"))
     found = prove_box(lossy, [parse_range(lossy, "contact.stiffness=±1%")])

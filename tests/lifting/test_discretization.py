@@ -16,7 +16,6 @@ from apc.frame.discretize import (
     FEW_TOGETHER,
     UNIT,
     discretize,
-    exponential_rows,
 )
 
 DAMPINGS = (0.0, 1e-12, 1e-6, 5.0, 1e6)
@@ -103,15 +102,3 @@ def test_a_chain_of_many_masses_is_within_its_bound(stiffness: int, damping: int
     units = np.tile([1.0, np.sqrt(stiffness * 100.0)], FEW_TOGETHER)
     scaled = bound / units[:, None] * np.concatenate([units, np.full(2, 1 / 100.0)])
     assert scaled.max() <= 4 * 130 * UNIT
-
-
-@pytest.mark.parametrize("decay", [0.0, 1e-9, 1.0, 50.0, 4000.0])
-def test_exponentials_are_within_their_bound_of_ball_arithmetic(decay: float) -> None:
-    """A mass with damping and a spring to a held input, slow and stiff."""
-    a = np.array([[0.0, 1.0], [-30.0, -decay]])
-    b = np.array([[0.0], [2.0]])
-    [truth] = discretize(a, b, [Fraction(1, 100)])
-    step = exponential_rows(a[None], b[None], 0.01)
-    off = step.roundings * UNIT * step.size[0]
-    assert np.all(np.abs(step.matrix[0] - truth.matrix) <= off + UNIT * truth.size)
-    assert np.all(off < 1e-10)

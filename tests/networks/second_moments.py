@@ -40,22 +40,32 @@ class Law:
     good_loss: float = 0.0
     zero: bool = False
 
+    @property
+    def independent(self) -> bool:
+        return abs(self.p + self.r - 1) < 1e-12
+
     def moves(self, arrivals: int) -> Iterator[tuple[State, State, float, tuple[bool, ...]]]:
         """Yield what so many packets of a way may do: (before, after, chance, which are there)."""
-        for before in itertools.product((False, True), (False, True) if self.zero else (False,)):
+        losses = [self.good_loss, self.bad_loss]
+        if self.independent:
+            losses = [(1 - self.p) * self.good_loss + self.p * self.bad_loss]
+        moods = (False, True)[: len(losses)]
+        for before in itertools.product(moods, (False, True) if self.zero else (False,)):
             paths: list[tuple[State, float, tuple[bool, ...]]] = [(before, 1.0, ())]
             for _ in range(arrivals):
                 paths = [
                     ((turned != bad, lost and self.zero), chance * of_loss * of_turn, (*there, not lost))
                     for (bad, _), chance, there in paths
-                    for lost, of_loss in self._either(self.bad_loss if bad else self.good_loss)
-                    for turned, of_turn in self._either(self.r if bad else self.p)
+                    for lost, of_loss in self._either(losses[bad])
+                    for turned, of_turn in self._either(
+                        0.0 if self.independent else self.r if bad else self.p
+                    )
                 ]
-            yield from ((before, *path) for path in paths if path[1])
+            yield from ((before, *path) for path in paths)
 
     @staticmethod
-    def _either(chance: float) -> tuple[tuple[bool, float], tuple[bool, float]]:
-        return (True, chance), (False, 1 - chance)
+    def _either(chance: float) -> list[tuple[bool, float]]:
+        return [one for one in ((True, chance), (False, 1 - chance)) if one[1]]
 
 
 def arrivals_of(scene: Scene) -> int:

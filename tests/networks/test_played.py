@@ -15,7 +15,7 @@ from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 from tests.lossy import apart
 from tests.sites import MS
-from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
+from tests.topologies import AVERAGE, SCENES, compiled, replaced
 
 # A ring of three peers is complete.
 ODD = (
@@ -124,9 +124,3 @@ def test_the_same_seed_gives_the_same_rows_however_long_the_chunks_are() -> None
     assert rows_of(replace(short, length=3)).tolist() == other.tolist()
     assert np.abs(played(system, duration=Fraction(3), seed=2) - one).max() > 1e-3
     assert np.abs(rows_of(long, run=1) - one).max() > 1e-3
-
-
-def test_a_mesh_is_an_average_of_n_minus_one_times_the_stiffness_packet_by_packet() -> None:
-    more = "loss: {p: 10 %, r: 30 %}, jitter: 9 ms, distribution: normal"
-    mesh = compiled(apart(MESH, more).replace("stiffness: 500 N/m", "stiffness: 250 N/m"))
-    np.testing.assert_allclose(played(mesh), played(compiled(apart(AVERAGE, more))), rtol=0, atol=1e-12)
