@@ -161,13 +161,6 @@ def test_the_text_is_readable() -> None:
     assert sorted(defined) == sorted(declared)  # as many equations as unknowns, one each
 
 
-def test_two_peers_that_differ_share_what_they_share() -> None:
-    text = modelica(apc.compile(SCENES / "experiment-average.yaml")).text
-    assert re.search(r"parameter Real (contact|'contact).side'.* = 1 ", text)  # of the two
-    assert re.search(r"parameter Real 'right.contact.side'.* = -1 ", text)
-    assert text.count("parameter Real 'cube.mass'") == 1
-
-
 LOSSY = replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 2 %}"))
 MEET = replaced(
     AVERAGE, ("network: 8 ms", "network: {period: 8 ms, phase: 3 ms}"), ("delay: 8 ms}", "delay: 0 ms}")

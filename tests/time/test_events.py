@@ -96,20 +96,6 @@ def test_groups_tables_and_clocks_are_followed(scene: str) -> None:
     check_followed(apply(system, [parse_override(system, f"{group}.device.x=10 mm")]), Fraction(1, 20))
 
 
-@pytest.mark.parametrize(("text", "added"), [(AVERAGE, 2.3), (MESH, 4.6)])
-@pytest.mark.parametrize("delay", ["0 ms", "1 ms"])
-def test_a_late_network_drags_a_moved_cube_as_the_viscosity_formula_says(
-    text: str, added: float, delay: str
-) -> None:
-    # K_eff ((T_n − T_c)/2 + T_d); with a computational delay of the whole force nothing changes.
-    hand = "hands: {hand: {type: ConstantForce, flange: device, force: 1 N}}\nstudies:"
-    text = replaced(text, ("stiffness: 500 N/m", "stiffness: 200 N/m"), ("studies:", hand))
-    text = text.replace("delay: 1 ms", f"delay: {delay}")
-    found = simulate(compiled(text), duration=Fraction(4), signals=["cube.x"], jit=False)
-    speed = (found.values[-1] - found.values[-1 - 80]) / 0.080
-    assert 1 / speed - 10 == pytest.approx(np.full(3, added), rel=1e-3)
-
-
 MOVING = replaced(AVERAGE, ("{count: 3}", MOVED))
 LIMITED = replaced(MESH, ("{count: 3}", MOVED), ("type: FullMesh", "type: SaturatedMesh, limit: 1 N"))
 
