@@ -80,7 +80,7 @@ def worst(system: apc.CompiledSystem, seconds: float, method: str | None = None)
     return max(apart)
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @needs_rumoca
 @pytest.mark.parametrize("times", TIMES)
 def test_rumoca_plays_the_papers_scene_at_any_times_as_simulate_does(times: str) -> None:
@@ -88,7 +88,7 @@ def test_rumoca_plays_the_papers_scene_at_any_times_as_simulate_does(times: str)
 
 
 # Other groups, couplers that remember, a server, a graph, a plane, forces that change with time.
-@pytest.mark.few(7)
+@pytest.mark.few(5)
 @needs_rumoca
 @pytest.mark.parametrize(
     ("name", "settings"),

@@ -32,6 +32,7 @@ def unlike(masses: np.ndarray, text: str) -> str:
     return re.sub(r"count: \d+", f"set: {{device.mass: [{listed}]}}", text, count=1)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     ("count", "ring", "together"),
     [
@@ -143,7 +144,7 @@ def test_a_lone_mass_feels_like_itself() -> None:
 RING = replaced(MESH, ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("count", [2, 3, 5])
 @pytest.mark.parametrize(("text", "heard"), [(AVERAGE, 1), (MESH, 4), (RING, 2)])
 def test_a_network_feels_viscous_by_as_much_as_dampers_lack(text: str, heard: int, count: int) -> None:
@@ -192,7 +193,7 @@ def check_alike(one: Feel, other: Feel) -> None:
         assert abs(getattr(one.low_frequency, name) - getattr(other.low_frequency, name)) <= near
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("system", "at", "between"),
     [
@@ -232,6 +233,7 @@ def test_groups_are_as_right_as_all_peers_in_one_and_a_million_users_are_served(
 
 # Of hands and of sensors, at the first of either group: error and velocity, by an independent program, which
 # adds up the answers to each tick's noise.
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("at", "known"),
     [

@@ -92,6 +92,7 @@ def by_turns(closed: int, opened: int, count: int) -> Floats:
     return np.repeat(ticks.reshape(-1, 8, 1), count, axis=2).astype(float)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("mass", "damping", "delay"), [(0.1, 5.0, 0.0), (0.1, 5.0, 1e-3), (0.3, 2.0, 2.5e-3), (1.0, 20.0, 1e-3)]
 )
@@ -108,7 +109,7 @@ def test_a_wall_may_be_switched_as_far_as_its_closed_form_says(
     assert above.verdict == OPEN and above.stable is None and "circle criterion fails" in above.reason
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("count", "tie", "damping"),
     [(2, 200.0, 0.0), (3, 200.0, 0.5), (3, 60.0, 0.0), (3, 400.0, 0.0), (2, 25.0, 0.5)],
@@ -130,7 +131,7 @@ def test_what_is_proved_never_grows_whatever_switches(count: int, tie: float, da
     assert max(growth(count, one, tie, stiffness, damping) for one in patterns) <= 1 + 1e-9
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("change", "stiffness"),
     [

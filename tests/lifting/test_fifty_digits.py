@@ -31,7 +31,7 @@ def _radius(scene: Scene, rigid: int) -> flint.arb:
         return max(abs(value).mid() for value in values[rigid:])
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["ring-of-eight", "star-lecture", "mixed-clocks", "experiment-mesh"][::-1])
 def test_what_bench_compares_with_is_the_truth_of_the_independent_engine(name: str) -> None:
     system = compile_topology(SCENES / f"{name}.yaml")
@@ -62,6 +62,7 @@ def _truth(system: CompiledSystem) -> Truth:
     return found
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     "values",
     [

@@ -43,17 +43,17 @@ def said(found: Ensemble) -> str:
 def test_a_run_does_not_depend_on_how_many_there_are_or_who_plays_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ensemble, "PART", 5)
     few = runs(SHAKY, 4, "1/2", jit=False).runs
-    shared = runs(SHAKY, 9, "1/2", jit=False, jobs=2).runs
+    together = runs(SHAKY, 9, "1/2", jit=False, jobs=2)
+    shared = together.runs
     assert [one.number for one in shared] == [*range(9)]
     assert shared[:4] == few
     assert len({one.settled for one in shared}) > 3, "they are different runs"
     settled = [one.settled for one in shared if one.settled is not None]
-    told = play_many(compiled(SHAKY), Settings(Fraction(1, 2), seed=3, jit=False), runs=9).statistics(
-        "settled"
-    )
-    assert told is not None and told.count == len(settled)
-    assert (told.low, told.high, told.mean) == (min(settled), max(settled), pytest.approx(np.mean(settled)))
-    assert told.standard_error == pytest.approx(np.std(settled, ddof=1) / math.sqrt(len(settled)))
+    of_all = together.statistics("settled")
+    assert of_all is not None and of_all.count == len(settled)
+    assert (of_all.low, of_all.high) == (min(settled), max(settled))
+    assert of_all.mean == pytest.approx(np.mean(settled))
+    assert of_all.standard_error == pytest.approx(np.std(settled, ddof=1) / math.sqrt(len(settled)))
     alone, _ = play(prepare(compiled(SHAKY), Settings(Fraction(1, 2), seed=3, jit=False)), [])
     assert alone.largest_force is not None
     told = (few[0].verdict, few[0].settled, few[0].largest_force)
@@ -110,10 +110,10 @@ def test_runs_agree_with_the_judgedin_mean_square_and_take_the_time_of_its_growt
 
 
 def test_runs_that_are_about_something_else_than_a_verdict_say_so() -> None:
-    short = runs(moved(1200), seconds="0.3")
+    short = runs(moved(1200), 2, "0.3")
     assert short.agrees is False and "and the runs show how it begins" in said(short)
     hand = "hands:\n  hand: {type: SineForce, flange: device, force: 1 N, frequency: 3 Hz}\n"
-    driven = runs(moved(500) + hand)
+    driven = runs(moved(500) + hand, 2, "1")
     assert driven.agrees is False and "what moves the others is a force that goes on" in said(driven)
     text = (SCENES / "experiment-average.yaml").read_text(encoding="utf-8")
     pressed = runs(replaced(text, ("delay: 8 ms}", "delay: 8 ms, loss: 5 %}")), 2)

@@ -14,6 +14,7 @@ def late(peers: int, stiffness: float, jitter: str, delay: str = "8 ms") -> str:
     return scene(peers, stiffness, loss="0 %", more=f", jitter: {jitter}", delay=delay)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("peers", "stiffness", "expected"),
     [

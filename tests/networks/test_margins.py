@@ -77,6 +77,7 @@ def test_margins_that_take_long_are_looked_for_if_asked_and_never_of_an_unstable
 
 # Largest stiffness of three users by the share lost (brute force over all patterns, to 0.5 N/m): none
 # 1096.4, 5 % 1118, 10 % 1143.2, 40 % 1384.
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     ("stiffness", "more", "box", "stable"),
     [
@@ -144,6 +145,7 @@ links:
 """
 
 
+@pytest.mark.whole
 def test_a_wide_box_far_inside_is_proved_and_points_of_it_are_stable() -> None:
     """Its cells are halved where that makes them easier to prove: the mass, which hardly moves the radius."""
     system = compiled(ARMED)

@@ -61,7 +61,7 @@ GROUPS = replaced(
 )
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("more", ["loss: 0 %", "jitter: 0 ms, reorder: all", "loss: 0 %, on_loss: zero"])
 @pytest.mark.parametrize(
     "name",

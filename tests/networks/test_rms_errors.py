@@ -26,6 +26,7 @@ def metres(text: str) -> float:
 
 
 # By independent programs: users, K_T in N/m, 1 N² a tick of 1 ms at each device, every packet on time.
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("count", "stiffness", "expected"),
     [
@@ -46,6 +47,7 @@ def test_with_next_to_no_loss_the_error_is_that_of_an_ideal_network(
 PATH = dict.fromkeys([(0, 1), (1, 0), (1, 2), (2, 1)], 1.0)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     ("text", "more", "law"),
     [
@@ -81,6 +83,7 @@ def test_it_is_that_of_moments_followed_event_by_event(text: str, more: dict[str
     assert metres(text) == pytest.approx(rms_error(followed, law), rel=1e-9)
 
 
+@pytest.mark.whole
 def test_of_many_users_bursts_tell_an_estimate_that_is_called_one() -> None:
     found = judged(scene(5, 500.0, loss="{p: 0.3 %, r: 30 %}"))
     assert found.rms_error_m == pytest.approx(metres(scene(5, 500.0, loss="1e-9 %")), rel=0.01)
