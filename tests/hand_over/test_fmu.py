@@ -72,7 +72,7 @@ def gap(system: apc.CompiledSystem, path: Path, unit: Unit, method: str = "", se
     return float(np.abs(rows - course.values).max() / max(1.0, np.abs(course.values).max()))
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_is_played_as_simulate_plays_it(name: str, fmpy: Any, tmp_path: Path) -> None:
     path, unit = written(SCENES[name], tmp_path)

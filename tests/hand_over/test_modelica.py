@@ -88,7 +88,7 @@ def test_rumoca_plays_the_papers_scene_at_any_times_as_simulate_does(times: str)
 
 
 # Other groups, couplers that remember, a server, a graph, a plane, forces that change with time.
-@pytest.mark.few(5)
+@pytest.mark.few(3)
 @needs_rumoca
 @pytest.mark.parametrize(
     ("name", "settings"),
@@ -129,7 +129,7 @@ HANDS = {
 }
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @needs_rumoca
 @pytest.mark.parametrize("hand", HANDS)
 def test_rumoca_plays_hands_as_simulate_does(hand: str, tmp_path: Path) -> None:

@@ -93,6 +93,7 @@ PUBLISHED = (
 )
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("count", "felt", "arrives", "apart", "alias", "ticks", "sampled", "rms"), PUBLISHED)
 def test_numbers_of_an_independent_program(
     count: int,

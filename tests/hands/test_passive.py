@@ -199,6 +199,7 @@ def by_region(system: CompiledSystem, limit: float) -> None:
     assert "stable with every passive hand" in str(found)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("way", [by_critical, by_certificate, by_sweep, by_box, by_region])
 def test_every_way_to_ask_finds_what_an_independent_program_found(
     way: Callable[[CompiledSystem, float], None],

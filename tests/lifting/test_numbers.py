@@ -121,7 +121,7 @@ def test_a_time_that_depends_on_a_third_stays_the_very_tick(setting: str) -> Non
     assert resolve(changed).timings["lan.delay"] == Fraction(8, 1000)
 
 
-@pytest.mark.few(8)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("scene", sorted(path.name for path in SCENES.glob("*.yaml")))
 def test_setting_a_number_to_what_it_is_changes_nothing(scene: str) -> None:
     system = compile_topology(SCENES / scene)

@@ -59,6 +59,7 @@ def test_every_scene_is_listed() -> None:
     assert sorted([*KEPT, *IN_TIME]) == sorted(path.stem for path in SCENES.glob("*.yaml"))
 
 
+@pytest.mark.few(10)
 @pytest.mark.parametrize("name", KEPT)
 def test_a_scene_keeps_what_it_needs_and_no_more(name: str) -> None:
     system = compile_topology(SCENES / f"{name}.yaml")
@@ -67,7 +68,7 @@ def test_a_scene_keeps_what_it_needs_and_no_more(name: str) -> None:
     assert system.dropped == ()
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", KEPT)
 def test_unused_parts_change_nothing_and_cost_nothing_in_any_scene(name: str, tmp_path: Path) -> None:
     path = SCENES / f"{name}.yaml"

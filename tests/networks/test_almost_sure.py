@@ -32,7 +32,7 @@ def of_one_number(law: ChannelLaw, heard: float, lost: float, *, seed: int, fram
     return exponent(loop, [Chance(law, (0,))], seed=seed, courses=40, frames=frames)
 
 
-@pytest.mark.few(1)
+@pytest.mark.whole
 @pytest.mark.parametrize("law", [BURSTS, replace(RELIABLE, p=0.3, r=0.7)])
 def test_intervals_hold_the_exponent_of_one_number_95_times_in_a_hundred(law: ChannelLaw) -> None:
     known = (1 - law.mean_loss) * math.log(0.7) + law.mean_loss * math.log(1.4)

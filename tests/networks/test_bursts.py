@@ -45,7 +45,7 @@ def test_the_growth_of_second_moments_is_that_of_the_references(
 
 
 # Five peers: stiffness, packets a burst of 1 % lost, radius of moments with at most two and three tags.
-@pytest.mark.few(1)
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("stiffness", "packets", "two", "three"),
     [

@@ -69,7 +69,7 @@ def rows_of_runs(system: CompiledSystem, count: int, first: int) -> NDArray[np.f
     return played.rows.reshape(-1, simulation.population.width, count).copy()
 
 
-@pytest.mark.few(1)
+@pytest.mark.whole
 @machine_code
 @pytest.mark.parametrize(("peers", "more"), [*((3, more) for more in ("", *ODD)), (7, ""), (7, ODD[-1])])
 def test_runs_side_by_side_are_to_the_bit_those_played_alone(peers: int, more: str) -> None:

@@ -87,7 +87,7 @@ def test_the_growth_of_second_moments_is_that_of_the_references(
         assert found == pytest.approx(expected, abs=max(digits, 1e-12))
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("peers", "mass", "loss", "on_loss", "stiffness"), CRITICAL)
 def test_where_a_reference_is_critical_the_radius_is_1(
     peers: int, mass: float, loss: float, on_loss: str, stiffness: float
@@ -136,7 +136,7 @@ def by_box(system: CompiledSystem, near: float) -> tuple[float, float]:
 HOLD_10, ZERO_20 = ("loss: 10 %", 1143.224858916119), ("loss: 20 %, on_loss: zero", 1354.3615910782753)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("way", "more", "stiffness"),
     [

@@ -31,6 +31,7 @@ def longest(pattern: tuple[bool, ...]) -> int:
 
 
 # Peers, stiffness, losses in a row certified, the fewest in a row of a pattern that grows.
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("peers", "stiffness", "certified", "unstable"),
     [(2, 200.0, 7, None), (2, 900.0, 0, 2), (3, 500.0, 1, None), (3, 1000.0, 0, None), (5, 700.0, 0, None)],

@@ -151,7 +151,7 @@ def listener(
     return Listener(source, newest=newest, phase=0, period=8, delay=8, quantum=quantum)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("newest", [True, False])
 @pytest.mark.parametrize(
     "law",

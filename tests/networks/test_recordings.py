@@ -141,6 +141,7 @@ def recorded(folder: Path, law: ChannelLaw, count: int, seed: int) -> NetworkRec
     return describe(folder / "t.csv", 0.008)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("distribution", ["uniform", "normal", "pareto"])
 def test_the_keys_are_those_of_the_link_that_was_recorded(tmp_path: Path, distribution: str) -> None:
     """Of a simulated link, whose law is known: shares in their intervals, delays to a few standard errors."""
@@ -156,6 +157,7 @@ def test_the_keys_are_those_of_the_link_that_was_recorded(tmp_path: Path, distri
     assert not any("distributions" in told or "follow one another" in told for told in found.left_out)
 
 
+@pytest.mark.whole
 def test_bursts_are_told_from_luck(tmp_path: Path) -> None:
     """Of 100 recordings of independent losses at most one is called bursty (0.1 are to be expected)."""
     law = ChannelLaw(0.05, 0.95, 1.0, 0.0, 0.02, 0.0, "uniform", None)

@@ -173,7 +173,7 @@ ON_A_FINGER = {
 
 
 # The other device forgets a push within 2 ns: what moves it is all but over before a quadrature's first node.
-@pytest.mark.few(5)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("device", ["mass: 0.1 kg, damping: 5 N*s/m", "mass: 1 mg, damping: 500 N*s/m"])
 @pytest.mark.parametrize("push", ON_A_FINGER)
 def test_a_finger_is_pushed_as_balls_follow_it(push: str, device: str, tmp_path: Path) -> None:
