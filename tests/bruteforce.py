@@ -126,6 +126,14 @@ def lossy_frame(scene: Scene, luck: Luck) -> tuple[NDArray[np.float64], NDArray[
     return whole[:, :n], whole[:, n:]
 
 
+def states_read(matrices: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the states that others follow from in any of some maps (k, n, n), of those alone."""
+    read = np.ones(matrices.shape[1], dtype=bool)
+    while not (now := matrices[:, read].any(axis=(0, 1)) & read)[read].all():
+        read = now
+    return read.nonzero()[0]
+
+
 def frame_matrices(scene: Scene, count: int) -> NDArray[np.float64]:
     """Return the same in floats for many scenes at once, (count, n, n): numbers may be arrays (count,).
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from tests.bruteforce import Luck, Scene, lossy_frame, ways_of
+from tests.bruteforce import Luck, Scene, lossy_frame, states_read, ways_of
 from tests.topologies import compiled
 
 Floats = NDArray[np.float64]
@@ -53,21 +53,30 @@ def system_of(text: str) -> CompiledSystem:
 
 @dataclass(frozen=True)
 class Frames:
-    """One frame of all users and of what each hears of each; `pairs` are (sender, receiver)."""
+    """One frame of all users and of what each hears of each; `pairs` are (sender, receiver).
+
+    `read` are the states that something follows from.
+    """
 
     scene: Scene
     pairs: tuple[tuple[int, int], ...]
+    read: NDArray[np.intp]
 
     def matrix(self, heard: Sequence[float]) -> Floats:
         """Return the frame's matrix where ways hear (1) or lose (0) the packet that arrives in it."""
-        there = {pair: (bool(one),) for pair, one in zip(self.pairs, heard, strict=True)}
-        return lossy_frame(self.scene, Luck(there))[0]
+        return _whole(self.scene, self.pairs, heard)[np.ix_(self.read, self.read)]
+
+
+def _whole(scene: Scene, pairs: Sequence[tuple[int, int]], heard: Sequence[float]) -> Floats:
+    return lossy_frame(scene, Luck({pair: (bool(one),) for pair, one in zip(pairs, heard, strict=True)}))[0]
 
 
 def frames(peers: int, stiffness: float, damping: float = 0.0, operator: str = "mean") -> Frames:
     """Return the frames of the paper's users, whose packets are heard in the frame after they are sent."""
-    whole = Scene(operator=operator, peers=peers, kt=stiffness, bt=damping, cube=0.6 / peers)
-    return Frames(whole, tuple(ways_of(whole)))
+    scene = Scene(operator=operator, peers=peers, kt=stiffness, bt=damping, cube=0.6 / peers)
+    pairs = tuple(ways_of(scene))
+    either = np.array([_whole(scene, pairs, [one] * len(pairs)) for one in (0.0, 1.0)])
+    return Frames(scene, pairs, states_read(either))
 
 
 def growth(matrices: list[Floats]) -> float:

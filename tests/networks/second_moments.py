@@ -21,7 +21,7 @@ import scipy.linalg
 import scipy.sparse.linalg
 from numpy.typing import NDArray
 
-from tests.bruteforce import Luck, Scene, common_period, lossy_frame, ways_of
+from tests.bruteforce import Luck, Scene, common_period, lossy_frame, states_read, ways_of
 
 Floats = NDArray[np.float64]
 State = tuple[bool, bool]  # of a way: whether it is bad, and whether its last packet is missed
@@ -102,10 +102,7 @@ class Lossy:
                 luck = Luck(dict(zip(ways, there, strict=True)), gone, law.zero)
                 made[missed, there] = lossy_frame(scene, luck)
         moved = np.array([made[missed, there][0] for _, missed, there in happens])
-        read = np.ones(len(moved[0]), dtype=bool)
-        while not (now := moved[:, read].any(axis=(0, 1)) & read)[read].all():
-            read = now
-        self.read, self.whole = read.nonzero()[0], len(read)
+        self.read, self.whole = states_read(moved), moved.shape[1]
         moved = moved[:, self.read][:, :, self.read]
         unit = np.eye(len(self.read))
         standing = scipy.linalg.null_space((moved - unit).reshape(-1, len(unit)), rcond=STANDING)
