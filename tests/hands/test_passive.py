@@ -200,7 +200,10 @@ def by_region(system: CompiledSystem, limit: float) -> None:
 
 
 @pytest.mark.few(4)
-@pytest.mark.parametrize("way", [by_critical, by_certificate, by_sweep, by_box, by_region])
+@pytest.mark.parametrize(
+    "way",
+    [by_critical, by_certificate, by_sweep, by_box, pytest.param(by_region, marks=pytest.mark.whole)],
+)
 def test_every_way_to_ask_finds_what_an_independent_program_found(
     way: Callable[[CompiledSystem, float], None],
 ) -> None:

@@ -156,6 +156,7 @@ def test_every_way_to_ask_finds_the_stiffness_at_which_a_reference_is_critical(
     assert error < 0.011
 
 
+@pytest.mark.whole
 def test_a_region_over_loss_ends_where_the_references_do() -> None:
     system = compiled(unreliable("loss: 10 %"))
     found = apc.region(system, x="lan.loss=0 %:40 %", y=f"{STIFFNESS}=1000 N/m:1500 N/m")
