@@ -19,7 +19,7 @@ from apc.compiler.language.expression import format_expression
 from apc.compiler.language.grammar import parse_equation, parse_expression
 from apc.compiler.language.vectors import sizes_of, whole_and_index, written_equation, written_out
 from apc.compiler.pipeline import run_stages
-from tests.test_messages import told
+from tests.language.test_messages import MODELS
 from tests.topologies import ROOT, compiled, library
 from tests.topologies import told as told_of
 

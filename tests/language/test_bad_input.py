@@ -187,7 +187,7 @@ def test_the_line_is_shown_with_a_caret_under_the_place_however_long_it_is(
     assert capsys.readouterr().err == (
         "scene.yaml:4:11: E204 haptic wants ms, got 1 kg.\n      haptic: 1 kg\n              ^\n"
     )
-    FILE.write_text(f"a: {{{'b, ' * 100}c: !mine 1{', d' * 100}}}", encoding="utf-8")
+    FILE.write_text(f"a: [{'b, ' * 100}!mine 1{', d' * 100}]", encoding="utf-8")
     assert run(["check", "scene.yaml"]) == 1
     _, shown, caret = capsys.readouterr().err.splitlines()
     assert shown[caret.index("^") :].startswith("!mine")
@@ -340,6 +340,5 @@ def test_any_text_is_a_value_or_refused_and_nothing_else(text: str) -> None:
     quoted = text.replace("'", "''")
     scene = f"topology: t\npeers: {{u: {{count: 1}}}}\nparameters: {{a: '{quoted}'}}\n"
     FILE.write_text(scene, encoding="utf-8")
-    with pytest.raises(apc.ApcError) as caught:  # masses are missing
+    with pytest.raises(apc.ApcError, match="E201 the topology has no masses section"):
         apc.compile(FILE)
-    assert len(caught.value.mistakes) in (1, 2)
