@@ -208,5 +208,6 @@ def test_a_delay_is_an_expression_of_parameters(tmp_path: Path) -> None:
 def test_the_line_to_write_for_a_reduction_that_is_sent_works(tmp_path: Path) -> None:
     """What is heard and sent on, over a variable of the clock: each packet holds the newest of them."""
     more = "a.x\n  - relayed = 0.5*sample(a.x, clock) + 0.5*mean(others.sent)"
-    own = OWN.format(force="hold(K*(y - relayed))", sent="sample(hold(relayed))", **{**NAMED, "continuous": more})
+    named = {**NAMED, "continuous": more}
+    own = OWN.format(force="hold(K*(y - relayed))", sent="sample(hold(relayed))", **named)
     assert 0.9 < apc.analyze(compiled(SCENE, library(tmp_path, own))).spectral_radius < 1.1
