@@ -8,8 +8,9 @@ from pathlib import Path
 
 from tests.topologies import ROOT
 
-ROWS = [line.split(": ", 1) for line in Path(__file__).with_name("codes.txt").read_text("utf-8").splitlines()]
-PAGES = [path.read_text(encoding="utf-8") for top in ("compiler", "runtime") for path in (ROOT / top).rglob("*.py")]
+CATALOGUE = Path(__file__).with_name("codes.txt").read_text(encoding="utf-8")
+ROWS = [line.split(": ", 1) for line in CATALOGUE.splitlines()]
+FILES = [*(ROOT / "compiler").rglob("*.py"), *(ROOT / "runtime").rglob("*.py")]
 
 
 def test_a_code_has_one_meaning_and_a_meaning_one_code() -> None:
@@ -18,7 +19,8 @@ def test_a_code_has_one_meaning_and_a_meaning_one_code() -> None:
 
 
 def test_codes_that_are_told_are_those_of_the_catalogue_and_docstrings_name_no_others() -> None:
-    constants = {node.value for page in PAGES for node in ast.walk(ast.parse(page)) if isinstance(node, ast.Constant)}
-    told = {one for one in constants if isinstance(one, str) and re.fullmatch(r"[EW]\d{3}", one)}
+    pages = [path.read_text(encoding="utf-8") for path in FILES]
+    nodes = [node for page in pages for node in ast.walk(ast.parse(page)) if isinstance(node, ast.Constant)]
+    told = {str(node.value) for node in nodes if re.fullmatch(r"[EW]\d{3}", str(node.value))}
     assert told == {code for code, _ in ROWS}
-    assert {code for page in PAGES for code in re.findall(r"\b[EW]\d{3}\b", page)} <= told
+    assert {code for page in pages for code in re.findall(r"\b[EW]\d{3}\b", page)} <= told

@@ -33,7 +33,8 @@ def test_a_file_is_named_after_what_it_defines_in_kebab_case(path: Path) -> None
 
 def test_a_folder_of_ones_own_comes_before_the_library(tmp_path: Path) -> None:
     own = library(tmp_path, BALL.replace("Ball", "Mass"), BALL)
-    system = compiled("topology: own\npeers: {u: {count: 1}}\nmasses: {device: {type: Mass}, ball: {type: Ball}}\n", own)
+    masses = "masses: {device: {type: Mass}, ball: {type: Ball}}\n"
+    system = compiled(f"topology: own\npeers: {{u: {{count: 1}}}}\n{masses}", own)
     assert "device.damping" not in values(system)
     assert apc.analyze(system).rigid_modes == 2
 

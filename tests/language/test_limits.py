@@ -175,7 +175,9 @@ def test_a_chain_of_masses_is_sorted_in_seconds_and_a_rigid_one_is_one_mass() ->
     def row(count: int, kind: str) -> str:
         masses = f"masses: {{m: {{count: {count}, mass: 0.5 kg, damping: 0.1 N*s/m}}}}\n"
         pairs = f"count: {count - 1}, a: 'm[1:{count - 1}]', b: 'm[2:{count}]'"
-        return f"topology: row\npeers: {{u: {{count: 1}}}}\n{masses}couplers: {{c: {{{pairs}, type: {kind}}}}}\n"
+        return (
+            f"topology: row\npeers: {{u: {{count: 1}}}}\n{masses}couplers: {{c: {{{pairs}, type: {kind}}}}}\n"
+        )
 
     assert len(compiled(row(160, "SpringDamper, stiffness: 9 N/m")).kinds[0].states) == 320
     rigid = compiled(row(60, "Gear, ratio: 1"))

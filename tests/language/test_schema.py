@@ -18,7 +18,20 @@ from tests.topologies import AVERAGE, ROOT, SCENES, replaced
 jsonschema = pytest.importorskip("jsonschema")
 
 FILE = ROOT / "models" / "topology.schema.json"
-SECTIONS = ["topology", "about", "library", "clocks", "parameters", "peers", "masses", "couplers", "links", "hands", "experiment", "studies"]
+SECTIONS = [
+    "topology",
+    "about",
+    "library",
+    "clocks",
+    "parameters",
+    "peers",
+    "masses",
+    "couplers",
+    "links",
+    "hands",
+    "experiment",
+    "studies",
+]
 COMMENT = "# yaml-language-server: $schema=../topology.schema.json\n"
 ALL = """\
 topology: all

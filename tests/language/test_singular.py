@@ -107,7 +107,9 @@ LOOP = f"{LINE}E503 .* a loop that many values solve, or none"
         (["z = z*z/L + z + sample(a.x)", *HELD], "0 m", "E808 .* at the start values"),
     ],
 )  # fmt: skip
-def test_what_has_no_answer_is_told_by_name(equations: list[str], x: str, expected: str, tmp_path: Path) -> None:
+def test_what_has_no_answer_is_told_by_name(
+    equations: list[str], x: str, expected: str, tmp_path: Path
+) -> None:
     with pytest.raises(apc.ApcError, match=expected):
         apc.analyze(model(tmp_path, equations, x))
 
@@ -158,7 +160,9 @@ couplers: {{tank: {{flange: device, type: {part}}}}}
 def test_two_joints_that_say_the_same_with_these_numbers_are_refused() -> None:
     """For ratios that differ both masses would stand still; for equal ones nothing decides the forces."""
     text = "topology: joined\npeers: {user: {count: 1}}\nmasses: {one: {mass: 1 kg}, two: {mass: 1 kg}}\n"
-    gears = "couplers: {g: {type: Gear, a: one, b: two, ratio: 1}, h: {type: Gear, a: one, b: two, ratio: %d}}\n"
+    gears = (
+        "couplers: {g: {type: Gear, a: one, b: two, ratio: 1}, h: {type: Gear, a: one, b: two, ratio: %d}}\n"
+    )
     [line] = told(compiled, text + gears % 1)
     assert "`h.a.x = h.ratio*h.b.x` (h) says what other constraints say already" in line
     assert told(compiled, text + gears % 2) == []

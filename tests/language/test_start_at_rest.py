@@ -36,7 +36,7 @@ def test_the_largest_force_that_nothing_balances_is_told_first_of_all() -> None:
     first, second = apc.analyze(system).left_out
     assert first.startswith("the start is not at rest: 120 N acts on left.")
     assert "is not linear" in second
-    assert str(apc.analyze(system)).splitlines()[1].strip() == first
+    assert str(apc.analyze(system)).splitlines()[1].strip().startswith("the start is not at rest: 120 N")
     assert apc.analyze(system).to_dict()["left_out"] == [first, second]
 
 
@@ -46,7 +46,7 @@ def test_every_answer_that_holds_near_the_start_says_what_moves_there() -> None:
     found = (
         apc.critical(system, "contact.stiffness"),
         apc.feel(system, [1.0], at="left[1].device", between="right[1].device"),
-        apc.region(system, x=x, y=y, cells=2),
+        apc.region(system, x=x, y=y),
         apc.analyze_many(system, {"contact.stiffness": [500.0]}),
     )
     for one in found:

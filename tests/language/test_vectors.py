@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import random
-import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.library.parts import rates
-from tests.topologies import ROOT, compiled, library, told
+from tests.topologies import compiled, library, told
 
 OWN = """\
 component: Own
@@ -125,15 +122,3 @@ def test_potentials_and_flows_of_a_connector_go_in_pairs_and_a_vector_keeps_its_
     text = scene(2).replace("type: PlanarMass", "type: Heavy").partition("hands")[0]
     [line] = told(compiled, text, library(tmp_path, component("u", [1.0, 2.0]), heavy))
     assert line.endswith("E205 x is a vector of 2 in what this component extends. Write: another name")
-
-
-def test_scenes_of_vectors_compile_or_are_told_what_is_wrong(tmp_path: Path) -> None:
-    """Here forty; thousands are `python -m tests.fuzz --inputs 10000 --sort vectors`."""
-    command = [sys.executable, "-m", "tests.fuzz", "--inputs", "40", "--sort", "vectors", "--seed", "7"]
-    ran = subprocess.run(
-        [*command, "--out", str(tmp_path / "failures")], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert ran.returncode == 0, ran.stdout + ran.stderr
-    outcomes = {sort: int(count) for count, sort in re.findall(r"(\d+)  vectors: (\w+)", ran.stdout)}
-    assert outcomes["compiled"] > 8
-    assert sum(outcomes.values()) == 40
