@@ -66,7 +66,6 @@ FILES: list[tuple[str | bytes, str]] = [
     ("- a\n- b\n", LIST),
     ("just text\n", LIST.replace("a list", "just text")),
     ("topology: [a\nmasses: {", "1:11: E109 this [ is never closed, or a comma is missing behind it."),
-    ("[1, 2\n", "1:1: E109 this [ is never closed, or a comma is missing behind it."),
     ("{a: 1}}\n", f"1:7: {NO_PLACE}"),
     (" a: 1\nb: 2\n", f"2:1: {NO_PLACE}"),
     ("? [a]\n: b\n", "1:3: E112 a key wants a name, got a list."),
@@ -81,7 +80,6 @@ FILES: list[tuple[str | bytes, str]] = [
     ("a: {x: [1] [2]}\n", "1:4: E109 this { is never closed, or a comma is missing behind it."),
     ("{a: \n", "2:1: E109 a value or a closing bracket is missing here."),
     ("a: 1\n\tb: 2\n", f"2:1: E109 {TABBED}"),
-    ("a:\n\tb: 1\n", f"2:1: E109 {TABBED}"),
     ("a: 1\nb\nc: 2\n", "2:1: E109 a key stands here without its colon and a space. Write: b:"),
     ("a:\n  b: 1\n c: 2\n", "3:2: E109 this line is indented differently from the keys it belongs to."),
     ("x: !mine 3", "1:4: E113 the tag '!mine' is not part of this language."),
@@ -257,6 +255,9 @@ def test_a_model_that_is_cut_off_or_older_than_its_topology_is_refused(message: 
     assert apc.analyze(model).stable, "no topology there to be older than"
 
 
+EACH = "peers: {user: {count: 3, set: {device.x: [0 m, 10 mm, 0 m]}}}"
+
+
 @pytest.mark.parametrize(
     ("setting", "expected"),
     [
@@ -268,19 +269,15 @@ def test_a_model_that_is_cut_off_or_older_than_its_topology_is_refused(message: 
         ("contact.stiffness=9**9**9", "E222 a unit wants a name such as N, m or s, got ^."),
         ("haptic.period=0 s", "E625 haptic.period wants a time above 0 s"),
         ("__class__.x=1", "E622 __class__.x is no parameter of three-users-average."),
-        ("user[2].device.x=10 mm", "Write: peers: {user: {count: 3, set: {device.x: [0 m, 10 mm, 0 m]}}}"),
+        ("user[2].device.x=10 mm", f"Write: {EACH}"),
     ],
 )
 def test_a_setting_that_cannot_be_is_one_message(setting: str, expected: str, message: Say) -> None:
     FILE.write_text(AVERAGE, encoding="utf-8")
     assert expected in message("analyze", "--set", setting)
-
-
-def test_a_value_for_one_peer_is_written_as_it_is_told() -> None:
-    line = "peers: {user: {count: 3, set: {device.x: [0 m, 10 mm, 0 m]}}}"
-    FILE.write_text(replaced(AVERAGE, ("peers:\n  user: {count: 3}", line)), encoding="utf-8")
-    [group] = apc.compile(FILE).groups
-    assert [column.values.tolist() for column in group.columns] == [[0.0, 0.01, 0.0]]
+    if EACH in expected:
+        FILE.write_text(replaced(AVERAGE, ("peers:\n  user: {count: 3}", EACH)), encoding="utf-8")
+        assert apc.compile(FILE).groups[0].columns[0].values.tolist() == [0.0, 0.01, 0.0]
 
 
 # ---- the scene that is meant ----

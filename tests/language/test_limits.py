@@ -93,8 +93,8 @@ MUCH: list[tuple[tuple[tuple[str, str], ...], str]] = [
     *(((MANY, (DELAY, f"delay: 8 ms, graph: {graph}}}")), ON_A_GRAPH)
       for graph in ("ring", "star", "{edges: [[1, 2], [2, 3]]}")),
     ((("  cube:", "  more: {mass: 1 kg, count: 501}\n  cube:"),), "E208 "),
-    ((("  cube:", "  more: {mass: 1 kg, count: 499}\n  cube:"),), "E804 1 different peers make one system of 1,002 states; "
-     "the matrix of one may have 1,000."),
+    ((("  cube:", "  more: {mass: 1 kg, count: 499}\n  cube:"),), "E804 1 different peers make one system of "
+     "1,002 states; the matrix of one may have 1,000."),
 ]  # fmt: skip
 
 

@@ -23,11 +23,12 @@ def test_lines_are_filled_up_to_the_width_and_no_word_is_lost(words: list[str]) 
     assert all(line.startswith("    ") for line in lines[1:])
 
 
-def test_a_word_wider_than_a_line_is_broken_behind_an_operator() -> None:
+def test_a_word_wider_than_a_line_is_broken_behind_an_operator_or_not_at_all() -> None:
     product = "*".join(["stiffness"] * 12)
     lines = wrapped(f"f = {product}", "", "  ")
     assert "".join(line.strip() for line in lines) == f"f = {product}"
     assert len(lines) == 2 and lines[0].endswith("*") and max(map(len, lines)) <= WIDTH
+    assert wrapped("a" * (WIDTH + 5)) == ["a" * (WIDTH + 5)]
 
 
 @pytest.mark.parametrize(
@@ -63,8 +64,8 @@ def test_what_is_shown_holds_whatever_the_error_holds(value: float, error: float
     ) * abs(Fraction(value))
 
 
-def test_digits_that_an_error_leaves_open_are_not_shown() -> None:
-    assert known_digits(1645.3530049, 1e-9, 7) == "1645.353"
-    assert known_digits(1645.3530049, 0.2, 7) == "1645"
-    assert known_digits(1645.3530049, 3e3, 7) == "2e+03"
-    assert known_digits(0.25, 0.0, 7) == "0.25"
+@pytest.mark.parametrize(
+    ("error", "expected"), [(1e-9, "1645.353"), (0.2, "1645"), (3e3, "2e+03"), (0.0, "1645.353")]
+)
+def test_digits_that_an_error_leaves_open_are_not_shown(error: float, expected: str) -> None:
+    assert known_digits(1645.3530049, error, 7) == expected

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import casadi
-import numpy as np
 import pytest
 
 import apc
@@ -158,14 +157,6 @@ def test_a_link_is_reliable_and_a_channel_holds_newest_and_uniform_unless_it_say
     full = changed(("8 ms}", text)).links[0].channel
     assert full is not None
     assert (full.distribution, full.reorder, full.on_loss) == ("pareto", "all", "zero")
-
-
-def test_a_channel_changes_nothing_of_what_a_peer_computes() -> None:
-    plain, more = compiled(AVERAGE).kinds[0], changed(("8 ms}", "8 ms, loss: 2 %, jitter: 1 ms}")).kinds[0]
-    assert plain.parameters == more.parameters
-    numbers, tick = np.random.default_rng(0), plain.clocks[0].tick
-    given = [numbers.uniform(-1, 1, tick.numel_in(i)) for i in range(tick.n_in())]
-    assert listed(tick(*given)) == listed(more.clocks[0].tick(*given))
 
 
 def test_a_trace_is_a_column_of_delays_lost_ones_infinite_and_stays_in_the_model(tmp_path: Path) -> None:

@@ -109,16 +109,3 @@ def test_what_doubles_at_each_level_is_refused_before_it_fills_the_memory(tmp_pa
         nested = f"cross({nested}, v)"
     [line] = told(compiled, scene(3), library(tmp_path, component(nested, [1.0, 2.0, 3.0])))
     assert "entry by entry this has more than 10000 terms: give a part of it a name" in line
-
-
-def test_potentials_and_flows_of_a_connector_go_in_pairs_and_a_vector_keeps_its_size(tmp_path: Path) -> None:
-    point = "connector: Point\npotentials: {x: {unit: m, size: 2}}\nflows: {f: {unit: N, size: 3}}\n"
-    own = component("u", [1.0, 2.0]).replace("PlanarFlange", "Point")
-    [line] = told(compiled, scene(2), library(tmp_path, own, point))
-    assert line.endswith(
-        "E501 Point is unbalanced: 2 potentials for 3 flows. Write: a flow for each potential, of its size"
-    )
-    heavy = "component: Heavy\nextends: PlanarMass\nvariables:\n  x: {unit: m, size: 3}\n"
-    text = scene(2).replace("type: PlanarMass", "type: Heavy").partition("hands")[0]
-    [line] = told(compiled, text, library(tmp_path, component("u", [1.0, 2.0]), heavy))
-    assert line.endswith("E205 x is a vector of 2 in what this component extends. Write: another name")
