@@ -34,6 +34,8 @@ BINDING = {
     "-a*b": -6,
     "a*-b": -6,
     "+a": 2,
+    "--a": 2,
+    "a - -b": 5,
     "a**2": 4,
     "a^-2": Fraction(1, 4),
     "(a^2)^3": 64,
@@ -108,10 +110,15 @@ TERMS = {
 
 
 @pytest.mark.parametrize("term", TERMS)
-def test_every_function_of_the_language_has_its_meaning(term: str, tmp_path: Path) -> None:
-    system = model(tmp_path, "x = flange.x/L", f"flange.f = -F*({term})")
+def test_every_function_of_the_language_has_its_meaning_and_its_slope(term: str, tmp_path: Path) -> None:
+    equations = ["x = flange.x/L", f"y = {term}", "s = T*sample(der(y))", "flange.f = -F*y - hold(F*s)"]
+    system, value = model(tmp_path, *equations), TERMS[term]
     for x in (-1.5, 0.5, 1.0, 2.5, 3.0):
-        assert force(system, x) == pytest.approx(TERMS[term](x), rel=1e-14), x
+        assert force(system, x) == pytest.approx(value(x), rel=1e-14), x
+    for x in (-1.5, 0.5, 2.5):
+        slope = (value(x + 1e-6) - value(x - 1e-6)) / 2e-6
+        for held in ticked(system, {"device.x": x, "device.v": 0.5}).values():
+            assert held == pytest.approx(0.5 * slope, rel=1e-7, abs=1e-9), x
 
 
 def _random(chance: random.Random, depth: int) -> str:

@@ -316,6 +316,7 @@ ODD: list[tuple[tuple[tuple[str, str], ...], list[str]]] = [
      ["9:3: W272 lone is joined to nothing: no coupler, no hand and no other mass."]),
     ((("masses:\n", "masses:\n  lone: {mass: 1 kg, flange: device}\n"),), []),
     ((("b: cube, ", "b: ground, "),), []),
+    ((("masses:\n", "masses:\n  fixed: {mass: 1 kg, flange: ground}\n"),), []),
     ((("  user: {count: 3}", "  left: {count: 2}\n  right: {count: 2}"),
       ("b: cube, ", "b: cube, at: [left], ")),
      ["10:3: W272 device of right is joined to nothing: no coupler, no hand and no other mass."]),
