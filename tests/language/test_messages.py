@@ -42,6 +42,10 @@ def _lines(row: str, mark: str) -> str:
     return "\n".join(line[2:] for line in row.splitlines() if line[:2] == f"{mark} ")
 
 
+def _told(row: str) -> list[str]:
+    return [line for line in row.splitlines() if line[:2] not in ("- ", "+ ", "= ")]
+
+
 @pytest.fixture
 def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
     """Return what gives the mistakes that `apc check` tells of a section with its first file changed."""
@@ -88,20 +92,30 @@ def written(text: str, mistake: str, line: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-@pytest.mark.parametrize(
-    ("section", "row"), ROWS, ids=[f"{row.partition(' Write: ')[0][-60:]}" for _, row in ROWS]
-)
-def test_a_mistake_is_told_once_and_mended_as_it_says(section: str, row: str, check: Any) -> None:
+def _named(rows: list[tuple[str, str]]) -> Any:
+    return pytest.mark.parametrize(
+        ("section", "row"), rows, ids=[row.partition(" Write: ")[0][-60:] for _, row in rows]
+    )
+
+
+@_named(ROWS)
+def test_a_mistake_is_told_once_at_its_place(section: str, row: str, check: Any) -> None:
+    text = next(iter(MODELS[section].values()))
+    told = check(section, replaced(text, (_lines(row, "-"), _lines(row, "+"))))
+    assert told == _told(row)
+
+
+@pytest.mark.few(120)
+@_named([(section, row) for section, row in ROWS if "Write: " in row])
+def test_what_a_message_says_to_write_is_accepted(section: str, row: str, check: Any) -> None:
     text = next(iter(MODELS[section].values()))
     old, new, instead = (_lines(row, mark) for mark in "-+=")
     wrong = replaced(text, (old, new))
-    told = check(section, wrong)
-    assert told == [line for line in row.splitlines() if line[:2] not in ("- ", "+ ", "= ")]
+    hints = [(one, one.partition("Write: ")[2].split(", or ")) for one in _told(row) if "Write: " in one]
     if instead:
         assert check(section, replaced(text, (old, instead))) == []
         return
-    hints = [(one, one.partition("Write: ")[2].split(", or ")) for one in told if "Write: " in one]
-    for place in range(max((len(lines) for _, lines in hints), default=0)):
+    for place in range(max(len(lines) for _, lines in hints)):
         right = wrong
         for mistake, lines in reversed(hints):
             right = written(right, mistake, lines[min(place, len(lines) - 1)])

@@ -76,7 +76,7 @@ def test_a_second_derivative_takes_the_velocity_that_is_named_as_its_state(tmp_p
 
 
 def test_of_two_that_follow_each_other_the_one_with_a_start_value_is_the_state(tmp_path: Path) -> None:
-    equations = ["der(a) = u", "a = 2*b", "K*T*der(u) = F", "flange.f = 0"]
+    equations = ["der(a) = u", "a = 2*b", "K*T^2*der(u) = F", "flange.f = 0"]
     system = model(tmp_path, *equations, variables="a u=m/s: b:")
     assert {one.name for one in system.kinds[0].states} == {"device.x", "device.v", "own.b", "own.u"}
     assert rates(system, {"own.u": 0.5})["own.b"] == 0.25
