@@ -42,7 +42,6 @@ def test_what_is_held_is_one_value_and_a_memory_that_nobody_reads_is_none(tmp_pa
     system = filtered(tmp_path, "s = sample(flange.x)", "w = previous(s)", "k*hold(s - 2*s)")
     [tick] = system.kinds[0].clocks
     assert (len(tick.outputs), tick.memories) == (1, ())
-    assert "all.s" not in system.kinds[0].parameters
     assert list(ticked(system, {"device.x": 0.25}).values()) == [-0.25]
 
 

@@ -156,14 +156,6 @@ def test_an_expression_and_its_derivative_mean_what_is_written(seed: int, tmp_pa
             assert held == pytest.approx(0.5 * float(slope), rel=1e-11, abs=1e-11)
 
 
-def test_a_quotient_is_rounded_once() -> None:
-    text = replaced(ONE_MASS, ("2 kg", "3 kg"), ("3 N*s/m", "0.1 N*s/m"))
-    [kind] = compiled(text).kinds
-    values = {one.name: one.value for one in compiled(text).parameters}
-    found = kind.derivative([0.0, 0.7], [], [values[name] for name in kind.parameters], 0)
-    assert float(found[1]) == -(0.1 * 0.7) / 3
-
-
 def test_what_follows_from_others_keeps_its_text_and_follows() -> None:
     text = replaced(
         AVERAGE,

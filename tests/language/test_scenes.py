@@ -367,7 +367,6 @@ for name in {NAMES!r}:
 print(whole.hexdigest())
 """
 LINES = {
-    "source": ["topology:  (1:1)", "  'three-users-average'  (str, 1:11)", "      '3'  (int, 7:17)"],
     "scene": ["clock haptic: every 0.001 s, first at 0 s", "masses cube: Mass, shared, at user"],
     "clocked": [
         "  sample on haptic: contact.a.x",
