@@ -75,13 +75,6 @@ def test_a_second_derivative_takes_the_velocity_that_is_named_as_its_state(tmp_p
     assert rates(system, {"own.v": 1.0})["own.v"] == pytest.approx(0.01 - 1, rel=1e-14)
 
 
-def test_of_two_that_follow_each_other_the_one_with_a_start_value_is_the_state(tmp_path: Path) -> None:
-    equations = ["der(a) = u", "a = 2*b", "K*T^2*der(u) = F", "flange.f = 0"]
-    system = model(tmp_path, *equations, variables="a u=m/s: b:")
-    assert {one.name for one in system.kinds[0].states} == {"device.x", "device.v", "own.b", "own.u"}
-    assert rates(system, {"own.u": 0.5})["own.b"] == 0.25
-
-
 def test_the_derivative_of_a_sampled_algebraic_variable_follows_by_the_chain_rule(tmp_path: Path) -> None:
     equations = [
         "y = L*exp(2*flange.x/L)",
