@@ -4,13 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from apc.analysis.analysis import NOT_LINEAR, analyze
-from apc.exports.lifted import about
-from apc.hands.feel import feel
-from apc.regions.axes import parse_axes
-from apc.regions.region import region
-from apc.vary.critical import critical
-from apc.vary.many import analyze_many
+import apc
 from tests.topologies import AVERAGE, compiled
 
 # A device 0.2 m in a cube of 600 N/m: 120 N. `push` is what balances it, `held` that on the cube.
@@ -39,34 +33,34 @@ def _pressed(push: str = "0 N", held: str = "0 N", left: str = "device.x: -180 m
 
 def test_the_largest_force_that_nothing_balances_is_told_first_of_all() -> None:
     system = compiled(_pressed())
-    first, second = analyze(system).left_out
+    first, second = apc.analyze(system).left_out
     assert first.startswith("the start is not at rest: 120 N acts on left.")
-    assert second == NOT_LINEAR
-    assert str(analyze(system)).splitlines()[1].strip().startswith("the start is not at rest: 120 N")
-    assert analyze(system).to_dict()["left_out"][0] == first
+    assert "is not linear" in second
+    assert str(apc.analyze(system)).splitlines()[1].strip().startswith("the start is not at rest: 120 N")
+    assert apc.analyze(system).to_dict()["left_out"] == [first, second]
 
 
 def test_every_answer_that_holds_near_the_start_says_what_moves_there() -> None:
     system = compiled(_pressed())
     x, y = "contact.stiffness=500 N/m:700 N/m", "device.damping=4 N*s/m:6 N*s/m"
     found = (
-        critical(system, "contact.stiffness").left_out,
-        feel(system, [1.0], at="left[1].device", between="right[1].device").left_out,
-        region(system, parse_axes(system, x, y), cells=2).left_out,
-        analyze_many(system, {"contact.stiffness": [500.0]}).left_out,
-        about(system)[1],
+        apc.critical(system, "contact.stiffness"),
+        apc.feel(system, [1.0], at="left[1].device", between="right[1].device"),
+        apc.region(system, x=x, y=y),
+        apc.analyze_many(system, {"contact.stiffness": [500.0]}),
     )
-    for told in found:
-        assert told[0].startswith("the start is not at rest: 120 N acts on left.")
+    for one in found:
+        assert one.left_out[0].startswith("the start is not at rest: 120 N acts on left.")
 
 
 @pytest.mark.parametrize("moved", ["-180 mm", "-17 cm"])
 def test_of_forces_that_balance_nothing_is_said(moved: str) -> None:
     force = 600 * (0.02 - float(moved.split()[0]) * (0.001 if "mm" in moved else 0.01))
     balanced = f"device.x: {moved}, push.force: {-force} N, held.force: {force} N"
-    assert analyze(compiled(_pressed(left=balanced))).left_out == (NOT_LINEAR,)
+    [left_out] = apc.analyze(compiled(_pressed(left=balanced))).left_out
+    assert "is not linear" in left_out
 
 
 def test_of_a_scene_whose_verdict_does_not_depend_on_the_start_nothing_is_said() -> None:
     pushed = AVERAGE.replace("device: {mass", "device: {x: 1 m, mass")
-    assert analyze(compiled(pushed)).left_out == ()
+    assert apc.analyze(compiled(pushed)).left_out == ()
