@@ -50,7 +50,7 @@ from apc.processes import Workers, digest_of
 from tests.fuzz.arrays import recorded
 from tests.fuzz.packets import run_packets
 from tests.topologies import AVERAGE, replaced, told
-from tests.wire import HOUR, SOON, Other, Wire, loop_at, send_packets
+from tests.surfaces.wire import HOUR, SOON, Other, Wire, loop_at, send_packets
 
 DIGEST = hashlib.sha256(b"a scene").digest()
 HERE: Address = ("127.0.0.1", 5000)

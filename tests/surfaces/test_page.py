@@ -28,7 +28,7 @@ from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.frame.names import Free
 from apc.frame.overrides import parse_override
-from tests.pages import CHROMIUM, MODEL, VERDICT, Tab, launched, served
+from tests.surfaces.pages import CHROMIUM, MODEL, VERDICT, Tab, launched, served
 from tests.topologies import AVERAGE, SCENES
 
 pytest.importorskip("bokeh")
