@@ -530,6 +530,7 @@ def test_a_device_takes_the_text_format_of_a_command_and_its_words_stand_beside(
     assert not Path(f"{os.devnull}.json").exists()
 
 
+@pytest.mark.whole
 def test_two_outputs_may_be_one_device(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["simulate", "scene.yaml", "--duration", "10 ms", "--plot", "/dev/null", "--still", "/dev/null"]
     assert run(words) == 0, capsys.readouterr().err
