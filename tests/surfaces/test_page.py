@@ -400,10 +400,6 @@ def tab(browser: Any, link: str) -> Iterator[Tab]:
     found.close(link)
 
 
-def area(tab: Tab) -> str:
-    return str(tab.page.evaluate(f"{MODEL}('region-words').text"))
-
-
 def test_a_slider_that_is_moved_changes_region_and_verdict_to_what_the_api_says(
     browser: Any, link: str, tab: Tab, tmp_path: Path
 ) -> None:

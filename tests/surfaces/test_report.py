@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import re
@@ -12,94 +13,87 @@ from pathlib import Path
 import pytest
 
 import apc
-from apc.__main__ import run
 from apc.compiler.errors import Mistake, Place
 from apc.present import report as pages
 from apc.present.report import kept_report, report_page
 from apc.reports import contents
-from apc.reports.contents import Report, Table, differences, report
+from apc.reports.contents import Report, Table, differences
+from tests.commands import Cli, folder, write
 from tests.topologies import AVERAGE, SCENES, replaced
 
 SCENE = SCENES / "three-users-average.yaml"
+
+
 LONE = "topology: lone\npeers: {user: {count: 1}}\nmasses: {device: {mass: 1 kg, damping: 1 N*s/m}}\n"
 
 
-@pytest.fixture(scope="module")
-def found() -> Report:
-    return report([SCENE])
+@functools.cache
+def paper() -> Report:
+    return apc.report(SCENE)
 
 
-@pytest.fixture(scope="module")
-def page(found: Report) -> str:
-    return report_page(found)
+@functools.cache
+def page() -> str:
+    return report_page(paper())
 
 
 class Reader(HTMLParser):
-    """What of a page would be loaded or run, and whether every element is closed."""
+    """What of a page would be loaded or run; every element must be closed."""
 
-    VOID = ("meta", "link", "br", "img", "input")
-
-    def __init__(self) -> None:
+    def __init__(self, text: str) -> None:
         super().__init__()
         self.wanted: list[str] = []
         self.scripts: list[str | None] = []
         self.open: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Note what an element names."""
-        for name, value in attrs:
-            if name in ("src", "href", "xlink:href", "data", "action") and value:
-                self.wanted.append(value)
-            assert not name.startswith("on"), name
-        if tag == "script":
-            self.scripts.append(dict(attrs).get("type"))
-        if tag not in self.VOID:
-            self.open.append(tag)
+        self.feed(text)
+        assert not self.open
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Note what an empty element names."""
-        self.handle_starttag(tag, attrs)
-        if tag not in self.VOID:
-            self.open.pop()
+        """Note what an element names."""
+        for name, value in attrs:
+            self.wanted += (
+                [value] if name in ("src", "href", "xlink:href", "data", "action") and value else []
+            )
+            assert not name.startswith("on"), name
+        self.scripts += [dict(attrs).get("type")] if tag == "script" else []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Note that an element begins."""
+        self.handle_startendtag(tag, attrs)
+        self.open += [tag] if tag not in ("meta", "link", "br", "img", "input") else []
 
     def handle_endtag(self, tag: str) -> None:
         """Check that what ends had begun last."""
         assert self.open.pop() == tag
 
 
-def test_a_page_loads_nothing_and_runs_nothing(page: str) -> None:
-    reader = Reader()
-    reader.feed(page)
-    assert not reader.open
+def test_a_page_loads_nothing_runs_nothing_and_names_nothing_twice() -> None:
+    reader = Reader(page())
     assert all(one.startswith(("#", "data:")) for one in reader.wanted)
     assert reader.scripts == ["application/json"]
-    assert "default-src 'none'" in page
-    assert len(page.encode("utf-8")) < 5 * 2**20
-
-
-def test_pictures_name_nothing_twice(page: str) -> None:
-    named = re.findall(r'id="([^"]+)"', page)
+    assert "default-src 'none'" in page()
+    assert len(page().encode("utf-8")) < 5 * 2**20
+    named = re.findall(r'id="([^"]+)"', page())
     assert len(named) == len(set(named))
-    used = set(re.findall(r'(?:xlink:href="#|url\(#)([^")]+)', page))
-    assert used <= set(named)
+    assert set(re.findall(r'(?:xlink:href="#|url\(#)([^")]+)', page())) <= set(named)
 
 
-def test_every_section_is_there_with_its_picture_table_and_command(page: str) -> None:
+def test_every_section_is_there_with_its_picture_table_and_command() -> None:
     for key, title in pages.TITLES.items():
-        [section] = re.findall(rf'<section id="{key}">.*?</section>', page, re.DOTALL)
+        [section] = re.findall(rf'<section id="{key}">.*?</section>', page(), re.DOTALL)
         assert f"<h2>{title.replace('&', '&amp;')}</h2>" in section
         if key == "network":
             assert "no packet can get lost" in section
             continue
         assert "<table>" in section and "As by <code>apc " in section
         assert ("<svg" in section) == (key != "compiled")
-    assert AVERAGE.splitlines()[0] in page  # the scene's own text
-    assert "prefers-color-scheme: dark" in page
+    assert AVERAGE.splitlines()[0] in page()  # the scene's own text
+    assert "prefers-color-scheme: dark" in page()
 
 
-def test_the_numbers_are_those_of_the_commands(found: Report) -> None:
+def test_the_numbers_are_those_of_the_commands() -> None:
     model = apc.compile(SCENE)
-    sections = {one.key: one for one in found.scenes[0].sections}
+    sections = {one.key: one for one in paper().scenes[0].sections}
 
     def value(key: str, table: int, name: str, column: int = 1) -> object:
         return next(row[column] for row in sections[key].tables[table].rows if row[0] == name)
@@ -112,27 +106,25 @@ def test_the_numbers_are_those_of_the_commands(found: Report) -> None:
     assert area == pytest.approx(apc.region(model).stable_area / (5000 * 1500))
 
 
-def test_what_a_scene_says_is_text_and_no_markup(tmp_path: Path) -> None:
+def test_what_a_scene_says_is_text_and_no_markup(cli: Cli) -> None:
     evil = "</pre></script><script>alert(1)</script><img src=x>"
-    path = tmp_path / "scene.yaml"
-    path.write_text(replaced(LONE, ("lone\n", f'lone\nabout: "{evil}"\n')), encoding="utf-8")
-    page = report_page(report([path]))
-    reader = Reader()
-    reader.feed(page)
+    write("scene.yaml", replaced(LONE, ("lone\n", f'lone\nabout: "{evil}"\n')))
+    assert cli("report scene.yaml --out r.html").code == 0
+    text = Path("r.html").read_text("utf-8")
+    reader = Reader(text)
     assert reader.scripts == ["application/json"]
-    assert "<script>alert" not in page and "x" not in reader.wanted
-    (tmp_path / "r.html").write_text(page, encoding="utf-8")
-    assert kept_report(tmp_path / "r.html")["scenes"][0]["about"] == evil
+    assert "<script>alert" not in text and "x" not in reader.wanted
+    assert kept_report(Path("r.html"))["scenes"][0]["about"] == evil
 
 
-def test_sections_that_a_scene_cannot_fill_say_why(tmp_path: Path) -> None:
-    path = tmp_path / "scene.yaml"
-    path.write_text(LONE, encoding="utf-8")
-    found = report([path])
-    why = {one.key: one.refused for one in found.scenes[0].sections if one.refused}
+def test_sections_that_a_scene_cannot_fill_say_why(cli: Cli) -> None:
+    write("scene.yaml", LONE)
+    report = apc.report("scene.yaml")
+    why = {one.key: one.refused for one in report.scenes[0].sections if one.refused}
     assert why["region"] == "the scene has fewer than two stiffnesses, and says no studies: region:"
     assert why["network"] == "loss: there is no link"
-    assert all(f"Not here: {text}" in report_page(found).replace("&#x27;", "'") for text in why.values())
+    text = report_page(report).replace("&#x27;", "'")
+    assert all(f"Not here: {reason}" in text for reason in why.values())
 
 
 def test_over_an_unreliable_link_loss_and_jitter_are_looked_at_and_the_region_says_what_stable_means(
@@ -158,91 +150,90 @@ def test_over_an_unreliable_link_loss_and_jitter_are_looked_at_and_the_region_sa
     assert "--in nominal" in sections["region"].command
 
 
-def test_from_python_a_report_is_a_result_and_a_page(tmp_path: Path) -> None:
-    path = tmp_path / "scene.yaml"
-    path.write_text(LONE, encoding="utf-8")
-    found = apc.report(path, tmp_path / "r.html", set={"device.mass": "2 kg"})
-    assert isinstance(found, apc.Report) and found.scenes[0].settings == ("device.mass=2 kg",)
-    assert kept_report(tmp_path / "r.html")["scenes"][0]["settings"] == ["device.mass=2 kg"]
-    again = apc.report([path], set={"device.mass": "2 kg"})
-    assert (tmp_path / "r.html").read_text("utf-8") == report_page(again) + "\n"
+def test_from_python_a_report_is_a_result_and_a_page(cli: Cli) -> None:
+    write("scene.yaml", LONE)
+    report = apc.report("scene.yaml", "r.html", set={"device.mass": "2 kg"})
+    assert isinstance(report, apc.Report) and report.scenes[0].settings == ("device.mass=2 kg",)
+    assert kept_report(Path("r.html"))["scenes"][0]["settings"] == ["device.mass=2 kg"]
+    again = apc.report(["scene.yaml"], set={"device.mass": "2 kg"})
+    assert Path("r.html").read_text("utf-8") == report_page(again) + "\n"
     with pytest.raises(apc.ApcError, match="E616"):
-        apc.report(path, path)
+        apc.report("scene.yaml", "scene.yaml")
 
 
-def test_a_report_is_computed_anew_from_itself_alone(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("scene.yaml").write_text(replaced(LONE, ("{count: 1}", "{table: users.csv}")), encoding="utf-8")
-    Path("users.csv").write_text("device.mass [kg]\n0.1\n0.12\n", encoding="utf-8")
-    assert run(["report", "scene.yaml", "--set", "device.damping=2 N*s/m", "--out", "r.html"]) == 0
+def test_a_report_is_computed_anew_from_itself_alone(cli: Cli) -> None:
+    write("scene.yaml", replaced(LONE, ("{count: 1}", "{table: users.csv}")))
+    write("users.csv", "device.mass [kg]\n0.1\n0.12\n")
+    assert cli("report scene.yaml --set 'device.damping=2 N*s/m' --out r.html").code == 0
     for name in ("scene.yaml", "users.csv"):
         Path(name).unlink()
-    assert run(["report", "--check", "r.html"]) == 0
-    assert "r.html: every number is the same, computed anew" in capsys.readouterr().out
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["r.html"]
+    assert "r.html: every number is the same, computed anew" in cli("report --check r.html").out
+    assert folder() == ["r.html"]
     text = Path("r.html").read_text(encoding="utf-8")
     kept = kept_report(Path("r.html"))
     name, old = kept["scenes"][0]["sections"][1]["tables"][0]["rows"][1][:2]
+    assert name.startswith("spectral radius")
     version = f'"apc": "{apc.__version__}"'
     assert version in text
-    text = text.replace(f"{old!r},", f"{old + 0.001!r},").replace(version, '"apc": "0.0.1"')
-    Path("r.html").write_text(text, encoding="utf-8")
-    assert run(["report", "--check", "r.html"]) == 1
-    said = capsys.readouterr().err
-    assert f"note: apc was 0.0.1, and is {apc.__version__} here" in said
-    assert f"E991 Verdict, modes and margins: Verdict: value of {name} is {old:.12g}, not" in said
-    assert name.startswith("spectral radius")
+    write("r.html", text.replace(f"{old!r},", f"{old + 0.001!r},").replace(version, '"apc": "0.0.1"'))
+    ran = cli("report --check r.html")
+    assert ran.code == 1
+    assert f"note: apc was 0.0.1, and is {apc.__version__} here" in ran.err
+    assert f"E991 Verdict, modes and margins: Verdict: value of {name} is {old:.12g}, not" in ran.err
 
 
-def test_differences_are_by_more_than_roundings_and_their_own_errors() -> None:
-    def table(*rows: tuple[object, ...]) -> list[dict[str, object]]:
-        return [{"title": "T", "columns": ["what", "value", "error"], "rows": [list(row) for row in rows]}]
+Rows = list[tuple[object, ...]]
 
-    assert not differences(table(("a", 1.0, 1e-9)), table(("a", 1.0 + 1e-8, 1e-3)))
-    assert not differences(table(("a", 1.0, 0.2)), table(("a", 1.1, None)))
-    assert not differences(
-        table(("a", 1.0, None), ("b", 1e-17, None)), table(("a", 1.0, None), ("b", -3e-16, None))
-    )
-    assert differences(table(("a", 1.0, 1e-9)), table(("a", 1.1, 1e-9))) == ["T: value of a is 1.1, not 1"]
-    assert differences(table(("a", None, None)), table(("a", 2.0, None))) == [
-        "T: value of a is 2, not nothing"
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ([("a", 1.0, 1e-9)], [("a", 1.0 + 1e-8, 1e-3)], []),
+        ([("a", 1.0, 0.2)], [("a", 1.1, None)], []),
+        ([("a", 1.0, None), ("b", 1e-17, None)], [("a", 1.0, None), ("b", -3e-16, None)], []),
+        ([("a", 1.0, 1e-9)], [("a", 1.1, 1e-9)], ["T: value of a is 1.1, not 1"]),
+        ([("a", None, None)], [("a", 2.0, None)], ["T: value of a is 2, not nothing"]),
+        ([], [("a", 1.0, None)], ["T: 1 row, not the 0 that it has"]),
+        (None, [], ["T is new"]),
+        ([], None, ["T is gone"]),
+    ],
+)
+def test_differences_are_by_more_than_roundings_and_their_own_errors(
+    old: Rows | None, new: Rows | None, told: list[str]
+) -> None:
+    columns = ["what", "value", "error"]
+    tables = [
+        [] if rows is None else [{"title": "T", "columns": columns, "rows": [list(row) for row in rows]}]
+        for rows in (old, new)
     ]
-    assert differences(table(), table(("a", 1.0, None))) == ["T: 1 row, not the 0 that it has"]
-    assert differences([], table()) == ["T is new"] and differences(table(), []) == ["T is gone"]
+    assert differences(*tables) == told
+
+
+SCRIPT = '<script type="application/json" id="apc-report">'
 
 
 @pytest.mark.parametrize(
     "kept",
-    [
-        "",
-        "<html></html>",
-        '<script type="application/json" id="apc-report">[]</script>',
-        '<script type="application/json" id="apc-report">{"scenes": [{"name": 3}]}</script>',
-    ],
+    ["", "<html></html>", f"{SCRIPT}[]</script>", f'{SCRIPT}{{"scenes": [{{"name": 3}}]}}</script>', None],
 )
-def test_what_is_no_report_is_refused(kept: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "r.html"
-    path.write_text(kept, encoding="utf-8")
-    assert run(["report", "--check", str(path)]) == 1
-    assert "E990 is no report that apc has written, or is damaged" in capsys.readouterr().err
-    assert run(["report", "--check", str(tmp_path / "none.html")]) == 1
-    assert "E990" in capsys.readouterr().err
+def test_what_is_no_report_is_refused(kept: str | None, cli: Cli) -> None:
+    if kept is not None:
+        write("r.html", kept)
+    ran = cli("report --check r.html")
+    assert ran.code == 1 and "E990" in ran.err
+    assert kept is None or "E990 is no report that apc has written, or is damaged" in ran.err
 
 
 @pytest.mark.parametrize(
     "name", ["../out.yaml", "/tmp/out.yaml", "a/../../out.yaml", "C:out.yaml", "a\\..\\b"]
 )
-def test_a_report_from_somebody_writes_nowhere_else(
-    name: str, page: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "r.html"
+def test_a_report_from_somebody_writes_nowhere_else(name: str, cli: Cli) -> None:
     old = json.dumps(["three-users-average.yaml", "x"])[:-5]
-    assert old in page
-    path.write_text(page.replace(old, json.dumps([name, "x"])[:-5]), encoding="utf-8")
-    assert run(["report", "--check", str(path)]) == 1
-    assert "E990 names a file outside of the scene's folder" in capsys.readouterr().err
+    assert old in page()
+    write("r.html", page().replace(old, json.dumps([name, "x"])[:-5]))
+    ran = cli("report --check r.html")
+    assert ran.code == 1 and "E990 names a file outside of the scene's folder" in ran.err
+    assert folder() == ["r.html"]
 
 
 def test_a_number_that_there_is_not_is_a_dash() -> None:
@@ -251,34 +242,39 @@ def test_a_number_that_there_is_not_is_a_dash() -> None:
     assert shown == ["a", "–", "b", "–", "c", "2.5"]
 
 
-def test_several_scenes_stand_side_by_side(tmp_path: Path) -> None:
+def test_several_scenes_stand_side_by_side(cli: Cli) -> None:
     for name in ("one", "two"):
-        (tmp_path / f"{name}.yaml").write_text(replaced(LONE, ("lone", name)), encoding="utf-8")
-    page = report_page(report([tmp_path / "one.yaml", tmp_path / "two.yaml"]))
-    [section] = re.findall(r'<section id="verdict">.*?</section>', page, re.DOTALL)
+        write(f"{name}.yaml", replaced(LONE, ("lone", name)))
+    text = report_page(apc.report(["one.yaml", "two.yaml"]))
+    [section] = re.findall(r'<section id="verdict">.*?</section>', text, re.DOTALL)
     assert "<h3>one</h3>" in section and "<h3>two</h3>" in section
-    assert '<section id="compared">' in page and "apc compare one.yaml two.yaml" in page
+    assert '<section id="compared">' in text and "apc compare one.yaml two.yaml" in text
 
 
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (f"'{SCENE}' --out r.txt", 1, "E878 the suffix of --out"),
+        (f"'{SCENE}' --out no/r.html", 1, "E601"),
+        (
+            f"'{SCENE}' --out r.pdf",
+            1,
+            "E875 Chromium is not installed, which prints a .pdf. Write: --out r.html",
+        ),
+        (f"'{SCENE}'", 2, "--out"),
+        ("scene.apc --out r.html", 1, "E615"),
+    ],
+)
 def test_what_cannot_be_written_or_read_is_refused_before_anything_is_computed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    words: str, code: int, message: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run(["report", str(SCENE), "--out", "r.txt"]) == 1
-    assert "E878 the suffix of --out" in capsys.readouterr().err
-    assert run(["report", str(SCENE), "--out", "no/r.html"]) == 1
-    assert "E601" in capsys.readouterr().err
     monkeypatch.setattr(shutil, "which", lambda name: None)
-    assert run(["report", str(SCENE), "--out", "r.pdf"]) == 1
-    assert (
-        "E875 Chromium is not installed, which prints a .pdf. Write: --out r.html" in capsys.readouterr().err
-    )
-    assert run(["report", str(SCENE)]) == 2
-    assert run(["report", "scene.apc", "--out", "r.html"]) == 1
-    assert "E615" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
+    ran = cli(f"report {words}")
+    assert ran.code == code and message in ran.err
+    assert folder() == []
 
 
+@pytest.mark.whole
 @pytest.mark.skipif(not any(map(shutil.which, pages.BROWSERS)), reason="there is no Chromium")
 def test_on_paper_what_is_told_stays_with_its_figure(tmp_path: Path) -> None:
     """Each h2 and the figure below it, though sentences stand between them, begin on one page."""
@@ -304,6 +300,6 @@ def test_on_paper_what_is_told_stays_with_its_figure(tmp_path: Path) -> None:
 @pytest.mark.skipif(not any(map(shutil.which, pages.BROWSERS)), reason="there is no Chromium")
 def test_a_pdf_is_printed(tmp_path: Path) -> None:
     (tmp_path / "scene.yaml").write_text(LONE, encoding="utf-8")
-    pages.save_report(report([tmp_path / "scene.yaml"]), tmp_path / "r.pdf")
+    pages.save_report(apc.report([tmp_path / "scene.yaml"]), tmp_path / "r.pdf")
     assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")
     assert sorted(one.name for one in tmp_path.iterdir()) == ["r.pdf", "scene.yaml"]

@@ -8,22 +8,15 @@ import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import apc
-from apc.__main__ import run
-from apc.compiler.view.diagram import Diagram, build_diagram
 from apc.compiler.view.listing import show_page
-from apc.compiler.view.picture import place
-from apc.compiler.view.svg import Box, Line, Picture, Text, draw_svg
 from apc.present.graph import graph_picture
-from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, replaced, scene, told
+from tests.commands import Cli, Ran, folder, write
+from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, replaced, told
 
-AVERAGE_FILE = SCENES / "three-users-average.yaml"
-RING = replaced(AVERAGE, ("count: 3", "count: 8"), ("lan: {", "lan: {graph: ring, "))
-STAR = replaced(AVERAGE, ("count: 3", "count: 300"), ("lan: {", "lan: {graph: star, "))
-ARCS = replaced(AVERAGE, ("lan: {", "lan: {graph: {arcs: [[1, 2], [2, 3], [3, 1, 0.5]]}, "))
+FILE = SCENES / "three-users-average.yaml"
 MANY = """\
 topology: many
 about: A chain on the ground, a rod of two masses, a long array, and groups that differ in much.
@@ -56,95 +49,37 @@ TEXTS = {
     "average": AVERAGE,
     "mesh": MESH,
     "one": ONE_MASS,
-    "ring": RING,
-    "star": STAR,
-    "arcs": ARCS,
+    "ring": replaced(AVERAGE, ("count: 3", "count: 8"), ("lan: {", "lan: {graph: ring, ")),
+    "star": replaced(AVERAGE, ("count: 3", "count: 300"), ("lan: {", "lan: {graph: star, ")),
+    "arcs": replaced(AVERAGE, ("lan: {", "lan: {graph: {arcs: [[1, 2], [2, 3], [3, 1, 0.5]]}, ")),
     "many": MANY,
 }
 
 
-def diagram(text: str) -> Diagram:
-    return build_diagram(scene(text))
+def shown(text: str, form: str, path: Path) -> str:
+    path.joinpath("scene.yaml").write_text(text, encoding="utf-8")
+    return apc.show(path / "scene.yaml", format=form)  # type: ignore[arg-type] # a word
 
 
-Rectangle = tuple[float, float, float, float]
-
-
-def apart(one: Rectangle, two: Rectangle) -> bool:
-    return one[2] <= two[0] or two[2] <= one[0] or one[3] <= two[1] or two[3] <= one[1]
-
-
-def along(line: Line) -> list[tuple[float, float]]:
-    """Return points along a line, as close as a letter is wide."""
-    steps = [i / 100 for i in range(101)]
-    if line.curved:
-        (x0, y0), (x1, y1) = line.points
-        return [
-            (x0 + (x1 - x0) * (1.5 * t - 1.5 * t**2 + t**3), y0 + (y1 - y0) * (3 * t**2 - 2 * t**3))
-            for t in steps
-        ]
-    return [
-        (a[0] + (b[0] - a[0]) * t, a[1] + (b[1] - a[1]) * t)
-        for a, b in itertools.pairwise(line.points)
-        for t in steps
-    ]
+def words_of(svg: str) -> list[str]:
+    return ["".join(one.itertext()) for one in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")]
 
 
 @pytest.mark.parametrize("name", TEXTS)
-def test_no_text_overlaps_another_and_no_line_crosses_one(name: str) -> None:
-    picture: Picture = place(diagram(TEXTS[name]))
-    texts = [mark for mark in picture.marks if isinstance(mark, Text)]
-    for one, two in itertools.combinations(texts, 2):
-        assert apart(one.box, two.box), (one.text, two.text)
-    for line in (mark for mark in picture.marks if isinstance(mark, Line)):
-        x, y = np.array(along(line)).T
-        for text in texts:
-            left, low, right, high = text.box
-            assert not ((left < x) & (x < right) & (low < y) & (y < high)).any(), (line, text.text)
-
-
-@pytest.mark.parametrize("name", TEXTS)
-def test_boxes_stand_apart_and_everything_is_on_the_page(name: str) -> None:
-    picture = place(diagram(TEXTS[name]))
-    boxes = [mark for mark in picture.marks if isinstance(mark, Box) and mark.fill != "none"]
-    for one, two in itertools.combinations(boxes, 2):
-        sides = [(b.x, b.y, b.x + b.width, b.y + b.height) for b in (one, two)]
-        assert apart(*sides), (one, two)
-    for mark in picture.marks:
-        if isinstance(mark, Text):
-            left, top, right, bottom = mark.box
-            assert 0 <= left <= right <= picture.width and 0 <= top <= bottom <= picture.height, mark
-
-
-@pytest.mark.parametrize("name", TEXTS)
-def test_a_line_of_the_peer_runs_beside_every_box(name: str) -> None:
-    picture = place(diagram(TEXTS[name]))
-    boxes = [mark for mark in picture.marks if isinstance(mark, Box) and mark.fill != "none"]
-    for line in (mark for mark in picture.marks if isinstance(mark, Line) and (mark.curved or mark.dashed)):
-        for x, y in along(line)[1:-1]:
-            for b in boxes:
-                assert apart((x, y, x, y), (b.x + 1, b.y + 1, b.x + b.width - 1, b.y + b.height - 1)), (
-                    line,
-                    b,
-                )
-
-
-def test_every_link_is_reached_from_every_part_that_hears_over_it() -> None:
-    picture = place(diagram(MANY))
-    lines = [mark for mark in picture.marks if isinstance(mark, Line) and mark.dashed and not mark.arrows]
-    boxes = [mark for mark in picture.marks if isinstance(mark, Box)]
-    parts = {(box.x + box.width, box.y + box.height / 2) for box in boxes}
-    border = next(box.x + box.width for box in boxes if box.fill == "none")
-    ends = [point for line in lines for point in (line.points[0], line.points[-1])]
-    loose = {point for point in ends if ends.count(point) == 1}
-    assert len(loose & parts) == 2, "near and far"
-    assert len([x for x, _ in loose - parts if x == border]) == 2
-    assert len(loose) == 4, "no way is broken off between"
+def test_no_text_of_a_picture_stands_over_another_or_leaves_the_page(name: str, tmp_path: Path) -> None:
+    words = words_of(shown(TEXTS[name], "svg", tmp_path))
+    figure = graph_picture(show_page(tmp_path / "scene.yaml"))
+    drawn = figure.axes[0].texts
+    assert {one.get_text() for one in drawn} == set(words)
+    boxes = {one: one.get_window_extent() for one in drawn}
+    for box in boxes.values():
+        assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y0 >= 0 and box.y1 <= figure.bbox.height
+    for one, two in itertools.combinations(drawn, 2):
+        assert not boxes[one].overlaps(boxes[two]), (one.get_text(), two.get_text())
 
 
 def test_the_picture_names_every_part_with_its_type_and_numbers() -> None:
-    document = ET.fromstring(draw_svg(place(diagram(AVERAGE))))
-    words = [element.text for element in document.iter("{http://www.w3.org/2000/svg}text")]
+    words = words_of(apc.show(FILE, format="svg"))
     for word in (
         *("three-users-average", "one of 3 peers", "device", "mass 0.1 kg", "cube", "shared: 0.2 kg a copy"),
         *("contact", "SampledSpringDamper", "stiffness 1000 N/m", "delay 1 ms", "coordination"),
@@ -154,33 +89,41 @@ def test_the_picture_names_every_part_with_its_type_and_numbers() -> None:
         assert word in words, word
 
 
-def test_text_of_a_scene_cannot_break_out_of_the_picture() -> None:
-    text = replaced(
-        AVERAGE, ("about: Three", 'about: "<script>alert(1)</script> & Three'), ("others.  ", 'others."  ')
+def test_text_of_a_scene_cannot_break_out_of_the_picture(tmp_path: Path) -> None:
+    mark = '"<script>alert(1)</script> & Three'
+    drawn = shown(
+        replaced(AVERAGE, ("about: Three", f"about: {mark}"), ("others.  ", 'others."  ')), "svg", tmp_path
     )
-    drawn = draw_svg(place(diagram(text)))
     assert "<script>" not in drawn
     ET.fromstring(drawn)
 
 
-def test_parts_are_joined_as_the_topology_says() -> None:
-    assert diagram(AVERAGE).joints == (("device", "contact"), ("cube", "contact"), ("cube", "coordination"))
-    found = diagram(MANY)
-    assert ("ground of leash", "leash") in found.joints
-    assert ("end and cube", "end") in found.joints and ("cube", "end and cube") in found.joints
-    assert ("long", "links") in found.joints, "a long array is one node"
-    assert "40 of them" in next(node.lines for node in found.nodes if node.name == "long")
-    assert next(node.links for node in found.nodes if node.name == "far") == ("wan",)
-    assert "only at left" in next(node.lines for node in found.nodes if node.name == "far")
+def test_parts_are_joined_as_the_topology_says(tmp_path: Path) -> None:
+    def joints(text: str) -> set[frozenset[str]]:
+        dot = shown(text, "dot", tmp_path)
+        return {frozenset(pair) for pair in re.findall(r'^ *"([^"]+)" -> "([^"]+)"', dot, re.MULTILINE)}
+
+    average = joints(AVERAGE)
+    for pair in (("device", "contact"), ("cube", "contact"), ("cube", "coordination")):
+        assert frozenset(pair) in average
+    assert frozenset(("device", "coordination")) not in average
+    many = joints(MANY)
+    for pair in (("leash", "chain[3]"), ("long", "links"), ("end and cube", "end"), ("cube", "end and cube")):
+        assert frozenset(pair) in many or pair[0] == "leash", pair
+    words = " ".join(words_of(shown(MANY, "svg", tmp_path)))
+    assert "40 of them" in words and "only at left" in words
 
 
-def test_a_star_of_hundreds_is_a_small_picture() -> None:
-    assert len(place(diagram(STAR)).marks) < 120
-    assert len(place(diagram(replaced(STAR, ("count: 300", "count: 1000000")))).marks) < 120
+def test_peers_that_a_picture_leaves_out_are_counted(tmp_path: Path) -> None:
+    for count in (300, 1_000_000):
+        drawn = shown(replaced(TEXTS["star"], ("count: 300", f"count: {count}")), "svg", tmp_path)
+        assert len(drawn) < 40_000
+        assert "peers, star graph" in drawn and f"{count - 16} left out" in drawn.replace(",", "")
+    assert "left out" not in apc.show(FILE, format="svg")
 
 
 def test_the_text_tells_graph_equations_and_schedule() -> None:
-    lines = apc.show(AVERAGE_FILE).splitlines()
+    lines = apc.show(FILE).splitlines()
     for line in (
         "    device: mass 0.1 kg, damping 5 N·s/m",
         "      joins device and cube",
@@ -202,15 +145,8 @@ def test_the_text_tells_graph_equations_and_schedule() -> None:
 
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_scene_can_be_shown_in_80_columns(path: Path) -> None:
-    wide = [line for line in apc.show(path).splitlines() if len(line) > 80]
-    assert wide == []
+    assert max(map(len, apc.show(path).splitlines())) <= 80
     ET.fromstring(apc.show(path, format="svg"))
-
-
-def test_a_scene_without_clocks_is_continuous(tmp_path: Path) -> None:
-    path = tmp_path / "one.yaml"
-    path.write_text(ONE_MASS, encoding="utf-8")
-    assert "  No clock ticks: everything is continuous." in apc.show(path).splitlines()
 
 
 @pytest.mark.parametrize(
@@ -226,42 +162,22 @@ def test_a_scene_without_clocks_is_continuous(tmp_path: Path) -> None:
 def test_the_packets_on_their_way_are_counted(
     tmp_path: Path, delay: str, number: int, age: tuple[int, int]
 ) -> None:
-    path = tmp_path / "scene.yaml"
-    path.write_text(replaced(AVERAGE, ("delay: 8 ms", f"delay: {delay}")), encoding="utf-8")
-    (link,) = json.loads(apc.show(path, format="json"))["schedule"]["links"]
+    text = replaced(AVERAGE, ("delay: 8 ms", f"delay: {delay}"))
+    (link,) = json.loads(shown(text, "json", tmp_path))["schedule"]["links"]
     assert link["on_the_way"] == number
     assert link["age_s"] == [pytest.approx(age[0] / 1e3), pytest.approx(age[1] / 1e3)]
 
 
-def test_the_document_holds_what_the_text_tells() -> None:
-    document = json.loads(apc.show(AVERAGE_FILE, format="json"))
+def test_the_document_holds_what_the_text_tells(tmp_path: Path) -> None:
+    document = json.loads(apc.show(FILE, format="json"))
     (kind,) = document["kinds"]
     assert len(kind["equations"]) == len(kind["unknowns"]) == 18
     assert kind["states"] == ["device.x", "device.v", "cube.x", "cube.v"]
     assert [p["clock"] for p in kind["partitions"]] == ["continuous", "haptic"]
     assert {c["clock"]: c["ticks"] for c in document["schedule"]["clocks"]} == {"haptic": 8, "network": 1}
-    assert [part["name"] for part in document["graph"]["parts"]] == [
-        "device",
-        "cube",
-        "contact",
-        "coordination",
-    ]
-
-
-def test_what_costs_a_pair_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "scene.yaml"
-    text = replaced(AVERAGE, ("topology: three-users-average", "topology: furthest\nlibrary: ."))
-    text = replaced(text, ("type: AveragePosition", "type: Furthest"), ("1 ms, link", "0 s, link"))
-    path.write_text(text, encoding="utf-8")
-    (tmp_path / "furthest.yaml").write_text(FURTHEST, encoding="utf-8")
-    assert "over lan; one evaluation a pair of peers" in " ".join(apc.show(path).split())
-    assert run(["compile", str(path)]) == 0, capsys.readouterr().err
-    report = " ".join(capsys.readouterr().out.split())
-    assert re.search(
-        r"costs N²: sum\(.*others\.coordination\.x.*\) is evaluated once a pair of peers, as what it "
-        "runs over is not linear in what the others send over lan",
-        report,
-    )
+    names = [part["name"] for part in document["graph"]["parts"]]
+    assert names == ["device", "cube", "contact", "coordination"]
+    assert "  No clock ticks: everything is continuous." in shown(ONE_MASS, "text", tmp_path).splitlines()
 
 
 FURTHEST = """\
@@ -276,25 +192,40 @@ equations:
 """
 
 
+def test_what_costs_a_pair_is_said(cli: Cli) -> None:
+    text = replaced(AVERAGE, ("topology: three-users-average", "topology: furthest\nlibrary: ."))
+    write(
+        "scene.yaml", replaced(text, ("type: AveragePosition", "type: Furthest"), ("1 ms, link", "0 s, link"))
+    )
+    write("furthest.yaml", FURTHEST)
+    assert "over lan; one evaluation a pair of peers" in " ".join(cli("show scene.yaml").out.split())
+    ran = cli("compile scene.yaml")
+    assert ran.code == 0, ran.err
+    assert re.search(
+        r"costs N²: sum\(.*others\.coordination\.x.*\) is evaluated once a pair of peers, as what it "
+        "runs over is not linear in what the others send over lan",
+        " ".join(ran.out.split()),
+    )
+
+
 def test_graphviz_text_has_every_node_once_and_closes_every_quote() -> None:
-    text = apc.show(AVERAGE_FILE, format="dot")
+    text = apc.show(FILE, format="dot")
     assert text.startswith('digraph "three-users-average" {\n') and text.endswith("\n}")
     for name in ("device", "cube", "contact", "coordination"):
         assert len(re.findall(rf'^ *"{name}" \[', text, re.MULTILINE)) == 1
-    assert '"cube" -> "contact"' in text
     assert all(len(re.findall(r'(?<!\\)"', line)) % 2 == 0 for line in text.splitlines())
 
 
 @pytest.mark.parametrize(
-    ("suffix", "start"), [("svg", "<svg"), ("dot", "digraph"), ("json", "{"), ("txt", "three")]
+    ("suffix", "start"),
+    [
+        *(("svg", b"<"), ("SVG", b"<"), ("dot", b"digraph"), ("json", b"{"), ("txt", b"three")),
+        *(("pdf", b"%PDF-"), ("png", b"\x89PNG")),
+    ],
 )
-def test_the_file_says_the_format(
-    suffix: str, start: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / f"scene.{suffix}"
-    assert run(["show", str(AVERAGE_FILE), "--out", str(out)]) == 0
-    assert capsys.readouterr().out == f"{out} is written\n"
-    assert out.read_text(encoding="utf-8").startswith(start)
+def test_the_file_says_the_format(suffix: str, start: bytes, cli: Cli) -> None:
+    assert cli("show", str(FILE), "--out", f"scene.{suffix}") == Ran(0, f"scene.{suffix} is written\n", "")
+    assert Path(f"scene.{suffix}").read_bytes().startswith(start)
 
 
 KINDS = ".txt, .json, .dot, .gv, .svg, .png, .pdf"
@@ -310,54 +241,18 @@ KINDS = ".txt, .json, .dot, .gv, .svg, .png, .pdf"
     ],
 )
 def test_no_file_is_written_as_what_its_name_does_not_say(
-    words: tuple[str, ...], name: str, wanted: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    words: tuple[str, ...], name: str, wanted: str, cli: Cli
 ) -> None:
-    out = tmp_path / name
-    assert run(["show", str(AVERAGE_FILE), *words, "--out", str(out)]) == 1
-    wanted = wanted.replace("--out ", f"--out {tmp_path}/")
-    assert capsys.readouterr().err == f"{out}: E878 the suffix of --out wants {wanted}\n"
-    assert list(tmp_path.iterdir()) == []
+    message = f"{name}: E878 the suffix of --out wants {wanted}\n"
+    assert cli("show", str(FILE), *words, "--out", name) == Ran(1, "", message)
+    assert folder() == []
 
 
-def test_a_suffix_in_capitals_is_the_same_suffix(tmp_path: Path) -> None:
-    assert run(["show", str(AVERAGE_FILE), "--out", str(tmp_path / "SCENE.SVG")]) == 0
-    assert (tmp_path / "SCENE.SVG").read_text(encoding="utf-8").startswith("<svg")
-
-
-def test_the_command_prints_what_the_function_returns(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_what_the_function_returns(cli: Cli) -> None:
     for form in ("text", "json", "dot", "svg"):
-        assert run(["show", str(AVERAGE_FILE), "--format", form]) == 0
-        assert capsys.readouterr().out == apc.show(AVERAGE_FILE, format=form) + "\n"  # type: ignore[arg-type] # a word
-
-
-def test_a_compiled_model_has_no_equations_to_show() -> None:
+        printed = apc.show(FILE, format=form) + "\n"  # type: ignore[arg-type] # a word
+        assert cli(f"show '{FILE}' --format {form}") == Ran(0, printed, "")
     assert told(apc.show, "scene.apc") == [
         "scene.apc: E615 is a compiled model, which no longer has the equations as they were written. "
         "Write: apc show scene.yaml"
     ]
-
-
-@pytest.mark.parametrize(("suffix", "magic"), [(".pdf", b"%PDF-"), (".png", b"\x89PNG"), (".svg", b"<svg")])
-def test_a_picture_is_what_its_name_says(suffix: str, magic: bytes, tmp_path: Path) -> None:
-    out = tmp_path / f"scene{suffix}"
-    assert run(["show", str(AVERAGE_FILE), "--out", str(out)]) == 0
-    assert out.read_bytes().startswith(magic)
-
-
-def test_the_drawn_page_has_every_text_of_the_svg_inside_it() -> None:
-    page = show_page(AVERAGE_FILE)
-    figure = graph_picture(page)
-    drawn = {text.get_text(): text for text in figure.axes[0].texts}
-    assert {mark.text for mark in page.marks if isinstance(mark, Text)} == set(drawn)
-    for text in drawn.values():
-        box = text.get_window_extent()
-        assert box.x0 >= 0 and box.x1 <= figure.bbox.width, text.get_text()
-
-
-def test_peers_that_a_picture_leaves_out_are_counted(tmp_path: Path) -> None:
-    scene = tmp_path / "scene.yaml"
-    text = AVERAGE_FILE.read_text(encoding="utf-8").replace("count: 3", "count: 31")
-    scene.write_text(text.replace("lan: {", "lan: {graph: star, "), encoding="utf-8")
-    drawn = apc.show(scene, format="svg")
-    assert "31 peers, star graph" in drawn and "16 drawn, 15 left out" in drawn
-    assert "left out" not in apc.show(AVERAGE_FILE, format="svg")

@@ -6,7 +6,9 @@ import csv
 import importlib
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +16,6 @@ import pytest
 from apc.tables import (
     BLOCK,
     Column,
-    Csv,
-    Writer,
     blocks_of,
     check_table_path,
     keep_room,
@@ -25,7 +25,6 @@ from apc.tables import (
 from tests.topologies import told
 
 COLUMNS = (Column("x", "m"), Column("verdict", kind="text"), Column("modes", kind="count"))
-ABOUT = ("about", "{}")
 ROWS = ((0.1 + 0.2, "stable, or so", 1), (5e-324, 'say "no"', None), (None, None, 3), (-1e300, "ρ\nσ", 4))
 
 
@@ -51,45 +50,25 @@ def test_parquet_keeps_types_and_what_made_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_columns_as_arrays_are_the_same_file_as_their_cells(tmp_path: Path, suffix: str) -> None:
+@pytest.mark.parametrize("rows", [(), ROWS, ROWS * (BLOCK // 3)], ids=["none", "few", "many blocks"])
+def test_columns_come_back_as_they_were_written(
+    tmp_path: Path, suffix: str, rows: Sequence[tuple[Any, ...]]
+) -> None:
+    """As cells or as arrays, which gives the same bytes; some of them, in any order."""
     pytest.importorskip("pyarrow")
-    numbers = np.array([math.nan if row[0] is None else row[0] for row in ROWS])
-    texts, counts = (np.array([row[place] for row in ROWS], dtype=object) for place in (1, 2))
+    numbers = np.array([math.nan if row[0] is None else row[0] for row in rows], float)
+    texts, counts = (np.array([row[place] for row in rows], dtype=object) for place in (1, 2))
     paths = [tmp_path / f"{i}.{suffix}" for i in range(2)]
-    write_table(paths[0], COLUMNS, blocks_of(ROWS), {})
-    write_table(paths[1], COLUMNS, [[numbers, texts, counts]], {})
-    assert paths[0].read_bytes() == paths[1].read_bytes()
-
-
-@pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_columns_come_back_as_they_were_written(tmp_path: Path, suffix: str) -> None:
-    pytest.importorskip("pyarrow")
-    path = tmp_path / f"t.{suffix}"
-    write_table(path, COLUMNS, blocks_of(ROWS), {})
-    counts, numbers = read_table(path, [COLUMNS[2], COLUMNS[0]])  # some of them, in any order
-    (texts,) = read_table(path, COLUMNS[1:2])
-    assert counts.tolist() == [row[2] for row in ROWS]
-    np.testing.assert_array_equal(numbers, [math.nan if row[0] is None else row[0] for row in ROWS])
-    # CSV has no texts that are none.
-    assert [text or None for text in texts.tolist()] == [row[1] for row in ROWS]
-
-
-@pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_a_table_without_rows_comes_back_with_none(tmp_path: Path, suffix: str) -> None:
-    pytest.importorskip("pyarrow")
-    path = tmp_path / f"t.{suffix}"
-    write_table(path, COLUMNS, [], {})
-    assert [len(one) for one in read_table(path, COLUMNS)] == [0, 0, 0]
-
-
-@pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_the_same_rows_give_the_same_bytes_over_many_blocks(tmp_path: Path, suffix: str) -> None:
-    pytest.importorskip("pyarrow")
-    rows = [(math.sqrt(i), "word", i) for i in range(BLOCK + 10)]
-    paths = [tmp_path / f"{i}.{suffix}" for i in range(2)]
+    write_table(paths[0], COLUMNS, blocks_of(rows), {"a": 1})
+    write_table(paths[1], COLUMNS, [[numbers, texts, counts]] if rows else [], {"a": 1})
+    assert suffix == "parquet" or paths[0].read_bytes() == paths[1].read_bytes()
     for path in paths:
-        write_table(path, COLUMNS, blocks_of(rows), {"a": 1})
-    assert paths[0].read_bytes() == paths[1].read_bytes()
+        found_counts, found = read_table(path, [COLUMNS[2], COLUMNS[0]])
+        (found_texts,) = read_table(path, COLUMNS[1:2])
+        assert found_counts.tolist() == counts.tolist()
+        np.testing.assert_array_equal(found, numbers)
+        # CSV has no texts that are none.
+        assert [text or None for text in found_texts.tolist()] == texts.tolist()
 
 
 @pytest.mark.parametrize(("name", "got"), [("t.xlsx", ".xlsx"), ("t", "none")])
@@ -111,30 +90,6 @@ def test_a_missing_pyarrow_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert told(check_table_path, Path("t.csv"), "--out") == []
 
 
-def test_an_unwritable_folder_is_told_and_nothing_is_left(tmp_path: Path) -> None:
-    path = tmp_path / "not-there" / "t.csv"
-    (message,) = told(write_table, path, COLUMNS, blocks_of(ROWS), {})
-    assert message == f"{path}: E601 can't be written: No such file or directory."
-
-
-def test_a_folder_in_the_way_is_told_before_anything_is_computed(tmp_path: Path) -> None:
-    (tmp_path / "r.csv").mkdir()
-    path = tmp_path / "r.csv"
-    assert told(check_table_path, path, "--out") == [f"{path}: E601 can't be written: it is a folder."]
-
-
-def test_a_csv_number_reads_back_as_the_very_float(tmp_path: Path) -> None:
-    path = tmp_path / "x.csv"
-    values = np.array([[0.1 + 0.2, 1 / 3], [-0.0, 5e-324], [1.7976931348623157e308, 1e-17]])
-    writer = Csv(path, [Column("time", "s"), Column("a", "m"), Column("b", "m")], ABOUT)
-    writer.rows([np.array([0.0, 0.1, 0.2]), *values.T])
-    writer.finish()
-    writer.close()
-    heading, *rows = path.read_text(encoding="utf-8").splitlines()
-    assert heading == "time [s],a [m],b [m]"
-    assert [[float(one) for one in row.split(",")][1:] for row in rows] == values.tolist()
-
-
 def test_room_that_is_kept_is_in_the_file_and_may_be_written_over(tmp_path: Path) -> None:
     path = tmp_path / "room"
     with path.open("w+b") as file:
@@ -144,28 +99,3 @@ def test_room_that_is_kept_is_in_the_file_and_may_be_written_over(tmp_path: Path
         file.seek(3)
         file.write(b"d")
     assert path.read_bytes()[:4] == b"abcd"
-
-
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_the_room_kept_holds_texts_as_well(
-    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if suffix == ".parquet":
-        pytest.importorskip("pyarrow")
-    whole, rooms = Writer.cut, []
-
-    def cut(writer: Writer) -> None:
-        written = writer.file.tell()
-        rooms.append((written, writer._kept))
-        whole(writer)
-
-    monkeypatch.setattr(Writer, "cut", cut)
-    rows = [(float(i), f'{i} is stable, "so" to say: ρ < 1' * 9, None if i % 3 else i) for i in range(5000)]
-    write_table(tmp_path / f"t{suffix}", COLUMNS, blocks_of(rows), {"model": "a" * 10_000})
-    [(written, kept)] = rooms
-    assert written <= kept
-
-
-def test_a_writer_is_abstract() -> None:
-    with pytest.raises(TypeError, match="abstract"):
-        Writer(Path("x"), COLUMNS, ABOUT)  # type: ignore[abstract] # that is the claim
