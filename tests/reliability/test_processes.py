@@ -14,7 +14,7 @@ import pytest
 
 from apc.benchmark.scale import scale
 from apc.compiler.errors import ApcError
-from apc.processes import cores, local_processes, model_bytes, model_of_bytes, this_process
+from apc.processes import local_processes, model_bytes, this_process
 from apc.simulation.ensemble import play_many
 from apc.simulation.settings import Settings
 from apc.sweeps.grid import build_grid, parse_axis
@@ -123,21 +123,6 @@ def test_a_process_stopped_from_outside_is_told_and_finished_parts_are_kept(tmp_
     assert 1 <= len(parts(tmp_path / "r.csv")) < 16
 
 
-def test_a_process_stopped_from_outside_ends_the_runs_it_played_with_a_sentence() -> None:
-    if not Path("/proc/self/task").is_dir():
-        pytest.skip("this system does not tell which processes one has started")
-    before = set(workers_of_mine())
-
-    def stop(_: int) -> None:
-        for pid in set(workers_of_mine()) - before:
-            os.kill(pid, signal.SIGKILL)
-
-    settings = Settings(Fraction(1, 10), jit=False)
-    with pytest.raises(ApcError, match="E895 a process that played runs ended without a word"):
-        play_many(compiled(LOSSY), settings, runs=400, jobs=2, progress=stop)
-    assert set(workers_of_mine()) <= before
-
-
 def test_an_interrupt_ends_the_processes_at_once_and_keeps_the_runs_that_are_done() -> None:
     before = set(workers_of_mine())
 
@@ -166,14 +151,6 @@ def _lost_at_four(_: Path, count: int) -> int:
     if count == 4:
         os.kill(os.getpid(), signal.SIGKILL)
     return count
-
-
-def test_a_model_sent_to_another_process_is_the_same_model() -> None:
-    assert model_bytes(model_of_bytes(model_bytes(MODEL))) == model_bytes(MODEL)
-
-
-def test_at_least_one_core_is_there() -> None:
-    assert 1 <= cores() <= (os.cpu_count() or 1)
 
 
 def test_one_part_alone_is_computed_without_starting_a_process() -> None:

@@ -1,9 +1,11 @@
-"""`apc bench`: what is measured, what counts as better, what is printed."""
+"""`apc bench`: what is measured, what counts as better, what is printed; hard cases, whose truth is known."""
 
 from __future__ import annotations
 
 import itertools
 import json
+import math
+import shutil
 import sys
 from dataclasses import replace
 from fractions import Fraction
@@ -12,21 +14,15 @@ from pathlib import Path
 import pytest
 
 import apc
-from apc.__main__ import run
-from apc.benchmark.bench import (
-    SAME,
-    Bench,
-    Measured,
-    bench,
-    bench_analysis,
-    bench_simulation,
-    pareto_front,
-)
-from apc.benchmark.scale import scale, with_count
-from apc.benchmark.truth import MOST_STATES
+from apc.benchmark.bench import SAME, Bench, Measured, bench, bench_simulation, pareto_front
+from apc.benchmark.hard import compare, run_hard_cases
+from apc.benchmark.scale import scale
+from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.present.bench import bench_picture, save_bench
+from apc.present.bench import bench_picture
 from apc.simulation.settings import EXACT, Method
+from tests.commands import Cli, write
+from tests.hard.truths import HERE, TRUTHS, truth_of
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 
 
@@ -39,26 +35,24 @@ def _one(name: str, seconds: float, error: float | None, spread: float = 0.0) ->
     return Measured(name, seconds, spread, 3, error, None, False)
 
 
-def test_the_front_is_what_nothing_beats_in_both_ways() -> None:
-    quick, right = _one("quick", 1.0, 1e-3), _one("right", 4.0, 1e-9)
-    between, beaten = _one("between", 2.0, 1e-5), _one("beaten", 3.0, 1e-4)
-    marked = pareto_front([right, beaten, between, quick])
-    assert [(one.name, one.front) for one in marked] == [
-        ("quick", True),
-        ("between", True),
-        ("beaten", False),
-        ("right", True),
-    ]
-
-
-def test_differences_within_spread_or_rounding_are_none() -> None:
-    assert all(one.front for one in pareto_front([_one("a", 1.0, 1e-9, 0.2), _one("b", 1.1, 1e-9, 0.1)]))
-    rounding = [_one("a", 1.0, SAME / 2), _one("b", 2.0, 0.0)]
-    assert [one.front for one in pareto_front(rounding)] == [True, False]
-
-
-def test_without_errors_there_is_no_front() -> None:
-    assert not any(one.front for one in pareto_front([_one("a", 1.0, None), _one("b", 2.0, None)]))
+@pytest.mark.parametrize(
+    ("measured", "front"),
+    [
+        (
+            [_one("b", 2.0, 1e-5), _one("c", 3.0, 1e-4), _one("a", 1.0, 1e-3), _one("d", 4.0, 1e-9)],
+            {"a": True, "b": True, "c": False, "d": True},
+        ),
+        ([_one("a", 1.0, 1e-9, 0.2), _one("b", 1.1, 1e-9, 0.1)], {"a": True, "b": True}),  # within spread
+        ([_one("a", 1.0, SAME / 2), _one("b", 2.0, 0.0)], {"a": True, "b": False}),  # but for rounding
+        ([_one("a", 1.0, None), _one("b", 2.0, None)], {"a": False, "b": False}),
+    ],
+)
+def test_the_front_is_what_nothing_beats_in_both_ways(
+    measured: list[Measured], front: dict[str, bool]
+) -> None:
+    marked = {one.name: one.front for one in pareto_front(measured)}
+    assert marked == front
+    assert [*marked] == sorted(marked)
 
 
 @pytest.mark.whole
@@ -95,11 +89,15 @@ masses: {device: {mass: 0.25 kg, damping: 2 N*s/m}}
 couplers:
   idle: {type: SampledSpringDamper, a: device, b: ground, stiffness: 9 N/m, clock: haptic}
 """
+
+
 BETWEEN = """\
 hands:
   on: {type: StepForce, flange: device, force: 3 N, start: 10.25 ms}
   off: {type: StepForce, flange: device, force: -3 N, start: 10.75 ms}
 """
+
+
 ROTOR = """\
 component: Rotor
 about: A wheel that turns about its axis.
@@ -148,60 +146,24 @@ def test_what_rests_is_moved_by_its_own_scale_in_its_own_unit(tmp_path: Path) ->
     assert "device.x of its first peer starts 0.03 m" in note
 
 
-def test_the_function_of_its_name_does_what_the_command_does() -> None:
-    found = apc.bench(compiled(AVERAGE), set={"coordination.stiffness": "400 N/m"}, rounds=1)
-    assert isinstance(found, apc.Bench)
-    assert "spectral radius 0.95" in found.comparisons[0].reference
-    assert found.topology == "three-users-average"
-
-
 def test_a_method_that_cannot_serve_is_left_out_and_says_why() -> None:
     text = replaced(
         AVERAGE,
         ("haptic: 1 ms", "haptic: 1 ms\n  slow: 2 ms"),
         ("clock: haptic, delay: 1 ms, link", "clock: slow, delay: 1 ms, link"),
     )
-    [(name, reason)] = bench_analysis(compiled(text), rounds=1).refused
+    bench_of_two = apc.bench(compiled(text), set={"coordination.stiffness": "400 N/m"}, rounds=1)
+    assert isinstance(bench_of_two, apc.Bench)
+    [(name, reason)] = bench_of_two.comparisons[0].refused
     assert name == "paper"
     assert "one clock of forces (here are haptic and slow)" in reason
-
-
-def test_a_matrix_of_all_peers_that_is_too_large_is_left_out_with_the_reason_of_who_refuses_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    many = compiled(replaced(AVERAGE, ("count: 3", "count: 1000000")))
-    found = bench_analysis(many, rounds=1)
-    reasons = dict(found.refused)
-    assert reasons["krylov"] == "its matrix of 8,000,000 states is above the 2,500 tried here"
-    for name in ("dense", "paper"):
-        assert "system of 8,000,000 states; the matrix of one may have 1,000" in reasons[name]
+    many = apc.bench(compiled(replaced(AVERAGE, ("count: 3", "count: 1000000"))), rounds=1)
+    reasons = dict(many.comparisons[0].refused)
+    assert "8,000,000 states" in reasons["dense"]
     assert not any("Write:" in reason for reason in reasons.values())
-    assert {"modes", "certified"} <= {one.name for one in found.measured}
-    monkeypatch.setattr("apc.analysis.openloop.MOST_ROWS", 5)
-    [(name, reason)] = bench_analysis(compiled(AVERAGE), rounds=1).refused
-    assert name == "paper"
-    assert reason.endswith("have more than 5 rows")
-
-
-def test_a_proof_that_was_not_had_is_left_out_and_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("apc.eigen.spectrum.MOST_PROVED", 3)
-    found = bench_analysis(compiled(AVERAGE), rounds=1)
-    assert "not proved, as it has" in dict(found.refused)["certified"]
-    assert "certified" not in {one.name for one in found.measured}
-
-
-def test_what_is_too_large_to_be_played_is_analysed_all_the_same(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr("apc.simulation.simulation.NUMBER", 1e20)
-    found = bench(compiled(AVERAGE), rounds=1)
-    analysis, simulation = found.comparisons
-    assert analysis.measured
-    assert simulation.measured == ()
-    text = str(found)
-    assert "every method left out: 3 peers hold" in text
-    assert "--signals" not in text
-    save_bench(found, tmp_path / "bench.png")
+    assert "modes" in {one.name for one in many.comparisons[0].measured}
+    text = str(many)
+    assert "every method left out: " in text and "--signals" not in text
 
 
 def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
@@ -209,11 +171,11 @@ def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
     assert max(map(len, text.splitlines())) <= 80
     assert "analyze chooses modes, which is" in text
     assert "simulate chooses exact, which is" in text
-    words = " ".join(text.split())
-    assert "are of 1 run: processor time of an analysis, from the compiled scene to its verdict" in words
-    assert "processor time of a run, without what prepares it" in words
-    assert "error and bound are relative to the largest value of a state's unit" in words
-    assert "faster by more than both spreads and no less right, or more right and no slower" in words
+    analysis = found.comparisons[0]
+    for one in analysis.measured:
+        assert one.error is None or one.bound is None or one.error <= one.bound
+    assert "spectral radius 0.957171389625094952208279125575" in analysis.reference
+    json.dumps(found.to_dict(), allow_nan=False)
 
 
 def test_a_spread_needs_several_runs_and_a_time_has_no_exponent(found: Bench) -> None:
@@ -224,14 +186,6 @@ def test_a_spread_needs_several_runs_and_a_time_has_no_exponent(found: Bench) ->
     many = replace(analysis, measured=(replace(one, rounds=3),))
     assert "0.9996 ms" in str(replace(found, comparisons=(many,)))
     json.dumps(found.to_dict(), allow_nan=False)
-
-
-def test_the_picture_has_a_panel_a_task(found: Bench, tmp_path: Path) -> None:
-    axes = bench_picture(found).axes
-    assert [ax.get_title() for ax in axes] == ["apc analyze", "apc simulate"]
-    assert "exact (default)" in [text.get_text() for text in axes[1].texts]
-    save_bench(found, tmp_path / "bench.svg")
-    assert (tmp_path / "bench.svg").stat().st_size > 10_000
 
 
 def test_no_name_in_the_picture_stands_over_another_or_leaves_its_panel(found: Bench) -> None:
@@ -247,131 +201,185 @@ def test_no_name_in_the_picture_stands_over_another_or_leaves_its_panel(found: B
         assert all(frame.x0 <= box.x0 and box.x1 <= frame.x1 for box in boxes)
 
 
-def test_a_scaled_scene_is_the_text_with_another_count(tmp_path: Path) -> None:
-    path = tmp_path / "scene.yaml"
-    path.write_text(AVERAGE, encoding="utf-8")
-    grown, expected = with_count(path, 30), compiled(replaced(AVERAGE, ("count: 3", "count: 30")))
-    assert (grown.peers, grown.parameters) == (30, expected.parameters)
-    assert path.read_text(encoding="utf-8") == AVERAGE
-    two = replaced(AVERAGE, ("user: {count: 3}", "one: {count: 1}\n  many: {count: 4}"))
-    path.write_text(two, encoding="utf-8")
-    assert [group.count for group in with_count(path, 7).groups] == [1, 7]
+# ---- more peers ----
 
 
-def test_more_peers_are_measured_each_in_a_process_of_its_own(tmp_path: Path) -> None:
-    path = tmp_path / "scene.yaml"
-    path.write_text(AVERAGE, encoding="utf-8")
-    found = scale(path, [3, 3000])
-    assert [row.peers for row in found.rows] == [3, 3000]
-    assert all(row.error is not None and row.error <= row.bound for row in found.rows)
-    assert all(row.memory > 10 * 2**20 for row in found.rows)
-    text = str(found)
+def test_more_peers_are_measured_each_in_a_process_of_its_own(cli: Cli) -> None:
+    """The text with another count, of the group that grows; a number is measured once."""
+    write("scene.yaml", replaced(AVERAGE, ("user: {count: 3}", "one: {count: 1}\n  many: {count: 4}")))
+    grown = scale(Path("scene.yaml"), [5, 3000, 5])
+    assert [(row.count, row.peers) for row in grown.rows] == [(5, 6), (3000, 3001)]
+    assert all(row.error is not None and row.error <= row.bound for row in grown.rows)
+    assert all(row.memory > 10 * 2**20 for row in grown.rows)
+    text = str(grown)
     assert max(map(len, text.splitlines())) <= 80
-    assert "3,000" in text
-    assert "peers of group user\n" in text
+    assert "peers of group many, beside 1 of other groups" in text and "3,000" in text
 
 
-def test_the_group_that_grows_is_named_and_a_number_is_measured_once(tmp_path: Path) -> None:
-    path = tmp_path / "scene.yaml"
-    two = replaced(AVERAGE, ("user: {count: 3}", "one: {count: 1}\n  many: {count: 4}"))
-    path.write_text(two, encoding="utf-8")
-    found = scale(path, [5, 5])
-    assert [(row.count, row.peers) for row in found.rows] == [(5, 6)]
-    assert "peers of group many, beside 1 of other groups" in str(found)
-
-
-def test_numbers_none_of_which_can_be_analysed_are_an_error(tmp_path: Path) -> None:
-    path = tmp_path / "scene.yaml"
-    path.write_text(AVERAGE, encoding="utf-8")
-    with pytest.raises(ApcError, match=r"E921 leaves nothing to measure: 1 peer of user: .* 2 peers"):
-        scale(path, [1])
-
-
-@pytest.mark.parametrize("counts", [[], [0], [3, -1]])
-def test_numbers_of_peers_that_are_none_are_refused(tmp_path: Path, counts: list[int]) -> None:
-    with pytest.raises(ApcError, match="E921") as raised:
-        scale(tmp_path / "scene.yaml", counts)
-    assert "[" not in str(raised.value)
-
-
-def test_a_scene_of_a_table_has_no_count_to_grow() -> None:
-    with pytest.raises(ApcError, match="no group of this topology has a count that could grow"):
-        scale(SCENES / "users-table.yaml", [3])
-
-
-def test_the_command_prints_one_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "scene.yaml"
-    path.write_text(AVERAGE, encoding="utf-8")
-    assert run(["bench", str(path), "--scale", "3", "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert [row["peers"] for row in document["rows"]] == [3]
-    assert run(["bench", str(path), "--hard"]) == 2
+@pytest.mark.parametrize(
+    ("scene", "counts", "message"),
+    [
+        ("three-users-average", [1], r"E921 leaves nothing to measure: 1 peer of user: .* 2 peers"),
+        ("users-table", [3], "no group of this topology has a count that could grow"),
+        ("three-users-average", [], "E921"),
+        ("three-users-average", [0], "E921"),
+        ("three-users-average", [3, -1], "E921"),
+    ],
+)
+def test_numbers_of_peers_that_are_none_are_refused(scene: str, counts: list[int], message: str) -> None:
+    with pytest.raises(ApcError, match=message):
+        scale(SCENES / f"{scene}.yaml", counts)
 
 
 @pytest.mark.parametrize("words", ["many", "3,,4", "3.5", "nan", "1e400", "0", "1e10"])
-def test_a_list_that_is_none_of_peers_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["bench", str(SCENES / "template.yaml"), "--scale", words]) == 1
-    assert capsys.readouterr().err.startswith("--scale: E921 the list wants numbers ")
+def test_a_list_that_is_none_of_peers_is_refused(words: str, cli: Cli) -> None:
+    ran = cli(f"bench '{SCENES}/template.yaml' --scale {words}")
+    assert ran.code == 1 and ran.err.startswith("--scale: E921 the list wants numbers ")
 
 
-def test_a_picture_that_cannot_be_drawn_is_refused_before_anything_is_measured(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("apc.benchmark.bench.bench", lambda *_: pytest.fail("it is measured"))
-    words = ["bench", str(SCENES / "template.yaml"), "--plot"]
-    assert run([*words, "bench.txt"]) == 1
-    assert "E878 the suffix of --plot" in capsys.readouterr().err
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert run([*words, "bench.png"]) == 1
-    assert "E875 matplotlib is not installed" in capsys.readouterr().err
+# ---- the command ----
 
 
-def test_a_picture_that_cannot_be_written_is_refused_before_anything_is_measured(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    monkeypatch.setattr("apc.benchmark.bench.bench", lambda *_: pytest.fail("it is measured"))
-    folder = tmp_path / "folder.png"
-    folder.mkdir()
-    for plot, message in (
-        (str(tmp_path / "nowhere" / "bench.png"), "E601 can't be written: No such file or directory"),
-        (str(folder), "E601 can't be written: it is a folder"),
+@pytest.mark.parametrize(
+    ("plot", "message"),
+    [
+        ("bench.txt", "E878 the suffix of --plot"),
+        ("bench.png", "E875 matplotlib is not installed"),
+        ("nowhere/bench.png", "E601 can't be written: No such file or directory"),
         (".", "E601 can't be written: it is a folder"),
-        ("", "E601 can't be written: it is a folder"),
-    ):
-        assert run(["bench", str(SCENES / "template.yaml"), "--plot", plot]) == 1
-        assert message in capsys.readouterr().err
+        ("''", "E601 can't be written: it is a folder"),
+    ],
+)
+def test_a_picture_that_cannot_be_is_refused_before_anything_is_measured(
+    plot: str, message: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("apc.benchmark.bench.bench", lambda *_: pytest.fail("it is measured"))
+    if "E875" in message:
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
+    ran = cli(f"bench '{SCENES}/template.yaml' --plot {plot}")
+    assert ran.code == 1 and message in ran.err
 
 
-def test_a_picture_that_could_not_be_written_in_the_end_costs_no_figures(
-    found: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+def test_what_goes_wrong_in_the_end_costs_no_figures(
+    found: Bench, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
         raise ApcError(Mistake("E601", Place("bench.png"), "can't be written: no space"))
 
-    monkeypatch.setattr("apc.benchmark.bench.bench", lambda *_: found)
-    monkeypatch.setattr("apc.present.bench.save_bench", full)
-    assert run(["bench", str(SCENES / "template.yaml"), "--plot", str(tmp_path / "bench.png")]) == 1
-    printed = capsys.readouterr()
-    assert "E601 can't be written" in printed.err
-    assert "analyze chooses modes" in printed.out
-
-
-def test_a_bound_that_does_not_hold_ends_with_code_1_after_the_figures(
-    found: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
     assert found.faults == ()
     note = "WRONG: the bound of dense does not hold"
     first, *rest = found.comparisons
     broken = replace(found, comparisons=(replace(first, notes=(note,)), *rest))
-    monkeypatch.setattr("apc.benchmark.bench.bench", lambda *_: broken)
-    assert run(["bench", str(SCENES / "template.yaml")]) == 1
-    printed = capsys.readouterr()
-    assert "E922" in printed.err and note in printed.err
-    assert "analyze chooses modes" in printed.out
+    monkeypatch.setattr("apc.present.bench.save_bench", full)
+    for measured, plot, messages in (
+        (found, "--plot bench.png", ["E601 can't be written"]),
+        (broken, "", ["E922", note]),
+    ):
+        monkeypatch.setattr("apc.benchmark.bench.bench", lambda *_, measured=measured: measured)
+        ran = cli(f"bench '{SCENES}/template.yaml' {plot}")
+        assert ran.code == 1 and all(one in ran.err for one in messages)
+        assert "analyze chooses modes" in ran.out
 
 
-def test_the_help_names_the_limits_of_the_reference(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["bench", "--help"]) == 0
-    words = " ".join(capsys.readouterr().out.split())
-    assert f"at most {MOST_STATES} states" in words
-    assert "against the same equations in 512-bit balls" in words
+# ---- hard cases ----
+
+STORED: dict[str, dict[str, object]] = json.loads(TRUTHS.read_text(encoding="utf-8"))
+NAMES = sorted(path.stem for path in HERE.glob("*.yaml"))
+
+
+def test_every_scene_has_its_truth_and_says_where_it_comes_from_and_what_is_hard() -> None:
+    assert sorted(STORED) == NAMES
+    for name in NAMES:
+        text = (HERE / f"{name}.yaml").read_text(encoding="utf-8")
+        assert f"topology: {name}\nabout: " in text
+        assert "\n# From: " in text
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_hard_case_gets_the_right_verdict_and_a_bound_that_holds(name: str) -> None:
+    system = apc.compile(HERE / f"{name}.yaml")
+    case = compare(system, apc.analyze(system), STORED[name], 0.0, name)
+    assert case.failed == ""
+    assert case.verdict == STORED[name]["verdict"], "none of these is left undecided"
+    assert math.isfinite(case.bound)
+
+
+@pytest.mark.parametrize("name", ["coasting", "stiff-contact", "two-clusters", "million-peers"])
+def test_the_stored_truth_is_what_its_script_computes(name: str) -> None:
+    assert truth_of(apc.compile(HERE / f"{name}.yaml")) == STORED[name]
+
+
+def _one_case(**changes: object) -> str:
+    """Make the working folder one of one hard case, its truth changed; return its text."""
+    shutil.copy(HERE / "tiny-device.yaml", ".")
+    truth = STORED["tiny-device"] | changes
+    write("truths.json", json.dumps({"tiny-device": truth}))
+    return str(truth["spectral_radius"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"spectral_radius": "0.968810016486"}, "the bound does not hold"),
+        ({"verdict": "stable"}, "the verdict is wrong: stable"),
+        ({"rigid_modes": 0}, "0 rigid modes, not 1"),
+    ],
+)
+def test_a_case_that_is_wrong_fails(cli: Cli, changes: dict[str, object], message: str) -> None:
+    _one_case(**changes)
+    ran = cli("bench --hard .")
+    assert ran.code == 1 and f"FAILED tiny-device: {message}" in ran.out
+    assert "E922 not every hard case came out right: tiny-device" in ran.err
+
+
+OPEN = "the bound says nothing; the verdict is left open: stable up to a common translation"
+
+
+@pytest.mark.parametrize(
+    ("changes", "failed"),
+    [
+        ({"spectral_radius_error": math.inf, "stable": None, "verdict": "undecided: …"}, OPEN),
+        ({"spectral_radius": math.nan}, "there is no spectral radius"),
+        ({"spectral_radius_error": math.nan}, "the bound says nothing"),
+    ],
+)
+def test_what_is_no_number_or_no_verdict_fails_and_is_counted(
+    changes: dict[str, object], failed: str, cli: Cli
+) -> None:
+    def solve(system: CompiledSystem) -> apc.Analysis:
+        return replace(apc.analyze(system), **changes)  # type: ignore[arg-type] # some fields of it
+
+    _one_case()
+    report = run_hard_cases(Path(), solve=solve, repeats=1)
+    assert [case.failed for case in report.failures] == [failed]
+    assert "1 of 1 scene failed" in str(report)
+    assert report.to_dict()["undecided"] == (["tiny-device"] if "stable" in changes else [])
+
+
+def test_the_report_of_hard_cases_fits_a_terminal(cli: Cli) -> None:
+    write("other.yaml", "topology: other\n")
+    _one_case()
+    ran = cli("bench --hard .")
+    assert ran.code == 0 and max(map(len, ran.out.splitlines())) <= 80
+    assert "every bound holds; every verdict is right" in ran.out
+    assert "stable*: stable up to a common translation" in ran.out
+    assert "other.yaml has no truth beside it: left out" in ran.out
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "does not exist"),
+        ("{", "is not JSON"),
+        ("[]", "the truths wants spectral_radius"),
+        ('{"a": {"spectral_radius": "much"}}', "a wants spectral_radius"),
+        ('{"a": {"spectral_radius": "1/0", "rigid_modes": 1, "verdict": "stable"}}', "a wants spectral"),
+        ('{"a": {"spectral_radius": "1", "rigid_modes": "one", "verdict": "stable"}}', "a wants spectral"),
+        ("{}", "holds no topology whose truth is known"),
+    ],
+)
+def test_truths_that_are_none_are_refused(cli: Cli, text: str | None, message: str) -> None:
+    if text is not None:
+        write("truths.json", text)
+    ran = cli("bench --hard .")
+    assert ran.code == 1 and f"E920 {message}" in " ".join(ran.err.split())
