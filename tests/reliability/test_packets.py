@@ -64,34 +64,32 @@ def test_what_is_written_is_read(secret: bytes) -> None:
 
 @SECRETS
 def test_what_is_not_a_peers_changes_nothing_but_a_counter(secret: bytes) -> None:
-    """Random bytes, every bit of good datagrams turned, others' scenes, secrets and addresses."""
+    """Random bytes, every bit of good datagrams turned, others' scenes, secrets, sessions and addresses."""
     luck = random.Random(1)
     sender, receiver = met(secret)
-    good = sender.data(17, 1, 0, 4, (1.0,))
-    assert good is not None
-    before = dict(receiver.nonces), dict(receiver.keys)
-    for _ in range(2_000):
-        assert receiver.read(luck.randbytes(luck.randrange(200)), HERE) is None
-    assert receiver.dropped == {"malformed": 2_000}
+    good = sender.data(17, 1, 0, 4, (1.0,)) or b""
     said = [good, sender.hello(18, 1), sender.answer(19, Hello(1, 5, receiver.nonce, 0), 6, -1, 8)]
-    for one in said:
-        for at in range(8 * len(one)):
-            torn = bytearray(one)
-            torn[at // 8] ^= 1 << at % 8
-            assert receiver.read(bytes(torn), HERE) is None
-    assert receiver.dropped["other scene"] == 3 * 8 * 8
-    assert receiver.read(good, ("127.0.0.1", 5001)) is None
-    assert receiver.dropped["stranger"] == 1
-    before_forged = receiver.dropped["forged"]
-    others = [post(2, secret=b"another secret of some length"), post(2, digest=b"other" * 8, secret=secret)]
-    for one in (*others, post(3, secret=secret)):
-        assert receiver.read(one.hello(18, 1), HERE) is None
-    assert receiver.dropped["forged"] == before_forged + 1
-    again = met(secret)[0].data(17, 1, 0, 4, (1.0,))  # of another session
-    assert receiver.read(again or b"", HERE) is None
-    assert receiver.dropped["forged"] == before_forged + 2
-    for value in (math.nan, math.inf):
-        assert receiver.read(sender.data(17, 1, 0, 4, (value,)) or b"", HERE) is None
+    before = dict(receiver.nonces), dict(receiver.keys)
+
+    def dropped(*datagrams: bytes, address: Address = HERE) -> dict[str, int]:
+        """Return what is counted when some datagrams come, none of which is taken."""
+        receiver.dropped.clear()
+        assert {receiver.read(one, address) for one in datagrams} == {None}
+        return dict(receiver.dropped)
+
+    assert dropped(*(luck.randbytes(luck.randrange(200)) for _ in range(2000))) == {"malformed": 2000}
+    torn = [
+        bytes(byte ^ (1 << at % 8) * (place == at // 8) for place, byte in enumerate(one))
+        for one in said
+        for at in range(8 * len(one))
+    ]
+    assert dropped(*torn)["other scene"] == 3 * 8 * 8
+    assert dropped(good, address=("127.0.0.1", 5001)) == {"stranger": 1}
+    assert dropped(post(2, secret=b"another secret of some length").hello(18, 1)) == {"forged": 1}
+    assert dropped(met(secret)[0].data(17, 1, 0, 4, (1.0,)) or b"") == {"forged": 1}  # of another session
+    assert dropped(post(2, digest=b"other" * 8, secret=secret).hello(18, 1))
+    assert dropped(post(3, secret=secret).hello(18, 1))
+    assert dropped(*(sender.data(17, 1, 0, 4, (value,)) or b"" for value in (math.nan, math.inf)))
     assert (receiver.nonces, receiver.keys) == before
     assert receiver.read(good, HERE) is not None
 
@@ -130,6 +128,7 @@ def test_of_what_was_heard_in_one_session_nothing_is_taken_in_another(
     without = played(wires[1], secret, 2.0)
     wires.append(Wire(monkeypatch))
     found = played(wires[2], secret, 2.0, recorded)
+    assert {late for _, late, _ in found.player.log} == {0}, "though the system's clock was set"
     assert found.begins == without.begins
     assert found.offsets == without.offsets
     assert found.player.arrivals == without.player.arrivals
@@ -193,11 +192,6 @@ def test_peers_whose_clocks_were_started_at_different_times_begin_at_one_instant
         assert loop.first == (wire.time - loop.begins) // loop.frame_ns + 2
 
 
-def test_no_tick_waits_where_the_system_s_clock_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
-    loop = played(Wire(monkeypatch), b"", 1.0)
-    assert [late for _, late, _ in loop.player.log] == [0] * 104
-
-
 def test_a_flood_is_read_after_a_tick_s_work(monkeypatch: pytest.MonkeyPatch) -> None:
     """Datagrams without end, of strangers and of a peer, at 10 µs each: of them a late tick reads so many."""
     for address in (("192.0.2.9", 9), ("127.0.0.1", 5001)):
@@ -218,37 +212,45 @@ def test_a_flood_is_read_after_a_tick_s_work(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_ticks_packets_are_those_that_had_come(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without time: packets given by hand, out of order, twice, too early, too late, of another width."""
+    """Packets given by hand, out of order, twice, too early, too late, of another width; then a flood."""
     loop = loop_at(Wire(monkeypatch), compiled(MOVING), DIGEST, b"", "1")
     player = loop.player
     loop.begins = 1
-    period, frame = 8_000_000, loop.frame_ns
+    period, values = 8_000_000, (0.25,) * len(player.links[0].channels_of(1))
+    way = player.routes[0].pairs.tolist().index([1, 0])
 
-    def given(count: int, came: int, *values: float, sender: int = 1, link: int = 0) -> None:
-        player.hear(Data(sender, 0, link, count, values), came)
+    def newest(at: int) -> int:
+        """Return the packet that a tick sees at the end of a period."""
+        player.instant = at * period
+        player._sees(0, 0, ())
+        return int(player.newest[0][way])
 
-    width = len(player.links[0].channels_of(1))
-    values = [0.25] * width
-    player.instant = 5 * period
-    given(3, 3 * period + 1, *values)
-    given(2, 3 * period + 2, *values)  # newest wins
-    player._sees(0, 0, ())
-    way = next(way for way, pair in enumerate(player.routes[0].pairs.tolist()) if pair == [1, 0])
-    assert player.newest[0][way] == 3
-    given(3, 3 * period + 3, *values)
-    given(90, 4 * period, *values)
-    given(0, 500 * frame, *values)
-    given(4, 4 * period, *values, 1.0)
-    given(4, 4 * period, *values, link=7)
-    given(4, 4 * period, *values, sender=0)
-    given(6, 6 * period, *values)  # of later than the instant that this peer is at
-    player._sees(0, 0, ())
-    assert player.newest[0][way] == 3
+    for count, came in ((3, 3 * period + 1), (2, 3 * period + 2)):
+        player.hear(Data(1, 0, 0, count, values), came)
+    assert newest(5) == 3, "the newest wins"
+    for sender, link, count, came, given in (
+        (1, 0, 3, 3 * period + 3, values),
+        (1, 0, 90, 4 * period, values),
+        (1, 0, 0, 500 * loop.frame_ns, values),
+        (1, 0, 4, 4 * period, (*values, 1.0)),
+        (1, 7, 4, 4 * period, values),
+        (0, 0, 4, 4 * period, values),
+        (1, 0, 6, 6 * period, values),  # of later than the instant that this peer is at
+    ):
+        player.hear(Data(sender, 0, link, count, given), came)
+    assert newest(5) == 3
     assert loop.post.dropped == {"heard before": 1, "early": 1, "late": 1, "malformed": 3}
     assert [row[2] for row in player.arrivals] == [3, 2, 6]
-    player.instant = 6 * period
-    player._sees(0, 0, ())
-    assert player.newest[0][way] == 6
+    assert newest(6) == 6
+    before, luck = player.packets.copy(), random.Random(2)
+    loop.post.dropped.clear()
+    for _ in range(10_000):
+        player.hear(Data(1, 0, 0, 6, (luck.random(),) * len(values)), 6 * period)
+        player.hear(Data(1, 0, 0, luck.randrange(20, 2**60), values), 6 * period)
+        player.hear(Data(1, 0, 0, luck.randrange(1000), values), 2000 * loop.frame_ns)
+    assert loop.post.dropped == {"heard before": 10_000, "early": 10_000, "late": 10_000}
+    assert (player.packets == before).all()
+    assert len(player.arrivals) == 3
 
 
 def test_a_peer_that_is_far_behind_loses_packets_and_hears_none_in_the_place_of_others(
@@ -267,23 +269,6 @@ def test_a_peer_that_is_far_behind_loses_packets_and_hears_none_in_the_place_of_
     for count in heard:
         keys = [link.keys[channel, 0] for channel in link.channels_of(2)]
         assert (player.packets[count % kept, keys, column] == count).all()
-
-
-def test_a_flood_of_packets_moves_counters_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """10⁴ of each: replayed, too early, too late; what is heard stays, and what is kept does not grow."""
-    loop = loop_at(Wire(monkeypatch), compiled(MOVING), DIGEST, b"", "1")
-    loop.begins = 1
-    player, width = loop.player, len(loop.player.links[0].channels_of(1))
-    player.hear(Data(1, 0, 0, 0, (0.5,) * width), 0)
-    before = player.packets.copy()
-    luck = random.Random(2)
-    for _ in range(10_000):
-        player.hear(Data(1, 0, 0, 0, (luck.random(),) * width), 0)
-        player.hear(Data(1, 0, 0, luck.randrange(10, 2**60), (1.0,) * width), 0)
-        player.hear(Data(1, 0, 0, luck.randrange(1000), (1.0,) * width), 2000 * loop.frame_ns)
-    assert loop.post.dropped == {"heard before": 10_000, "early": 10_000, "late": 10_000}
-    assert (player.packets == before).all()
-    assert len(player.arrivals) == 1
 
 
 def test_of_answers_the_shortest_round_trip_tells_a_clock_and_the_first_the_beginning(

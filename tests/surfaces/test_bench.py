@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import apc
-from apc.benchmark.bench import SAME, Bench, Measured, bench, bench_simulation, pareto_front
+from apc.benchmark.bench import SAME, Bench, Measured, bench, bench_analysis, bench_simulation, pareto_front
 from apc.benchmark.hard import compare, run_hard_cases
 from apc.benchmark.scale import scale
 from apc.compiler.compiled import CompiledSystem
@@ -157,13 +157,18 @@ def test_a_method_that_cannot_serve_is_left_out_and_says_why() -> None:
     [(name, reason)] = bench_of_two.comparisons[0].refused
     assert name == "paper"
     assert "one clock of forces (here are haptic and slow)" in reason
-    many = apc.bench(compiled(replaced(AVERAGE, ("count: 3", "count: 1000000"))), rounds=1)
-    reasons = dict(many.comparisons[0].refused)
+    many = bench_analysis(compiled(replaced(AVERAGE, ("count: 3", "count: 1000000"))), rounds=1)
+    reasons = dict(many.refused)
     assert "8,000,000 states" in reasons["dense"]
     assert not any("Write:" in reason for reason in reasons.values())
-    assert "modes" in {one.name for one in many.comparisons[0].measured}
-    text = str(many)
-    assert "every method left out: " in text and "--signals" not in text
+    assert "modes" in {one.name for one in many.measured}
+
+
+def test_what_is_too_large_to_be_played_is_analysed_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("apc.simulation.simulation.NUMBER", 1e20)
+    text = str(apc.bench(compiled(AVERAGE), rounds=1))
+    assert "analyze chooses modes" in text
+    assert "every method left out: 3 peers hold" in text and "--signals" not in text
 
 
 def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
