@@ -73,6 +73,7 @@ def test_processes_end_at_once_whatever_they_do() -> None:
 
 # All that start processes, in one that was itself started elsewhere.
 STARTING = """\
+import sys
 from apc.__main__ import run
 from apc.explore.desk import Desk
 from apc.explore.sections import Task
@@ -81,8 +82,10 @@ from apc.processes import model_bytes
 
 if __name__ == "__main__":
     over = ["--over", "contact.stiffness=1 N/m:2 N/m:200"]
-    ran = [
-        run(["sweep", "scene.yaml", *over, "--jobs", "2", "--out", "r.csv"]),
+    ran = [run(["sweep", "scene.yaml", *over, "--jobs", "2", "--out", "r.csv"])]
+    if sys.argv[1:] == ["sweep"]:
+        raise SystemExit(any(ran))
+    ran += [
         run(["simulate", "lossy.yaml", "--duration", "40 ms", "--runs", "80", "--jobs", "2"]),
         run(["bench", "scene.yaml", "--scale", "3,4"]),
         run(["play", "scene.yaml", "--duration", "40 ms"]),
@@ -95,7 +98,8 @@ if __name__ == "__main__":
 """
 
 
-def test_no_process_that_is_started_runs_what_lies_beside_a_topology(tmp_path: Path) -> None:
+@pytest.mark.parametrize("what", ["sweep", pytest.param("all", marks=pytest.mark.whole)])
+def test_no_process_that_is_started_runs_what_lies_beside_a_topology(what: str, tmp_path: Path) -> None:
     script, folder = tmp_path / "script.py", tmp_path / "folder"
     script.write_text(STARTING, encoding="utf-8")
     folder.mkdir()
@@ -103,7 +107,9 @@ def test_no_process_that_is_started_runs_what_lies_beside_a_topology(tmp_path: P
     (folder / "lossy.yaml").write_text(LOSSY, encoding="utf-8")
     for name in (*sys.stdlib_module_names, "apc", "casadi", "numpy", "scipy"):
         (folder / f"{name}.py").write_text(f"open('{name}.ran', 'w')\n", encoding="utf-8")
-    ran = subprocess.run([sys.executable, script], cwd=folder, capture_output=True, text=True, check=False)
+    ran = subprocess.run(
+        [sys.executable, script, what], cwd=folder, capture_output=True, text=True, check=False
+    )
     assert sorted(path.name for path in folder.glob("*.ran")) == []
     assert ran.returncode == 0, ran.stderr
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import shutil
@@ -146,6 +145,7 @@ def test_what_rests_is_moved_by_its_own_scale_in_its_own_unit(tmp_path: Path) ->
     assert "device.x of its first peer starts 0.03 m" in note
 
 
+@pytest.mark.whole
 def test_a_method_that_cannot_serve_is_left_out_and_says_why() -> None:
     text = replaced(
         AVERAGE,
@@ -181,29 +181,9 @@ def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
         assert one.error is None or one.bound is None or one.error <= one.bound
     assert "spectral radius 0.957171389625094952208279125575" in analysis.reference
     json.dumps(found.to_dict(), allow_nan=False)
-
-
-def test_a_spread_needs_several_runs_and_a_time_has_no_exponent(found: Bench) -> None:
-    [analysis, _] = found.comparisons
-    one = replace(analysis.measured[0], seconds=0.9997e-3, spread=0.9996e-3)
-    lines = str(replace(found, comparisons=(replace(analysis, measured=(one,)),))).splitlines()
-    assert next(line for line in lines if one.name in line).split()[1:4] == ["0.9997", "ms", "–"]
-    many = replace(analysis, measured=(replace(one, rounds=3),))
-    assert "0.9996 ms" in str(replace(found, comparisons=(many,)))
-    json.dumps(found.to_dict(), allow_nan=False)
-
-
-def test_no_name_in_the_picture_stands_over_another_or_leaves_its_panel(found: Bench) -> None:
-    near = [_one(f"semi-implicit:{k} ms", 1e-3 * (1 + k / 50), 1e-9 * (1 + k / 20)) for k in range(9)]
-    for comparison in (*found.comparisons, replace(found.comparisons[1], measured=pareto_front(near))):
-        figure = bench_picture(replace(found, comparisons=(comparison, *found.comparisons[1:])))
-        figure.draw_without_rendering()
-        ax = figure.axes[0]
-        boxes = [text.get_window_extent() for text in ax.texts]
-        assert len(boxes) >= len(comparison.measured)
-        assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
-        frame = ax.get_window_extent()
-        assert all(frame.x0 <= box.x0 and box.x1 <= frame.x1 for box in boxes)
+    axes = bench_picture(found).axes
+    assert [ax.get_title() for ax in axes] == ["apc analyze", "apc simulate"]
+    assert "exact (default)" in [text.get_text() for text in axes[1].texts]
 
 
 # ---- more peers ----

@@ -137,24 +137,6 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(animation, "SHORTEST", 2.0)
 
 
-def test_bodies_are_where_the_run_has_them_and_never_out_of_sight() -> None:
-    from apc.present.still import draw_actors
-
-    system = compiled(replaced(AVERAGE, ("device: {", "device: {v: 2 m/s, ")))
-    found = apc.simulate(system, duration="50 ms", jit=False)
-    _, actors = draw_actors(system, named=False)
-    tracks = [1e3 * np.stack([found[name] for name in one.states], axis=1) for one in actors]
-    animation._keep_in_sight(actors, tracks)
-    for actor, track in zip(actors, tracks, strict=True):
-        low, high = actor.ax.get_xlim()
-        assert low < track.min() - actor.half and track.max() + actor.half < high
-        actor.move(track[-1])
-        assert actor.dot.get_xdata()[0] == track[-1][0]
-    assert {one.states[0] for one in actors} == {
-        f"user[{n}].{x}" for n in (1, 2, 3) for x in ("device.x", "cube.x")
-    }
-
-
 @pytest.mark.usefixtures("short")
 def test_every_frame_shows_what_stands_and_what_moved(tmp_path: Path) -> None:
     image = pytest.importorskip("PIL.Image")

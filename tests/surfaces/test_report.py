@@ -274,29 +274,6 @@ def test_what_cannot_be_written_or_read_is_refused_before_anything_is_computed(
     assert folder() == []
 
 
-@pytest.mark.whole
-@pytest.mark.skipif(not any(map(shutil.which, pages.BROWSERS)), reason="there is no Chromium")
-def test_on_paper_what_is_told_stays_with_its_figure(tmp_path: Path) -> None:
-    """Each h2 and the figure below it, though sentences stand between them, begin on one page."""
-    pytest.importorskip("playwright.sync_api")
-    from playwright.sync_api import sync_playwright
-
-    page = (
-        f"<style>{pages._STYLE} @page {{ size: 400px 400px; margin: 0; }} svg {{ height: 300px; }}</style>"
-        '<p style="height: 310px">Above</p><section><div class="scenes"><div>'
-        "<h2>Over time</h2><p>It settles.</p><p>Twice.</p><figure><svg></svg></figure></div></div></section>"
-    )
-    out = tmp_path / "r.pdf"
-    with sync_playwright() as play:
-        path = next(one for name in pages.BROWSERS if (one := shutil.which(name)))
-        browser = play.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        shown = browser.new_page()
-        shown.set_content(page)
-        out.write_bytes(shown.pdf(prefer_css_page_size=True))
-        browser.close()
-    assert len(re.findall(rb"/Type\s*/Page\b", out.read_bytes())) == 2
-
-
 @pytest.mark.skipif(not any(map(shutil.which, pages.BROWSERS)), reason="there is no Chromium")
 def test_a_pdf_is_printed(tmp_path: Path) -> None:
     (tmp_path / "scene.yaml").write_text(LONE, encoding="utf-8")
