@@ -284,8 +284,9 @@ def test_what_a_topology_says_is_never_taken_from_a_model_somebody_else_wrote(
         members[name] = members[name].replace(before, after)
     digest = hashlib.sha256(b"".join(members.values())).hexdigest().encode()
     marks = {"mine": members_of(mine).get("seal", b""), "a digest": digest, "none": b""}
-    members |= {"seal": marks[mark]} if mark in marks else {}
-    MODEL.write_bytes(zipped({name: content for name, content in members.items() if content}))
+    members["seal"] = marks.get(mark, members["seal"])
+    MODEL.write_bytes(zipped({name: members[name] for name in members if name != "seal" or members[name]}))
+    assert outcome() != "refused", "by its name it is opened"
     assert json.loads(honest_answer(capsys))["spectral_radius"] == radius
     assert not unchanged(capsys)
     assert MODEL.read_bytes() == mine
