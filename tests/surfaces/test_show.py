@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import apc
 from apc.compiler.view.listing import show_page
@@ -71,7 +72,8 @@ def test_no_text_of_a_picture_stands_over_another_or_leaves_the_page(name: str, 
     figure = graph_picture(show_page(tmp_path / "scene.yaml"))
     drawn = figure.axes[0].texts
     assert {one.get_text() for one in drawn} == set(words)
-    boxes = {one: one.get_window_extent() for one in drawn}
+    renderer = FigureCanvasAgg(figure).get_renderer()  # one for all: each is as large as the picture
+    boxes = {one: one.get_window_extent(renderer) for one in drawn}
     for box in boxes.values():
         assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y0 >= 0 and box.y1 <= figure.bbox.height
     for one, two in itertools.combinations(drawn, 2):
