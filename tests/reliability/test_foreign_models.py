@@ -192,7 +192,7 @@ def test_a_forged_document_ends_in_words(scene: str, turn: int) -> None:
 @pytest.mark.whole
 def test_forged_files_of_every_sort_do_nothing_else_and_end() -> None:
     """Each is opened and asked in a process that notes commands, libraries, sockets and files written."""
-    counts = ("--models", "100", "--recordings", "100", "--parts", "100")
+    counts = ("--models", "40", "--recordings", "40", "--parts", "40")
     command = [sys.executable, "-m", "tests.fuzz", "--inputs", "0", *counts, "--seed", "7"]
     command += ["--out", str(Path.cwd() / "failures")]
     ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
