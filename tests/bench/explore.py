@@ -15,7 +15,7 @@ from typing import Any
 
 import apc
 from tests.bench.judge import Judge, parser_of
-from tests.pages import CHROMIUM, MODEL, Tab, launched, served
+from tests.surfaces.pages import CHROMIUM, MODEL, Tab, launched, served
 from tests.topologies import AVERAGE
 
 SLIDER = "device.damping"

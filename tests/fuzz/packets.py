@@ -16,7 +16,7 @@ import pytest
 from apc.compiler.compiled import CompiledSystem
 from apc.loop.packets import ANSWER, DATA, HELLO, Address, Hello, Post
 from apc.loop.peer import Loop
-from tests.wire import OWN, SOON, Other, Wire, loop_at, send_packets
+from tests.surfaces.wire import OWN, SOON, Other, Wire, loop_at, send_packets
 
 DIGEST = bytes(range(32))
 SECRET = b"sixteen bytes or more"

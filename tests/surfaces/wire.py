@@ -68,7 +68,8 @@ class Wire:
         ready = bool(self.coming) and self.coming[0][0] <= end
         if self.endless is None:
             self.time = max(self.time, min(self.coming[0][0], end)) if ready else end
-        return ([self] if ready or self.endless else []), [], []
+        told = [one for one in watched if one is not self and one.poll()]
+        return told + ([self] if ready or self.endless else []), [], []
 
 
 class Other:
@@ -99,18 +100,28 @@ class Other:
         self.wire.send(datagram, self.address, at)
 
 
-def loop_at(wire: Wire, system: CompiledSystem, digest: bytes, secret: bytes, duration: str = "1/10") -> Loop:
+def loop_at(
+    wire: Wire,
+    system: CompiledSystem,
+    digest: bytes,
+    secret: bytes,
+    duration: str = "1/10",
+    device: Any = None,
+    stop: Any = None,
+) -> Loop:
     """Return the first peer of a scene at a wire, where the others are known."""
     names = [f"{group.name}[{at + 1}]" for group in system.groups for at in range(group.count)]
     others = {name: (OWN[0], OWN[1] + at) for at, name in enumerate(names) if at}
     return Loop(
         system,
         names[0],
-        wire,
+        wire,  # type: ignore[arg-type] # it stands for a socket
         others,
         digest=digest,
         duration=Fraction(duration),
-        secret=secret,  # type: ignore[arg-type]
+        secret=secret,
+        device=device,
+        stop=stop,
     )
 
 

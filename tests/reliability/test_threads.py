@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from apc import cli
-from apc.cli.options import Command
 from apc.threads import POOLS, single_threaded, start_single_threaded
 from tests.topologies import ROOT
 
@@ -26,17 +24,11 @@ def test_one_thread_inside_and_the_old_number_after() -> None:
     before = _threads()
     with single_threaded():
         assert set(_threads()) <= {1}
-        with single_threaded():
+        with pytest.raises(ZeroDivisionError), single_threaded():
             assert set(_threads()) <= {1}
+            _ = 1 / 0
         assert set(_threads()) <= {1}
-    assert _threads() == before
-
-
-def test_the_old_number_is_back_after_an_error() -> None:
-    before = _threads()
-    with pytest.raises(ZeroDivisionError), single_threaded():
-        _ = 1 / 0
-    assert _threads() == before
+    assert _threads() == before, "after an error as well"
 
 
 def _begun(environment: dict[str, str]) -> str:
@@ -58,6 +50,7 @@ def test_a_command_of_small_matrices_makes_no_threads() -> None:
     assert _begun({}).strip() == "{1} ['1', '1', '1']"
 
 
+@pytest.mark.whole
 def test_what_the_environment_says_of_threads_stays() -> None:
     assert "['2', None, None]" in _begun({"OMP_NUM_THREADS": "2"})
 
@@ -92,6 +85,7 @@ assert threads() == {3}
 """
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "load",
     [
@@ -112,8 +106,3 @@ def test_what_brings_a_pool_is_loaded_where_it_is_limited() -> None:
     for path in (ROOT / "runtime").rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         assert not re.search(r"import scipy\.(sparse\.)?linalg|from scipy\.(sparse\.)?linalg", text), path
-
-
-def test_every_command_asks_for_one_thread_before_it_loads_anything() -> None:
-    for name in cli.__all__:
-        assert type(getattr(cli, name)) is Command, name

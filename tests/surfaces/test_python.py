@@ -13,7 +13,7 @@ import pytest
 
 import apc
 from apc.arguments import _fits, _hints
-from tests.topologies import SCENES, told
+from tests.topologies import SCENES, replaced, told
 
 PATH = SCENES / "three-users-average.yaml"
 
@@ -21,11 +21,6 @@ PATH = SCENES / "three-users-average.yaml"
 @pytest.fixture(scope="module")
 def model() -> apc.CompiledSystem:
     return apc.compile(PATH)
-
-
-def test_the_example_of_the_package_holds(model: apc.CompiledSystem) -> None:
-    assert "'stable up to a common translation'" in (apc.__doc__ or "")
-    assert apc.analyze(model).verdict == "stable up to a common translation"
 
 
 def test_every_public_name_is_there_and_nothing_else() -> None:
@@ -43,30 +38,16 @@ def test_a_saved_model_analyses_as_the_one_it_was(model: apc.CompiledSystem, tmp
     assert apc.analyze(path) == apc.analyze(str(PATH)) == apc.analyze(model)
 
 
-def test_setting_changes_a_copy_only(model: apc.CompiledSystem) -> None:
-    changed = apc.set_parameters(model, {"coordination.stiffness": "5 N/mm", "lan.delay": "16 ms"})
-    assert changed is not model
-    stiffness = {p.name: p.value for p in changed.parameters}["coordination.stiffness"]
-    assert stiffness == 5000
-    assert {p.name: p.value for p in model.parameters}["coordination.stiffness"] == 500
-    assert apc.analyze(changed).verdict == "unstable"
-    assert apc.analyze(model, set={"coordination.stiffness": "5 N/mm", "lan.delay": "16 ms"}) == apc.analyze(
-        changed
-    )
-
-
-def test_setting_a_value_is_as_good_as_writing_it(model: apc.CompiledSystem, tmp_path: Path) -> None:
+def test_setting_changes_a_copy_and_is_as_good_as_writing(model: apc.CompiledSystem, tmp_path: Path) -> None:
+    settings = {"coordination.stiffness": "5 N/mm", "lan.delay": "16 ms"}
+    changed = apc.set_parameters(model, settings)
+    for system, value in ((changed, 5000), (model, 500)):
+        assert {p.name: p.value for p in system.parameters}["coordination.stiffness"] == value
     path = tmp_path / "scene.yaml"
-    path.write_text(PATH.read_text(encoding="utf-8").replace("500 N/m,", "800 N/m,"), encoding="utf-8")
-    written = apc.analyze(path)
-    assert apc.analyze(model, set={"coordination.stiffness": "800 N/m"}) == written
-
-
-def test_the_methods_agree(model: apc.CompiledSystem) -> None:
-    modes, dense = apc.analyze(model), apc.analyze(model, method="dense")
-    assert (modes.method, dense.method) == ("modes", "dense")
-    assert modes.verdict == dense.verdict
-    assert abs(modes.spectral_radius - dense.spectral_radius) < 1e-12
+    text = PATH.read_text(encoding="utf-8")
+    path.write_text(replaced(text, ("500 N/m,", "5 N/mm,"), ("delay: 8 ms", "delay: 16 ms")), "utf-8")
+    assert apc.analyze(changed) == apc.analyze(model, set=settings) == apc.analyze(path)
+    assert apc.analyze(changed).verdict == "unstable"
 
 
 def test_results_are_frozen_and_plain_data(model: apc.CompiledSystem) -> None:
@@ -106,14 +87,6 @@ def test_a_setting_that_cannot_be_is_told(
     model: apc.CompiledSystem, settings: dict[str, str], message: str
 ) -> None:
     assert told(apc.set_parameters, model, settings) == [message]
-
-
-def test_a_faulty_file_raises_all_its_mistakes(tmp_path: Path) -> None:
-    path = tmp_path / "bad.yaml"
-    path.write_text("topology: a\n", encoding="utf-8")
-    with pytest.raises(apc.ApcError) as caught:
-        apc.compile(path)
-    assert [mistake.code for mistake in caught.value.mistakes] == ["E201", "E201"]
 
 
 def test_a_list_of_no_scenes_is_refused_and_one_scene_needs_no_list(model: apc.CompiledSystem) -> None:
