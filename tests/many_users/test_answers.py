@@ -16,9 +16,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
 from tests.bench.random_scenes import check, truth
-from tests.bruteforce import Scene
 from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, library, replaced
-from tests.truths import text_of
 
 
 def test_the_answer_is_plain_data() -> None:
@@ -102,13 +100,10 @@ def test_a_table_that_is_empty_says_why(
     known = {row.name for row in apc.parameters(path).rows}
     words = [word for one, value in settings.items() if one in known for word in ("--set", f"{one}={value}")]
     found = json.loads(said(path, *words, "--json"))
-    for one in (found, found.get("network") or {}):
-        for key in ("sensitivities", "margins"):
-            table = one.get(key)
-            assert table is None or table.get("rows") or table.get("note") or table.get("parameters")
-    text = said(path, *words)
-    assert "margins" in text or "may grow" in text
-    assert "what moves it most" in text
+    for one in (found, found["network"]):
+        if one:
+            assert one["sensitivities"]["derivatives"] or one["sensitivities"]["note"]
+            assert one["margins"] or one["margins_note"]
 
 
 # ---- who hears whom ----
@@ -172,21 +167,13 @@ MEAN = ("FullMesh", "AveragePosition")
         ),
         (
             replaced(weighted("arcs: [[1, 2, 1], [3, 2, -1]]"), MEAN),
-            r"E801 user\[1\] hears nobody over lan",
+            r"E801 user\[1\] and user\[3\] hear nobody over lan: there is no mean over nobody",
         ),
     ],
 )
 def test_what_no_mean_can_be_of_is_refused(text: str, message: str) -> None:
     with pytest.raises(ApcError, match=message):
         apc.analyze(compiled(text))
-
-
-def test_a_sum_over_nobody_is_nothing() -> None:
-    alone = apc.analyze(compiled(text_of(Scene("sum", 1, kc=500.0))))
-    nobody = apc.analyze(compiled(text_of(Scene("mean", 2, kc=500.0, kt=0.0))))
-    # Without a network the frame is one tick of the force clock, an eighth of the other.
-    assert alone.frame_s == 0.001
-    assert alone.spectral_radius**8 == pytest.approx(nobody.spectral_radius, abs=1e-12)
 
 
 # ---- what is left out ----

@@ -155,19 +155,15 @@ def test_a_stiffness_of_exactly_zero_frees_what_it_held(
 ) -> None:
     users = () if alike else tuple({"device": mass} for mass in (0.1, 0.2, 0.15))
     scene = Scene(operator, users=users, **values)  # type: ignore[arg-type] # numbers
-    ways = ({}, {"method": "dense"}) if alike else ({}, {"method": "determinant"}, {"method": "krylov"})
-    for asked in ways:
-        try:
-            assert analyze(scene, **asked).rigid_modes == rigid
-        except apc.ApcError as error:
-            assert asked and error.mistakes[0].code == "E850"
+    methods = ["auto", "dense"] if alike or 1e-300 in values.values() else ["auto", "determinant"]
+    assert {analyze(scene, method=method).rigid_modes for method in methods} == {rigid}
 
 
 @pytest.mark.parametrize(
     ("values", "verdict", "rigid"),
     [
         ({"kt": 0.0, "bt": 0.0, "kc": 0.0}, "drifts", 6),
-        ({"kt": 0.0, "bt": 0.0}, "drifts", 3),
+        ({"kt": 0.0, "bt": 0.0, "bc": 2.0, "comp": Fraction(0)}, "drifts", 3),
         ({"kt": 0.0, "bt": 2.0, "bc": 2.0, "comp": Fraction(0)}, "drifts", 3),  # apart, the damper brakes
         # The late network brakes: K_eff ((T_n − T_c)/2 + T_d).
         ({"kt": 100.0, "bt": 2.0, "bc": 3.0}, "stable up to a common translation", 1),
