@@ -136,6 +136,7 @@ def test_conjugates_of_a_real_matrix_are_exact_and_the_upper_one_is_first() -> N
 LOOSE = Scene(device_damping=0.0, cube_damping=0.0)
 
 
+@pytest.mark.few(9)
 @pytest.mark.parametrize(
     ("values", "rigid"),
     [

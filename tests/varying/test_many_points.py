@@ -68,7 +68,8 @@ EVERY_SCENE = sorted(
 )
 
 
-@pytest.mark.parametrize("points", [2, pytest.param(6, marks=pytest.mark.whole)])
+@pytest.mark.few(24)
+@pytest.mark.parametrize("points", [2, 6])
 @pytest.mark.parametrize("path", EVERY_SCENE, ids=lambda path: path.stem)
 def test_every_point_is_as_an_analysis_of_its_own_says(path: Path, points: int) -> None:
     system = apc.compile(path)

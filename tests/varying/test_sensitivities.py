@@ -106,7 +106,8 @@ def changed(system: CompiledSystem, every: int) -> str:
     return ""
 
 
-@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.whole)])
+@pytest.mark.few(12)
+@pytest.mark.parametrize("every", [3, 1])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_row_says_what_setting_its_name_does(name: str, every: int) -> None:
     assert changed(shipped(name), every) == ""
