@@ -121,7 +121,8 @@ def test_files_and_tables_hold_the_rows_that_are_held_without_them(tmp_path: Pat
     held = small(jobs=1)
     for suffix in ("csv", "parquet"):
         found = small(out=tmp_path / f"r.{suffix}", jobs=1)
-        assert (found.verdicts, str(found)[-200:]) == (held.verdicts, str(held)[-200:])
+        assert found.verdicts == held.verdicts
+        assert str(found).splitlines()[1:] == str(held).splitlines()[1:]
         for heading, one, other in zip(held.headings, found.columns, held.columns, strict=True):
             assert one.dtype == other.dtype
             np.testing.assert_array_equal(one, other)
