@@ -47,7 +47,7 @@ from apc.loop.start import Part, Play, play_all
 from apc.network.recorded import describe
 from apc.present.loop import ticks_text
 from apc.processes import Workers, digest_of
-from tests.fuzz.arrays import recorded
+from tests.fuzz.models import recorded
 from tests.fuzz.packets import run_packets
 from tests.topologies import AVERAGE, replaced, told
 from tests.wire import HOUR, SOON, Other, Wire, loop_at, send_packets
