@@ -1,7 +1,7 @@
 # ruff: noqa: E501 -- scenes are written by long lines
 """Scenes that grow: more peers, different peers, kinds, equations, masses in a row.
 
-Takes: how many, and a folder for what stands beside a scene. Gives: `plain`, `lossy`, `flat`, `table`, `kinds`, `equations`, `row`.
+Takes: how many, and a folder for what stands beside a scene. Gives: `ring`, `plain`, `lossy`, `flat`, `table`, `kinds`, `equations`, `row`.
 Does not: load anything large, so that what measures whole processes can use it.
 """
 
@@ -16,6 +16,11 @@ AVERAGE = (SCENES / "three-users-average.yaml").read_text(encoding="utf-8")
 def flat(peers: int, folder: Path) -> str:
     """Return a scene of equal peers."""
     return _replaced(("count: 3", f"count: {peers}"))
+
+
+def ring(peers: int, folder: Path) -> str:
+    """Return a scene of equal peers in a ring."""
+    return _replaced(("count: 3", f"count: {peers}"), ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
 
 
 def plain(number: int, folder: Path) -> str:

@@ -1,8 +1,7 @@
-# ruff: noqa: E501 -- tables are printed by long lines
 """The map of the paper's scene over K_C and K_T, every verdict against 60 digits: `python -m tests.bench.map`.
 
 Four maps: P (no damping in the couplers) and PD (2 N·s/m), mean and mesh; then the points at the boundary of
-each column times 1 ± 1e-9; before them 10,000 points at once beside a batched program by hand. Wrong verdicts must be none; an error beside its bound must be below 1.
+each column times 1 ± 1e-9. Wrong verdicts must be none; an error beside its bound must be below 1.
 """
 
 from __future__ import annotations
@@ -11,26 +10,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from statistics import median
 
 import flint
 import numpy as np
 
-from apc.analysis.analysis import Prepared, analyze, prepare
+import apc
 from apc.benchmark.timing import timed
-from apc.compiler.compiled import CompiledSystem
 from apc.eigen.balls import precision
-from apc.frame.names import Free
-from apc.frame.overrides import Override, apply
-from apc.threads import single_threaded
-from apc.vary.many import analyze_many
-from tests.bench.judge import Judge, parser_of
-from tests.bench.naive_region import modal_radii
-from tests.bench.paper_scene import CUBE_DAMPING, DEVICE_DAMPING, DEVICE_MASS, SHARED_MASS, TICKS, USERS
+from tests.bench.by_hand import CUBE_DAMPING, DEVICE_DAMPING, DEVICE_MASS, SHARED_MASS, TICKS, USERS
+from tests.bench.judge import Judge, judged, parser_of
 from tests.bruteforce import Scene, as_ball, frame_matrix
 from tests.topologies import AVERAGE, MESH, compiled
 
-SIDE = 100  # of the map that is made at once
 BITS = 200  # of precision: 60 decimal digits
 CERTAIN = 1e-40  # so far, and no more, the truth itself may be off (`check_truth`)
 MOST_K_C, MOST_K_T = 5000.0, 1500.0  # the limits of the scene's own study; with dampers, twice that holds
@@ -108,143 +99,67 @@ def check_truth() -> None:
         assert float(abs(radius - truth(mesh, 1500.0, 800.0, 2.0).radius)) < CERTAIN
 
 
-@dataclass
-class Tally:
-    """What came out of some points."""
-
-    points: int = 0
-    wrong: int = 0
-    undecided: int = 0
-    proved: int = 0
-    seconds: float = 0.0
-    radius: float = 0.0  # the worst error of the radius beside its bound
-    mode: float = 0.0  # and of an eigenvalue
-    bound: float = 0.0
-
-    def add(self, system: CompiledSystem, shared: Prepared, values: dict[str, float], known: Truth) -> None:
-        """Analyse a point and compare."""
-        drawn = [Override(Free(name), Fraction(value)) for name, value in values.items()]
-        taken, found = timed(lambda: analyze(apply(system, drawn), prepared=shared))
-        self.seconds += taken
-        self.points += 1
-        self.undecided += found.stable is None
-        self.wrong += found.stable is not None and found.stable != bool(known.radius < 1)
-        self.proved += bool(found.proof)
-        off = float(abs(known.radius - flint.arb(found.spectral_radius)).mid())
-        self.radius = max(self.radius, _beside(off, found.spectral_radius_error))
-        self.bound = max(self.bound, found.spectral_radius_error)
-        for mode in found.modes:
+def compared(judge: Judge, name: str, mesh: bool, damping: float, points: list[tuple[float, float]]) -> None:
+    """Compare the analyses of some points with their truth, all eigenvalues of the first fifty too."""
+    system = compiled(MESH if mesh else AVERAGE)
+    k_c, k_t = np.array(points).T
+    dampers = {f"{one}.damping": f"{damping} N*s/m" for one in ("contact", "coordination")}
+    system = apc.set_parameters(system, dampers)
+    given = {"contact.stiffness": k_c, "coordination.stiffness": k_t}
+    seconds, results = timed(lambda: apc.analyze_many(system, given))
+    truths = [truth(mesh, x, y, damping) for x, y in points]
+    off = [abs(one.radius - flint.arb(rho)).mid() for one, rho in zip(truths, results.spectral_radius, strict=True)]
+    ratio = max(float(one) / bound for one, bound in zip(off, results.spectral_radius_error, strict=True))
+    wrong = sum(ours != bool(one.radius < 1) for ours, one in zip(results.stable, truths, strict=True))
+    worst = 0.0
+    for (x, y), known in list(zip(points, truths, strict=True))[:: max(1, len(points) // 50)]:
+        values = {"contact.stiffness": f"{x!r} N/m", "coordination.stiffness": f"{y!r} N/m"}
+        for mode in apc.analyze(system, set=values).modes:
             place = flint.acb(mode.eigenvalue.real, mode.eigenvalue.imag)
             distance = min(float(abs(place - value).mid()) for value in known.values)
-            self.mode = max(self.mode, _beside(distance, mode.error))
-
-    def __str__(self) -> str:
-        each = 1e3 * self.seconds / max(self.points, 1)
-        return (
-            f"{self.points:6} points  {self.wrong} wrong  {self.undecided} undecided  {self.proved} proved in balls  "
-            f"error/bound {self.radius:.2g} (radius) {self.mode:.2g} (modes)  largest bound {self.bound:.1e}  {each:.1f} ms a point"
-        )
-
-
-def _beside(error: float, bound: float) -> float:
-    """Return error ÷ bound; a bound that says nothing is as bad as one that does not hold."""
-    if not math.isfinite(bound):
-        return math.inf
-    if error <= CERTAIN:  # of an eigenvalue that is exactly 0 the analysis knows it, the truth 100 digits
-        return 0.0
-    return error / bound if bound else math.inf
-
-
-def one_map(text: str, mesh: bool, damping: float, side: int) -> tuple[Tally, Tally]:
-    """Compare a map of side² points, and the points next to its boundary."""
-    system = compiled(text)
-    shared = prepare(system)
-    inner, edge = Tally(), Tally()
-    grid = (np.arange(side) + 1) / side
-    most = 2 * MOST_K_T if damping else MOST_K_T
-
-    def values(k_c: float, k_t: float) -> dict[str, float]:
-        return {
-            "contact.stiffness": k_c,
-            "coordination.stiffness": k_t,
-            "contact.damping": damping,
-            "coordination.damping": damping,
-        }
-
-    for k_c in (grid * MOST_K_C).tolist():
-        stable = []
-        for k_t in (grid * most).tolist():
-            known = truth(mesh, k_c, k_t, damping)
-            stable.append(bool(known.radius < 1))
-            inner.add(system, shared, values(k_c, k_t), known)
-        for place in np.flatnonzero(np.diff(stable)).tolist():
-            low, high = (float(grid[place + more] * most) for more in (0, 1))
-            while high - low > 1e-12 * high:
-                middle = (low + high) / 2
-                same = bool(truth(mesh, k_c, middle, damping).radius < 1) == stable[place]
-                low, high = (middle, high) if same else (low, middle)
-            for k_t in (low * (1 - 1e-9), low * (1 + 1e-9)):
-                edge.add(system, shared, values(k_c, k_t), truth(mesh, k_c, k_t, damping))
-    return inner, edge
-
-
-def at_once(judge: Judge, rounds: int) -> None:
-    """Compare 10,000 points at once with the batched modal program, error beside time."""
-    grid = np.linspace(10.0, 3000.0, SIDE)
-    k_c, k_t = (one.ravel() for one in np.meshgrid(grid, grid))
-    given = {"contact.stiffness": k_c, "coordination.stiffness": k_t}
-    system = compiled(AVERAGE)
-    times = []
-    for _ in range(rounds + 1):  # in turn, as the machine is not always as fast; the first is warm-up
-        ours, found = timed(lambda: analyze_many(system, given))
-        theirs, radii = timed(lambda: modal_radii(k_c, k_t))
-        times.append((ours, theirs))
-    ours, theirs = (median(one) for one in zip(*times[1:], strict=True))
-    some = np.random.default_rng(1).choice(len(k_c), 200, replace=False)
-    known = [float(truth(False, float(k_c[place]), float(k_t[place]), 0.0).radius) for place in some]
-    off, naive = (float(np.abs(one[some] - known).max()) for one in (found.spectral_radius, radii))
-    bound = float(found.spectral_radius_error.max())
-    beside = float((np.abs(found.spectral_radius[some] - known) / found.spectral_radius_error[some]).max())
-    wrong = int((found.stable != (radii < 1)).sum())
-    print(f"{len(k_c):,} points of the mean at once, K_C and K_T in 10 to 3000 N/m")
+            worst = max(worst, 0.0 if distance <= CERTAIN else distance / mode.error if mode.error else math.inf)
     print(
-        f"  apc.analyze_many      {1e3 * ours:7.0f} ms   error {off:.1e}, bound {bound:.1e}, proved verdicts, modes"
+        f"{name:<22} {len(points):6} points  {wrong} wrong  error/bound {ratio:.2g} (radius) {worst:.2g} (modes)  "
+        f"largest bound {results.spectral_radius_error.max():.1e}  {1e3 * seconds / len(points):.2f} ms a point",
+        flush=True,
     )
-    print(
-        f"  batched modal program {1e3 * theirs:7.0f} ms   error {naive:.1e}, no bound; verdicts that differ: {wrong}"
-    )
-    print(f"  ratio {ours / theirs:.2f}: {judge.in_time('many at once / modal program', ours / theirs, 1)}")
-    judge.within("many at once: error of the radius / bound", beside, 1)
-    judge.beside(
-        f"{len(k_c):,} points: verdict, radius, modes",
-        (ours, f"{off:.1e} ≤ {bound:.1e}"),
-        "NumPy, two modes, all points at once",
-        (theirs, f"{naive:.1e}"),
-    )
+    judge.right(f"{name}: {wrong} verdicts wrong or left open", not wrong)
+    judge.within(f"{name}: error of the radius / bound", ratio, 1)
+    judge.within(f"{name}: error of a mode / bound", worst, 1)
+
+
+def boundary(mesh: bool, damping: float, k_c: float, heights: list[float]) -> list[tuple[float, float]]:
+    """Return the points next to where the verdict changes over a value of K_C."""
+
+    def stable(k_t: float) -> bool:
+        return bool(truth(mesh, k_c, k_t, damping).radius < 1)
+
+    points = []
+    verdicts = [stable(one) for one in heights]
+    for place in np.flatnonzero(np.diff(verdicts)).tolist():
+        low, high = heights[place], heights[place + 1]
+        while high - low > 1e-12 * high:
+            middle = (low + high) / 2
+            low, high = (middle, high) if stable(middle) == verdicts[place] else (low, middle)
+        points += [(k_c, low * (1 - 1e-9)), (k_c, low * (1 + 1e-9))]
+    return points
 
 
 def main() -> None:
-    """Print one line a map."""
+    """Print two lines a map."""
     parser = parser_of("map", __doc__)
     parser.add_argument("--points", type=int, default=10_000, help="of all four maps together")
-    given = parser.parse_args()
-    side = max(2, math.isqrt(given.points // 4))
-    judge = Judge(given.strict)
-    with single_threaded(), precision(BITS):
+    with judged(parser) as (judge, given), precision(BITS):
+        side = max(2, math.isqrt((400 if given.quick else given.points) // 4))
         check_truth()
-        at_once(judge, 3 if given.points < 1000 else 9)
-        for text, mesh in ((AVERAGE, False), (MESH, True)):
+        for mesh in (False, True):
             for damping in (0.0, 2.0):
-                name = f"{'mesh' if mesh else 'mean'} {'PD' if damping else 'P '}"
-                inner, edge = one_map(text, mesh, damping, side)
-                print(f"{name}  {inner}")
-                print(f"  boundary·(1 ± 1e-9)  {edge}", flush=True)
-                for place, tally in ((name, inner), (f"{name} at the boundary", edge)):
-                    judge.right(f"{place}: {tally.wrong} verdicts wrong", not tally.wrong)
-                    judge.right(f"{place}: {tally.undecided} verdicts left open", not tally.undecided)
-                    judge.within(f"{place}: error of the radius / bound", tally.radius, 1)
-                    judge.within(f"{place}: error of a mode / bound", tally.mode, 1)
-    judge.end()
+                name = f"{'mesh' if mesh else 'mean'} {'PD' if damping else 'P'}"
+                across = (MOST_K_C * (np.arange(side) + 1) / side).tolist()
+                up = ((2 if damping else 1) * MOST_K_T * (np.arange(side) + 1) / side).tolist()
+                compared(judge, name, mesh, damping, [(x, y) for x in across for y in up])
+                edge = [one for x in across for one in boundary(mesh, damping, x, up)]
+                compared(judge, f"{name}, boundary", mesh, damping, edge)
 
 
 if __name__ == "__main__":
