@@ -18,13 +18,9 @@ from tests.bench.readme import BLOCK, ERROR, PAGES, ROOT, pictures, printed, who
 HELPERS = {  # not run by themselves
     "__init__",
     "__main__",
-    "naive_region",
-    "drake",
+    "by_hand",
     "growing",
-    "pathsim",
     "judge",
-    "paper_scene",
-    "contact_reference",
     "sensitivity_truth",
     "shapes",
     "losses",  # draws a picture of the README

@@ -250,6 +250,8 @@ def by_pathsim(seconds: float, tolerance: float | None) -> tuple[float, Floats]:
     blocks = [system, forces, scope, acting, due, computed, taken]
     asked = {} if tolerance is None else {"tolerance_lte_abs": tolerance, "tolerance_lte_rel": tolerance}
     simulation = Simulation(blocks, wires, dt=TICK / 2, Solver=RKDP54, log=False, **asked)
-    seconds_taken, _ = timed(partial(simulation.run, seconds + TICK / 4))  # past the last tick, however rounded
+    seconds_taken, _ = timed(
+        partial(simulation.run, seconds + TICK / 4)
+    )  # past the last tick, however rounded
     _, rows = scope.read()
     return seconds_taken, np.asarray(rows).T[: round(seconds / TICK) + 1]

@@ -143,7 +143,13 @@ def many(judge: Judge, rounds: int) -> None:
     wrong = f"; {int((results.stable != (naive < 1)).sum())} verdicts differ"
     rows = [
         Timed("apc", ours, float(off.max()), float(results.spectral_radius_error.max())),
-        Timed("NumPy, two modes, all points at once", theirs, float(np.abs(naive[some] - exact).max()), None, wrong),
+        Timed(
+            "NumPy, two modes, all points at once",
+            theirs,
+            float(np.abs(naive[some] - exact).max()),
+            None,
+            wrong,
+        ),
     ]
     title = f"{SIDE**2:,} points: verdict, radius, modes"
     judge.table(title, rows, most={rows[1].program: 1.0})

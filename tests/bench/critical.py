@@ -97,7 +97,11 @@ def of_scenes(judge: Judge, quick: bool) -> None:
         first, _ = timed(partial(apc.margins, system))
         seconds, _ = median_time(partial(apc.margins, system), 3)
         analysis, _ = median_time(partial(apc.analyze, system), 3)
-        rows = [Timed("apc", seconds), Timed("apc, the first time", first), Timed("apc, an analysis", analysis)]
+        rows = [
+            Timed("apc", seconds),
+            Timed("apc, the first time", first),
+            Timed("apc, an analysis", analysis),
+        ]
         judge.table(f"margins of {path.stem}", rows, most_s=MARGINS_S)
 
 

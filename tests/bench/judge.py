@@ -15,10 +15,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-import numpy as np
-
-from apc.threads import single_threaded
-
 # Two medians of one program on one machine differ by up to a quarter where others work beside it.
 NOISE = 1.25
 # The first line of the rows of other programs; they alone begin as it does.
@@ -135,7 +131,9 @@ class Judge:
                 words.append(f"target {time_of(most_s)} {self.in_time(work, one.seconds, most_s)}")
             if target := (most or {}).get(one.program):
                 ratio = ours.seconds / one.seconds
-                words.append(f"target {target:g} {self.in_time(f'{work}, beside {one.program}', ratio, target)}")
+                words.append(
+                    f"target {target:g} {self.in_time(f'{work}, beside {one.program}', ratio, target)}"
+                )
             print(" ".join(words))
             if not one.program.startswith("apc"):
                 theirs = one.seconds, one.told(unit)
@@ -190,6 +188,10 @@ def parser_of(name: str, about: str | None) -> argparse.ArgumentParser:
 @contextmanager
 def judged(parser: argparse.ArgumentParser) -> Iterator[tuple[Judge, argparse.Namespace]]:
     """Give a judge and what the command line says, one core's worth of threads, and end the program."""
+    import numpy as np  # not by who measures processes: one begins as a copy
+
+    from apc.threads import single_threaded
+
     given = parser.parse_args()
     judge = Judge(given.strict)
     with single_threaded(), np.errstate(all="ignore"):

@@ -6,10 +6,11 @@ each column times 1 ± 1e-9. Wrong verdicts must be none; an error beside its bo
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 import flint
 import numpy as np
@@ -25,7 +26,6 @@ from tests.topologies import AVERAGE, MESH, compiled
 BITS = 200  # of precision: 60 decimal digits
 CERTAIN = 1e-40  # so far, and no more, the truth itself may be off (`check_truth`)
 MOST_K_C, MOST_K_T = 5000.0, 1500.0  # the limits of the scene's own study; with dampers, twice that holds
-MS = Fraction(1, 1000)
 DEVICE, CUBE = Fraction(DEVICE_MASS), Fraction(SHARED_MASS) / USERS  # the numbers a compiled scene holds
 
 
@@ -44,7 +44,7 @@ def truth(mesh: bool, k_c: float, k_t: float, damping: float) -> Truth:
     radius = flint.arb(0)
     for share, rigid in ((flint.arb(own), True), (-flint.arb(own) / 2, False)):
         matrix = _frame(own, share, flint.arb(k_c), flint.arb(k_t), flint.arb(damping))
-        found = flint.acb_mat(flint.arb_mat(matrix).mid()).eig(algorithm="approx")
+        found = flint.acb_mat(matrix.mid()).eig(algorithm="approx")
         found.sort(key=lambda value: float(abs(value - 1).mid()))
         values += found
         assert not rigid or float(abs(found[0] - 1).mid()) < CERTAIN
@@ -52,40 +52,32 @@ def truth(mesh: bool, k_c: float, k_t: float, damping: float) -> Truth:
     return Truth(values, radius)
 
 
-def _frame(
-    own: int, share: flint.arb, k_c: flint.arb, k_t: flint.arb, damping: flint.arb
-) -> list[list[flint.arb]]:
-    """Return one user's frame over (x, v, x_O, v_O, F_C, F_T, packet x_O, packet v_O), as rows."""
-    steps = [_step(DEVICE, DEVICE_DAMPING), _step(CUBE, CUBE_DAMPING)]
-    columns = []
+@functools.cache
+def _step() -> Any:
+    """Return e^(A T) (6, 6) of a tick, over (x, v, x_O, v_O, F_C, F_T) with the forces held."""
+    device, cube, zero = Fraction(DEVICE_DAMPING) / DEVICE, Fraction(CUBE_DAMPING) / CUBE, Fraction(0)
+    rates = [[zero] * 6 for _ in range(6)]
+    rates[0][1] = rates[2][3] = Fraction(1)
+    rates[1][1], rates[1][4] = -device, -1 / DEVICE
+    rates[3][3:6] = -cube, 1 / CUBE, -1 / CUBE
+    return flint.arb_mat(6, 6, [as_ball(one / 1000) for row in rates for one in row]).exp()
+
+
+def _frame(own: int, share: Any, k_c: Any, k_t: Any, damping: Any) -> Any:
+    """Return one user's frame over (x, v, x_O, v_O, F_C, F_T, packet x_O, packet v_O)."""
+    tick, step = flint.arb_mat(8, 8), _step()
+    for row in range(4):
+        for column in range(6):
+            tick[row, column] = step[row, column]
+    for column, value in enumerate((k_c, damping, -k_c, -damping)):
+        tick[4, column] = value
+    for column, value in enumerate((own * k_t, own * damping)):
+        tick[5, 2 + column], tick[5, 6 + column] = value, -share * value / own
+        tick[6 + column, 6 + column] = flint.arb(1)
+    frame = tick**TICKS
     for column in range(8):
-        x, v, x_o, v_o, f_c, f_t, p_x, p_v = (flint.arb(int(column == row)) for row in range(8))
-        sent = x_o, v_o
-        heard = share * (k_t * p_x + damping * p_v)
-        for _ in range(TICKS):
-            contact = k_c * (x - x_o) + damping * (v - v_o)
-            pull = own * (k_t * x_o + damping * v_o) - heard
-            x, v = _coast(steps[0], x, v, -f_c)
-            x_o, v_o = _coast(steps[1], x_o, v_o, f_c - f_t)
-            f_c, f_t = contact, pull
-        columns.append((x, v, x_o, v_o, f_c, f_t, *sent))
-    return [list(row) for row in zip(*columns, strict=True)]
-
-
-def _step(kilograms: Fraction, damping: float) -> tuple[flint.arb, ...]:
-    """Return what of x and v a millisecond leaves and what a force adds to them."""
-    mass, t = as_ball(kilograms), as_ball(MS)
-    b = flint.arb(damping)
-    decay = (-b * t / mass).exp()
-    rise = (1 - decay) / b  # ∫₀ᵗ e^(−b s/m)/m ds
-    return decay, rise, mass * rise, (t - mass * rise) / b
-
-
-def _coast(
-    step: Sequence[flint.arb], x: flint.arb, v: flint.arb, force: flint.arb
-) -> tuple[flint.arb, flint.arb]:
-    decay, rise, carried, pushed = step
-    return x + carried * v + pushed * force, decay * v + rise * force
+        frame[6, column], frame[7, column] = flint.arb(column == 2), flint.arb(column == 3)
+    return frame
 
 
 def check_truth() -> None:
@@ -108,7 +100,10 @@ def compared(judge: Judge, name: str, mesh: bool, damping: float, points: list[t
     given = {"contact.stiffness": k_c, "coordination.stiffness": k_t}
     seconds, results = timed(lambda: apc.analyze_many(system, given))
     truths = [truth(mesh, x, y, damping) for x, y in points]
-    off = [abs(one.radius - flint.arb(rho)).mid() for one, rho in zip(truths, results.spectral_radius, strict=True)]
+    off = [
+        abs(one.radius - flint.arb(rho)).mid()
+        for one, rho in zip(truths, results.spectral_radius, strict=True)
+    ]
     ratio = max(float(one) / bound for one, bound in zip(off, results.spectral_radius_error, strict=True))
     wrong = sum(ours != bool(one.radius < 1) for ours, one in zip(results.stable, truths, strict=True))
     worst = 0.0
@@ -117,7 +112,9 @@ def compared(judge: Judge, name: str, mesh: bool, damping: float, points: list[t
         for mode in apc.analyze(system, set=values).modes:
             place = flint.acb(mode.eigenvalue.real, mode.eigenvalue.imag)
             distance = min(float(abs(place - value).mid()) for value in known.values)
-            worst = max(worst, 0.0 if distance <= CERTAIN else distance / mode.error if mode.error else math.inf)
+            worst = max(
+                worst, 0.0 if distance <= CERTAIN else distance / mode.error if mode.error else math.inf
+            )
     print(
         f"{name:<22} {len(points):6} points  {wrong} wrong  error/bound {ratio:.2g} (radius) {worst:.2g} (modes)  "
         f"largest bound {results.spectral_radius_error.max():.1e}  {1e3 * seconds / len(points):.2f} ms a point",

@@ -140,7 +140,9 @@ def growth(judge: Judge, folder: Path, growing: Growing, quick: bool) -> None:
         (_, first, size, _), (_, second, other, said) = (
             once(f"-m apc {one}", folder, scene) for one in ("compile --force scene.yaml", asked)
         )
-        radius = next((line.split("radius")[1] for line in said.splitlines() if "spectral radius" in line), "")
+        radius = next(
+            (line.split("radius")[1] for line in said.splitlines() if "spectral radius" in line), ""
+        )
         rows.append((first, second))
         print(f"{number:>16}  {first:6.2f} s {size:4.0f} MiB  {second:6.2f} s {other:4.0f} MiB  {radius}")
     for place, name in enumerate(("compile", command.split()[0])):

@@ -65,11 +65,20 @@ def paper(judge: Judge, quick: bool) -> None:
     count = 30 if quick else COUNT
     taken, stable = timed(partial(stable_grid, LOW, HIGH, count))
     truth = curves.contains(*np.meshgrid(*[np.linspace(LOW, HIGH, count)] * 2))
-    obvious, modes = f"obvious program, {COUNT} × {COUNT} points", f"two modes at once, {COUNT} × {COUNT} points"
+    obvious, modes = (
+        f"obvious program, {COUNT} × {COUNT} points",
+        f"two modes at once, {COUNT} × {COUNT} points",
+    )
     programs = [
         Timed("apc", exact, true_error(curves, 40 if quick else 7), curves.curves[0].error),
         Timed("apc, the first time", first),
-        Timed(obvious, taken * (COUNT / count) ** 2, None, None, f"{np.sum(truth != stable)} of {count**2} points wrong"),
+        Timed(
+            obvious,
+            taken * (COUNT / count) ** 2,
+            None,
+            None,
+            f"{np.sum(truth != stable)} of {count**2} points wrong",
+        ),
         Timed(modes, at_once, None, None, f"{missed} of {COUNT**2} points wrong"),
     ]
     title = f"boundary curves of K_C, K_T, {LOW:.0f} to {HIGH:.0f} N/m"

@@ -1,8 +1,6 @@
-# ruff: noqa: E501 -- scenes are written by long lines
 """Sensitivities and frequencies of random scenes against 320-bit arithmetic.
 
-`run` draws scenes with weights on graphs, groups with numbers of their own, several clocks, couplers that are
-linearized where they start, stars, and no clocks at all; `check_sensitivities` and `check_frequencies` serve any
+`run` draws scenes of the built-in library (`bench.shapes`); `check_sensitivities` and `check_frequencies` serve any
 scene. The truth comes from the compiled functions alone, event by event (see `bench.events`): derivatives from
 frame matrices on either side of a value, frequencies from following each mode through a frame.
 """
@@ -34,6 +32,7 @@ from tests.fifty_digits.truth import (
     _to_state,
     classes_of,
 )
+from tests.bench.shapes import PARTS, draw_shape
 from tests.topologies import compiled
 
 BITS = 320
@@ -63,53 +62,10 @@ FADED = 1e-9
 
 
 def scene(generator: random.Random) -> str:
-    """Return a topology at random, in which something may be unstable and nothing is refused."""
-    pick, number = generator.choice, lambda low, high: f"{10 ** generator.uniform(low, high):.4g}"
-    kind = pick(["plain", "plain", "groups", "groups", "star", "arcs", "still", "contact"])
-    tick, ratio = pick(["1 ms", "0.5 ms", "2 ms"]), pick(["1 ms", "4 ms", "8 ms", "2.5 ms"])
-    delay, late = pick(["0 s", "1 ms", "1/3 ms"]), pick(["0 s", "1 ms", "8 ms", "7/3 ms"])
-    masses = (
-        f"  device: {{mass: {number(-1.5, 0)} kg, damping: {number(-1, 1)} N*s/m}}\n"
-        f"  cube: {{mass: {number(-1, 0.5)} kg, damping: {number(-1, 1)} N*s/m, shared: true}}\n"
-    )
-    if kind == "still":  # no clocks: nothing is sampled
-        return (
-            f"topology: still\npeers: {{user: {{count: 1}}}}\nmasses:\n{masses}couplers:\n"
-            f"  s: {{type: SpringDamper, a: device, b: cube, stiffness: {number(-2, 3)} N/m, damping: {number(-2, 0)} N*s/m}}\n"
-            f"  t: {{type: SpringDamper, a: cube, b: ground, stiffness: {number(-2, 3)} N/m, damping: {number(-2, 0)} N*s/m}}\n"
-        )
-    groups, graph = f"user: {{count: {generator.randint(2, 4)}}}", ""
-    if kind in ("groups", "contact"):
-        own = f"contact.stiffness: {number(1, 3)} N/m, device.mass: {number(-1.5, 0)} kg"
-        groups = f"a: {{count: {generator.randint(1, 2)}}}\n  b: {{count: {generator.randint(1, 2)}, set: {{{own}}}}}"
-    if kind == "star":
-        groups, graph = (
-            f"hub: {{count: 1, set: {{device.mass: {number(-1, 0)} kg}}}}\n  tip: {{count: 2}}",
-            ", graph: star",
-        )
-    if kind == "arcs":
-        groups = "user: {count: 3}"
-        arcs = ", ".join(f"[{i}, {j}, {pick([0.5, 1, 2])}]" for i, j in ((1, 2), (2, 1), (2, 3), (3, 1)))
-        graph = f", graph: {{arcs: [{arcs}]}}"
-    contact = f"{{type: SampledSpringDamper, a: device, b: cube, stiffness: {number(1, 3)} N/m, damping: {number(-2, 0.3)} N*s/m, clock: haptic, delay: {delay}}}"
-    if kind == "contact":  # a wall that pushes: linear where it is touched or left
-        contact = f"{{type: OneSidedContact, a: device, b: cube, half_width: 1 mm, stiffness: {number(1, 3)} N/m, damping: {number(-2, 0)} N*s/m, clock: haptic, delay: {delay}}}"
-    coupling = pick(["AveragePosition", "FullMesh"])
-    more = pick(
-        [
-            "",
-            f"  arm: {{type: SpringDamperArm, flange: device, stiffness: {number(0, 2)} N/m, damping: 1 N*s/m}}\n",
-        ]
-    )
-    arm = f"hands:\n{more}" if more else ""
-    fast = f"  link: {{type: SpringDamper, a: device, b: cube, stiffness: {number(2, 5)} N/m, damping: {number(-2, 0)} N*s/m}}\n"
-    fast = fast if generator.random() < 0.3 else ""
-    return (
-        f"topology: drawn\nclocks: {{haptic: {tick}, network: {ratio}, slow: {{period: {ratio}, phase: 0.25 ms}}}}\npeers:\n  {groups}\n"
-        f"masses:\n{masses}couplers:\n  contact: {contact}\n{fast}"
-        f"  coordination: {{type: {coupling}, object: cube, stiffness: {number(1, 2.7)} N/m, damping: {number(-2, 0)} N*s/m, clock: {pick(['haptic', 'slow'])}, delay: {delay}, link: lan}}\n"
-        f"links:\n  lan: {{clock: network, delay: {late}{graph}}}\n{arm}"
-    )
+    """Return a topology of the built-in library at random, in which something may be unstable."""
+    own = tuple(f"type: {name}" for name in PARTS)
+    texts = (draw_shape(generator).text for _ in itertools.count())
+    return next(text for text in texts if not any(name in text for name in own))
 
 
 def check_sensitivities(

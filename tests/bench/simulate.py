@@ -50,7 +50,12 @@ def speed(judge: Judge) -> None:
     size = np.abs(by_hand[:, :, :4]).max(axis=(0, 1))
     others = [
         Timed("NumPy, a loop over ticks", loop),
-        Timed("C, the last states only", in_c, float((np.abs(end.T - by_hand[10_000, :, :4]) / size).max()), LINEAR),
+        Timed(
+            "C, the last states only",
+            in_c,
+            float((np.abs(end.T - by_hand[10_000, :, :4]) / size).max()),
+            LINEAR,
+        ),
     ]
     for name, jit, part, most_s in (("virtual machine", False, 0.8, None), ("machine code", True, 0.2, 0.01)):
         taken, rows = median_time(partial(rows_of, prepare(system, Settings(Fraction(10), jit=jit))), REPEATS)
@@ -65,7 +70,7 @@ def many_peers(judge: Judge, number: int) -> None:
     seconds = Fraction(frames * TICKS, 1000)
     count = ("{count: 3}", f"{{count: {number}, set: {{device.x: {START} m}}}}")
     text = replaced(AVERAGE, count, ("0.6 kg", f"{CUBE_MASS!r} kg"), (", shared: true", ""))
-    preparing, ready = waited(partial(prepare, compiled(text), Settings(seconds), signals=["user[1].*"]))
+    ready = prepare(compiled(text), Settings(seconds), signals=["user[1].*"])
     c_loop(number, 1, number)  # compiled
     by_hand, states = median_time(partial(c_loop, number, frames, number), REPEATS)
     taken, rows = median_time(partial(rows_of, ready), REPEATS)
@@ -74,7 +79,6 @@ def many_peers(judge: Judge, number: int) -> None:
     programs = [
         Timed("apc", taken, error, LINEAR),
         Timed("C, a frame of a peer in registers", by_hand),
-        Timed("apc, preparing", preparing),
         Timed("time itself", float(seconds)),
     ]
     judge.table(f"{number:,} equal peers, {frames * TICKS} ticks", programs, most={programs[1].program: 3.0})
@@ -116,7 +120,9 @@ def many_runs(judge: Judge) -> None:
     by_hand, _ = median_time(partial(_draw_and_play, ticks, starts), 3)
     law = channel_law(system, system.links[0], Fraction(8, 1000))
     pairs = [(i, j) for i in range(USERS) for j in range(USERS)]
-    delays = [PacketSource(law, "lan", pairs, seed=SEED, run=run).take(ticks // TICKS + 1) for run in range(FEW)]
+    delays = [
+        PacketSource(law, "lan", pairs, seed=SEED, run=run).take(ticks // TICKS + 1) for run in range(FEW)
+    ]
     lost = np.isinf(np.array(delays)).reshape(FEW, USERS, USERS, -1).transpose(3, 0, 1, 2)
     theirs = np.array(numpy_runs(lost, ticks, starts)[1:])
     same = np.array([(one.largest_force, one.copies_apart) for one in ours.runs[:FEW]], np.float64).T
