@@ -21,6 +21,7 @@ HELPERS = {  # not run by themselves
     "by_hand",
     "growing",
     "judge",
+    "map",
     "sensitivity_truth",
     "shapes",
     "losses",  # draws a picture of the README
@@ -76,14 +77,14 @@ def test_what_a_program_says_on_stderr_is_kept_beside_its_output(monkeypatch: py
 
 def test_a_part_that_fails_fails_the_page(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def ran(part: Part, *_: object) -> tuple[str, list[str], int]:
-        return f"## {part.title}\n", [], int(part.name == "map")
+        return f"## {part.title}\n", [], int(part.name == "hands")
 
     monkeypatch.setattr("tests.bench.__main__.PAGE", tmp_path / "README.md")
     monkeypatch.setattr("tests.bench.__main__.run", ran)
     monkeypatch.setattr("sys.argv", ["bench", "--only", "hard"])
     main()
     monkeypatch.setattr("sys.argv", ["bench"])
-    with pytest.raises(SystemExit, match="failed: map"):
+    with pytest.raises(SystemExit, match="failed: hands"):
         main()
 
 
@@ -108,12 +109,12 @@ def test_the_first_table_is_made_of_the_rows_of_the_parts_and_keeps_those_not_ru
         return [line for line in found[BESIDE].splitlines() if "by hand" in line]
 
     row = "| {} | {} | 1e-9 | by hand | 2 s | – | {} | {} |"
-    first = played(0.5, "region", "map")
+    first = played(0.5, "region", "hands")
     assert first == [
         row.format("region", "500 ms", "0.25", "Regions"),
-        row.format("map", "500 ms", "0.25", "The paper's map"),
+        row.format("hands", "500 ms", "0.25", "Hands"),
     ]
-    assert played(4.0, "map") == [first[0], row.format("map", "4 s", "2", "The paper's map")]
+    assert played(4.0, "hands") == [first[0], row.format("hands", "4 s", "2", "Hands")]
 
 
 def test_every_part_with_targets_knows_strict() -> None:

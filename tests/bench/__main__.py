@@ -58,7 +58,6 @@ TITLES = {
     "region": "Regions",
     "network": "Unreliable networks",
     "hands": "Hands",
-    "map": "The paper's map",
     "sweep": "Sweeps",
 }
 PARTS = (

@@ -170,34 +170,6 @@ def numpy_loop(ticks: int) -> Floats:
     return rows
 
 
-def numpy_runs(lost: NDArray[np.bool_], ticks: int, starts: Floats) -> tuple[Floats, Floats, Floats]:
-    """Play runs of three users side by side in NumPy; `lost` is (frames, runs, senders, receivers).
-
-    Returns
-    -------
-    The positions (ticks, runs, users, 2), largest forces and last distances of the cubes of each run.
-    """
-    step, runs = moves().T, lost.shape[1]
-    state = np.zeros((runs, USERS, 6))  # the forces that act are the last two
-    state[..., 0] = state[..., 2] = starts
-    held = np.repeat(state[:, :, None, 2], USERS, axis=2)  # (runs, senders, receivers)
-    others, sent = 1.0 - np.eye(USERS), held.copy()
-    rows, largest = np.empty((ticks, runs, USERS, 2)), np.zeros((runs, USERS, 2))
-    force = np.zeros((runs, USERS, 2))
-    for k in range(ticks):
-        rows[k] = state[..., [0, 2]]
-        np.maximum(largest, np.abs(force), out=largest)
-        if k % TICKS == 0:
-            if k:
-                held = np.where(lost[k // TICKS - 1], held, sent)
-            sent = np.repeat(state[:, :, None, 2], USERS, axis=2)
-            heard = (held * others).sum(axis=1) / (USERS - 1)
-        state[..., 4:] = force
-        force = np.stack([K_C * (state[..., 0] - state[..., 2]), K_T * (state[..., 2] - heard)], axis=-1)
-        state[..., :4] = state @ step
-    return rows, largest.max(axis=(1, 2)), np.ptp(rows[-1, :, :, 1], axis=1)
-
-
 def c_loop(number: int, frames: int, moved: int) -> Floats:
     """Play equal peers in C, the first so many moved; return their states (4, number) after so many frames."""
     names = ("a", "b", "c", "d", "f_now", "g_now")

@@ -1,4 +1,4 @@
-"""What a person waits for: whole processes, their memory, growth, imports: `python -m tests.bench.process`.
+"""What a person waits for: whole processes, their memory, growth: `python -m tests.bench.process`.
 
 A time is that of a processor, from the start of the process to its end, after one that compiles Python's own
 files; memory is the most it held. This program loads nothing large itself, as a process begins as a copy.
@@ -9,14 +9,12 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import re
 import resource
 import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -65,8 +63,6 @@ GROWTH: tuple[Growing, ...] = (
     ),
     ("runs", (10, 100, 1000), lossy, "simulate scene.apc --duration 1s --runs @", None),
 )
-MOST_PACKAGES = 8  # listed
-LINE = re.compile(r"import time:\s+(\d+) \|\s+\d+ \|\s+(\S+)")
 
 
 def _environment(folder: Path) -> dict[str, str]:
@@ -94,21 +90,8 @@ def once(words: str, folder: Path, where: Path | None = None) -> tuple[float, fl
     return seconds, used.ru_utime + used.ru_stime, used.ru_maxrss / scale, printed.decode()
 
 
-def imports(words: str, folder: Path) -> str:
-    """Return what importing the packages takes, those that take longest by name, without what is below."""
-    command = [sys.executable, "-X", "importtime", *words.split()]
-    environment = _environment(folder)
-    ran = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)
-    taken: Counter[str] = Counter()
-    for match in map(LINE.match, ran.stderr.splitlines()):
-        if match:
-            taken[match[2].partition(".")[0]] += int(match[1])
-    listed = ", ".join(f"{one} {size / 1e3:.0f} ms" for one, size in taken.most_common(MOST_PACKAGES))
-    return f"{sum(taken.values()) / 1e3:.0f} ms in all\n  {listed}"
-
-
 def commands(judge: Judge, folder: Path, runs: int) -> None:
-    """Print a line a command, and what each imports."""
+    """Print a line a command."""
     for scene in (SCENE, STAR):
         shutil.copy(SCENES / f"{scene}.yaml", folder)
     print(f"{'process':<12} {'median':>9} {'spread':>9} {'processor':>10} {'memory':>9}   target")
@@ -119,8 +102,6 @@ def commands(judge: Judge, folder: Path, runs: int) -> None:
         target = "" if most is None else f"   {most:g} s {judge.in_time(title, used, most)}"
         spread = f"{statistics.median(times):7.3f} s {spread_of(list(times)):7.3f} s"
         print(f"{title:<12} {spread} {used:8.3f} s {max(memory):5.0f} MiB{target}")
-    for title, words, _ in COMMANDS[1:]:
-        print(f"\nimports of {title}: {imports(words, folder)}")
 
 
 def growth(judge: Judge, folder: Path, growing: Growing, quick: bool) -> None:

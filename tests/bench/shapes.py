@@ -219,7 +219,7 @@ SHAPES: tuple[Shape, ...] = (
     Shape("topology: users\n$clocks\npeers: $groups\n$bodies$contact$coordination$lan$arm", _WHOLE),
     Shape("topology: users\n$clocks\npeers: $groups\n$bodies$contact$coordination$lan", _WHOLE),
     Shape(
-        "topology: weights\n$clocks\npeers: {user: {count: 3}}\n$bodies$contact$coordination"
+        "topology: weights\n$clocks\npeers: {user: {count: 3}}\n$bodies$contact$coordination\n"
         "links: {lan: {clock: network, delay: $late, graph: {GRAPH}}}\n$arm",
         _WHOLE,
     ),
@@ -245,7 +245,7 @@ SHAPES: tuple[Shape, ...] = (
     ),
     Shape(
         "topology: clocks\nclocks: {haptic: 1 ms, slow: $slow, network: {period: 4 ms$phase}}\n"
-        "peers: {near: {count: 2}, far: {count: 1, set: $far}}\n$bodies$contact$coordination"
+        "peers: {near: {count: 2}, far: {count: 1, set: $far}}\n$bodies$contact$coordination\n"
         "links: {lan: {clock: network, delay: $late, delays: {far: {near: 3.3 ms}}}}\n$arm",
         _WHOLE,
     ),

@@ -1,36 +1,28 @@
 """How right and how fast `apc simulate` is: `python -m tests.bench.simulate`.
 
-A time is the median of a few runs in a warm process, after compiling; beside it stand programs written by hand
-for this one scene, in NumPy and C (`tests.bench.by_hand`), or time itself.
+A time is the median of a few runs in a warm process, after compiling; beside it stand programs written by
+hand for this one scene, in NumPy and C (`tests.bench.by_hand`), or time itself.
 """
 
 from __future__ import annotations
 
-import math
 from fractions import Fraction
 from functools import partial
 
 import numpy as np
 
 from apc.benchmark.timing import median_time, waited
-from apc.network.channel import PacketSource, channel_law
-from apc.simulation.ensemble import play_many
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import simulate
-from tests.bench.by_hand import CUBE_MASS, START, TICKS, USERS, Floats, c_loop, numpy_loop, numpy_runs
+from tests.bench.by_hand import CUBE_MASS, START, TICKS, USERS, Floats, c_loop, numpy_loop
 from tests.bench.comparison import MOVED, rows_of
 from tests.bench.judge import Judge, Timed, judged, parser_of
-from tests.lossy import APART, LINK, STARTS
 from tests.topologies import AVERAGE, compiled, replaced
 
 REPEATS = 7
 # Relative, of 10 s: 10,000 ticks each round by 1e-16, which all in one direction are 1e-12.
 LINEAR = 1e-12
-# Of real time, for 300 peers on unreliable links, and how their time grows, which is as their ways do but for
-# what no longer fits the caches.
-MOST_LOSSY, MOST_EXPONENT = 1.0, 2.2
-RUNS, FEW, LOSS, SEED = 1000, 20, 0.05, 3
 STATES = ("device.x", "device.v", "cube.x", "cube.v")
 
 
@@ -84,60 +76,11 @@ def many_peers(judge: Judge, number: int) -> None:
     judge.table(f"{number:,} equal peers, {frames * TICKS} ticks", programs, most={programs[1].program: 3.0})
 
 
-def lossy(judge: Judge, numbers: list[int]) -> None:
-    """Peers that hear each other over ways that lose packets, each way by itself."""
-    print("\npeers on a complete graph of unreliable links, 5 % lost, up to 4 ms late or early")
-    times = []
-    for number in numbers:
-        seconds = Fraction(1) if number < 1000 else Fraction(1, 5)
-        moved = ("{count: 3}", f"{{count: {number}, set: {{device.x: 1 mm}}}}")
-        text = replaced(AVERAGE, moved, (LINK, f"{LINK[:-1]}, loss: 5 %, jitter: 4 ms}}"))
-        ready = prepare(compiled(text), Settings(seconds, seed=SEED), signals=["user[1].*"])
-        times.append(median_time(partial(rows_of, ready), 3)[0] / float(seconds))
-        kept = judge.in_time("300 lossy peers", times[-1], MOST_LOSSY) if number == 300 else ""
-        print(f"  {number:>7} peers   {times[-1]:8.3f} of real time   {kept}")
-    exponent = math.log(times[-1] / times[0]) / math.log(numbers[-1] / numbers[0])
-    print(f"  exponent {exponent:.2f}: {judge.in_time('lossy peers, exponent', exponent, MOST_EXPONENT, 1)}")
-
-
-def _draw_and_play(ticks: int, starts: Floats) -> Floats:
-    """Do all that the program by hand does: its own packets, the runs, when each settles."""
-    lost = np.random.default_rng(SEED).random((ticks // TICKS + 1, RUNS, USERS, USERS)) < LOSS
-    rows, _, _ = numpy_runs(lost, ticks, starts)
-    span = np.ptp(rows, axis=0).max(axis=1, keepdims=True)
-    outside = (np.abs(rows - rows[-1]) > 0.05 * span).any(axis=(2, 3))
-    return np.asarray(ticks - outside[::-1].argmax(axis=0), np.float64)
-
-
-def many_runs(judge: Judge) -> None:
-    """Many runs of a second of three users, each with packets of its own."""
-    ticks = 1001
-    starts = np.array([float(word.split()[0]) * 1e-3 for word in STARTS[1:-1].split(",")])
-    system = compiled(replaced(AVERAGE, APART, (LINK, f"{LINK[:-1]}, loss: 5 %}}")))
-    call = partial(play_many, system, Settings(Fraction(1), seed=SEED), runs=RUNS)
-    call()  # compiled
-    taken, ours = median_time(call, 5)
-    by_hand, _ = median_time(partial(_draw_and_play, ticks, starts), 3)
-    law = channel_law(system, system.links[0], Fraction(8, 1000))
-    pairs = [(i, j) for i in range(USERS) for j in range(USERS)]
-    delays = [
-        PacketSource(law, "lan", pairs, seed=SEED, run=run).take(ticks // TICKS + 1) for run in range(FEW)
-    ]
-    lost = np.isinf(np.array(delays)).reshape(FEW, USERS, USERS, -1).transpose(3, 0, 1, 2)
-    theirs = np.array(numpy_runs(lost, ticks, starts)[1:])
-    same = np.array([(one.largest_force, one.copies_apart) for one in ours.runs[:FEW]], np.float64).T
-    error = float((np.abs(same - theirs) / theirs.max(axis=1, keepdims=True)).max())
-    programs = [Timed("apc", taken, error, LINEAR), Timed("NumPy, all runs at once", by_hand)]
-    judge.table(f"{RUNS:,} runs of a lossy second", programs, most={programs[1].program: 1.5})
-
-
 def main() -> None:
     """Print everything."""
     with judged(parser_of("simulate", __doc__)) as (judge, given):
         speed(judge)
         many_peers(judge, 10**4 if given.quick else 10**5)
-        lossy(judge, [100, 300] if given.quick else [100, 300, 1000])
-        many_runs(judge)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Error against time: what each method gives for its work, on three scenes.
 
-Run it from the project's folder: `python -m tests.bench.work_precision [--plot FILE.png]`.
+Run it from the project's folder: `python -m tests.bench.work_precision`.
 
     stiff contact   a device bounces on a hard ball, by Hunt and Crossley's law; a contact lasts a millisecond
     soft contact    the same on foam; a contact lasts twenty
@@ -10,8 +10,8 @@ The error is that of the positions, relative to the way they go, against program
 those compared: fifty digits event by event (`tests.fifty_digits`) for the arm. For the contacts the equations
 are written here by hand (Hunt and Crossley, J. Applied Mechanics 42 (1975) 440) and solved by the explicit
 method of Dormand and Prince of order 8 at the tightest tolerance it takes, stopped and started anew at every
-tick, where the seat's force jumps, and at every beginning and end of a contact, where the push bends. The time
-is that of the run, without preparing it, as a part of real time.
+tick, where the seat's force jumps, and at every beginning and end of a contact, where the push bends. The
+time is that of the run, without preparing it, as a part of real time.
 """
 
 from __future__ import annotations
@@ -20,14 +20,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
 from apc.benchmark.timing import median_time
-from apc.optional import need
-from apc.present.pictures import write_figure
 from apc.simulation.settings import CVODES, EXACT, TOLERANCE, Method, Settings
 from apc.simulation.simulation import prepare
 from tests.bench.by_hand import TICK, Floats
@@ -68,19 +65,17 @@ CONTACTS = {"stiff contact": (3e6, 1e6), "soft contact": (2e4, 1e4)}  # N/m^(3/2
 ADDED_UP, ROUNDED = 1e3, 1e-12
 MS = Fraction(1, 1000)
 STEPS = (MS, MS / 2, MS / 5, MS / 10, MS / 20, MS / 50, MS / 100)
-METHODS = {
-    "semi-implicit Euler": [Method("semi-implicit", step=step) for step in STEPS],
-    "Runge and Kutta, order 4": [Method("rk4", step=step) for step in STEPS],
-    "CVODES": [Method("cvodes", tolerance=10.0**-n) for n in range(3, 13)],
-    "exact": [Method("exact")],
-}
-LOOKS = ("s:", "^--", "o-", "*")
+METHODS = [
+    *(Method("semi-implicit", step=step) for step in STEPS),
+    *(Method("rk4", step=step) for step in STEPS),
+    *(Method("cvodes", tolerance=10.0**-n) for n in range(3, 13)),
+    Method(EXACT),
+]
 RTOL, ATOL = 2.3e-14, 1e-17  # SciPy refuses relative tolerances below 100 roundings
 # m: so deep a contact begins, and so far off it ends, so that no crossing is met twice. Positions are rounded
 # by 1e-18, and the push at this depth is 1e-16 N at most.
 EDGE = 1e-15
 LOOSER = 100.0  # the run that shows how far the reference is certain
-Points = dict[Method, tuple[float, float]]  # the error relative to the range, the time as a part of real time
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +143,7 @@ def _until(
 
 
 def truth_of(scene: str) -> tuple[str, tuple[str, ...], Floats, float]:
-    """Return a scene's text, the names of its positions, these at every tick, and how far they are certain."""
+    """Return a scene's text, its positions' names, these at every tick, and how far they are certain."""
     if scene == "arm":
         course = exact_course(compiled(ARM), DURATION)
         assert not isinstance(course, str), course
@@ -162,10 +157,10 @@ def truth_of(scene: str) -> tuple[str, tuple[str, ...], Floats, float]:
     return text, ("user[1].device.x", "user[1].ball.x"), rows, float(doubt)
 
 
-def compared(judge: Judge, scene: str, methods: Sequence[Method]) -> Points:
-    """Return, print and judge what each method takes and is off by on a scene."""
+def compared(judge: Judge, scene: str, methods: Sequence[Method]) -> None:
+    """Print and judge what each method takes and is off by on a scene."""
     text, names, exact, doubt = truth_of(scene)
-    system, points = compiled(text), {}
+    system = compiled(text)
     print(f"\n{scene}, {float(DURATION):g} s, the truth certain to {doubt:.0e}")
     print(f"  {'method':<24}{'error / range':>14}{'of real time':>14}")
     for method in methods:
@@ -173,43 +168,21 @@ def compared(judge: Judge, scene: str, methods: Sequence[Method]) -> Points:
         seconds, rows = median_time(partial(rows_of, ready), REPEATS)
         places = [[signal.name for signal in ready.signals].index(name) for name in names]
         error = float((np.abs(rows[:, places] - exact) / np.ptp(exact, axis=0)).max())
-        points[method] = error, seconds / float(DURATION)
-        print(f"  {method!s:<24}{error:>14.1e}{points[method][1]:>14.5f}")
+        print(f"  {method!s:<24}{error:>14.1e}{seconds / float(DURATION):>14.5f}")
         if method.name == EXACT:
             judge.within(f"{scene}, {method}", error, ROUNDED)
         elif method == Method(CVODES, tolerance=TOLERANCE):
             judge.within(f"{scene}, {method}", error, ADDED_UP * TOLERANCE + doubt)
-    return points
-
-
-def draw(results: dict[str, Points], path: Path) -> None:
-    """Draw a panel a scene."""
-    figure = need("matplotlib.figure", "plot").Figure(figsize=(11, 4), layout="constrained")
-    axes = figure.subplots(1, len(results), sharey=True)
-    for ax, (scene, points) in zip(axes, results.items(), strict=True):
-        for (name, methods), look in zip(METHODS.items(), LOOKS, strict=True):
-            shown = np.array([points[one] for one in methods if one in points]).reshape(-1, 2)
-            ax.loglog(shown[:, 1], shown[:, 0], look, label=name, markersize=5)
-        ax.set(title=scene, xlabel="time of the run / simulated time")
-        ax.grid(visible=True, linewidth=0.4, alpha=0.5)
-    axes[0].set_ylabel("largest error of a position / its range")
-    handles, labels = axes[-1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
-    write_figure(figure, path)
 
 
 def main() -> None:
-    """Print the table, and draw it if a file is named."""
-    parser = parser_of("work_precision", __doc__)
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it: .png, .svg or .pdf")
-    with judged(parser) as (judge, given):
-        every = [method for methods in METHODS.values() for method in methods]
-        every = [Method(CVODES, tolerance=TOLERANCE), METHODS["exact"][0]] if given.quick else every
+    """Print a table a scene."""
+    with judged(parser_of("work_precision", __doc__)) as (judge, given):
+        every = [Method("cvodes", tolerance=TOLERANCE), Method(EXACT)] if given.quick else METHODS
         stepped = [method for method in every if method.name != EXACT]
-        scenes = {**dict.fromkeys(CONTACTS, stepped), "arm": every}
-        results = {scene: compared(judge, scene, methods) for scene, methods in scenes.items()}
-        if given.plot is not None:
-            draw(results, given.plot)
+        for scene in CONTACTS:
+            compared(judge, scene, stepped)
+        compared(judge, "arm", every)
 
 
 if __name__ == "__main__":
