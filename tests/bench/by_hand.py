@@ -171,7 +171,7 @@ def numpy_loop(ticks: int) -> Floats:
 
 
 def c_loop(number: int, frames: int, moved: int) -> Floats:
-    """Play equal peers in C, the first so many moved; return their states (4, number) after so many frames."""
+    """Play equal peers in C, the first so many moved; return their states (4, number) after the frames."""
     names = ("a", "b", "c", "d", "f_now", "g_now")
     sums = [
         " + ".join(f"{float(value)!r} * {name}" for value, name in zip(row, names, strict=True) if value)
@@ -193,9 +193,9 @@ def by_pathsim(seconds: float, tolerance: float | None) -> tuple[float, Floats]:
     """Play the scene in PathSim (pathsim.readthedocs.io); return the seconds and the states at every tick.
 
     It is given one linear plant of 12 states, a function of the forces, and sample-and-holds. It runs what
-    happens at one instant in the order in which the blocks are listed, each seeing what those before it did; the
-    hold that lets a force act is listed before the one that computes it, so that it takes the force of the tick
-    before. A packet is handed on half a millisecond before it is due.
+    happens at one instant in the order in which the blocks are listed, each seeing what those before it did;
+    the hold that lets a force act is listed before the one that computes it, so that it takes the force of the
+    tick before. A packet is handed on half a millisecond before it is due.
     """
     from pathsim import Connection, Simulation
     from pathsim.blocks import Function, SampleHold, Scope, StateSpace

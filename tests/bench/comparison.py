@@ -11,8 +11,8 @@ First the spectral radius of one frame, without the eigenvalue 1 of the common t
                     again joined by hand
 
 Where an eigenvalue has to be told from 1 by its distance, as by all but apc, it is the one nearest to 1. Then
-the states at every tick while three users' cube swings, by apc, prepared before, by a loop in NumPy whose steps
-are exact, and by PathSim. Last 10,000 points of the stiffnesses at once, beside a program of two modes.
+the states at every tick while three users' cube swings, by apc, prepared before, by a loop in NumPy whose
+steps are exact, and by PathSim. Last 10,000 points of the stiffnesses at once, beside a program of two modes.
 
 Times (of the processor) and errors (against fifty digits) stand side by side. A program that is not installed
 is left out.

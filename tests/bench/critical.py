@@ -32,7 +32,7 @@ def stable(scene: Scene) -> bool:
 
 
 def gain_by_hand(frames: int) -> float:
-    """Return the least critical stiffness where packets are so many frames late: steps of 10 %, then halvings."""
+    """Return the least critical stiffness with packets so many frames late: steps of 10 %, then halvings."""
 
     def scene(k_t: float) -> Scene:
         return Scene(kc=K_C, kt=k_t, comm=Fraction(frames, 125))

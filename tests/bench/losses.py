@@ -65,7 +65,7 @@ def growths(peers: int, law: str, coupler: str = "AveragePosition") -> Callable[
 
 
 def largest(at: Callable[[float], Growth], start: float) -> tuple[float, float]:
-    """Return the stiffness at which second moments begin to grow, and what bounds or orders leave open of it."""
+    """Return the stiffness at which second moments begin to grow, and what bounds leave open of it."""
 
     def height(stiffness: float) -> float:
         return math.log(at(stiffness).radius)

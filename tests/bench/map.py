@@ -29,7 +29,7 @@ class Truth:
 
 
 def truth(mesh: bool, k_c: float, k_t: float, damping: float) -> Truth:
-    """Return the truth at a point, by propagating one user who hears its own packets times an eigenvalue of W."""
+    """Return the truth at a point, by one user who hears its own packets times an eigenvalue of W."""
     own = 2 if mesh else 1
     values: list[flint.acb] = []
     radius = flint.arb(0)

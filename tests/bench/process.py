@@ -36,8 +36,8 @@ COMMANDS: tuple[tuple[str, str, float | None], ...] = (
     ("feel", f"-m apc feel {SCENE}.apc", None),
     ("region", f"-m apc region {SCENE}.apc", None),
 )
-# What grows: how many of it, the scene of so many, the command (`@` the number), and how many may take how many
-# seconds in `compile` and in the command beyond those of the smallest.
+# What grows: how many of it, the scene of so many, the command (`@` the number), and how many may take how
+# many seconds in `compile` and in the command beyond those of the smallest.
 Growing = tuple[str, tuple[int, ...], Callable[[int, Path], str], str, tuple[int, float, float] | None]
 GROWTH: tuple[Growing, ...] = (
     ("equations", (10, 30, 100, 300, 1000), equations, "analyze scene.apc", (1000, 1.0, 3.0)),

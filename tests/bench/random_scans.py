@@ -63,7 +63,7 @@ equations:
 
 @dataclass(frozen=True)
 class Draw:
-    """A scan: the scene as text and as numbers, what varies, and the numbers of a scene with another value."""
+    """A scan: the scene as text and as numbers, what varies, and how to have a scene of another value."""
 
     text: str
     scene: Scene
@@ -103,8 +103,11 @@ def draw(generator: random.Random) -> Draw:
     if name == "contact.setting":
         middle, high, present = decades(1, 3), decades(2.5, 4), decades(1, 3)
         width = float(f"{decades(-2, -0.5) * middle:.3g}")
-        words = f"high: {high!r} N/m, setting: {present!r}, middle: {middle!r}, width: {width!r}, low: {scene.kc!r}"
-        spring = ("type: SampledSpringDamper", "type: Bump"), (f"stiffness: {scene.kc!r}", words)
+        words = f"high: {high!r} N/m, setting: {present!r}, middle: {middle!r}, width: {width!r}"
+        spring = (
+            ("type: SampledSpringDamper", "type: Bump"),
+            (f"stiffness: {scene.kc!r}", f"{words}, low: {scene.kc!r}"),
+        )
         grid = np.concatenate([_spread(present), middle + width * np.linspace(-6, 6, GRID // 2)])
 
         def bumped(one: Scene, value: Floats) -> Scene:
@@ -202,7 +205,7 @@ class Tally:
         """Return a few lines."""
         words = ", ".join(f"{count} of {name}" for name, count in sorted(self.kinds.items()))
         return (
-            f"{self.scans} scans: {words}\n{self.crossings} crossings, {self.estimated} of them without a proof; "
+            f"{self.scans} scans: {words}\n{self.crossings} crossings, {self.estimated} without a proof; "
             f"{self.open} scans with an eigenvalue that follows the circle; {len(self.wrong)} wrong; "
             f"{self.seconds / max(self.scans, 1):.2f} s a scan"
         )

@@ -1,7 +1,8 @@
 """Exact boundary curves against the obvious program, error beside time: `python -m tests.bench.region`.
 
 The obvious program decides a grid of 100 × 100 points of the paper's scene by max |λ| < 1. Times are CPU
-seconds in a warm process, from a compiled model to curves. Errors are against 50 digits (`tests.paper_limit`).
+seconds in a warm process, from a compiled model to curves. Errors are against 50 digits
+(`tests.paper_limit`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Sensitivities and frequencies of random scenes against 320-bit arithmetic.
 
-`run` draws scenes of the built-in library (`bench.shapes`); `check_sensitivities` and `check_frequencies` serve any
-scene. The truth comes from the compiled functions alone, event by event (see `bench.events`): derivatives from
-frame matrices on either side of a value, frequencies from following each mode through a frame.
+`run` draws scenes of the built-in library (`bench.shapes`); `check_sensitivities` and `check_frequencies`
+serve any scene. The truth comes from the compiled functions alone, event by event (see `fifty_digits.events`):
+derivatives from frame matrices on either side of a value, frequencies from following each mode through a frame.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from apc.eigen.balls import precision
 from apc.frame.names import find, parameter_of
 from apc.frame.overrides import Override, apply
 from apc.vary.sensitivity import Sensitivities, sensitivities
+from tests.bench.shapes import PARTS, draw_shape
 from tests.fifty_digits.events import Happening, Play, build_peers, refusal
 from tests.fifty_digits.truth import (
     RIGID,
@@ -32,7 +33,6 @@ from tests.fifty_digits.truth import (
     _to_state,
     classes_of,
 )
-from tests.bench.shapes import PARTS, draw_shape
 from tests.topologies import compiled
 
 BITS = 320
@@ -241,7 +241,7 @@ def check_frequencies(system: CompiledSystem, found: Analysis) -> str:
                     turns = _turns(scene, frame, [right[i, 0] for i in range(right.nrows())])
                     truths += [abs(turn) / (2 * math.pi * float(frame)) for turn in turns]
             if truths and min(abs(mode.frequency_hz - truth) for truth in truths) > 1e-4 / float(frame):
-                return f"mode {mode.eigenvalue} of {mode.shape}: {mode.frequency_hz} Hz, truth {sorted(set(truths))}"
+                return f"mode {mode.eigenvalue}: {mode.frequency_hz} Hz, truth {sorted(set(truths))}"
             rate = complex(math.log(mode.magnitude), 2 * math.pi * mode.frequency_hz * float(frame))
             if abs(mode.damping_ratio - (-rate.real / abs(rate) if rate else 1.0)) > 1e-6:
                 return f"mode {mode.eigenvalue}: damping {mode.damping_ratio} at {mode.frequency_hz} Hz"

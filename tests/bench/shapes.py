@@ -162,7 +162,6 @@ equations:
 }
 
 _RULES = rules_of("""\
-none: 
 tick: 1 ms  0.5 ms  2 ms  4/3 ms
 ratio: 1 ms  2 ms  4 ms  8 ms  2.5 ms  10 ms
 phase: $none  $none  , phase: 0.2 ms  , phase: 1/7 ms
@@ -181,6 +180,7 @@ integrator: Integrator, $gains, leak: 0 Hz  SampledIntegrator, $gains, leak: 1, 
 share: -0.9  -0.41  0.13  0.367  0.638  0.85
 expressions: Expressions  Named
 """) | {
+    "none": [""],
     "bodies": [
         "masses:\n  device: {mass: 0.1 kg, damping: 5 N*s/m}\n  cube: {mass: 0.6 kg, damping: 5 N*s/m, shared: true}\ncouplers:\n"
     ],

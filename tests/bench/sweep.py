@@ -61,7 +61,7 @@ def main() -> None:
             now = parts(target)
             untouched = judge.right("finished parts are left as they are", before.items() <= now.items())
             print(
-                f"  killed with {len(now):>6} parts of {whole} finished; those of before untouched: {untouched}"
+                f"  killed with {len(now):>6} parts of {whole} finished; those before untouched: {untouched}"
             )
             before = now
         rest, last = waited(lambda: finish(folder, [*words, target.name]))
