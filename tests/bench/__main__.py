@@ -31,7 +31,7 @@ AVERAGE = "models/scenes/three-users-average.yaml"
 
 @dataclass(frozen=True)
 class Part:
-    """A section of the page: its title, the words after `python -m`; `timed` ones know --quick and --strict."""
+    """A section of the page: its title, the words after `python -m`; `timed` by --quick and --strict."""
 
     name: str
     title: str

@@ -194,8 +194,8 @@ def by_pathsim(seconds: float, tolerance: float | None) -> tuple[float, Floats]:
 
     It is given one linear plant of 12 states, a function of the forces, and sample-and-holds. It runs what
     happens at one instant in the order in which the blocks are listed, each seeing what those before it did;
-    the hold that lets a force act is listed before the one that computes it, so that it takes the force of the
-    tick before. A packet is handed on half a millisecond before it is due.
+    the hold that lets a force act is listed before the one that computes it, and takes the force of the tick
+    before. A packet is handed on half a millisecond before it is due.
     """
     from pathsim import Connection, Simulation
     from pathsim.blocks import Function, SampleHold, Scope, StateSpace

@@ -1,7 +1,8 @@
 """Verdicts over networks that lose packets, error beside time: `python -m tests.bench.network`.
 
 The opponent follows second moments event by event and draw by draw, by ARPACK
-(`tests.networks.second_moments`). Times are CPU seconds, of a compiled and once analysed scene: what is added to the nominal answer.
+(`tests.networks.second_moments`). Times are CPU seconds, of a compiled and once analysed
+scene: what is added to the nominal answer.
 """
 
 from __future__ import annotations

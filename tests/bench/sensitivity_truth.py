@@ -1,8 +1,8 @@
 """Sensitivities and frequencies of random scenes against 320-bit arithmetic.
 
 `run` draws scenes of the built-in library (`bench.shapes`); `check_sensitivities` and `check_frequencies`
-serve any scene. The truth comes from the compiled functions alone, event by event (see `fifty_digits.events`):
-derivatives from frame matrices on either side of a value, frequencies from following each mode through a frame.
+serve any scene. The truth comes from the compiled functions alone, event by event (`fifty_digits.events`):
+derivatives from frame matrices on either side of a value, frequencies from following a mode through a frame.
 """
 
 from __future__ import annotations

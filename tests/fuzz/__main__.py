@@ -1,6 +1,6 @@
 """`python -m tests.fuzz --inputs 100000 --seed 1`: exit code 1 when an input does what none may.
 
-Each different failure is told once, with a smaller input of the same failure in a folder.
+Each different failure is told once, its input in a folder.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from tests.fuzz.inputs import SORTS
 from tests.fuzz.models import FORGERIES
 from tests.fuzz.packets import run_packets
-from tests.fuzz.running import kind_of, once, run_all, shrunk
+from tests.fuzz.running import kind_of, run_all
 from tests.topologies import AVERAGE, compiled
 
 
@@ -64,12 +64,10 @@ def _run(what: str, options: argparse.Namespace) -> bool:
     title = "inputs" if is_input else f"forged {what}"
     print(f"{count - start} {title} in {time.monotonic() - began:.0f} s")
     for place, failure in enumerate(sorted(failures, key=lambda one: -often[one.key]), start=1):
-        small = shrunk(kind, failure) if is_input else failure.given
-        told = once(kind, small)[1] or failure.told
         folder = options.out / f"{what}-{place:02d}"
         came = f"seed {options.seed}, number {failure.index}, {often[failure.key]} times"
-        text = f"{failure.key}\n{came}\n\n{told}\n"
-        for name, data in (*small.files, ("told.txt", text.encode())):
+        text = f"{failure.key}\n{came}\n\n{failure.told}\n"
+        for name, data in (*failure.given.files, ("told.txt", text.encode())):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(data)
         print(f"\n{folder}: {text}")

@@ -1,6 +1,6 @@
 """Runs hostile inputs through the compiler and forged files through the program, under a watchdog.
 
-Takes: inputs, forged files. Gives: `Kind`, `KINDS`, `Failure`, `run_all`, `shrunk`.
+Takes: inputs, forged files. Gives: `Kind`, `kind_of`, `Failure`, `run_all`.
 Guarantees: one input can't bring the run down, whether it crashes, hangs or eats memory.
 Does not: make inputs.
 
@@ -128,12 +128,6 @@ def kind_of(what: str, sort: str | None = None) -> Kind:
         return Kind(_warm_up, lambda seed: make_input(random.Random(seed), sort), _judged)
     forgery = FORGERIES[what]
     return Kind(partial(_warm_files, forgery), forgery.make, partial(_asked, forgery))
-
-
-def once(kind: Kind, given: Input) -> tuple[str, str]:
-    """Return the outcome and text of one input, run in a process of its own."""
-    [(_, key, told)] = list(_watched(lambda tell: tell(0, *kind.judge(given)), 0, 1))
-    return key, told
 
 
 def _warm_files(forgery: Forgery) -> None:
@@ -384,37 +378,3 @@ def _fault_in(mistake: Mistake, texts: dict[str, list[bytes]]) -> str:
     if not quoted and not 1 <= place.column <= len(line) + 2:
         return "a column that isn't there"
     return ""
-
-
-# ---- shrinking ----
-
-
-def shrunk(kind: Kind, failure: Failure, *, seconds: float = 40.0) -> Input:
-    """Return a smaller input that fails in the same way: pieces taken out as long as that goes."""
-    deadline = time.monotonic() + seconds
-    files = dict(failure.given.files)
-
-    def fails(**changed: bytes | None) -> bool:
-        trial = {name: data for name, data in {**files, **changed}.items() if data is not None}
-        return once(kind, Input(failure.given.sort, tuple(trial.items())))[0] == failure.key
-
-    if not fails():
-        return failure.given  # it needs what ran before it
-    for name in list(files):
-        if name != TOPOLOGY and fails(**{name: None}):
-            del files[name]
-    for name in files:
-        for separator in (b"\n", b", ", b" ", b""):
-            pieces = files[name].split(separator) if separator else [bytes([b]) for b in files[name]]
-            size = len(pieces) // 2 if len(pieces) < 5000 else 0
-            while size and time.monotonic() < deadline:
-                at = 0
-                while at < len(pieces) and time.monotonic() < deadline:
-                    trial = separator.join(pieces[:at] + pieces[at + size :])
-                    if fails(**{name: trial}):
-                        files[name] = trial
-                        del pieces[at : at + size]
-                    else:
-                        at += size
-                size //= 2
-    return Input(failure.given.sort, tuple(files.items()))
