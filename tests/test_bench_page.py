@@ -21,7 +21,6 @@ HELPERS = {  # not run by themselves
     "by_hand",
     "growing",
     "judge",
-    "map",
     "sensitivity_truth",
     "shapes",
     "losses",  # draws a picture of the README

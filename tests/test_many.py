@@ -22,8 +22,8 @@ from apc.frame.overrides import Override, apply
 from apc.vary import many
 from apc.vary.evaluator import free_parameters
 from apc.vary.many import Analyses, analyze_many
-from tests.bench.map import BITS, truth
 from tests.fifty_digits.truth import spectral_truth
+from tests.paper_limit import BITS, truth
 from tests.topologies import AVERAGE, MESH, OSCILLATOR, ROOT, SCENES, compiled, replaced, told
 
 

@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from apc.benchmark.timing import median_time, take_turns, timed
+from apc.benchmark.timing import take_turns, timed
 from apc.frame.overrides import apply, parse_override
 from apc.regions.axes import parse_axes
 from apc.regions.boundary import relative_to
@@ -21,7 +21,7 @@ from apc.regions.region import Region, region
 from tests.bench.by_hand import modal_radii, stable_grid
 from tests.bench.judge import Judge, Timed, judged, parser_of
 from tests.paper_limit import limit
-from tests.topologies import AVERAGE, MESH, ROOT, compiled
+from tests.topologies import AVERAGE, MESH, compiled
 
 LOW, HIGH, COUNT = 10.0, 3000.0, 100
 X = f"contact.stiffness={LOW} N/m:{HIGH} N/m"
@@ -133,30 +133,11 @@ def factors(judge: Judge) -> None:
             print(f"  {figure} {panel:<16} {low:.10f} to {high:.10f} ({len(ratios)} values of K_C{note})")
 
 
-def islands(judge: Judge) -> None:
-    """Time scenes with an island and a hole, whose boundaries are circles."""
-    print("\nan island and a hole, circles by construction")
-    for name in ("island", "hole"):
-        system = compiled((ROOT / "tests" / "scenes" / f"{name}.yaml").read_text(encoding="utf-8"))
-        axes = parse_axes(system, "u=0 N/m:1000 N/m", "v=0 N/m:1000 N/m")
-        seconds, found = median_time(partial(region, system, axes), 5)
-        radii = np.hypot(*(found.curves[0].points - [620, 410]).T)
-        spread = float(np.ptp(radii) / radii.mean())
-        # A point is off by the curve's error times the rectangle's width at most; two are by twice that.
-        width = float(np.max(found.rectangle.width))
-        most = 2 * found.curves[0].error * width / float(radii.mean())
-        said = judge.within(f"{name}: spread of the radius", spread, most)
-        print(
-            f"  {name:<7} {1e3 * seconds:8.1f} ms   radius {radii.mean():.6f} N/m, spread {spread:.1e} {said}"
-        )
-
-
 def main() -> None:
     """Print the tables."""
     with judged(parser_of("region", __doc__)) as (judge, given):
         paper(judge, given.quick)
         factors(judge)
-        islands(judge)
 
 
 if __name__ == "__main__":

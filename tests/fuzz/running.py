@@ -12,11 +12,11 @@ what is asked of it answered or refused. Anything else is a failure, and is told
 from __future__ import annotations
 
 import importlib
+import multiprocessing
 import os
 import random
 import re
 import resource
-import select
 import signal
 import sys
 import tempfile
@@ -26,6 +26,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import apc
@@ -162,58 +163,41 @@ def _warm_up() -> None:
 def _watched(
     work: Callable[[Callable[[int, str, str], None]], object], start: int, stop: int
 ) -> Iterator[tuple[int, str, str]]:
-    read, write = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.close(read)
-        _become_worker(work, write)
-    os.close(write)
-    following, rest = start, b""
-    killed = ""
-    with os.fdopen(read, "rb", buffering=0) as stream:
-        while following < stop:
-            ready, _, _ = select.select([stream], [], [], PATIENCE)
-            data = stream.read(1 << 16) if ready else b""
-            if not data:
-                killed = "" if ready else "takes for ever"
-                break
-            *lines, rest = (rest + data).split(b"\0")
-            for line in lines:
-                number, key, told = line.decode("utf-8", "replace").split("\x1f")
-                yield int(number), key, told
-                following = int(number) + 1
-    if killed:
-        os.kill(child, signal.SIGKILL)
-    _, status = os.waitpid(child, 0)
-    if following < stop:
-        ended = (
-            f"signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else f"exit {os.WEXITSTATUS(status)}"
-        )
-        yield following, killed or f"process ended by {ended}", ""
+    """Yield (index, outcome, text) of inputs run in a process of their own; ends early if that is killed.
 
-
-def _become_worker(work: Callable[[Callable[[int, str, str], None]], object], write: int) -> None:
-    """Do the work and leave; never returns."""
-    code = 1
+    The text of an input that did nothing wrong is its sort.
+    """
+    context = multiprocessing.get_context("fork")
+    heard, tell = context.Pipe(duplex=False)
+    child = context.Process(target=_become_worker, args=(work, tell))
+    child.start()
+    tell.close()
+    following = start
     try:
-        in_use = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (in_use + MEMORY, in_use + MEMORY))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, 1)
-        os.dup2(null, 2)
-        sys.addaudithook(_listen)
+        while following < stop and heard.poll(PATIENCE):
+            index, key, told = heard.recv()
+            yield index, key, told
+            following = index + 1
+        silent = following < stop
+    except EOFError:
+        silent = False
+    if silent:
+        child.kill()
+    child.join()
+    if following < stop:
+        yield following, "takes for ever" if silent else f"process ended with code {child.exitcode}", ""
 
-        def tell(index: int, key: str, told: str) -> None:
-            line = "\x1f".join((str(index), key, told.replace("\x1f", " ").replace("\0", " ")))
-            data = line.encode("utf-8", "replace") + b"\0"
-            while data:
-                data = data[os.write(write, data) :]
 
-        work(tell)
-        code = 0
-    finally:
-        os._exit(code)
+def _become_worker(work: Callable[[Callable[[int, str, str], None]], object], pipe: Connection) -> None:
+    """Do the work, with little memory, no output and what it causes noted."""
+    in_use = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (in_use + MEMORY, in_use + MEMORY))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 1)
+    os.dup2(null, 2)
+    sys.addaudithook(_listen)
+    work(lambda index, key, told: pipe.send((index, key, told)))
 
 
 _foreign: list[str] = []
