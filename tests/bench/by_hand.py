@@ -98,39 +98,37 @@ def stable_grid(low: float, high: float, count: int) -> NDArray[np.bool_]:
     return np.asarray(np.abs(np.linalg.eigvals(frames)).max(axis=-1) < 1)
 
 
-def mode_radius(damping: float) -> float:
-    """Return the spectral radius as an expert has it: two modes, with participation and a disc a value."""
-    tick, hears = user(damping=damping)
-    sizes = []
-    for weight in (1.0, -1 / (USERS - 1)):  # all alike, and apart
-        frame = np.linalg.matrix_power(tick + weight * hears, TICKS)
-        frame[6] = np.eye(7)[2]
-        values, vectors = np.linalg.eig(frame)
-        inverse = np.linalg.inv(vectors)
-        shares = np.abs(inverse.T * vectors)
-        rounded = np.finfo(float).eps * len(frame) * np.abs(inverse) @ np.abs(frame) @ np.abs(vectors)
-        discs = (np.abs(inverse @ frame @ vectors - np.diag(values)) + rounded).sum(axis=1)  # Gershgorin's
-        assert len(discs) == len(shares)
-        apart = np.abs(values - 1) > (weight == 1) * np.abs(values - 1).min()  # all moving together
-        sizes.append(np.abs(values[apart]).max())
-    return float(max(sizes))
+def mode_frames(contact: Floats, coordination: Floats, damping: float) -> Floats:
+    """Return a frame (2, k, 7, 7) of each of two modes at many points (k,), as an expert writes it.
 
-
-def modal_radii(contact: Floats, coordination: Floats) -> Floats:
-    """Return the spectral radii of many points (k,) as an expert writes it: two modes, all points at once.
-
-    The mean of the others is 1 times one's own packets where all move alike, −1/2 times where they move
-    apart: 7 states a mode. The eigenvalue next to 1 of the first is left out.
+    The mean of the others is 1 times one's own packets where all move alike, −1/2 times where apart.
     """
     tick = np.zeros((2, len(contact), 7, 7))
-    tick[:, :] = user(0.0, 0.0)[0]
+    tick[:, :] = user(0.0, 0.0, damping)[0]
     tick[:, :, 4, 0], tick[:, :, 4, 2] = contact, -contact
     tick[:, :, 5, 2] = coordination
     tick[0, :, 5, 6], tick[1, :, 5, 6] = -coordination, coordination / (USERS - 1)
     for _ in range(TICKS.bit_length() - 1):
         tick = tick @ tick
     tick[:, :, 6] = np.eye(7)[2]
-    values = np.linalg.eigvals(tick)
+    return tick
+
+
+def mode_radius(damping: float) -> float:
+    """Return the spectral radius of one point, with participation and a disc of Gershgorin's a value."""
+    frames = mode_frames(np.array([K_C]), np.array([K_T]), damping)[:, 0]
+    values, vectors = np.linalg.eig(frames)
+    inverse = np.linalg.inv(vectors)
+    shares = np.abs(inverse.swapaxes(1, 2) * vectors)
+    rounded = 7 * np.finfo(float).eps * np.abs(inverse) @ np.abs(frames) @ np.abs(vectors)
+    off = np.abs(inverse @ frames @ vectors - np.eye(7) * values[:, None])
+    assert (off + rounded).sum(axis=2).shape == shares[..., 0].shape
+    return float(np.abs(np.delete(values, np.argmin(np.abs(values[0] - 1)))).max())  # all moving together
+
+
+def modal_radii(contact: Floats, coordination: Floats) -> Floats:
+    """Return the spectral radii (k,) of many points, the eigenvalue next to 1 of the first mode left out."""
+    values = np.linalg.eigvals(mode_frames(contact, coordination, DEVICE_DAMPING))
     sizes = np.abs(values)
     sizes[0][np.abs(values[0] - 1) < 1e-7] = 0
     return np.asarray(sizes.max(axis=(0, 2)))

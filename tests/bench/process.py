@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from apc.benchmark.timing import spread_of, waited
-from tests.bench.growing import SCENES, equations, flat, kinds, lossy, plain, ring, row, table
+from tests.bench.growing import SCENES, equations, flat, kinds, lossy, ring, row, table
 from tests.bench.judge import Judge, parser_of
 
 RUNS = 7
@@ -46,21 +46,6 @@ GROWTH: tuple[Growing, ...] = (
     ("equal peers", (3, 3000, 1_000_000), flat, "analyze scene.apc", None),
     ("peers in a ring", (1000, 10_000, 100_000), ring, "analyze scene.apc", None),
     ("different peers", (1000, 10_000, 100_000), table, "analyze scene.apc", None),
-    (
-        "frames of delay",
-        (1, 3, 10, 30, 100, 300),
-        plain,
-        "critical coordination.stiffness scene.apc --set lan.delay=@*8ms",
-        None,
-    ),
-    (
-        "hundred points",
-        (10, 100, 1000),
-        plain,
-        "sweep scene.apc --jobs 1 --out p.csv --over contact.stiffness=10N/m:3000N/m:100"
-        " --over coordination.stiffness=10N/m:3000N/m:@",
-        None,
-    ),
     ("runs", (10, 100, 1000), lossy, "simulate scene.apc --duration 1s --runs @", None),
 )
 
@@ -117,7 +102,7 @@ def growth(judge: Judge, folder: Path, growing: Growing, quick: bool) -> None:
         scene = folder / title.replace(" ", "-") / str(number)
         scene.mkdir(parents=True)
         (scene / "scene.yaml").write_text(write(number, scene), encoding="utf-8")
-        asked = command.replace("@*8", str(8 * number)).replace("@", str(number))
+        asked = command.replace("@", str(number))
         (_, first, size, _), (_, second, other, said) = (
             once(f"-m apc {one}", folder, scene) for one in ("compile --force scene.yaml", asked)
         )

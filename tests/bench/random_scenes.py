@@ -34,7 +34,8 @@ from apc.threads import single_threaded
 from tests.bench.judge import judged, parser_of
 from tests.bench.sensitivity_truth import check_frequencies, check_sensitivities
 from tests.bench.shapes import PARTS, draw_shape, numbers
-from tests.fifty_digits.truth import RIGID, classes_of, eigenvalues, frame_matrices
+from tests.fifty_digits.truth import _truth as truth_of
+from tests.fifty_digits.truth import classes_of, eigenvalues, frame_matrices
 from tests.topologies import compiled
 
 BITS = 256  # a chain of four equal eigenvalues still keeps 19 digits
@@ -87,13 +88,9 @@ class Tally:
 
 def truth(system: CompiledSystem) -> tuple[flint.arb, int]:
     """Return the radius without eigenvalues that are 1, and how many these are (a drift counts twice)."""
-    radius, rigid = flint.arb(0), 0
-    for _, count, matrix in frame_matrices(system, classes_of(system)):
-        for value in eigenvalues(matrix):
-            if float(abs(value - 1).mid()) < RIGID:
-                rigid += count
-            else:
-                radius = max(radius, abs(value).mid())
+    classes = classes_of(system)
+    found = truth_of([(count, eigenvalues(one)) for _, count, one in frame_matrices(system, classes)])
+    radius, rigid = found.radius, found.rigid
     # Without clocks any frame will do: the analysis takes a second, the reference a row of a simulation.
     return radius if system.clocks else radius ** int(1 / ROW), rigid
 

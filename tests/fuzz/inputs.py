@@ -65,6 +65,7 @@ key: topology  about  library  clocks  parameters  peers  masses  couplers  link
 name: x  v  f  a.x  b.x  a.f  b.f  flange.x  flange.f  object.x  object.f  mass  damping  stiffness  delay  limit  side  others.x  others.v  others  time  peers  device.x  kt  haptic  held1  q  a  b  x[1]  a.x[2]  device.x[1]
 cut: (  )  *  ^  /  =  ,  .  ..  [1]  __  é  '  if   then  1e  {"9" * 30}  :
 """) | {"hostile": HOSTILE}  # fmt: skip
+_NEW = ("$hostile", "$hostile", "$quantity", "$cut", "$key", "$name", "$count", "$e")
 _LIKE = str.maketrans({"a": "а", "e": "е", "o": "о", "c": "с", "x": "х", "-": "−", ":": "：", "*": "∗", "/": "∕", " ": "\u00a0"})  # fmt: skip
 _MARKS = [b"\0", b"\t", b"\r", b"\r\n", b"\x1b", b"\xff", b"\xc0\xaf", b"\xed\xa0\x80", b"\xe2\x80\xa8", b"\x85", b"\n...\n", b"\n---\n", b"%YAML 1.1\n", b"\xef\xbb\xbf", b"   ", b"- ", b"\n\n", *(mark.encode() for mark in "{}[],:#&*!|>'\"%@`^/+-=.()<")]  # fmt: skip
 
@@ -93,37 +94,23 @@ def make_input(rng: random.Random, sort: str | None = None) -> Input:
 
 
 def mutated(rng: random.Random, data: bytes) -> bytes:
-    """Return bytes changed at random: pieces between line ends, words or single bytes taken away, twice, swapped,
+    """Return bytes changed at random.
 
-    replaced by what nobody expects, or made to look like others; all of it cut, or in another encoding.
+    A line, word, cell or byte is taken away, doubled, replaced by what nobody expects, marked, or made to look
+    like itself, once or more; rarely all of it is cut or in another encoding.
     """
     for _ in range(rng.randrange(1, 4)):
         between = rng.choice([b"\n", b"\n", b" ", b",", b""])
         pieces = data.split(between) if between else [data[at : at + 1] for at in range(len(data))]
-        at, other = (rng.randrange(max(1, len(pieces))) for _ in range(2))
-        old = pieces[at] if pieces else b""
-        text = old.decode("utf-8", "replace")
-        hostile = (
-            _hostile(rng),
-            *(grown(rng, _RULES, one, 2) for one in ("$cut", "$key", "$name", "$count", "$e")),
+        at = rng.randrange(max(1, len(pieces)))
+        old = b"".join(pieces[at : at + 1])
+        new = _encoded(grown(rng, _RULES, rng.choice(_NEW), 2))
+        alike = _encoded(old.decode("utf-8", "replace").translate(_LIKE))
+        turned = bytes(one ^ (1 << rng.randrange(8)) for one in old[:1]) + old[1:]
+        marked = rng.choice(_MARKS) + old
+        pieces[at : at + 1] = rng.choice(
+            ([], [old, old], [new], [new], [marked], [alike], [old.lstrip()], [turned])
         )
-        new = _encoded(rng.choice(hostile))
-        turned = bytes([*old[:-1], old[-1] ^ 1 << rng.randrange(8)]) if old else b"\0"
-        ways = [
-            [],
-            [old, old],
-            [new],
-            [new],
-            [rng.choice(_MARKS) + old],
-            [_encoded(text.translate(_LIKE))],
-            [text.lstrip().encode()],
-            [turned],
-        ]
-        pieces[at : at + 1] = rng.choice(ways)
-        if pieces and rng.random() < 0.2:
-            place = min(at, len(pieces) - 1)
-            other = min(other, len(pieces) - 1)
-            pieces[place], pieces[other] = pieces[other], pieces[place]
         data = (rng.choice(_MARKS) if rng.random() < 0.03 else between).join(pieces)
     if rng.random() < 0.05:
         data = data.decode("utf-8", "replace").encode(rng.choice(["utf-16", "utf-32", "cp1252"]), "replace")
@@ -142,6 +129,10 @@ def _hostile(rng: random.Random) -> str:
     return grown(rng, _RULES, rng.choice(["$hostile"] * 4 + ["$quantity"]))
 
 
+def _mutated(rng: random.Random, text: str) -> str:
+    return mutated(rng, _encoded(text)).decode("utf-8", "replace")
+
+
 def _bytes(rng: random.Random) -> Files:
     return {
         TOPOLOGY: rng.choice([rng.randbytes(rng.randrange(400)), *[mutated(rng, _encoded(_scene(rng)))] * 20])
@@ -153,20 +144,13 @@ def _bytes(rng: random.Random) -> Files:
 
 def any_value(rng: random.Random) -> Tree:
     """Return what may be put in a place of a tree."""
-    text = grown(rng, _RULES, rng.choice(("$count", "$e", "$name", "$quantity", "$quantity")))
+    text = grown(rng, _RULES, rng.choice(_NEW))
     few = [_hostile(rng) for _ in range(rng.randrange(4))]
-    keys = Pairs([[grown(rng, _RULES, "$key"), one] for one in few])
-    return rng.choice([few, keys, [[text], [text, *few]], text, text, *[_hostile(rng)] * 4])
+    return rng.choice([few, Pairs([[text, one] for one in few]), [[text, *few]], text, text, text, text])
 
 
 def _once_changed(tree: Tree, rng: random.Random, donor: Tree) -> None:
-    changed(
-        tree,
-        rng,
-        donor,
-        value=lambda: any_value(rng),
-        key=lambda: grown(rng, _RULES, rng.choice(["$key", "$hostile"])),
-    )
+    changed(tree, rng, donor, value=lambda: any_value(rng), key=lambda: grown(rng, _RULES, rng.choice(_NEW)))
 
 
 def _structure(rng: random.Random) -> Files:
@@ -193,7 +177,7 @@ def _numbers(rng: random.Random) -> Files:
         number, _, unit = pair[1].partition(" ")
         fits = {"N/m": "kt*$own", "ms": "tick*$own"}.get(unit, f"{number}*$own*1")
         made = grown(rng, _RULES, rng.choice(["$quantity", "$e", "$own", "$hostile", fits, fits]))
-        pair[1] = mutated(rng, _encoded(made)).decode("utf-8", "replace") if rng.random() < 0.5 else made
+        pair[1] = _mutated(rng, made) if rng.random() < 0.5 else made
     return {TOPOLOGY: _encoded(as_yaml(tree))}
 
 
@@ -224,7 +208,7 @@ def _change_equation(tree: Tree, rng: random.Random, donor: Tree) -> None:
         if key == "equations" and value and type(value) is list:
             at = rng.randrange(len(value))
             new = grown(rng, _RULES, rng.choice(["$e = $e", "$name = $e"]))
-            other = mutated(rng, _encoded(str(value[at]))).decode("utf-8", "replace")
+            other = _mutated(rng, str(value[at]))
             value[at] = rng.choice([new, other])
 
 
