@@ -24,7 +24,7 @@ from apc.moments.network import Growth, growth
 from apc.optional import need
 from apc.present.pictures import COLOURS, LINES, write_figure
 from apc.present.region_picture import PANEL
-from tests.bench.judge import judged, parser_of
+from tests.bench.judge import Judge, judged, parser_of
 from tests.topologies import SCENES, compiled, replaced
 
 PEERS = (2, 3, 5)
@@ -81,8 +81,29 @@ def largest(at: Callable[[float], Growth], start: float) -> tuple[float, float]:
     return stiffness, max(there.high - there.radius, there.radius - there.low) / slope
 
 
+def curve(judge: Judge, peers: int, law: str, start: float, quick: bool) -> tuple[list[float], list[float]]:
+    """Return shares of packets lost, and the largest stable stiffness at each, a mesh's as well."""
+    burst = LAWS[law][1]
+    points = 3 if quick else POINTS if burst is None else FEWER if peers < ESTIMATED else FEWEST
+    at, mesh = growths(peers, law), growths(peers, law, "FullMesh")
+    shares = [MOST * place / points for place in range(1, points + 1)]
+    values, left = [], 0.0
+    for share in shares:
+        start, open_ = largest(partial(at, share), start)
+        values.append(start)
+        left = max(left, open_)
+    for share, value in list(zip(shares, values, strict=True))[points // 4 :: -(-points // 3)]:
+        borne, _ = largest(partial(mesh, share), value)
+        judge.within(f"mesh of {peers}, {law}, {share:.0%} lost", abs(borne / value - 1), SAME)
+    exact = peers < ESTIMATED or burst is None
+    told = "exact" if exact else f"an estimate: another order of moments, {left:.2g} N/m"
+    numbers = "  ".join(f"{100 * x:.3g} %: {y:.1f}" for x, y in zip(shares, values, strict=True))
+    print(f"  {law:<22} {told}\n    {numbers}", flush=True)
+    return shares, values
+
+
 def main() -> None:
-    """Print and draw the curves, and judge that the mesh lies on them."""
+    """Print and draw the curves."""
     parser = parser_of("losses", __doc__)
     parser.add_argument("--out", type=Path, help="draw them into this file: .svg, .png or .pdf")
     size = (PANEL * 3 + 0.6, PANEL + 1.0)
@@ -91,43 +112,24 @@ def main() -> None:
     with judged(parser) as (judge, given):
         print("largest stable coordination.stiffness [N/m] in mean square, by the share of packets lost")
         for ax, peers in list(zip(axes, PEERS, strict=True))[: 1 if given.quick else None]:
-            whole = start = largest(partial(growths(peers, next(iter(LAWS))), 0.0), START)[0]
+            whole = largest(partial(growths(peers, next(iter(LAWS))), 0.0), START)[0]
             print(f"\n{peers} users, {whole:.2f} with no packet lost")
             for law, line, colour in zip(LAWS, LINES, COLOURS, strict=False):
-                burst = LAWS[law][1]
-                points = POINTS if burst is None else FEWER if peers < ESTIMATED else FEWEST
-                points = 3 if given.quick else points
-                at, mesh = growths(peers, law), growths(peers, law, "FullMesh")
-                shares = [MOST * place / points for place in range(1, points + 1)]
-                values, left, start = [], 0.0, whole
-                for share in shares:
-                    start, open_ = largest(partial(at, share), start)
-                    values.append(start)
-                    left = max(left, open_)
-                asked = range(points // 4, points, -(-points // 3))
-                for place in asked:
-                    value, _ = largest(partial(mesh, shares[place]), values[place])
-                    what = f"mesh of {peers}, {law}, {shares[place]:.0%} lost"
-                    judge.within(what, abs(value / values[place] - 1), SAME)
-                exact = peers < ESTIMATED or burst is None
-                told = "exact" if exact else f"an estimate: another order of moments, {left:.2g} N/m"
-                numbers = "  ".join(f"{100 * x:.3g} %: {y:.1f}" for x, y in zip(shares, values, strict=True))
-                print(f"  {law:<22} {told}\n    {numbers}", flush=True)
+                shares, values = curve(judge, peers, law, whole, given.quick)
                 percent = [100 * share for share in (0.0, *shares)]
                 ax.plot(percent, [whole, *values], color=colour, linestyle=line, label=law)
-                circles = [percent[place + 1] for place in asked], [values[place] for place in asked]
-                ax.plot(*circles, "o", mfc="none", color=colour, ms=5, label=None)
+                asked = slice(1 + len(shares) // 4, None, -(-len(shares) // 3))
+                circles = percent[asked], [whole, *values][asked]
+                ax.plot(*circles, "o", mfc="none", color=colour, ms=5)
             note = "bursts: an estimate" if peers >= ESTIMATED else "bursts: exact"
             ax.set_title(f"{peers} users ({note})", fontsize=9)
             ax.set(xlabel="packets lost [%]", xlim=(0, 100 * MOST), ylim=(0, TOP))
             ax.tick_params(direction="in", top=True, right=True)
             ax.grid(visible=True, linewidth=0.4, alpha=0.5)
+        axes[0].plot([], [], "o", mfc="none", color="0.35", ms=5, label="mesh, its stiffness × (N − 1)")
         axes[0].set_ylabel("largest stable\ncoordination.stiffness [N/m]")
-        handles, labels = axes[0].get_legend_handles_labels()
-        handles.append(axes[0].plot([], [], "o", mfc="none", color="0.35", ms=5)[0])
-        labels.append("mesh, its stiffness × (N − 1)")
-        style = {"loc": "outside lower center", "frameon": False, "fontsize": 8.5}
-        figure.legend(handles, labels, ncols=3, handlelength=3, **style)
+        shown = axes[0].get_legend_handles_labels()
+        figure.legend(*shown, loc="outside lower center", frameon=False, fontsize=8.5, ncols=3)
         if given.out is not None:
             write_figure(figure, given.out)
 

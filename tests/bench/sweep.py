@@ -6,7 +6,6 @@ by default, twice over: half a minute on two cores.
 
 from __future__ import annotations
 
-import hashlib
 import tempfile
 from functools import partial
 from pathlib import Path
@@ -66,9 +65,8 @@ def main() -> None:
             before = now
         rest, last = waited(lambda: finish(folder, [*words, target.name]))
         print(f"  {last.splitlines()[-1].strip()}")
-        digests = [hashlib.sha256(path.read_bytes()).hexdigest() for path in (alone, target)]
-        same = judge.right("the same file, killed or not", digests[0] == digests[1])
-        print(f"files the same: {same} (SHA-256 {digests[0][:16]}…)")
+        same = alone.read_bytes() == target.read_bytes()
+        print(f"files the same: {judge.right('the same file, killed or not', same)}")
         axis = np.linspace(10.0, 3000.0, side)
         points = dict(zip(names, (one.ravel() for one in np.meshgrid(axis, axis)), strict=True))
         at_once, _ = waited(lambda: apc.analyze_many(SCENES / "three-users-average.yaml", points))

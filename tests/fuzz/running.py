@@ -307,26 +307,18 @@ def _fault_of(error: ApcError, files: dict[str, bytes]) -> tuple[str, str] | Non
     """Return what is wrong with the mistakes of an error."""
     told = str(error)[:3000]
     mistakes = error.mistakes
-    if len(set(mistakes)) < len(mistakes) or len({str(m) for m in mistakes}) < len(mistakes):
-        return f"told twice: {_twice(mistakes)}", told
+    if len({str(one) for one in mistakes}) < len(mistakes):
+        return f"told twice: {mistakes[0].code}", told
     texts = {name: re.split(rb"\r\n|\n|\r", data) for name, data in files.items()}
     for mistake in mistakes:
         fault = _fault_in(mistake, texts)
         if fault:
             return f"{fault}: {mistake.code} {_shape(mistake.sentence)}", told
-    by_file: dict[str, list[Mistake]] = {}
-    for mistake in mistakes:
-        by_file.setdefault(mistake.place.file, []).append(mistake)
-    for own in by_file.values():
-        places = [(mistake.place.line, mistake.place.column) for mistake in own]
+    for name in {one.place.file for one in mistakes}:
+        places = [(one.place.line, one.place.column) for one in mistakes if one.place.file == name]
         if places != sorted(places):
             return f"not in the file's order: {mistakes[0].code}", told
     return None
-
-
-def _twice(mistakes: tuple[Mistake, ...]) -> str:
-    (text, _), *_ = Counter(f"{m.code} {_shape(m.sentence)}" for m in mistakes).most_common(1)
-    return text
 
 
 def _shape(sentence: str) -> str:
