@@ -43,7 +43,7 @@ MEMORY = 1 << 30  # bytes an input may ask for beyond what is in use
 BATCH = 4000  # inputs a process runs before a fresh one takes over
 LONGEST_SENTENCE = 2000
 FINE = ("compiled", "refused", "answered")
-WHOLE_FILE = re.compile(r"E(10[1-8]|110|701|[89]\d\d)\Z")  # these mistakes may have no line
+WHOLE_FILE = re.compile(r"E(10[1-8]|110|219|701|[89]\d\d)\Z")  # these mistakes may have no line
 
 # What no input may cause; events of Python's own audit hooks.
 _FOREIGN = ("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "socket.connect",
