@@ -17,8 +17,8 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
 from apc.vary.many import Analyses
-from tests.bench.map import BITS, truth
 from tests.fifty_digits.truth import spectral_truth
+from tests.paper_limit import BITS, truth
 from tests.topologies import AVERAGE, MESH, OSCILLATOR, ROOT, SCENES, compiled, replaced, told
 
 Floats = NDArray[np.float64]
