@@ -162,6 +162,8 @@ def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
     token, stack = fault.token, fault.state.value_stack
     if token.type == "$END":
         token = Token("$END", "the end of the text", len(text))
+    if token.type in ("NAME", "FUNCTION"):
+        _check_name(token)
     got, at = "^" if token.type == "POWER" else cut(token), unclosed(stack)
     opener = kind_of(stack[at]) if at >= 0 else ""
     called = f"{stack[at - 1]}(" if at > 0 and kind_of(stack[at - 1]) == "FUNCTION" else ""
@@ -204,7 +206,7 @@ def _check(expr: Expr, text: str) -> None:
     waiting: list[tuple[Expr, int, bool]] = [(expr, 0, False)]
     while waiting:
         node, depth, conditional = waiting.pop()
-        if depth > MAX_DEPTH:
+        if depth >= MAX_DEPTH:
             raise FaultError("E328", node.start, TOO_DEEP)
         condition = isinstance(node, Compare | Logic | Not)
         # A name may stand for a condition; what it is, only its declaration can tell.
@@ -213,10 +215,25 @@ def _check(expr: Expr, text: str) -> None:
             what = f"{cut(text[node.start : node.end])} is {kinds} is due here"
             fault = fault or FaultError("E327", node.start, what)
         first, others = isinstance(node, Logic | Not | Conditional), isinstance(node, Logic)
-        parts = enumerate(children(node))
-        waiting += reversed([(part, depth + 1, others if k else first) for k, part in parts])
+        # A first operand that is a leaf is read at the level of its operator.
+        parts = children(node)
+        levels = [depth + 1 - (part is parts[0] is not parts[-1] and not children(part)) for part in parts]
+        due = [first, *(others for _ in parts[1:])]
+        waiting += reversed([*zip(parts, levels, due, strict=False)])
     if fault is not None:
         raise fault
+
+
+def _check_name(token: Token) -> None:
+    """Raise E324 for a name that cannot be one."""
+    for segment in token.split("."):
+        word, _, index = segment.rstrip("]").partition("[")
+        if word.startswith("_"):
+            raise FaultError("E324", token, "a name", "a letter first", cut(token))
+        if segment in KEYWORDS:
+            raise FaultError("E324", token, f"{word} is a word of the language, not a name")
+        if index.startswith("0") or len(index) > 9:
+            raise FaultError("E324", token, "an index", "a whole number counted from 1", cut(index))
 
 
 class _Trees(TREE):
@@ -233,19 +250,12 @@ class _Trees(TREE):
         return token
 
     def NAME(self, token: Token) -> Token:
-        for segment in token.split("."):
-            word, _, index = segment.rstrip("]").partition("[")
-            if word.startswith("_"):
-                raise FaultError("E324", token, "a name", "a letter first", cut(token))
-            if segment in KEYWORDS:
-                raise FaultError("E324", token, f"{word} is a word of the language, not a name")
-            if index.startswith("0") or len(index) > 9:
-                expected = "a whole number counted from 1"
-                raise FaultError("E324", token, "an index", expected, cut(index))
+        _check_name(token)
         return token
 
     def FUNCTION(self, token: Token) -> Token:
-        if self.NAME(token) not in FUNCTIONS:
+        _check_name(token)
+        if token not in FUNCTIONS:
             close = nearest(token, FUNCTIONS, alike=ALIKE)
             what = f"there is no function {cut(token)}"
             if not close:
