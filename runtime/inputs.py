@@ -13,10 +13,11 @@ import os
 import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apc.compiler.cache import DAMAGE, LARGEST, SUFFIX, Archive, changed, read_archive, record_of
+from apc.compiler.cache import HANDS_CHANGE, LARGEST, SUFFIX, Archive, changed, program_digest, read_archive
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import (
     RefusedError,
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
 
 YAML_SUFFIXES = (".yaml", ".yml")
+_RATIONAL = re.compile(r"-?[0-9]{1,4000}(/[1-9][0-9]{,4000})?")
 _TOPOLOGY = re.compile(rb"^\xef?\xbb?\xbf?topology\s*:", re.MULTILINE)
 
 
@@ -85,15 +87,58 @@ def _is_topology(path: Path) -> bool:
 
 def load_fresh(path: Path) -> CompiledSystem:
     """Read a compiled model. Raises ApcError if it is damaged, or if what it was made from has changed."""
-    from apc.compiler.store import load_with_record
-
-    system, record = load_with_record(path)
-    now = changed(record, path.parent) if path.with_name(record.topology).is_file() else ""
+    archive = read_archive(path)
+    topology = path.with_name(archive.origin.topology)
+    now = changed(archive, path.parent) if topology.is_file() else ""
     if now:
         what = f"is stale: {now} has changed since it was compiled"
-        hint = f"apc compile {path.with_name(record.topology)}"
-        raise ApcError(Mistake("E605", Place(str(path)), what, hint=hint))
+        raise ApcError(Mistake("E605", Place(str(path)), what, hint=f"apc compile {topology}"))
+    return opened(archive, path.parent)
+
+
+def opened(archive: Archive, folder: Path) -> CompiledSystem:
+    """Return the model of a file: its own if this user's apc wrote it, else what its texts compile to.
+
+    Parameters
+    ----------
+    archive
+        The file.
+    folder
+        Where it is: there its texts are said to stand in messages.
+
+    Raises
+    ------
+    ApcError
+        The mistakes of its texts.
+    """
+    if archive.sealed and archive.origin.program == program_digest():
+        from apc.compiler import store
+
+        return store.opened(archive)
+    from apc.analysis.selfcheck import check_frame
+    from apc.compiler.pipeline import compile_again
+
+    system = compile_again(archive.origin, folder)
+    check_frame(system)
+    for change in archive.origin.changes:
+        system = _changed_again(system, change)
     return system
+
+
+def _changed_again(system: CompiledSystem, change: Sequence[tuple[str, str]]) -> CompiledSystem:
+    """Make a change that a model's origin tells of. Raises ApcError if there can be none such."""
+    from apc.frame.devices import with_hands
+    from apc.frame.names import find
+    from apc.frame.overrides import Override, apply
+
+    for name, value in change:
+        if name == HANDS_CHANGE:
+            return with_hands(system, value)
+        if not _RATIONAL.fullmatch(value):
+            what = f"is no rational number: {value[:80]}"
+            raise ApcError(Mistake("E604", Place(name[:80]), what))
+    found = [(find(system, name, counts=True), Fraction(value)) for name, value in change]
+    return apply(system, [Override(free, value) for free, value in found])
 
 
 def load_or_compile(path: Path) -> CompiledSystem:
@@ -107,15 +152,10 @@ def load_or_compile(path: Path) -> CompiledSystem:
     ApcError
         The file is at fault.
     """
-    from apc.compiler.store import unpacked
-
     if path.suffix == ".apc":
         return load_fresh(path)
     if (archive := compiled_already(path)) is not None:
-        try:
-            return unpacked(archive, path.with_suffix(".apc"))
-        except (ApcError, *DAMAGE):
-            pass  # it is only a saving of time; the topology itself decides
+        return opened(archive, path.parent)
     from apc.analysis.selfcheck import check_frame
     from apc.compiler.pipeline import compile_topology
 
@@ -291,10 +331,13 @@ def compiled_already(topology: Path) -> Archive | None:
     """
     try:
         archive = read_archive(topology.with_suffix(".apc"))
-        if not archive.sealed:
-            return None
-        record = record_of(archive)
-        fresh = record.topology == topology.name and not changed(record, topology.parent)
-    except (RefusedError, *DAMAGE):
+    except ApcError:
         return None
+    fresh = (
+        archive.sealed
+        and archive.compiled
+        and archive.origin.topology == topology.name
+        and archive.origin.program == program_digest()
+        and not changed(archive, topology.parent)
+    )
     return archive if fresh else None

@@ -15,8 +15,9 @@ from apc.compiler.language.recordings import read_trace
 from apc.compiler.language.tables import MOST_MISTAKES
 from apc.compiler.pipeline import compile_topology
 from apc.compiler.scene.channels import SceneChannel
-from apc.compiler.store import load, save
+from apc.compiler.store import save
 from apc.compiler.view.stages import describe
+from apc.inputs import load_fresh
 from tests.topologies import AVERAGE, compiled, replaced, scene, told
 
 LINK = "  lan: {clock: network, delay: 8 ms}"
@@ -275,7 +276,7 @@ def test_a_model_on_disk_keeps_its_channels(tmp_path: Path) -> None:
     (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
     system = compile_topology(tmp_path / "scene.yaml")
     save(system, tmp_path / "scene.apc")
-    lan, wan = (link.channel for link in load(tmp_path / "scene.apc").links)
+    lan, wan = (link.channel for link in load_fresh(tmp_path / "scene.apc").links)
     assert lan is not None
     assert wan is not None
     assert (lan.loss, lan.jitter, lan.on_loss) == (
@@ -286,7 +287,7 @@ def test_a_model_on_disk_keeps_its_channels(tmp_path: Path) -> None:
     assert lan.trace is None
     assert wan.loss is None
     np.testing.assert_array_equal(wan.trace, [0.008, math.inf])
-    save(load(tmp_path / "scene.apc"), tmp_path / "again.apc")
+    save(load_fresh(tmp_path / "scene.apc"), tmp_path / "again.apc")
     assert (tmp_path / "again.apc").read_bytes() == (tmp_path / "scene.apc").read_bytes()
 
 

@@ -84,9 +84,7 @@ def test_a_parameter_keeps_its_bounds_its_unit_and_what_it_follows_from() -> Non
     )
     system = compiled(text)
     found = {parameter.name: parameter for parameter in system.parameters}
-    quotient = PlainFunction(
-        *("formula", (("p", 2), ("c", 1)), ("y",), (), (("add", 1, 2), ("div", 0, 3)), ((4,),), None)
-    )
+    quotient = PlainFunction(*((("p", 2), ("c", 1)), (), (("add", 1, 2), ("div", 0, 3)), ((4,),)))
     spans = ((0, 2), (4, 9), (12, 13), (4, 13), (0, 14))
     formula = Formula("kt/(peers + 1)", ("kt", "peers"), (Fraction(1),), quotient, spans)
     assert system.followers == ("coordination.stiffness",)

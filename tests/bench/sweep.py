@@ -35,9 +35,9 @@ def axes(points: int) -> dict[str, str]:
 
 def plain(model: Path, over: dict[str, str], count: int) -> float:
     """Return the processor seconds a point takes in one process without parts, over the first points."""
-    from apc.compiler.store import load
+    from apc.inputs import load_fresh
 
-    system = load(model)
+    system = load_fresh(model)
     grid = build_grid([parse_axis(system, name, text) for name, text in over.items()])
     quantity = find_quantity(system, "analyze")
     with single_threaded():

@@ -27,6 +27,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
+
 import apc
 from apc.compiler import pipeline
 from apc.compiler.components.library import Library
@@ -220,9 +222,9 @@ def _forge_model(seed: str) -> tuple[str, arrays.Files]:
 def _warm_models() -> None:
     """Load everything once: what is loaded later looks as if a file had had it loaded."""
     with tempfile.TemporaryDirectory() as name:
-        for document, members in models.bases():
+        for origin, model in models.bases():
             path = Path(name) / models.FILE
-            path.write_bytes(models.packed(document, members))
+            path.write_bytes(models.unsealed(msgspec.json.encode(origin), model))
             assert models.ask(path, everything=True) == "answered"
 
 

@@ -19,7 +19,7 @@ import apc
 from apc.compiler.errors import ApcError
 from apc.compiler.interpolation import Interpolation, function_of
 from apc.compiler.pipeline import compile_topology
-from apc.compiler.plain import plain, read_function
+from apc.compiler.plain import straight
 from apc.frame.exact import ROWS, evaluate_exact
 from apc.frame.parameters import resolve
 from apc.simulation import forcing as forcings
@@ -245,10 +245,9 @@ def test_a_table_is_data_of_a_function_that_is_as_short_however_many_rows(tmp_pa
         rows = "".join(f"{one!r},{one * one!r}\n" for one in times.tolist())
         (tmp_path / "force.csv").write_text(f"time [s],force [N]\n{rows}", encoding="utf-8")
         [kind] = compile_topology(tmp_path / "scene.yaml").kinds
-        found = plain(kind.derivative)
+        found = straight(kind.derivative)
         [table] = found.tables
         assert np.array_equal(table.times, times)
-        assert plain(read_function(found.document()).build()).document() == found.document()
         lengths.append((len(found.operations), kind.derivative.n_instructions()))
         forcing = forcing_of(rates(kind))
         lengths[-1] += (forcing.line.n_instructions(), forcing.switches.numel_out(0))
@@ -270,22 +269,3 @@ def test_every_way_to_evaluate_a_table_gives_its_lines_and_their_slopes() -> Non
         assert [float(each[0]) for each in many] == pytest.approx(expected)
         if 2 * one not in times:
             assert np.asarray(function(one)).ravel() == pytest.approx(expected)
-
-
-@pytest.mark.parametrize(
-    "rows",
-    [
-        [[0.0], [1.0]],
-        [[0.0, 0.0], [1.0, 2.0]],
-        [[0.0, 1.0], [1.0]],
-        [[0.0, 1.0], [1.0, float("inf")]],
-        [[0, 1], [1, 2]],
-    ],
-)
-def test_a_file_whose_table_is_none_is_refused(rows: Any) -> None:
-    at = casadi.SX.sym("at")
-    table = function_of(Interpolation(np.array([0.0, 1.0]), np.array([1.0, 2.0])))
-    document = plain(casadi.Function("f", [at], [table(at)])).document()
-    read_function(document)
-    with pytest.raises(ValueError):
-        read_function({**document, "tables": [rows]})
