@@ -13,11 +13,10 @@ import os
 import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apc.compiler.cache import HANDS_CHANGE, LARGEST, SUFFIX, Archive, changed, program_digest, read_archive
+from apc.compiler.cache import LARGEST, SUFFIX, Archive, changed, program_digest, read_archive
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import (
     RefusedError,
@@ -29,13 +28,13 @@ from apc.compiler.files import (
     same_file,
 )
 from apc.compiler.timings import part
+from apc.opening import opened
 from apc.suffixes import written
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
 
 YAML_SUFFIXES = (".yaml", ".yml")
-_RATIONAL = re.compile(r"-?[0-9]{1,4000}(/[1-9][0-9]{,4000})?")
 _TOPOLOGY = re.compile(rb"^\xef?\xbb?\xbf?topology\s*:", re.MULTILINE)
 
 
@@ -94,51 +93,6 @@ def load_fresh(path: Path) -> CompiledSystem:
         what = f"is stale: {now} has changed since it was compiled"
         raise ApcError(Mistake("E605", Place(str(path)), what, hint=f"apc compile {topology}"))
     return opened(archive, path.parent)
-
-
-def opened(archive: Archive, folder: Path) -> CompiledSystem:
-    """Return the model of a file: its own if this user's apc wrote it, else what its texts compile to.
-
-    Parameters
-    ----------
-    archive
-        The file.
-    folder
-        Where it is: there its texts are said to stand in messages.
-
-    Raises
-    ------
-    ApcError
-        The mistakes of its texts.
-    """
-    if archive.sealed and archive.origin.program == program_digest():
-        from apc.compiler import store
-
-        return store.opened(archive)
-    from apc.analysis.selfcheck import check_frame
-    from apc.compiler.pipeline import compile_again
-
-    system = compile_again(archive.origin, folder)
-    check_frame(system)
-    for change in archive.origin.changes:
-        system = _changed_again(system, change)
-    return system
-
-
-def _changed_again(system: CompiledSystem, change: Sequence[tuple[str, str]]) -> CompiledSystem:
-    """Make a change that a model's origin tells of. Raises ApcError if there can be none such."""
-    from apc.frame.devices import with_hands
-    from apc.frame.names import find
-    from apc.frame.overrides import Override, apply
-
-    for name, value in change:
-        if name == HANDS_CHANGE:
-            return with_hands(system, value)
-        if not _RATIONAL.fullmatch(value):
-            what = f"is no rational number: {value[:80]}"
-            raise ApcError(Mistake("E604", Place(name[:80]), what))
-    found = [(find(system, name, counts=True), Fraction(value)) for name, value in change]
-    return apply(system, [Override(free, value) for free, value in found])
 
 
 def load_or_compile(path: Path) -> CompiledSystem:

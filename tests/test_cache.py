@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import apc
-from apc import inputs
+from apc import inputs, opening
 from apc.__main__ import run
 from apc.api import load
 from apc.compiler import cache, files, store, timings
@@ -92,7 +92,8 @@ def test_a_change_of_the_library_or_of_the_program_is_noticed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(inputs, "program_digest", lambda: "other")
+        for module in (inputs, opening):
+            patch.setattr(module, "program_digest", lambda: "other")
         assert not compiled_already(SCENE)
         patch.setattr(store, "opened", lambda archive: pytest.fail("what another program compiled is used"))
         assert load(MODEL).name == "scene", "compiled again from its texts"

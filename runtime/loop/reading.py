@@ -23,12 +23,12 @@ from apc.compiler.cache import read_archive
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, read_file
 from apc.compiler.words import counted
-from apc.inputs import opened
 from apc.loop.packets import DROPPED
 from apc.loop.peer import live_scene
 from apc.loop.run import ARRAYS, PLAIN, SCENE, PeerRun, Run
 from apc.network.timetable import START, Route
 from apc.npz import DamageError, read_arrays
+from apc.opening import opened
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 
@@ -133,6 +133,7 @@ def _peer(found: dict[str, NDArray[Any]]) -> PeerRun:
     _want(found["told"].size <= LONGEST, "it tells too much")
     try:
         told = msgspec.json.decode(found["told"].tobytes(), type=_Told)
+        _want(all(map(str.isprintable, told.not_given)), "")  # it is shown in a terminal
     except ValueError:
         raise DamageError("what it tells is not what apc play writes") from None
     routed = {f"{name}{at}" for name in ("packets", "missing") for at in range(min(told.routes, len(found)))}
