@@ -1,8 +1,8 @@
 """The model in a file NAME.apc, whoever wrote the file.
 
 Takes: an `Archive`. Gives: `opened`.
-Guarantees: of what this user's own apc did not write only the texts are taken, and compiled; nothing else in it
-is read, and no file of this machine but the built-in library.
+Guarantees: of what this user's own apc did not write only the texts are taken, and compiled; nothing else in
+it is read, and no file of this machine but the built-in library.
 Does not: ask whether the texts have changed since (see `inputs`).
 """
 

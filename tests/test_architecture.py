@@ -53,7 +53,7 @@ HOUSE = (
     ),
     ("apc.compiler.functions", "casadi_writer reached exchange functions"),
     ("apc.compiler", "pipeline store"),
-    ("apc.compiler.view", "schema catalogue diagram svg layers picture stages listing"),
+    ("apc.compiler.view", "schema catalogue diagram stages listing"),
     (
         "apc",
         """

@@ -7,17 +7,15 @@ import json
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 
 import apc
 from apc.__main__ import run
-from apc.compiler.view.diagram import Diagram, build_diagram
-from apc.compiler.view.listing import show_page
-from apc.compiler.view.picture import place
-from apc.compiler.view.svg import Box, Line, Picture, Text, draw_svg
-from apc.present.graph import graph_picture
+from apc.compiler.view.diagram import Diagram, boxes_of, build_diagram, edges_of
+from apc.present.graph import GAP, _places, graph_picture
 from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, replaced, scene, told
 
 AVERAGE_FILE = SCENES / "three-users-average.yaml"
@@ -67,100 +65,58 @@ def diagram(text: str) -> Diagram:
     return build_diagram(scene(text))
 
 
-Rectangle = tuple[float, float, float, float]
-
-
-def apart(one: Rectangle, two: Rectangle) -> bool:
-    return one[2] <= two[0] or two[2] <= one[0] or one[3] <= two[1] or two[3] <= one[1]
-
-
-def along(line: Line) -> list[tuple[float, float]]:
-    """Return points along a line, as close as a letter is wide."""
-    steps = [i / 100 for i in range(101)]
-    if line.curved:
-        (x0, y0), (x1, y1) = line.points
-        return [
-            (x0 + (x1 - x0) * (1.5 * t - 1.5 * t**2 + t**3), y0 + (y1 - y0) * (3 * t**2 - 2 * t**3))
-            for t in steps
-        ]
-    return [
-        (a[0] + (b[0] - a[0]) * t, a[1] + (b[1] - a[1]) * t)
-        for a, b in itertools.pairwise(line.points)
-        for t in steps
-    ]
+def apart(one: tuple[float, ...], two: tuple[float, ...]) -> bool:
+    """Say whether two boxes, each of left, top, width and height, do not overlap."""
+    return any(a[k] + a[k + 2] <= b[k] for k in (0, 1) for a, b in ((one, two), (two, one)))
 
 
 @pytest.mark.parametrize("name", TEXTS)
-def test_no_text_overlaps_another_and_no_line_crosses_one(name: str) -> None:
-    picture: Picture = place(diagram(TEXTS[name]))
-    texts = [mark for mark in picture.marks if isinstance(mark, Text)]
-    for one, two in itertools.combinations(texts, 2):
-        assert apart(one.box, two.box), (one.text, two.text)
-    for line in (mark for mark in picture.marks if isinstance(mark, Line)):
-        x, y = np.array(along(line)).T
-        for text in texts:
-            left, low, right, high = text.box
-            assert not ((left < x) & (x < right) & (low < y) & (y < high)).any(), (line, text.text)
+def test_boxes_stand_apart_and_lines_run_between_columns_that_are_neighbours(name: str) -> None:
+    drawn = diagram(TEXTS[name])
+    places = _places(boxes_of(drawn), edges_of(drawn))
+    for one, two in itertools.combinations(places.values(), 2):
+        assert apart(one, two)
+    for edge in edges_of(drawn):
+        first, second = sorted((places[edge.one], places[edge.two]))
+        assert second[0] - (first[0] + first[2]) == pytest.approx(GAP)
 
 
 @pytest.mark.parametrize("name", TEXTS)
-def test_boxes_stand_apart_and_everything_is_on_the_page(name: str) -> None:
-    picture = place(diagram(TEXTS[name]))
-    boxes = [mark for mark in picture.marks if isinstance(mark, Box) and mark.fill != "none"]
+def test_no_text_of_a_picture_overlaps_another_or_leaves_the_page(name: str) -> None:
+    figure = graph_picture(diagram(TEXTS[name]))
+    figure.draw_without_rendering()
+    labels = [label for ax in figure.axes[1:] if ax.axison for label in ax.get_yticklabels()]
+    texts = [*(text for ax in figure.axes for text in (*ax.texts, ax.title)), *labels]
+    boxes = [text.get_window_extent().bounds for text in texts if text.get_text()]
     for one, two in itertools.combinations(boxes, 2):
-        sides = [(b.x, b.y, b.x + b.width, b.y + b.height) for b in (one, two)]
-        assert apart(*sides), (one, two)
-    for mark in picture.marks:
-        if isinstance(mark, Text):
-            left, top, right, bottom = mark.box
-            assert 0 <= left <= right <= picture.width and 0 <= top <= bottom <= picture.height, mark
-
-
-@pytest.mark.parametrize("name", TEXTS)
-def test_a_line_of_the_peer_runs_beside_every_box(name: str) -> None:
-    picture = place(diagram(TEXTS[name]))
-    boxes = [mark for mark in picture.marks if isinstance(mark, Box) and mark.fill != "none"]
-    for line in (mark for mark in picture.marks if isinstance(mark, Line) and (mark.curved or mark.dashed)):
-        for x, y in along(line)[1:-1]:
-            for b in boxes:
-                assert apart((x, y, x, y), (b.x + 1, b.y + 1, b.x + b.width - 1, b.y + b.height - 1)), (
-                    line,
-                    b,
-                )
-
-
-def test_every_link_is_reached_from_every_part_that_hears_over_it() -> None:
-    picture = place(diagram(MANY))
-    lines = [mark for mark in picture.marks if isinstance(mark, Line) and mark.dashed and not mark.arrows]
-    boxes = [mark for mark in picture.marks if isinstance(mark, Box)]
-    parts = {(box.x + box.width, box.y + box.height / 2) for box in boxes}
-    border = next(box.x + box.width for box in boxes if box.fill == "none")
-    ends = [point for line in lines for point in (line.points[0], line.points[-1])]
-    loose = {point for point in ends if ends.count(point) == 1}
-    assert len(loose & parts) == 2, "near and far"
-    assert len([x for x, _ in loose - parts if x == border]) == 2
-    assert len(loose) == 4, "no way is broken off between"
+        assert apart(one, two)
+    for left, low, width, height in boxes:
+        assert left >= 0 and left + width <= figure.bbox.width
+        assert low >= 0 and low + height <= figure.bbox.height
 
 
 def test_the_picture_names_every_part_with_its_type_and_numbers() -> None:
-    document = ET.fromstring(draw_svg(place(diagram(AVERAGE))))
+    document = ET.fromstring(apc.show(AVERAGE_FILE, format="svg"))
     words = [element.text for element in document.iter("{http://www.w3.org/2000/svg}text")]
     for word in (
-        *("three-users-average", "one of 3 peers", "device", "mass 0.1 kg", "cube", "shared: 0.2 kg a copy"),
+        *("three-users-average, one of 3 peers", "device", "mass 0.1 kg", "cube", "shared: 0.2 kg a copy"),
         *("contact", "SampledSpringDamper", "stiffness 1000 N/m", "delay 1 ms", "coordination"),
-        *("AveragePosition", "lan", "available 8 ms later", "3 peers, complete graph"),
-        *("clock haptic: every 1 ms", "one frame, 8 ms"),
+        *("AveragePosition", "lan", "available 8 ms later", "lan: 3 peers, complete graph"),
+        *("haptic: every 1 ms", "ms of one frame, 8 ms"),
     ):
         assert word in words, word
 
 
-def test_text_of_a_scene_cannot_break_out_of_the_picture() -> None:
-    text = replaced(
-        AVERAGE, ("about: Three", 'about: "<script>alert(1)</script> & Three'), ("others.  ", 'others."  ')
-    )
-    drawn = draw_svg(place(diagram(text)))
+@pytest.mark.parametrize("form", ["svg", "mermaid"])
+def test_text_of_a_scene_cannot_break_out_of_the_picture(
+    form: Literal["svg", "mermaid"], tmp_path: Path
+) -> None:
+    about = ("about: Three", 'about: "<script>alert(1)</script> & Three'), ("others.  ", 'others."  ')
+    (tmp_path / "scene.yaml").write_text(replaced(AVERAGE, *about), encoding="utf-8")
+    drawn = apc.show(tmp_path / "scene.yaml", format=form)
     assert "<script>" not in drawn
-    ET.fromstring(drawn)
+    if form == "svg":
+        ET.fromstring(drawn)
 
 
 def test_parts_are_joined_as_the_topology_says() -> None:
@@ -175,8 +131,20 @@ def test_parts_are_joined_as_the_topology_says() -> None:
 
 
 def test_a_star_of_hundreds_is_a_small_picture() -> None:
-    assert len(place(diagram(STAR)).marks) < 120
-    assert len(place(diagram(replaced(STAR, ("count: 300", "count: 1000000")))).marks) < 120
+    small = graph_picture(diagram(replaced(STAR, ("count: 300", "count: 3")))).get_size_inches()
+    for count in ("300", "1000000"):
+        figure = graph_picture(diagram(replaced(STAR, ("count: 300", f"count: {count}"))))
+        assert np.allclose(figure.get_size_inches(), small, rtol=0.05)
+        assert len(boxes_of(diagram(STAR))) == 6
+
+
+def test_of_many_groups_the_first_are_drawn_and_the_others_counted() -> None:
+    groups = "".join(f"  g{k}: {{count: 1}}\n" for k in range(20))
+    found = boxes_of(diagram(replaced(AVERAGE, ("  user: {count: 3}\n", groups))))
+    assert [box.lines for box in found if box.role == "group"][-2:] == [
+        ("g7: 1 peer",),
+        ("and 12 more groups",),
+    ]
 
 
 def test_the_text_tells_graph_equations_and_schedule() -> None:
@@ -281,12 +249,19 @@ def test_graphviz_text_has_every_node_once_and_closes_every_quote() -> None:
     assert text.startswith('digraph "three-users-average" {\n') and text.endswith("\n}")
     for name in ("device", "cube", "contact", "coordination"):
         assert len(re.findall(rf'^ *"{name}" \[', text, re.MULTILINE)) == 1
-    assert '"cube" -> "contact"' in text
+    assert '"cube" -> "contact"' in text and '"coordination" -> "link lan" [dir=both, style=dashed]' in text
     assert all(len(re.findall(r'(?<!\\)"', line)) % 2 == 0 for line in text.splitlines())
 
 
+def test_mermaids_text_joins_what_is_joined() -> None:
+    lines = apc.show(AVERAGE_FILE, format="mermaid").splitlines()
+    assert lines[0] == "flowchart LR"
+    assert lines[1] == '  n0["device<br>mass 0.1 kg<br>damping 5 N·s/m"]'
+    assert "  n0 --- n2" in lines and "  n3 -.- n4" in lines
+
+
 @pytest.mark.parametrize(
-    ("suffix", "start"), [("svg", "<svg"), ("dot", "digraph"), ("json", "{"), ("txt", "three")]
+    ("suffix", "start"), [("dot", "digraph"), ("mmd", "flowchart"), ("json", "{"), ("txt", "three")]
 )
 def test_the_file_says_the_format(
     suffix: str, start: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -297,7 +272,7 @@ def test_the_file_says_the_format(
     assert out.read_text(encoding="utf-8").startswith(start)
 
 
-KINDS = ".txt, .json, .dot, .gv, .svg, .png, .pdf"
+KINDS = ".txt, .json, .dot, .gv, .mmd, .svg, .png, .pdf"
 
 
 @pytest.mark.parametrize(
@@ -321,11 +296,11 @@ def test_no_file_is_written_as_what_its_name_does_not_say(
 
 def test_a_suffix_in_capitals_is_the_same_suffix(tmp_path: Path) -> None:
     assert run(["show", str(AVERAGE_FILE), "--out", str(tmp_path / "SCENE.SVG")]) == 0
-    assert (tmp_path / "SCENE.SVG").read_text(encoding="utf-8").startswith("<svg")
+    assert "<svg" in (tmp_path / "SCENE.SVG").read_text(encoding="utf-8")
 
 
 def test_the_command_prints_what_the_function_returns(capsys: pytest.CaptureFixture[str]) -> None:
-    for form in ("text", "json", "dot", "svg"):
+    for form in ("text", "json", "dot", "mermaid", "svg"):
         assert run(["show", str(AVERAGE_FILE), "--format", form]) == 0
         assert capsys.readouterr().out == apc.show(AVERAGE_FILE, format=form) + "\n"  # type: ignore[arg-type] # a word
 
@@ -337,21 +312,11 @@ def test_a_compiled_model_has_no_equations_to_show() -> None:
     ]
 
 
-@pytest.mark.parametrize(("suffix", "magic"), [(".pdf", b"%PDF-"), (".png", b"\x89PNG"), (".svg", b"<svg")])
+@pytest.mark.parametrize(("suffix", "magic"), [(".pdf", b"%PDF-"), (".png", b"\x89PNG"), (".svg", b"<?xml")])
 def test_a_picture_is_what_its_name_says(suffix: str, magic: bytes, tmp_path: Path) -> None:
     out = tmp_path / f"scene{suffix}"
     assert run(["show", str(AVERAGE_FILE), "--out", str(out)]) == 0
     assert out.read_bytes().startswith(magic)
-
-
-def test_the_drawn_page_has_every_text_of_the_svg_inside_it() -> None:
-    page = show_page(AVERAGE_FILE)
-    figure = graph_picture(page)
-    drawn = {text.get_text(): text for text in figure.axes[0].texts}
-    assert {mark.text for mark in page.marks if isinstance(mark, Text)} == set(drawn)
-    for text in drawn.values():
-        box = text.get_window_extent()
-        assert box.x0 >= 0 and box.x1 <= figure.bbox.width, text.get_text()
 
 
 def test_peers_that_a_picture_leaves_out_are_counted(tmp_path: Path) -> None:
@@ -359,5 +324,5 @@ def test_peers_that_a_picture_leaves_out_are_counted(tmp_path: Path) -> None:
     text = AVERAGE_FILE.read_text(encoding="utf-8").replace("count: 3", "count: 31")
     scene.write_text(text.replace("lan: {", "lan: {graph: star, "), encoding="utf-8")
     drawn = apc.show(scene, format="svg")
-    assert "31 peers, star graph" in drawn and "16 drawn, 15 left out" in drawn
+    assert "lan: 31 peers, star graph" in drawn and "16 drawn, 15 left out" in drawn
     assert "left out" not in apc.show(AVERAGE_FILE, format="svg")

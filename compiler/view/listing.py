@@ -1,7 +1,7 @@
 """What a scene is made of, as text for a person to read: what `apc show` tells.
 
 Takes: a topology's path.
-Gives: `show_text` and `show_document` (for JSON), `show_dot`, `show_svg`, `show_page`.
+Gives: `show_text` and `show_document` (for JSON); `diagram_of`.
 Guarantees: `show_text` has at most 80 columns wherever a name allows it; the same topology gives the same
 bytes.
 Does not: analyse, or compute anything new.
@@ -24,28 +24,11 @@ from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.multiples import common_multiple
 from apc.compiler.pipeline import each_stage, run_stages
 from apc.compiler.scene.scene import Scene
-from apc.compiler.view.diagram import Diagram, build_diagram, draw_dot, one_of, seconds
-from apc.compiler.view.picture import place
+from apc.compiler.view.diagram import Diagram, build_diagram, one_of, seconds, shape_of
 from apc.compiler.view.stages import step_lines
-from apc.compiler.view.svg import Picture, draw_svg
 from apc.compiler.words import counted, wrapped
 
 PAIRWISE = ("max", "min")
-
-
-def show_dot(path: Path) -> str:
-    """Return the graph of a topology in Graphviz's language."""
-    return draw_dot(_diagram(path))
-
-
-def show_svg(path: Path) -> str:
-    """Return the graph of a topology as a picture, an SVG document."""
-    return draw_svg(show_page(path))
-
-
-def show_page(path: Path) -> Picture:
-    """Return the graph of a topology as marks on a page."""
-    return place(_diagram(path))
 
 
 def show_text(path: Path) -> str:
@@ -100,7 +83,8 @@ def show_document(path: Path) -> dict[str, Any]:
     }
 
 
-def _diagram(path: Path) -> Diagram:
+def diagram_of(path: Path) -> Diagram:
+    """Return the graph of a topology."""
     scene = run_stages(path, until="scene")
     assert isinstance(scene, Scene)
     return build_diagram(scene)
@@ -142,8 +126,7 @@ def _graph_lines(diagram: Diagram) -> Iterator[str]:
         if node.role == "joint":
             yield from wrapped(f"rigidly joined: {node.name}", "    ", "      ")
     for net in diagram.nets:
-        shape = f"{counted(len(net.pairs), 'arc')}" if net.shape == "arcs" else f"{net.shape} graph"
-        yield from wrapped(f"{net.name}: {shape}, {', '.join(net.lines)}", "  ", "    ")
+        yield from wrapped(f"{net.name}: {shape_of(net)}, {', '.join(net.lines)}", "  ", "    ")
     for crowd in diagram.crowds:
         own = f"; {', '.join(crowd.settings)}" if crowd.settings else ""
         yield from wrapped(f"{crowd.name}: {counted(crowd.count, 'peer')}{own}", "  ", "    ")
