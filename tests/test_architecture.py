@@ -71,7 +71,7 @@ HOUSE = (
         lift nearby ports batch_lift course residues
         """,
     ),
-    ("apc.network", "philox channel nominal timetable recorded"),
+    ("apc.network", "channel nominal timetable recorded"),
     (
         "apc.eigen",
         """

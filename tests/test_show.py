@@ -125,9 +125,9 @@ def test_parts_are_joined_as_the_topology_says() -> None:
     assert ("ground of leash", "leash") in found.joints
     assert ("end and cube", "end") in found.joints and ("cube", "end and cube") in found.joints
     assert ("long", "links") in found.joints, "a long array is one node"
-    assert "40 of them" in next(node.lines for node in found.nodes if node.name == "long")
-    assert next(node.links for node in found.nodes if node.name == "far") == ("wan",)
-    assert "only at left" in next(node.lines for node in found.nodes if node.name == "far")
+    assert "40 of them" in next(node.about for node in found.parts if node.name == "long")
+    assert next(node.links for node in found.parts if node.name == "far") == ("wan",)
+    assert "only at left" in next(node.about for node in found.parts if node.name == "far")
 
 
 def test_a_star_of_hundreds_is_a_small_picture() -> None:
@@ -150,21 +150,21 @@ def test_of_many_groups_the_first_are_drawn_and_the_others_counted() -> None:
 def test_the_text_tells_graph_equations_and_schedule() -> None:
     lines = apc.show(AVERAGE_FILE).splitlines()
     for line in (
-        "    device: mass 0.1 kg, damping 5 N·s/m",
-        "      joins device and cube",
-        "      hears the others over lan",
-        "  18 equations, 18 unknowns",
-        "    device.mass*der(device.v) = device.flange.f - device.damping*device.v",
-        "    der(device.v) := (device.flange.f - device.damping*device.v)/device.mass",
+        "  device: mass 0.1 kg, damping 5 N·s/m",
+        "    joined to device, cube",
+        "    joined to cube, lan",
+        "  kind user: 18 equations, 18 unknowns",
+        "    device.mass*der(device.v) = device.flange.f - device.damping*device.v #",
+        "      der(device.v) := (device.flange.f - device.damping*device.v)/device.mass",
         "  frame of 8 ms, after which every clock stands as before",
-        "  network ticks every 8 ms, once a frame: packets leave over lan",
-        "  contact.f acts from 1 ms after its tick, held for 1 ms until the next one acts",
+        "  clock network, period 8 ms, ticks 1, sends lan",
+        "  kind user, hold contact.f, clock haptic, delay 1 ms, held 1 ms",
     ):
         assert line in lines, line
     schedule = " ".join(" ".join(lines[lines.index("SCHEDULE") :]).split())
     assert (
-        "lan: a packet (coordination.x, coordination.v) every 8 ms, available 8 ms later; "
-        "1 packet of each sender on the way; the newest one heard is 8 ms to 16 ms old"
+        "link lan, sends coordination.x and coordination.v, period 8 ms, delay 8 ms, on the way 1, "
+        "age 8 ms to 16 ms"
     ) in schedule
 
 
@@ -222,7 +222,7 @@ def test_what_costs_a_pair_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     text = replaced(text, ("type: AveragePosition", "type: Furthest"), ("1 ms, link", "0 s, link"))
     path.write_text(text, encoding="utf-8")
     (tmp_path / "furthest.yaml").write_text(FURTHEST, encoding="utf-8")
-    assert "over lan; one evaluation a pair of peers" in " ".join(apc.show(path).split())
+    assert "link lan, pairwise" in " ".join(apc.show(path).split())
     assert run(["compile", str(path)]) == 0, capsys.readouterr().err
     report = " ".join(capsys.readouterr().out.split())
     assert re.search(

@@ -37,29 +37,29 @@ LONGEST_EXPRESSION = 24  # characters shown beside its value
 class Vertex:
     """A part, or where parts meet.
 
-    `role` is mass, coupler, hand, ground or joint; `lines` are what to write below its name: its type, then
-    its numbers.
+    `role` is mass, coupler, hand, ground or joint; `about` are its type, then its numbers; `links` those over
+    which it hears.
     """
 
     name: str
     role: str
-    lines: tuple[str, ...]
+    about: tuple[str, ...]
     clock: str
     links: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Net:
-    """A link: what to write below its name, and who hears whom, peers counted from 0.
+    """A link: the shape of its graph, what is told of it, and who hears whom, peers counted from 0.
 
-    `pairs` are (sender, receiver) of a graph given arc by arc, and empty for the other shapes.
+    `arcs` are (sender, receiver) of a graph given arc by arc, and empty for the other shapes.
     """
 
     name: str
-    lines: tuple[str, ...]
     clock: str
-    shape: str
-    pairs: tuple[tuple[int, int], ...]
+    graph: str
+    arcs: tuple[tuple[int, int], ...]
+    about: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,20 +82,20 @@ class Pulse:
 
 @dataclass(frozen=True, slots=True)
 class Diagram:
-    """One peer's parts, and the peers. `joints` are pairs of nodes by name."""
+    """One peer's parts, and the peers. `joints` are pairs of parts by name."""
 
     title: str
     about: str
-    nodes: tuple[Vertex, ...]
+    parts: tuple[Vertex, ...]
     joints: tuple[tuple[str, str], ...]
-    nets: tuple[Net, ...]
-    crowds: tuple[Crowd, ...]
+    links: tuple[Net, ...]
+    groups: tuple[Crowd, ...]
     pulses: tuple[Pulse, ...]
 
     @property
     def peers(self) -> int:
         """The number of peers."""
-        return sum(crowd.count for crowd in self.crowds)
+        return sum(group.count for group in self.groups)
 
 
 def build_diagram(scene: Scene) -> Diagram:
@@ -235,7 +235,7 @@ def _net(link: SceneLink) -> Net:
     lines += [f"{d.sender} to {d.receiver}: {seconds(d.delay.number)} later" for d in link.delays]
     lines += [] if link.channel is None else link.channel.told
     pairs = tuple((int(sender), int(receiver)) for sender, receiver in link.graph.arcs)
-    return Net(link.name, tuple(lines), link.clock, link.graph.shape, pairs)
+    return Net(link.name, link.clock, link.graph.shape, pairs, tuple(lines))
 
 
 def _crowds(scene: Scene) -> Iterator[Crowd]:
@@ -280,33 +280,33 @@ class Edge:
 def boxes_of(diagram: Diagram) -> tuple[Box, ...]:
     """Return what is drawn of a scene, of many groups the first."""
     found = [
-        Box(node.name, node.role, (GROUND if node.role == GROUND else node.name, *node.lines), node.clock)
-        for node in diagram.nodes
+        Box(part.name, part.role, (GROUND if part.role == GROUND else part.name, *part.about), part.clock)
+        for part in diagram.parts
     ]
     found += [
-        Box(f"link {net.name}", "link", (net.name, shape_of(net), *net.lines), net.clock)
-        for net in diagram.nets
+        Box(f"link {net.name}", "link", (net.name, shape_of(net), *net.about), net.clock)
+        for net in diagram.links
     ]
-    for crowd in diagram.crowds[:MOST_CROWDS]:
+    for crowd in diagram.groups[:MOST_CROWDS]:
         name = f"{crowd.name}: {counted(crowd.count, 'peer', ',')}"
         found.append(Box(f"group {crowd.name}", "group", (name, *crowd.settings[:MOST_LINES])))
-    if len(diagram.crowds) > MOST_CROWDS:
-        found.append(Box("groups", "group", (f"and {len(diagram.crowds) - MOST_CROWDS} more groups",)))
+    if len(diagram.groups) > MOST_CROWDS:
+        found.append(Box("groups", "group", (f"and {len(diagram.groups) - MOST_CROWDS} more groups",)))
     return tuple(found)
 
 
 def edges_of(diagram: Diagram) -> tuple[Edge, ...]:
     """Return what joins the boxes of a scene."""
     joined = [Edge(one, two, sent=False) for one, two in diagram.joints]
-    heard = [Edge(node.name, f"link {link}", sent=True) for node in diagram.nodes for link in node.links]
+    heard = [Edge(node.name, f"link {link}", sent=True) for node in diagram.parts for link in node.links]
     groups = [box.key for box in boxes_of(diagram) if box.role == "group"]
-    told = [Edge(f"link {net.name}", group, sent=True) for net in diagram.nets for group in groups]
+    told = [Edge(f"link {net.name}", group, sent=True) for net in diagram.links for group in groups]
     return (*joined, *heard, *told)
 
 
 def shape_of(net: Net) -> str:
     """Return who hears whom over a link, in words."""
-    return counted(len(net.pairs), "arc") if net.shape == "arcs" else f"{net.shape} graph"
+    return counted(len(net.arcs), "arc") if net.graph == "arcs" else f"{net.graph} graph"
 
 
 _DOT = {

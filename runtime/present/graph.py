@@ -57,11 +57,11 @@ def graph_picture(diagram: Diagram) -> Any:
     boxes, edges = boxes_of(diagram), edges_of(diagram)
     places = _places(boxes, edges)
     title = f"{diagram.title}, {one_of(diagram)}"
-    below = BESIDE * (len(diagram.nets) + 2 * bool(diagram.pulses))
+    below = BESIDE * (len(diagram.links) + 2 * bool(diagram.pulses))
     right = max(left + wide for left, _, wide, _ in places.values())
     width = max(below, max(right, _width(title, TITLE)) + 2 * MARGIN)
     graph = max(top + high for _, top, _, high in places.values()) + BETWEEN
-    small = BELOW if diagram.pulses or diagram.nets else 0.0
+    small = BELOW if diagram.pulses or diagram.links else 0.0
     height = HEAD + graph + small + MARGIN
     figure = need("matplotlib.figure", "plot").Figure(figsize=(width / 72, height / 72))
     ax = figure.add_axes((0, (small + MARGIN) / height, 1, (graph + HEAD) / height), xlim=(0, width))
@@ -138,18 +138,18 @@ def _draw(ax: Any, box: Box, place: tuple[float, float, float, float], colours: 
 def _colours(diagram: Diagram) -> dict[str, str]:
     """Return the colours of clocks, and from the other end those of groups."""
     clocks = {f"clock {pulse.name}": COLOURS[1 + i % 6] for i, pulse in enumerate(diagram.pulses)}
-    groups = {f"group {crowd.name}": COLOURS[-1 - i % 6] for i, crowd in enumerate(diagram.crowds)}
+    groups = {f"group {crowd.name}": COLOURS[-1 - i % 6] for i, crowd in enumerate(diagram.groups)}
     return clocks | groups
 
 
 def _draw_below(figure: Any, diagram: Diagram, height: float, colours: dict[str, str]) -> None:
     """Draw who hears whom over each link, and the ticks of each clock along a frame."""
-    owners = [crowd.name for crowd in diagram.crowds for _ in range(min(crowd.count, MOST_PEERS))][
+    owners = [crowd.name for crowd in diagram.groups for _ in range(min(crowd.count, MOST_PEERS))][
         :MOST_PEERS
     ]
-    shares = [*(1 for _ in diagram.nets), *([2] if diagram.pulses else [])]
+    shares = [*(1 for _ in diagram.links), *([2] if diagram.pulses else [])]
     start = 0.02
-    for share, net in zip(shares, [*diagram.nets, None], strict=False):
+    for share, net in zip(shares, [*diagram.links, None], strict=False):
         width = 0.96 * share / sum(shares)
         if net is None:
             ax = figure.add_axes((start + 0.35 * width, 0.3 * height, 0.62 * width, 0.5 * height))
@@ -168,12 +168,12 @@ def _draw_peers(ax: Any, diagram: Diagram, net: Net, fills: list[str]) -> None:
         "ring": networkx.cycle_graph,
         "star": lambda peers: networkx.star_graph(peers - 1),
     }
-    if net.shape in shapes:
-        graph = shapes[net.shape](number)
+    if net.graph in shapes:
+        graph = shapes[net.graph](number)
     else:
-        graph = networkx.DiGraph(pair for pair in net.pairs if max(pair) < number)
+        graph = networkx.DiGraph(pair for pair in net.arcs if max(pair) < number)
         graph.add_nodes_from(range(number))
-    inner = [0] if net.shape == "star" else []
+    inner = [0] if net.graph == "star" else []
     shells = [one for one in (inner, [peer for peer in range(number) if peer not in inner]) if one]
     look = {"node_size": 40, "edge_color": FAINT, "width": 0.7, "with_labels": False}
     places = networkx.shell_layout(graph, shells)
