@@ -1,9 +1,9 @@
 """What is read from disk and written to it, whoever named the file.
 
-Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `same_file`;
-`recorded`, `replayed`; `write_file`, `write_text`, `write_texts`, `check_target`, `unwritable`, `is_special`,
-`is_stdout`, and for what is written piece by piece `begin_file`, `finish_file`, `drop_file`, `partial_name`;
-`unlink_link`.
+Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `same_file`; `recorded`,
+`replayed`; `write_file`, `write_bytes`, `write_text`, `write_texts`, `check_target`, `unwritable`,
+`is_special`, `is_stdout`, and for what is written piece by piece `begin_file`, `finish_file`, `drop_file`,
+`partial_name`; `unlink_link`.
 Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
 waited for. What is written is there whole or not at all, and what a writer left that was killed goes with the
 next: a file is replaced by one of its mode and owner unless it is read-only, a link stays and its file is
@@ -259,13 +259,18 @@ def write_file(path: Path, write: Callable[[Path], None]) -> None:
         raise
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text and the end of its last line, whole or not at all. Raises ApcError (E601) if it can't."""
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file, whole or not at all. Raises ApcError (E601) if it can't be written."""
 
     def write(temporary: Path) -> None:
-        temporary.write_bytes(f"{text}\n".encode())
+        temporary.write_bytes(content)
 
     write_file(path, write)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text and the end of its last line, whole or not at all. Raises ApcError (E601) if it can't."""
+    write_bytes(path, f"{text}\n".encode())
 
 
 def write_texts(texts: Mapping[Path, str]) -> None:

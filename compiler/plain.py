@@ -179,9 +179,8 @@ def straight(function: Any) -> PlainFunction:
     ]
     numbers = [function.instruction_constant(k) for code, _, _, k in instructions if code == casadi.OP_CONST]
     constants = {number: first[-1] + place for place, number in enumerate(dict.fromkeys(map(_key, numbers)))}
-    called = _tables(function, [k for code, _, _, k in instructions if code == casadi.OP_CALL])
+    called = _called(function, [k for code, _, _, k in instructions if code == casadi.OP_CALL])
     tables = tuple(dict.fromkeys(table for _, table in called.values()))
-    places = {table: first[-1] + len(constants) + place for place, table in enumerate(tables)}
     before = first[-1] + len(constants) + len(tables)
     work = [0] * function.sz_w()
     operations: list[tuple[Any, ...]] = []
@@ -196,7 +195,8 @@ def straight(function: Any) -> PlainFunction:
         elif code == casadi.OP_CALL:
             name, table = called[k]
             at, by = work[taken[0]], work[taken[-1]]
-            operations.append((LOOK if name == TABLE else SLOPE, places[table], at))
+            number = first[-1] + len(constants) + tables.index(table)
+            operations.append((LOOK if name == TABLE else SLOPE, number, at))
             if name != TABLE:  # a derivative, of any order, is the slope times what it is taken by
                 operations.append(("mul", before + len(operations) - 1, by))
             work[given[0]] = before + len(operations) - 1
@@ -210,19 +210,15 @@ def straight(function: Any) -> PlainFunction:
     )
 
 
-def _tables(function: Any, calls: Sequence[int]) -> dict[int, tuple[str, Interpolation]]:
+def _called(function: Any, calls: Sequence[int]) -> dict[int, tuple[str, Interpolation]]:
     """Return what an SX function's calls, by their instructions, call, and the table that is looked up."""
-    found: dict[int, tuple[str, Interpolation]] = {}
-    read: dict[int, Interpolation] = {}  # of each function, which may be called many times
-    known: dict[tuple[bytes, bytes], Interpolation] = {}  # of equal rows, which are one table
     expressions: Any = function.instructions_sx() if calls else None
-    for k in calls:
-        one = expressions[k].which_function()
-        if one.__hash__() not in read:
-            table = table_of(one)
-            rows = table.times.tobytes(), table.numbers.tobytes()
-            read[one.__hash__()] = known.setdefault(rows, table)
-        found[k] = one.name(), read[one.__hash__()]
+    functions = {k: expressions[k].which_function() for k in calls}
+    known: dict[bytes, Interpolation] = {}  # of equal rows, which are one table
+    found = {}
+    for k, one in functions.items():
+        table = table_of(one)
+        found[k] = one.name(), known.setdefault(table.times.tobytes() + table.numbers.tobytes(), table)
     return found
 
 

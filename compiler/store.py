@@ -19,19 +19,14 @@ import numpy as np
 
 from apc.compiler.cache import Archive, Origin, packed
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.files import write_file
+from apc.compiler.files import write_bytes
 from apc.compiler.timings import part
 
 
 @part("save")
 def save(system: CompiledSystem, path: Path, *, compiled: bool = False) -> None:
     """Write a model; `compiled` if it is as its texts compile now. Raises ApcError if it can't be written."""
-    content = packed(system.origin, model_of(system), compiled=compiled)
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(content)
-
-    write_file(path, write)
+    write_bytes(path, packed(system.origin, model_of(system), compiled=compiled))
 
 
 def model_of(system: CompiledSystem) -> bytes:
