@@ -638,7 +638,7 @@ def _several(scenes: _Scene | Iterable[_Scene], function: str) -> list[_Scene]:
 
 
 def _path(scene: _Scene, function: str) -> Path:
-    """Return the path of a topology; refuse a compiled model, which no longer has its text."""
+    """Return the path of a topology; refuse a compiled model, beside which it stands."""
     from apc.inputs import refuse_model
 
     if isinstance(scene, CompiledSystem):
@@ -874,7 +874,7 @@ def show(path: str | Path, *, format: Format = "text") -> str:
     Raises
     ------
     ApcError
-        The file is at fault, or is a compiled model, which no longer has the equations as written.
+        The file is at fault, or is a compiled model: its topology is meant.
     """
     from apc.compiler.view import diagram, listing
     from apc.present.forms import json_text

@@ -169,7 +169,7 @@ def open_scene(
 def refuse_model(path: Path, command: str) -> None:
     """Refuse a compiled model (E615) where a command tells of equations and texts as they were written."""
     if path.suffix == ".apc":
-        what = "is a compiled model, which no longer has the equations as they were written"
+        what = "is a compiled model, and this reads the topology that it was made from"
         hint = f"apc {command} {path.with_suffix('.yaml')}"
         raise ApcError(Mistake("E615", Place(str(path)), what, hint=hint))
 

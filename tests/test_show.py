@@ -307,7 +307,7 @@ def test_the_command_prints_what_the_function_returns(capsys: pytest.CaptureFixt
 
 def test_a_compiled_model_has_no_equations_to_show() -> None:
     assert told(apc.show, "scene.apc") == [
-        "scene.apc: E615 is a compiled model, which no longer has the equations as they were written. "
+        "scene.apc: E615 is a compiled model, and this reads the topology that it was made from. "
         "Write: apc show scene.yaml"
     ]
 
