@@ -94,14 +94,6 @@ def test_a_name_nobody_has_gives_nothing() -> None:
     assert built_in.connector("Mass") is None, "a component is no connector"
 
 
-def test_the_texts_handed_out_are_listed_with_their_digests() -> None:
-    built_in = Library()
-    assert built_in.texts == ()
-    built_in.component("Mass")
-    assert [name for name, _ in built_in.texts] == ["Flange", "Mass"]
-    assert all(len(digest) == 64 for _, digest in built_in.texts)
-
-
 def test_a_folder_of_ones_own_comes_before_the_built_in_library(tmp_path: Path) -> None:
     own = library(tmp_path, BALL, BALL.replace("Ball", "Mass"))
     found = own.component("Mass")
