@@ -285,7 +285,7 @@ def compiled_already(topology: Path) -> Archive | None:
     """
     try:
         archive = read_archive(topology.with_suffix(".apc"))
-    except ApcError:
+    except (ApcError, ValueError):  # ValueError: "." and "/" have no suffix
         return None
     fresh = (
         archive.sealed

@@ -63,6 +63,6 @@ def _changed_again(system: CompiledSystem, change: Sequence[tuple[str, str]]) ->
             return with_hands(system, value)
         if not _RATIONAL.fullmatch(value):
             what = f"is no rational number: {value[:80]}"
-            raise ApcError(Mistake("E604", Place(name[:80]), what))
+            raise ApcError(Mistake("E621", Place(name[:80]), what))
     found = [(find(system, name, counts=True), Fraction(value)) for name, value in change]
     return apply(system, [Override(free, value) for free, value in found])

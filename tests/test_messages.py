@@ -582,7 +582,7 @@ TOPOLOGY = [
     (  # longer than any file system's names
         "studies:",
         f"library: {'x' * 300}\nstudies:",
-        f"16:10: E214 the library folder {'x' * 57}... does not exist.",
+        f"16:10: E214 the library folder {'x' * 57}... can't be read: File name too long.",
     ),
     (
         "500 N/m,",

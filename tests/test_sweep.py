@@ -23,6 +23,7 @@ from apc.__main__ import run
 from apc.analysis.analysis import Analysis
 from apc.compiler import seal
 from apc.compiler.errors import ApcError
+from apc.compiler.files import unwritable
 from apc.processes import model_bytes
 from apc.sweeps import store as sweep_store
 from apc.sweeps import sweep as sweep_module
@@ -204,16 +205,16 @@ def test_two_processes_may_do_the_same_sweep(tmp_path: Path) -> None:
 
 def test_a_full_disk_keeps_what_is_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target = tmp_path / "r.csv"
-    fill = sweep_store._fill
+    write = sweep_store.write_bytes
     written: list[Path] = []
 
     def full(path: Path, content: bytes) -> None:
         written.append(path)
         if len(written) > 2:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        fill(path, content)
+            raise unwritable(path, OSError(errno.ENOSPC, "No space left on device"))
+        write(path, content)
 
-    monkeypatch.setattr(sweep_store, "_fill", full)
+    monkeypatch.setattr(sweep_store, "write_bytes", full)
     with pytest.raises(ApcError, match="E601 can't be written: No space left on device"):
         small(out=target, jobs=1)
     assert len(parts(target)) == 2
