@@ -41,6 +41,7 @@ LARGEST = 256 * 2**20  # bytes of the file
 LARGEST_ORIGIN = 64 * 2**20  # bytes of its third line, each of which takes up to ten of memory
 SUFFIX = ".yaml"  # of the files in a folder of components
 HANDS_CHANGE = "hands"  # what stands in the place of a number's name where hands were put to devices
+_RATIONAL = re.compile(r"-?[0-9]{1,4000}(/[1-9][0-9]{,4000})?")
 FOREIGN = "is damaged: it is not what apc compile writes"
 
 
@@ -112,6 +113,9 @@ def read_archive(path: Path) -> Archive:
         made_from = msgspec.json.decode(origin, type=Origin)
         name = made_from.topology
         if name in ("", "..") or PurePath(name).name != name or name not in dict(made_from.texts):
+            raise ValueError
+        numbers = (one for change in made_from.changes for one in change if one[0] != HANDS_CHANGE)
+        if not all(_RATIONAL.fullmatch(value) for _, value in numbers):
             raise ValueError
     except ValueError:
         raise ApcError(Mistake("E604", Place(str(path)), FOREIGN, hint=hint)) from None
