@@ -21,11 +21,11 @@ equations                   connections: where connectors meet; flatten
                             and states; structure
 functions                   casadi_writer, reached: what is written; exchange: what lies beside;
                             functions
-compiled, plain, formula    the compiled model; its functions as data; numbers that follow from others
+compiled, plain, formula    the compiled model; operations of its functions; numbers that follow from others
 interpolation               tables over time in these functions
 crowd                       how many peers there are, and how many each hears
 store                       the compiled model on disk
 seal, cache                 what this user's apc wrote; whether it still is what its texts compile to
 pipeline                    the stages one after another
-view                        schema; catalogue: the library; diagram; svg, layers, picture; stages, listing
+view                        schema; catalogue: the library; diagram; stages, listing
 """

@@ -181,5 +181,5 @@ def _listed(expr: Expr, place: Place) -> _Listed:
 
     result = fold(expr, leaf, operation)
     inputs = (("p", len(names)), ("c", len(numbers)))
-    function = PlainFunction("formula", inputs, ("y",), (), tuple(operations), ((result,),), None)
+    function = PlainFunction(inputs, (), tuple(operations), ((result,),))
     return _Listed(tuple(names), tuple(numbers), function, tuple(nodes))
