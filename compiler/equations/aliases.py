@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence, Set
 
+from sympy import Add
+
 from apc.compiler.equations.derivatives import Derivative, Derivatives
 from apc.compiler.equations.residuals import Residual
 from apc.compiler.equations.solution import Assignment
-from apc.compiler.equations.terms import ZERO, Symbol, Term, terms_of
+from apc.compiler.equations.terms import ZERO, Term
 
 
 class Aliases:
@@ -48,7 +50,7 @@ class Aliases:
         other = {
             s: one for s, derivative in derivatives.items() if (one := self._stands_for(*derivative)) is not s
         }
-        return expression.replace(other) if other else expression  # putting it together anew takes longest
+        return expression.xreplace(other) if other else expression  # putting it together anew takes longest
 
     def remove(self, residuals: Sequence[Residual]) -> list[Residual]:
         """Take the alias equations out, pass by pass until none is left; return the others, rewritten."""
@@ -76,14 +78,14 @@ class Aliases:
 
     def _pair(self, expression: Term) -> tuple[Derivative, Derivative, int] | None:
         """Return a, b and the sign of a = ±b; for a = 0, a twice and the sign 0; else None."""
-        terms = terms_of(expression)
-        if not 0 < len(terms) <= 2:
+        if expression == 0 or len(expression.args) > 2:
             return None
         derivatives = self.derivatives.derivatives(expression)
-        (one, factor), (two, other_factor) = terms[0], terms[-1]
-        if not (isinstance(one, Symbol) and isinstance(two, Symbol) and {one, two} <= derivatives.keys()):
+        parts = [part.as_coeff_Mul() for part in Add.make_args(expression)]
+        if not all(name in derivatives for _, name in parts):
             return None
-        if len(terms) == 1:
+        (factor, one), (other_factor, two) = parts[0], parts[-1]
+        if len(parts) == 1:
             return derivatives[one], derivatives[one], 0
         if abs(factor) != abs(other_factor):
             return None

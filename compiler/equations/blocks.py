@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
+import sympy
+
 from apc.compiler.equations.elimination import ZeroTests, eliminate
 from apc.compiler.equations.matching import match_columns, strong_components
 from apc.compiler.equations.residuals import (
@@ -23,15 +25,9 @@ from apc.compiler.equations.residuals import (
     report_singular,
 )
 from apc.compiler.equations.solution import Assignment, ImplicitBlock, Step
-from apc.compiler.equations.symbolic import (
-    NoDerivativeError,
-    differential,
-    is_no_number,
-    linear_form,
-    smooth_pieces,
-)
+from apc.compiler.equations.symbolic import determinant_of, is_no_number, linear_form, slope, smooth_pieces
 from apc.compiler.equations.tearing import tear
-from apc.compiler.equations.terms import ONE, ZERO, Symbol, Term, add, scaled, symbol
+from apc.compiler.equations.terms import ZERO, NoDerivativeError, Symbol, Term, symbol
 from apc.compiler.equations.zero_test import NOTHING_VANISHES, Vanishing, ZeroTest
 from apc.compiler.errors import Mistakes, Place
 
@@ -127,7 +123,7 @@ class _Solver:
                 self._report_dependent(block, free)
             return list(steps)
         [(coefficients, rest)] = linear
-        coefficient = coefficients[unknowns[0]]
+        coefficient = coefficients.get(unknowns[0], ZERO)
         if self.tests.is_zero(coefficient) or self.tests.vanishes(coefficient):
             self._report_dependent(block, unknowns)
             return []
@@ -152,10 +148,10 @@ class _Solver:
         pieces = smooth_pieces(residuals, MOST_PIECES)
         for piece in pieces or ():
             try:
-                slopes = [[_slope(one, guess) for guess in guesses] for one in piece]
+                slopes = [[slope(one, guess) for guess in guesses] for one in piece]
             except NoDerivativeError:
                 continue
-            determinant = _determinant(slopes)
+            determinant = determinant_of(sympy.Matrix(slopes))
             if self.tests.is_zero(determinant) or self.tests.vanishes(determinant):
                 return True
         return False
@@ -172,27 +168,9 @@ class _Solver:
         self.mistakes.add("E511", block[0].equation.place, what)
 
 
-def _slope(residual: Term, by: Symbol) -> Term:
-    """Return the derivative of a residual. Raises NoDerivativeError if it has none."""
-    return differential(residual, lambda s: ONE if s == by else ZERO)
-
-
-def _determinant(rows: Sequence[Sequence[Term]]) -> Term:
-    """Return the determinant of a few rows, by Laplace's expansion along the first."""
-    if not rows:
-        return ONE
-    minors = (_determinant([[*row[:j], *row[j + 1 :]] for row in rows[1:]]) for j in range(len(rows)))
-    return add(
-        *(
-            scaled(entry * minor, (-1) ** j)
-            for j, (entry, minor) in enumerate(zip(rows[0], minors, strict=True))
-        )
-    )
-
-
 def _put_in(residual: Term, inner: Sequence[Assignment]) -> Term:
     """Return a residual with the inner values put in, when they are few."""
     if len(inner) <= MOST_LISTED:
         for name, expression in reversed(inner):
-            residual = residual.replace({symbol(name): expression})
+            residual = residual.xreplace({symbol(name): expression})
     return residual

@@ -9,12 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from apc.compiler.equations.symbolic import (
-    NoDerivativeError,
-    derivative_symbol,
-    differential,
-)
-from apc.compiler.equations.terms import ONE, ZERO, Symbol, Term, symbol
+from apc.compiler.equations.symbolic import derivative_symbol, differential
+from apc.compiler.equations.terms import ONE, ZERO, NoDerivativeError, Symbol, Term, in_order, symbol
 
 TIME = symbol("time")
 Derivative = tuple[str, int]  # a variable and how often it is differentiated
@@ -75,8 +71,8 @@ class Derivatives:
 
     def derivatives(self, expression: Term) -> dict[Symbol, Derivative]:
         """Return the variables and derivatives an expression holds, in the order of their names."""
-        found = [s for s in expression.free_symbols if s in self._derivatives]
-        return {s: self._derivatives[s] for s in sorted(found, key=lambda s: s.name)}
+        held = expression.free_symbols & self._derivatives.keys()
+        return {s: self._derivatives[s] for s in in_order(held)}
 
     def differentiate(self, expression: Term) -> Term:
         """Return the time derivative. Raises NoDerivativeError if a held force would have to give it."""

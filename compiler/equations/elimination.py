@@ -7,7 +7,9 @@ that a chain of a thousand equations stays as long as it was.
 Does not: know sizes: numbers come in when a model runs.
 
 The next pivot is one that stays when every parameter that may be zero is, if there is one; of these the one
-that fills in least (Markowitz, Management Science 1957), and of several a number.
+that fills in least (Markowitz, Management Science 1957), and of several a number. Where none stays and few
+equations are left, they are solved by Cramer's rule, which divides by nothing but their determinant: the
+inertia of a mechanism is regular in every position, and each of its entries may vanish in some.
 """
 
 from __future__ import annotations
@@ -16,16 +18,19 @@ import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import sympy
+
 from apc.compiler.equations.solution import Assignment
-from apc.compiler.equations.symbolic import LinearForm
-from apc.compiler.equations.terms import ZERO, Number, Symbol, Term, add, symbol
+from apc.compiler.equations.symbolic import LinearForm, determinant_of
+from apc.compiler.equations.terms import ZERO, Symbol, Term, size, symbol
 from apc.compiler.equations.zero_test import Vanishing, ZeroTest
 
 # An entry with more nodes than this gets a name of its own: substituted into one another, the entries of a
 # chain of a thousand equations would grow without end.
 LARGEST_ENTRY = 40
+MOST_BY_CRAMER = 3  # equations: the terms of a determinant grow with the factorial
 
-_Cost = tuple[bool, bool, int, bool, int, int]  # ends with the row and the column
+_Cost = tuple[bool, bool, int, bool, int, int]  # ends with the row and the place of the unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,10 +74,16 @@ def eliminate(
         The unknowns that the equations leave open; if there are any, nothing is assigned.
     """
     system = _Elimination(forms, unknowns, tests)
-    while (pivot := system.next_pivot()) is not None:
-        system.clear_column(*pivot)
-    free = system.free()
-    return ([] if free else system.solution()), free
+    solved: list[Assignment] = []
+    while not solved and (pivot := system.next_pivot()) is not None:
+        if pivot[1] and len(system.open) <= MOST_BY_CRAMER:
+            solved = system.by_cramer()
+        if not solved:
+            system.clear_column(*pivot[-2:])
+    if solved or not system.open:
+        return system.named + solved + system.solution(), []
+    pivots = {j for _, j in system.pivots}
+    return [], [unknown for j, unknown in enumerate(unknowns) if j not in pivots]
 
 
 class _Elimination:
@@ -87,6 +98,7 @@ class _Elimination:
             for coefficients, _ in forms
         ]
         self.right = [-rest for _, rest in forms]
+        self.open = dict.fromkeys(range(len(forms)))
         self.holders: list[set[int]] = [set() for _ in unknowns]  # the open rows that hold a column
         for i, row in enumerate(self.rows):
             for j in row:
@@ -96,24 +108,22 @@ class _Elimination:
         self.heap = [self._cost(i, j) for i, row in enumerate(self.rows) for j in row]
         heapq.heapify(self.heap)
 
-    def next_pivot(self) -> tuple[int, int] | None:
+    def next_pivot(self) -> _Cost | None:
         """Return the row and column to go on with; None when there is nothing left to divide by."""
         while self.heap:
             entry = heapq.heappop(self.heap)
             i, j = entry[-2:]
             if i not in self.holders[j]:
                 continue
-            if (current := self._cost(i, j)) > entry:
-                heapq.heappush(self.heap, current)  # the pattern has filled in since
-            elif current[0]:
-                return None
-            else:
-                return i, j
+            if (current := self._cost(i, j)) <= entry:
+                return None if current[0] else current
+            heapq.heappush(self.heap, current)  # the pattern has filled in since
         return None
 
     def clear_column(self, i: int, j: int) -> None:
         """Take unknown j out of every other open row, by row i."""
         self.pivots.append((i, j))
+        del self.open[i]
         for column in self.rows[i]:
             self.holders[column].discard(i)
         for other in sorted(self.holders[j]):
@@ -124,31 +134,35 @@ class _Elimination:
             self.right[other] = self._named(self.right[other] - factor * self.right[i])
         self.holders[j].clear()
 
-    def free(self) -> list[Symbol]:
-        """Return the unknowns without a pivot."""
-        solved = {column for _, column in self.pivots}
-        return [unknown for j, unknown in enumerate(self.unknowns) if j not in solved]
+    def by_cramer(self) -> list[Assignment]:
+        """Solve the open rows by their determinant; nothing where that is zero."""
+        columns = sorted({column for i in self.open for column in self.rows[i]})
+        if len(columns) < len(self.open):
+            return []
+        matrix = sympy.Matrix([[self.rows[i].get(j, ZERO) for j in columns] for i in self.open])
+        determinant = determinant_of(matrix)
+        if self.tests.is_zero(determinant) or self.tests.vanishes(determinant):
+            return []
+        divisor, right = self._named(determinant), sympy.Matrix([self.right[i] for i in self.open])
+        solved = []
+        for place, j in enumerate(columns):
+            matrix_of_it = matrix.copy()
+            matrix_of_it[:, place] = right
+            solved.append((self.unknowns[j].name, determinant_of(matrix_of_it) / divisor))
+        return solved
 
     def solution(self) -> list[Assignment]:
-        """Return what gives each unknown, by back substitution."""
+        """Return what gives each unknown of a pivot, by back substitution."""
         solved = []
         for i, j in reversed(self.pivots):
-            others = add(
-                *(value * self.unknowns[column] for column, value in self.rows[i].items() if column != j)
-            )
-            solved.append((self.unknowns[j].name, (self.right[i] - others) / self.rows[i][j]))
-        return self.named + solved
+            others = (value * self.unknowns[column] for column, value in self.rows[i].items() if column != j)
+            solved.append((self.unknowns[j].name, (self.right[i] - sympy.Add(*others)) / self.rows[i][j]))
+        return solved
 
     def _cost(self, i: int, j: int) -> _Cost:
         entry, fill = self.rows[i][j], (len(self.rows[i]) - 1) * (len(self.holders[j]) - 1)
-        return (
-            self.tests.vanishes(entry),
-            self.tests.can_vanish(entry),
-            fill,
-            not isinstance(entry, Number),
-            i,
-            j,
-        )
+        vanishes, can_vanish = self.tests.vanishes(entry), self.tests.can_vanish(entry)
+        return (vanishes, can_vanish, fill, not entry.is_number, i, j)
 
     def _subtract(self, row: int, column: int, value: Term) -> None:
         left = self._named(self.rows[row].get(column, ZERO) - value)
@@ -162,7 +176,7 @@ class _Elimination:
 
     def _named(self, entry: Term) -> Term:
         """Return an entry, or the name it gets when it is long."""
-        if entry.size <= LARGEST_ENTRY:
+        if size(entry) <= LARGEST_ENTRY:
             return entry
         short = symbol(f"{self.unknowns[0].name} by elimination {len(self.named) + 1}")
         self.tests.define(short, entry)

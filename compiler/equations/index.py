@@ -21,10 +21,10 @@ from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 
 from apc.compiler.equations.derivatives import TIME, Derivative, Derivatives
-from apc.compiler.equations.matching import match_columns
+from apc.compiler.equations.matching import alternating, match_columns
 from apc.compiler.equations.residuals import SCENE, Residual, report_singular
-from apc.compiler.equations.symbolic import NoDerivativeError, linear_form
-from apc.compiler.equations.terms import ZERO, Number, Symbol, Term
+from apc.compiler.equations.symbolic import linear_form
+from apc.compiler.equations.terms import ZERO, NoDerivativeError, Symbol, Term, size, text_of
 from apc.compiler.equations.zero_test import NOTHING_VANISHES, Vanishing, ZeroTest
 from apc.compiler.errors import Mistakes, Place
 
@@ -137,52 +137,38 @@ class _System:
 
     def differentiate_constraints(self, mistakes: Mistakes) -> bool:
         """Match every equation to a highest derivative, differentiating those that hold none of their own."""
-        computed_by: dict[str, int] = {}
-        computes: dict[int, str] = {}
-        for start in range(len(self.residuals)):
-            row = start
-            while (stuck := self._augment(row, computed_by, computes)) is not None:
-                rows, names = stuck
-                if still := [one for one in rows if not self._moves_on(one)]:
-                    self._report_empty(still[0], mistakes)
-                    return False
-                for name in names:
-                    self.order[name] += 1
-                    if self.order[name] > HIGHEST_ORDER:
-                        self._report_endless(rows, mistakes)
+        column = {name: j for j, name in enumerate(self.names)}
+        while True:
+            newest = [row for row in range(len(self.residuals)) if row not in self.derivative]
+            incidence = [
+                [column[name] for name, order in self.held[row].items() if order == self.order[name]]
+                for row in newest
+            ]
+            match = match_columns(incidence, len(column))
+            partner = {j: i for j, i in enumerate(match) if i is not None}
+            left = sorted(set(range(len(newest))) - set(partner.values()))
+            if not left:
+                return True
+            passed: set[int] = set()
+            for start in left:
+                blocked, columns = alternating([start], incidence, partner)
+                if passed.isdisjoint(columns):
+                    passed.update(columns)
+                    names = [self.names[j] for j in columns]
+                    if not self._pass_on([newest[i] for i in blocked], names, mistakes):
                         return False
-                for each in rows:
-                    if not self._differentiate(each, mistakes):
-                        return False
-                for name in names:
-                    computed_by[name] = self.derivative[computed_by[name]]
-                    computes[computed_by[name]] = name
-                row = self.derivative[row]
-        return True
 
-    def _augment(
-        self, start: int, computed_by: dict[str, int], computes: dict[int, str]
-    ) -> tuple[list[int], list[str]] | None:
-        """Match one more equation; else return the equations and variables that block one another."""
-        came_from: dict[str, int] = {}
-        queue = [start]
-        for row in queue:
-            for name, order in self.held[row].items():
-                if name in came_from or order < self.order[name]:
-                    continue
-                came_from[name] = row
-                if name in computed_by:
-                    queue.append(computed_by[name])
-                    continue
-                while True:
-                    row = came_from[name]
-                    before = computes.get(row)
-                    computed_by[name], computes[row] = row, name
-                    if row == start:
-                        return None
-                    assert before is not None
-                    name = before
-        return queue, list(came_from)
+    def _pass_on(self, rows: Sequence[int], names: Sequence[str], mistakes: Mistakes) -> bool:
+        """Differentiate equations that block one another, and with them the order of what they hold."""
+        if still := [row for row in rows if not self._moves_on(row)]:
+            self._report_empty(still[0], mistakes)
+            return False
+        for name in names:
+            self.order[name] += 1
+            if self.order[name] > HIGHEST_ORDER:
+                self._report_endless(rows, mistakes)
+                return False
+        return all(self._differentiate(row, mistakes) for row in rows)
 
     def _differentiate(self, row: int, mistakes: Mistakes) -> bool:
         residual = self.residuals[row]
@@ -192,7 +178,7 @@ class _System:
             report_no_derivative(residual, missing, mistakes)
             return False
         self.derivative[row], self.integral[len(self.residuals)] = len(self.residuals), row
-        if expression.size > LARGEST:
+        if size(expression) > LARGEST:
             self._report_endless([row], mistakes)
             return False
         made = Residual(expression, residual.equation)
@@ -283,7 +269,7 @@ class _System:
                 continue
             pivot = min(
                 fixed,
-                key=lambda row: (not isinstance(matrix[row][derivative], Number), len(matrix[row]), row),
+                key=lambda row: (not matrix[row][derivative].is_number, len(matrix[row]), row),
             )
             entries = matrix.pop(pivot)
             chosen.append(derivative)
@@ -323,7 +309,10 @@ class _System:
         for row, entries in matrix.items():
             residual = self.residuals[row]
             if entries and not all(self.vanishes(c) for c in entries.values()):
-                factors = ", ".join(f"{name} (by the factor {c})" for (name, _), c in sorted(entries.items()))
+                factors = ", ".join(
+                    f"{name} (by the factor {text_of(entries[name, order])})"
+                    for name, order in sorted(entries)
+                )
                 what = (
                     f"{where}: no variable follows from the constraint {residual.shown} in every position, "
                     f"since the factor moves and may vanish: {factors}"

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from apc.compiler.equations.flatten import FlatEquation
-from apc.compiler.equations.matching import leftovers
+from apc.compiler.equations.matching import alternating
 from apc.compiler.equations.terms import Term
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.words import counted
@@ -65,26 +65,30 @@ def report_singular(
     place
         Where to point when there is no equation.
     """
-    found = leftovers(incidence, match)
+    rows = {column: row for column, row in enumerate(match) if row is not None}
+    columns = {row: column for column, row in rows.items()}
+    holders: list[list[int]] = [[] for _ in unknowns]
+    for i, held in enumerate(incidence):
+        for j in held:
+            holders[j].append(i)
+    over, over_columns = alternating([i for i in range(len(residuals)) if i not in columns], incidence, rows)
+    under_columns, under = alternating([j for j in range(len(unknowns)) if j not in rows], holders, columns)
     parts = []
     place = residuals[0].equation.place if residuals else place
-    if found.over_rows:
-        place = next(r for i, r in enumerate(residuals) if i not in match).equation.place
-        count = counted(len(found.over_columns), "unknown")
-        named = [unknowns[j] for j in found.over_columns]
-        held = f"hold only {count} ({listed(named)})" if named else "hold no unknown"
-        parts.append(
-            f"{counted(len(found.over_rows), 'equation')} {held}: "
-            f"{listed([residuals[i].shown for i in found.over_rows])}"
+    if over:
+        place = residuals[over[-1]].equation.place
+        named = [unknowns[j] for j in over_columns]
+        holding = (
+            f"hold only {counted(len(named), 'unknown')} ({listed(named)})" if named else "hold no unknown"
         )
-    if found.under_columns:
-        count = counted(len(found.under_columns), "unknown")
-        shown = [residuals[i].shown for i in found.under_rows]
-        by = f"only {counted(len(shown), 'equation')}, {listed(shown)}" if shown else "no equation"
-        parts.append(
-            f"{count} ({listed([unknowns[j] for j in found.under_columns])}) "
-            f"{'has' if len(found.under_columns) == 1 else 'have'} {by}"
-        )
+        shown = listed([residuals[i].shown for i in over])
+        parts.append(f"{counted(len(over), 'equation')} {holding}: {shown}")
+    if under_columns:
+        named = [unknowns[j] for j in under_columns]
+        texts = [residuals[i].shown for i in under]
+        by = f"only {counted(len(texts), 'equation')}, {listed(texts)}" if texts else "no equation"
+        has = "has" if len(named) == 1 else "have"
+        parts.append(f"{counted(len(named), 'unknown')} ({listed(named)}) {has} {by}")
     mistakes.add("E502", place, f"{where} can't be solved: {'; and '.join(parts)}")
 
 

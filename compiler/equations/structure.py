@@ -31,8 +31,8 @@ from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.index import reduce_index, report_no_derivative
 from apc.compiler.equations.residuals import SCENE, Residual, report_no_number
 from apc.compiler.equations.solution import Assignment, ImplicitBlock, Step, assigned
-from apc.compiler.equations.symbolic import NoDerivativeError, is_no_number, no_derivative, to_term
-from apc.compiler.equations.terms import ZERO, Symbol, Term, symbol
+from apc.compiler.equations.symbolic import is_no_number, no_derivative, to_term
+from apc.compiler.equations.terms import ZERO, NoDerivativeError, Symbol, Term, symbol
 from apc.compiler.equations.zero_test import NOTHING_VANISHES, Given, Vanishing
 from apc.compiler.errors import Mistakes
 from apc.compiler.language.expression import Expr, Name, names

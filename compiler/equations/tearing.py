@@ -71,7 +71,7 @@ class _Loop:
         for i, residual in enumerate(block):
             for u in self.holds[i]:
                 form = linear_form(residual.expression, frozenset((u,)))
-                if form is not None and solvable(form[0][u]):
+                if form is not None and u in form[0] and solvable(form[0][u]):
                     self.computable[u].add(i)
 
     def compute(self) -> None:

@@ -20,6 +20,7 @@ from apc.compiler.equations.clocks import ClockedSystem
 from apc.compiler.equations.flatten import FlatKind, FlatSystem
 from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.structure import SortedKind, SortedSystem
+from apc.compiler.equations.terms import text_of
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.multiples import common_multiple
 from apc.compiler.pipeline import each_stage, run_stages
@@ -86,12 +87,12 @@ def show_document(path: Path) -> dict[str, Any]:
                     for p in two.partitions
                 ],
                 "states": list(three.states),
-                "aliases": [{"name": name, "is": str(value)} for name, value in three.aliases],
+                "aliases": [{"name": name, "is": text_of(value)} for name, value in three.aliases],
                 "computed": [
                     {"clock": p.clock, "steps": [_step_document(step) for step in p.assignments]}
                     for p in three.partitions
                 ],
-                "sent": [{"name": s.name, "link": s.link, "is": str(s.expression)} for s in three.sends],
+                "sent": [{"name": s.name, "link": s.link, "is": text_of(s.expression)} for s in three.sends],
             }
             for one, two, three in zip(flat.kinds, clocked.kinds, ordered.kinds, strict=True)
         ],
@@ -194,14 +195,16 @@ def _computed_lines(kind: SortedKind) -> Iterator[str]:
     for partition in kind.partitions:
         yield f"  {partition.clock}" if partition.clock == "continuous" else f"  tick of {partition.clock}"
         for name, expression in samples.get(partition.clock, []):
-            yield from wrapped(f"{name} := {expression}", "    ", "        ")
+            yield from wrapped(f"{name} := {text_of(expression)}", "    ", "        ")
         for step in partition.assignments:
             for line in step_lines(step):
                 indent = line[: len(line) - len(line.lstrip())]
                 yield from wrapped(line.lstrip(), indent, indent + "    ")
     for send in kind.sends:
-        yield from wrapped(f"sent over {send.link}: {send.name} := {send.expression}", "  ", "      ")
-    pairs = {name: str(value) for name, value in kind.aliases}
+        yield from wrapped(
+            f"sent over {send.link}: {send.name} := {text_of(send.expression)}", "  ", "      "
+        )
+    pairs = {name: text_of(value) for name, value in kind.aliases}
     if pairs:
         yield "  the same as another"
         yield from wrapped(", ".join(f"{name} = {value}" for name, value in pairs.items()), "    ", "    ")
@@ -209,12 +212,12 @@ def _computed_lines(kind: SortedKind) -> Iterator[str]:
 
 def _step_document(step: Any) -> dict[str, Any]:
     if not isinstance(step, ImplicitBlock):
-        return {"name": step[0], "is": str(step[1])}
+        return {"name": step[0], "is": text_of(step[1])}
     return {
         "loop": list(step.unknowns),
         "guess": list(step.tearing),
-        "inner": [{"name": name, "is": str(value)} for name, value in step.inner],
-        "zero": [str(residual) for residual in step.residuals],
+        "inner": [{"name": name, "is": text_of(value)} for name, value in step.inner],
+        "zero": [text_of(residual) for residual in step.residuals],
     }
 
 
