@@ -20,7 +20,7 @@ from apc.compiler.equations.residuals import Residual
 from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.symbolic import no_derivative, to_term
 from apc.compiler.equations.terms import symbol
-from apc.compiler.equations.zero_test import ZeroTest
+from apc.compiler.equations.zero_test import Divisors
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.functions.casadi_writer import Writer
 from apc.compiler.language.expression import Name
@@ -229,7 +229,7 @@ def test_a_number_a_peer_has_the_residue_of_its_fraction() -> None:
     numbers = [0.1, -3.5, 1e300, 5e-324, -2.3e-308, 0.0, 1.0, 123456789.123]
     for number in numbers:
         others = [one for one in numbers if one != number]
-        test = ZeroTest(values={symbol("a"): np.array(others), symbol("b"): Fraction(number)})
+        test = Divisors(numbers=[{symbol("a"): np.array(others), symbol("b"): Fraction(number)}]).vanishes
         assert not test(symbol("a") - symbol("b"))
-        test = ZeroTest(values={symbol("a"): np.array(numbers), symbol("b"): Fraction(number)})
+        test = Divisors(numbers=[{symbol("a"): np.array(numbers), symbol("b"): Fraction(number)}]).vanishes
         assert test(symbol("a") - symbol("b"))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.matching import alternating
-from apc.compiler.equations.terms import Term
+from apc.compiler.equations.terms import NoDerivativeError, Term
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.words import counted
 
@@ -37,6 +37,13 @@ def report_no_number(texts: Sequence[str], place: Place, mistakes: Mistakes) -> 
     """Add the mistake E512: equations in which a constant is none, maybe after others are put in."""
     what = f"{listed(texts)} hold{'s' if len(texts) == 1 else ''} a constant that is no number"
     mistakes.add("E512", place, f"{what}, such as 1/0 or sqrt(-1)")
+
+
+def report_no_derivative(residual: Residual, missing: NoDerivativeError, mistakes: Mistakes) -> None:
+    """Add the mistake E508: an equation's derivative is needed, and what it holds has none."""
+    what = f"{residual.shown} needs the derivative of {missing}"
+    why = "a position follows such a force only through a mass"
+    mistakes.add("E508", residual.equation.place, f"{what}; {why}")
 
 
 def report_singular(
