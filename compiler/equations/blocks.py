@@ -27,7 +27,7 @@ from apc.compiler.equations.residuals import (
     report_singular,
 )
 from apc.compiler.equations.solution import Step, expressions
-from apc.compiler.equations.symbolic import determinant_of, is_no_number, linear_form, slope, smooth_pieces
+from apc.compiler.equations.symbolic import is_no_number, linear_form, slope, smooth_pieces
 from apc.compiler.equations.tearing import tear
 from apc.compiler.equations.terms import NoDerivativeError, Symbol, Term, symbol
 from apc.compiler.equations.zero_test import Divisors
@@ -133,8 +133,7 @@ class _Solver:
                 slopes = sympy.Matrix([[slope(one, guess) for guess in guesses] for one in piece])
             except NoDerivativeError:
                 continue
-            determinant = determinant_of(slopes)
-            if self.divisors.is_zero(determinant) or self.divisors.vanishes(determinant):
+            if not self.divisors.allow(slopes.det(method="laplace")):
                 return True
         return False
 

@@ -5,23 +5,23 @@ Guarantees: what is divided by is never zero with the scene's numbers; a long en
 that a chain of a thousand equations stays as long as it was.
 Does not: know sizes: numbers come in when a model runs.
 
-The next pivot is one that stays when every parameter that may be zero is, if there is one; of these the one
-that fills in least (Markowitz, Management Science 1957), and of several a number. Where none stays and few
+The next pivot is one that stays when every parameter that may be zero is, if there is one; of these one of a
+short row and column, which fills in little (Markowitz, Management Science 1957), and of several a number. Where none stays and few
 equations are left, they are solved by Cramer's rule, which divides by nothing but their determinant: the
 inertia of a mechanism is regular in every position, and each of its entries may vanish in some.
 """
 
 from __future__ import annotations
 
-import heapq
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 
 import sympy
+from sympy.matrices import dotprodsimp
 
 from apc.compiler.equations.solution import Assignment
-from apc.compiler.equations.symbolic import LinearForm, determinant_of
+from apc.compiler.equations.symbolic import LinearForm
 from apc.compiler.equations.terms import ONE, ZERO, Symbol, Term, size, symbol
 from apc.compiler.equations.zero_test import Divisors
 
@@ -29,8 +29,6 @@ from apc.compiler.equations.zero_test import Divisors
 # chain of a thousand equations would grow without end.
 LARGEST_ENTRY = 40
 MOST_BY_CRAMER = 3  # equations: the terms of a determinant grow with the factorial
-
-_Cost = tuple[bool, int, bool, int, str]  # may it vanish, how much it fills in, is it no number, row, unknown
 
 
 class Elimination:
@@ -49,22 +47,25 @@ class Elimination:
         self.holders: defaultdict[Term, set[int]] = defaultdict(set)  # the open rows that hold an unknown
         self.named: list[Assignment] = []
         self.pivots: list[tuple[Symbol, dict[Term, Term]]] = []
-        self.heap: list[_Cost] = []
         for i, row in enumerate(rows):
             self.rows[i] = {}
             for unknown, value in row.items():
                 self._put(i, unknown, value)
 
-    def next_pivot(self) -> _Cost | None:
-        """Return the pivot to go on with; None when there is nothing left to divide by."""
-        while self.heap:
-            entry = heapq.heappop(self.heap)
-            i, unknown = entry[-2], symbol(entry[-1])
-            if unknown in self.rows.get(i, {}) and not self.divisors.vanishes(self.rows[i][unknown]):
-                current = self._cost(i, unknown)
-                if current <= entry:
-                    return current
-                heapq.heappush(self.heap, current)  # the pattern has filled in since
+    def next_pivot(self, *, stays: bool) -> tuple[int, Symbol] | None:
+        """Return the shortest row that may be divided by a coefficient, and of these the one in fewest rows.
+
+        With `stays` only by what stays when every parameter is zero that may be. None if there is nothing.
+        """
+        for i in sorted(self.rows, key=lambda i: len(self.rows[i])):
+            usable = [
+                (len(self.holders[unknown]), not factor.is_number, unknown.name)
+                for unknown, factor in self.rows[i].items()
+                if unknown is not ONE and not self.divisors.vanishes(factor)
+                if not (stays and self.divisors.can_vanish(factor))
+            ]
+            if usable:
+                return i, symbol(min(usable)[-1])
         return None
 
     def clear(self, i: int, unknown: Symbol) -> None:
@@ -86,17 +87,15 @@ class Elimination:
         columns = list(dict.fromkeys(column for row in rows for column in row if column is not ONE))
         if len(columns) != len(rows):
             return []
-        matrix = sympy.Matrix([[row.get(column, ZERO) for column in columns] for row in rows])
-        determinant = determinant_of(matrix)
-        if self.divisors.is_zero(determinant) or self.divisors.vanishes(determinant):
-            return []
+        with dotprodsimp(False):
+            matrix = sympy.Matrix([[row.get(column, ZERO) for column in columns] for row in rows])
+            determinant = matrix.det(method="laplace")
+            if not self.divisors.allow(determinant):
+                return []
+            right = sympy.Matrix([-row.get(ONE, ZERO) for row in rows])
+            solved = matrix.adjugate(method="laplace") * right
         divisor = self._short(determinant)
-        solved = []
-        for place, column in enumerate(columns):
-            of_it = matrix.copy()
-            of_it[:, place] = sympy.Matrix([-row.get(ONE, ZERO) for row in rows])
-            solved.append((column.name, determinant_of(of_it) / divisor))
-        return solved
+        return [(column.name, value / divisor) for column, value in zip(columns, solved, strict=True)]
 
     def solution(self) -> list[Assignment]:
         """Return what gives each unknown of a pivot, by back substitution."""
@@ -104,10 +103,6 @@ class Elimination:
             (unknown.name, -sympy.Add(*(c * u for u, c in row.items() if u is not unknown)) / row[unknown])
             for unknown, row in reversed(self.pivots)
         ]
-
-    def _cost(self, i: int, unknown: Symbol) -> _Cost:
-        entry, fill = self.rows[i][unknown], (len(self.rows[i]) - 1) * (len(self.holders[unknown]) - 1)
-        return self.divisors.can_vanish(entry), fill, not entry.is_number, i, unknown.name
 
     def _put(self, i: int, unknown: Term, value: Term) -> None:
         value = self._short(value)
@@ -117,8 +112,6 @@ class Elimination:
             return
         self.rows[i][unknown] = value
         self.holders[unknown].add(i)
-        if unknown is not ONE:
-            heapq.heappush(self.heap, self._cost(i, unknown))
 
     def _short(self, entry: Term) -> Term:
         """Return an entry, or the name it gets when it is long."""
@@ -154,10 +147,14 @@ def eliminate(
     rows = ({**coefficients, ONE: rest} for coefficients, rest in forms)
     longest = LARGEST_ENTRY if len(unknowns) > 1 else sys.maxsize  # what is not put into another may be long
     system = Elimination(rows, divisors, unknowns[0].name, longest)
-    while (pivot := system.next_pivot()) is not None:
-        if pivot[0] and 1 < len(system.rows) <= MOST_BY_CRAMER and (solved := system.by_cramer()):
+    while system.rows:
+        pivot = system.next_pivot(stays=True)
+        if pivot is None and 1 < len(system.rows) <= MOST_BY_CRAMER and (solved := system.by_cramer()):
             return system.named + solved + system.solution(), []
-        system.clear(pivot[-2], symbol(pivot[-1]))
+        pivot = pivot or system.next_pivot(stays=False)
+        if pivot is None:
+            break
+        system.clear(*pivot)
     free = set(unknowns) - {unknown for unknown, _ in system.pivots}
     if free:
         return [], [unknown for unknown in unknowns if unknown in free]

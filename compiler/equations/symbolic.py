@@ -10,10 +10,8 @@ from __future__ import annotations
 import operator
 import sys
 from collections.abc import Callable, Iterable, Sequence, Set
-from typing import Any
 
 import sympy
-from sympy.matrices import dotprodsimp
 
 from apc.compiler.equations.terms import (
     FUNCTIONS,
@@ -110,12 +108,6 @@ def differential(expression: Term, rate: Callable[[Symbol], Term]) -> Term:
         if (along := slope(term, s)) != 0
     )
     return sympy.Add(*parts)
-
-
-def determinant_of(matrix: Any) -> Term:
-    """Return the determinant of a few rows, its products as they stand."""
-    with dotprodsimp(False):
-        return matrix.det(method="laplace")
 
 
 def smooth_pieces(expressions: Sequence[Term], most: int) -> list[tuple[Term, ...]] | None:

@@ -73,14 +73,12 @@ class If(Choice):
 class Max(Choice):
     """The largest of its arguments."""
 
-    @classmethod
-    def _holds(cls, best: Term, other: Term) -> Term:
-        return FUNCTIONS["<="](other, best)
+    stays = ">="  # what the best so far is to the next
 
     def _eval_derivative(self, by: Symbol) -> Term:
         best, slope = self.args[0], self.args[0].diff(by)
         for argument in self.args[1:]:
-            slope = If.between(self._holds(best, argument), slope, argument.diff(by))
+            slope = If.between(FUNCTIONS[self.stays](best, argument), slope, argument.diff(by))
             best = self.func(best, argument)
         return slope
 
@@ -88,9 +86,7 @@ class Max(Choice):
 class Min(Max):
     """The least of its arguments."""
 
-    @classmethod
-    def _holds(cls, best: Term, other: Term) -> Term:
-        return FUNCTIONS["<="](best, other)
+    stays = "<="
 
 
 class Interpolate(Choice):

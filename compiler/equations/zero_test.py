@@ -54,6 +54,10 @@ class Divisors:
         """Return whether an expression is zero for all values of its symbols."""
         return self._any.vanishes(expression)
 
+    def allow(self, expression: Term) -> bool:
+        """Return whether an expression is zero neither for all values nor with the scene's numbers."""
+        return not (self.is_zero(expression) or self.vanishes(expression))
+
     def can_vanish(self, expression: Term) -> bool:
         """Return whether an expression is zero when every parameter is that may be."""
         return self._least.vanishes(expression)
@@ -75,6 +79,10 @@ class _Residues:
     def __init__(self, given: Mapping[Symbol, Given], nonzero: Collection[Symbol] | None = None) -> None:
         self.given = given
         self.nonzero = nonzero
+        fractions = {name: value for name, value in given.items() if isinstance(value, Fraction)}
+        self.numbers = {
+            name: sympy.Rational(one.numerator, one.denominator) for name, one in fractions.items()
+        }
         self.known: dict[Term, Residue] = {}
         self.chosen: dict[Term, int] = {}
         self.random = random.Random(0)
@@ -85,12 +93,7 @@ class _Residues:
             return True
         if self.nonzero is not None or not expression.has(sympy.Function):
             return False
-        numbers = {
-            name: sympy.Rational(value.numerator, value.denominator)
-            for name, value in self.given.items()
-            if isinstance(value, Fraction)
-        }
-        return _is_identity(expression.xreplace(numbers))
+        return _is_identity(expression.xreplace(self.numbers))
 
     def __call__(self, node: Term) -> Residue:
         """Return the residue of an expression."""
@@ -102,11 +105,11 @@ class _Residues:
         return self.known[node]
 
     def _value(self, node: Term) -> Residue:
+        node = self.numbers.get(node, node)
         if node in self.given:
             value = self.given[node]
-            if isinstance(value, np.ndarray):
-                return np.array([_modular(Fraction(one)) for one in value.tolist()], dtype=np.object_)
-            return _modular(value) if isinstance(value, Fraction) else self(value)
+            residues = np.frompyfunc(lambda one: _modular(Fraction(one)), 1, 1)
+            return residues(value) if isinstance(value, np.ndarray) else self(value)
         if node.is_Rational:
             return _modular(node)
         if node.is_Add:
@@ -114,13 +117,13 @@ class _Residues:
         if node.is_Mul:
             return prod(map(self, node.args)) % PRIME
         if node.is_Pow and node.exp.is_Integer:
-            base, raised = self(node.base), np.frompyfunc(lambda one: self._power(one, node), 1, 1)
-            return self._power(base, node) if isinstance(base, int) else raised(base)
+
+            def raised(base: int) -> int:
+                return pow(base, int(node.exp), PRIME) if base else self._some(node)
+
+            return np.frompyfunc(raised, 1, 1)(self(node.base))
         is_none = self.nonzero is not None and node.is_Symbol and node not in self.nonzero
         return 0 if is_none else self._some(node)
-
-    def _power(self, base: int, node: Term) -> int:
-        return pow(base, int(node.exp), PRIME) if base else self._some(node)
 
     def _some(self, node: Term) -> int:
         """Return the random residue of a node, the same each time."""
@@ -128,7 +131,7 @@ class _Residues:
 
 
 def _modular(value: Fraction | Term) -> int:
-    return value.numerator * pow(value.denominator, -1, PRIME) % PRIME
+    return int(value.numerator * pow(value.denominator, -1, PRIME) % PRIME)
 
 
 def _is_identity(expression: Term) -> bool:
