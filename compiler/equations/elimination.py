@@ -6,9 +6,10 @@ that a chain of a thousand equations stays as long as it was.
 Does not: know sizes: numbers come in when a model runs.
 
 The next pivot is one that stays when every parameter that may be zero is, if there is one; of these one of a
-short row and column, which fills in little (Markowitz, Management Science 1957), and of several a number. Where none stays and few
-equations are left, they are solved by Cramer's rule, which divides by nothing but their determinant: the
-inertia of a mechanism is regular in every position, and each of its entries may vanish in some.
+short row and column, which fills in little (Markowitz, Management Science 1957), and of several a number.
+Where none stays and few equations are left, they are solved by Cramer's rule, which divides by nothing but
+their determinant: the inertia of a mechanism is regular in every position, and each of its entries may vanish
+in some.
 """
 
 from __future__ import annotations
