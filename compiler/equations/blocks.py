@@ -91,7 +91,7 @@ class _Solver:
         """Solve one block; its expressions must be numbers: what was divided may cancel."""
         steps = self.solve(block, unknowns)
         if any(is_no_number(expression) for step in steps for expression in expressions(step)):
-            report_no_number([residual.shown for residual in block], block[0].equation.place, self.mistakes)
+            report_no_number(block, self.mistakes)
             return []
         return steps
 

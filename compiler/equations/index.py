@@ -1,7 +1,7 @@
 """Index reduction: equations differentiated until every derivative can be solved for, and states chosen.
 
-Takes: residuals in variables and their derivatives (see `derivatives`). Gives: `reduce_index`: the equations
-to solve, their unknowns, and the states.
+Takes: residuals in variables and their derivatives (see `derivatives`). Gives: `IndexReduction`, whose result
+are the equations to solve, their unknowns, and the states.
 Guarantees: as many equations as unknowns; the states are independent and chosen once and for all.
 Does not: solve anything (see `blocks`).
 
@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from apc.compiler.equations.derivatives import TIME, Derivative, Moving, derivative
 from apc.compiler.equations.elimination import Elimination
 from apc.compiler.equations.matching import alternating, match_columns
-from apc.compiler.equations.residuals import SCENE, Residual, report_no_derivative, report_singular
+from apc.compiler.equations.residuals import Residual, report_no_derivative, report_singular
 from apc.compiler.equations.symbolic import linear_form
 from apc.compiler.equations.terms import NoDerivativeError, Symbol, Term, size, text_of
 from apc.compiler.equations.zero_test import Divisors
@@ -47,17 +47,8 @@ class Reduced:
     states: tuple[Symbol, ...]
 
 
-def reduce_index(
-    residuals: Sequence[Residual],
-    orders: Mapping[str, int],
-    started: Set[Symbol],
-    moving: Moving,
-    where: str,
-    mistakes: Mistakes,
-    divisors: Divisors,
-    place: Place = SCENE,
-) -> Reduced | None:
-    """Differentiate what must be and choose the states; None if the equations can't be solved.
+class IndexReduction:
+    """The equations as they grow: each may have a derivative, which then takes its place in the matching.
 
     Parameters
     ----------
@@ -66,8 +57,6 @@ def reduce_index(
     orders
         The variables they hold, in the order of preference as states, and how many derivatives of each are
         asked for even if no equation holds them.
-    started
-        The variables and derivatives with a declared start value.
     moving
         Knows the derivatives of the variables.
     where
@@ -77,34 +66,7 @@ def reduce_index(
         value that jumps, E509 states that can't be chosen once and for all.
     divisors
         What may be divided by.
-    place
-        Where to point when there is no equation left.
     """
-    names = list(orders)
-    system = _System(residuals, orders, moving, where, mistakes, divisors)
-    incidence = [[j for j, name in enumerate(names) if name in held] for held in system.held]
-    match = match_columns(incidence, len(names))
-    if len(residuals) != len(names) or None in match:
-        report_singular(residuals, names, incidence, match, where, mistakes, place)
-        return None
-    if not system.differentiate_constraints():
-        return None
-    dummies = system.choose_dummies(started)
-    if dummies is None:
-        return None
-    states: list[Symbol] = []
-    unknowns: list[Symbol] = []
-    for name, top in system.order.items():
-        # The orders made unknowns of begin here; the one below is solved for as the derivative of a state.
-        first = min((k for k in range(top + 1) if (name, k) in dummies), default=top + 1)
-        split = max(first - 1, 0)
-        states += [derivative(name, k) for k in range(split)]
-        unknowns += [derivative(name, k) for k in range(split, top + 1)]
-    return Reduced(tuple(system.residuals), tuple(unknowns), tuple(states))
-
-
-class _System:
-    """The equations as they grow: each may have a derivative, which then takes its place in the matching."""
 
     def __init__(
         self,
@@ -127,6 +89,35 @@ class _System:
             self._add(residual)
             for name, order in self.held[-1].items():
                 self.order[name] = max(self.order[name], order)
+
+    def reduced(self, started: Set[Symbol], place: Place) -> Reduced | None:
+        """Differentiate what must be and choose the states; None if the equations can't be solved.
+
+        Parameters
+        ----------
+        started
+            The variables and derivatives with a declared start value.
+        place
+            Where to point when there is no equation left.
+        """
+        names = list(self.order)
+        incidence = [[j for j, name in enumerate(names) if name in held] for held in self.held]
+        match = match_columns(incidence, len(names))
+        if len(self.residuals) != len(names) or None in match:
+            report_singular(self.residuals, names, incidence, match, self.where, self.mistakes, place)
+            return None
+        dummies = self.choose_dummies(started) if self.differentiate_constraints() else None
+        if dummies is None:
+            return None
+        states: list[Symbol] = []
+        unknowns: list[Symbol] = []
+        for name, top in self.order.items():
+            # The orders made unknowns of begin here; the one below is solved for as a state's derivative.
+            first = min((k for k in range(top + 1) if (name, k) in dummies), default=top + 1)
+            split = max(first - 1, 0)
+            states += [derivative(name, k) for k in range(split)]
+            unknowns += [derivative(name, k) for k in range(split, top + 1)]
+        return Reduced(tuple(self.residuals), tuple(unknowns), tuple(states))
 
     def _add(self, residual: Residual) -> None:
         self.residuals.append(residual)

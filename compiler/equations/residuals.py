@@ -33,10 +33,11 @@ class Residual:
         return f"`{self.equation.text}` ({self.equation.origin})"
 
 
-def report_no_number(texts: Sequence[str], place: Place, mistakes: Mistakes) -> None:
+def report_no_number(residuals: Sequence[Residual], mistakes: Mistakes) -> None:
     """Add the mistake E512: equations in which a constant is none, maybe after others are put in."""
-    what = f"{listed(texts)} hold{'s' if len(texts) == 1 else ''} a constant that is no number"
-    mistakes.add("E512", place, f"{what}, such as 1/0 or sqrt(-1)")
+    texts = listed([residual.shown for residual in residuals])
+    what = f"{texts} hold{'s' if len(residuals) == 1 else ''} a constant that is no number"
+    mistakes.add("E512", residuals[0].equation.place, f"{what}, such as 1/0 or sqrt(-1)")
 
 
 def report_no_derivative(residual: Residual, missing: NoDerivativeError, mistakes: Mistakes) -> None:

@@ -28,7 +28,7 @@ from apc.compiler.equations.clocks import (
 )
 from apc.compiler.equations.derivatives import Moving, derivative
 from apc.compiler.equations.flatten import FlatEquation
-from apc.compiler.equations.index import reduce_index
+from apc.compiler.equations.index import IndexReduction
 from apc.compiler.equations.residuals import SCENE, Residual, report_no_derivative, report_no_number
 from apc.compiler.equations.solution import Assignment, ImplicitBlock, Step, assigned
 from apc.compiler.equations.symbolic import is_no_number, no_derivative, to_term
@@ -142,8 +142,8 @@ def sort_kind(kind: ClockedKind, mistakes: Mistakes, divisors: Divisors | None =
     kind
         A kind of peer, partitioned by clock.
     mistakes
-        Takes E502, E503, E508, E509, E511 and E512 as in `solve_blocks` and `reduce_index`, and E510 a state
-        has no start value.
+        Takes E502, E503, E508, E509, E511 and E512 as in `solve_blocks` and `IndexReduction`, and E510 a
+        state has no start value.
     divisors
         What may be divided by.
     """
@@ -204,7 +204,7 @@ def _sort_continuous(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) 
     residuals = aliases.remove(_residuals(partition.equations, sides))
     read = [Residual(aliases.substitute(value), at) for (_, value), at in zip(values, reads, strict=True)]
     if none := [one for one in (*residuals, *read) if is_no_number(one.expression)]:
-        report_no_number([one.shown for one in none], none[0].equation.place, mistakes)
+        report_no_number(none, mistakes)
         return None
     # A derivative that has a name of its own, or that is read, is asked for, even if no equation holds it.
     asked = [*aliases.velocities, *(it for one in read for it in moving.derivatives(one.expression).values())]
@@ -212,7 +212,8 @@ def _sort_continuous(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) 
     for name, order in asked:
         orders[name] = max(orders[name], order)
     begun = {aliases.value(name) for name in started}
-    reduced = reduce_index(residuals, orders, begun, moving, where, mistakes, divisors, place)
+    reduction = IndexReduction(residuals, orders, moving, where, mistakes, divisors)
+    reduced = reduction.reduced(begun, place)
     if reduced is None:
         return None
     states = tuple(aliases.shown(s).name for s in reduced.states)
@@ -256,7 +257,7 @@ def _sides(
             report_no_derivative(Residual(ZERO, equation), missing, mistakes)
             continue
         if any(map(is_no_number, sides)):
-            report_no_number([Residual(ZERO, equation).shown], equation.place, mistakes)
+            report_no_number([Residual(ZERO, equation)], mistakes)
         else:
             found.append(sides)
     return found if len(found) == len(equations) else None
