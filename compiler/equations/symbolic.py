@@ -16,6 +16,7 @@ import sympy
 from apc.compiler.equations.terms import (
     FUNCTIONS,
     ZERO,
+    Abs,
     Condition,
     If,
     Interpolate,
@@ -35,7 +36,7 @@ OPERATORS: dict[str, Callable[[Term, Term], Term]] = {
     "/": operator.truediv,
     "^": operator.pow,
 }
-BENT = (Max, sympy.Abs, sympy.sign, sympy.floor)  # beside a choice
+BENT = (Max, Abs, sympy.Abs, sympy.sign, sympy.floor)  # beside a choice
 NOT_LINEAR = (*BENT, Interpolate, Condition)  # in what stands in them
 
 
@@ -122,7 +123,7 @@ def smooth_pieces(expressions: Sequence[Term], most: int) -> list[tuple[Term, ..
             choices = bent.args[1:]
         elif isinstance(bent, Max):
             choices = bent.args
-        elif isinstance(bent, sympy.Abs):
+        elif isinstance(bent, Abs | sympy.Abs):
             choices = (bent.args[0], -bent.args[0])
         else:
             choices = (symbol(f"constant {bent}"),)

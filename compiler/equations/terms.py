@@ -70,6 +70,21 @@ class If(Choice):
         return self.between(condition, then.diff(by), otherwise.diff(by))
 
 
+class Abs(Choice):
+    """The absolute value; SymPy's has no slope of what it doesn't know to be real, such as x/y."""
+
+    @classmethod
+    def eval(cls, value: Term) -> Term | None:
+        """Return the value of a number."""
+        return sympy.Abs(value) if value.is_number else None
+
+    def _eval_power(self, exponent: Term) -> Term | None:
+        return self.args[0] ** exponent if exponent.is_even else None
+
+    def _eval_derivative(self, by: Symbol) -> Term:
+        return sympy.sign(self.args[0]) * self.args[0].diff(by)
+
+
 class Max(Choice):
     """The largest of its arguments."""
 
@@ -97,17 +112,12 @@ class Interpolate(Choice):
         raise NoDerivativeError(text_of(self), "which has none")
 
 
-def absolute(value: Term) -> Term:
-    """Return what differs from a value in its sign alone; SymPy's Abs has no slope of what may be complex."""
-    return sympy.Abs(value) if value.is_extended_real else If(FUNCTIONS["<"](value, ZERO), -value, value)
-
-
 FUNCTIONS: dict[str, Any] = {
     "if": If,
     "max": Max,
     "min": Min,
     "interpolate": Interpolate,
-    "abs": absolute,
+    "abs": Abs,
     "sqrt": sympy.sqrt,
     **{name: getattr(sympy, name) for name in ("sign", "floor", "atan2", *SMOOTH)},
     **{name: type(name, (Condition,), {}) for name in (*COMPARISONS, "and", "or", "not")},

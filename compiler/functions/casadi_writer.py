@@ -9,10 +9,10 @@ Does not: choose what is written (see `functions`).
 
 from __future__ import annotations
 
+import functools
 import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, TypeAlias
 
 import casadi
@@ -30,10 +30,9 @@ MOST_FACTORS = 100  # of a power that is written as a product
 # Functions that are infinite or no number somewhere, or whose slopes are; and where none of them is.
 _SOMEWHERE_NONE = ("exp", "log", "tan", "asin", "acos", "sinh", "cosh", "atan2")
 HARMLESS = 0.5
-_EXTREMES = {"min": casadi.fmin, "max": casadi.fmax}  # of two values each
-# Python's + and * come to the same by way of much that finds out what their operands are.
-_PLUS, _TIMES = partial(casadi.SX.binary, casadi.OP_ADD), partial(casadi.SX.binary, casadi.OP_MUL)
 _CASADI: dict[str, Callable[..., Any]] = {
+    "min": casadi.fmin,
+    "max": casadi.fmax,
     "abs": casadi.fabs,
     "sign": casadi.sign,
     "floor": casadi.floor,
@@ -192,7 +191,7 @@ class Writer:
         if expression.is_NumberSymbol:
             return casadi.SX(float(expression))
         if expression.is_Add:
-            return _fold([self._build(one, taken) for one in expression.args], _PLUS)
+            return functools.reduce(operator.add, (self._build(one, taken) for one in expression.args))
         if expression.is_Mul or expression.is_Pow:
             return self._product(expression, taken)
         name = NAMES[expression.func]
@@ -203,7 +202,8 @@ class Writer:
         arguments = [self._build(argument, taken) for argument in expression.args]
         if taken is not None and name in _SOMEWHERE_NONE:
             arguments = [casadi.if_else(taken, one, HARMLESS) for one in arguments]
-        return _fold(arguments, _EXTREMES[name]) if name in _EXTREMES else _CASADI[name](*arguments)
+        function = _CASADI[name]
+        return functools.reduce(function, arguments) if name in ("max", "min") else function(*arguments)
 
     def _chosen(self, condition: Term, then: Term, otherwise: Term, taken: Any) -> Any:
         """Return the value of a conditional in a branch."""
@@ -227,10 +227,12 @@ class Writer:
                 below.append((base, -exponent))
             else:
                 above.append((base, exponent))
-        product = _fold([self._power(*one, taken) for one in above], _TIMES) if above else casadi.SX(1)
+        product, divisor = (
+            functools.reduce(operator.mul, [self._power(*one, taken) for one in powers] or [casadi.SX(1)])
+            for powers in (above, below)
+        )
         if not below:
             return product
-        divisor = _fold([self._power(*one, taken) for one in below], _TIMES)
         moving = any(base.free_symbols for base, _ in below)
         return product / (casadi.if_else(taken, divisor, 1) if taken is not None and moving else divisor)
 
@@ -242,12 +244,5 @@ class Writer:
         if exponent == HALF:
             return casadi.sqrt(value)
         if exponent.is_Integer and exponent <= MOST_FACTORS:
-            return _fold([value] * int(exponent), _TIMES)
+            return functools.reduce(operator.mul, [value] * int(exponent))
         return value ** self._build(exponent, taken)
-
-
-def _fold(values: Sequence[Any], join: Callable[[Any, Any], Any]) -> Any:
-    total = values[0]
-    for value in values[1:]:
-        total = join(total, value)
-    return total
