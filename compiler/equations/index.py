@@ -196,7 +196,7 @@ class IndexReduction:
         self._report("E509", next(iter(rows)), what)
         return False
 
-    def _report(self, code: str, row: int, what: str, hint: str | None = None) -> None:
+    def _report(self, code: str, row: int, what: str, hint: str = "") -> None:
         self.mistakes.add(code, self.residuals[row].equation.place, what, hint=hint)
 
     # ---- dummy derivatives ----

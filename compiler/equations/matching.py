@@ -56,7 +56,7 @@ def alternating(
     partner
         For each node of the other side its own on this side.
     """
-    near, far = dict.fromkeys(starts), dict.fromkeys(())
+    near, far = dict.fromkeys(starts), dict.fromkeys(range(0))
     queue = list(near)
     for node in queue:
         for other in neighbours[node]:

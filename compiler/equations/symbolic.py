@@ -17,16 +17,26 @@ from apc.compiler.equations.terms import (
     FUNCTIONS,
     ZERO,
     Abs,
-    Condition,
     If,
-    Interpolate,
     Max,
     Symbol,
     Term,
     in_order,
     symbol,
 )
-from apc.compiler.language.expression import Binary, Call, Conditional, Expr, Name, Negate, Not, Number, fold
+from apc.compiler.language.expression import (
+    Binary,
+    Call,
+    Compare,
+    Conditional,
+    Expr,
+    Logic,
+    Name,
+    Negate,
+    Not,
+    Number,
+    fold,
+)
 
 LARGEST = int(sys.float_info.max)
 OPERATORS: dict[str, Callable[[Term, Term], Term]] = {
@@ -37,7 +47,6 @@ OPERATORS: dict[str, Callable[[Term, Term], Term]] = {
     "^": operator.pow,
 }
 BENT = (Max, Abs, sympy.Abs, sympy.sign, sympy.floor)  # beside a choice
-NOT_LINEAR = (*BENT, Interpolate, Condition)  # in what stands in them
 
 
 def derivative_symbol(name: str) -> Symbol:
@@ -67,6 +76,7 @@ def to_term(expression: Expr, differentiate: Callable[[Term], Term]) -> Term:
                 return If(*operands)
             case Not():
                 return FUNCTIONS["not"](*operands)
+        assert isinstance(node, Compare | Logic)
         return FUNCTIONS[node.operator](*operands)
 
     return fold(expression, leaf, operation)
@@ -84,7 +94,7 @@ def is_no_number(expression: Term) -> bool:
 
 def _is_none(node: Term) -> bool:
     if node.is_Rational:
-        return abs(node.p) > LARGEST * node.q
+        return bool(abs(node.p) > LARGEST * node.q)
     if node is sympy.nan or isinstance(node, sympy.AccumBounds):
         return True
     return bool(node.is_number) and (node.is_extended_real is False or node.is_finite is False)
@@ -146,7 +156,8 @@ LinearForm = tuple[dict[Symbol, Term], Term]
 
 def linear_form(expression: Term, unknowns: Set[Symbol]) -> LinearForm | None:
     """Return the coefficients and the rest of Σ coefficient·unknown + rest, or None if it isn't linear."""
-    if any(not unknowns.isdisjoint(jump.free_symbols) for jump in expression.atoms(*NOT_LINEAR)):
+    functions = (one for one in expression.atoms(sympy.Function) if not isinstance(one, If))
+    if any(not unknowns.isdisjoint(one.free_symbols) for one in functions):
         return None
     slopes: dict[Symbol, list[Term]] = {}
     for term in sympy.Add.make_args(expression):

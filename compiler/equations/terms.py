@@ -173,7 +173,7 @@ def _written(term: Term) -> Expr:
         root = exponent == HALF
         return Call("sqrt", (_written(base),)) if root else Binary("^", _written(base), _written(exponent))
     arguments = tuple(map(_written, term.args))
-    name = NAMES.get(term.func, str(term.func))
+    name = NAMES.get(term.func, term.func.__name__)
     if name == "if":
         return Conditional(*arguments)
     if name in COMPARISONS:

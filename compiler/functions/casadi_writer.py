@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import casadi
-from sympy import Mul
+from sympy import Mul, tan
 
 from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.terms import HALF, NAMES, ONE, Symbol, Term, in_order, symbol
@@ -194,11 +194,16 @@ class Writer:
             return functools.reduce(operator.add, (self._build(one, taken) for one in expression.args))
         if expression.is_Mul or expression.is_Pow:
             return self._product(expression, taken)
-        name = NAMES[expression.func]
+        name = NAMES.get(expression.func)
+        if name is None:
+            return self._build(
+                expression.rewrite(tan), taken
+            )  # a cotangent, which SymPy makes of some tangents
         if name == "interpolate":
             return self._interpolated(*expression.args)
         if name == "if":
-            return self._chosen(*expression.args, taken)
+            condition, then, otherwise = expression.args
+            return self._chosen(condition, then, otherwise, taken)
         arguments = [self._build(argument, taken) for argument in expression.args]
         if taken is not None and name in _SOMEWHERE_NONE:
             arguments = [casadi.if_else(taken, one, HARMLESS) for one in arguments]
