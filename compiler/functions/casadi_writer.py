@@ -195,10 +195,8 @@ class Writer:
         if expression.is_Mul or expression.is_Pow:
             return self._product(expression, taken)
         name = NAMES.get(expression.func)
-        if name is None:
-            return self._build(
-                expression.rewrite(tan), taken
-            )  # a cotangent, which SymPy makes of some tangents
+        if name is None:  # a cotangent, which SymPy makes of some tangents
+            return self._build(expression.rewrite(tan), taken)
         if name == "interpolate":
             return self._interpolated(*expression.args)
         if name == "if":
