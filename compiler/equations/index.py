@@ -24,8 +24,8 @@ from apc.compiler.equations.derivatives import TIME, Derivative, Moving, derivat
 from apc.compiler.equations.elimination import Elimination
 from apc.compiler.equations.matching import alternating, match_columns
 from apc.compiler.equations.residuals import Residual, report_no_derivative, report_singular
-from apc.compiler.equations.symbolic import linear_form
-from apc.compiler.equations.terms import NoDerivativeError, Symbol, Term, size, text_of
+from apc.compiler.equations.symbolic import derivative_size, linear_form
+from apc.compiler.equations.terms import NoDerivativeError, Symbol, Term, text_of
 from apc.compiler.equations.zero_test import Divisors
 from apc.compiler.errors import Mistakes, Place
 
@@ -33,9 +33,9 @@ from apc.compiler.errors import Mistakes, Place
 # needs two), so the equations do not end.
 HIGHEST_ORDER = 8
 
-# Nodes of a derivative: that of a product of nonlinear factors is longer than the product. The derivatives
-# of the joints of a mechanism have some hundreds of them.
-LARGEST = 20_000
+# Nodes a derivative may have, at most: that of a product of nonlinear factors is longer than the product. The
+# derivatives of the joints of a mechanism have some hundreds of them.
+LARGEST = 100_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,13 +168,13 @@ class IndexReduction:
 
     def _differentiate(self, row: int) -> bool:
         residual = self.residuals[row]
+        if derivative_size(residual.expression) > LARGEST:
+            return self._report_endless([row])
         try:
             expression = self.moving.differentiate(residual.expression)
         except NoDerivativeError as missing:
             report_no_derivative(residual, missing, self.mistakes)
             return False
-        if size(expression) > LARGEST:
-            return self._report_endless([row])
         self.integral[len(self.residuals)] = row
         self._add(Residual(expression, residual.equation))
         return True

@@ -121,6 +121,20 @@ def differential(expression: Term, rate: Callable[[Symbol], Term]) -> Term:
     return sympy.Add(*parts)
 
 
+def derivative_size(expression: Term) -> int:
+    """Return how many nodes a derivative has at most, about: each factor's stands beside all the others."""
+    return _sizes(expression)[1]
+
+
+def _sizes(node: Term) -> tuple[int, int]:
+    """Return how many nodes a term has, and its derivative."""
+    if not node.args:
+        return 1, int(node.is_Symbol)
+    sizes, slopes = zip(*map(_sizes, node.args), strict=True)
+    whole = 1 + sum(sizes)
+    return whole, sum(slopes) + (0 if node.is_Add else len(sizes) * whole)
+
+
 def smooth_pieces(expressions: Sequence[Term], most: int) -> list[tuple[Term, ...]] | None:
     """Return what expressions may be between their corners and jumps, None if that is more than `most`.
 
