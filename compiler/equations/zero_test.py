@@ -119,7 +119,7 @@ class _Residues:
         if node.is_Pow and node.exp.is_Integer:
 
             def raised(base: int) -> int:
-                return pow(base, int(node.exp), PRIME) if base else self._some(node)
+                return pow(base, int(node.exp), PRIME) if base or node.exp > 0 else self._some(node)
 
             return np.frompyfunc(raised, 1, 1)(self(node.base))
         is_none = self.nonzero is not None and node.is_Symbol and node not in self.nonzero
