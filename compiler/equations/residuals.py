@@ -79,12 +79,13 @@ def report_singular(
     for i, held in enumerate(incidence):
         for j in held:
             holders[j].append(i)
-    over, over_columns = alternating([i for i in range(len(residuals)) if i not in columns], incidence, rows)
+    unmatched = [i for i in range(len(residuals)) if i not in columns]
+    over, over_columns = alternating(unmatched, incidence, rows)
     under_columns, under = alternating([j for j in range(len(unknowns)) if j not in rows], holders, columns)
     parts = []
     place = residuals[0].equation.place if residuals else place
     if over:
-        place = residuals[over[-1]].equation.place
+        place = residuals[unmatched[0]].equation.place
         named = [unknowns[j] for j in over_columns]
         holding = (
             f"hold only {counted(len(named), 'unknown')} ({listed(named)})" if named else "hold no unknown"
