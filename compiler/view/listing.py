@@ -75,7 +75,7 @@ def show_document(path: Path) -> dict[str, Any]:
                     for p in two.partitions
                 ],
                 "states": list(three.states),
-                "aliases": [{"name": name, "is": str(value)} for name, value in three.aliases],
+                "aliases": [{"name": name, "is": text_of(value)} for name, value in three.aliases],
                 "computed": [
                     {"clock": p.clock, "steps": [_step_document(step) for step in p.assignments]}
                     for p in three.partitions
@@ -128,7 +128,7 @@ def _step_document(step: Any) -> dict[str, Any]:
     return {
         "loop": list(step.unknowns),
         "guess": list(step.tearing),
-        "inner": [{"name": name, "is": str(value)} for name, value in step.inner],
+        "inner": [{"name": name, "is": text_of(value)} for name, value in step.inner],
         "zero": [str(residual) for residual in step.residuals],
     }
 
