@@ -52,7 +52,7 @@ PLACES = 9
 
 # Half the bracket first tried, relative to the value; where it decides nothing the next is so much wider: by
 # half more than what its own errors ask for, within these limits.
-HALF, BEYOND, LEAST_WIDER, MOST_WIDER, TRIES = 1e-13, 1.5, 4.0, 64.0, 12
+HALF, BEYOND, LEAST_WIDER, MOST_WIDER, TRIES = 1e-13, 1.5, 4.0, 16.0, 12
 
 # Steps of Newton's method.
 NEWTON = 12

@@ -112,7 +112,7 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
         delays = _delays(system) if start is not None else []
         most = MOST_IN_PASSING if quick else math.inf
         effort = effort_of(system, at, most=most)
-        slow = many_packets(system, at)
+        slow = effort.largest > MOST_SCANNED and many_packets(system, at)
         fitting = slow or effort.largest <= MOST_SCANNED
         each = effort.of_analyses(VALUES) if slow else effort.of_parameter()
         borne = affordable([each] * len(free), most if fitting else -1.0)
