@@ -49,7 +49,7 @@ MOST_NAMED = 30  # columns of a contact mode's name; a longer one has a line of 
 NOT_PLAYED = "not predicted and played: --buzz"
 SHOWN = 1e-9  # digits of a contact mode's spectral radius that its column has room for
 
-_NOUNS = {"determinant": "determinant", "krylov": "sparse system"}
+_NOUNS = {"determinant": "determinant"}
 
 _WORDS = {
     "stable": "Every motion dies out.",
