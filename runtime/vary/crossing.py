@@ -50,9 +50,8 @@ PARTS, MOST_OPEN, MOST_LEVELS = 8, 64, 12
 # Places at which a cubic is looked at.
 PLACES = 9
 
-# Half the bracket first tried, relative to the value; where it decides nothing the next is so much wider: by
-# half more than what its own errors ask for, within these limits.
-HALF, BEYOND, LEAST_WIDER, MOST_WIDER, TRIES = 1e-13, 1.5, 4.0, 16.0, 12
+# Half the bracket first tried, relative to the value; where it decides nothing the next is so much wider.
+HALF, WIDER, TRIES = 1e-13, 16.0, 12
 
 # Steps of Newton's method.
 NEWTON = 12
@@ -384,7 +383,7 @@ def _crossing(
                 return None
         if (left, right) == (low, high):
             break
-        width *= _wider(below, above)
+        width *= WIDER
     frequency = (above if rising else below).frequency_hz
     return Crossing(value, min(width, high - low), side, frequency, "crossing", ESTIMATE)
 
@@ -429,13 +428,3 @@ def _held(stretch: Stretch, ends: tuple[float, float], sides: tuple[Verdict, Ver
     grows = above if below.stable else below
     proof = grows.proof or "bounded in floats"
     return Crossing((left + right) / 2, (right - left) / 2, side, grows.frequency_hz, "crossing", proof)
-
-
-def _wider(below: Verdict, above: Verdict) -> float:
-    """Return how many times wider a bracket decides, as the radius changes evenly near a crossing."""
-    asked = [
-        BEYOND * one.error / abs(one.radius - 1)
-        for one in (below, above)
-        if one.stable is None and one.radius != 1 and math.isfinite(one.error)
-    ]
-    return min(max([LEAST_WIDER, *asked]), MOST_WIDER)

@@ -64,21 +64,21 @@ EVERY, FURTHER = 32, 1.25
 
 
 def judged(systems: Sequence[ClosedSystem]) -> Verdict:
-    """Return the verdict of closed systems. A drift decides nothing: it is so on both sides of a crossing."""
-    return _verdict(solve_spectrum(systems, verdict_only=True))
+    """Return the verdict of closed systems; what drifts does so on both sides of a crossing."""
+    found = solve_spectrum(systems, verdict_only=True)
+    return _verdict(found, found.stable if found.verdict != DRIFTS else True)
 
 
 def analysed(system: CompiledSystem, prepared: Prepared) -> Verdict:
-    """Return the verdict of a scene, open where it can't be analysed."""
+    """Return the verdict of a scene, open where it drifts or can't be analysed."""
     try:
         found = analyze(system, prepared=prepared)
     except ApcError:
         return Verdict(None, math.nan, math.inf, (), "")
-    return _verdict(found)
+    return _verdict(found, found.stable if found.verdict != DRIFTS else None)
 
 
-def _verdict(found: Spectrum | Analysis) -> Verdict:
-    stable = None if found.verdict == DRIFTS else found.stable
+def _verdict(found: Spectrum | Analysis, stable: bool | None) -> Verdict:
     return Verdict(stable, found.spectral_radius, found.spectral_radius_error, found.modes, found.proof)
 
 

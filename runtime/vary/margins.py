@@ -22,7 +22,7 @@ from apc.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
-from apc.eigen.spectrum import finite
+from apc.eigen.spectrum import DRIFTS, finite
 from apc.finite_equations import finite_equations
 from apc.frame.names import Free, named_times, parameter_of, unit_of, value_now
 from apc.result import Result
@@ -121,9 +121,9 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
         rest = [not_looked(system, one, why) for one in free if one not in chosen]
         if quick and rest and not chosen:  # and whether the scene is stable is not known
             return Margins((*rest, *(not_looked(system, one, why) for one in delays)), _notes(rest, start))
-        stable = analyze(system, prepared=prepared).stable
-        if not stable:
-            return Margins((), NOT_STABLE.format("stable" if stable is False else "proved stable"))
+        now = analyze(system, prepared=prepared)
+        if not now.stable and now.verdict != DRIFTS:
+            return Margins((), NOT_STABLE.format("stable" if now.stable is False else "proved stable"))
         lines = _lines(system, chosen, at, slow=slow)
         found = [row for pair in zip(chosen, lines, strict=True) if (row := _along(system, *pair))]
         found += rest
