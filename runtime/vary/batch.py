@@ -200,7 +200,8 @@ class BatchEvaluator:
 
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems at one point (m,), as an analysis has them: with error bounds."""
-        return tuple(map(close_loop, lifted_here(self.exact_at(value))))
+        assert not self.timed, "another time is another schedule"
+        return tuple(map(close_loop, lifted_here(self.with_sites(self.closed, value))))
 
     def with_sites(self, systems: Sequence[Wired], value: Sequence[float]) -> tuple[Wired, ...]:
         """Return systems with the exact sites of one point (m,); of a time, all but the steps is of it."""
