@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
@@ -68,6 +68,19 @@ class Scene:
         return [(j, self.weights[j, receiver]) for j in others if (j, receiver) in self.weights]
 
 
+@dataclass(frozen=True)
+class Luck:
+    """What becomes of packets in one frame: whether each that arrives is there, by (sender, receiver).
+
+    `missed` are the ways whose last packet before the frame is missing. With `zero` a peer that misses the
+    newest packet hears itself in its place, without it the newest that was there before.
+    """
+
+    there: Mapping[tuple[int, int], Sequence[bool]]
+    missed: Collection[tuple[int, int]] = ()
+    zero: bool = False
+
+
 def as_ball(value: Any) -> flint.arb:
     """Return a number as a ball: FLINT's, at the working precision set by the caller."""
     if isinstance(value, Fraction):
@@ -89,6 +102,36 @@ def frame_matrix(
         state = [number(1 if row == column else 0) for row in range(n)]
         columns.append(_one_frame(scene, state, frame, force_depth, packet_depth, number, exp))
     return [[columns[c][r] for c in range(n)] for r in range(n)]
+
+
+def ways_of(scene: Scene) -> list[tuple[int, int]]:
+    """Return who hears whom, as (sender, receiver)."""
+    return [(j, i) for i in range(scene.peers) for j, _ in scene.hears(i)]
+
+
+def lossy_frame(scene: Scene, luck: Luck) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the one-frame matrix (n, n) in floats, and what pushes at each tick make of the state (n, k).
+
+    Behind the state of `frame_matrix` stands by way the packet, (x, v), that is heard until another is there.
+    At each haptic tick every device is pushed anew, by 1 N until the next.
+    """
+    size, frame, force_depth, packet_depth = _shape(scene)
+    n = size + 2 * len(ways_of(scene))
+    rows = np.eye(n + scene.peers * int(frame / scene.haptic))
+    found = _one_frame(
+        scene, list(rows[:n]), frame, force_depth, packet_depth,
+        lambda value: np.asarray(value, dtype=np.float64)[..., None], np.exp, luck, iter(rows[n:]),
+    )  # fmt: skip
+    whole = np.stack([np.broadcast_to(row, len(rows)) for row in found])
+    return whole[:, :n], whole[:, n:]
+
+
+def states_read(matrices: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the states that others follow from in any of some maps (k, n, n), of those alone."""
+    read = np.ones(matrices.shape[1], dtype=bool)
+    while not (now := matrices[:, read].any(axis=(0, 1)) & read)[read].all():
+        read = now
+    return read.nonzero()[0]
 
 
 def frame_matrices(scene: Scene, count: int) -> NDArray[np.float64]:
@@ -129,9 +172,13 @@ def _one_frame(
     packet_depth: int,
     number: Callable[[Any], Any],
     exp: Any,
+    luck: Luck | None = None,
+    pushes: Iterator[Any] | None = None,
 ) -> list[Any]:
-    """Propagate all peers through one frame."""
+    """Propagate all peers through one frame; with luck each way's last packet stands behind them."""
     size = 4 + 3 * force_depth + 2 * packet_depth
+    behind = iter(state[scene.peers * size :])
+    last = {way: (next(behind), next(behind)) for way in ways_of(scene)} if luck else {}
     parts = [list(state[i * size : (i + 1) * size]) for i in range(scene.peers)]
     value = [
         {
@@ -161,12 +208,14 @@ def _one_frame(
         packets.append(
             [(network_0 - (k + 1) * network, *part[at + 2 * k : at + 2 * k + 2]) for k in range(packet_depth)]
         )
+    pushing = [number(0)] * scene.peers
     instants = {0, ending}
     for start, period, delay in (
         (haptic_0, haptic, comp),
         (haptic_0, haptic, contact_comp),
         (haptic_0, haptic, 0),
         (network_0, network, 0),
+        *((network_0, network, delay) for delay in {comm, *late.values()} if luck),
     ):
         first = -(delay // period) - 2
         instants |= {start + k * period + delay for k in range(first, ending // period + 2)}
@@ -175,18 +224,31 @@ def _one_frame(
     def newest(listed: Sequence[tuple[Any, ...]], now: int, delay: int) -> tuple[Any, ...]:
         return max((one for one in listed if one[0] + delay <= now), key=lambda one: one[0])
 
+    there = {way: iter(listed) for way, listed in luck.there.items()} if luck else {}
+    missed = set(luck.missed) if luck else set()
+
+    def hear(j: int, i: int, now: int) -> tuple[Any, ...]:
+        if not luck:
+            return newest(packets[j], now, late.get((j, i), comm))
+        return (now, *(motion[i][2:] if luck.zero and (j, i) in missed else last[j, i]))
+
     for now, following in itertools.pairwise(times):
         if (now - network_0) % network == 0:
             for i in range(scene.peers):
                 packets[i].append((now, motion[i][2], motion[i][3]))
+        for way in last:
+            delay = late.get(way, comm)
+            if (now - network_0 - delay) % network == 0:
+                missed -= {way}
+                if next(there[way]):
+                    last[way] = newest(packets[way[0]], now, delay)[1:]
+                else:
+                    missed |= {way}
         if (now - haptic_0) % haptic == 0:
+            pushing = [next(pushes) for _ in motion] if pushes else pushing
             for i, (x, v, x_o, v_o) in enumerate(motion):
                 p = value[i]
-                weights = scene.hears(i)
-                heard = [
-                    (number(weight), j, newest(packets[j], now, late.get((j, i), comm)))
-                    for j, weight in weights
-                ]
+                heard = [(number(weight), j, hear(j, i, now)) for j, weight in scene.hears(i)]
                 total = sum((weight for weight, _, _ in heard), number(0))
                 share = total if scene.operator == "mean" else number(1)
                 own = number(1) if scene.operator == "mean" else number(scene.peers - 1)
@@ -216,7 +278,7 @@ def _one_frame(
             at_once = newest(forces[i], now, 0)
             pull = delayed[2] + (at_once if scene.own_delay else delayed)[3]
             x, v, x_o, v_o = motion[i]
-            x, v = _coast(x, v, -contact, p["device"], p["device_damping"], duration, number, exp)
+            x, v = _coast(x, v, pushing[i] - contact, p["device"], p["device_damping"], duration, number, exp)
             x_o, v_o = _coast(x_o, v_o, contact - pull, p["cube"], p["cube_damping"], duration, number, exp)
             motion[i] = [x, v, x_o, v_o]
 
@@ -227,7 +289,7 @@ def _one_frame(
             result += one[1:]
         for one in sorted(packets[i], key=lambda one: one[0], reverse=True)[:packet_depth]:
             result += one[1:]
-    return result
+    return [*result, *itertools.chain(*last.values())]
 
 
 def _coast(

@@ -10,12 +10,15 @@ values of each parameter as they can, and all of them with `pytest --whole`.
 from __future__ import annotations
 
 import gc
+import shlex
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+from tests.commands import Cli, Ran
 
 # How long an example takes, or the making of one, says nothing of whether a claim is true.
 settings.register_profile("apc", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -81,6 +84,21 @@ def users_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         # Processes that tests start keep what Python compiled, as where apc is installed.
         patch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
         yield
+
+
+@pytest.fixture
+def cli(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Cli:
+    """Run commands in an empty folder, each a line as for a shell, or its words."""
+    from apc.__main__ import run
+
+    monkeypatch.chdir(tmp_path)
+
+    def call(line: str, *words: str) -> Ran:
+        capsys.readouterr()
+        code = run([*shlex.split(line), *words])
+        return Ran(code, *capsys.readouterr())
+
+    return call
 
 
 @pytest.fixture

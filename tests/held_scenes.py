@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from tests.bruteforce import Scene, frame_matrix
+from tests.bruteforce import Luck, Scene, lossy_frame, states_read, ways_of
 from tests.topologies import compiled
 
 Floats = NDArray[np.float64]
@@ -52,40 +53,30 @@ def system_of(text: str) -> CompiledSystem:
 
 @dataclass(frozen=True)
 class Frames:
-    """One frame, x⁺ = A x + B h and q = C x, of the motion x of all users and what each hears of each, h.
+    """One frame of all users and of what each hears of each; `pairs` are (sender, receiver).
 
-    A user's packet is its position and velocity; `pairs` (receiver, sender) names the channels, each of two
-    numbers in h.
+    `read` are the states that something follows from.
     """
 
-    a: Floats
-    b: Floats
-    c: Floats
+    scene: Scene
     pairs: tuple[tuple[int, int], ...]
+    read: NDArray[np.intp]
 
-    def matrix(self, heard: Floats) -> Floats:
-        """Return the frame's matrix over (x, h) where channels hear (1) or lose (0) the packet sent in it."""
-        kept = np.repeat(heard, 2)
-        return np.block([[self.a, self.b], [kept[:, None] * self.c, np.diag(1 - kept)]])
+    def matrix(self, heard: Sequence[float]) -> Floats:
+        """Return the frame's matrix where ways hear (1) or lose (0) the packet that arrives in it."""
+        return _whole(self.scene, self.pairs, heard)[np.ix_(self.read, self.read)]
+
+
+def _whole(scene: Scene, pairs: Sequence[tuple[int, int]], heard: Sequence[float]) -> Floats:
+    return lossy_frame(scene, Luck({pair: (bool(one),) for pair, one in zip(pairs, heard, strict=True)}))[0]
 
 
 def frames(peers: int, stiffness: float, damping: float = 0.0, operator: str = "mean") -> Frames:
-    """Take the frame of `bruteforce` apart, whose packets are heard in the frame after they are sent."""
-    whole = np.array(
-        frame_matrix(Scene(operator=operator, peers=peers, kt=stiffness, bt=damping, cube=0.6 / peers))
-    )
-    size = len(whole) // peers
-    packet = size - 4  # the newest of two that are kept
-    moves = [peer * size + place for peer in range(peers) for place in range(packet)]
-    pairs = tuple((i, j) for i in range(peers) for j in range(peers) if i != j)
-    b = np.zeros((len(moves), 2 * len(pairs)))
-    c = np.zeros((2 * len(pairs), len(moves)))
-    for place, (i, j) in enumerate(pairs):
-        own = slice(i * packet, (i + 1) * packet)
-        columns = [j * size + packet, j * size + packet + 1]
-        b[own, 2 * place : 2 * place + 2] = whole[i * size : i * size + packet, columns]
-        c[2 * place : 2 * place + 2] = whole[np.ix_(columns, moves)]
-    return Frames(whole[np.ix_(moves, moves)], b, c, pairs)
+    """Return the frames of the paper's users, whose packets are heard in the frame after they are sent."""
+    scene = Scene(operator=operator, peers=peers, kt=stiffness, bt=damping, cube=0.6 / peers)
+    pairs = tuple(ways_of(scene))
+    either = np.array([_whole(scene, pairs, [one] * len(pairs)) for one in (0.0, 1.0)])
+    return Frames(scene, pairs, states_read(either))
 
 
 def growth(matrices: list[Floats]) -> float:

@@ -7,8 +7,9 @@ through one frame together: a number is a row, what it is of each state at the b
 from __future__ import annotations
 
 import cmath
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,12 +24,18 @@ Law = Callable[
 ]
 
 
+# (sender, receiver, tick) → which packet counts, and whether a newer one is missing. The number 0 is the
+# first that was sent, −1 stands for the start values.
+Late = Callable[[int, int, int], tuple[int, bool]]
+
+
 @dataclass(frozen=True)
 class ByHand:
     """A scheme: force ticks every millisecond, packets every `ratio` of them, `late` and `comp` in ticks.
 
     `bodies` are by peer (mass, damping, springs to the ground). A packet holds the sampled (x, v) of body
-    `told` and what the law put out at the tick before. `hears` are by peer those it hears.
+    `told` and what the law put out at the tick before. `hears` are by peer those it hears. Where a packet is
+    missing and `zero` is set, a peer hears its own motion in its place.
     """
 
     bodies: Sequence[Sequence[tuple[float, float, float]]]
@@ -38,13 +45,25 @@ class ByHand:
     memory: int = 0
     out: int = 0
     ratio: int = 8
-    late: int = 8
+    late: int | Late = 8
     comp: int = 1
     period: float = 1e-3
+    zero: bool = False
+
+    @property
+    def kept(self) -> int:
+        """How many packets of a peer are kept from before a frame."""
+        return -(-self.late // self.ratio) + 1 if isinstance(self.late, int) else 1
+
+    def counts(self, sender: int, receiver: int, tick: int) -> tuple[int, bool]:
+        """Return the packet that counts on a way at a tick, and whether a newer one is missing."""
+        if isinstance(self.late, int):
+            return (tick - self.late) // self.ratio, False
+        return self.late(sender, receiver, tick)
 
 
 @dataclass
-class _Playing:
+class Playing:
     """What all peers hold: newest first what is computed and waits, and packets."""
 
     motion: list[Any]
@@ -54,43 +73,41 @@ class _Playing:
     packets: list[Any]
 
 
-def _kept(scheme: ByHand) -> int:
-    """Return how many packets of a peer are kept."""
-    return -(-scheme.late // scheme.ratio) + 1
-
-
-def _tick(scheme: ByHand, now: _Playing, tick: int) -> None:
-    """Play a tick of a frame, and the time to the next."""
+def _tick(scheme: ByHand, now: Playing, tick: int) -> None:
+    """Play a tick, and the time to the next."""
     peers = range(len(scheme.bodies))
-    if tick == 0:
+    if tick % scheme.ratio == 0:
         for i in peers:
-            now.packets[i] = [[*now.motion[i][scheme.told], *now.out[i]], *now.packets[i][:-1]]
-    sent = (tick - scheme.late) // scheme.ratio  # the newest packet that is here; 0 is the frame's own
-    age = max(-sent, 0)
-    seconds = (tick - sent * scheme.ratio) * scheme.period
+            now.packets[i] = [[*now.motion[i][scheme.told], *now.out[i]], *now.packets[i]]
     acting: list[Any] = []
     for i in peers:
-        heard = {j: [*now.packets[j][age], seconds] for j in scheme.hears[i]}
+        heard = {}
+        for j in scheme.hears[i]:
+            number, missing = scheme.counts(j, i, tick)
+            packet = now.packets[j][tick // scheme.ratio - number]
+            if missing and scheme.zero:
+                packet = now.motion[i][scheme.told]
+            heard[j] = [*packet, (tick - number * scheme.ratio) * scheme.period]
         new, now.memory[i], now.out[i] = scheme.law(i, now.motion[i], heard, now.memory[i])
         queue = [list(new), *now.forces[i]]
         acting.append(queue[scheme.comp])
         now.forces[i] = queue[: scheme.comp]
     for i in peers:
         now.motion[i] = [
-            _coast(x, v, force, *body, scheme.period)
+            coast(x, v, force, *body, scheme.period)
             for (x, v), force, body in zip(now.motion[i], acting[i], scheme.bodies[i], strict=True)
         ]
 
 
 def frame_matrix(scheme: ByHand) -> NDArray[np.float64]:
     """Return the one-frame matrix of all peers."""
-    kept = _kept(scheme)
+    kept = scheme.kept
     sizes = [
         2 * len(own) + scheme.comp * len(own) + scheme.memory + scheme.out + kept * (2 + scheme.out)
         for own in scheme.bodies
     ]
     rows = iter(np.eye(sum(sizes)))
-    now = _Playing([], [], [], [], [])
+    now = Playing([], [], [], [], [])
     for own in scheme.bodies:
         now.motion.append([(next(rows), next(rows)) for _ in own])
         now.forces.append([[next(rows) for _ in own] for _ in range(scheme.comp)])
@@ -104,17 +121,14 @@ def frame_matrix(scheme: ByHand) -> NDArray[np.float64]:
     for i in range(len(scheme.bodies)):
         rows_out += [value for pair in now.motion[i] for value in pair]
         rows_out += [value for one in now.forces[i] for value in one]
-        rows_out += [*now.memory[i], *now.out[i], *(value for one in now.packets[i] for value in one)]
+        rows_out += [*now.memory[i], *now.out[i], *(value for one in now.packets[i][:kept] for value in one)]
     return np.array(rows_out)
 
 
-def played(
-    scheme: ByHand,
-    starts: Sequence[Sequence[tuple[float, float]]],
-    memory: Sequence[Sequence[float]],
-    ticks: int,
-) -> NDArray[np.float64]:
-    """Return the positions at each tick (ticks, bodies of all peers), of a law that need not be linear.
+def course(
+    scheme: ByHand, starts: Sequence[Sequence[tuple[float, float]]], memory: Sequence[Sequence[float]] = ()
+) -> Iterator[Playing]:
+    """Yield all that is held before each tick, of a law that need not be linear; it changes on the way.
 
     Parameters
     ----------
@@ -123,27 +137,58 @@ def played(
     starts
         By peer the position and velocity of each body; who is not heard yet stands there.
     memory
-        By peer its memory at first.
-    ticks
-        How many.
+        By peer its memory at first, none if left out.
     """
-    nought = [[0.0] * len(own) for own in scheme.bodies]
     silent = [0.0] * scheme.out
-    now = _Playing(
+    now = Playing(
         motion=[list(own) for own in starts],
-        forces=[[own] * scheme.comp for own in nought],
-        memory=[list(own) for own in memory],
+        forces=[[[0.0] * len(own)] * scheme.comp for own in starts],
+        memory=[list(own) for own in memory or [()] * len(starts)],
         out=[silent for _ in starts],
-        packets=[[[*own[scheme.told], *silent]] * _kept(scheme) for own in starts],
+        packets=[[[*own[scheme.told], *silent]] * scheme.kept for own in starts],
     )
-    found = []
-    for tick in range(ticks):
-        found.append([x for own in now.motion for x, _ in own])
-        _tick(scheme, now, tick % scheme.ratio)
-    return np.array(found)
+    for tick in itertools.count():
+        yield now
+        _tick(scheme, now, tick)
 
 
-def _coast(
+def played(
+    scheme: ByHand,
+    starts: Sequence[Sequence[tuple[float, float]]],
+    memory: Sequence[Sequence[float]],
+    ticks: int,
+) -> NDArray[np.float64]:
+    """Return the positions at each tick (ticks, bodies of all peers)."""
+    rows = itertools.islice(course(scheme, starts, memory), ticks)
+    return np.array([[x for own in now.motion for x, _ in own] for now in rows])
+
+
+def experiment(operator: str, ticks: int) -> NDArray[np.float64]:
+    """Return the paper's experiment: one user pushes with 4 N against two with 2 N each.
+
+    The rows are x, v, x_O, v_O and the forces F_C, F_T computed at the tick before (ticks, users, 6).
+    """
+    pushes, half_width = [-4.0, 2.0, 2.0], 0.02
+
+    def law(i: int, motion: Sequence[tuple[Any, Any]], heard: Any, memory: Any) -> tuple[Any, Any, Any]:
+        (x, v), (x_o, v_o) = motion
+        side = math.copysign(1.0, pushes[i])  # the user at the right pushes to the left
+        depth = half_width + side * (x - x_o)
+        f_c = side * max(0.0, 3900 * depth + 0.05 * side * (v - v_o)) if depth > 0 else 0.0
+        f_t = sum(2000 * (x_o - packet[0]) + v_o - packet[1] for packet in heard.values())
+        f_t = f_t / 2 if operator == "mean" else f_t
+        return [pushes[i] - f_c, f_c - f_t], [f_c, f_t], []
+
+    bodies = [[(0.1, 5.0, 0.0)] * 2] * 3
+    scheme = ByHand(bodies, everybody(3), law, told=1, memory=2, comp=0)
+    starts = [[(-math.copysign(0.03, push), 0.0), (0.0, 0.0)] for push in pushes]
+    rows = itertools.islice(course(scheme, starts, [[0.0, 0.0]] * 3), ticks)
+    return np.array(
+        [[[*motion[0], *motion[1], *now.memory[i]] for i, motion in enumerate(now.motion)] for now in rows]
+    )
+
+
+def coast(
     x: Any, v: Any, force: Any, mass: float, damping: float, spring: float, time: float
 ) -> tuple[Any, Any]:
     """Move a mass under a constant force: m x'' + b x' + k x = F, by its two roots (or m v' + b v = F)."""

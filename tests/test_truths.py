@@ -252,8 +252,8 @@ LIMIT = _limits()
 def _critical(one: Limit) -> float:
     found = apc.critical(compiled(one.text), one.parameter, lower="1 N/m", upper=f"{2 * one.value} N/m")
     first = found.crossings[0]
-    assert first.stable_side == "below"
-    assert first.error < 1e-6
+    assert first.stable_side == "below" and first.proof.startswith("proved") and found.whole
+    assert first.error <= 1e-12 * first.value
     return first.value
 
 

@@ -186,7 +186,13 @@ def text_of(scene: Scene) -> str:
         groups = "".join(
             f"  {name}: {{count: 1, set: {{{one}}}}}\n" for name, one in zip(names, own, strict=True)
         )
-    pairs = "".join(f"{names[i]}: {{{names[j]}: {_ms(late)}}}, " for (i, j), late in scene.late.items())
+    heard = {
+        names[i]: "".join(
+            f"{names[j]}: {_ms(late)}, " for (sender, j), late in scene.late.items() if sender == i
+        )
+        for i, _ in scene.late
+    }
+    pairs = "".join(f"{name}: {{{listed}}}, " for name, listed in heard.items())
     arcs = "".join(f"[{i + 1}, {j + 1}, {weight!r}], " for (i, j), weight in (scene.weights or {}).items())
     link = f"clock: network, delay: {_ms(scene.comm)}"
     link += f", delays: {{{pairs}}}" if pairs else ""

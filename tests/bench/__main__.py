@@ -31,61 +31,43 @@ AVERAGE = "models/scenes/three-users-average.yaml"
 
 @dataclass(frozen=True)
 class Part:
-    """A section of the page: its title, the words after `python -m`, and those of a quick run.
-
-    `timed` says that it knows `--strict`.
-    """
+    """A section of the page: its title, the words after `python -m`; `timed` by --quick and --strict."""
 
     name: str
     title: str
     words: tuple[str, ...]
-    quick: tuple[str, ...] | None = None
     timed: bool = True
 
     def command(self, quick: bool, strict: bool = False) -> tuple[str, ...]:
         """Return the words after `python -m`."""
-        words = self.quick if quick and self.quick is not None else self.words
-        return (*words, "--strict") if strict and self.timed else words
+        judged = self.timed and self.words[0] != "apc"
+        return self.words + (("--quick",) * quick + ("--strict",) * strict) * judged
 
 
-def _own(name: str, *words: str) -> tuple[str, ...]:
-    return f"tests.bench.{name}", *words
+def _bench(name: str, title: str, *words: str) -> Part:
+    return Part(name, title, ("apc", "bench", *words), timed=False)
 
 
+TITLES = {
+    "random_scenes": "Random scenes",
+    "random_scans": "Random scans",
+    "comparison": "Other programs",
+    "work_precision": "Methods of simulation",
+    "play": "Peers in real time",
+    "simulate": "Simulation",
+    "critical": "Critical values",
+    "region": "Regions",
+    "network": "Unreliable networks",
+    "hands": "Hands",
+    "sweep": "Sweeps",
+}
 PARTS = (
-    Part("readme", "Pictures and blocks of the README", _own("readme"), timed=False),
-    Part("process", "Whole processes", _own("process"), _own("process", "--runs", "3", "--quick")),
-    Part(
-        "scenes",
-        "The default on every scene",
-        _own("scenes"),
-        _own("scenes", "--rounds", "3"),
-    ),
-    Part("needs", "What each scene needs", _own("needs"), timed=False),
-    Part("bench", "Speed against error on the paper's scene", ("apc", "bench", AVERAGE), timed=False),
-    Part("hard", "Hard cases", ("apc", "bench", "--hard", "tests/hard"), timed=False),
-    Part("scale", "More peers", ("apc", "bench", AVERAGE, "--scale", "3,30,300,3000,30000,1e6"), timed=False),
-    Part(
-        "random",
-        "Random scenes",
-        _own("random_scenes", "--every", "0"),
-        _own("random_scenes", "--points", "200", "--every", "0"),
-    ),
-    Part("scans", "Random scans", _own("random_scans"), _own("random_scans", "--points", "40")),
-    Part("comparison", "Other programs", _own("comparison")),
-    Part("work_precision", "Methods of simulation", _own("work_precision")),
-    Part("handed_over", "A scene handed over as code", _own("handed_over")),
-    Part("play", "Peers in real time", _own("play"), _own("play", "--seconds", "5")),
-    Part("simulate", "Simulation", _own("simulate"), _own("simulate", "--quick")),
-    Part("language", "Compiling", _own("language"), _own("language", "--quick")),
-    Part("populations", "Populations", _own("populations"), _own("populations", "--quick")),
-    Part("critical", "Critical values", _own("critical")),
-    Part("region", "Regions", _own("region"), _own("region", "--quick")),
-    Part("network", "Unreliable networks", _own("network"), _own("network", "--quick")),
-    Part("hands", "Hands", _own("hands")),
-    Part("explore", "A slider of the page", _own("explore")),
-    Part("map", "The paper's map", _own("map"), _own("map", "--points", "400")),
-    Part("sweep", "Sweeps", _own("sweep"), _own("sweep", "--points", "5000", "--kills", "1"), timed=False),
+    Part("readme", "Pictures and blocks of the README", ("tests.bench.readme",), timed=False),
+    Part("process", "Whole processes", ("tests.bench.process",)),
+    _bench("bench", "Speed against error on the paper's scene", AVERAGE),
+    _bench("hard", "Hard cases", "--hard", "tests/hard"),
+    _bench("scale", "More peers", AVERAGE, "--scale", "3,30,300,3000,30000,1e6"),
+    *(Part(name, title, (f"tests.bench.{name}",)) for name, title in TITLES.items()),
 )
 
 

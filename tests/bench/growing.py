@@ -1,7 +1,7 @@
 # ruff: noqa: E501 -- scenes are written by long lines
 """Scenes that grow: more peers, different peers, kinds, equations, masses in a row.
 
-Takes: how many, and a folder for what stands beside a scene. Gives: `plain`, `lossy`, `flat`, `table`, `kinds`, `equations`, `row`.
+Takes: how many, and a folder for what stands beside a scene. Gives: `ring`, `lossy`, `flat`, `table`, `kinds`, `equations`, `row`.
 Does not: load anything large, so that what measures whole processes can use it.
 """
 
@@ -18,9 +18,9 @@ def flat(peers: int, folder: Path) -> str:
     return _replaced(("count: 3", f"count: {peers}"))
 
 
-def plain(number: int, folder: Path) -> str:
-    """Return the paper's scene: what grows is told to the command."""
-    return AVERAGE
+def ring(peers: int, folder: Path) -> str:
+    """Return a scene of equal peers in a ring."""
+    return _replaced(("count: 3", f"count: {peers}"), ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
 
 
 def lossy(number: int, folder: Path) -> str:

@@ -4,13 +4,15 @@ A number is judged by its own bound, or by what it must be by construction, and 
 long something takes is the machine's: a target is printed as kept, or missed, or near where it is missed by
 no more than two runs of one program differ.
 
-What another program takes for the same work is taken down too: the rows printed at the end are those of the
-first table of the page (`tests.bench.__main__`).
+`Judge.table` prints programs that do the same work, ours first. What others take is taken down too: the rows
+printed at the end are those of the first table of the page (`tests.bench.__main__`).
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 # Two medians of one program on one machine differ by up to a quarter where others work beside it.
@@ -18,6 +20,23 @@ NOISE = 1.25
 # The first line of the rows of other programs; they alone begin as it does.
 ROW = "| "
 HEAD = f"{ROW}work | apc | its error | other program | it takes | its error | apc / other |"
+
+
+@dataclass(frozen=True, slots=True)
+class Timed:
+    """What a program takes, in seconds, how far it is off, and the most it may be; a remark in words."""
+
+    program: str
+    seconds: float
+    error: float | None = None
+    bound: float | None = None
+    remark: str = ""
+
+    def told(self, unit: str) -> str:
+        """Return the error in words."""
+        if self.error is None:
+            return self.remark or "–"
+        return f"{self.error:.1e}" + ("" if self.bound is None else f" ≤ {self.bound:.1e}") + unit
 
 
 @dataclass(slots=True)
@@ -73,17 +92,52 @@ class Judge:
         other
             The other program.
         """
-        (seconds, error), (their_seconds, their_error) = ours, theirs
-        cells = (
-            work,
-            time_of(seconds),
-            error,
-            other,
-            time_of(their_seconds),
-            their_error,
-            f"{seconds / their_seconds:.3g}",
-        )
-        self.rows.append(ROW + " | ".join(cells) + " |")
+        cells = (work, time_of(ours[0]), ours[1], other, time_of(theirs[0]), theirs[1])
+        self.rows.append(f"{ROW}{' | '.join(cells)} | {ours[0] / theirs[0]:.3g} |")
+
+    def table(
+        self,
+        work: str,
+        programs: Sequence[Timed],
+        *,
+        unit: str = "",
+        most_s: float | None = None,
+        most: Mapping[str, float] | None = None,
+    ) -> None:
+        """Print programs that do the same work, the first of them ours, and judge errors and times.
+
+        Parameters
+        ----------
+        work
+            What they do.
+        programs
+            What each takes and is off by; the first is apc, and what has a bound is judged by it. Names that
+            begin with apc are not other programs.
+        unit
+            Of the errors, with a space before it.
+        most_s
+            The seconds that ours may take.
+        most
+            By another program's name, how many times as long as it ours may take.
+        """
+        ours = programs[0]
+        print(f"\n{work}")
+        for one in programs:
+            words = [f"  {one.program:<36}{time_of(one.seconds):>9}", f"{one.seconds / ours.seconds:9.3g}"]
+            words.append(f" {one.told(unit)}")
+            if one.error is not None and one.bound is not None:
+                words.append(self.within(f"{work}, {one.program}", one.error, one.bound))
+            if one is ours and most_s is not None:
+                words.append(f"target {time_of(most_s)} {self.in_time(work, one.seconds, most_s)}")
+            if target := (most or {}).get(one.program):
+                ratio = ours.seconds / one.seconds
+                words.append(
+                    f"target {target:g} {self.in_time(f'{work}, beside {one.program}', ratio, target)}"
+                )
+            print(" ".join(words))
+            if not one.program.startswith("apc"):
+                theirs = one.seconds, one.told(unit)
+                self.beside(work, (ours.seconds, ours.told(unit)), one.program, theirs)
 
     @property
     def code(self) -> int:
@@ -127,4 +181,19 @@ def parser_of(name: str, about: str | None) -> argparse.ArgumentParser:
     """
     parser = argparse.ArgumentParser(prog=f"python -m tests.bench.{name}", description=about)
     parser.add_argument("--strict", action="store_true", help="a missed target of time is a failure too")
+    parser.add_argument("--quick", action="store_true", help="smaller sizes, fewer runs")
     return parser
+
+
+@contextmanager
+def judged(parser: argparse.ArgumentParser) -> Iterator[tuple[Judge, argparse.Namespace]]:
+    """Give a judge and what the command line says, one core's worth of threads, and end the program."""
+    import numpy as np  # not by who measures processes: one begins as a copy
+
+    from apc.threads import single_threaded
+
+    given = parser.parse_args()
+    judge = Judge(given.strict)
+    with single_threaded(), np.errstate(all="ignore"):
+        yield judge, given
+    judge.end()

@@ -1,114 +1,53 @@
-"""What a person waits for: whole processes, their memory, growth, imports: `python -m tests.bench.process`.
+"""What a person waits for: whole processes, their memory, growth: `python -m tests.bench.process`.
 
-A time is the median of a few runs, from the start of the process to its end, after one that compiles Python's
-own files; memory is the most it held. This program loads nothing large itself, as a process begins as a copy.
+A time is that of a processor, from the start of the process to its end, after one that compiles Python's own
+files; memory is the most it held. This program loads nothing large itself, as a process begins as a copy.
 """
 
 from __future__ import annotations
 
+import argparse
 import math
 import os
-import re
 import resource
 import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 from apc.benchmark.timing import spread_of, waited
-from tests.bench.growing import SCENES, equations, flat, kinds, lossy, plain, row, table
+from tests.bench.growing import SCENES, equations, flat, kinds, lossy, ring, row, table
 from tests.bench.judge import Judge, parser_of
 
 RUNS = 7
 SCENE, STAR = "three-users-average", "client-server"
-# Seconds of a processor.
-TARGETS = {"help": 0.1, "compile": 0.4, "compile star": 0.4, "unchanged": 0.15, "analyze": 0.25}
-COMMANDS = (
-    ("import apc", ("-c", "import apc")),
-    ("help", ("-m", "apc", "--help")),
-    ("compile", ("-m", "apc", "compile", "--force", f"{SCENE}.yaml")),
-    ("compile star", ("-m", "apc", "compile", "--force", f"{STAR}.yaml")),
-    ("unchanged", ("-m", "apc", "compile", f"{SCENE}.yaml")),
-    ("analyze", ("-m", "apc", "analyze", f"{SCENE}.apc")),
-    ("simulate", ("-m", "apc", "simulate", "--duration", "1 s", f"{SCENE}.apc")),
-    ("feel", ("-m", "apc", "feel", f"{SCENE}.apc")),
-    ("region", ("-m", "apc", "region", f"{SCENE}.apc")),
+# A command and its target in seconds.
+COMMANDS: tuple[tuple[str, str, float | None], ...] = (
+    ("import apc", "-c import%apc", None),
+    ("help", "-m apc --help", 0.1),
+    ("compile", f"-m apc compile --force {SCENE}.yaml", 0.4),
+    ("compile star", f"-m apc compile --force {STAR}.yaml", 0.4),
+    ("unchanged", f"-m apc compile {SCENE}.yaml", 0.15),
+    ("analyze", f"-m apc analyze {SCENE}.apc", 0.25),
+    ("simulate", f"-m apc simulate --duration 1s {SCENE}.apc", None),
+    ("feel", f"-m apc feel {SCENE}.apc", None),
+    ("region", f"-m apc region {SCENE}.apc", None),
 )
-# What grows, over two decades: how many of it, and how many may take how many seconds of a processor in
-# `compile` and in `analyze` beyond those of the smallest.
-Target = tuple[int, tuple[float, float]]
-GROWTH: tuple[tuple[str, Callable[[int, Path], str], tuple[int, ...], Target], ...] = (
-    ("equations", equations, (10, 30, 100, 300, 1000), (1000, (1.0, 3.0))),
-    ("masses in a row", row, (4, 12, 40, 120, 400), (400, (2.0, 3.0))),
-    ("kinds", kinds, (1, 2, 4, 8, 16, 32, 100), (32, (0.1, 0.1))),
+# What grows: how many of it, the scene of so many, the command (`@` the number), and how many may take how
+# many seconds in `compile` and in the command beyond those of the smallest.
+Growing = tuple[str, tuple[int, ...], Callable[[int, Path], str], str, tuple[int, float, float] | None]
+GROWTH: tuple[Growing, ...] = (
+    ("equations", (10, 30, 100, 300, 1000), equations, "analyze scene.apc", (1000, 1.0, 3.0)),
+    ("masses in a row", (4, 12, 40, 120, 400), row, "analyze scene.apc", (400, 2.0, 3.0)),
+    ("kinds", (1, 2, 4, 8, 16, 32, 100), kinds, "analyze scene.apc", (32, 0.1, 0.1)),
+    ("equal peers", (3, 3000, 1_000_000), flat, "analyze scene.apc", None),
+    ("peers in a ring", (1000, 10_000, 100_000), ring, "analyze scene.apc", None),
+    ("different peers", (1000, 10_000, 100_000), table, "analyze scene.apc", None),
+    ("runs", (10, 100, 1000), lossy, "simulate scene.apc --duration 1s --runs @", None),
 )
-# What one command is asked for more of: how many, the scene of so many, and the command's words.
-Scene, Words = Callable[[int, Path], str], Callable[[int], tuple[str, ...]]
-AMOUNTS: tuple[tuple[str, tuple[int, ...], Scene, Words], ...] = (
-    ("equal peers", (30, 300, 3000, 30_000), flat, lambda number: ("analyze", "scene.apc")),
-    ("different peers", (1000, 10_000, 100_000), table, lambda number: ("analyze", "scene.apc")),
-    (
-        "frames of delay",
-        (1, 3, 10, 30, 100, 300),
-        plain,
-        lambda number: (
-            *("critical", "coordination.stiffness", "scene.apc"),
-            *("--set", f"lan.delay={8 * number} ms"),
-        ),
-    ),
-    (
-        "points",
-        (1000, 10_000, 100_000),
-        plain,
-        lambda number: (
-            *("sweep", "scene.apc", "--jobs", "1", "--out", "points.parquet"),
-            *("--over", "contact.stiffness=10 N/m:3000 N/m:100"),
-            *("--over", f"coordination.stiffness=10 N/m:3000 N/m:{number // 100}"),
-        ),
-    ),
-    (
-        "runs",
-        (10, 100, 1000),
-        lossy,
-        lambda number: ("simulate", "scene.apc", "--duration", "1 s", "--runs", f"{number}"),
-    ),
-)
-MOST_PACKAGES = 8  # listed
-LINE = re.compile(r"import time:\s+(\d+) \|\s+\d+ \|\s+(\S+)")
-
-
-def once(words: tuple[str, ...], folder: Path, where: Path | None = None) -> tuple[float, float, int]:
-    """Return the seconds, those of a processor, and the most bytes of one process, run in `where`."""
-    command = [sys.executable, *words]
-
-    def run() -> tuple[int, resource.struct_rusage]:
-        process = subprocess.Popen(
-            command, cwd=where or folder, env=_environment(folder), stdout=subprocess.DEVNULL
-        )
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        return process.returncode, used
-
-    seconds, (code, used) = waited(run)
-    assert code == 0, words
-    return seconds, used.ru_utime + used.ru_stime, used.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-
-
-def imports(words: tuple[str, ...], folder: Path) -> Counter[str]:
-    """Return the microseconds that importing each package takes, its own and nothing below it."""
-    command = [sys.executable, "-X", "importtime", *words]
-    ran = subprocess.run(
-        command, cwd=folder, env=_environment(folder), capture_output=True, text=True, check=True
-    )
-    found: Counter[str] = Counter()
-    for line in ran.stderr.splitlines():
-        if match := LINE.match(line):
-            found[match[2].partition(".")[0]] += int(match[1])
-    return found
 
 
 def _environment(folder: Path) -> dict[str, str]:
@@ -117,112 +56,91 @@ def _environment(folder: Path) -> dict[str, str]:
     return kept | {"PYTHONPYCACHEPREFIX": str(folder / "python")}
 
 
-def print_growth(
-    title: str,
-    write: Callable[[int, Path], str],
-    numbers: Sequence[int],
-    targets: Target,
-    judge: Judge,
-    folder: Path,
-) -> None:
-    """Measure `compile` and `analyze` of ever larger scenes; judge one, and print the exponents.
+def once(words: str, folder: Path, where: Path | None = None) -> tuple[float, float, float, str]:
+    """Return the seconds, those of a processor, the most MiB of one process, and what it prints."""
+    command = [sys.executable, *(word.replace("%", " ") for word in words.split())]
+    environment = _environment(folder)
+
+    def run() -> tuple[bytes, int, resource.struct_rusage]:
+        process = subprocess.Popen(command, cwd=where or folder, env=environment, stdout=subprocess.PIPE)
+        assert process.stdout is not None
+        printed = process.stdout.read()
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        return printed, process.returncode, used
+
+    seconds, (printed, code, used) = waited(run)
+    assert code == 0, words
+    scale = 2.0**20 if sys.platform == "darwin" else 2.0**10
+    return seconds, used.ru_utime + used.ru_stime, used.ru_maxrss / scale, printed.decode()
+
+
+def commands(judge: Judge, folder: Path, runs: int) -> None:
+    """Print a line a command."""
+    for scene in (SCENE, STAR):
+        shutil.copy(SCENES / f"{scene}.yaml", folder)
+    print(f"{'process':<12} {'median':>9} {'spread':>9} {'processor':>10} {'memory':>9}   target")
+    for title, words, most in COMMANDS:
+        rows = [once(words, folder) for _ in range(runs + 1)][1:]
+        times, busy, memory, _ = zip(*rows, strict=True)
+        used = statistics.median(busy)
+        target = "" if most is None else f"   {most:g} s {judge.in_time(title, used, most)}"
+        spread = f"{statistics.median(times):7.3f} s {spread_of(list(times)):7.3f} s"
+        print(f"{title:<12} {spread} {used:8.3f} s {max(memory):5.0f} MiB{target}")
+
+
+def growth(judge: Judge, folder: Path, growing: Growing, quick: bool) -> None:
+    """Measure `compile` and a command of ever more of something, and print the exponents.
 
     An exponent is that of the time beyond the smallest scene's, over the last step.
     """
-    print(f"\n{title:>16}  {'compile':>17}  {'analyze':>17}   radius")
+    title, numbers, write, command, target = growing
+    print(f"\n{title:>16}  {'compile':>17}  {command.split()[0]:>17}")
     rows = []
+    numbers = numbers[:2] if quick else numbers
     for number in numbers:
         scene = folder / title.replace(" ", "-") / str(number)
         scene.mkdir(parents=True)
         (scene / "scene.yaml").write_text(write(number, scene), encoding="utf-8")
-        model = str(scene / "scene.apc")
-        commands = (("compile", "--force", str(scene / "scene.yaml")), ("analyze", model))
-        measured = [once(("-m", "apc", *words), folder)[1:] for words in commands]
-        told = subprocess.run(
-            [sys.executable, "-m", "apc", "analyze", model],
-            cwd=folder, env=_environment(folder), capture_output=True, text=True, check=True,
-        ).stdout  # fmt: skip
-        radius = next(line.split("radius")[1] for line in told.splitlines() if "spectral radius" in line)
-        rows.append([seconds for seconds, _ in measured])
-        print(
-            f"{number:>16}  "
-            + "  ".join(f"{seconds:6.2f} s {size / 2**20:4.0f} MiB" for seconds, size in measured)
-            + f" {radius}"
+        asked = command.replace("@", str(number))
+        (_, first, size, _), (_, second, other, said) = (
+            once(f"-m apc {one}", folder, scene) for one in ("compile --force scene.yaml", asked)
         )
-    most, seconds = targets
-    for place, (command, target) in enumerate(zip(("compile", "analyze"), seconds, strict=True)):
+        radius = next(
+            (line.split("radius")[1] for line in said.splitlines() if "spectral radius" in line), ""
+        )
+        rows.append((first, second))
+        print(f"{number:>16}  {first:6.2f} s {size:4.0f} MiB  {second:6.2f} s {other:4.0f} MiB  {radius}")
+    for place, name in enumerate(("compile", command.split()[0])):
         times = [one[place] for one in rows]
-        told = f"{command}: exponent {exponent_of(numbers, times):.1f}"
-        if most in numbers:
-            taken = times[numbers.index(most)] - times[0]
-            judged = judge.in_time(f"{command}, {most} {title}", taken, target)
-            told += f"; target of {most} {target:g} s beyond the first {judged}"
+        told = f"{name}: exponent {exponent_of(numbers, times):.1f}"
+        if target is not None and target[0] in numbers:
+            beyond, most = times[numbers.index(target[0])] - times[0], target[place + 1]
+            kept = judge.in_time(f"{name}, {target[0]} {title}", beyond, most)
+            told += f"; target of {target[0]} {most:g} s beyond the first {kept}"
         print(told)
 
 
-def exponent_of(numbers: Sequence[int], times: Sequence[float]) -> float:
+def exponent_of(numbers: tuple[int, ...], times: list[float]) -> float:
     """Return the exponent of the time beyond the first, over the last step."""
-    first, *_, before, last = times
-    return math.log(max(last - first, 0.01) / max(before - first, 0.01)) / math.log(numbers[-1] / numbers[-2])
-
-
-def print_amounts(
-    title: str,
-    numbers: Sequence[int],
-    write: Scene,
-    words: Words,
-    folder: Path,
-) -> None:
-    """Measure a command that is asked for more and more of something, and print the exponent."""
-    print(f"\n{title:>16}  {words(numbers[0])[0]:>17}")
-    times = []
-    for number in numbers:
-        scene = folder / title.replace(" ", "-") / str(number)
-        scene.mkdir(parents=True)
-        (scene / "scene.yaml").write_text(write(number, scene), encoding="utf-8")
-        once(("-m", "apc", "compile", "scene.yaml"), folder, scene)
-        if not times:  # compiles Python's own files
-            once(("-m", "apc", *words(number)), folder, scene)
-        _, seconds, size = once(("-m", "apc", *words(number)), folder, scene)
-        times.append(seconds)
-        print(f"{number:>16}  {seconds:6.2f} s {size / 2**20:4.0f} MiB")
-    print(f"exponent {exponent_of(numbers, times):.1f}")
+    before = max(times[-2] - times[0], 0.01)
+    return math.log(max(times[-1] - times[0], 0.01) / before) / math.log(numbers[-1] / numbers[-2])
 
 
 def main() -> None:
     """Print the tables."""
     parser = parser_of("process", __doc__)
     parser.add_argument("--runs", type=int, default=RUNS)
-    parser.add_argument("--quick", action="store_true", help="leave out the largest of what grows")
-    given = parser.parse_args()
+    parser.add_argument("--only", choices=["commands", *(one[0] for one in GROWTH)], help="one table")
+    given: argparse.Namespace = parser.parse_args()
     judge = Judge(given.strict)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for scene in (SCENE, STAR):
-            shutil.copy(SCENES / f"{scene}.yaml", folder)
-        print(f"{'process':<12} {'median':>9} {'spread':>9} {'processor':>10} {'memory':>9}   target")
-        for title, words in COMMANDS:
-            measured = [once(words, folder) for _ in range(given.runs + 1)][1:]
-            times = [seconds for seconds, _, _ in measured]
-            busy = statistics.median(seconds for _, seconds, _ in measured)
-            memory = max(size for _, _, size in measured) / 2**20
-            median, target = statistics.median(times), ""
-            if title in TARGETS:
-                target = f"{TARGETS[title]:g} s {judge.in_time(title, busy, TARGETS[title])}"
-            print(
-                f"{title:<12} {median:7.3f} s {spread_of(times):7.3f} s "
-                f"{busy:8.3f} s "
-                f"{memory:5.0f} MiB   {target}".rstrip()
-            )
-        for title, words in COMMANDS[1:]:
-            found = imports(words, folder)
-            listed = ", ".join(f"{one} {size / 1e3:.0f} ms" for one, size in found.most_common(MOST_PACKAGES))
-            print(f"\nimports of {title}: {sum(found.values()) / 1e3:.0f} ms in all\n  {listed}")
-        for title, write, numbers, targets in GROWTH:
-            some = numbers[:-1] if given.quick else numbers
-            print_growth(title, write, some, targets, judge, folder)
-        for title, numbers, write, command in AMOUNTS:
-            print_amounts(title, numbers[:-1] if given.quick else numbers, write, command, folder)
+        if given.only in (None, "commands"):
+            commands(judge, folder, given.runs)
+        for growing in GROWTH:
+            if given.only in (None, growing[0]):
+                growth(judge, folder, growing, given.quick)
     judge.end()
 
 

@@ -1,4 +1,3 @@
-# ruff: noqa: E501 -- scenes are written by long lines
 """Random scans of a parameter or delay against a fine grid: `python -m tests.bench.random_scans`.
 
 Stiffnesses, delays and settings that stiffnesses follow by a narrow bump are scanned in scenes with clocks,
@@ -14,21 +13,19 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+import apc
 from apc.benchmark.timing import timed
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError
 from apc.threads import single_threaded
-from apc.vary.critical import Critical, critical
-from tests.bench.judge import Judge, parser_of
+from tests.bench.by_hand import Floats
+from tests.bench.judge import judged, parser_of
 from tests.bruteforce import Scene, frame_matrices
-from tests.topologies import compiled, library
-
-Floats = NDArray[np.float64]
+from tests.topologies import compiled, library, replaced
+from tests.truths import text_of
 
 # A radius nearer to 1 than this tells no side: the rounding of some fifty eigenvalues in floats.
 UNSURE = 1e-10
@@ -66,7 +63,7 @@ equations:
 
 @dataclass(frozen=True)
 class Draw:
-    """A scan: the scene as text and as numbers, what varies, and the numbers of a scene with another value."""
+    """A scan: the scene as text and as numbers, what varies, and how to have a scene of another value."""
 
     text: str
     scene: Scene
@@ -79,93 +76,70 @@ class Draw:
 
 def draw(generator: random.Random) -> Draw:
     """Return a scan at random."""
-    pick = generator.choice
+    pick, ms = generator.choice, Fraction(1, 1000)
 
     def decades(low: float, high: float) -> float:
         return float(f"{10 ** generator.uniform(low, high):.3g}")
 
-    tick = pick([Fraction(1), Fraction(1), Fraction(1, 2), Fraction(2)])
+    tick = ms * pick([Fraction(1), Fraction(1), Fraction(1, 2), Fraction(2)])
     period = tick * pick([1, 2, 4, 4, Fraction(5, 2)])
-    late, contact = (_late(generator, tick) for _ in range(2))
-    packets = pick([Fraction(0), period, period, 2 * period, Fraction(generator.randint(1, 1500), 100)])
-    own = generator.random() < 0.6
-    operator = pick(["mean", "sum"])
+    late, contact = (pick([Fraction(0), tick, tick, ms * generator.randint(1, 250) / 100]) for _ in range(2))
     scene = Scene(
-        operator=operator,
+        operator=pick(["mean", "sum"]),
         peers=generator.randint(2, 3),
         kt=decades(1.5, 3.3),
         bt=pick([0.0, decades(-1, 1)]),
         kc=decades(2, 3.5),
         bc=pick([0.0, decades(-1, 1)]),
-        comp=late / 1000,
-        contact_comp=contact / 1000,
-        comm=packets / 1000,
-        own_delay=own,
-        haptic=tick / 1000,
-        network=period / 1000,
+        comp=late,
+        contact_comp=contact,
+        comm=pick([Fraction(0), period, period, 2 * period, ms * generator.randint(1, 1500) / 100]),
+        own_delay=generator.random() < 0.6,
+        haptic=tick,
+        network=period,
     )
-    kind = pick(["stiffness", "stiffness", "delay", "bump"])
-    spring = f"type: SampledSpringDamper, stiffness: {scene.kc!r} N/m"
-    if kind == "bump":
-        middle, width = decades(1, 3), decades(-2, -0.5)
-        high, present = decades(2.5, 4), decades(1, 3)
-        width = float(f"{width * middle:.3g}")
-        spring = f"type: Bump, low: {scene.kc!r} N/m, high: {high!r} N/m, setting: {present!r}, middle: {middle!r}, width: {width!r}"
-    text = (
-        f"topology: scan\nclocks: {{haptic: {tick} ms, network: {period} ms}}\npeers: {{user: {{count: {scene.peers}}}}}\n"
-        "masses:\n  device: {mass: 0.1 kg, damping: 5 N*s/m}\n"
-        f"  cube: {{mass: {scene.cube * scene.peers!r} kg, damping: 5 N*s/m, shared: true}}\n"
-        "couplers:\n"
-        f"  contact: {{{spring}, a: device, b: cube, damping: {scene.bc!r} N*s/m, clock: haptic, delay: {contact} ms}}\n"
-        f"  coordination: {{type: {'AveragePosition' if operator == 'mean' else 'FullMesh'}, object: cube, stiffness: {scene.kt!r} N/m,"
-        f" damping: {scene.bt!r} N*s/m, clock: haptic, delay: {late} ms, link: lan, delays: {'own' if own else 'all'}}}\n"
-        f"links:\n  lan: {{clock: network, delay: {packets} ms}}\n"
-    )
-    if kind == "bump":
-        low = scene.kc
+    name = pick(["contact.stiffness", "coordination.stiffness", "contact.setting", pick([*_FIELDS][2:])])
+    text = text_of(scene)
+    if name == "contact.setting":
+        middle, high, present = decades(1, 3), decades(2.5, 4), decades(1, 3)
+        width = float(f"{decades(-2, -0.5) * middle:.3g}")
+        words = f"high: {high!r} N/m, setting: {present!r}, middle: {middle!r}, width: {width!r}"
+        spring = (
+            ("type: SampledSpringDamper", "type: Bump"),
+            (f"stiffness: {scene.kc!r}", f"{words}, low: {scene.kc!r}"),
+        )
         grid = np.concatenate([_spread(present), middle + width * np.linspace(-6, 6, GRID // 2)])
 
         def bumped(one: Scene, value: Floats) -> Scene:
-            return replace(one, kc=low + high / (1 + ((value - middle) / width) ** 4))  # type: ignore[arg-type] # an array
+            return replace(one, kc=scene.kc + high / (1 + ((value - middle) / width) ** 4))  # type: ignore[arg-type] # an array
 
-        return Draw(text, scene, "contact.setting", present, bumped, grid[grid > 0])
-    if kind == "stiffness":
-        field_of = pick([("contact.stiffness", "kc"), ("coordination.stiffness", "kt")])
-        return Draw(
-            text,
-            scene,
-            field_of[0],
-            getattr(scene, field_of[1]),
-            _with(field_of[1]),
-            _spread(getattr(scene, field_of[1])),
-        )
-    name, attribute, now = pick(
-        [
-            ("contact.delay", "contact_comp", contact),
-            ("coordination.delay", "comp", late),
-            ("lan.delay", "comm", packets),
-        ]
-    )
-    present = float(now) / 1000
+        return Draw(replaced(text, *spring), scene, name, present, bumped, grid[grid > 0])
+    present = float(getattr(scene, _FIELDS[name]))
+    if name.endswith("stiffness"):
+        return Draw(text, scene, name, present, partial(_with, _FIELDS[name]), _spread(present))
     # None of them a time at which events coincide.
-    grid = (max(present, float(tick) / 1000) * 3) * (np.arange(DELAYS) + np.pi / 8) / DELAYS
-    return Draw(text, scene, name, present, _with(attribute), grid, one_by_one=True)
+    grid = (max(present, float(tick)) * 3) * (np.arange(DELAYS) + np.pi / 8) / DELAYS
+    return Draw(text, scene, name, present, partial(_with, _FIELDS[name]), grid, one_by_one=True)
 
 
-def _late(generator: random.Random, tick: Fraction) -> Fraction:
-    """Return a computational delay at random, in ms: none, a tick, or what a processor takes."""
-    return generator.choice([Fraction(0), tick, tick, Fraction(generator.randint(1, 250), 100)])
+# What is scanned, and what `Scene` calls it.
+_FIELDS = {
+    "contact.stiffness": "kc",
+    "coordination.stiffness": "kt",
+    "contact.delay": "contact_comp",
+    "coordination.delay": "comp",
+    "lan.delay": "comm",
+}
 
 
-def _with(name: str) -> Callable[[Scene, Floats], Scene]:
-    return lambda scene, value: replace(scene, **{name: value})
+def _with(name: str, scene: Scene, value: Floats) -> Scene:
+    return replace(scene, **{name: value})
 
 
 def _spread(present: float) -> Floats:
     """Return a grid from next to nothing to far beyond the present value, evenly about it."""
-    return np.concatenate(
-        [np.geomspace(1e-9 * present, 900 * present, GRID // 2), np.linspace(0, 6 * present, GRID // 2)[1:]]
-    )
+    wide = np.geomspace(1e-9 * present, 900 * present, GRID // 2)
+    return np.concatenate([wide, np.linspace(0, 6 * present, GRID // 2)[1:]])
 
 
 def radii(scan: Draw, values: Floats) -> Floats:
@@ -183,7 +157,7 @@ def _radii(scene: Scene, count: int) -> Floats:
     return np.asarray(sizes.max(axis=1))
 
 
-def check(scan: Draw, found: Critical) -> str:
+def check(scan: Draw, found: apc.Critical) -> str:
     """Return what is wrong with a scan, "" if nothing is."""
     low, high = found.scanned
     if not low <= scan.present <= high:
@@ -231,22 +205,14 @@ class Tally:
         """Return a few lines."""
         words = ", ".join(f"{count} of {name}" for name, count in sorted(self.kinds.items()))
         return (
-            f"{self.scans} scans: {words}\n{self.crossings} crossings, {self.estimated} of them without a proof; "
+            f"{self.scans} scans: {words}\n{self.crossings} crossings, {self.estimated} without a proof; "
             f"{self.open} scans with an eigenvalue that follows the circle; {len(self.wrong)} wrong; "
             f"{self.seconds / max(self.scans, 1):.2f} s a scan"
         )
 
 
 def run(points: int, *, seed: int = 0) -> Tally:
-    """Scan so many random scenes.
-
-    Parameters
-    ----------
-    points
-        How many.
-    seed
-        Of what is drawn.
-    """
+    """Scan so many random scenes, of a seed."""
     generator, tally = random.Random(seed), Tally()
     with single_threaded(), tempfile.TemporaryDirectory() as folder:
         parts = library(Path(folder), BUMP)
@@ -254,36 +220,32 @@ def run(points: int, *, seed: int = 0) -> Tally:
             scan = draw(generator)
             tally.kinds[scan.name] += 1
             tally.scans += 1
-            system: CompiledSystem = compiled(scan.text, parts)
             try:
-                taken, found = timed(lambda system=system, name=scan.name: critical(system, name))  # type: ignore[misc] # bound at once
+                taken, found = timed(partial(apc.critical, compiled(scan.text, parts), scan.name))
                 fault = check(scan, found)
-            except (ApcError, AssertionError, ArithmeticError, IndexError, ValueError) as error:
+            except (apc.ApcError, AssertionError, ArithmeticError, IndexError, ValueError) as error:
                 tally.wrong.append(f"{scan.name}: {error!r}\n{scan.text}")
                 continue
             tally.seconds += taken
             tally.crossings += len(found.crossings)
             tally.estimated += sum(one.proof.startswith("estimated") for one in found.crossings)
             tally.open += not found.whole
-            if fault:
-                tally.wrong.append(f"{scan.name}: {fault}\n{scan.text}")
+            tally.wrong += [f"{scan.name}: {fault}\n{scan.text}"] if fault else []
     return tally
 
 
 def main() -> None:
     """Print what came out, and every scan that is wrong."""
     parser = parser_of("random_scans", __doc__)
-    parser.add_argument("--points", type=int, default=600)
+    parser.add_argument("--count", type=int, default=600)
     parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
-    judge = Judge(given.strict)
-    tally = run(given.points, seed=given.seed)
-    print(tally)
-    for one in tally.wrong:
-        judge.right(one, holds=False)
-    judge.within("crossings without a proof", tally.estimated, MOST_OPEN * tally.crossings)
-    judge.within("scans left open", tally.open, MOST_OPEN * tally.scans)
-    judge.end()
+    with judged(parser) as (judge, given):
+        tally = run(40 if given.quick else given.count, seed=given.seed)
+        print(tally)
+        for one in tally.wrong:
+            judge.right(one, holds=False)
+        judge.within("crossings without a proof", tally.estimated, MOST_OPEN * tally.crossings)
+        judge.within("scans left open", tally.open, MOST_OPEN * tally.scans)
 
 
 if __name__ == "__main__":

@@ -13,10 +13,9 @@ import random
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from fractions import Fraction
 from functools import partial
 from pathlib import Path
 
@@ -29,14 +28,14 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.components.library import Library
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
-from apc.frame.names import Free
-from apc.frame.overrides import Override, apply
+from apc.frame.overrides import apply
 from apc.simulation.simulation import ROW
 from apc.threads import single_threaded
-from tests.bench.judge import Judge, parser_of
+from tests.bench.judge import judged, parser_of
 from tests.bench.sensitivity_truth import check_frequencies, check_sensitivities
-from tests.bench.shapes import PARTS, Shape, draw_shape
-from tests.fifty_digits.truth import RIGID, classes_of, eigenvalues, frame_matrices
+from tests.bench.shapes import PARTS, draw_shape, numbers
+from tests.fifty_digits.truth import _truth as truth_of
+from tests.fifty_digits.truth import classes_of, eigenvalues, frame_matrices
 from tests.topologies import compiled
 
 BITS = 256  # a chain of four equal eigenvalues still keeps 19 digits
@@ -58,17 +57,6 @@ def own_library() -> Iterator[Library]:
         for name, text in PARTS.items():
             (Path(folder) / f"{name}.yaml").write_text(text.lstrip(), encoding="utf-8")
         yield Library((Path(folder),))
-
-
-def numbers(generator: random.Random, shape: Shape, system: CompiledSystem) -> list[Override]:
-    """Return numbers at random: a decade is as likely as the next."""
-    known = {parameter.name for parameter in system.parameters}
-    found = []
-    for name, (low, high, zero) in shape.ranges.items():
-        value = 0.0 if generator.random() < zero else 10 ** generator.uniform(low, high)
-        if name in known:
-            found.append(Override(Free(name), Fraction(value)))
-    return found
 
 
 @dataclass
@@ -100,13 +88,9 @@ class Tally:
 
 def truth(system: CompiledSystem) -> tuple[flint.arb, int]:
     """Return the radius without eigenvalues that are 1, and how many these are (a drift counts twice)."""
-    radius, rigid = flint.arb(0), 0
-    for _, count, matrix in frame_matrices(system, classes_of(system)):
-        for value in eigenvalues(matrix):
-            if float(abs(value - 1).mid()) < RIGID:
-                rigid += count
-            else:
-                radius = max(radius, abs(value).mid())
+    classes = classes_of(system)
+    found = truth_of([(count, eigenvalues(one)) for _, count, one in frame_matrices(system, classes)])
+    radius, rigid = found.radius, found.rigid
     # Without clocks any frame will do: the analysis takes a second, the reference a row of a simulation.
     return radius if system.clocks else radius ** int(1 / ROW), rigid
 
@@ -145,13 +129,7 @@ def _looked_into(system: CompiledSystem, found: Analysis) -> list[str]:
 
 
 def run(
-    points: int,
-    *,
-    seed: int = 0,
-    methods: Sequence[str] = ("auto",),
-    draws: int = DRAWS,
-    tally: Tally | None = None,
-    tell: Callable[[int, Tally], None] = lambda done, tally: None,
+    points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws: int = DRAWS, every: int = 0
 ) -> Tally:
     """Analyse so many random scenes by each method.
 
@@ -165,92 +143,77 @@ def run(
         See `analysis.analyze`.
     draws
         Of numbers for each structure.
-    tally
-        What is counted on, so that who stops in the middle has what there is.
-    tell
-        Is shown how many scenes are done, and the tally, before each structure.
+    every
+        Scenes from one running tally on the other stream to the next, 0 for none.
     """
-    generator, tally = random.Random(seed), Tally() if tally is None else tally
+    generator, tally = random.Random(seed), Tally()
     with single_threaded(), precision(BITS), own_library() as library:
         for number in range(points):
             if number % draws == 0:
-                tell(number, tally)
                 shape = draw_shape(generator)
-                text, plain = shape.text, None
+            if every and number and number % every == 0:
+                print(f"{number:,} of {points:,}: {tally}", file=sys.stderr, flush=True)
+            text = shape.text
             try:
-                plain = plain or compiled(text, library)
+                plain = compiled(text, library)
                 drawn = numbers(generator, shape, plain)
                 system = apply(plain, drawn)
+                text += ", ".join(f"{one.free.label}={float(one.value)!r}" for one in drawn)
             except Exception as error:  # whatever it is, it is a bug
                 tally.wrong.append(f"not compiled: {error!r}\n{text}")
                 continue
-            known = None
             for method in methods:
-                values = ", ".join(f"{one.free.label}={float(one.value)!r}" for one in drawn)
-                try:
-                    taken, found = timed(partial(analyze, system, method=method))
-                except ApcError as error:
-                    code = error.mistakes[0].code
-                    tally.as_they_must += bool(shape.refused) and code == shape.refused
-                    tally.refused += code in BEYOND
-                    if code not in (*BEYOND, shape.refused):
-                        tally.wrong.append(f"{method}: {error}\n{text}{values}")
-                    continue
-                except Exception as error:  # whatever it is, it is a bug
-                    tally.wrong.append(f"{method}: {error!r}\n{text}{values}")
-                    continue
-                if shape.refused:
-                    tally.wrong.append(f"{method}: {shape.refused} was due\n{text}{values}")
-                tally.seconds += taken
-                known = known or truth(system)
-                tally.scenes += 1
-                tally.undecided += found.stable is None
-                tally.proved += bool(found.proof)
-                tally.verdicts[found.verdict.partition(":")[0]] += 1
-                off = float(abs(known[0] - flint.arb(found.spectral_radius)).mid())
-                if found.spectral_radius_error:
-                    tally.tightest = max(tally.tightest, off / found.spectral_radius_error)
-                told = [check(found, *known)]
-                if method == "auto" and number % draws == 0:
-                    tally.looked_into += 1
-                    told += _looked_into(system, found)
-                tally.wrong += [f"{method}: {wrong}\n{text}{values}" for wrong in told if wrong]
+                look = method == "auto" and number % draws == 0
+                tally.wrong += [
+                    f"{method}: {one}\n{text}"
+                    for one in _analysed(system, method, shape.refused, look, tally)
+                ]
     return tally
 
 
-def main() -> None:
-    """Print what came out, and every scene that is wrong; so far, on the way, on the other stream.
+def _analysed(system: CompiledSystem, method: str, due: str, look: bool, tally: Tally) -> list[str]:
+    """Analyse a scene, take it down in the tally, and return what is wrong; `due` is the error it must give."""
+    try:
+        taken, found = timed(partial(analyze, system, method=method))
+    except ApcError as error:
+        code = error.mistakes[0].code
+        tally.as_they_must += code == due
+        tally.refused += code in BEYOND
+        return [] if code in (*BEYOND, due) else [str(error)]
+    except Exception as error:  # whatever it is, it is a bug
+        return [repr(error)]
+    radius, rigid = truth(system)
+    tally.seconds += taken
+    tally.scenes += 1
+    tally.undecided += found.stable is None
+    tally.proved += bool(found.proof)
+    tally.verdicts[found.verdict.partition(":")[0]] += 1
+    if found.spectral_radius_error:
+        off = float(abs(radius - flint.arb(found.spectral_radius)).mid())
+        tally.tightest = max(tally.tightest, off / found.spectral_radius_error)
+    faults = [check(found, radius, rigid), f"{due} was due" if due else ""]
+    if look:
+        tally.looked_into += 1
+        faults += _looked_into(system, found)
+    return [one for one in faults if one]
 
-    Stopped in the middle, it says what there is.
-    """
+
+def main() -> None:
+    """Print what came out, and every scene that is wrong; so far, on the way, on the other stream."""
     parser = parser_of("random_scenes", __doc__)
-    parser.add_argument("--points", type=int, default=10_000)
+    parser.add_argument("--count", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--methods", default="auto", help="auto,dense,determinant,krylov")
-    parser.add_argument(
-        "--every", type=int, default=200, help="scenes from one running tally to the next, 0 for none"
-    )
-    given = parser.parse_args()
-    judge, tally, told = Judge(given.strict), Tally(), [0]
-
-    def tell(done: int, tally: Tally) -> None:
-        for wrong in tally.wrong[told[0] :]:
-            print(f"WRONG after {done:,}: {wrong}", file=sys.stderr, flush=True)
-        told[0] = len(tally.wrong)
-        if done and given.every and done % given.every == 0:
-            print(f"{done:,} of {given.points:,}: {tally}", file=sys.stderr, flush=True)
-
-    try:
-        run(given.points, seed=given.seed, methods=given.methods.split(","), tally=tally, tell=tell)
-    except KeyboardInterrupt:
-        print(f"stopped before {given.points:,} were done")
-    print(tally)
-    for one in tally.wrong:
-        judge.right(one, holds=False)
-    most = tally.scenes + tally.refused
-    judge.within("verdicts left open", tally.undecided, MOST_UNDECIDED * most)
-    judge.within("scenes beyond floats", tally.refused, MOST_REFUSED * most)
-    judge.end()
+    parser.add_argument("--every", type=int, default=0, help="scenes from one running tally to the next")
+    with judged(parser) as (judge, given):
+        count = 200 if given.quick else given.count
+        tally = run(count, seed=given.seed, methods=given.methods.split(","), every=given.every)
+        print(tally)
+        for one in tally.wrong:
+            judge.right(one, holds=False)
+        most = tally.scenes + tally.refused
+        judge.within("verdicts left open", tally.undecided, MOST_UNDECIDED * most)
+        judge.within("scenes beyond floats", tally.refused, MOST_REFUSED * most)
 
 
 if __name__ == "__main__":

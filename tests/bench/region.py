@@ -1,35 +1,31 @@
 """Exact boundary curves against the obvious program, error beside time: `python -m tests.bench.region`.
 
-The obvious program (`tests.bench.naive_region`) decides a grid of 100 × 100 points of the paper's scene by
-max |λ| < 1. Both run on one BLAS thread; times are CPU seconds, the median of some runs in a warm process,
-from a compiled model to curves. Errors are against 50 digits (`tests.paper_limit`).
+The obvious program decides a grid of 100 × 100 points of the paper's scene by max |λ| < 1. Times are CPU
+seconds in a warm process, from a compiled model to curves. Errors are against 50 digits
+(`tests.paper_limit`).
 """
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 
-from apc.benchmark.timing import median_time, take_turns, timed
+from apc.benchmark.timing import take_turns, timed
 from apc.frame.overrides import apply, parse_override
 from apc.regions.axes import parse_axes
 from apc.regions.boundary import relative_to
 from apc.regions.curves import between
 from apc.regions.region import Region, region
-from apc.threads import single_threaded
-from tests.bench.judge import Judge, parser_of
-from tests.bench.naive_region import modal_radii, stable_grid
+from tests.bench.by_hand import modal_radii, stable_grid
+from tests.bench.judge import Judge, Timed, judged, parser_of
 from tests.paper_limit import limit
-from tests.topologies import AVERAGE, MESH, ROOT, compiled
+from tests.topologies import AVERAGE, MESH, compiled
 
 LOW, HIGH, COUNT = 10.0, 3000.0, 100
 X = f"contact.stiffness={LOW} N/m:{HIGH} N/m"
 Y = f"coordination.stiffness={LOW} N/m:{HIGH} N/m"
-TARGET, TARGET_MODAL, MOST_S = 50.0, 20.0, 6e-3  # times as fast as each program by hand; seconds
 
 # For factors of curves: where these are steep, an error across is a larger one in height.
 SPANS = (("contact", 5000), ("coordination", 9000))
@@ -38,14 +34,6 @@ FINE = 1e-12
 # that are right to FINE across are so to this in height, where they are steeper than 1 in 1,000 at most.
 PROPORTIONAL = "Fig. 3, B = 0"
 FACTOR, FACTOR_ERROR = 2.0, 1e-8
-
-Found = TypeVar("Found")
-
-
-def warm(function: Callable[[], Found], runs: int) -> tuple[float, Found]:
-    """Return the median CPU seconds of some runs after a first one, and what they returned."""
-    function()
-    return median_time(function, runs)
 
 
 def true_error(found: Region, every: int) -> float:
@@ -64,43 +52,38 @@ def true_error(found: Region, every: int) -> float:
     return worst
 
 
-def paper(quick: bool, judge: Judge) -> None:
-    """Time the paper's boundary against the obvious program."""
+def paper(judge: Judge, quick: bool) -> None:
+    """Time the paper's boundary against the obvious program, and two modes of all points at once."""
     system = compiled(AVERAGE)
     axes = parse_axes(system, X, Y)
-    first, found = timed(lambda: region(system, axes))
-    every = np.meshgrid(*[np.linspace(LOW, HIGH, COUNT)] * 2)
-    k_c, k_t = (one.ravel() for one in every)
-    calls: Mapping[str, Callable[[], object]]
-    calls = {"exact": lambda: region(system, axes), "modal": lambda: modal_radii(k_c, k_t)}
+    first, curves = timed(lambda: region(system, axes))
+    points = np.meshgrid(*[np.linspace(LOW, HIGH, COUNT)] * 2)
+    modal = partial(modal_radii, *(one.ravel() for one in points))
+    calls = {"exact": lambda: region(system, axes), "modal": modal}
     times = take_turns(calls, 5 if quick else 15)
-    exact, modal = (statistics.median(times[name]) for name in calls)
-    modal_wrong = np.sum(found.contains(*every).ravel() != (modal_radii(k_c, k_t) < 1))
+    exact, at_once = (statistics.median(times[name]) for name in calls)
+    missed = int(np.sum(curves.contains(*points).ravel() != (modal() < 1)))
     count = 30 if quick else COUNT
     taken, stable = timed(partial(stable_grid, LOW, HIGH, count))
-    naive = taken * (COUNT / count) ** 2
-    grid = np.linspace(LOW, HIGH, count)
-    truth = found.contains(*np.meshgrid(grid, grid))
-    points = sum(len(curve.points) for curve in found.curves)
-    told, off = found.curves[0].error, true_error(found, 40 if quick else 7)
-    wrong = f"{np.sum(truth != stable)} of {count**2} points wrong"
-    print("the paper's scene, K_C and K_T in 10 to 3000 N/m")
-    print(f"  exact curves      {1e3 * exact:8.1f} ms   {points} points, error ≤ {told:.1e} as told")
-    print(f"    the first time  {1e3 * first:8.1f} ms   what the model keeps for later is made")
-    said = judge.within("the paper's curves", off, told)
-    print(f"    true error      {off:11.1e}   against 50 digits, at the points and between: {said}")
-    print(f"  obvious program   {1e3 * naive:8.1f} ms   {wrong}")
-    print(f"  two modes at once {1e3 * modal:8.1f} ms   {modal_wrong} of {COUNT**2} points wrong")
-    work, ours = "boundary curves of K_C, K_T, 10 to 3000 N/m", (exact, f"{off:.1e} ≤ {told:.1e}")
-    for name, seconds, target, missed in (
-        ("obvious program", naive, TARGET, wrong),
-        ("two modes at once", modal, TARGET_MODAL, f"{modal_wrong} of {COUNT**2} points wrong"),
-    ):
-        kept = judge.in_time(f"exact curves, as a part of the {name}", exact / seconds, 1 / target)
-        print(f"  {name} / exact curves {seconds / exact:8.1f}   target {target:g} {kept}")
-        judge.beside(work, ours, f"{name}, {COUNT} × {COUNT} points", (seconds, missed))
-    kept = judge.in_time("exact curves, seconds", exact, MOST_S)
-    print(f"  exact curves, target {1e3 * MOST_S:g} ms: {kept}")
+    truth = curves.contains(*np.meshgrid(*[np.linspace(LOW, HIGH, count)] * 2))
+    obvious, modes = (
+        f"obvious program, {COUNT} × {COUNT} points",
+        f"two modes at once, {COUNT} × {COUNT} points",
+    )
+    programs = [
+        Timed("apc", exact, true_error(curves, 40 if quick else 7), curves.curves[0].error),
+        Timed("apc, the first time", first),
+        Timed(
+            obvious,
+            taken * (COUNT / count) ** 2,
+            None,
+            None,
+            f"{np.sum(truth != stable)} of {count**2} points wrong",
+        ),
+        Timed(modes, at_once, None, None, f"{missed} of {COUNT**2} points wrong"),
+    ]
+    title = f"boundary curves of K_C, K_T, {LOW:.0f} to {HIGH:.0f} N/m"
+    judge.table(title, programs, most_s=6e-3, most={obvious: 1 / 50, modes: 1 / 20})
 
 
 def crossing(found: Region, x: float) -> float | None:
@@ -150,35 +133,11 @@ def factors(judge: Judge) -> None:
             print(f"  {figure} {panel:<16} {low:.10f} to {high:.10f} ({len(ratios)} values of K_C{note})")
 
 
-def islands(judge: Judge) -> None:
-    """Time scenes with an island and a hole, whose boundaries are circles."""
-    print("\nan island and a hole, circles by construction")
-    for name in ("island", "hole"):
-        system = compiled((ROOT / "tests" / "scenes" / f"{name}.yaml").read_text(encoding="utf-8"))
-        axes = parse_axes(system, "u=0 N/m:1000 N/m", "v=0 N/m:1000 N/m")
-        seconds, found = warm(lambda system=system, axes=axes: region(system, axes), 5)  # type: ignore[misc]
-        radii = np.hypot(*(found.curves[0].points - [620, 410]).T)
-        spread = float(np.ptp(radii) / radii.mean())
-        # A point is off by the curve's error times the rectangle's width at most; two are by twice that.
-        width = float(np.max(found.rectangle.width))
-        most = 2 * found.curves[0].error * width / float(radii.mean())
-        said = judge.within(f"{name}: spread of the radius", spread, most)
-        print(
-            f"  {name:<7} {1e3 * seconds:8.1f} ms   radius {radii.mean():.6f} N/m, spread {spread:.1e} {said}"
-        )
-
-
 def main() -> None:
     """Print the tables."""
-    parser = parser_of("region", __doc__)
-    parser.add_argument("--quick", action="store_true", help="a coarser grid, fewer runs")
-    given = parser.parse_args()
-    judge = Judge(given.strict)
-    with single_threaded():
-        paper(given.quick, judge)
+    with judged(parser_of("region", __doc__)) as (judge, given):
+        paper(judge, given.quick)
         factors(judge)
-        islands(judge)
-    judge.end()
 
 
 if __name__ == "__main__":

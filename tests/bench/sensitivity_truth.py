@@ -1,10 +1,8 @@
-# ruff: noqa: E501 -- scenes are written by long lines
 """Sensitivities and frequencies of random scenes against 320-bit arithmetic.
 
-`run` draws scenes with weights on graphs, groups with numbers of their own, several clocks, couplers that are
-linearized where they start, stars, and no clocks at all; `check_sensitivities` and `check_frequencies` serve any
-scene. The truth comes from the compiled functions alone, event by event (see `bench.events`): derivatives from
-frame matrices on either side of a value, frequencies from following each mode through a frame.
+`run` draws scenes of the built-in library (`bench.shapes`); `check_sensitivities` and `check_frequencies`
+serve any scene. The truth comes from the compiled functions alone, event by event (`fifty_digits.events`):
+derivatives from frame matrices on either side of a value, frequencies from following a mode through a frame.
 """
 
 from __future__ import annotations
@@ -25,6 +23,7 @@ from apc.eigen.balls import precision
 from apc.frame.names import find, parameter_of
 from apc.frame.overrides import Override, apply
 from apc.vary.sensitivity import Sensitivities, sensitivities
+from tests.bench.shapes import PARTS, draw_shape
 from tests.fifty_digits.events import Happening, Play, build_peers, refusal
 from tests.fifty_digits.truth import (
     RIGID,
@@ -63,53 +62,10 @@ FADED = 1e-9
 
 
 def scene(generator: random.Random) -> str:
-    """Return a topology at random, in which something may be unstable and nothing is refused."""
-    pick, number = generator.choice, lambda low, high: f"{10 ** generator.uniform(low, high):.4g}"
-    kind = pick(["plain", "plain", "groups", "groups", "star", "arcs", "still", "contact"])
-    tick, ratio = pick(["1 ms", "0.5 ms", "2 ms"]), pick(["1 ms", "4 ms", "8 ms", "2.5 ms"])
-    delay, late = pick(["0 s", "1 ms", "1/3 ms"]), pick(["0 s", "1 ms", "8 ms", "7/3 ms"])
-    masses = (
-        f"  device: {{mass: {number(-1.5, 0)} kg, damping: {number(-1, 1)} N*s/m}}\n"
-        f"  cube: {{mass: {number(-1, 0.5)} kg, damping: {number(-1, 1)} N*s/m, shared: true}}\n"
-    )
-    if kind == "still":  # no clocks: nothing is sampled
-        return (
-            f"topology: still\npeers: {{user: {{count: 1}}}}\nmasses:\n{masses}couplers:\n"
-            f"  s: {{type: SpringDamper, a: device, b: cube, stiffness: {number(-2, 3)} N/m, damping: {number(-2, 0)} N*s/m}}\n"
-            f"  t: {{type: SpringDamper, a: cube, b: ground, stiffness: {number(-2, 3)} N/m, damping: {number(-2, 0)} N*s/m}}\n"
-        )
-    groups, graph = f"user: {{count: {generator.randint(2, 4)}}}", ""
-    if kind in ("groups", "contact"):
-        own = f"contact.stiffness: {number(1, 3)} N/m, device.mass: {number(-1.5, 0)} kg"
-        groups = f"a: {{count: {generator.randint(1, 2)}}}\n  b: {{count: {generator.randint(1, 2)}, set: {{{own}}}}}"
-    if kind == "star":
-        groups, graph = (
-            f"hub: {{count: 1, set: {{device.mass: {number(-1, 0)} kg}}}}\n  tip: {{count: 2}}",
-            ", graph: star",
-        )
-    if kind == "arcs":
-        groups = "user: {count: 3}"
-        arcs = ", ".join(f"[{i}, {j}, {pick([0.5, 1, 2])}]" for i, j in ((1, 2), (2, 1), (2, 3), (3, 1)))
-        graph = f", graph: {{arcs: [{arcs}]}}"
-    contact = f"{{type: SampledSpringDamper, a: device, b: cube, stiffness: {number(1, 3)} N/m, damping: {number(-2, 0.3)} N*s/m, clock: haptic, delay: {delay}}}"
-    if kind == "contact":  # a wall that pushes: linear where it is touched or left
-        contact = f"{{type: OneSidedContact, a: device, b: cube, half_width: 1 mm, stiffness: {number(1, 3)} N/m, damping: {number(-2, 0)} N*s/m, clock: haptic, delay: {delay}}}"
-    coupling = pick(["AveragePosition", "FullMesh"])
-    more = pick(
-        [
-            "",
-            f"  arm: {{type: SpringDamperArm, flange: device, stiffness: {number(0, 2)} N/m, damping: 1 N*s/m}}\n",
-        ]
-    )
-    arm = f"hands:\n{more}" if more else ""
-    fast = f"  link: {{type: SpringDamper, a: device, b: cube, stiffness: {number(2, 5)} N/m, damping: {number(-2, 0)} N*s/m}}\n"
-    fast = fast if generator.random() < 0.3 else ""
-    return (
-        f"topology: drawn\nclocks: {{haptic: {tick}, network: {ratio}, slow: {{period: {ratio}, phase: 0.25 ms}}}}\npeers:\n  {groups}\n"
-        f"masses:\n{masses}couplers:\n  contact: {contact}\n{fast}"
-        f"  coordination: {{type: {coupling}, object: cube, stiffness: {number(1, 2.7)} N/m, damping: {number(-2, 0)} N*s/m, clock: {pick(['haptic', 'slow'])}, delay: {delay}, link: lan}}\n"
-        f"links:\n  lan: {{clock: network, delay: {late}{graph}}}\n{arm}"
-    )
+    """Return a topology of the built-in library at random, in which something may be unstable."""
+    own = tuple(f"type: {name}" for name in PARTS)
+    texts = (draw_shape(generator).text for _ in itertools.count())
+    return next(text for text in texts if not any(name in text for name in own))
 
 
 def check_sensitivities(
@@ -285,7 +241,7 @@ def check_frequencies(system: CompiledSystem, found: Analysis) -> str:
                     turns = _turns(scene, frame, [right[i, 0] for i in range(right.nrows())])
                     truths += [abs(turn) / (2 * math.pi * float(frame)) for turn in turns]
             if truths and min(abs(mode.frequency_hz - truth) for truth in truths) > 1e-4 / float(frame):
-                return f"mode {mode.eigenvalue} of {mode.shape}: {mode.frequency_hz} Hz, truth {sorted(set(truths))}"
+                return f"mode {mode.eigenvalue}: {mode.frequency_hz} Hz, truth {sorted(set(truths))}"
             rate = complex(math.log(mode.magnitude), 2 * math.pi * mode.frequency_hz * float(frame))
             if abs(mode.damping_ratio - (-rate.real / abs(rate) if rate else 1.0)) > 1e-6:
                 return f"mode {mode.eigenvalue}: damping {mode.damping_ratio} at {mode.frequency_hz} Hz"

@@ -1,19 +1,26 @@
 # ruff: noqa: E501 -- scenes are written by long lines
 """Random topologies of every shape a scene may have: graphs, weights, groups, clocks, integrators, expressions.
 
-Takes: a generator. Gives: `Shape`, `SHAPES`, `draw_shape`, `PARTS`.
+Takes: a generator. Gives: `Shape`, `SHAPES`, `draw_shape`, `numbers`, `PARTS`.
 Guarantees: each compiles, and is linear or says what of it is not.
 Does not: know what becomes of them.
 
-A shape's numbers are drawn apart from it (see `random_scenes`): a range of decades by the parameter's name.
+A shape is a text in which `$name` stands for any of a name's alternatives (see `tests.fuzz.grammar`). Its numbers
+are drawn apart from it: a range of decades by the parameter's name.
 """
 
 from __future__ import annotations
 
+import itertools
 import random
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from fractions import Fraction
+
+from apc.compiler.compiled import CompiledSystem
+from apc.frame.names import Free
+from apc.frame.overrides import Override
+from tests.fuzz.grammar import grown, rules_of
 
 # Least and largest decade, and the chance of 0.
 Decades = tuple[float, float, float]
@@ -154,206 +161,151 @@ equations:
 """,
 }
 
-TICKS = ("1 ms", "0.5 ms", "2 ms", "4/3 ms")
-LATE = ("0 s", "1 ms", "1.5 ms", "1/3 ms", "0.13 ms")
-BODIES = "masses:\n  device: {mass: 0.1 kg, damping: 5 N*s/m}\n  cube: {mass: 0.6 kg, damping: 5 N*s/m, shared: true}\n"
-
-
-def draw_shape(generator: random.Random) -> Shape:
-    """Return a shape at random, each as likely as the next."""
-    return generator.choice(tuple(SHAPES.values()))(generator)
-
-
-def _contact(tick: str, delay: str) -> str:
-    return f"  contact: {{type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: {tick}, delay: {delay}}}\n"
-
-
-def _coordination(generator: random.Random, delay: str, kind: str = "") -> str:
-    kind = kind or generator.choice(["AveragePosition", "FullMesh"])
-    own = generator.choice(["", "", ", delays: own"]) if kind in ("AveragePosition", "FullMesh") else ""
-    return f"  coordination: {{type: {kind}, object: cube, stiffness: 500 N/m, clock: haptic, delay: {delay}, link: lan{own}}}\n"
-
-
-def _arm(generator: random.Random) -> str:
-    arm = "hands:\n  arm: {type: SpringDamperArm, flange: device, stiffness: 80 N/m, damping: 1 N*s/m}\n"
-    return arm if generator.random() < 0.4 else ""
-
-
-def _clocks(generator: random.Random) -> tuple[str, str]:
-    """Return the clocks, and a link's delay that they don't make too long."""
-    tick, ratio = (
-        generator.choice(TICKS),
-        generator.choice(["1 ms", "2 ms", "4 ms", "8 ms", "2.5 ms", "10 ms"]),
-    )
-    late = generator.choice(
-        ["0 s", "1 ms", "7/3 ms", ratio, ratio, "8 ms" if Fraction(ratio.split()[0]) < 4 else "20 ms"]
-    )
-    phase = generator.choice(["", "", ", phase: 0.2 ms", ", phase: 1/7 ms"])
-    return f"clocks: {{haptic: {{period: {tick}{phase}}}, network: {ratio}}}\n", late
-
-
-def users(generator: random.Random) -> Shape:
-    """Users who move a cube, on any graph: the paper's scene."""
-    clocks, late = _clocks(generator)
-    delay, peers = generator.choice(LATE), generator.randint(2, 5)
-    graph = generator.choice(["", "", ", graph: ring", ", graph: star"])
-    groups = f"user: {{count: {min(peers, 3) if graph else peers}}}"
-    if generator.random() < 0.4:
-        groups = (
-            f"one: {{count: 1, set: {{device.mass: 0.37 kg}}}}\n  two: {{count: {2 if graph else peers}}}"
-        )
-    text = f"topology: users\n{clocks}peers:\n  {groups}\n{BODIES}couplers:\n{_contact('haptic', delay)}{_coordination(generator, delay)}"
-    return Shape(
-        f"{text}links:\n  lan: {{clock: network, delay: {late}{graph}}}\n{_arm(generator)}",
-        MASSES | CONTACT | COORDINATION,
-    )
-
-
-def weights(generator: random.Random) -> Shape:
-    """Peers who weigh one another by decimals, that doubles round."""
-    clocks, late = _clocks(generator)
-    digits, kind = (
-        generator.choice([1, 2, 3, 6, 16]),
-        generator.choice(["FullMesh", "AveragePosition", "WeightedMean"]),
-    )
-    drawn = {
-        pair: round(generator.uniform(0.05, 1.5), digits)
-        for pair in ((1, 2), (1, 3), (2, 3), (2, 1), (3, 1), (3, 2))
-    }
-    if kind == "WeightedMean":  # rows that add up to 1, in decimals
-        for receiver in (1, 2, 3):
-            one, two = (sender for sender in (1, 2, 3) if sender != receiver)
-            tenths = generator.randint(1, 10**digits - 1) if digits < 10 else generator.randint(1, 999)
-            whole = 10**digits if digits < 10 else 1000
-            drawn[one, receiver], drawn[two, receiver] = tenths / whole, (whole - tenths) / whole
-    if kind != "WeightedMean" and generator.random() < 0.5:
-        graph = f"edges: [{', '.join(f'[{a}, {b}, {drawn[a, b]!r}]' for a, b in ((1, 2), (1, 3), (2, 3)))}]"
-    else:
-        graph = f"arcs: [{', '.join(f'[{a}, {b}, {weight!r}]' for (a, b), weight in drawn.items())}]"
-    delay = generator.choice(LATE)
-    text = f"topology: weights\n{clocks}peers: {{user: {{count: 3}}}}\n{BODIES}couplers:\n{_contact('haptic', delay)}{_coordination(generator, delay, kind)}"
-    return Shape(
-        f"{text}links:\n  lan: {{clock: network, delay: {late}, graph: {{{graph}}}}}\n{_arm(generator)}",
-        MASSES | CONTACT | COORDINATION,
-    )
-
-
-GAINS: dict[str, Decades] = {
+_RULES = rules_of("""\
+tick: 1 ms  0.5 ms  2 ms  4/3 ms
+ratio: 1 ms  2 ms  4 ms  8 ms  2.5 ms  10 ms
+phase: $none  $none  , phase: 0.2 ms  , phase: 1/7 ms
+clocks: clocks: {haptic: {period: $tick$phase}, network: $ratio}
+acts: 0 s  1 ms  1.5 ms  1/3 ms  0.13 ms
+late: 0 s  1 ms  7/3 ms  4 ms  8 ms  8 ms
+few: 1  2  3
+some: 2  3  4
+graph: $none  $none  , graph: ring  , graph: star
+groups: {user: {count: $some}}  {user: {count: 3}}  {one: {count: 1, set: {device.mass: 0.37 kg}}, two: {count: $some}}
+mesh: AveragePosition$delays  FullMesh$delays
+delays: $none  $none  , delays: own
+ground: cube  ground
+gains: kp: 100 N/m, ki: 10 N/(m*s), kd: 1 N*s/m
+integrator: Integrator, $gains, leak: 0 Hz  SampledIntegrator, $gains, leak: 1, alpha: 0.5, period: 1 ms, clock: haptic, delay: $acts  HeldIntegrator, $gains, leak: 0 Hz, clock: haptic, delay: $acts
+share: -0.9  -0.41  0.13  0.367  0.638  0.85
+expressions: Expressions  Named
+""") | {
+    "none": [""],
+    "bodies": [
+        "masses:\n  device: {mass: 0.1 kg, damping: 5 N*s/m}\n  cube: {mass: 0.6 kg, damping: 5 N*s/m, shared: true}\ncouplers:\n"
+    ],
+    "contact": [
+        "  contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic, delay: $acts}\n"
+    ],
+    "coordination": [
+        "  coordination: {type: $mesh, object: cube, stiffness: 500 N/m, clock: haptic, delay: $acts, link: lan}\n"
+    ],
+    "spring": ["  spring: {type: SpringDamper, a: device, b: cube, stiffness: 100 N/m, damping: 1 N*s/m}\n"],
+    "more": ["", "$contact", "  spring: {type: SpringDamper, a: device, b: ground, stiffness: 30 N/m}\n"],
+    "arm": [
+        "",
+        "hands: {arm: {type: SpringDamperArm, flange: device, stiffness: 80 N/m, damping: 1 N*s/m}}\n",
+    ],
+    "lan": ["links: {lan: {clock: network, delay: $late$graph}}\n"],
+    "slow": ["2 ms", "{period: 2 ms, phase: 0.5 ms}", "1.5 ms"],
+    "far": ["{contact.clock: slow, contact.delay: $acts, coordination.clock: slow}"],
+}
+_GAINS: dict[str, Decades] = {
     "own.kp": (-1, 4, 0.1),
     "own.ki": (-2, 4, 0.3),
     "own.kd": (-3, 1.5, 0.3),
     "own.leak": (-2, 0, 0.5),
 }
-
-
-def integrators(generator: random.Random) -> Shape:
-    """Integrators of all kinds, some of which nobody reads."""
-    clocks, _ = _clocks(generator)
-    kind = generator.choice(["Integrator", "SampledIntegrator", "HeldIntegrator"])
-    values = "kp: 100 N/m, ki: 10 N/(m*s), kd: 1 N*s/m"
-    values += {
-        "Integrator": ", leak: 0 Hz",
-        "SampledIntegrator": ", leak: 1, alpha: 0.5, period: 1 ms, clock: haptic, delay: "
-        + generator.choice(LATE),
-        "HeldIntegrator": ", leak: 0 Hz, clock: haptic, delay: " + generator.choice(LATE),
-    }[kind]
-    ground = generator.choice(["cube", "ground"])
-    text = f"topology: integrators\n{clocks}peers: {{user: {{count: {generator.randint(1, 3)}}}}}\n{BODIES}couplers:\n"
-    text += f"  own: {{type: {kind}, a: device, b: {ground}, {values}}}\n"
-    text += generator.choice(
-        [
-            "",
-            "  spring: {type: SpringDamper, a: device, b: ground, stiffness: 30 N/m}\n",
-            _contact("haptic", "0 s"),
-        ]
-    )
-    return Shape(text + _arm(generator), MASSES | CONTACT | GAINS | {"spring.stiffness": (-1, 5, 0.1)})
-
-
-SPRING: dict[str, Decades] = {"spring.stiffness": (-1, 7, 0.05), "spring.damping": (-3, 2, 0.3)}
-
-
-def unclocked(generator: random.Random) -> Shape:
-    """No clock at all: two masses on a spring, held or free."""
-    held = generator.choice(
-        ["", "  arm: {type: SpringDamperArm, flange: device, stiffness: 80 N/m, damping: 1 N*s/m}\n"]
-    )
-    text = f"topology: unclocked\npeers: {{user: {{count: {generator.randint(1, 3)}}}}}\n{BODIES}couplers:\n"
-    text += "  spring: {type: SpringDamper, a: device, b: cube, stiffness: 100 N/m, damping: 1 N*s/m}\n"
-    return Shape(text + (f"hands:\n{held}" if held else ""), MASSES | SPRING)
-
-
-def stiff(generator: random.Random) -> Shape:
-    """A continuous spring, stiff or not, beside sampled couplers."""
-    clocks, late = _clocks(generator)
-    delay = generator.choice(LATE)
-    text = (
-        f"topology: stiff\n{clocks}peers: {{user: {{count: {generator.randint(1, 4)}}}}}\n{BODIES}couplers:\n"
-    )
-    text += "  spring: {type: SpringDamper, a: device, b: cube, stiffness: 100 N/m, damping: 1 N*s/m}\n"
-    if generator.random() < 0.5:
-        text += f"  contact: {{type: SampledSpringDamper, a: cube, b: ground, stiffness: 10 N/m, clock: haptic, delay: {delay}}}\n"
-        return Shape(text, MASSES | SPRING | CONTACT)
-    text = text.replace("count: 1}", "count: 2}")
-    text += f"{_coordination(generator, delay)}links:\n  lan: {{clock: network, delay: {late}}}\n"
-    return Shape(text, MASSES | SPRING | COORDINATION)
-
-
-def several_clocks(generator: random.Random) -> Shape:
-    """Groups with clocks, delays and a link's delays of their own."""
-    late = generator.choice(["0 s", "4 ms", "8 ms"])
-    slow = generator.choice(["2 ms", "{period: 2 ms, phase: 0.5 ms}", "1.5 ms"])
-    clocks = f"clocks: {{haptic: 1 ms, slow: {slow}, network: {{period: 4 ms, phase: {generator.choice(['0 s', '0.7 ms', '3 ms'])}}}}}\n"
-    own = f"contact.clock: slow, contact.delay: {generator.choice(LATE)}, coordination.clock: slow"
-    text = f"topology: clocks\n{clocks}peers:\n  near: {{count: {generator.randint(1, 2)}}}\n  far: {{count: 1, set: {{{own}}}}}\n{BODIES}couplers:\n"
-    text += _contact("haptic", generator.choice(LATE)) + _coordination(generator, generator.choice(LATE))
-    text += f"links:\n  lan: {{clock: network, delay: {late}, delays: {{far: {{near: {generator.choice(['0 s', '9 ms', '3.3 ms'])}}}}}}}\n"
-    return Shape(text + _arm(generator), MASSES | CONTACT | COORDINATION)
-
-
-def memories(generator: random.Random) -> Shape:
-    """A digital filter between two masses, or to the ground."""
-    clocks, _ = _clocks(generator)
-    b, delay = generator.choice(["cube", "ground"]), generator.choice(LATE)
-    drawn = ", ".join(f"{name}: {generator.uniform(-0.9, 0.9):.3f}" for name in ("a1", "a2", "b0", "b1"))
-    text = f"topology: memories\n{clocks}peers: {{user: {{count: 2}}}}\n{BODIES}couplers:\n{_contact('haptic', delay)}"
-    text += (
-        f"  own: {{type: Memory, a: device, b: {b}, gain: 50 N/m, {drawn}, clock: haptic, delay: {delay}}}\n"
-    )
-    return Shape(text, MASSES | CONTACT | {"own.gain": (-1, 4, 0.1)})
-
-
-def expressions(generator: random.Random) -> Shape:
-    """Plain expressions in every place an expression can stand, or the same with a name for each."""
-    clocks, late = _clocks(generator)
-    kind = generator.choice(["Expressions", "Named"])
-    text = f"topology: expressions\n{clocks}peers: {{user: {{count: {generator.randint(2, 4)}}}}}\n{BODIES}couplers:\n{_contact('haptic', '0 s')}"
-    text += f"  own: {{type: {kind}, object: cube, stiffness: 100 N/m, damping: 1 N*s/m, tau: 3 ms, clock: haptic, link: lan, delay: {generator.choice(LATE)}}}\n"
-    ranges = {"own.stiffness": (-1, 4, 0.05), "own.damping": (-3, 1.5, 0.4), "own.tau": (-4, -1, 0.1)}
-    return Shape(f"{text}links:\n  lan: {{clock: network, delay: {late}}}\n", MASSES | CONTACT | ranges)
-
-
-def timed(generator: random.Random) -> Shape:
-    """Time that multiplies a motion, which is refused, or that pushes, which is left out."""
-    clocks, _ = _clocks(generator)
-    kind = generator.choice(["Timed", "Pushed"])
-    text = f"topology: timed\n{clocks}peers: {{user: {{count: 2}}}}\n{BODIES}couplers:\n{_contact('haptic', '0 s')}"
-    text += f"  own: {{type: {kind}, a: device, b: ground, stiffness: 100 N/m, clock: haptic}}\n"
-    return Shape(text, MASSES | CONTACT | {"own.stiffness": (-1, 4, 0)}, "E810" if kind == "Timed" else "")
-
-
-SHAPES: Mapping[str, Callable[[random.Random], Shape]] = {
-    one.__name__: one
-    for one in (
-        users,
-        users,
-        weights,
-        integrators,
-        unclocked,
-        stiff,
-        several_clocks,
-        memories,
-        expressions,
-        timed,
-    )
+_SPRING: dict[str, Decades] = {"spring.stiffness": (-1, 7, 0.05), "spring.damping": (-3, 2, 0.3)}
+_OWN: dict[str, Decades] = {
+    "own.stiffness": (-1, 4, 0.05),
+    "own.damping": (-3, 1.5, 0.4),
+    "own.tau": (-4, -1, 0.1),
 }
+_CONTACT, _WHOLE = MASSES | CONTACT, MASSES | CONTACT | COORDINATION
+
+# What it is about, its text, its ranges and what is due. The paper's scene comes twice, as it has most forms.
+SHAPES: tuple[Shape, ...] = (
+    Shape("topology: users\n$clocks\npeers: $groups\n$bodies$contact$coordination$lan$arm", _WHOLE),
+    Shape("topology: users\n$clocks\npeers: $groups\n$bodies$contact$coordination$lan", _WHOLE),
+    Shape(
+        "topology: weights\n$clocks\npeers: {user: {count: 3}}\n$bodies$contact$coordination\n"
+        "links: {lan: {clock: network, delay: $late, graph: {GRAPH}}}\n$arm",
+        _WHOLE,
+    ),
+    Shape(
+        "topology: weighted\nclocks: {haptic: {period: $tick$phase}, network: $ratio}\npeers: {user: {count: 3}}\n$bodies$contact"
+        "  coordination: {type: WeightedMean, object: cube, stiffness: 500 N/m, clock: haptic, delay: $acts, link: lan}\n"
+        "links: {lan: {clock: network, delay: $late, graph: {ROWS}}}\n$arm",
+        _WHOLE,
+    ),
+    Shape(
+        "topology: integrators\n$clocks\npeers: {user: {count: $few}}\n$bodies  own: {a: device, b: $ground, type: $integrator}\n$more$arm",
+        _CONTACT | _GAINS | {"spring.stiffness": (-1, 5, 0.1)},
+    ),
+    Shape("topology: unclocked\npeers: {user: {count: $few}}\n$bodies$spring$arm", MASSES | _SPRING),
+    Shape(
+        "topology: stiff\n$clocks\npeers: {user: {count: $few}}\n$bodies$spring"
+        "  contact: {type: SampledSpringDamper, a: cube, b: ground, stiffness: 10 N/m, clock: haptic, delay: $acts}\n",
+        _CONTACT | _SPRING,
+    ),
+    Shape(
+        "topology: stiff\n$clocks\npeers: {user: {count: $some}}\n$bodies$spring$coordination$lan",
+        MASSES | _SPRING | COORDINATION,
+    ),
+    Shape(
+        "topology: clocks\nclocks: {haptic: 1 ms, slow: $slow, network: {period: 4 ms$phase}}\n"
+        "peers: {near: {count: 2}, far: {count: 1, set: $far}}\n$bodies$contact$coordination\n"
+        "links: {lan: {clock: network, delay: $late, delays: {far: {near: 3.3 ms}}}}\n$arm",
+        _WHOLE,
+    ),
+    Shape(
+        "topology: memories\n$clocks\npeers: {user: {count: 2}}\n$bodies$contact  own: {type: Memory, a: device, b: $ground, "
+        "gain: 50 N/m, a1: $share, a2: $share, b0: $share, b1: $share, clock: haptic, delay: $acts}\n",
+        _CONTACT | {"own.gain": (-1, 4, 0.1)},
+    ),
+    Shape(
+        "topology: expressions\n$clocks\npeers: {user: {count: $some}}\n$bodies$contact  own: {type: $expressions, object: cube, "
+        "stiffness: 100 N/m, damping: 1 N*s/m, tau: 3 ms, clock: haptic, link: lan, delay: $acts}\nlinks: {lan: {clock: network, delay: $late}}\n",
+        _CONTACT | _OWN,
+    ),
+    # Time that multiplies a motion is refused; time that pushes is left out.
+    Shape(
+        "topology: timed\n$clocks\npeers: {user: {count: 2}}\n$bodies$contact  own: {type: Timed, a: device, b: ground, stiffness: 100 N/m, clock: haptic}\n",
+        _CONTACT,
+        "E810",
+    ),
+    Shape(
+        "topology: pushed\n$clocks\npeers: {user: {count: 2}}\n$bodies$contact  own: {type: Pushed, a: device, b: ground, stiffness: 100 N/m, clock: haptic}\n",
+        _CONTACT | _OWN,
+    ),
+)
+
+
+def draw_shape(generator: random.Random) -> Shape:
+    """Return a shape at random, each as likely as the next."""
+    shape = generator.choice(SHAPES)
+    text = shape.text.replace("GRAPH", _graph(generator)).replace("ROWS", _rows(generator))
+    return replace(shape, text=grown(generator, _RULES, text, 9))
+
+
+def _graph(generator: random.Random) -> str:
+    """Return how three peers weigh one another by decimals, that doubles round."""
+    digits = generator.choice([1, 2, 3, 6, 16])
+    pairs = list(itertools.permutations((1, 2, 3), 2))
+    kind, pairs = generator.choice([("edges", pairs[:2] + pairs[3:4]), ("arcs", pairs)])
+    return f"{kind}: [{', '.join(f'[{a}, {b}, {round(generator.uniform(0.05, 1.5), digits)!r}]' for a, b in pairs)}]"
+
+
+def _rows(generator: random.Random) -> str:
+    """Return weights that add up to 1 for each of three receivers, in decimals."""
+    whole = 10 ** generator.choice([1, 2, 3, 6])
+    arcs = []
+    for receiver, one, other in ((1, 2, 3), (2, 1, 3), (3, 1, 2)):
+        part = generator.randint(1, whole - 1)
+        arcs += [
+            f"[{one}, {receiver}, {part / whole!r}]",
+            f"[{other}, {receiver}, {(whole - part) / whole!r}]",
+        ]
+    return f"arcs: [{', '.join(arcs)}]"
+
+
+def numbers(generator: random.Random, shape: Shape, system: CompiledSystem) -> list[Override]:
+    """Return numbers at random: a decade is as likely as the next."""
+    known = {parameter.name for parameter in system.parameters}
+    values = []
+    for name, (low, high, zero) in shape.ranges.items():
+        value = 0.0 if generator.random() < zero else 10 ** generator.uniform(low, high)
+        if name in known:
+            values.append(Override(Free(name), Fraction(value)))
+    return values

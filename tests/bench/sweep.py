@@ -1,58 +1,33 @@
 """A sweep that is killed again and again, against one left alone: the same file, and what the kills cost.
 
 `python -m tests.bench.sweep` sweeps the paper's scene over contact and coordination stiffness, 100,000 points
-by default, twice over: half a minute on two cores. `--points 2000` is quick.
+by default, twice over: half a minute on two cores.
 """
 
 from __future__ import annotations
 
-import argparse
-import hashlib
-import resource
 import tempfile
 from functools import partial
 from pathlib import Path
 
-from apc.benchmark.timing import timed, waited
-from apc.compiler.pipeline import compile_topology
-from apc.compiler.store import save
-from apc.sweeps.grid import build_grid, parse_axis
-from apc.sweeps.quantities import find_quantity
+import numpy as np
+
+import apc
+from apc.benchmark.timing import waited
 from apc.sweeps.sweep import part_points
-from apc.threads import single_threaded
+from tests.bench.judge import Judge, Timed, parser_of
 from tests.sweeping import parts, start, wait_for_parts
 from tests.topologies import SCENES
 
 
-def axes(points: int) -> dict[str, str]:
-    """Return two axes whose grid has about so many points."""
-    side = max(2, round(points**0.5))
-    return {
-        "contact.stiffness": f"10 N/m:3000 N/m:{side}",
-        "coordination.stiffness": f"10 N/m:3000 N/m:{max(2, round(points / side))}",
-    }
-
-
-def plain(model: Path, over: dict[str, str], count: int) -> float:
-    """Return the processor seconds a point takes in one process without parts, over the first points."""
-    from apc.compiler.store import load
-
-    system = load(model)
-    grid = build_grid([parse_axis(system, name, text) for name, text in over.items()])
-    quantity = find_quantity(system, "analyze")
-    with single_threaded():
-        quantity.cells(grid, range(count))
-        return timed(lambda: quantity.cells(grid, range(count)))[0] / count
-
-
-def finish(folder: Path, words: list[str]) -> tuple[str, float]:
-    """Run a sweep to its end; return what it printed and the seconds it took."""
-    seconds, (out, err) = waited(lambda: start(folder, *words).communicate())
+def finish(folder: Path, words: list[str]) -> str:
+    """Run a sweep to its end; return what it printed."""
+    out, err = start(folder, *words).communicate()
     assert not err, err
-    return out, seconds
+    return str(out)
 
 
-def _kill(folder: Path, words: list[str], target: Path, moment: int) -> None:
+def kill(folder: Path, words: list[str], target: Path, moment: int) -> None:
     """Start a sweep and kill it once so many parts are finished."""
     running = start(folder, *words)
     wait_for_parts(running, target, moment)
@@ -60,55 +35,48 @@ def _kill(folder: Path, words: list[str], target: Path, moment: int) -> None:
     running.communicate()
 
 
-def killed(folder: Path, words: list[str], target: Path, kills: int, points: int) -> float:
-    """Kill a sweep so many times at moments spread evenly over its work; return the seconds it ran in all."""
-    whole = -(-points // part_points(points, quick=True))
-    moments = [whole * (kill + 1) // (kills + 1) for kill in range(kills)]
-    seconds = 0.0
-    before: dict[str, tuple[int, int]] = {}
-    for moment in moments:
-        seconds += waited(partial(_kill, folder, words, target, max(moment, len(before) + 1)))[0]
-        now = parts(target)
-        kept = before.items() <= now.items()
-        print(f"  killed with {len(now):>6} parts of {whole} finished; those of before untouched: {kept}")
-        assert kept
-        before = now
-    return seconds
-
-
 def main() -> None:
-    """Print the comparison."""
-    parser = argparse.ArgumentParser(prog="python -m tests.bench.sweep", description=__doc__)
+    """Print the comparison, times by the clock on the wall."""
+    parser = parser_of("sweep", __doc__)
     parser.add_argument("--points", type=int, default=100_000)
     parser.add_argument("--kills", type=int, default=3)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--suffix", choices=["parquet", "csv"], default="parquet")
     given = parser.parse_args()
-    over = axes(given.points)
+    judge, kills = Judge(given.strict), 1 if given.quick else given.kills
+    side = max(2, round((5000 if given.quick else given.points) ** 0.5))
+    names = ("contact.stiffness", "coordination.stiffness")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        model = folder / "scene.apc"
-        save(compile_topology(SCENES / "three-users-average.yaml"), model)
-        words = ["scene.apc", *(word for axis in over.items() for word in ("--over", "=".join(axis)))]
-        words += ["--jobs", str(given.jobs)]
-        alone, target = folder / f"alone.{given.suffix}", folder / f"killed.{given.suffix}"
-        out, left_alone = finish(folder, [*words, "--out", alone.name])
-        used = resource.getrusage(resource.RUSAGE_CHILDREN)  # of processes that have ended
-        cpu = used.ru_utime + used.ru_stime
+        (folder / "scene.yaml").write_bytes((SCENES / "three-users-average.yaml").read_bytes())
+        words = [word for one in names for word in ("--over", f"{one}=10 N/m:3000 N/m:{side}")]
+        words = ["scene.yaml", *words, "--jobs", "2", "--out"]
+        alone, target = folder / "alone.parquet", folder / "killed.parquet"
+        left_alone, out = waited(lambda: finish(folder, [*words, alone.name]))
         print(out.rstrip())
-        points = int(out.split(": ")[1].split(" ")[0].replace(",", ""))
-        print(f"\nleft alone: {left_alone:.1f} s, {points / left_alone:.0f} points a second")
-        took = killed(folder, [*words, "--out", target.name], target, given.kills, points)
-        last, rest = finish(folder, [*words, "--out", target.name])
+        whole = -(-(side**2) // part_points(side**2, quick=True))
+        seconds, before = 0.0, parts(target)
+        for one in range(kills):
+            moment = max(whole * (one + 1) // (kills + 1), len(before) + 1)
+            seconds += waited(partial(kill, folder, [*words, target.name], target, moment))[0]
+            now = parts(target)
+            untouched = judge.right("finished parts are left as they are", before.items() <= now.items())
+            print(
+                f"  killed with {len(now):>6} parts of {whole} finished; those before untouched: {untouched}"
+            )
+            before = now
+        rest, last = waited(lambda: finish(folder, [*words, target.name]))
         print(f"  {last.splitlines()[-1].strip()}")
         same = alone.read_bytes() == target.read_bytes()
-        digest = hashlib.sha256(target.read_bytes()).hexdigest()
-        print(f"killed {given.kills} times: {took + rest:.1f} s")
-        print(f"files the same: {same} (SHA-256 {digest[:16]}…)")
-        print(f"time killed / left alone: {(took + rest) / left_alone:.2f}")
-        each = plain(model, over, min(5000, points))
-        print(f"processor time / that of as many points in one process: {cpu / (each * points):.2f}")
-        assert same
+        print(f"files the same: {judge.right('the same file, killed or not', same)}")
+        axis = np.linspace(10.0, 3000.0, side)
+        points = dict(zip(names, (one.ravel() for one in np.meshgrid(axis, axis)), strict=True))
+        at_once, _ = waited(lambda: apc.analyze_many(SCENES / "three-users-average.yaml", points))
+        programs = [
+            Timed("apc sweep, two processes", left_alone),
+            Timed(f"apc sweep, killed {kills} times", seconds + rest),
+            Timed("apc.analyze_many, one process", at_once),
+        ]
+        judge.table(f"{side**2:,} points, by the clock on the wall", programs)
+    judge.end()
 
 
 if __name__ == "__main__":

@@ -2,25 +2,25 @@
 
 Takes: a kind's equations between its ticks, one peer's numbers, an interval.
 Gives: `in_the_way`, `Push`, `push_of`, `switches`, `impulse`.
-Guarantees: the balls hold the true impulse; forces are expanded only where they are smooth.
+Guarantees: forces are replaced by polynomials only where they are smooth, and where these are as right as
+half the bits in hand say, at points that they were not made of.
 Does not: serve a force that hangs on the motion too, or one whose switches are not linear in time.
 
-Of x' = A x + B u + g(t), with g expanded about the beginning of an interval of length h,
+Of x' = A x + B u + g(t), with g(s) = Σ_{k<K} g_k s^k within an interval of length h,
 
-    g(s) = Σ_{k<K} g_k s^k + ρ s^K,    ∫₀ʰ e^{A (h − s)} g(s) ds = Σ_{k<K} k! M_k g_k + R
+    ∫₀ʰ e^{A (h − s)} g(s) ds = Σ_{k<K} k! M_k g_k
     M_k = ∫₀ʰ e^{A (h − s)} s^k/k! ds = A M_{k+1} + h^{k+1}/(k+1)!
 
-where ρ is g's coefficient K somewhere within the interval (Taylor's remainder, as Lagrange has it), so that
-|R| ≤ e^{|A| h} h^{K+1}/(K+1) max |ρ|. The moments M_k come downwards from one that is too small to count.
+where the polynomial meets the force at K points of Chebyshev. The moments M_k come downwards from one that is
+too small to count.
 """
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
-import operator
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
@@ -29,10 +29,11 @@ import casadi
 import flint
 
 from apc.compiler.compiled import Kind
+from apc.eigen.balls import precision
 from apc.frame.exact import evaluate_exact, is_rational
 from apc.frame.jacobians import guards_of
 
-# K. Of a sine the terms left out are 1e-56 where it makes a tenth of a turn within the interval.
+# K. Of a sine the polynomial is off by 1e-60 where it makes half a turn within the interval.
 ORDER = 40
 # What is left may be this part of the bits in hand: half of them, which is 1e-77 at the fewest.
 SPARED = 2
@@ -55,69 +56,6 @@ class Push:
     parameters: tuple[Fraction, ...]
     a: Any  # flint.fmpq_mat
     moments: dict[Fraction, list[Any]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Germ:
-    """A function's Taylor series about the `middle`, the beginning (`near`) and all (`wide`) of an interval.
-
-    Germs are compared by their values in the middle, which is right between two switches.
-    """
-
-    middle: Any  # flint.arb_series of one term
-    near: Any  # flint.arb_series
-    wide: Any  # flint.arb_series
-
-    def each(self, step: Callable[[Any], Any]) -> Germ:
-        """Apply a step to all three."""
-        return Germ(step(self.middle), step(self.near), step(self.wide))
-
-    def both(self, step: Callable[[Any, Any], Any], other: Any) -> Germ:
-        """Join with another germ or a constant."""
-        one = other if isinstance(other, Germ) else _constant(other)
-        return Germ(step(self.middle, one.middle), step(self.near, one.near), step(self.wide, one.wide))
-
-    def __add__(self, other: Any) -> Germ:
-        return self.both(operator.add, other)
-
-    def __sub__(self, other: Any) -> Germ:
-        return self.both(operator.sub, other)
-
-    def __mul__(self, other: Any) -> Germ:
-        return self.both(operator.mul, other)
-
-    def __truediv__(self, other: Any) -> Germ:
-        return self.both(operator.truediv, other)
-
-    def __radd__(self, other: Any) -> Germ:
-        return self.both(operator.add, other)
-
-    def __rmul__(self, other: Any) -> Germ:
-        return self.both(operator.mul, other)
-
-    def __rsub__(self, other: Any) -> Germ:
-        return (-self).both(operator.add, other)
-
-    def __rtruediv__(self, other: Any) -> Germ:
-        return _constant(other) / self
-
-    def __neg__(self) -> Germ:
-        return self.each(operator.neg)
-
-    def __abs__(self) -> Germ:
-        return -self if self < 0 else self
-
-    def __lt__(self, other: Any) -> bool:
-        return bool((self - other).middle[0] < 0)
-
-    def __gt__(self, other: Any) -> bool:
-        return bool((self - other).middle[0] > 0)
-
-    def __le__(self, other: Any) -> bool:
-        return not self > other
-
-    def __ge__(self, other: Any) -> bool:
-        return not self < other
 
 
 def in_the_way(kind: Kind) -> str:
@@ -207,69 +145,51 @@ def impulse(push: Push, start: Fraction, length: Fraction, depth: int = 0) -> li
     depth
         How often it was halved before.
     """
-    size, h, norm = push.a.nrows(), _ball(length), _norm(push.a)
-    germs = _germs(push, start, length)
-    most = _largest([abs(germ.wide[ORDER]) for germ in germs])
-    left = (norm * h).exp() * h ** (ORDER + 1) / (ORDER + 1) * most
+    size, h = push.a.nrows(), _ball(length)
+    points, solving = _points(flint.ctx.prec)
+    values = flint.arb_mat([_forces(push, _ball(start) + point * h) for point in points])
+    terms = solving * values  # of (s/h)^k
+    off = flint.arb(0)
+    for place in (Fraction(1, 7), Fraction(4, 7), Fraction(13, 14)):
+        powers = flint.arb_mat([[_ball(place) ** k for k in range(ORDER)]])
+        true = flint.arb_mat([_forces(push, _ball(start + place * length))])
+        off = max(off, _largest((powers * terms - true).entries()))
     # A force that begins at zero has a small impulse as well: what is spared is of 1 N if not of the force.
-    enough = flint.arb(2) ** (-flint.ctx.prec // SPARED) * h * max(_largest([g.near[0] for g in germs]), ONE)
-    if not left <= enough and depth < MOST_HALVINGS:
+    enough = flint.arb(2) ** (-flint.ctx.prec // SPARED) * max(_largest(values.entries()), ONE)
+    if not off <= enough and depth < MOST_HALVINGS:
         half = length / 2
         first = flint.arb_mat(size, 1, impulse(push, start, half, depth + 1))
         last = impulse(push, start + half, half, depth + 1)
         passed = (flint.arb_mat(push.a) * _ball(half)).exp() * first
         return [one + other for one, other in zip(passed.entries(), last, strict=True)]
-    total = flint.arb_mat(size, 1, [flint.arb(0, left.upper())] * size)
-    moments = _moments(push, length)
-    for k in range(ORDER):
-        column = [germ.near[k] * math.factorial(k) for germ in germs]
-        if any(not entry.is_zero() for entry in column):
-            total = total + moments[k] * flint.arb_mat(size, 1, column)
+    left = flint.arb(0, (off * h * (_norm(push.a) * h).exp()).upper())
+    total = flint.arb_mat(size, 1, [left] * size)
+    for k, moment in enumerate(_moments(push, length)):
+        scale = flint.arb(math.factorial(k)) / h**k
+        total = total + moment * flint.arb_mat(size, 1, [terms[k, i] * scale for i in range(size)])
     return list(total.entries())
 
 
-def _germs(push: Push, start: Fraction, length: Fraction) -> list[Germ]:
-    """Expand every force on an interval."""
-    begin, end = _ball(start), _ball(start + length)
-    with _terms(ORDER + 1):
-        time = Germ(
-            flint.arb_series([_ball(start + length / 2)], prec=1),
-            flint.arb_series([begin, 1]),
-            flint.arb_series([begin.union(end), 1]),
-        )
-        found = evaluate_exact(push.rate, [push.parameters, [time]], rounded=_transcendental)[0]
-        return [one if isinstance(one, Germ) else _constant(one) for one in found]
+@functools.cache
+def _points(bits: int) -> tuple[list[Any], Any]:
+    """Return points of Chebyshev within 0 and 1, and what makes coefficients of values there."""
+    with precision(3 * bits):  # the inverse of powers loses digits
+        angles = [flint.arb.pi() * (2 * k + 1) / (2 * ORDER) for k in range(ORDER)]
+        points = [((1 + angle.cos()) / 2).mid() for angle in angles]
+        solving = flint.arb_mat([[point**k for k in range(ORDER)] for point in points]).inv()
+        return points, flint.arb_mat([[one.mid() for one in row] for row in solving.tolist()])
 
 
-def _constant(value: Any) -> Germ:
-    return Germ(*(flint.arb_series([_ball(Fraction(value))]) for _ in range(3)))
-
-
-def _transcendental(name: str, *values: Any) -> Germ:
-    (value,) = values
-    germ = value if isinstance(value, Germ) else _constant(value)
-    return germ.each(lambda series: _SERIES[name](series))
-
-
-_SERIES: dict[str, Callable[[Any], Any]] = {
-    **{
-        name: operator.methodcaller(name)
-        for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan")
-    },
-    "sinh": lambda series: (series.exp() - (-series).exp()) / 2,
-    "cosh": lambda series: (series.exp() + (-series).exp()) / 2,
-    "tanh": lambda series: 1 - 2 / ((2 * series).exp() + 1),
-}
-
-
-@contextmanager
-def _terms(count: int) -> Iterator[None]:
-    """Set the number of terms of python-flint's series for a while."""
-    before, flint.ctx.cap = flint.ctx.cap, count
-    try:
-        yield
-    finally:
-        flint.ctx.cap = before
+def _forces(push: Push, time: Any) -> list[Any]:
+    """Return the forces (n_x,) at a time in seconds."""
+    parameters = [_ball(one) for one in push.parameters]
+    found = evaluate_exact(
+        push.rate,
+        [parameters, [time]],
+        number=lambda value: _ball(Fraction(value)),
+        rounded=lambda name, value: getattr(flint.arb(value), name)(),
+    )[0]
+    return [flint.arb(one) for one in found]
 
 
 def _ball(value: Fraction) -> Any:

@@ -1,4 +1,4 @@
-# ruff: noqa: E501 -- lists of hostile texts, and texts built in one line, read best as they are
+# ruff: noqa: E501 -- lists of hostile texts read best as they are
 """Hostile inputs: bytes, YAML, expressions, units, components and tables that nobody should write.
 
 Takes: a seeded generator. Gives: `Input`, `make_input`.
@@ -8,36 +8,26 @@ Does not: run anything.
 
 from __future__ import annotations
 
-import json
 import random
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import yaml
 
 from apc.compiler.language.expression import SMOOTH
-from tests.fuzz.equations import odd_equations
-from tests.fuzz.vectors import odd_vectors
+from tests.fuzz.grammar import grown, odd_equations, odd_vectors, rules_of
+from tests.fuzz.trees import Pairs, Tree, as_yaml, changed, of_yaml, spots
 
 MODELS = Path(__file__).resolve().parents[2] / "models"
 TOPOLOGY = "scene.yaml"
 PLAYED = "equations"  # the sort that is analysed and simulated as well
 SENTINEL = "sentinel"  # the file that a run of foreign code would leave behind
-
-# A tree of YAML that can hold a key twice: mappings are lists of pairs in a `Pairs`.
-Tree = Any
-
-
-class Pairs(list[list[Any]]):
-    """A mapping as (key, value) pairs, keys not necessarily different."""
+Files = dict[str, bytes]
 
 
 @dataclass(frozen=True, slots=True)
 class Input:
-    """Files by name, `TOPOLOGY` among them, and the sort of input they are."""
+    """Files by name, and the sort of input they are."""
 
     sort: str
     files: tuple[tuple[str, bytes], ...]
@@ -48,82 +38,83 @@ def _read(folder: str) -> dict[str, str]:
 
 
 SCENES = _read("scenes")
-COMPONENTS = {
-    name: text
-    for folder in ("contacts", "coordination", "devices", "hands", "mechanics", "network")
-    for name, text in _read(folder).items()
-}
-TITLES = {
-    text.partition("component: ")[2].split()[0]: text for text in COMPONENTS.values() if "component: " in text
-}
-TABLES = {"users.csv": (MODELS / "scenes" / "users.csv").read_text(encoding="utf-8")}
+COMPONENTS = [text for text in _read("").values() if "component: " in text]
+USERS = (MODELS / "scenes" / "users.csv").read_text(encoding="utf-8")
 PUSH = "time [s],force [N]\n0,0\n1,2\n2,-1\n"
 
-CODE = f"__import__('os').system('touch {SENTINEL}')"
-HOSTILE = (
-    "", "~", "null", "true", "false", "on", "no", "1:30", "2001-01-01", ".nan", ".inf", "-.inf", "nan", "inf",
-    "NaN kg", "inf N/m", "-0", "0", "0x10", "0o17", "1_000", "1e400", "1e-400", "1e300 N/m", "-1e300 kg",
-    "9"*400, "9"*5000, "9**9**9**9", "9^9^9^9", "2^-100", "(-8)^(1/3)", "1/0", "0/0", "1/0 s", "1/3 ms", "1e308 m",
-    "10**100", "1 N/0", "0 s", "-1 ms", "1e-300 s", "1/999999999 s", "1e99 s", "5 kg kg", "5 kg^999", "5 kg^(1/0)",
-    "5 degC", "3 dB", "1 MS", "1 ms", "1 m s", "1 N·m", "1 µs", "1 μs", "5 Ω", "５ kg", "٣ kg", "1０0 N/m", "½ kg",
-    "dеvice", "сube", "devi\u200bce", "dev\u0301ice", "ｄevice", "ﬁnger", "İ", "ß", "𝒙", "😀", "\u202edevice",
-    "__class__", "device.__class__", "().__class__.__bases__[0]", "{}.format", "lambda: 0", CODE, "!!python/name:os.system",
-    f"!!python/object/apply:os.system ['touch {SENTINEL}']", "{{7*7}}", "${HOME}", "$(id)", "%s%s%n", "../../etc/passwd",
-    "/etc/passwd", "/dev/zero", ".", "..", "\\", "'", '"', "`", "|", ">", "&a", "*a", "*missing", "!tag x", "? x", "- x", "[", "]",
-    "{", "}", "[[[[]]]]", "{a: {b: {c: d}}}", "[1, 2", "a: b: c", "<<", "=", "==", "a = b", "a == b", "x = = y",
-    "device", "cube", "device.flange", "cube.flange.f", "ground", "others", "others.x", "peers", "time", "user[1]", "user[0]", "user[-1]",
-    "chain[1:3]", "device[1]", "device[999999]", "device[1", "haptic", "network", "lan", "Mass", "Flange", "FullMesh", "Link",
-    "mean(others.x)", "sum(others.x)", "der(der(der(x)))", "sample(hold(sample(x)))", "previous(previous(f))", "hold(f, delay)",
-    "hold(f, -1)", "initial(x)", "interpolate(force, time)", "if a then b else c", "if then else", "peers/(peers - peers)",
-    "sqrt(-1)", "log(0)", "exp(1000)", "exp(exp(exp(10)))", "floor(1e300)", "max()", "min(1)", "abs(1, 2)", "f(x)", "sin(x",
-    "users.csv", "push.csv", "missing.csv", "complete", "ring", "star", "stars", "right", "left", "all", "own",
-    "a" * 64, "a" * 63, "A" * 3000, "x " * 200, "(" * 150 + "1" + ")" * 150, "-" * 200 + "1", "1+" * 400 + "1", "2^" * 60 + "2",
-    "1 " + "kg*" * 200 + "kg", "1 (" + "(" * 100 + "m" + ")" * 101, "x\ty", "x\ny", "  x  ", "\u00a0", "x\r\ny", "#", "x # y", "x: y",
-    "count(others)", "1 N/m, 2 N/m", "500N/m", "500  N/m", "5,0 N", "1.2.3 kg", "+5 kg", "--5 kg", "1 /2 s", "1/ 2 s", "1e3", "1E3 N/m", "1 Hz", "-1 Hz", "1 kHz",
-    "0 Hz", "1 1/s", "1 rad", "90 deg", "100 %", "1 kg*m/s^2", "1 lb", "1 in", "1 lightyear", "1 year", "1 eV", "1 h",
+# Values that YAML, units, names or expressions may stumble over: three spaces or a line apart in the file.
+_WORDS = re.split("   |\n", (Path(__file__).parent / "hostile.txt").read_text(encoding="utf-8").rstrip("\n"))
+_LONG = (("9", 400), ("9", 5000), ("a", 63), ("a", 64), ("A", 3000), ("x ", 200), ("-", 201), ("1+", 400), ("2^", 61), ("1 kg*", 200))  # fmt: skip
+HOSTILE = [*_WORDS, *(text * times for text, times in _LONG), "(" * 150 + "1" + ")" * 150, "", "x\ty", "x\ny", "  x  ", "\xa0", "x\r\ny"]  # fmt: skip
+_RULES = rules_of(f"""\
+e: 0  1  2  0.5  1e-3  1e300  3/2  $name  $name
+e+: -$e  ($e)^$power  $unary($e)  $unary($e, $e)  if $e $test $e then $e else $e  {{$e, $e}}  $e + $e  $e - $e  $e * $e  $e / $e
+power: 2  -1  0  (1/2)  1.5  100  101  x
+test: <  <=  >  >=  ==  !=  and  or
+unary: der  sample  hold  previous  initial  abs  sign  sqrt  atan2  age  floor  mean  sum  max  min  count  dot  norm  cross  foo  {"  ".join(SMOOTH)}
+own: q  peers  2  0  1/3  1e-3  1e30
+own+: ($own + $own)  ($own / $own)  ($own * $own)  $call($own)  (if $own $sign $own then $own else $own)  ($own)^$whole  max($own, $own)
+call: abs  sqrt  exp  log  tanh  floor  sign  cos
+sign: <  >=  ==  !=
+whole: 2  3  -1  (1/2)  100
+quantity: $amount $unit  $amount
+amount: 0  1  -1  0.5  1e-9  1e9  1/3  1e300  5  1000  2.5e-3  .5  5.
+unit: kg  N  N/m  N*s/m  s  ms  m  m/s  Hz  1  rad  N/m^(3/2)  kg*m/s^2  furlong  µm  N//m  N/m/  ^2  m^0  m^(1/3)
+count: 0  -1  1  2  3  7  1e3  1e9  1000000  1000000000  1000000001  10000  3.0  three  {"1" * 500}
+key: topology  about  library  clocks  parameters  peers  masses  couplers  links  hands  experiment  studies  count  set  table  type  at  shared  a  b  object  flange  clock  delay  link  stiffness  damping  mass  graph  delays  edges  arcs  period  phase  region  x  y  v  unit  min  max  above  default  options  start  size  component  connector  extends  connectors  variables  parts  connect  sends  equations  source  potentials  flows  <<  device  cube  haptic  user  lan  device.mass  contact.stiffness  duration  seed
+name: x  v  f  a.x  b.x  a.f  b.f  flange.x  flange.f  object.x  object.f  mass  damping  stiffness  delay  limit  side  others.x  others.v  others  time  peers  device.x  kt  haptic  held1  q  a  b  x[1]  a.x[2]  device.x[1]
+cut: (  )  *  ^  /  =  ,  .  ..  [1]  __  é  '  if   then  1e  {"9" * 30}  :
+""") | {"hostile": HOSTILE}  # fmt: skip
+_NEW = ("$hostile", "$hostile", "$quantity", "$cut", "$key", "$name", "$count", "$e")
+_LIKE = str.maketrans({"a": "а", "e": "е", "o": "о", "c": "с", "x": "х", "-": "−", ":": "：", "*": "∗", "/": "∕", " ": "\u00a0"})  # fmt: skip
+_MARKS = [b"\0", b"\t", b"\r", b"\r\n", b"\x1b", b"\xff", b"\xc0\xaf", b"\xed\xa0\x80", b"\xe2\x80\xa8", b"\x85", b"\n...\n", b"\n---\n", b"%YAML 1.1\n", b"\xef\xbb\xbf", b"   ", b"- ", b"\n\n", *(mark.encode() for mark in "{}[],:#&*!|>'\"%@`^/+-=.()<")]  # fmt: skip
+
+# What is asked for too much of. Between « and » stands what comes hundreds of times, ‹ › at most a hundred
+# times, ¿ ‡ thousands of bytes; # is the number of a time and @ the next. What stands before => is replaced;
+# the rest is added to a scene.
+BOMBS = (
+    "x0: &x0 [1]\n«x@: &x@ [*x#, *x#, *x#, *x#, *x#, *x#, *x#, *x#, *x#]\n»", "x: «[»«]»\n", "x: «{a: »1«}»\n",
+    "«- »1\n", "about2: ¿x‡\n", "0.1 kg=>¿1‡ kg", "0.1 kg=>«(»1 kg«)»", '0.1 kg=>"«1+»1"', "0.1 kg=>1 «m*»kg",
+    "parameters: {p0: 2, «p@: p#*p#, »q: 1}\n", "parameters: {«p#: p@, »q: 1}\n", "parameters: {p0: 1, «p@: p#, »q: 1}\n",
+    "count: 3=>count: $count", "{mass: 0.1 kg=>{count: 100, mass: 0.1 kg", "haptic: 1 ms=>haptic: 1e-200 s",
+    "haptic: 1 ms=>haptic: 1/999999999999 s", "haptic: 1 ms=>haptic: 7/11 ms", "haptic: 1 ms=>haptic: 0.0010000001 s",
+    "delay: 8 ms}=>delay: 1e9 s}", "delay: 8 ms}=>delay: 1e-99 s}", "delay: 8 ms}=>delay: 1/7 ms}", "«k: v\n»", "«k#: v\n»",
+    "count: 3=>count: 3, set: {device.mass: [«1 kg, »1 kg]}", "delay: 8 ms}=>delay: 8 ms, graph: {edges: [«[#, @], »]}}",
+    "hands: {‹h#: {type: ConstantForce, flange: device, force: 1 N}, ›}\n", "# ¿x‡\n", "«? »x\n", "x: |\n« line\n»",
+    "x: '«\n\n»'\n", "«!»\n", "x: !<«a»> 1\n", "«a:\n »", "\n&a [*a, *a]\n", "¿ ‡\n",
 )  # fmt: skip
-COUNTS = (
-    "0",
-    "-1",
-    "1",
-    "2",
-    "3",
-    "7",
-    "1e3",
-    "1e9",
-    "1000000",
-    "1000000000",
-    "1000000001",
-    "10000",
-    "3.0",
-    "three",
-    "1" * 500,
-)
-KEYS = (
-    "topology", "about", "library", "clocks", "parameters", "peers", "masses", "couplers", "links", "hands", "experiment", "studies",
-    "count", "set", "table", "type", "at", "shared", "a", "b", "object", "flange", "clock", "delay", "link", "stiffness", "damping", "mass",
-    "graph", "delays", "edges", "arcs", "period", "phase", "region", "x", "y", "v", "unit", "min", "max", "above", "default", "options",
-    "start", "size", "component", "connector", "extends", "connectors", "variables", "parts", "connect", "sends", "equations", "source",
-    "potentials", "flows", "<<", "device", "cube", "haptic", "user", "lan", "device.mass", "contact.stiffness", "duration", "seed",
-)  # fmt: skip
-NAMES = ("x", "v", "f", "a.x", "b.x", "a.f", "b.f", "flange.x", "flange.f", "object.x", "object.f", "mass", "damping", "stiffness", "delay",
-         "limit", "side", "others.x", "others.v", "others", "time", "peers", "device.x", "kt", "haptic", "held1", "q", "a", "b", "x[1]", "a.x[2]", "device.x[1]")  # fmt: skip
-UNITS = ("", "kg", "N", "N/m", "N*s/m", "s", "ms", "m", "m/s", "Hz", "1", "rad", "N/m^(3/2)", "kg*m/s^2", "furlong", "µm", "N//m", "N/m/", "^2", "m^0", "m^(1/3)")  # fmt: skip
-UNARY = ("der", "sample", "hold", "previous", "initial", "abs", "sign", "sqrt", *SMOOTH, "atan2", "age", "floor",
-         "mean", "sum", "max", "min", "count", "dot", "norm", "cross", "foo")  # fmt: skip
-LIKE = str.maketrans(
-    {"a": "а", "e": "е", "o": "о", "c": "с", "x": "х", "-": "−", ":": "：", "*": "∗", "/": "∕", " ": "\u00a0"}
-)
 
 
 def make_input(rng: random.Random, sort: str | None = None) -> Input:
     """Return one input, of a sort if one is given."""
     wanted = [one for one in SORTS if sort in (None, one[0])]
     sort, make, _ = rng.choices(wanted, weights=[weight for _, _, weight in wanted])[0]
-    files = make(rng)
-    files.setdefault("users.csv", TABLES["users.csv"].encode())
-    files.setdefault("push.csv", PUSH.encode())
+    files = {"users.csv": USERS.encode(), "push.csv": PUSH.encode()} | make(rng)
     return Input(sort, tuple(files.items()))
+
+
+def mutated(rng: random.Random, data: bytes) -> bytes:
+    """Return bytes changed at random.
+
+    A line, word, cell or byte is taken away, doubled, replaced by what nobody expects, marked, or made to look
+    like itself, once or more; rarely all of it is cut or in another encoding.
+    """
+    for _ in range(rng.randrange(1, 4)):
+        between = rng.choice([b"\n", b"\n", b" ", b",", b""])
+        pieces = data.split(between) if between else [data[at : at + 1] for at in range(len(data))]
+        at = rng.randrange(max(1, len(pieces)))
+        old = b"".join(pieces[at : at + 1])
+        new = _encoded(grown(rng, _RULES, rng.choice(_NEW), 2))
+        alike = _encoded(old.decode("utf-8", "replace").translate(_LIKE))
+        turned = bytes(one ^ (1 << rng.randrange(8)) for one in old[:1]) + old[1:]
+        marked = rng.choice(_MARKS) + old
+        pieces[at : at + 1] = rng.choice(
+            ([], [old, old], [new], [new], [marked], [alike], [old.lstrip()], [turned])
+        )
+        data = (rng.choice(_MARKS) if rng.random() < 0.03 else between).join(pieces)
+    if rng.random() < 0.05:
+        data = data.decode("utf-8", "replace").encode(rng.choice(["utf-16", "utf-32", "cp1252"]), "replace")
+    return data[: rng.randrange(len(data) + 1)] if rng.random() < 0.05 else data
 
 
 def _scene(rng: random.Random) -> str:
@@ -134,425 +125,135 @@ def _encoded(text: str) -> bytes:
     return text.encode("utf-8", "surrogatepass")
 
 
-# ---- bytes and text ----
+def _hostile(rng: random.Random) -> str:
+    return grown(rng, _RULES, rng.choice(["$hostile"] * 4 + ["$quantity"]))
 
 
-def _bytes(rng: random.Random) -> dict[str, bytes]:
-    data = bytearray(_encoded(_scene(rng)))
-    how = rng.randrange(8)
-    if how == 0:
-        data = bytearray(rng.randbytes(rng.randrange(400)))
-    elif how == 1:
-        data = bytearray(b"\xef\xbb\xbf" * rng.randrange(1, 3)) + data
-    elif how == 2:
-        data = bytearray(
-            bytes(data).decode().encode(rng.choice(["utf-16", "utf-32", "cp1252", "utf-16-le"]), "replace")
-        )
-    elif how == 3:
-        data = data[: rng.randrange(len(data))]
-    else:
-        for _ in range(rng.randrange(1, 6)):
-            where = rng.randrange(len(data))
-            if how == 4:
-                data[where] ^= 1 << rng.randrange(8)
-            elif how == 5:
-                data[where:where] = rng.randbytes(rng.randrange(1, 5))
-            elif how == 6:
-                del data[where : where + rng.randrange(1, 20)]
-            else:
-                data[where:where] = rng.choice([b"\0", b"\t", b"\r", b"\r\n", b"\x1b", b"\xff", b"\xc0\xaf", b"\xed\xa0\x80", b"\xe2\x80\xa8", b"\x85", b"\n...\n", b"\n---\n", b"%YAML 1.1\n"])  # fmt: skip
-    return {TOPOLOGY: bytes(data)}
+def _mutated(rng: random.Random, text: str) -> str:
+    return mutated(rng, _encoded(text)).decode("utf-8", "replace")
 
 
-def _lines(rng: random.Random) -> dict[str, bytes]:
-    return {TOPOLOGY: _encoded(_mangled(_scene(rng), rng))}
-
-
-def _mangled(text: str, rng: random.Random) -> str:
-    """Change a text by lines, words and characters."""
-    for _ in range(rng.randrange(1, 4)):
-        lines = text.splitlines() or [""]
-        at, other = rng.randrange(len(lines)), rng.randrange(len(lines))
-        how = rng.randrange(11)
-        if how == 0:
-            del lines[at]
-        elif how == 1:
-            lines.insert(other, lines[at])
-        elif how == 2:
-            lines[at], lines[other] = lines[other], lines[at]
-        elif how == 3:
-            lines[at] = rng.choice([" ", "\t", "   ", "- "]) + lines[at]
-        elif how == 4:
-            lines[at] = lines[at].lstrip()
-        elif how == 5:
-            lines[at] = lines[at].translate(LIKE)
-        elif how == 6:
-            return rng.choice(["\r\n", "\r", "\u2028", "\x85"]).join(lines)
-        elif how == 7 and lines[at]:
-            cut = rng.randrange(len(lines[at]))
-            lines[at] = (
-                lines[at][:cut]
-                + rng.choice("{}[],:#&*!|>'\"%@`^/+-=.()<\t")
-                + lines[at][cut + rng.randrange(2) :]
-            )
-        else:
-            words = re.split(r"([\w.]+)", lines[at])
-            if len(words) > 1:
-                words[2 * rng.randrange(len(words) // 2) + 1] = rng.choice(
-                    [_hostile(rng), rng.choice(KEYS), rng.choice(NAMES)]
-                )
-                lines[at] = "".join(words)
-        text = "\n".join(lines) + "\n"
-    return text
+def _bytes(rng: random.Random) -> Files:
+    return {
+        TOPOLOGY: rng.choice([rng.randbytes(rng.randrange(400)), *[mutated(rng, _encoded(_scene(rng)))] * 20])
+    }
 
 
 # ---- structure ----
 
 
-def _hostile(rng: random.Random) -> str:
-    return rng.choice(HOSTILE) if rng.random() < 0.8 else _quantity(rng)
+def any_value(rng: random.Random) -> Tree:
+    """Return what may be put in a place of a tree."""
+    text = grown(rng, _RULES, rng.choice(_NEW))
+    few = [_hostile(rng) for _ in range(rng.randrange(4))]
+    return rng.choice([few, Pairs([[text, one] for one in few]), [[text, *few]], text, text, text, text])
 
 
-def _quantity(rng: random.Random) -> str:
-    number = rng.choice(
-        ["0", "1", "-1", "0.5", "1e-9", "1e9", "1/3", "1e300", "5", "1000", "2.5e-3", ".5", "5."]
-    )
-    return f"{number} {rng.choice(UNITS)}".strip()
+def _once_changed(tree: Tree, rng: random.Random, donor: Tree) -> None:
+    changed(tree, rng, donor, value=lambda: any_value(rng), key=lambda: grown(rng, _RULES, rng.choice(_NEW)))
 
 
-class _Loader(yaml.BaseLoader):
-    """Everything a string, mappings as `Pairs`."""
-
-
-_Loader.add_constructor(
-    "tag:yaml.org,2002:map",
-    lambda loader, node: Pairs(
-        [
-            [loader.construct_object(k, deep=True), loader.construct_object(v, deep=True)]
-            for k, v in node.value
-        ]
-    ),
-)
-
-
-_trees: dict[str, Tree] = {}  # of the texts that come again and again
-
-
-def tree_of(text: str) -> Tree:
-    """Return a YAML text as a tree that can be changed."""
-    if text not in _trees:
-        _trees[text] = yaml.load(text, Loader=_Loader)
-    return _copied(_trees[text])
-
-
-def _spots(tree: Tree) -> list[tuple[Any, int]]:
-    """Return every (collection, index) of a tree."""
-    found: list[tuple[Any, int]] = []
-    open_: list[Tree] = [tree]
-    while open_:
-        node = open_.pop()
-        if isinstance(node, list):
-            for i, item in enumerate(node):
-                found.append((node, i))
-                open_.append(item[1] if isinstance(node, Pairs) else item)
-    return found
-
-
-def _value(rng: random.Random) -> Tree:
-    how = rng.randrange(12)
-    if how == 0:
-        return [_hostile(rng) for _ in range(rng.randrange(4))]
-    if how == 1:
-        return Pairs([[rng.choice(KEYS), _hostile(rng)] for _ in range(rng.randrange(4))])
-    if how == 2:
-        return rng.choice(COUNTS)
-    if how == 3:
-        return _expression(rng, 3)
-    if how == 4:
-        return rng.choice(NAMES)
-    if how == 5:
-        return [[_hostile(rng), rng.choice(COUNTS)], [rng.choice(COUNTS)]]
-    if how in (6, 7):
-        return _quantity(rng)
-    return _hostile(rng)
-
-
-def changed(tree: Tree, rng: random.Random, donor: Tree) -> None:
-    """Change a tree in place, once."""
-    spots = _spots(tree)
-    if not spots:
-        return
-    node, i = rng.choice(spots)
-    how = rng.randrange(9)
-    if how == 0:
-        del node[i]
-    elif how == 1:
-        node.insert(rng.randrange(len(node) + 1), _copied(node[i]))
-    elif how == 2:  # moved
-        to, _ = rng.choice(spots)
-        if isinstance(to, Pairs) == isinstance(node, Pairs):
-            to.append(_copied(node[i]))
-            if to is not node:
-                del node[i]
-    elif how == 3 and isinstance(node, Pairs):
-        node[i][0] = rng.choice(
-            [rng.choice(KEYS), _hostile(rng), str(node[i][0])[:-1], str(node[i][0]) + "s"]
-        )
-    elif how == 4 and isinstance(node, Pairs):
-        node.append([rng.choice(KEYS), _value(rng)])
-    elif how == 5:
-        other, j = rng.choice(_spots(donor))
-        if isinstance(other, Pairs) == isinstance(node, Pairs):
-            node[i] = _copied(other[j])
-    elif isinstance(node, Pairs):
-        node[i][1] = _value(rng)
-    else:
-        node[i] = _value(rng)
-
-
-def _copied(tree: Tree) -> Tree:
-    if isinstance(tree, Pairs):
-        return Pairs([[key, _copied(value)] for key, value in tree])
-    if isinstance(tree, list):
-        return [_copied(item) for item in tree]
-    return tree
-
-
-_PLAIN = re.compile(r"[\w./*+^()<=·µ-][\w ./*+^()<=·µ-]*\Z")
-
-
-def written(tree: Tree, rng: random.Random | None = None) -> str:
-    """Return a tree as YAML in one line a top key, scalars plain where YAML allows, and sometimes where not."""
-    if isinstance(tree, Pairs):
-        return "\n".join(f"{_flow(key, rng)}: {_flow(value, rng)}" for key, value in tree) + "\n"
-    return _flow(tree, rng) + "\n"
-
-
-def _flow(tree: Tree, rng: random.Random | None) -> str:
-    if isinstance(tree, Pairs):
-        return "{" + ", ".join(f"{_flow(key, rng)}: {_flow(value, rng)}" for key, value in tree) + "}"
-    if isinstance(tree, list):
-        return "[" + ", ".join(_flow(item, rng) for item in tree) + "]"
-    text = str(tree)
-    plain = _PLAIN.match(text) and text == text.strip()
-    if plain or (rng is not None and rng.random() < 0.05):
-        return text
-    return json.dumps(text, ensure_ascii=False)
-
-
-def _structure(rng: random.Random) -> dict[str, bytes]:
-    tree, donor = tree_of(_scene(rng)), tree_of(_scene(rng))
+def _structure(rng: random.Random) -> Files:
+    tree, donor = of_yaml(_scene(rng)), of_yaml(_scene(rng))
     for _ in range(rng.choice([1, 1, 1, 2, 3, 6])):
-        changed(tree, rng, donor)
-    return {TOPOLOGY: _encoded(written(tree, rng))}
+        _once_changed(tree, rng, donor)
+    return {TOPOLOGY: _encoded(as_yaml(tree, rng))}
 
 
 # ---- expressions and units ----
 
 
-def _expression(rng: random.Random, depth: int) -> str:
-    how = rng.randrange(10) if depth else rng.randrange(3)
-    if how == 0:
-        return rng.choice(["0", "1", "2", "0.5", "1e-3", "1e300", "3/2"])
-    if how in (1, 2):
-        return rng.choice(NAMES)
-    inner = _expression(rng, depth - 1)
-    if how == 3:
-        return f"-{inner}"
-    if how == 4:
-        return f"({inner})^{rng.choice(['2', '-1', '0', '(1/2)', '1.5', '100', '101', 'x'])}"
-    if how == 5:
-        more = f", {_expression(rng, depth - 1)}" if rng.random() < 0.3 else ""
-        return f"{rng.choice(UNARY)}({inner}{more})"
-    if how == 6:
-        other = _expression(rng, depth - 1)
-        test = rng.choice(["<", "<=", ">", ">=", "==", "!=", "and", "or"])
-        return f"if {inner} {test} {other} then {_expression(rng, depth - 1)} else {other}"
-    if how == 7:
-        return f"{{{inner}, {_expression(rng, depth - 1)}}}"
-    return f"{inner} {rng.choice('+-*/')} {_expression(rng, depth - 1)}"
-
-
-def _own_expression(rng: random.Random, depth: int = 2) -> str:
-    """Return an expression over the number q that has no unit."""
-    if not depth or rng.random() < 0.2:
-        return rng.choice(["q", "peers", "2", "0", "1/3", "1e-3", "1e30"])
-    one, two = _own_expression(rng, depth - 1), _own_expression(rng, depth - 1)
-    call = f"{rng.choice(['abs', 'sqrt', 'exp', 'log', 'tanh', 'floor', 'sign', 'cos'])}({one})"
-    choice = f"(if {one} {rng.choice(['<', '>=', '==', '!='])} {two} then {one} else {two})"
-    return rng.choice([f"({one} {rng.choice('+-*/')} {two})", call, choice, f"({one})^{rng.choice(['2', '3', '-1', '(1/2)', '100'])}", f"max({one}, {two})"])  # fmt: skip
-
-
-def _scrambled(text: str, rng: random.Random) -> str:
-    for _ in range(rng.randrange(3)):
-        at = rng.randrange(len(text) + 1)
-        text = text[:at] + rng.choice(["(", ")", "*", "^", "/", "=", ",", ".", " ", "..", "[1]", "__", "é", "'", "if ", "then", "1e", "9" * 30, ":"]) + text[at + rng.randrange(3) :]  # fmt: skip
-    return text
-
-
-def _numbers(rng: random.Random) -> dict[str, bytes]:
+def _numbers(rng: random.Random) -> Files:
     """Put expressions, quantities and units where a topology has numbers."""
-    tree = tree_of(_scene(rng))
-    numbers = [
-        (node, i)
-        for node, i in _spots(tree)
-        if isinstance(node, Pairs) and isinstance(node[i][1], str) and re.match(r"-?[\d.]", node[i][1])
-    ]
+    tree = of_yaml(_scene(rng))
+    numbers = [pair for pair in _pairs_of(tree) if isinstance(pair[1], str) and re.match(r"-?[\d.]", pair[1])]
     tree[:] = [pair for pair in tree if pair[0] != "parameters"]
     named = [["kt", "2000 N/m"], ["tick", "1 ms"], ["q", "3"]]
     if rng.random() < 0.3:
-        named.append([rng.choice(NAMES), rng.choice([_quantity, _own_expression])(rng)])
+        named.append([grown(rng, _RULES, "$name"), grown(rng, _RULES, rng.choice(["$quantity", "$own"]))])
     tree.append(["parameters", Pairs(named)])
     for _ in range(rng.choice([1, 1, 2, 4])):
-        node, i = rng.choice(numbers)
-        if rng.random() < 0.3:  # what fits in its unit
-            made = f"{node[i][1].split(' ')[0]}*{_own_expression(rng)}*1"
-            unit = node[i][1].partition(" ")[2]
-            made = {"N/m": f"kt*{_own_expression(rng)}", "ms": f"tick*{_own_expression(rng)}"}.get(unit, made)
-        else:
-            made = rng.choice([_quantity, lambda r: _expression(r, 3), _own_expression, _hostile])(rng)
-        node[i][1] = _scrambled(made, rng) if rng.random() < 0.5 else made
-    return {TOPOLOGY: _encoded(written(tree))}
+        pair = rng.choice(numbers)
+        number, _, unit = pair[1].partition(" ")
+        fits = {"N/m": "kt*$own", "ms": "tick*$own"}.get(unit, f"{number}*$own*1")
+        made = grown(rng, _RULES, rng.choice(["$quantity", "$e", "$own", "$hostile", fits, fits]))
+        pair[1] = _mutated(rng, made) if rng.random() < 0.5 else made
+    return {TOPOLOGY: _encoded(as_yaml(tree))}
+
+
+def _pairs_of(tree: Tree) -> list[list[Tree]]:
+    return [node[at] for node, at in spots(tree) if isinstance(node, Pairs)]
 
 
 # ---- components ----
 
 
-def _component(rng: random.Random) -> dict[str, bytes]:
+def _component(rng: random.Random) -> Files:
     """Shadow a component of the library by a changed one of the same name, in a folder of the scene's own."""
-    scene = tree_of(_scene(rng))
+    scene = of_yaml(_scene(rng))
     shown = str(scene)
-    used = [text for name, text in TITLES.items() if name in shown]
-    text = rng.choice(used or list(COMPONENTS.values()))
-    if rng.random() < 0.3:
-        text = _mangled(text, rng)
-    else:
-        tree, donor = tree_of(text), tree_of(rng.choice(list(COMPONENTS.values())))
-        for _ in range(rng.choice([1, 1, 2, 4])):
-            if rng.random() < 0.5:
-                _change_equation(tree, rng)
-            else:
-                changed(tree, rng, donor)
-        text = written(tree)
-    scene.append(
-        ["library", rng.choice(["./parts", "parts", ["parts"], "."] if rng.random() < 0.05 else ["parts"])]
-    )
-    return {TOPOLOGY: _encoded(written(scene)), "parts/own.yaml": _encoded(text)}
+    used = [text for text in COMPONENTS if text.partition("component: ")[2].split()[0] in shown]
+    text = rng.choice(used or COMPONENTS)
+    tree, donor = of_yaml(text), of_yaml(rng.choice(COMPONENTS))
+    for _ in range(rng.choice([1, 1, 2, 4])):
+        rng.choice([_change_equation, _once_changed])(tree, rng, donor)
+    part = mutated(rng, _encoded(text)) if rng.random() < 0.3 else _encoded(as_yaml(tree))
+    scene.append(["library", rng.choice(["parts"] * 40 + ["./parts", ["parts"], "."])])
+    return {TOPOLOGY: _encoded(as_yaml(scene)), "parts/own.yaml": part}
 
 
-def _change_equation(tree: Tree, rng: random.Random) -> None:
+def _change_equation(tree: Tree, rng: random.Random, donor: Tree) -> None:
     """Replace an equation, or a name or number in one."""
     for key, value in tree:
         if key == "equations" and value and type(value) is list:
-            i = rng.randrange(len(value))
-            how = rng.randrange(5)
-            if how == 0:
-                value[i] = f"{_expression(rng, 2)} = {_expression(rng, 3)}"
-            elif how == 1:
-                value.append(f"{rng.choice(NAMES)} = {_expression(rng, 3)}")
-            elif how == 2:
-                value[i] = _scrambled(str(value[i]), rng)
-            else:
-                words = re.split(r"([\w.]+)", str(value[i]))
-                if len(words) > 1:
-                    words[2 * rng.randrange(len(words) // 2) + 1] = rng.choice(
-                        [rng.choice(NAMES), _expression(rng, 1), _expression(rng, 2)]
-                    )
-                    value[i] = "".join(words)
+            at = rng.randrange(len(value))
+            new = grown(rng, _RULES, rng.choice(["$e = $e", "$name = $e"]))
+            other = _mutated(rng, str(value[at]))
+            value[at] = rng.choice([new, other])
 
 
 # ---- tables ----
 
 
-def _table(rng: random.Random) -> dict[str, bytes]:
+def _table(rng: random.Random) -> Files:
     """Change a table, or what names it."""
-    name = rng.choice(["users.csv", "push.csv", "edges.csv"])
-    if name == "users.csv":
-        text, scene = TABLES[name], SCENES["users-table"]
-    elif name == "push.csv":
-        text = PUSH
-        scene = (
-            SCENES["three-users-average"]
-            + "hands:\n  hand: {type: TableForce, flange: device, force: push.csv}\n"
+    scene, name, text = rng.choice(
+        (
+            (SCENES["users-table"], "users.csv", USERS),
+            (
+                f"{SCENES['three-users-average']}hands: {{h: {{type: TableForce, flange: device, force: push.csv}}}}\n",
+                "push.csv",
+                PUSH,
+            ),
+            (
+                SCENES["three-users-average"].replace("8 ms}", "8 ms, graph: {arcs: edges.csv}}"),
+                "edges.csv",
+                "from,to,weight\n1,2,1\n2,3,0.5\n3,1,2\n",
+            ),
         )
-    else:
-        text = "from,to,weight\n1,2,1\n2,3,0.5\n3,1,2\n"
-        scene = SCENES["three-users-average"].replace(
-            "delay: 8 ms}\n", "delay: 8 ms, graph: {arcs: edges.csv}}\n"
-        )
-    for _ in range(rng.choice([1, 1, 2, 5])):
-        cells = [line.split(",") for line in text.splitlines()] or [[""]]
-        row = rng.randrange(len(cells))
-        how = rng.randrange(8)
-        if how == 0:
-            del cells[row]
-        elif how == 1:
-            cells[row].append(_hostile(rng))
-        elif how == 2 and cells[row]:
-            cells[row].pop()
-        elif how == 3:
-            cells.insert(row, list(cells[rng.randrange(len(cells))]))
-        elif how == 4:
-            text = rng.choice(["\r\n", "\r", "\n\n", ";\n", "\x00\n"]).join(",".join(line) for line in cells)
-            continue
-        elif cells[row]:
-            made = rng.choice([_hostile(rng), rng.choice(COUNTS), f"{rng.choice(KEYS)} [{rng.choice(UNITS)}]", f"{rng.choice(NAMES)}[", '"', '"1', "1\n2"])  # fmt: skip
-            cells[row][rng.randrange(len(cells[row]))] = made
-        text = "\n".join(",".join(line) for line in cells) + "\n"
-    return {
-        TOPOLOGY: _encoded(scene),
-        name: _encoded(text) + (rng.randbytes(3) if rng.random() < 0.03 else b""),
-    }
+    )
+    return {TOPOLOGY: _encoded(scene), name: mutated(rng, _encoded(text))}
 
 
-# ---- blow-ups ----
-
-
-def _bomb(rng: random.Random) -> dict[str, bytes]:
+def _bomb(rng: random.Random) -> Files:
     """Ask for too much: of memory, depth, length or number."""
     scene = _scene(rng)
-    n = rng.choice([10, 100, 1000, 10000])
-    if n == 10000 and rng.random() < 0.8:
-        n = 300
+    count = rng.choice([10, 100, 300, 1000] * 5 + [10_000])
     large = rng.choice([1 << 16, 1 << 20, 10 << 20]) if rng.random() < 0.15 else 1 << 12
-    texts: list[Callable[[], str]] = [
-        lambda: scene + "".join(f"x{i}: &x{i} [{', '.join([f'*x{i - 1}'] * 9) if i else 1}]\n" for i in range(12)),
-        lambda: scene + "x: " + "[" * n + "]" * n + "\n",
-        lambda: scene + "x: " + "{a: " * n + "1" + "}" * n + "\n",
-        lambda: scene + "\n".join(" " * i + "a:" for i in range(min(n, 1000))) + "\n",
-        lambda: scene + "- " * n + "1\n",
-        lambda: scene + "about2: " + "x" * large + "\n",
-        lambda: scene.replace("0.1 kg", "1" * large + " kg", 1),
-        lambda: scene.replace("0.1 kg", "(" * n + "1 kg" + ")" * n, 1),
-        lambda: scene.replace("0.1 kg", '"' + "1+" * n + '1"', 1),
-        lambda: scene.replace("0.1 kg", "1 " + "m*" * n + "kg", 1),
-        lambda: scene + "parameters: {" + ", ".join(f"p{i}: {f'p{i - 1}*p{i - 1}' if i else 2}" for i in range(min(n, 300))) + "}\n",
-        lambda: scene + "parameters: {" + ", ".join(f"p{i}: p{i + 1}" for i in range(n)) + "}\n",
-        lambda: scene + "parameters: {" + ", ".join(f"p{i}: p{i + 1}" for i in range(n)) + f", p{n}: 1}}\n",
-        lambda: scene.replace("count: 3", "count: " + rng.choice(COUNTS)),
-        lambda: scene.replace("{mass: 0.1 kg", f"{{count: {min(n, 100)}, mass: 0.1 kg", 1),
-        lambda: scene.replace("haptic: 1 ms", "haptic: " + rng.choice(["1e-200 s", "1/999999999999 s", "1e200 s", "7/11 ms", "0.0010000001 s"])),
-        lambda: scene.replace("delay: 8 ms}", "delay: " + rng.choice(["1e9 s", "1e-99 s", "1e300 s", "0 s", "1/7 ms"]) + "}"),
-        lambda: scene + "k: v\n" * n,
-        lambda: scene + "\n".join(f"k{i}: v" for i in range(n)) + "\n",
-        lambda: scene.replace("count: 3", "count: 3, set: {device.mass: [" + ", ".join(["1 kg"] * n) + "]}"),
-        lambda: scene.replace("delay: 8 ms}", "delay: 8 ms, graph: {edges: [" + ", ".join(f"[{i}, {i + 1}]" for i in range(n)) + "]}}"),
-        lambda: scene + "hands: {" + ", ".join(f"h{i}: {{type: ConstantForce, flange: device, force: 1 N}}" for i in range(min(n, 100))) + "}\n",
-        lambda: "&a [*a, *a]\n",
-        lambda: "# " + "x" * large + "\n" + scene,
-        lambda: scene + " " * large + "\n",
-        lambda: scene + "? " * min(n, 1000) + "x\n",
-        lambda: scene + "x: |\n" + " line\n" * n,
-        lambda: scene + "x: '" + "\n\n" * n + "'\n",
-        lambda: scene + "!" * n + "\n",
-        lambda: scene + "x: !<" + "a" * n + "> 1\n",
-    ]  # fmt: skip
-    return {TOPOLOGY: _encoded(rng.choice(texts)())}
+    old, replaces, new = rng.choice(BOMBS).partition("=>")
+
+    def many(match: re.Match[str]) -> str:
+        text, times = match[0][1:-1], {"«": count, "‹": min(count, 100), "¿": large}[match[0][0]]
+        if not set(text) & set("#@"):
+            return text * times
+        return "".join(text.replace("#", str(at)).replace("@", str(at + 1)) for at in range(times))
+
+    made = re.sub("(?s)«.*?»|‹.*?›|¿.*?‡", many, grown(rng, _RULES, new if replaces else old))
+    return {TOPOLOGY: _encoded(scene.replace(old, made, 1) if replaces else scene + made)}
 
 
-SORTS: tuple[tuple[str, Callable[[random.Random], dict[str, bytes]], int], ...] = (
-    ("bytes", _bytes, 12),
-    ("lines", _lines, 14),
+SORTS: tuple[tuple[str, Callable[[random.Random], Files], int], ...] = (
+    ("bytes", _bytes, 26),
     ("structure", _structure, 26),
     ("numbers", _numbers, 18),
     ("component", _component, 20),

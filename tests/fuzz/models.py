@@ -1,36 +1,47 @@
-# ruff: noqa: E501 -- lists of hostile values, and models in text, read best as they are
-"""Forged compiled models: files that say of themselves that they are whole, with anything inside.
+# ruff: noqa: E501 -- scenes, and lists of hostile values, read best as they are
+"""Damaged and forged files: compiled models, what `apc play` recorded of a peer, parts of a sweep.
 
-Takes: a seed. Gives: `forge`, a file's bytes and what sort of forgery they are; `bases`, `packed`, `zipped`; `ask`.
-Guarantees: of equal seed comes equal input; every digest is that of what it stands for, as whoever forges a file
-makes it.
+Takes: a seed. Gives: `FORGERIES`; `zipped`, `packed`, `recorded`.
+Guarantees: of equal seed comes equal input, but for what a clock says in a recording; every digest of a model
+is that of what it stands for, as whoever forges a file makes it.
 Does not: watch over what it runs (see `running`).
 """
 
 from __future__ import annotations
 
-import copy
 import functools
 import hashlib
 import io
 import json
 import random
+import socket
 import tempfile
+import threading
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from apc.api import analyze, critical, simulate
+import numpy as np
+
+import apc
 from apc.compiler import store
 from apc.compiler.cache import MEMBER
-from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
+from apc.loop.beside import compare_run
+from apc.loop.peer import Loop
+from apc.loop.reading import read_run
+from apc.loop.run import run_of, write_run
+from apc.processes import digest_of
+from apc.sweeps.store import open_parts
+from tests.fuzz.inputs import MODELS, Input, any_value, mutated
+from tests.fuzz.trees import Pairs, Tree, as_json, changed, of_json
+from tests.topologies import AVERAGE, replaced
 
 FILE = "scene.apc"
-_MODELS = Path(__file__).resolve().parents[2] / "models" / "scenes"
 _PART = """\
 component: Cubic
 about: A spring that hardens, given the wrong way round.
@@ -66,107 +77,12 @@ links: {lan: {graph: {edges: [[1, 2], [2, 3], [3, 1]]}, clock: network, delay: 8
 hands: {hand: {type: ConstantForce, flange: device, force: 1 N, at: [one]}}
 experiment: {duration: 20 ms}
 """
-_HOSTILE: tuple[Any, ...] = (
-    *(
-        None,
-        True,
-        False,
-        0,
-        1,
-        -1,
-        2,
-        7,
-        255,
-        10**6,
-        2**31,
-        2**63,
-        10**18,
-        -(10**18),
-        10**400,
-        1.5,
-        -0.0,
-        1e308,
-    ),
-    *(
-        1e-308,
-        float("inf"),
-        float("-inf"),
-        float("nan"),
-        "",
-        "0",
-        "1/0",
-        "1/3",
-        "-1",
-        "1e9",
-        "1e999999999",
-        "9" * 5000,
-    ),
-    *(
-        "nan",
-        "x",
-        "x" * 10_000,
-        "lan",
-        "kt",
-        "device.x",
-        "derivative",
-        "id > PWNED",
-        "\x1b[31m",
-        "\ud800",
-        "0/0",
-    ),
-    *(
-        "9^9^9^9",
-        "__import__('os').system('touch PWNED')",
-        "../../x",
-        "a; b",
-        '"',
-        "shell",
-        "jit",
-        "add",
-        "pow",
-    ),
-    *([], {}, [[]], [0], [[0, 0]], ["add", 0, 0], {"member": "array0", "shape": [10**9, 10**9]}, [None] * 50),
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Forged:
-    """A file's bytes, and in a word what sort of forgery it is."""
-
-    sort: str
-    content: bytes
-
-
-@functools.cache
-def bases() -> tuple[tuple[dict[str, Any], dict[str, bytes]], ...]:
-    """Return whole models to start from: the document and the arrays of each."""
-    found = []
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "parts").mkdir()
-        (folder / "parts" / "cubic.yaml").write_text(_PART, encoding="utf-8")
-        for text in (_LOOP, _EDGES):
-            (folder / "scene.yaml").write_text(text, encoding="utf-8")
-            found.append(_parts_of(compile_topology(folder / "scene.yaml"), folder))
-        scenes = ("three-users-average", "users-table", "finger", "mixed-clocks", "experiment-mesh")
-        found += [_parts_of(compile_topology(_MODELS / f"{scene}.yaml"), folder) for scene in scenes]
-    return tuple(found)
-
-
-def _parts_of(system: CompiledSystem, folder: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
-    path = folder / FILE
-    store.save(system, path)
-    with zipfile.ZipFile(path) as archive:
-        document = json.loads(archive.read(MEMBER))
-        return document, {member: archive.read(member) for member in document["members"]}
-
-
-def packed(document: Any, members: dict[str, bytes], *, kind: int = zipfile.ZIP_DEFLATED) -> bytes:
-    """Return the file of a document and its arrays, with the digests that they have."""
-    if isinstance(document, dict) and isinstance(document.get("members"), dict):
-        digests = {name: hashlib.sha256(content).hexdigest() for name, content in members.items()}
-        document = {**document, "members": digests}
-    return zipped({MEMBER: json.dumps(document).encode(), **members}, kind=kind)
+RUN, PEER = "a.run", "a.run/user-1.npz"
+TARGET, SWEEP = Path("r.csv"), {"model": "abc"}
+_CELLS = (np.array(["stable", "unstable"] * 20, dtype=object), np.linspace(0.0, 1.0, 40))
+_NUMBERS = (None, True, False, 0, 1, -1, 2, 255, 2**31, 2**53, 2**62, 2**63 - 1, -(2**63), 10**400, -0.0, 0.5, 1e300, -1e300, 1e-300)  # fmt: skip
+_FLOATS = (0.0, -1.0, -0.0, 1e-300, 1e300, -1e300, float("nan"), float("inf"), float("-inf"))
+_SORTS = ("bytes", "document", "document", "document", "array", "array", "members")
 
 
 def zipped(members: dict[str, bytes], *, kind: int = zipfile.ZIP_DEFLATED) -> bytes:
@@ -178,128 +94,135 @@ def zipped(members: dict[str, bytes], *, kind: int = zipfile.ZIP_DEFLATED) -> by
     return buffer.getvalue()
 
 
-def forge(seed: str) -> Forged:
-    """Return a forged file."""
-    chance = random.Random(seed)
-    document, members = copy.deepcopy(chance.choice(bases()))
-    sort = chance.choice(
-        ("value", "value", "value", "move", "number", "function", "function", "array", "bytes")
-    )
-    for _ in range(chance.choice((1, 1, 1, 2, 5))):
-        try:
-            _SORTS[sort](chance, document, members)
-        except (IndexError, KeyError, TypeError):
-            break  # what it changes is gone already
-    content = packed(document, members, kind=chance.choice((zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED)))
+def _unzipped(content: bytes) -> dict[str, bytes]:
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def packed(document: Any, members: dict[str, bytes], *, kind: int = zipfile.ZIP_DEFLATED) -> bytes:
+    """Return the file of a compiled model: its document and its arrays, with the digests that they have."""
+    return zipped(_digested({MEMBER: json.dumps(document).encode(), **members}), kind=kind)
+
+
+def _digested(members: dict[str, bytes]) -> dict[str, bytes]:
+    """Return the members of a model, the digests in its document those of the others."""
+    tree = of_json(members[MEMBER])
+    others = {name: content for name, content in members.items() if name != MEMBER}
+    for pair in tree if isinstance(tree, Pairs) else ():
+        if pair[0] == "members" and isinstance(pair[1], Pairs):
+            pair[1] = Pairs([[name, hashlib.sha256(one).hexdigest()] for name, one in others.items()])
+    return {MEMBER: as_json(tree).encode(), **others}
+
+
+def array(value: Any) -> bytes:
+    """Return an array as a member of a file."""
+    file = io.BytesIO()
+    np.save(file, value)
+    return file.getvalue()
+
+
+# ---- forging ----
+
+
+def _forged(
+    rng: random.Random, content: bytes, donor: bytes, *, name: str, digested: bool
+) -> tuple[str, bytes]:
+    """Return what sort of forgery it is, and a forged archive.
+
+    Parameters
+    ----------
+    rng
+        The luck of it.
+    content, donor
+        An archive, and one from whose document a part may come.
+    name
+        Of the member that holds a document: JSON, or an array of its bytes.
+    digested
+        Whether the document holds the others' digests, which are made to fit.
+    """
+    sort = rng.choice(_SORTS)
     if sort == "bytes":
-        data = bytearray(content)
-        for _ in range(chance.randint(1, 4)):
-            data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
-        content = bytes(data)
-    return Forged(sort, content)
+        return sort, mutated(rng, content)
+    members = _unzipped(content)
+    for _ in range(rng.choice((1, 1, 1, 2, 5))):
+        try:
+            _change(rng, sort, members, _document(_unzipped(donor)[name]), name)
+        except (IndexError, KeyError, ValueError):
+            break  # what it changes is gone already, or damaged
+    members = _digested(members) if digested else members
+    return sort, zipped(members, kind=rng.choice((zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED)))
 
 
-def _places(value: Any, wanted: Callable[[Any], bool] = lambda one: True) -> list[tuple[Any, Any]]:
-    """Return every place in a document whose value is wanted, as (what holds it, where in that)."""
-    found = []
-    waiting = [value]
-    while waiting:
-        holder = waiting.pop()
-        for key in range(len(holder)) if isinstance(holder, list) else list(holder):
-            if wanted(holder[key]):
-                found.append((holder, key))
-            if isinstance(holder[key], dict | list):
-                waiting.append(holder[key])
-    return found
+def _change(rng: random.Random, sort: str, members: dict[str, bytes], donor: Tree, name: str) -> None:
+    """Change the document in the member of a name, or another member, once."""
+    if sort == "document":
+        tree = _document(members[name])
+        changed(tree, rng, donor, value=lambda: _value(rng), key=lambda: "x")
+        text = as_json(tree).encode()
+        members[name] = array(np.frombuffer(text, np.uint8)) if name.endswith(".npy") else text
+        return
+    one = rng.choice(sorted(members.keys() - {name}))
+    if sort == "array":
+        members[one] = _changed_array(rng, members[one])
+        return
+    new = rng.choice((one, "x.npy", "../x.npy", "packets9.npy", "time", "told.npy.npy"))
+    made = members.pop(one)
+    members[new] = rng.choice((b"", b"\x93NUMPY", rng.randbytes(200), made, members[name]))
 
 
-def _value(chance: random.Random, document: Any, members: dict[str, bytes]) -> None:
-    """Put something else in a place, or take the place away, or have it twice."""
-    holder, key = chance.choice(_places(document))
-    match chance.randrange(6):
-        case 0 if isinstance(holder, dict):
-            del holder[key]
-        case 1 if isinstance(holder, list):
-            holder.insert(key, copy.deepcopy(holder[key]))
-        case 2 if isinstance(holder, list):
-            del holder[key]
-        case _:
-            holder[key] = copy.deepcopy(chance.choice(_HOSTILE))
+def _document(content: bytes) -> Tree:
+    is_array = content.startswith(b"\x93NUMPY")
+    return of_json(np.load(io.BytesIO(content)).tobytes() if is_array else content)
 
 
-def _move(chance: random.Random, document: Any, members: dict[str, bytes]) -> None:
-    """Put what stands in one place in another, of the same type."""
-    source, key = chance.choice(_places(document))
-    target, there = chance.choice(_places(document, lambda one: type(one) is type(source[key])))
-    target[there] = copy.deepcopy(source[key])
+def _value(rng: random.Random) -> Tree:
+    numbers = rng.choice((*_NUMBERS, *_FLOATS))
+    huge = Pairs([["member", "array0"], ["shape", [10**9, 10**9]]])
+    return rng.choice((numbers, numbers, any_value(rng), huge))
 
 
-def _number(chance: random.Random, document: Any, members: dict[str, bytes]) -> None:
-    """Change a number a little, or a lot."""
-    holder, key = chance.choice(_places(document, lambda one: type(one) in (int, float)))
-    holder[key] = chance.choice(
-        (holder[key] + 1, holder[key] - 1, -holder[key], holder[key] * 1000, 0, 10**9, 1e-300, 1e300)
-    )
+def _changed_array(rng: random.Random, content: bytes) -> bytes:
+    """Return an array with another number, another shape or another head; of what is none, other bytes."""
+    if not content.startswith(b"\x93NUMPY") or rng.random() < 0.2:
+        return rng.choice((content[: len(content) // 2], content + rng.randbytes(16), mutated(rng, content)))
+    value = np.load(io.BytesIO(content)).copy()
+    if value.dtype.kind == "U" or not value.size or rng.random() < 0.3:
+        others = (value.ravel()[:-1], value[None], value.T.copy(), value != 0)
+        return array(rng.choice((*others, np.zeros(()), np.array(["x"]), np.zeros((10**6, 5)))))
+    numbers = _FLOATS if value.dtype.kind == "f" else (0, 1, -1, -2, 2**31, 2**53, 2**63 - 1)
+    with np.errstate(all="ignore"):
+        value.flat[rng.choice((0, value.size - 1, rng.randrange(value.size)))] = np.array(
+            rng.choice(numbers)
+        ).astype(value.dtype)
+    return array(value)
 
 
-def _function(chance: random.Random, document: Any, members: dict[str, bytes]) -> None:
-    """Change an operation, a result, a constant or a size of a function."""
-    holder, key = chance.choice(_places(document, lambda one: isinstance(one, dict) and "operations" in one))
-    part = chance.choice(
-        [one for one in ("operations", "results", "constants", "inputs") if holder[key][one]]
-    )
-    inside, place = chance.choice(_places(holder[key][part]))
-    words = (
-        "add",
-        "mul",
-        "div",
-        "pow",
-        "constpow",
-        "if_else_zero",
-        "sq",
-        "call",
-        "external",
-        "lt",
-        "exp",
-        "not",
-    )
-    kinds = {str: words, int: (0, 1, 5, 40, 10**9, -1), float: (0.0, -1.0, 1e300, float("nan"), float("inf"))}
-    inside[place] = chance.choice(kinds.get(type(inside[place]), _HOSTILE))
+# ---- compiled models ----
 
 
-def _array(chance: random.Random, document: Any, members: dict[str, bytes]) -> None:
-    """Change an array's bytes, or its shape."""
-    shapes = _places(document["system"], lambda one: isinstance(one, dict) and "member" in one)
-    if not shapes:
-        return _value(chance, document, members)
-    holder, key = chance.choice(shapes)
-    name = holder[key]["member"]
-    match chance.randrange(4):
-        case 0:
-            holder[key]["shape"] = chance.choice(
-                ([10**9, 10**9], [0], [], [1], [2**40], [-1], [1, 1, 1], [True], ["1"], 3)
-            )
-        case 1:
-            members[name] = members[name][: chance.randrange(1 + len(members[name]))]
-        case 2:
-            members[name] += chance.randbytes(8 * chance.randint(1, 4))
-        case _:
-            members[name] = chance.randbytes(len(members[name]))
-    return None
+@functools.cache
+def bases() -> tuple[bytes, ...]:
+    """Return whole models to start from."""
+    files = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "parts").mkdir()
+        (folder / "parts" / "cubic.yaml").write_text(_PART, encoding="utf-8")
+        scenes = ("three-users-average", "users-table", "finger", "mixed-clocks", "experiment-mesh")
+        paths = [MODELS / "scenes" / f"{scene}.yaml" for scene in scenes]
+        for place, text in enumerate((_LOOP, _EDGES)):
+            paths.append(folder / f"scene{place}.yaml")
+            paths[-1].write_text(text, encoding="utf-8")
+        for path in paths:
+            store.save(compile_topology(path), folder / FILE)
+            files.append((folder / FILE).read_bytes())
+    return tuple(files)
 
 
-def _nothing(chance: random.Random, document: Any, members: dict[str, bytes]) -> None:
-    """Leave the document as it is: the bytes of the file are changed."""
-
-
-_SORTS: dict[str, Callable[[random.Random, Any, dict[str, bytes]], None]] = {
-    "value": _value,
-    "move": _move,
-    "number": _number,
-    "function": _function,
-    "array": _array,
-    "bytes": _nothing,
-}
+def _forge_model(seed: str) -> Input:
+    rng = random.Random(seed)
+    sort, content = _forged(rng, rng.choice(bases()), rng.choice(bases()), name=MEMBER, digested=True)
+    return Input(sort, ((FILE, content),))
 
 
 def ask(path: Path, *, everything: bool = False) -> str:
@@ -315,14 +238,119 @@ def ask(path: Path, *, everything: bool = False) -> str:
         return "refused"
     first = system.parameters[0].name if system.parameters else "device.mass"
     questions: list[Callable[[], object]] = [
-        lambda: analyze(system),
-        lambda: simulate(system, duration="20 ms", jit=False),
+        lambda: apc.analyze(system),
+        lambda: apc.simulate(system, duration="20 ms", jit=False),
     ]
     if everything or path.stat().st_size % 8 == 0:
-        questions.append(lambda: critical(system, first, criterion="nominal"))
+        questions.append(lambda: apc.critical(system, first, criterion="nominal"))
     for question in questions:
         try:
             question()
         except ApcError:  # it is told
             continue
     return "answered"
+
+
+# ---- recordings and parts of sweeps ----
+
+
+@functools.cache
+def recorded() -> dict[str, bytes]:
+    """Return the files of a run of two peers, played here for some milliseconds."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        moving = replaced(AVERAGE, ("{count: 3}", "{count: 2, set: {device.x: 3 mm}}"))
+        (folder / "scene.yaml").write_text(moving, encoding="utf-8")
+        system = compile_topology(folder / "scene.yaml")
+        names = ("user[1]", "user[2]")
+        sockets = {peer: socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for peer in names}
+        for one in sockets.values():
+            one.bind(("127.0.0.1", 0))
+        loops = [
+            Loop(system, peer, sockets[peer], others, digest=digest_of(system), duration=Fraction(1, 20))
+            for peer in names
+            for others in [{one: to.getsockname() for one, to in sockets.items() if one != peer}]
+        ]
+        threads = [threading.Thread(target=lambda one=one: (one.meet(60), one.run())) for one in loops]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        write_run(folder / RUN, system, [run_of(loop, digest_of(system), ()) for loop in loops])
+        return {path.name: path.read_bytes() for path in sorted((folder / RUN).iterdir())}
+
+
+def _forge_recording(seed: str) -> Input:
+    """Return the files of a run, one of its peers forged; of no seed, those that nobody changed."""
+    files = {f"{RUN}/{name}": content for name, content in recorded().items()}
+    sort = ""
+    if seed:
+        peer = files[PEER]
+        sort, files[PEER] = _forged(random.Random(seed), peer, peer, name="told.npy", digested=False)
+    return Input(sort, tuple(files.items()))
+
+
+def _ask_recording() -> str:
+    """Read the run in this folder and lay it beside its scene, unless it is refused."""
+    try:
+        run = read_run(Path(RUN))
+    except ApcError as error:
+        assert {one.code for one in error.mistakes} == {"E973"}, str(error)
+        return "refused"
+    try:
+        compared = compare_run(run)
+    except ApcError:  # a delay of years, say, which nothing is computed with
+        return "refused"
+    assert str(compared)
+    assert json.dumps(compared.to_dict(), allow_nan=False)
+    return "answered"
+
+
+@functools.cache
+def _part() -> tuple[str, bytes]:
+    """Return the name and the bytes of a part that this user's apc wrote."""
+    with tempfile.TemporaryDirectory() as name:
+        parts = open_parts(Path(name) / TARGET, SWEEP)
+        parts.write(0, _CELLS)
+        [path] = parts.folder.iterdir()
+        return f"{TARGET}.parts/{path.name}", path.read_bytes()
+
+
+def _forge_part(seed: str) -> Input:
+    """Return the file of a forged part of a sweep; some have the seal that they had."""
+    rng = random.Random(seed)
+    name, content = _part()
+    if not seed:
+        return Input("", ((name, content),))
+    mark, _, body = content.partition(b"\n")
+    sort, forged = _forged(rng, body, body, name="texts.npy", digested=False)
+    line = rng.choice((mark + b"\n", mark + b"\n", mark, b"\n", b"", b"0" * 64 + b"\n"))
+    return Input(sort, ((name, line + forged),))
+
+
+def _ask_part() -> str:
+    """Read the part in this folder: it is what it was, or it is computed again."""
+    name, content = _part()
+    cells = open_parts(TARGET, SWEEP).read(0)
+    assert (cells is None) == (Path(name).read_bytes() != content)
+    return "refused" if cells is None else "answered"
+
+
+@dataclass(frozen=True, slots=True)
+class Forgery:
+    """Makes a file of a seed, asks what it is asked in its folder, and has whole ones, which are answered."""
+
+    make: Callable[[str], Input]
+    ask: Callable[[], str]
+    whole: Callable[[], list[Input]]
+
+
+FORGERIES = {
+    "models": Forgery(
+        _forge_model,
+        lambda: ask(Path(FILE)),
+        lambda: [Input("", ((FILE, one),)) for one in bases()],
+    ),
+    "recordings": Forgery(_forge_recording, _ask_recording, lambda: [_forge_recording("")]),
+    "parts": Forgery(_forge_part, _ask_part, lambda: [_forge_part("")]),
+}

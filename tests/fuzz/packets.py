@@ -16,7 +16,8 @@ import pytest
 from apc.compiler.compiled import CompiledSystem
 from apc.loop.packets import ANSWER, DATA, HELLO, Address, Hello, Post
 from apc.loop.peer import Loop
-from tests.wire import OWN, SOON, Other, Wire, loop_at, send_packets
+from tests.fuzz.inputs import mutated
+from tests.surfaces.wire import OWN, SOON, Other, Wire, loop_at, send_packets
 
 DIGEST = bytes(range(32))
 SECRET = b"sixteen bytes or more"
@@ -107,22 +108,11 @@ def _meeting(here: _Scene, forged: Forgery, may: bool) -> str:
     return told or _playing(here, (here.others[0].post.hello(1, 0), here.others[0].address), True)
 
 
-def _random(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
-    return luck.randbytes(luck.randrange(200)), luck.choice(here.others).address
-
-
 def _torn(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
-    """Return a good one with bits turned, bytes gone, or the end of another."""
+    """Return a good one changed anyhow, but for one that is as it was."""
     datagram, address = luck.choice(here.given)
-    torn = bytearray(datagram)
-    for _ in range(luck.randrange(1, 4)):
-        torn[luck.randrange(len(torn))] ^= 1 << luck.randrange(8)
-    other = luck.choice(here.given)[0]
-    cut = luck.randrange(len(datagram))
-    ways = [bytes(torn), datagram[:cut], datagram + luck.randbytes(1 + cut)]
-    if other[cut:] != datagram[cut:]:
-        ways.append(datagram[:cut] + other[cut:])
-    return luck.choice(ways), address
+    torn = next(one for one in iter(lambda: mutated(luck, datagram), None) if one != datagram)
+    return torn, address
 
 
 def _again(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
@@ -131,10 +121,6 @@ def _again(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
     stranger = ("192.0.2.1", 5000)
     where = [address, OWN, stranger, *(one.address for one in here.others)]
     return datagram, luck.choice(where)
-
-
-def _earlier(luck: random.Random, _: _Scene, earlier: _Scene) -> Forgery:
-    return luck.choice(earlier.given)
 
 
 def _own(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
@@ -177,10 +163,13 @@ def _wrong(luck: random.Random, here: _Scene, _: _Scene) -> Forgery:
 
 
 FORGED: dict[str, Callable[[random.Random, _Scene, _Scene], Forgery]] = {
-    "random bytes": _random,
+    "random bytes": lambda luck, here, _: (
+        luck.randbytes(luck.randrange(200)),
+        luck.choice(here.others).address,
+    ),
     "torn": _torn,
     "heard before": _again,
-    "of an earlier session": _earlier,
+    "of an earlier session": lambda luck, _, earlier: luck.choice(earlier.given),
     "this peer's own": _own,
     "sealed without the secret": _guessed,
     "of a peer gone wrong": _wrong,

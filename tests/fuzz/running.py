@@ -1,40 +1,39 @@
-"""Runs inputs through the compiler and forged models through the program, under a watchdog.
+"""Runs hostile inputs through the compiler and forged files through the program, under a watchdog.
 
-Takes: inputs, forged models. Gives: `Failure`, `run_all`, `run_models`, `shrunk`.
+Takes: inputs, forged files. Gives: `Kind`, `kind_of`, `Failure`, `run_all`.
 Guarantees: one input can't bring the run down, whether it crashes, hangs or eats memory.
 Does not: make inputs.
 
 An input may compile, or be refused with `ApcError` whose mistakes each have a code, a sentence of one line
-and a place that exists, in the order of the file, none twice. A forged model may be refused as damaged, or
+and a place that exists, in the order of the file, none twice. A forged file may be refused as damaged, or
 what is asked of it answered or refused. Anything else is a failure, and is told.
 """
 
 from __future__ import annotations
 
 import importlib
+import multiprocessing
 import os
 import random
 import re
 import resource
-import select
 import signal
 import sys
 import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import apc
-from apc.compiler import pipeline
-from apc.compiler.components.library import Library
 from apc.compiler.errors import ApcError, Mistake
-from apc.compiler.language import unit_names
 from apc.compiler.pipeline import run_stages
-from tests.fuzz import arrays, models
 from tests.fuzz.inputs import MODELS, PLAYED, SENTINEL, TOPOLOGY, Input, make_input
+from tests.fuzz.models import FORGERIES, Forgery
 
 SECONDS = 5.0  # of processor time, the longest an input may take to compile
 PLAYED_SECONDS = 10.0  # and to compile, check itself, be analysed and simulated
@@ -43,9 +42,8 @@ PATIENCE = 300.0  # seconds until a process that says nothing is taken to hang, 
 MEMORY = 1 << 30  # bytes an input may ask for beyond what is in use
 BATCH = 4000  # inputs a process runs before a fresh one takes over
 LONGEST_SENTENCE = 2000
-WHOLE_FILE = re.compile(
-    r"E(10[1-8]|110|701|[89]\d\d)\Z"
-)  # mistakes about a file or scene as a whole may have no line
+FINE = ("compiled", "refused", "answered")
+WHOLE_FILE = re.compile(r"E(10[1-8]|110|219|701|[89]\d\d)\Z")  # these mistakes may have no line
 
 # What no input may cause; events of Python's own audit hooks.
 _FOREIGN = ("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "socket.connect",
@@ -73,15 +71,19 @@ class Failure:
     given: Input
 
 
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """Inputs of a kind: what is loaded before them, how a seed makes one, and its outcome in words."""
+
+    warm_up: Callable[[], None]
+    make: Callable[[str], Input]
+    judge: Callable[[Input], tuple[str, str]]
+
+
 def run_all(
-    count: int,
-    seed: int,
-    *,
-    start: int = 0,
-    sort: str | None = None,
-    progress: Callable[[str], None] = lambda text: None,
+    kind: Kind, count: int, seed: int, *, start: int = 0, progress: Callable[[str], None] = lambda text: None
 ) -> tuple[list[Failure], Counter[str], Counter[str]]:
-    """Run inputs number `start` to `count` of a seed, all of one sort if one is given.
+    """Run inputs number `start` to `count` of a seed.
 
     Returns
     -------
@@ -92,223 +94,110 @@ def run_all(
     outcomes
         How many inputs of each sort came to what.
     """
-    _warm_up()
+    kind.warm_up()
     failures: dict[str, Failure] = {}
     often: Counter[str] = Counter()
     outcomes: Counter[str] = Counter()
-    following = start
-    shown = time.monotonic()
+    following, shown = start, time.monotonic()
     while following < count:
-        for index, key, told in _worker(seed, following, min(count, following + BATCH), sort):
+        stop = min(count, following + BATCH)
+
+        def work(tell: Callable[[int, str, str], None], first: int = following, stop: int = stop) -> None:
+            for index in range(first, stop):
+                given = kind.make(f"{seed}/{index}")
+                key, told = kind.judge(given)
+                tell(index, key, told or given.sort)
+
+        for index, key, told in _watched(work, following, stop):
             following = index + 1
-            fine = key in ("compiled", "refused")
-            outcomes[f"{told}: {key}" if fine else f"{nth_input(seed, index, sort).sort}: FAILED"] += 1
-            if not fine:
+            if key in FINE:
+                outcomes[f"{told}: {key}"] += 1
+            else:
+                given = kind.make(f"{seed}/{index}")
+                outcomes[f"{given.sort}: FAILED"] += 1
                 often[key] += 1
-                if key not in failures:
-                    failures[key] = Failure(key, told, index, nth_input(seed, index, sort))
+                failures.setdefault(key, Failure(key, told, index, given))
             if time.monotonic() - shown > 10:
                 shown = time.monotonic()
                 progress(f"{following} inputs, {len(failures)} different failures")
     return list(failures.values()), often, outcomes
 
 
-def nth_input(seed: int, index: int, sort: str | None = None) -> Input:
-    """Return one input of a run."""
-    return make_input(random.Random(f"{seed}/{index}"), sort)
+def kind_of(what: str, sort: str | None = None) -> Kind:
+    """Return inputs, of a sort if one is given, or the forged files of a name."""
+    if what == "inputs":
+        return Kind(_warm_up, lambda seed: make_input(random.Random(seed), sort), _judged)
+    forgery = FORGERIES[what]
+    return Kind(partial(_warm_files, forgery), forgery.make, partial(_asked, forgery))
 
 
-class _WarmLibrary(Library):
-    """A library that has read the built-in components already, as long as no folder shadows one."""
+def _warm_files(forgery: Forgery) -> None:
+    """Load everything once: what is loaded later looks as if a file had had it loaded."""
+    for given in forgery.whole():
+        assert _asked(forgery, given) == ("answered", ""), "nobody changed it"
 
-    builtin = Library()
 
-    def __init__(self, folders: tuple[Path, ...] = ()) -> None:
-        super().__init__(folders)
-        if not folders:
-            self._components = dict(self.builtin._components)
-            self._connectors = dict(self.builtin._connectors)
+def _asked(forgery: Forgery, given: Input) -> tuple[str, str]:
+    return _traced(given, lambda: (forgery.ask(), ""), QUESTIONS)
 
 
 def _warm_up() -> None:
     """Load everything once, so that no input pays for it and processes share it."""
-    for name in _WarmLibrary.builtin.component_names:
-        _WarmLibrary.builtin.component(name)
-    pipeline.Library = _WarmLibrary  # type: ignore[misc] # for the fuzzer's own processes
     # What is loaded when it is first needed, and compiles text then: for a hint, for a large scene.
-    loaded = (
-        "numpy.ma",
-        "numpy.random",
-        "difflib",
-        "tempfile",
-        "traceback",
-        "scipy.linalg",
-        "sympy.physics.units",
-    )
-    for module in loaded:
+    late = "numpy.ma numpy.random difflib tempfile traceback scipy.linalg sympy.physics.units"
+    for module in late.split():
         importlib.import_module(module)
-    unit_names._scaled("furlong")  # one of the rare units, which pint knows
-    for scene in ("three-users-average", "finger", "users-table"):
-        run_stages(MODELS / "scenes" / f"{scene}.yaml", until="compiled")
     before = Path.cwd()
     os.chdir(MODELS / "scenes")
-    for scene in ("three-users-average", "experiment-average"):
+    for scene in ("three-users-average", "experiment-average", "finger", "users-table"):
         system = apc.compile(f"{scene}.yaml")
         apc.analyze(system)
         apc.simulate(system, duration="20 ms", jit=False)
     os.chdir(before)
-
-
-def _worker(seed: int, start: int, stop: int, sort: str | None) -> Iterator[tuple[int, str, str]]:
-    """Yield (index, outcome, text) of inputs run in a process of their own; ends early if that is killed.
-
-    The text of an input that compiled or was refused is its sort.
-    """
-
-    def work(tell: Callable[[int, str, str], None]) -> None:
-        for index in range(start, stop):
-            given = nth_input(seed, index, sort)
-            key, told = _judged(given)
-            tell(index, key, told or given.sort)
-
-    return _watched(work, start, stop)
-
-
-def run_forged(what: str, count: int, seed: int) -> tuple[dict[str, tuple[int, str]], Counter[str]]:
-    """Run forged files number 0 to `count` of a seed.
-
-    Parameters
-    ----------
-    what
-        One of `FORGERIES`.
-
-    Returns
-    -------
-    failures
-        Of each cause, the number of the first and what is told of it.
-    outcomes
-        How many files of each sort came to what.
-    """
-    warm_up, forge, ask = FORGERIES[what]
-    warm_up()
-    failures: dict[str, tuple[int, str]] = {}
-    outcomes: Counter[str] = Counter()
-    following = 0
-
-    def work(tell: Callable[[int, str, str], None]) -> None:
-        for index in range(following, count):
-            sort, files = forge(f"{seed}/{index}")
-            key, told = _traced(files, lambda: (ask(), ""), QUESTIONS)
-            tell(index, key, told or sort)
-
-    while following < count:
-        for index, key, told in _watched(work, following, count):
-            following = index + 1
-            if key in ("answered", "refused"):
-                outcomes[f"{told}: {key}"] += 1
-            else:
-                outcomes[f"{forge(f'{seed}/{index}')[0]}: FAILED"] += 1
-                failures.setdefault(key, (index, told))
-    return failures, outcomes
-
-
-def _forge_model(seed: str) -> tuple[str, arrays.Files]:
-    forged = models.forge(seed)
-    return forged.sort, ((models.FILE, forged.content),)
-
-
-def _warm_models() -> None:
-    """Load everything once: what is loaded later looks as if a file had had it loaded."""
-    with tempfile.TemporaryDirectory() as name:
-        for document, members in models.bases():
-            path = Path(name) / models.FILE
-            path.write_bytes(models.packed(document, members))
-            assert models.ask(path, everything=True) == "answered"
-
-
-def _warm_arrays(files: arrays.Files, ask: Callable[[], str]) -> None:
-    """Read what nobody changed."""
-    assert _traced(files, lambda: (ask(), "")) == ("answered", "")
-
-
-FORGERIES: dict[
-    str, tuple[Callable[[], None], Callable[[str], tuple[str, arrays.Files]], Callable[[], str]]
-] = {
-    "models": (_warm_models, _forge_model, lambda: models.ask(Path(models.FILE))),
-    "recordings": (
-        lambda: _warm_arrays(arrays.recording(), arrays.ask_recording),
-        arrays.forge_recording,
-        arrays.ask_recording,
-    ),
-    "parts": (
-        lambda: _warm_arrays(arrays.part(), arrays.ask_part),
-        arrays.forge_part,
-        arrays.ask_part,
-    ),
-}
-
-
-def once(given: Input) -> tuple[str, str]:
-    """Return the outcome and text of one input, run in a process of its own."""
-    [(_, key, told)] = list(_watched(lambda tell: tell(0, *_judged(given)), 0, 1))
-    return key, told
+    odd = MODELS.joinpath("scenes", "three-users-average.yaml").read_bytes()
+    _judged(
+        Input("rare", ((TOPOLOGY, odd.replace(b"0.1 kg", b"1 furlong")),))
+    )  # a unit that is looked up late
 
 
 def _watched(
     work: Callable[[Callable[[int, str, str], None]], object], start: int, stop: int
 ) -> Iterator[tuple[int, str, str]]:
-    read, write = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.close(read)
-        _become_worker(work, write)
-    os.close(write)
-    following, rest = start, b""
-    killed = ""
-    with os.fdopen(read, "rb", buffering=0) as stream:
-        while following < stop:
-            ready, _, _ = select.select([stream], [], [], PATIENCE)
-            data = stream.read(1 << 16) if ready else b""
-            if not data:
-                killed = "" if ready else "takes for ever"
-                break
-            *lines, rest = (rest + data).split(b"\0")
-            for line in lines:
-                number, key, told = line.decode("utf-8", "replace").split("\x1f")
-                yield int(number), key, told
-                following = int(number) + 1
-    if killed:
-        os.kill(child, signal.SIGKILL)
-    _, status = os.waitpid(child, 0)
-    if following < stop:
-        ended = (
-            f"signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else f"exit {os.WEXITSTATUS(status)}"
-        )
-        yield following, killed or f"process ended by {ended}", ""
+    """Yield (index, outcome, text) of inputs run in a process of their own; ends early if that is killed.
 
-
-def _become_worker(work: Callable[[Callable[[int, str, str], None]], object], write: int) -> None:
-    """Do the work and leave; never returns."""
-    code = 1
+    The text of an input that did nothing wrong is its sort.
+    """
+    context = multiprocessing.get_context("fork")
+    heard, tell = context.Pipe(duplex=False)
+    child = context.Process(target=_become_worker, args=(work, tell))
+    child.start()
+    tell.close()
+    following = start
     try:
-        in_use = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (in_use + MEMORY, in_use + MEMORY))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, 1)
-        os.dup2(null, 2)
-        sys.addaudithook(_listen)
+        while following < stop and heard.poll(PATIENCE):
+            index, key, told = heard.recv()
+            yield index, key, told
+            following = index + 1
+        silent = following < stop
+    except EOFError:
+        silent = False
+    if silent:
+        child.kill()
+    child.join()
+    if following < stop:
+        yield following, "takes for ever" if silent else f"process ended with code {child.exitcode}", ""
 
-        def tell(index: int, key: str, told: str) -> None:
-            line = "\x1f".join((str(index), key, told.replace("\x1f", " ").replace("\0", " ")))
-            data = line.encode("utf-8", "replace") + b"\0"
-            while data:
-                data = data[os.write(write, data) :]
 
-        work(tell)
-        code = 0
-    finally:
-        os._exit(code)
+def _become_worker(work: Callable[[Callable[[int, str, str], None]], object], pipe: Connection) -> None:
+    """Do the work, with little memory, no output and what it causes noted."""
+    in_use = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (in_use + MEMORY, in_use + MEMORY))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 1)
+    os.dup2(null, 2)
+    sys.addaudithook(_listen)
+    work(lambda index, key, told: pipe.send((index, key, told)))
 
 
 _foreign: list[str] = []
@@ -340,23 +229,23 @@ def _judged(given: Input) -> tuple[str, str]:
             run_stages(Path(TOPOLOGY), until="compiled")
             _listening = False
             if given.sort == PLAYED:
-                _play()
+                system = apc.compile(TOPOLOGY)
+                apc.analyze(system)
+                apc.simulate(system, duration="20 ms", jit=False)
         except ApcError as error:
             return _fault_of(error, dict(given.files)) or ("refused", "")
         return "compiled", ""
 
-    return _traced(given.files, run, PLAYED_SECONDS if given.sort == PLAYED else SECONDS)
+    return _traced(given, run, PLAYED_SECONDS if given.sort == PLAYED else SECONDS)
 
 
-def _traced(
-    files: Sequence[tuple[str, bytes]], run: Callable[[], tuple[str, str]], seconds: float = SECONDS
-) -> tuple[str, str]:
-    """Return what `run` gives in a folder of some files, or the key and text of what it does wrong."""
+def _traced(given: Input, run: Callable[[], tuple[str, str]], seconds: float) -> tuple[str, str]:
+    """Return what `run` gives in a folder of an input's files, or the key and text of what it does wrong."""
     global _listening
     with tempfile.TemporaryDirectory(prefix="apc-fuzz-", dir=_memory_folder()) as name:
         folder = Path(name)
-        for file, data in files:
-            (folder / file).parent.mkdir(exist_ok=True)
+        for file, data in given.files:
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
             (folder / file).write_bytes(data)
         before = Path.cwd()
         os.chdir(folder)
@@ -384,13 +273,6 @@ def _traced(
                 "\n".join(_foreign),
             )
         return outcome
-
-
-def _play() -> None:
-    """Compile, analyse and simulate a scene; ends the run of one that is refused with ApcError."""
-    system = apc.compile(TOPOLOGY)
-    apc.analyze(system)
-    apc.simulate(system, duration="20 ms", jit=False)
 
 
 def _memory_folder() -> str | None:
@@ -425,26 +307,18 @@ def _fault_of(error: ApcError, files: dict[str, bytes]) -> tuple[str, str] | Non
     """Return what is wrong with the mistakes of an error."""
     told = str(error)[:3000]
     mistakes = error.mistakes
-    if len(set(mistakes)) < len(mistakes) or len({str(m) for m in mistakes}) < len(mistakes):
-        return f"told twice: {_twice(mistakes)}", told
+    if len({str(one) for one in mistakes}) < len(mistakes):
+        return f"told twice: {mistakes[0].code}", told
     texts = {name: re.split(rb"\r\n|\n|\r", data) for name, data in files.items()}
     for mistake in mistakes:
         fault = _fault_in(mistake, texts)
         if fault:
             return f"{fault}: {mistake.code} {_shape(mistake.sentence)}", told
-    by_file: dict[str, list[Mistake]] = {}
-    for mistake in mistakes:
-        by_file.setdefault(mistake.place.file, []).append(mistake)
-    for own in by_file.values():
-        places = [(mistake.place.line, mistake.place.column) for mistake in own]
+    for name in {one.place.file for one in mistakes}:
+        places = [(one.place.line, one.place.column) for one in mistakes if one.place.file == name]
         if places != sorted(places):
             return f"not in the file's order: {mistakes[0].code}", told
     return None
-
-
-def _twice(mistakes: tuple[Mistake, ...]) -> str:
-    (text, _), *_ = Counter(f"{m.code} {_shape(m.sentence)}" for m in mistakes).most_common(1)
-    return text
 
 
 def _shape(sentence: str) -> str:
@@ -480,37 +354,3 @@ def _fault_in(mistake: Mistake, texts: dict[str, list[bytes]]) -> str:
     if not quoted and not 1 <= place.column <= len(line) + 2:
         return "a column that isn't there"
     return ""
-
-
-# ---- shrinking ----
-
-
-def shrunk(failure: Failure, *, seconds: float = 40.0) -> Input:
-    """Return a smaller input that fails in the same way: pieces taken out as long as that goes."""
-    deadline = time.monotonic() + seconds
-    files = dict(failure.given.files)
-
-    def fails(trial: dict[str, bytes]) -> bool:
-        key, _ = once(Input(failure.given.sort, tuple(trial.items())))
-        return key == failure.key
-
-    if not fails(files):
-        return failure.given  # it needs what ran before it
-    for name in list(files):
-        if name != TOPOLOGY and fails({k: v for k, v in files.items() if k != name}):
-            del files[name]
-    for name in list(files):
-        for separator in (b"\n", b", ", b" ", b""):
-            pieces = files[name].split(separator) if separator else [bytes([b]) for b in files[name]]
-            size = max(1, len(pieces) // 2)
-            while size and time.monotonic() < deadline and len(pieces) < 5000:
-                at = 0
-                while at < len(pieces) and time.monotonic() < deadline:
-                    trial = pieces[:at] + pieces[at + size :]
-                    if fails({**files, name: separator.join(trial)}):
-                        pieces = trial
-                    else:
-                        at += size
-                size //= 2
-            files[name] = separator.join(pieces) if len(pieces) < 5000 else files[name]
-    return Input(failure.given.sort, tuple(files.items()))

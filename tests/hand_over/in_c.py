@@ -19,11 +19,14 @@ from apc.exports.c_header import header
 from apc.exports.c_names import CPeer, c_peer
 from apc.exports.c_text import source
 from apc.exports.peer import Peer, peer_of
-from apc.network.timetable import Timetable, luck_of
+from apc.network.channel import PacketSource, channel_law
 from apc.simulation.settings import DEFAULT, parse_method
 from apc.simulation.simulation import Plan, plan_of
+from tests.lossy import effective
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+# Of a way, looked at packet by packet: more than a run sends.
+MOST_PACKETS = 100
 SANITIZED = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
@@ -97,8 +100,8 @@ def differences(
 ) -> dict[str, tuple[float, float]]:
     """Play a scene, and its peers in C with the devices' motion and the packets' arrivals of that run.
 
-    Packets go from peer to peer as they come out of C, late by what the scene says, or by what a `Timetable`
-    says where they get lost. Returns by signal the largest difference and the largest value.
+    Packets go from peer to peer as they come out of C, late by what the scene says, or as the links' luck has
+    it. Returns by signal the largest difference and the largest value.
     """
     how = parse_method(method) if method else DEFAULT
     plan = plan_of(system, how)
@@ -110,7 +113,7 @@ def differences(
         Running.started(c_peer(peer_of(plan, k, how, device=device)), folder)
         for k in range(plan.exchange.peers)
     ]
-    network = _Network(plan, marks[-1])
+    network = _Network(plan)
     off: dict[str, tuple[float, float]] = {}
     while (at := min(one.at for one in running)) < marks[-1]:
         row = int(np.searchsorted(marks, at, side="right")) - 1
@@ -137,7 +140,7 @@ def differences(
 class _Network:
     """All packets that were sent, and which of them each peer hears."""
 
-    def __init__(self, plan: Plan, until: int) -> None:
+    def __init__(self, plan: Plan) -> None:
         self.plan, self.sent = plan, dict[tuple[str, int, int], Mapping[str, float]]()
         self.quantum = plan.schedules[0].quantum
         timings = plan.numbers.timings
@@ -147,15 +150,15 @@ class _Network:
             for link, one in plan.exchange.links.items()
             for own in (clocks[one.clock],)
         }
-        self.seen = {}
-        lucks = tuple(
-            luck_of(plan.system, timings, plan.exchange, route, self.quantum) for route in plan.routes
-        )
-        if lucks:
-            table = Timetable(plan.routes, lucks, seed=plan.system.experiment.seed, run=0)
-            for route, luck, seen in zip(plan.routes, lucks, table.take(until), strict=True):
-                ways = {tuple(pair): k for k, pair in enumerate(route.pairs.tolist())}
-                self.seen[route.link] = ways, luck.tick_phase, luck.tick_period, seen
+        self.late: dict[tuple[str, int, int], list[float]] = {}
+        self.links = {one.name: one for one in plan.system.links}
+        for name, link in self.links.items():
+            if link.channel is None:
+                continue
+            law = channel_law(plan.system, link, timings[link.delay])
+            for way in itertools.permutations(range(plan.exchange.peers), 2):
+                taken = PacketSource(law, name, [way], seed=plan.system.experiment.seed).take(MOST_PACKETS)
+                self.late[(name, *way)] = taken[0].tolist()
 
     def send(self, peer: Peer, at: int, said: Mapping[str, float]) -> None:
         for line in peer.lines:
@@ -174,11 +177,10 @@ class _Network:
             for sender in line.senders:
                 late = exchange.delay(line.link, int(groups[sender.peer]), int(groups[peer.number]))
                 number, gone = (at - int(timings[late] / self.quantum) - phase) // period, False
-                if line.link in self.seen:
-                    ways, first, every, seen = self.seen[line.link]
-                    way, tick = ways[sender.peer, peer.number], (at - first) // every
-                    number = int(seen.packets[tick, way]) if tick >= 0 else -1
-                    gone = bool(seen.missing[tick, way]) if tick >= 0 else False
+                if (way := (line.link, sender.peer, peer.number)) in self.late:
+                    newest = self.links[line.link].channel.reorder != "all"
+                    tick = int(at * self.quantum * 1000)  # ticks every millisecond, packets every eight
+                    number, gone = effective(self.late[way], tick, newest=newest)
                 if number < 0:
                     found += sender.start
                 else:

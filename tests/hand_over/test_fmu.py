@@ -72,7 +72,7 @@ def gap(system: apc.CompiledSystem, path: Path, unit: Unit, method: str = "", se
     return float(np.abs(rows - course.values).max() / max(1.0, np.abs(course.values).max()))
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_is_played_as_simulate_plays_it(name: str, fmpy: Any, tmp_path: Path) -> None:
     path, unit = written(SCENES[name], tmp_path)
@@ -136,7 +136,7 @@ class Instance:
         self.unit.freeInstance()
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("text", "late"), [(PAPER, 8), (AT_ONCE, 0), (MOVED, 8)])
 def test_peers_joined_by_a_network_of_ones_own_are_the_scene(
     text: str, late: int, fmpy: Any, tmp_path: Path

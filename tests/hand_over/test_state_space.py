@@ -62,6 +62,7 @@ def magnitudes(matrix: Floats) -> Floats:
     return np.sort(np.abs(np.linalg.eigvals(matrix)))[::-1]
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", EVERY)
 def test_its_eigenvalues_are_those_of_the_analysis(name: str) -> None:
     analysis = apc.analyze(made(name))
@@ -79,6 +80,7 @@ def cuts(system: apc.CompiledSystem) -> list[str]:
     return [*(link.name for link in system.links), *sorted(forces)]
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", EVERY)
 def test_cut_open_and_closed_again_it_is_the_loop(name: str) -> None:
     whole = state_space(made(name))
@@ -138,6 +140,7 @@ PUSHED: dict[str, tuple[str, str, str, dict[str, str]]] = {
 }
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", PUSHED)
 def test_its_step_response_is_what_simulate_plays(name: str) -> None:
     scene, group, part, settings = PUSHED[name]
@@ -269,7 +272,7 @@ FREE = {
 }
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("cut", ["", "link", "coupler"])
 @pytest.mark.parametrize("name", FREE)
 def test_with_a_number_free_it_is_at_each_value_what_it_is_with_that_set(name: str, cut: str) -> None:

@@ -32,6 +32,7 @@ def unlike(masses: np.ndarray, text: str) -> str:
     return re.sub(r"count: \d+", f"set: {{device.mass: [{listed}]}}", text, count=1)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     ("count", "ring", "together"),
     [
@@ -92,6 +93,7 @@ PUBLISHED = (
 )
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("count", "felt", "arrives", "apart", "alias", "ticks", "sampled", "rms"), PUBLISHED)
 def test_numbers_of_an_independent_program(
     count: int,
@@ -143,7 +145,7 @@ def test_a_lone_mass_feels_like_itself() -> None:
 RING = replaced(MESH, ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("count", [2, 3, 5])
 @pytest.mark.parametrize(("text", "heard"), [(AVERAGE, 1), (MESH, 4), (RING, 2)])
 def test_a_network_feels_viscous_by_as_much_as_dampers_lack(text: str, heard: int, count: int) -> None:
@@ -192,7 +194,7 @@ def check_alike(one: Feel, other: Feel) -> None:
         assert abs(getattr(one.low_frequency, name) - getattr(other.low_frequency, name)) <= near
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("system", "at", "between"),
     [
@@ -230,17 +232,9 @@ def test_groups_are_as_right_as_all_peers_in_one_and_a_million_users_are_served(
     assert abs(many.transmitted_admittance[0]) < 1e-5 and many.bound[0] < 1e-4
 
 
-def test_multiples_of_the_frame_rate_are_as_their_neighbours() -> None:
-    """The scene may rest anywhere: e^{sT} = 1 is a pole of its frames, and none of its responses."""
-    for system in (compiled(AVERAGE), different(4)):
-        found = feel(system, [125.0, 125.0 - 0.01, 125.0 + 0.01], quick=True)
-        for name in ("impedance", "transmitted_admittance", "error_per_force"):
-            one, *two = getattr(found, name)
-            assert abs(one - np.mean(two)) < abs(one) * (1e-5 + found.bound.max())
-
-
 # Of hands and of sensors, at the first of either group: error and velocity, by an independent program, which
 # adds up the answers to each tick's noise.
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("at", "known"),
     [
@@ -263,47 +257,47 @@ def test_noise_of_groups_whose_forces_switch_at_other_times(
 
 
 def test_an_unstable_scene_has_no_response_in_time_but_its_map_has_one() -> None:
-    with pytest.raises(ApcError, match="E934"):
-        apc.feel(compiled(users(3, 1200)), [1.0])
     found = apc.feel(compiled(users(3, 1200)), [1.0], unstable=True)
     assert found.notes and not found.hinf
     below = apc.feel(compiled(users(3, 1090)), [1.0])
     assert abs(found.impedance[0] / below.impedance[0] - 1) < 0.2
 
 
+BARE = """\
+topology: bare
+clocks: {tick: 8 ms, fast: 1 ms}
+peers: {user: {count: 2}}
+masses: {cube: {mass: 1 kg, damping: 1 N*s/m, shared: true}}
+couplers: {c: {type: AveragePosition, object: cube, stiffness: 9 N/m, clock: fast, link: lan}}
+links: {lan: {clock: tick, delay: 8 ms}}
+"""
+TOOL = (SCENES / "two-handed-tool.yaml").read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize(
-    ("frequency", "at", "why"),
+    ("text", "frequency", "at", "why"),
     [
-        ([501.0], "", "E935"),
-        ([0.0], "", "E935"),
-        ([], "", "E935"),
-        ([math.nan], "", "E935"),
-        ([1.0], "nobody[1]", "E936"),
-        ([1.0], "user[0].device", "E936"),
-        ([1.0], "user[1].cub", "E936"),
-        ([1.0], "contact", "E936"),
-        ([1.0], "user[4].device", r'--at "user\[3\].device"'),
-        ([1.0], "usr[2].device", r'--at "user\[2\].device"'),
+        (AVERAGE, [501.0], "", "E935"),
+        (AVERAGE, [0.0], "", "E935"),
+        (AVERAGE, [], "", "E935"),
+        (AVERAGE, [math.nan], "", "E935"),
+        (AVERAGE, [1.0], "nobody[1]", "E936"),
+        (AVERAGE, [1.0], "user[0].device", "E936"),
+        (AVERAGE, [1.0], "user[1].cub", "E936"),
+        (AVERAGE, [1.0], "contact", "E936"),
+        (AVERAGE, [1.0], "user[4].device", r'--at "user\[3\].device"'),
+        (AVERAGE, [1.0], "usr[2].device", r'--at "user\[2\].device"'),
+        (ONE_MASS, [1.0], "", "E935 the scene has nothing that ticks, .* Write: a coupler with a clock"),
+        (BARE, [1.0], "", "E931"),
+        (TOOL, [1.0], "", r"E931 left moves with masses .*, and a hand may hold any of them \(user\)\.$"),
+        (users(3, 1200), [1.0], "", "E934"),
     ],
 )
-def test_what_can_t_be_felt_is_refused(frequency: list[float], at: str, why: str) -> None:
+def test_what_can_t_be_felt_is_refused(text: str, frequency: list[float], at: str, why: str) -> None:
     with pytest.raises(ApcError, match=why):
-        apc.feel(compiled(AVERAGE), frequency, at=at)
-
-
-def test_a_scene_in_which_nothing_ticks_and_a_peer_without_a_device_are_refused_by_name() -> None:
-    with pytest.raises(
-        ApcError, match=r"E935 the scene has nothing that ticks, .* Write: a coupler with a clock"
-    ):
-        apc.feel(compiled(ONE_MASS), [1.0])
-    text = "topology: bare\nclocks: {tick: 8 ms, fast: 1 ms}\npeers: {user: {count: 2}}\n" + (
-        "masses: {cube: {mass: 1 kg, damping: 1 N*s/m, shared: true}}\n"
-        "couplers: {c: {type: AveragePosition, object: cube, stiffness: 9 N/m, clock: fast, link: lan}}\n"
-        "links: {lan: {clock: tick, delay: 8 ms}}\n"
-    )
-    with pytest.raises(ApcError, match="E931"):
-        apc.feel(compiled(text), [1.0])
-    assert apc.feel(compiled(text), [1.0], at="user[1].cube").at == "user[1].cube"
+        apc.feel(compiled(text), frequency, at=at)
+    if text == BARE:
+        assert apc.feel(compiled(text), frequency, at="user[1].cube").at == "user[1].cube"
 
 
 @pytest.mark.parametrize("name", ["planar-users", "god-object", "client-server"])
@@ -313,12 +307,6 @@ def test_where_it_is_open_what_is_held_the_line_to_write_is_one_that_works(name:
         feel(scene, [1.0], quick=True)
     option, at = (told.value.mistakes[0].hint or "").split(" ", 1)
     assert option == "--at" and feel(scene, [1.0], at=at.strip('"'), quick=True).at == at.strip('"')
-
-
-def test_where_no_part_can_be_held_alone_it_says_why_and_names_no_line() -> None:
-    told = "E931 left moves with masses that move otherwise, and a hand may hold any of them (user)."
-    with pytest.raises(ApcError, match=re.escape(told) + "$"):
-        apc.feel(SCENES / "two-handed-tool.yaml", [1.0])
 
 
 def test_in_a_plane_a_hand_feels_along_each_axis_what_it_feels_on_a_line() -> None:

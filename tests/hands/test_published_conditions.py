@@ -10,7 +10,7 @@ import pytest
 import apc
 from apc.frame.names import Free, Range
 from apc.regions.overlay import overlay_points, parse_overlay, symbol_values
-from apc.regions.passivity import CONDITIONS, colgate_limit, diolaiti_limit, gil_limit
+from apc.regions.passivity import colgate_limit, diolaiti_limit, gil_limit
 from tests.topologies import AVERAGE, compiled, told, wall
 
 
@@ -47,16 +47,6 @@ def test_the_linear_condition_is_within_4_percent_of_a_walls_exact_limit(
     assert exact is None or found == pytest.approx(exact, abs=5e-4)  # printed to three decimals
 
 
-@pytest.mark.parametrize("name", CONDITIONS)
-def test_a_margin_changes_sign_at_its_limit(name: str) -> None:
-    condition = CONDITIONS[name]
-    numbers = {"b": 0.8, "B": 0.1, "T": 0.001, "t_d": 0.002, "c": 0.02, "D": 6e-5}
-    rest = [numbers[symbol] for symbol in condition.symbols[1:]]
-    limit = float(condition.limit(*rest))
-    assert condition.margin(0.999 * limit, *rest) > 0 > condition.margin(1.001 * limit, *rest)
-    assert condition.formula in str(condition) and condition.source in str(condition)
-
-
 MODEL = wall(0.1, 5.0, 0.001, 900.0, 0.25)
 COLGATE = "colgate:K=it.stiffness,B=it.damping,b=device.damping,T=tick.period"
 GIL = "gil:K=it.stiffness,B=it.damping,b=device.damping,T=tick.period,t_d=it.delay"
@@ -68,19 +58,29 @@ def curve(words: str, *axes: tuple[str, float, float]) -> np.ndarray:
     return overlay_points(MODEL, parse_overlay(MODEL, words), *ranges)
 
 
-def test_a_curve_runs_from_border_to_border_in_order() -> None:
-    stiffness, damping = ("it.stiffness", 0.0, 4000.0), ("it.damping", 0.0, 3.0)
-    rising = curve(GIL, stiffness, damping)
-    # K = (5 + B)/1.5e-3 from (3333.3, 0) to (4000, 1).
-    assert rising[[0, -1]].tolist() == [pytest.approx([5 / 1.5e-3, 0]), pytest.approx([4000, 1])]
-    assert rising[:, 0] == pytest.approx((5 + rising[:, 1]) / 1.5e-3, rel=1e-12)
-    assert (np.diff(rising, axis=0) >= 0).all()
-    assert curve(GIL, damping, stiffness)[:, ::-1] == pytest.approx(rising, rel=1e-12)
-    falling = curve(COLGATE, ("it.stiffness", 0.0, 20_000.0), ("it.damping", 0.0, 8.0))
-    assert falling[[0, -1]].tolist() == [pytest.approx([0, 5]), pytest.approx([10_000, 0])]
-    flat = curve(COLGATE, ("device.mass", 0.1, 1.0), ("it.stiffness", 0.0, 20_000.0))
-    assert flat[:, 1] == pytest.approx(2 * 4.75 / 1e-3, rel=1e-12) and flat[[0, -1], 0].tolist() == [0.1, 1.0]
-    assert not len(curve(COLGATE, ("it.stiffness", 0.0, 100.0), ("it.damping", 0.0, 1.0)))
+@pytest.mark.parametrize(
+    ("words", "x", "y", "ends"),
+    [
+        # K = (5 + B)/1.5e-3
+        (GIL, ("it.stiffness", 0.0, 4000.0), ("it.damping", 0.0, 3.0), [(5 / 1.5e-3, 0), (4000, 1)]),
+        (GIL, ("it.damping", 0.0, 3.0), ("it.stiffness", 0.0, 4000.0), [(0, 5 / 1.5e-3), (1, 4000)]),
+        # K = 2 (5 − B)/1e-3
+        (COLGATE, ("it.stiffness", 0.0, 20_000.0), ("it.damping", 0.0, 8.0), [(0, 5), (10_000, 0)]),
+        (COLGATE, ("device.mass", 0.1, 1.0), ("it.stiffness", 0.0, 20_000.0), [(0.1, 9500), (1.0, 9500)]),
+    ],
+)
+def test_a_curve_is_its_line_from_border_to_border(
+    words: str,
+    x: tuple[str, float, float],
+    y: tuple[str, float, float],
+    ends: list[tuple[float, float]],
+) -> None:
+    found = curve(words, x, y)
+    assert found[[0, -1]].tolist() == [pytest.approx(end) for end in ends]
+    first, last = found[[0, -1]]
+    along = (found - first) @ (last - first) / ((last - first) @ (last - first))
+    assert (np.diff(along) > 0).all()
+    np.testing.assert_allclose(found, first + along[:, None] * (last - first), rtol=1e-9, atol=1e-9)
 
 
 def test_symbols_follow_the_scene_its_expressions_and_groups() -> None:

@@ -2,8 +2,7 @@
 
 All peers (equal ones by a representative and the weights of its class) are followed event by event in ball
 arithmetic, see `tests.fifty_digits`; two precisions agree on every digit written. Nothing of the analysis
-takes part. A delay of a thousand frames comes as a polynomial, whose roots Arb encloses. The gains of the
-scenes `boundary-*` are found here by bisection and compared with those that stand in them.
+takes part. A delay of a thousand frames comes as a polynomial, whose roots Arb encloses.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from typing import Any
 
 import flint
 
-import apc
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
 from apc.eigen.balls import precision
@@ -32,7 +30,6 @@ from tests.fifty_digits.truth import (
 
 HERE = Path(__file__).resolve().parent
 TRUTHS = HERE / "truths.json"
-AVERAGE = HERE.parents[1] / "models" / "scenes" / "three-users-average.yaml"
 
 # Below this a pivot of M − 1, of entries of 1 or more, is none: at 1024 bits its rounding is 1e-300.
 NO_PIVOT = 1e-60
@@ -40,18 +37,9 @@ NO_PIVOT = 1e-60
 # Frames of delay up to which packets are states.
 MOST_FRAMES = 60
 
-# How far the gains of the scenes at the boundary are from it; a float there is 1e-16 from the next.
-OFFSETS = {
-    "inside-9": Fraction(-1, 10**9),
-    "outside-9": Fraction(1, 10**9),
-    "inside-13": Fraction(-1, 10**13),
-    "outside-13": Fraction(1, 10**13),
-}
-
 
 def main() -> None:
-    """Write the truths, and the scenes at the boundary."""
-    write_boundary()
+    """Write the truths."""
     found = {}
     for path in sorted(HERE.glob("*.yaml")):
         found[path.stem] = truth_of(compile_topology(path))
@@ -169,40 +157,6 @@ def _shifted(polynomial: Any, by: int) -> Any:
 def _roots(coefficients: list[Any]) -> list[Any]:
     """Return all roots, enclosed apart."""
     return list(flint.acb_poly(coefficients).roots(tol=flint.arb(10) ** (-DIGITS - 10), maxprec=8192))
-
-
-def boundary() -> float:
-    """Return the largest stable coordination stiffness of the paper's scene that a float holds, in N/m."""
-    system = compile_topology(AVERAGE)
-    low, high = 500.0, 3000.0
-    while (middle := (low + high) / 2) not in (low, high):
-        low, high = (middle, high) if _is_stable(system, middle) else (low, middle)
-    return low
-
-
-def _is_stable(system: CompiledSystem, stiffness: float) -> bool:
-    changed = apc.set_parameters(system, {"coordination.stiffness": f"{stiffness!r} N/m"})
-    with precision(512):
-        found = [eigenvalues(matrix) for _, _, matrix in frame_matrices(changed, classes_of(changed))]
-        return all(abs(v) < 1 for own in found for v in own if float(abs(v - 1).mid()) > RIGID)
-
-
-def write_boundary() -> None:
-    """Write the scenes next to the boundary."""
-    at = Fraction(boundary())
-    text = AVERAGE.read_text(encoding="utf-8")
-    body = text[text.index("clocks:") : text.index("studies:")]
-    for name, offset in OFFSETS.items():
-        gain = float(at * (1 + offset))
-        side, size = name.split("-")
-        about = f"A gain {'below' if side == 'inside' else 'above'} the boundary by 1e-{size} of it."
-        head = (
-            f"topology: boundary-{name}\nabout: {about}\n"
-            "# From: the paper's scene (Rakhsha and Constantinescu, section III), its gain by bisection\n"
-        )
-        (HERE / f"boundary-{name}.yaml").write_text(
-            head + body.replace("stiffness: 500 N/m", f"stiffness: {gain!r} N/m"), encoding="utf-8"
-        )
 
 
 if __name__ == "__main__":

@@ -13,8 +13,6 @@ from pathlib import Path
 import pytest
 
 import apc
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.pipeline import compile_topology
 from tests.library.parts import CLOCK, TWO, coupled, held, pushes, rates, ticked, values
 from tests.topologies import MESH, ONE_MASS, SCENES, compiled, library, replaced, told
 
@@ -275,7 +273,7 @@ def swings(mass: float, damping: float, stiffness: float) -> list[complex]:
     return sorted(found, key=lambda z: (z.imag, z.real))
 
 
-def in_a_second(system: CompiledSystem) -> list[complex]:
+def in_a_second(system: apc.CompiledSystem) -> list[complex]:
     """Return the eigenvalues of a frame of a second, which is what a scene without clocks has."""
     return sorted((mode.eigenvalue for mode in apc.analyze(system).modes), key=lambda z: (z.imag, z.real))
 
@@ -342,7 +340,7 @@ def test_a_table_is_handed_on_to_a_part_inside(tmp_path: Path) -> None:
     path = tmp_path / "scene.yaml"
     hands = "library: ./\nhands:\n  it: {type: Tabled, flange: device, push: force.csv}\n"
     path.write_text(ONE_MASS + hands, encoding="utf-8")
-    assert pushes(compile_topology(path), {}) == pytest.approx([2.0], rel=1e-14)
-    own = library(tmp_path, tabled.replace("UNIT", "mm"))
-    [line] = told(own.component, "Tabled")
+    assert pushes(apc.compile(path), {}) == pytest.approx([2.0], rel=1e-14)
+    library(tmp_path, tabled.replace("UNIT", "mm"))
+    [line] = told(apc.compile, path)
     assert "E204 force wants N, got mm." in line

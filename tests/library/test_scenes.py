@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 import apc
-from apc.compiler.pipeline import compile_topology
 from tests.topologies import SCENES, compiled, replaced
 
 COMMON = "stable up to a common translation"
@@ -39,7 +38,7 @@ def path_of(name: str) -> Path:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_scene_compiles_needs_all_it_names_and_has_its_verdict(name: str) -> None:
-    system = compile_topology(path_of(name))
+    system = apc.compile(path_of(name))
     assert system.about
     assert system.name == (name if name != "template" else "my-scene")
     assert system.dropped == ()
@@ -60,7 +59,7 @@ def test_the_experiment_settles_for_the_average_and_shakes_for_the_mesh(name: st
 
 
 def test_users_table_gives_each_user_a_row() -> None:
-    (group,) = compile_topology(path_of("users-table")).groups
+    (group,) = apc.compile(path_of("users-table")).groups
     columns = {column.name: column.values.tolist() for column in group.columns}
     assert columns["device.mass"] == pytest.approx([0.1, 0.12, 0.08, 0.25, 0.1], rel=1e-15)
     assert columns["arm.position"] == pytest.approx([0, -0.005, 0.005, 0.01, -0.01], rel=1e-15)

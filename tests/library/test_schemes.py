@@ -13,8 +13,6 @@ from typing import Any
 import pytest
 
 import apc
-from apc.analysis.methods import Method
-from apc.compiler.compiled import CompiledSystem
 from tests.schemes import ByHand, Law, everybody, magnitudes, mean
 from tests.topologies import SCENES, compiled, replaced
 
@@ -46,7 +44,7 @@ def pulling(pull: Pull, damping: float = 0.0) -> Law:
     return law
 
 
-def same(system: CompiledSystem, scheme: ByHand, method: Method = "auto") -> None:
+def same(system: apc.CompiledSystem, scheme: ByHand, method: Any = "auto") -> None:
     found = apc.analyze(system, method=method)
     rigid, radius = magnitudes(scheme)
     assert found.rigid_modes == rigid

@@ -110,7 +110,7 @@ def same(system: CompiledSystem, hand: ByHand, method: str = "auto") -> None:
     assert not found.linearized
 
 
-@pytest.mark.few(10)
+@pytest.mark.few(8)
 @pytest.mark.parametrize("late", [0, 1, 3, 4, 10])
 @pytest.mark.parametrize("force", LAWS)
 def test_a_coefficient_of_age_is_its_law_in_every_tick(force: str, late: int, tmp_path: Path) -> None:

@@ -7,9 +7,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from typing import Any
 
-import casadi
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, example, given, settings
@@ -18,7 +16,6 @@ from hypothesis import strategies as st
 from apc.analysis.analysis import analyze, lifted_groups
 from apc.compiler.errors import ApcError
 from apc.eigen.modes import dense, split
-from apc.frame.lift import LiftedSite
 from tests.bruteforce import Scene, common_period, frame_matrix
 from tests.sites import MS, alone, paper
 from tests.topologies import compiled
@@ -132,40 +129,38 @@ def check_scenes(count: int) -> None:
     run()
 
 
-PHI = float(np.exp(-0.001))
+PHI, GAMMA = float(np.exp(-0.001)), float(-np.expm1(-0.001))  # of x' = u − x, in a tick
 
 
-GAMMA = float(-np.expm1(-0.001))
-
-
-def _alone(**values: Any) -> LiftedSite:
-    [group], _ = lifted_groups(alone(lambda x, u: -x + u, **values))
-    return group.lifted
-
-
-def test_a_remembered_sample_is_a_delay_of_one_tick() -> None:
-    """u[k] = −3 x[k−1], by previous() or by a computational delay of one tick."""
-    remembered = _alone(
-        tick=lambda x, u, m: casadi.vertcat(-3 * m[0], x), outputs=("f", "seen"), memories=(1,)
-    )
-    delayed = _alone(tick=lambda x, u, m: -3 * x, delay=MS)
-    assert remembered.z_names == ("x", "seen(-1 ms)")
-    np.testing.assert_allclose(remembered.p, [[PHI, -3 * GAMMA], [1, 0]], rtol=1e-14)
-    np.testing.assert_allclose(delayed.p, [[PHI, GAMMA], [-3, 0]], rtol=1e-14)
-
-
-def test_a_memory_that_nothing_reads_is_no_state() -> None:
-    lifted = _alone(
-        tick=lambda x, u, m: casadi.vertcat(-3 * x, m[0] + x), outputs=("f", "sum"), memories=(1,)
-    )
-    assert lifted.z_names == ("x",)
-
-
-def test_a_tick_that_reads_a_hold_reads_it_before_it_switches() -> None:
-    """f[k] = 0.5 u(t⁻) + 2 x with u(t⁻) = f[k−1]; then x[k+1] = Φ x + Γ f[k]."""
-    lifted = _alone(tick=lambda x, u, m: 0.5 * u[0] + 2 * x)
-    assert lifted.z_names == ("x", "f(-1 ms)")
-    np.testing.assert_allclose(lifted.p, [[PHI + 2 * GAMMA, 0.5 * GAMMA], [2, 0.5]], rtol=1e-14)
+@pytest.mark.parametrize(
+    ("ticks", "delay", "names", "expected"),
+    [
+        # u[k] = −3 x[k−1], by previous() or by a computational delay of one tick.
+        (
+            ["f = -3*previous(s)", "s = sample(x)"],
+            "0 s",
+            ["it.x", "it.s(-1 ms)"],
+            [[PHI, -3 * GAMMA], [1, 0]],
+        ),
+        (["f = -3*sample(x)"], "1 ms", ["it.x", "it.f(-1 ms)"], [[PHI, GAMMA], [-3, 0]]),
+        # A memory that nothing reads is no state.
+        (["f = -3*sample(x)", "s = previous(s) + sample(x)"], "0 s", ["it.x"], [[PHI - 3 * GAMMA]]),
+        # A hold is read before it switches: f[k] = 0.5 u(t⁻) + 2 x with u(t⁻) = f[k−1].
+        (
+            ["f = 0.5*sample(hold(f, delay)) + 2*sample(x)"],
+            "0 s",
+            ["it.x", "it.f(-1 ms)"],
+            [[PHI + 2 * GAMMA, 0.5 * GAMMA], [2, 0.5]],
+        ),
+    ],
+)
+def test_what_is_remembered_and_held_is_a_state_where_it_is_read(
+    ticks: list[str], delay: str, names: list[str], expected: list[list[float]]
+) -> None:
+    variables = ", f: {unit: 1, start: 0}" + (", s: {unit: 1, start: 0}" if len(ticks) > 1 else "")
+    [group], _ = lifted_groups(alone("hold(f, delay) - x", *ticks, variables=variables, delay=delay))
+    assert list(group.lifted.z_names) == names
+    np.testing.assert_allclose(group.lifted.p, expected, rtol=1e-14)
 
 
 def test_clocks_that_hardly_ever_stand_as_before_are_refused_with_their_periods() -> None:

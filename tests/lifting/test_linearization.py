@@ -34,7 +34,7 @@ def _cubic_pairs(starts: list[float], cubic: float) -> dict[tuple[int, int], flo
 def test_an_edge_function_is_linearized_pair_by_pair(operator: str, graph: str, starts: list[float]) -> None:
     base = edged(paper(operator, peers=4, **GAINS), operator, cubic=2e5)
     arcs = None if graph == "complete" else arcs_of(graph, 4)
-    system = columned(linked(base, arcs or "complete"), cube__x__start=starts)
+    system = columned(linked(base, arcs or "complete"), cube__x=starts)
     scene = Scene(
         operator,
         4,
@@ -58,7 +58,7 @@ def test_the_largest_of_equal_peers_has_no_linearization() -> None:
     message = r"E803 pull of user\[1\]: max over equal peers has no linearization"
     with pytest.raises(ApcError, match=message):
         analyze(edged(paper(), "max"))
-    apart = columned(edged(paper(), "max"), cube__x__start=[0.0, 0.01, 0.02])
+    apart = columned(edged(paper(), "max"), cube__x=[0.0, 0.01, 0.02])
     assert analyze(apart).linearized
     # Two peers: the only other one is the largest, and the smallest, and the mean.
     two = [analyze(edged(paper(peers=2), operator)).spectral_radius for operator in ("max", "min", "mean")]
@@ -69,7 +69,7 @@ def test_the_largest_is_the_one_that_starts_furthest_away() -> None:
     """F_T = K max_j (x_i − x_j): everyone hears the lowest, the lowest the next: a graph of arcs."""
     starts = [0.03, 0.0, 0.01]
     arcs = [(1, 0, 1.0), (2, 1, 1.0), (1, 2, 1.0)]
-    largest = columned(edged(paper(), "max"), cube__x__start=starts)
+    largest = columned(edged(paper(), "max"), cube__x=starts)
     assert analyze(largest).spectral_radius == pytest.approx(
         analyze(linked(paper(), arcs), method="dense").spectral_radius, abs=1e-10
     )

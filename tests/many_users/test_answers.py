@@ -1,140 +1,78 @@
-"""The answer as a whole: plain data, the method that serves, what stands beside it, what is refused."""
+"""An answer as a whole: plain data, what was left out of it and why, what no mean can be of, empty tables."""
 
 from __future__ import annotations
 
 import json
+import random
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from apc.analysis.analysis import analyze, prepare
-from apc.analysis.box import parse_range
-from apc.analysis.needs import needs
-from apc.answer import answer, judge
+import apc
+from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.compiler.pipeline import compile_topology
-from apc.frame.overrides import apply, parse_override
-from tests.populations import different
-from tests.sites import MS, columned, edged, linked, paper
-from tests.topologies import ROOT, SCENES
+from apc.eigen.balls import precision
+from tests.bench.random_scenes import check, truth
+from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, library, replaced
 
 
 def test_the_answer_is_plain_data() -> None:
-    found = json.loads(json.dumps(analyze(paper()).to_dict(), allow_nan=False))
+    found = json.loads(json.dumps(apc.analyze(compiled(AVERAGE)).to_dict(), allow_nan=False))
     assert list(found) == [
-        "topology",
-        "peers",
-        "frame_s",
-        "states_per_peer",
-        "method",
-        "verdict",
-        "stable",
-        "spectral_radius",
-        "spectral_radius_error",
-        "rigid_modes",
-        "modes",
-        "linearized",
-        "notes",
-        "proof",
-        "left_out",
-        "translations",
-        "rotations",
-        "unfelt",
+        *("topology", "peers", "frame_s", "states_per_peer", "method", "verdict", "stable"),
+        *("spectral_radius", "spectral_radius_error", "rigid_modes", "modes", "linearized", "notes", "proof"),
+        *("left_out", "translations", "rotations", "unfelt"),
     ]
-    assert (found["topology"], found["peers"], found["frame_s"]) == ("paper", 3, 0.008)
-    assert (found["states_per_peer"], found["method"], found["stable"]) == (8, "modes", True)
+    assert (found["peers"], found["frame_s"], found["states_per_peer"]) == (3, 0.008, 8)
     first = found["modes"][0]
-    assert complex(*first["eigenvalue"]) == pytest.approx(
-        first["magnitude"] * complex(*first["eigenvalue"]) / abs(complex(*first["eigenvalue"]))
-    )
+    assert abs(complex(*first["eigenvalue"])) == pytest.approx(first["magnitude"], rel=1e-15)
     assert set(first["participation"]) >= {"device.x", "contact.f(-1 ms)", "coordination.x sent(-8 ms)"}
 
 
-def test_prepared_work_serves_other_numbers_and_other_times() -> None:
-    system = paper()
-    prepared = prepare(system)
-    for text in ("coordination.stiffness=900 N/m", "lan.delay=4 ms", "haptic.period=0.5 ms"):
-        changed = apply(system, [parse_override(system, text)])
-        assert analyze(changed, prepared=prepared) == analyze(changed)
-
-
 def test_peers_that_differ_only_at_the_start_are_equal_however_many() -> None:
-    many = 10_000
-    moved = columned(paper(peers=many), device__x__start=1e-6 * np.arange(many))
-    found = analyze(moved)
-    assert (found.method, found.spectral_radius) == ("modes", analyze(paper(peers=many)).spectral_radius)
+    rows = ", ".join(f"{k} um" for k in range(2000))
+    many = compiled(replaced(AVERAGE, ("{count: 3}", f"{{set: {{device.x: [{rows}]}}}}")))
+    plain = compiled(replaced(AVERAGE, ("count: 3", "count: 2000")))
+    assert apc.analyze(many).method == "modes"
+    assert apc.analyze(many).spectral_radius == apc.analyze(plain).spectral_radius
 
 
-def test_a_matrix_too_large_is_refused_and_so_is_a_method_that_cannot_serve() -> None:
-    with pytest.raises(ApcError, match=r"E804 200 peers make one system of 1,600 states; the matrix of one"):
-        analyze(paper(peers=200), method="dense")
-    different = columned(linked(paper(), "ring"), device__mass=[0.1, 0.2, 0.3])
-    with pytest.raises(ApcError, match=r"E850 method modes can't serve this scene: all peers as one system"):
-        analyze(different, method="modes")
-    with pytest.raises(ApcError, match=r"E850 method krylov can't serve this scene: user looks at each"):
-        analyze(edged(paper()), method="krylov")
-    with pytest.raises(ApcError, match=r"E850 method krylov .* all of 600 peers hear each other over lan"):
-        analyze(columned(paper(peers=600), device__mass=np.linspace(0.1, 0.2, 600)), method="krylov")
-    many = columned(linked(paper(peers=60), "ring"), device__mass=np.linspace(0.1, 0.2, 60))
-    with pytest.raises(ApcError, match=r"E850 method determinant .* hear all others over lan"):
-        analyze(many, method="determinant")
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Return what runs `apc analyze` and returns what it prints."""
+
+    def analyze(path: Path, *words: str) -> str:
+        assert run(["analyze", str(path), *words]) == 0
+        return capsys.readouterr().out
+
+    return analyze
 
 
-@pytest.mark.parametrize(
-    ("system", "method", "systems"),
-    [
-        (paper(peers=1_000_000), "modes", ((2, 8),)),
-        (columned(paper(), device__mass=[0.1, 0.2, 0.3]), "modes", ((1, 24),)),
-        (different(60), "determinant", ((1, 2),)),
-        (different(3, graph="ring"), "dense", ((1, 24),)),
-        (different(60, graph="ring"), "krylov", ((1, 480),)),
-        (linked(paper(peers=100_000), "ring"), "modes", ((50_001, 8),)),
-        (paper(comm=8000 * MS), "determinant", ((2, 2),)),
-        (paper(comm=80 * MS), "modes", ((2, 26),)),
-    ],
-)
-def test_the_method_is_chosen_by_what_differs(
-    system: CompiledSystem, method: str, systems: tuple[tuple[int, int], ...]
+PAPER = SCENES / "three-users-average.yaml"
+
+
+def test_a_verdict_that_hangs_on_a_convention_is_warned_of(said: Callable[..., str]) -> None:
+    path = ROOT / "tests" / "scenes" / "verdict-hangs-on-the-order.yaml"
+    text = said(path)
+    assert "Warning: the verdict hangs on a convention" in text
+    assert all(len(line) <= 80 for line in text.splitlines())
+    assert len(json.loads(said(path, "--json"))["warnings"]) == 1
+
+
+def test_a_box_and_a_proof_stand_beside_the_answer(said: Callable[..., str]) -> None:
+    words = ("--certify", "--box", "contact.stiffness=±1%", "--conventions", "--json")
+    found = json.loads(said(PAPER, *words))
+    assert found["proof"].startswith("proved stable") and {"conventions", "box"} <= found.keys()
+
+
+def test_a_delay_of_a_thousand_frames_has_its_verdict_and_says_what_it_has_not(
+    said: Callable[..., str],
 ) -> None:
-    assert (analyze(system).method, needs(system).systems) == (method, systems)
-
-
-FLIPS = ROOT / "tests" / "scenes" / "verdict-hangs-on-the-order.yaml"
-
-
-def test_a_verdict_that_hangs_on_a_convention_is_warned_of() -> None:
-    system = compile_topology(FLIPS)
-    found = answer(system)
-    assert found.to_dict()["warnings"] == [found.conventions.warning]
-    assert "Warning: the verdict hangs on a convention" in str(found)
-    assert all(len(line) <= 80 for line in str(found).splitlines())
-
-
-def test_a_box_and_a_proof_stand_below_the_answer() -> None:
-    system = compile_topology(SCENES / "three-users-average.yaml")
-    ranges = [parse_range(system, "contact.stiffness=±1%")]
-    found = answer(system, certify=True, box=ranges, every_convention=True)
-    assert found.analysis.proof.startswith("proved stable")
-    assert found.box is not None and found.box.stable
-    assert {"conventions", "box"} <= found.to_dict().keys()
-
-
-def test_the_method_of_the_paper_agrees_and_proves_nothing() -> None:
-    system = compile_topology(SCENES / "three-users-average.yaml")
-    assert judge(system, method="paper").spectral_radius == pytest.approx(
-        judge(system).spectral_radius, abs=1e-12
-    )
-    with pytest.raises(ApcError, match="E850 method paper gives no proof"):
-        judge(system, method="paper", certify=True)
-
-
-def test_a_delay_of_a_thousand_frames_has_its_verdict_and_says_what_it_has_not() -> None:
-    system = compile_topology(SCENES / "three-users-average.yaml")
-    late = apply(system, [parse_override(system, "lan.delay=8 s")])
-    found = answer(late)
-    assert found.analysis.verdict == analyze(late).verdict
-    text = str(found)
+    text = said(PAPER, "--set", "lan.delay=8 s")
+    assert apc.analyze(PAPER, set={"lan.delay": "8 s"}).verdict in text
     assert "what moves it most: not looked for: 3 peers make one system of 2,006" in text
     assert "margins none: the scene is not stable as it is" in text
     assert all(len(line) <= 80 for line in text.splitlines())
@@ -145,7 +83,7 @@ def test_a_delay_of_a_thousand_frames_has_its_verdict_and_says_what_it_has_not()
     "name", ["three-users-mesh", "three-users-average", "two-users-waves", "lossy-average"]
 )
 @pytest.mark.parametrize(
-    "values",
+    "settings",
     [
         {"coordination.stiffness": "1e12 N/m"},
         {"contact.stiffness": "0 N/m", "contact.damping": "0 N*s/m"},
@@ -155,13 +93,171 @@ def test_a_delay_of_a_thousand_frames_has_its_verdict_and_says_what_it_has_not()
     ],
     ids=str,
 )
-def test_a_table_that_is_empty_says_why(name: str, values: dict[str, str]) -> None:
-    system = compile_topology(SCENES / f"{name}.yaml")
-    known = {one.name for one in (*system.parameters, *system.timings)}
-    overrides = [parse_override(system, f"{one}={value}") for one, value in values.items() if one in known]
-    found = answer(apply(system, overrides))
-    listed = [found, *([found.network] if found.network else [])]
-    for one in listed:
-        for table in (one.sensitivities, one.margins):
-            assert table.rows or table.note
-            assert str(table).strip()
+def test_a_table_that_is_empty_says_why(
+    name: str, settings: dict[str, str], said: Callable[..., str]
+) -> None:
+    path = SCENES / f"{name}.yaml"
+    known = {row.name for row in apc.parameters(path).rows}
+    words = [word for one, value in settings.items() if one in known for word in ("--set", f"{one}={value}")]
+    found = json.loads(said(path, *words, "--json"))
+    for one in (found, found["network"]):
+        if one:
+            assert one["sensitivities"]["derivatives"] or one["sensitivities"]["note"]
+            assert one["margins"] or one["margins_note"]
+
+
+# ---- who hears whom ----
+
+
+def weighted(edges: str, text: str = MESH) -> str:
+    """Return a scene of three users who hear one another over weighted edges or arcs."""
+    return replaced(text, ("delay: 8 ms}", f"delay: 8 ms, graph: {{{edges}}}}}"))
+
+
+@pytest.mark.few(3)
+@pytest.mark.parametrize("seed", range(6))
+def test_peers_that_weigh_one_another_move_together_freely(seed: int) -> None:
+    generator, digits = random.Random(seed), (1, 2, 4, 9, 15, 17)[seed]
+    arcs = [
+        f"[{sender}, {receiver}, {generator.uniform(0.05, 1.2):.{digits}f}]"
+        for sender in (1, 2, 3)
+        for receiver in (1, 2, 3)
+        if sender != receiver
+    ]
+    system = compiled(weighted(f"arcs: [{', '.join(arcs)}]"))
+    found = apc.analyze(system, certify=True)
+    assert found.verdict == "stable up to a common translation"
+    assert found.proof.startswith("proved stable")
+    with precision(256):
+        assert check(found, *truth(system)) == ""
+
+
+def test_rows_of_weights_that_add_up_to_one_as_decimals_are_a_mean(tmp_path: Path) -> None:
+    part = """\
+component: WeightedMean
+about: Pulls a copy to what the weights make of the others.
+connectors: {object: Flange}
+sends: {x: sample(object.x)}
+parameters: {stiffness: {unit: N/m}, clock: clock, link: link}
+equations:
+  - object.f = hold(f)
+  - f = stiffness*(sample(object.x) - sum(others.x))
+"""
+    text = weighted("arcs: [[1, 2, 0.1], [3, 2, 0.9], [2, 1, 0.3], [3, 1, 0.7], [1, 3, 0.4], [2, 3, 0.6]]")
+    text = replaced(text, ("type: FullMesh", "type: WeightedMean"), (", delay: 1 ms, link", ", link"))
+    system = compiled(text, library(tmp_path, part))
+    assert apc.analyze(system, certify=True).verdict == "stable up to a common translation"
+
+
+CANCEL = "arcs: [[1, 4, 0.1], [2, 4, 0.2], [3, 4, -0.3], [4, 1], [4, 2], [4, 3]]"
+MEAN = ("FullMesh", "AveragePosition")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            weighted("arcs: [[1, 2, 0.3], [2, 1, 0.3], [3, 1, 1.0e-20], [1, 3]]"),
+            r"E217 .* sums that doubles can't tell apart",
+        ),
+        (replaced(weighted(CANCEL), MEAN, ("count: 3", "count: 4")), "E802"),
+        (
+            replaced(weighted("arcs: [[1, 2, 1], [3, 2, -1], [2, 1, 1], [2, 3, 1]]"), MEAN),
+            r"E802 the weights of what user\[2\] hears over lan add up to 0: there is no mean",
+        ),
+        (
+            replaced(weighted("arcs: [[1, 2, 1], [3, 2, -1]]"), MEAN),
+            r"E801 user\[1\] and user\[3\] hear nobody over lan: there is no mean over nobody",
+        ),
+    ],
+)
+def test_what_no_mean_can_be_of_is_refused(text: str, message: str) -> None:
+    with pytest.raises(ApcError, match=message):
+        apc.analyze(compiled(text))
+
+
+# ---- what is left out ----
+
+WHEEL = """\
+component: Wheel
+about: A mass that turns as well, its angle coupled to the others'.
+connectors: {a: Flange}
+parameters:
+  mass: {unit: kg}
+  damping: {unit: N*s/m}
+  stiffness: {unit: N/m}
+  inertia: {unit: kg*m^2}
+  turning: {unit: N*m*s}
+  twist: {unit: N*m}
+  clock: clock
+  link: link
+sends: {phi: sample(phi)}
+variables:
+  x: {unit: m, start: 0 m}
+  v: {unit: m/s, start: 0 m/s}
+  phi: {unit: ANGLE, start: 0}
+  w: {unit: ANGLE/s, start: 0 rad/s}
+  t: {unit: N*m}
+equations:
+  - der(x) = v
+  - mass*der(v) = a.f - damping*v - stiffness*x
+  - der(phi) = w
+  - t = twist*(sample(phi) - mean(others.phi))
+  - inertia*der(w) = -hold(t) - turning*w
+  - a.x = x
+"""
+WHEELS = """\
+topology: wheels
+clocks: {haptic: 1 ms, network: 4 ms}
+peers: {left: {count: 1}, right: {count: 1, set: {wheel.phi: 0.1}}}
+masses:
+  wheel: {type: Wheel, mass: 1 kg, damping: 5 N*s/m, stiffness: 0 N/m, inertia: 0.001 kg*m^2,
+          turning: 0.01 N*m*s, twist: 0.1 N*m, clock: haptic, link: lan}
+links: {lan: {clock: network, delay: 4 ms}}
+"""
+# What is kept follows what the others keep, and pulls nothing.
+KEPT = """\
+component: Kept
+about: Keeps what the others keep.
+connectors: {object: Flange}
+parameters: {lag: {unit: s, default: 1 s}, clock: clock, link: link}
+sends: {s: sample(s)}
+variables: {s: {unit: N, start: 1 N}, y: {unit: N, start: 0 N}}
+equations:
+  - der(s) = (hold(y) - s)/lag
+  - y = mean(others.s)
+  - object.f = 0*s
+"""
+
+
+@pytest.mark.parametrize("angle", ["rad", "deg", "turn"])
+def test_what_turns_freely_is_a_rotation_and_what_shifts_freely_a_translation(
+    angle: str, tmp_path: Path
+) -> None:
+    wheels: CompiledSystem = compiled(WHEELS, library(tmp_path, WHEEL.replace("ANGLE", angle)))
+    free = apc.analyze(wheels)
+    assert (free.translations, free.rotations, free.unfelt) == (2, 1, ())
+    assert "2 translations and 1 rotation left out" in str(free)
+    assert "3 motions are held back by nothing" in str(free)
+    held = apc.analyze(wheels, set={"wheel.stiffness": "300 N/m"})
+    assert (held.verdict, held.translations, held.rotations) == ("stable up to a common rotation", 0, 1)
+    assert "turned together" in str(held)
+
+
+def test_what_is_left_out_though_some_of_it_moves_in_modes_is_a_common_shift(tmp_path: Path) -> None:
+    text = AVERAGE.replace("links:", "  kept: {type: Kept, object: cube, clock: haptic, link: lan}\nlinks:")
+    found = apc.analyze(compiled(text, library(tmp_path, KEPT)))
+    assert found.unfelt == ("the common shift of kept.s, kept.s sent",)
+    assert any(share[0].startswith("kept.s") for mode in found.modes for share in mode.participation)
+    assert "the common shift of kept.s" in str(found)
+
+
+def test_prepared_work_serves_other_numbers_and_other_times() -> None:
+    for name, value in (
+        ("coordination.stiffness", "900 N/m"),
+        ("lan.delay", "4 ms"),
+        ("haptic.period", "0.5 ms"),
+    ):
+        changed = apc.set_parameters(compiled(AVERAGE), {name: value})
+        assert apc.analyze(changed) == apc.analyze(compiled(AVERAGE), set={name: value})
+        assert not np.isclose(apc.analyze(changed).spectral_radius, 0.95717138962509, atol=1e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -13,12 +14,23 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from apc.analysis.analysis import Analysis, analyze
+import apc
+from apc.analysis.analysis import Analysis
 from tests.bruteforce import Scene, as_ball, frame_matrix
-from tests.sites import MS, grouped, paper
+from tests.topologies import compiled
+from tests.truths import text_of
+
+MS = Fraction(1, 1000)
+
+# What four equal eigenvalues of the truth, a Jordan block of zeros say, keep of its 120 digits.
+SCATTERED = 1e-30
 
 
-def _truth(scene: Scene) -> list[flint.acb]:
+def analyze(scene: Scene, **asked: Any) -> Analysis:
+    return apc.analyze(compiled(text_of(scene)), **asked)
+
+
+def truth_of(scene: Scene) -> list[flint.acb]:
     """Return the eigenvalues of the full map at 120 digits, of which four equal ones keep 30."""
     before, flint.ctx.dps = flint.ctx.dps, 120
     try:
@@ -26,10 +38,6 @@ def _truth(scene: Scene) -> list[flint.acb]:
         return flint.acb_mat([[flint.acb(e.mid()) for e in row] for row in rows]).eig(algorithm="approx")
     finally:
         flint.ctx.dps = before
-
-
-# What four equal eigenvalues of the truth, a Jordan block of zeros say, keep of its 120 digits.
-SCATTERED = 1e-30
 
 
 @st.composite
@@ -41,38 +49,16 @@ def scenes(draw: st.DrawFn) -> dict[str, Any]:
 
     return {
         "operator": draw(st.sampled_from(["mean", "sum"])),
-        "kt": draw(gain(4000)),
-        "bt": draw(gain(5)),
-        "kc": draw(gain(4000)),
-        "bc": draw(gain(4)),
+        **{name: draw(gain(largest)) for name, largest in (("kt", 4000), ("bt", 5), ("kc", 4000), ("bc", 4))},
         "comp": draw(st.sampled_from([Fraction(0), MS, MS * 2 / 5, MS * 5 / 2])),
         "comm": draw(st.sampled_from([Fraction(0), 8 * MS, 11 * MS])),
     }
 
 
-@settings(max_examples=12, derandomize=True)
-@given(scenes())
-@example(
-    {
-        "operator": "mean",
-        "kt": 0.05,
-        "kc": 1.0,
-        "bc": 2.0,
-        "network": MS,
-        "comp": Fraction(0),
-        "comm": 11 * MS,
-    }
-)
-@example({"operator": "mean", "kt": 0.0, "kc": 1000.0, "bc": 2.0, "comm": 80 * MS})
-def test_the_truth_at_120_digits_is_within_the_bound_of_every_mode(values: dict[str, Any]) -> None:
-    found = _check_against_truth(values)
-    assert found.spectral_radius_error < 1e-6
-
-
-def _check_against_truth(values: dict) -> Analysis:
+def check(values: dict[str, Any]) -> Analysis:
     """Assert that truth is within every bound, and that no verdict contradicts it; return the analysis."""
-    found = analyze(paper(peers=2, **values))
-    truth = _truth(Scene(peers=2, **values))
+    scene = Scene(peers=2, **values)
+    found, truth = analyze(scene), truth_of(scene)
     for mode in found.modes:
         place = flint.acb(mode.eigenvalue.real, mode.eigenvalue.imag)
         assert min(float(abs(place - value).mid()) for value in truth) <= mode.error + SCATTERED
@@ -86,40 +72,109 @@ def _check_against_truth(values: dict) -> Analysis:
     return found
 
 
+QUEUE = {"operator": "mean", "kt": 0.05, "kc": 1.0, "bc": 2.0, "network": MS, "comp": Fraction(0)}
+
+
+@settings(max_examples=12, derandomize=True)
+@given(scenes())
+@example({**QUEUE, "comm": 11 * MS})
+@example({"operator": "mean", "kt": 0.0, "kc": 1000.0, "bc": 2.0, "comm": 80 * MS})
+def test_the_truth_at_120_digits_is_within_the_bound_of_every_mode(values: dict[str, Any]) -> None:
+    assert check(values).spectral_radius_error < 1e-6
+
+
 @pytest.mark.parametrize("bt", [0.0, 1.0])
 def test_next_to_the_boundary_every_verdict_is_decided_and_right(bt: float) -> None:
     values = {"bt": bt, "bc": 2.0, "kc": 500.0, "comp": MS, "comm": 8 * MS}
+    system = compiled(text_of(Scene(peers=2, kt=1.0, **values)))  # type: ignore[arg-type] # numbers and times
 
     def beyond(kt: float) -> float:
-        return analyze(paper(peers=2, **values, kt=kt)).spectral_radius - 1
+        return apc.analyze(system, set={"coordination.stiffness": f"{kt!r} N/m"}).spectral_radius - 1
 
     crossing = brentq(beyond, 1.0, 20000.0, xtol=1e-12)
     steps = (-1e-9, -1e-13, 0.0, 1e-13, 1e-9)
-    verdicts = {_check_against_truth({**values, "kt": crossing * (1 + step)}).verdict for step in steps}
+    verdicts = {check({**values, "kt": crossing * (1 + step)}).verdict for step in steps}
     assert verdicts == {"stable up to a common translation", "unstable"}
+
+
+def test_as_many_digits_are_taken_as_decide() -> None:
+    """At the last float below a boundary, 1 − ρ is 1e-16 or less: too near for floats, not for a proof."""
+    system = compiled(text_of(Scene()))
+
+    def at(kt: float) -> Analysis:
+        return apc.analyze(system, set={"coordination.stiffness": f"{kt!r} N/m"})
+
+    low, high = 1096.0, 1097.0
+    while np.nextafter(low, high) < high:
+        middle = (low + high) / 2
+        low, high = (middle, high) if at(middle).stable else (low, middle)
+    assert (at(low).stable, at(high).stable) == (True, False)
+    assert at(low).proof.startswith(("decided with", "proved stable"))
+    assert at(high).proof.startswith("proved unstable")
+    assert abs(low - 1096.411) < 6e-4  # the reference limit of K_T at K_C = 1000
 
 
 @pytest.mark.parametrize("comp", [Fraction(0), MS])
 @pytest.mark.parametrize(("operator", "viscosity"), [("mean", 2.3), ("sum", 4.6)])
 def test_a_slow_late_network_brakes_like_a_damper(operator: str, viscosity: float, comp: Fraction) -> None:
     """K_eff ((T_n − T_c)/2 + T_d) at low frequency: a copy so heavy that v decays as e^(−B t/m)."""
-    mass = 1e5
-    system = grouped(
-        paper(operator, kt=200.0, kc=0.0, cube=mass, comp=comp), ("user", 3, {"cube.damping": 0.0})
-    )
-    slow = next(mode for mode in analyze(system).modes if mode.shape == "common")
-    assert -mass * math.log(slow.magnitude) / 0.008 == pytest.approx(viscosity, rel=1e-4)
+    scene = Scene(operator, kt=200.0, kc=0.0, cube=1e5, cube_damping=0.0, comp=comp)
+    slow = next(mode for mode in analyze(scene).modes if mode.shape == "common")
+    assert -1e5 * math.log(slow.magnitude) / 0.008 == pytest.approx(viscosity, rel=1e-4)
 
 
 def test_conjugates_of_a_real_matrix_are_exact_and_the_upper_one_is_first() -> None:
-    found = analyze(paper(kt=800.0, bt=2.0, kc=1500.0, bc=2.0))
+    found = analyze(Scene(kt=800.0, bt=2.0, kc=1500.0, bc=2.0))
     pairs = [mode.eigenvalue for mode in found.modes if mode.eigenvalue.imag]
     assert pairs
     for upper, lower in zip(pairs[::2], pairs[1::2], strict=True):
-        assert upper == lower.conjugate()
-        assert upper.imag > 0
+        assert upper == lower.conjugate() and upper.imag > 0
 
 
-def test_a_translation_is_one_exact_mode_and_never_a_question_of_tolerance() -> None:
-    for k_t in np.linspace(1, 1000, 9):
-        assert analyze(paper(kt=float(k_t))).rigid_modes == 1
+# ---- what nothing holds back ----
+
+LOOSE = Scene(device_damping=0.0, cube_damping=0.0)
+
+
+@pytest.mark.few(9)
+@pytest.mark.parametrize(
+    ("values", "rigid"),
+    [
+        ({"kt": 1.0}, 1),
+        ({"kt": 0.0, "bt": 0.0}, 3),  # nothing ties the peers
+        ({"kt": 0.0, "bt": 2.0}, 3),  # a damper holds no position
+        ({"kt": 0.0, "bt": 2.0, "kc": 0.0}, 6),  # device and cube apart
+        ({"kt": 1e-300}, 1),  # the weakest spring holds
+        ({"kc": 1e-300}, 1),
+        ({"kc": 0.0}, 4),
+    ],
+)
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+@pytest.mark.parametrize("alike", [True, False])
+def test_a_stiffness_of_exactly_zero_frees_what_it_held(
+    values: dict[str, float], rigid: int, operator: str, alike: bool
+) -> None:
+    users = () if alike else tuple({"device": mass} for mass in (0.1, 0.2, 0.15))
+    scene = Scene(operator, users=users, **values)  # type: ignore[arg-type] # numbers
+    methods = ["auto", "dense"] if alike or 1e-300 in values.values() else ["auto", "determinant"]
+    assert {analyze(scene, method=method).rigid_modes for method in methods} == {rigid}
+
+
+@pytest.mark.parametrize(
+    ("values", "verdict", "rigid"),
+    [
+        ({"kt": 0.0, "bt": 0.0, "kc": 0.0}, "drifts", 6),
+        ({"kt": 0.0, "bt": 0.0, "bc": 2.0, "comp": Fraction(0)}, "drifts", 3),
+        ({"kt": 0.0, "bt": 2.0, "bc": 2.0, "comp": Fraction(0)}, "drifts", 3),  # apart, the damper brakes
+        # The late network brakes: K_eff ((T_n − T_c)/2 + T_d).
+        ({"kt": 100.0, "bt": 2.0, "bc": 3.0}, "stable up to a common translation", 1),
+        ({"kt": 0.0, "bt": 0.0, "kc": 3000.0}, "unstable", 3),
+    ],
+)
+def test_undamped_peers_drift_as_far_as_nothing_brakes_them(
+    values: dict[str, Any], verdict: str, rigid: int
+) -> None:
+    for asked in ({}, {"certify": True}):
+        found = analyze(replace(LOOSE, **values), **asked)
+        assert (found.verdict, found.rigid_modes) == (verdict, rigid)
+    assert found.proof.startswith({"d": "proved to drift", "s": "proved stable", "u": "proved"}[verdict[0]])

@@ -32,6 +32,7 @@ def of_one_number(law: ChannelLaw, heard: float, lost: float, *, seed: int, fram
     return exponent(loop, [Chance(law, (0,))], seed=seed, courses=40, frames=frames)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("law", [BURSTS, replace(RELIABLE, p=0.3, r=0.7)])
 def test_intervals_hold_the_exponent_of_one_number_95_times_in_a_hundred(law: ChannelLaw) -> None:
     known = (1 - law.mean_loss) * math.log(0.7) + law.mean_loss * math.log(1.4)
@@ -43,7 +44,7 @@ def test_intervals_hold_the_exponent_of_one_number_95_times_in_a_hundred(law: Ch
 
 # Of an independent program, for the paper's users at 10 % loss: peers, stiffness, exponent per frame and half
 # of its 95 % interval.
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("peers", "stiffness", "known", "half"),
     [

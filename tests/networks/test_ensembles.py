@@ -17,7 +17,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.simulation import ensemble
 from apc.simulation.blocks import pushes
-from apc.simulation.ensemble import Ensemble, Run, play_many, share_interval
+from apc.simulation.ensemble import Ensemble, play_many, share_interval
 from apc.simulation.native import compiler
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
@@ -43,10 +43,17 @@ def said(found: Ensemble) -> str:
 def test_a_run_does_not_depend_on_how_many_there_are_or_who_plays_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ensemble, "PART", 5)
     few = runs(SHAKY, 4, "1/2", jit=False).runs
-    shared = runs(SHAKY, 9, "1/2", jit=False, jobs=2).runs
+    together = runs(SHAKY, 9, "1/2", jit=False, jobs=2)
+    shared = together.runs
     assert [one.number for one in shared] == [*range(9)]
     assert shared[:4] == few
     assert len({one.settled for one in shared}) > 3, "they are different runs"
+    settled = [one.settled for one in shared if one.settled is not None]
+    of_all = together.statistics("settled")
+    assert of_all is not None and of_all.count == len(settled)
+    assert (of_all.low, of_all.high) == (min(settled), max(settled))
+    assert of_all.mean == pytest.approx(np.mean(settled))
+    assert of_all.standard_error == pytest.approx(np.std(settled, ddof=1) / math.sqrt(len(settled)))
     alone, _ = play(prepare(compiled(SHAKY), Settings(Fraction(1, 2), seed=3, jit=False)), [])
     assert alone.largest_force is not None
     told = (few[0].verdict, few[0].settled, few[0].largest_force)
@@ -62,7 +69,7 @@ def rows_of_runs(system: CompiledSystem, count: int, first: int) -> NDArray[np.f
     return played.rows.reshape(-1, simulation.population.width, count).copy()
 
 
-@pytest.mark.few(1)
+@pytest.mark.whole
 @machine_code
 @pytest.mark.parametrize(("peers", "more"), [*((3, more) for more in ("", *ODD)), (7, ""), (7, ODD[-1])])
 def test_runs_side_by_side_are_to_the_bit_those_played_alone(peers: int, more: str) -> None:
@@ -74,26 +81,6 @@ def test_runs_side_by_side_are_to_the_bit_those_played_alone(peers: int, more: s
     together = rows_of_runs(system, 13, 2)
     for number in (2, 9, 14):
         np.testing.assert_array_equal(together[:, :, number - 2], rows_of_runs(system, 1, number)[:, :, 0])
-
-
-def test_runs_that_diverge_are_told_from_those_beside_them() -> None:
-    """So stiff a coupling grows until the numbers end, however the packets come."""
-    found = runs(replaced(SHAKY, ("stiffness: 500 N/m", "stiffness: 500 kN/m")), 3, "20").runs
-    assert [one.verdict for one in found] == ["diverges"] * 3
-
-
-def test_statistics_are_those_of_the_runs_that_have_the_number() -> None:
-    listed = [Run(n, "moves on" if at is None else "settles", at, 2.0 * n, 1e-3) for n, at in enumerate((0.1, 0.4, None, 0.2))]  # noqa: E501 # fmt: skip
-    found = Ensemble("scene", Fraction(3), 7, tuple(listed))
-    one = found.statistics("settled")
-    assert one is not None
-    assert (one.count, one.low, one.high) == (3, 0.1, 0.4)
-    assert one.mean == pytest.approx(0.7 / 3)
-    assert one.standard_error == pytest.approx(math.sqrt((0.01 + 0.16 + 0.04 - 0.49 / 3) / 2 / 3))
-    assert one.quantiles[1] == pytest.approx(0.2)
-    assert Ensemble("scene", Fraction(3), 7, tuple(listed[2:3])).statistics("settled") is None
-    assert found.verdicts == (("settles", 3), ("moves on", 1))
-    assert "settles 3 75 % (95 % sure: 30.1 % to 95.4 %)" in said(found)
 
 
 def test_a_shares_interval_is_wilsons() -> None:
@@ -123,10 +110,10 @@ def test_runs_agree_with_the_judgedin_mean_square_and_take_the_time_of_its_growt
 
 
 def test_runs_that_are_about_something_else_than_a_verdict_say_so() -> None:
-    short = runs(moved(1200), seconds="0.3")
+    short = runs(moved(1200), 2, "0.3")
     assert short.agrees is False and "and the runs show how it begins" in said(short)
     hand = "hands:\n  hand: {type: SineForce, flange: device, force: 1 N, frequency: 3 Hz}\n"
-    driven = runs(moved(500) + hand)
+    driven = runs(moved(500) + hand, 2, "1")
     assert driven.agrees is False and "what moves the others is a force that goes on" in said(driven)
     text = (SCENES / "experiment-average.yaml").read_text(encoding="utf-8")
     pressed = runs(replaced(text, ("delay: 8 ms}", "delay: 8 ms, loss: 5 %}")), 2)

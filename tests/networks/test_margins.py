@@ -17,6 +17,7 @@ from apc.frame.overrides import Override, apply
 from apc.vary import over_network
 from apc.vary.margins import Margins
 from apc.vary.over_network import network_margins, network_sensitivities
+from tests.bruteforce import Scene
 from tests.held_scenes import scene, system_of
 from tests.networks.second_moments import Law, second_moment_radius
 from tests.networks.test_loss import STIFFNESS
@@ -42,8 +43,7 @@ def test_derivatives_are_those_of_moments_followed_event_by_event() -> None:
     found = {row.parameter: row for row in network_sensitivities(system, prepare(system)).rows}
 
     def radius(stiffness: float = 900.0, loss: float = 0.1) -> float:
-        moved = system_of(scene(2, stiffness, loss=f"{100 * loss!r} %"))
-        return second_moment_radius(moved, {"lan": Law(loss, 1 - loss)})
+        return second_moment_radius(Scene(peers=2, kt=stiffness, cube=0.3), Law(loss, 1 - loss))
 
     for name, step, up, down in (
         (STIFFNESS, 1.0, radius(901.0), radius(899.0)),
@@ -77,6 +77,7 @@ def test_margins_that_take_long_are_looked_for_if_asked_and_never_of_an_unstable
 
 # Largest stiffness of three users by the share lost (brute force over all patterns, to 0.5 N/m): none
 # 1096.4, 5 % 1118, 10 % 1143.2, 40 % 1384.
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("stiffness", "more", "box", "stable"),
     [
@@ -144,6 +145,7 @@ links:
 """
 
 
+@pytest.mark.whole
 def test_a_wide_box_far_inside_is_proved_and_points_of_it_are_stable() -> None:
     """Its cells are halved where that makes them easier to prove: the mass, which hardly moves the radius."""
     system = compiled(ARMED)

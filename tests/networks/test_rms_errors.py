@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from typing import Any
 
 import pytest
 
-from tests.held_scenes import scene, system_of
+from tests import bruteforce
+from tests.held_scenes import scene
 from tests.networks.second_moments import Law, rms_error
 from tests.networks.test_loss import judged
 from tests.topologies import replaced
@@ -24,6 +26,7 @@ def metres(text: str) -> float:
 
 
 # By independent programs: users, K_T in N/m, 1 N² a tick of 1 ms at each device, every packet on time.
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("count", "stiffness", "expected"),
     [
@@ -41,33 +44,46 @@ def test_with_next_to_no_loss_the_error_is_that_of_an_ideal_network(
         assert found == pytest.approx(expected, rel=1e-9)
 
 
+PATH = dict.fromkeys([(0, 1), (1, 0), (1, 2), (2, 1)], 1.0)
+
+
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
-    ("text", "law"),
+    ("text", "more", "law"),
     [
-        (scene(2, 500.0, loss="40 %"), Law(0.4, 0.6)),
-        (scene(2, 900.0, more=", on_loss: zero"), Law(0.1, 0.9, zero=True)),
-        (scene(2, 500.0, more=", on_loss: zero", delay="5 ms"), Law(0.1, 0.9, zero=True)),
-        (scene(2, 500.0, loss="{p: 3 %, r: 30 %}"), Law(0.03, 0.3)),
-        (scene(2, 500.0, loss="{p: 3 %, r: 30 %}", delay="13 ms"), Law(0.03, 0.3)),
-        (replaced(scene(2, 500.0), ("  user: {count: 2}\n", GROUPS)), Law(0.1, 0.9)),
+        (scene(2, 500.0, loss="40 %"), {}, Law(0.4, 0.6)),
+        (scene(2, 900.0, more=", on_loss: zero"), {"kt": 900.0}, Law(0.1, 0.9, zero=True)),
+        (
+            scene(2, 500.0, more=", on_loss: zero", delay="5 ms"),
+            {"comm": Fraction(5, 1000)},
+            Law(0.1, 0.9, zero=True),
+        ),
+        (scene(2, 500.0, loss="{p: 3 %, r: 30 %}"), {}, Law(0.03, 0.3)),
+        (
+            scene(2, 500.0, loss="{p: 3 %, r: 30 %}", delay="13 ms"),
+            {"comm": Fraction(13, 1000)},
+            Law(0.03, 0.3),
+        ),
+        (
+            replaced(scene(2, 500.0), ("  user: {count: 2}\n", GROUPS)),
+            {"users": ({}, {"device": 0.25, "kt": 700.0, "kc": 800.0})},
+            Law(0.1, 0.9),
+        ),
         pytest.param(
             scene(3, 500.0, loss="20 %", more=", graph: {edges: [[1, 2], [2, 3]]}"),
+            {"peers": 3, "weights": PATH, "cube": 0.2},
             Law(0.2, 0.8),
-            marks=pytest.mark.whole,
-        ),
-        pytest.param(scene(3, 500.0, loss="{p: 3 %, r: 30 %}"), Law(0.03, 0.3), marks=pytest.mark.whole),
-        pytest.param(
-            scene(2, 700.0, loss="0 %", more=", jitter: 6 ms"),
-            Law(jitter=Fraction(6, 1000)),
             marks=pytest.mark.whole,
         ),
     ],
 )
-def test_it_is_that_of_moments_followed_event_by_event(text: str, law: Law) -> None:
+def test_it_is_that_of_moments_followed_event_by_event(text: str, more: dict[str, Any], law: Law) -> None:
     """The largest of all copies; whatever the delay, it is looked at as packets are sent."""
-    assert metres(text) == pytest.approx(rms_error(system_of(text), {"lan": law}), rel=1e-9)
+    followed = bruteforce.Scene(**{"peers": 2, "cube": 0.3, **more})
+    assert metres(text) == pytest.approx(rms_error(followed, law), rel=1e-9)
 
 
+@pytest.mark.whole
 def test_of_many_users_bursts_tell_an_estimate_that_is_called_one() -> None:
     found = judged(scene(5, 500.0, loss="{p: 0.3 %, r: 30 %}"))
     assert found.rms_error_m == pytest.approx(metres(scene(5, 500.0, loss="1e-9 %")), rel=0.01)

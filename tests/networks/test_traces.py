@@ -40,7 +40,7 @@ def test_equal_recorded_delays_are_a_nominal_delay(tmp_path: Path, delay: str, c
 def test_recorded_losses_are_frames_multiplied_by_hand(tmp_path: Path, heard: tuple[int, ...]) -> None:
     found = judged(tmp_path, "".join("8\n" if one else "lost\n" for one in heard), peers=2)
     own = frames(2, 500.0)
-    truth = growth([own.matrix(own.c[:2, 0] * 0 + one) for one in heard])
+    truth = growth([own.matrix([one, one]) for one in heard])
     assert found.mean_square_radius is not None and found.error is not None
     assert abs(found.mean_square_radius - truth**2) <= 1e-9 + found.error
 

@@ -41,17 +41,6 @@ def test_a_fixed_place_that_decides_is_a_wall() -> None:
     assert walls == [Wall(0.0)]
 
 
-def test_a_limit_of_a_force_is_no_surface() -> None:
-    text = replaced(
-        AVERAGE,
-        ("type: SampledSpringDamper", "type: ForceSaturation"),
-        ("stiffness: 1000 N/m,", "stiffness: 1000 N/m, limit: 3 N,"),
-    )
-    bodies, walls = first_peer(compiled(text))
-    assert [one.half_width for one in bodies] == [0, 0]
-    assert walls == []
-
-
 def test_every_peer_has_a_row_and_the_rest_is_counted(tmp_path: Path) -> None:
     drawn = draw_still(scene("experiment-average")).axes[0]
     assert [one.get_text() for one in drawn.get_yticklabels()] == ["right[1]", "left[1]", "left[2]"]
@@ -110,29 +99,6 @@ def test_every_peer_has_a_plane_of_its_own_to_one_scale(tmp_path: Path) -> None:
     assert right - left == pytest.approx(high - low)
     assert left < -30 < 82 < right
     assert low < -62 < 23 < high
-
-
-def test_of_space_two_coordinates_are_drawn_and_the_caption_says_so() -> None:
-    text = (
-        "topology: ball\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
-        "masses: {device: {type: SpatialMass, mass: 1 kg, x: [3 mm, 4 mm, 5 mm]}, slider: {mass: 1 kg}}\n"
-        "couplers:\n"
-        "  ball: {type: SphereContact, a: device, b: ground, radius: 16 mm, stiffness: 9 N/m, clock: tick}\n"
-        "  table: {type: PlaneContact, flange: device, normal: [0, 0, 2], stiffness: 9 N/m, clock: tick}\n"
-    )
-    system = compiled(text)
-    spots, surfaces = in_plane(system)
-    assert spots == [Spot("device", (0.003, 0.004, 0.005), 0.0)]
-    assert sorted(surfaces, key=repr) == [Disc((0.0, 0.0, 0.0), 0.016), Line((0.0, 0.0, 1.0), 0.0)]
-    figure = draw_still(system)
-    assert figure.get_suptitle().splitlines() == [
-        "ball: at the start",
-        "of three coordinates the first two",
-        "not drawn, as they move along one axis: slider",
-    ]
-    [ax] = figure.axes
-    assert len(ax.patches) == 1
-    assert len(ax.lines) == 1  # the table lies in the plane that is drawn
 
 
 def test_a_run_in_a_plane_is_drawn_as_paths_as_well(tmp_path: Path) -> None:

@@ -5,16 +5,14 @@ A `Link` brings each packet after its delay; forces act when they are due; betwe
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
 from fractions import Fraction
 
 import numpy as np
 import pytest
 
-from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
-from apc.eigen.modes import dense
 from apc.frame.overrides import apply, parse_override
 from apc.simulation.blocks import blocks
 from apc.simulation.native import compiler
@@ -22,23 +20,18 @@ from apc.simulation.propagate import MOST_EXACT
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import Trajectory, simulate
-from tests.eventwise import MS, Play, User, experiment, play
-from tests.sites import alone, columned, linked, paper
+from tests.fifty_digits.truth import exact_course
+from tests.schemes import experiment
+from tests.sites import MS, alone, paper
 from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, replaced
 
 MOVED = "{count: 3, set: {device.x: [10 mm, 0 mm, -5 mm], cube.x: [2 mm, 0 mm, 1 mm]}}"
-USERS = (User(0.01, cube_x=0.002), User(), User(-0.005, cube_x=0.001))
 
 
 def users(trajectory: Trajectory, n: int) -> np.ndarray:
     """Return the rows as (rows, users, [x, v, x_O, v_O, F_C, F_T])."""
     kept = [i for i, one in enumerate(trajectory.signals) if not one.local.endswith(" acting")]
     return trajectory.values[:, kept].reshape(len(trajectory.time), n, 6)
-
-
-def by_hand(scene: Play, duration: Fraction) -> tuple[np.ndarray, np.ndarray]:
-    rows = np.array(play(scene, duration))
-    return rows[:, 0], rows[:, 1:].reshape(len(rows), len(scene.users), 6)
 
 
 def scene_file(name: str) -> str:
@@ -54,110 +47,53 @@ def test_the_papers_experiment_is_what_stepping_it_by_hand_gives(
     # The mesh shakes: each contact made or lost multiplies the roundings.
     length = Fraction(4, 5)
     found = simulate(compiled(scene_file(f"experiment-{name}.yaml")), duration=length, jit=False)
-    time, expected = by_hand(experiment(operator), length)
+    expected = experiment(operator, 801)
     expected[:, 0, 4] *= -1  # a push is positive on either side
-    assert (found.time == time).all()
+    assert found.time.tolist() == [tick / 1000 for tick in range(801)]
     assert np.abs(users(found, 3) - expected).max() < tolerance
 
 
-@pytest.mark.few(5)
-@pytest.mark.parametrize(
-    ("comp", "comm"),
-    [
-        (Fraction(0), Fraction(0)),  # heard at the very tick it is sent
-        (MS, 8 * MS),
-        (Fraction(3, 10) * MS, Fraction(5, 2) * MS),  # within the frame, between ticks
-        (Fraction(9, 4) * MS, 21 * MS),  # over more than one tick, and over frames
-        (9 * MS, Fraction(1, 1000) * MS),
-    ],
-)
-@pytest.mark.parametrize(("text", "operator"), [(AVERAGE, "mean"), (MESH, "sum")])
-def test_delays_of_any_length_act_when_they_should(
-    text: str, operator: str, comp: Fraction, comm: Fraction
-) -> None:
-    pairs = (("{count: 3}", MOVED), ("delay: 8 ms}", f"delay: {float(comm * 1000)!r} ms}}"))
-    text = replaced(text, *pairs).replace("delay: 1 ms", f"delay: {float(comp * 1000)!r} ms")
-    text = text.replace("stiffness: 500 N/m", "stiffness: 200 N/m, damping: 1 N*s/m")
-    text = text.replace("stiffness: 1000 N/m,", "stiffness: 300 N/m, damping: 0.5 N*s/m,")
-    found = simulate(compiled(text), duration=Fraction(1, 10), jit=False)
-    scene = Play(USERS, operator, kc=300.0, bc=0.5, kt=200.0, bt=1.0, comp=comp, comm=comm)
-    time, expected = by_hand(scene, Fraction(1, 10))
-    assert (found.time == time).all()
-    assert np.abs(users(found, 3) - expected).max() < 1e-12
-
-
-def check_powers(
-    moved: CompiledSystem,
-    still: CompiledSystem,
-    start: Callable[[str], float],
-    duration: Fraction,
-    error: float,
-) -> None:
-    """Check what is moved more than what is still against powers of the analysis' map of all peers."""
-    closed = dense(*lifted_groups(still))
-    state = np.array([start(name) for name in closed.names])
-    names = [closed.names[place] for place in closed.motion]
-    runs = [simulate(one, duration=duration, signals=names, jit=False) for one in (moved, still)]
-    assert [one.name for one in runs[0].signals] == names
-    for row in (runs[0].values - runs[1].values)[:: round(closed.frame_s * 1000)]:
-        assert np.abs(row - state[list(closed.motion)]).max() < error
-        state = closed.matrix @ state
-
-
-def test_ten_seconds_are_the_powers_of_the_analysis_frame_map() -> None:
-    moved = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: [10 mm, 0 mm, 0 mm]}}"))
-
-    def start(name: str) -> float:
-        return 0.01 if name == "user[1].device.x" else 0.0
-
-    check_powers(compiled(moved), compiled(AVERAGE), start, Fraction(10), 1e-13)
-
-
-@pytest.mark.parametrize("scene", ["star-lecture", "users-table", "mixed-clocks"])
-def test_graphs_groups_and_clocks_follow_the_frame_map(scene: str) -> None:
-    system = compile_topology(SCENES / f"{scene}.yaml")
-    group = system.groups[0].name
-    values = system.groups[0].values or system.parameters
-    first = next((one.value for one in values if one.name == "device.x"), 0.0)
-    pushed = apply(system, [parse_override(system, f"{group}.device.x={first + 0.01!r} m")])
-
-    def start(name: str) -> float:
-        return 0.01 if name.startswith(f"{group}[") and name.endswith("].device.x") else 0.0
-
-    check_powers(pushed, system, start, Fraction(2, 5), 1e-13)
+def check_followed(system: CompiledSystem, duration: Fraction) -> None:
+    """Check a run against the course that the independent engine follows in balls."""
+    followed = exact_course(system, duration)
+    assert not isinstance(followed, str), followed
+    names, rows = followed
+    found = simulate(system, duration=duration, signals=names, jit=False)
+    assert [one.name for one in found.signals] == [*names]
+    assert np.ptp(rows, axis=0).max() > 1e-4
+    assert np.abs(found.values - rows).max() < 1e-12 * max(1.0, np.abs(rows).max())
 
 
 @pytest.mark.few(6)
-@pytest.mark.parametrize("operator", ["mean", "sum"])
+@pytest.mark.parametrize(
+    ("comp", "comm"),
+    [
+        ("0 ms", "0 ms"),  # heard at the very tick it is sent
+        ("1 ms", "8 ms"),
+        ("0.3 ms", "2.5 ms"),  # within the frame, between ticks
+        ("2.25 ms", "21 ms"),  # over more than one tick, and over frames
+        ("9 ms", "0.001 ms"),
+    ],
+)
 @pytest.mark.parametrize("graph", ["complete", "ring", "star"])
-@pytest.mark.parametrize("comm", [Fraction(0), 3 * MS, 8 * MS, 24 * MS])
-def test_packets_over_any_graph_are_heard_as_the_map_of_the_analysis_says(
-    operator: str, graph: str, comm: Fraction
-) -> None:
+@pytest.mark.parametrize("text", [AVERAGE, MESH], ids=["mean", "sum"])
+def test_delays_of_any_length_act_when_they_should(text: str, graph: str, comp: str, comm: str) -> None:
     """Packets on their way hold the senders' start values; forces before the first tick are zero."""
-    system = linked(paper(operator, peers=4, kt=200.0, bt=1.0, comm=comm), graph)
-    starts = [0.01, -0.02, 0.03, 0.0]
-
-    def start(name: str) -> float:
-        at_first = any(one in name for one in (".device.x", ".cube.x", "coordination.x sent"))
-        return starts[int(name[len("user[")]) - 1] if at_first else 0.0
-
-    moved = columned(system, cube__x__start=starts, device__x__start=starts)
-    check_powers(moved, system, start, 40 * MS, 1e-14)
+    starts = "[10 mm, 0 mm, -5 mm, 7 mm]"
+    four = f"{{set: {{device.x: {starts}, cube.x: [2 mm, 0 mm, 1 mm, -3 mm]}}}}"
+    text = replaced(text, ("{count: 3}", four), ("delay: 8 ms}", f"delay: {comm}, graph: {graph}}}"))
+    text = text.replace("delay: 1 ms", f"delay: {comp}")
+    text = text.replace("stiffness: 500 N/m", "stiffness: 200 N/m, damping: 1 N*s/m")
+    text = text.replace("stiffness: 1000 N/m,", "stiffness: 300 N/m, damping: 0.5 N*s/m,")
+    check_followed(compiled(text), Fraction(1, 20))
 
 
-@pytest.mark.parametrize(("text", "added"), [(AVERAGE, 2.3), (MESH, 4.6)])
-@pytest.mark.parametrize("delay", ["0 ms", "1 ms"])
-def test_a_late_network_drags_a_moved_cube_as_the_viscosity_formula_says(
-    text: str, added: float, delay: str
-) -> None:
-    # K_eff ((T_n − T_c)/2 + T_d); with a computational delay of the whole force nothing changes.
-    hand = "hands: {hand: {type: ConstantForce, flange: device, force: 1 N}}\nstudies:"
-    text = replaced(text, ("stiffness: 500 N/m", "stiffness: 200 N/m"), ("studies:", hand))
-    text = text.replace("delay: 1 ms", f"delay: {delay}")
-    found = simulate(compiled(text), duration=Fraction(4), signals=["cube.x"], jit=False)
-    speed = (found.values[-1] - found.values[-1 - 80]) / 0.080
-    assert 1 / speed - 10 == pytest.approx(np.full(3, added), rel=1e-3)
+@pytest.mark.few(2)
+@pytest.mark.parametrize("scene", ["mixed-clocks", "users-table", "star-lecture"])
+def test_groups_tables_and_clocks_are_followed(scene: str) -> None:
+    system = compile_topology(SCENES / f"{scene}.yaml")
+    group = system.groups[0].name
+    check_followed(apply(system, [parse_override(system, f"{group}.device.x=10 mm")]), Fraction(1, 20))
 
 
 MOVING = replaced(AVERAGE, ("{count: 3}", MOVED))
@@ -191,12 +127,13 @@ def test_a_clock_with_a_phase_ticks_late_and_the_first_row_is_at_time_0() -> Non
 
 def test_what_is_remembered_starts_at_its_start_value_and_acts_as_zero_before_it_is_computed() -> None:
     # y counts up by one a tick from its start value; what is held is y, late by one tick and a half.
-    system = alone(lambda x, u: 0 * x + u[0], lambda x, u, m: m + 1, memories=(0,), delay=Fraction(3, 2) * MS)
+    count = ", f: {unit: 1, start: 0}"
+    system = alone("hold(f, delay)", "f = previous(f) + 1", variables=count, delay="1.5 ms")
     found = simulate(system, duration=5 * MS, jit=False)
-    assert found["peer[1].f"].tolist() == [0, 1, 2, 3, 4, 5]
-    assert found["peer[1].f acting"].tolist() == [0, 0, 1, 2, 3, 4]
+    assert found["peer[1].it.f"].tolist() == [0, 1, 2, 3, 4, 5]
+    assert found["peer[1].it.f acting"].tolist() == [0, 0, 1, 2, 3, 4]
     expected = np.array([0, 0, 0.5, 2, 4.5, 8]) * 1e-3
-    assert found["peer[1].x"] == pytest.approx(expected, abs=1e-18)
+    assert found["peer[1].it.x"] == pytest.approx(expected, abs=1e-18)
 
 
 def test_a_long_run_comes_in_blocks_of_bounded_size_tick_by_tick(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,6 +154,8 @@ def test_what_diverges_is_kept_while_it_is_finite() -> None:
     assert found.summary.stopped_at is not None
     assert found.time[-1] == pytest.approx(found.summary.stopped_at - 0.001)
     assert np.abs(found.values[-1]).max() > 1e290
+    # Forces times speeds leave the range of floats halfway: that ends no document.
+    json.dumps(found.to_dict(), allow_nan=False)
 
 
 def test_many_different_peers_move_as_each_by_itself() -> None:

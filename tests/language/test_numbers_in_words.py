@@ -1,0 +1,71 @@
+"""Numbers of reports end with the digit their error stands in; lines fit a terminal."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from fractions import Fraction
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from apc.compiler.words import WIDTH, known_digits, measured, wrapped
+
+
+@given(st.lists(st.text("abc", min_size=1, max_size=WIDTH - 4), max_size=40))
+def test_lines_are_filled_up_to_the_width_and_no_word_is_lost(words: list[str]) -> None:
+    lines = wrapped(" ".join(words), "  ", "    ")
+    assert " ".join(" ".join(lines).split()) == " ".join(words)
+    assert all(len(line) <= WIDTH for line in lines)
+    for line, following in itertools.pairwise(lines):
+        assert len(line) + 1 + len(following.split()[0]) > WIDTH, "the next word has its place on this line"
+    assert all(line.startswith("    ") for line in lines[1:])
+
+
+def test_a_word_wider_than_a_line_is_broken_behind_an_operator_or_not_at_all() -> None:
+    product = "*".join(["stiffness"] * 12)
+    lines = wrapped(f"f = {product}", "", "  ")
+    assert "".join(line.strip() for line in lines) == f"f = {product}"
+    assert len(lines) == 2 and lines[0].endswith("*") and max(map(len, lines)) <= WIDTH
+    assert wrapped("a" * (WIDTH + 5)) == ["a" * (WIDTH + 5)]
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "expected"),
+    [
+        (1096.4108683656437, 1.2e-10, "1096.4108683656 ± 2e-10 N/m"),
+        (0.957171389624963, 4.4e-13, "0.9571713896250 ± 5e-13 N/m"),
+        (0.00178074101228953, 1.7e-16, "0.0017807410122895 ± 2e-16 N/m"),
+        (1234.5, 20.0, "1230 ± 3e+01 N/m"),
+        (9.96, 0.06, "9.96 ± 6e-02 N/m"),
+        (9.996, 0.096, "10.0 ± 1e-01 N/m"),
+        (-0.5, 0.25, "-0.5 ± 3e-01 N/m"),
+        (2.5e-9, 1e-12, "2.500e-09 ± 1e-12 N/m"),
+        (0.0, 1e-3, "0.000 ± 1e-03 N/m"),
+        (1.0, math.inf, "1 ± inf N/m"),
+        (0.0, 0.0, "0 ± 0 N/m"),
+        (0.0, 5e-307, "0 ± 5e-307 N/m"),
+    ],
+)
+def test_a_number_ends_with_the_digit_its_error_stands_in(value: float, error: float, expected: str) -> None:
+    number, unit = expected.rsplit(" ", 1)
+    shown, mark, off = number.partition(" ± ")
+    assert measured(value, error, unit) == f"{shown} {unit}{mark}{off}"
+
+
+@given(st.floats(-1e12, 1e12), st.floats(1e-30, 1e9))
+def test_what_is_shown_holds_whatever_the_error_holds(value: float, error: float) -> None:
+    shown, _, off = measured(value, error).partition(" ± ")
+    assert abs(Fraction(shown) - Fraction(repr(value))) + Fraction(repr(error)) <= Fraction(off)
+    digit = Fraction(10) ** math.floor(math.log10(float(off)) + 1e-9)
+    assert Fraction(off) <= 2 * Fraction(error) + Fraction(digit) or Fraction(off) < Fraction(
+        1, 10**10
+    ) * abs(Fraction(value))
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"), [(1e-9, "1645.353"), (0.2, "1645"), (3e3, "2e+03"), (0.0, "1645.353")]
+)
+def test_digits_that_an_error_leaves_open_are_not_shown(error: float, expected: str) -> None:
+    assert known_digits(1645.3530049, error, 7) == expected

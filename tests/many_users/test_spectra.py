@@ -1,0 +1,266 @@
+"""Many users as few small systems, by groups, graphs, columns: against all of them stepped by hand."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import apc
+from apc.analysis.analysis import Analysis
+from apc.compiler.errors import ApcError
+from tests.bruteforce import Scene, frame_matrices, frame_matrix
+from tests.pairing import apart, arcs_of
+from tests.topologies import AVERAGE, compiled, replaced
+from tests.truths import text_of
+
+MS = Fraction(1, 1000)
+GAINS: dict[str, Any] = {"kt": 800.0, "bt": 2.0, "kc": 1500.0, "bc": 2.0}
+SOFT = {**GAINS, "kt": 200.0}
+
+
+def weights(name: str, peers: int) -> dict[tuple[int, int], float]:
+    return {(i, j): weight for i, j, weight in arcs_of(name, peers)}
+
+
+def masses(*values: float) -> tuple[dict[str, float], ...]:
+    return tuple({"device": value} for value in values)
+
+
+def pairs(first: dict[tuple[int, int], int]) -> dict[tuple[int, int], Fraction]:
+    """Return delays of pairs of peers of four, of which the first two are alike and the others are."""
+    return {
+        (i, j): first[i // 2, j // 2] * MS for i in range(4) for j in range(4) if (i // 2, j // 2) in first
+    }
+
+
+def on(name: str, operator: str) -> Scene:
+    """Return four equal peers on a graph; a sum is over the differences to those who are heard."""
+    springs = {(i, j): 800.0 for i in range(4) for j in range(4)} if operator == "sum" else {}
+    return Scene(operator, 4, weights=weights(name, 4), pairs=springs, **GAINS)
+
+
+def listed(found: Analysis) -> NDArray[np.complex128]:
+    """Return all eigenvalues that an analysis lists, those that it leaves out, too."""
+    values = [np.repeat(mode.eigenvalue, mode.multiplicity) for mode in found.modes]
+    return np.concatenate([*values, np.ones(found.rigid_modes)])
+
+
+# Scenes, how they are taken apart, and how far eigenvalues may be off: a defective one scatters by the root
+# of its rounding, four peers deep.
+SCENES: dict[str, tuple[Scene, str, float]] = {
+    **{f"mean of {n}": (Scene(peers=n, **GAINS), "modes", 1e-11) for n in (2, 3, 12)},
+    "sum of 8": (Scene("sum", 8, **{**GAINS, "kt": 100.0, "bt": 0.25}), "modes", 1e-11),
+    **{
+        f"{operator} on {name}": (on(name, operator), "modes", 1e-10)
+        for name, operator in (
+            *(("ring", "sum"), ("star", "mean"), ("path", "mean"), ("two pairs", "mean"), ("cycle", "sum")),
+            ("apart", "mean"),
+        )
+    },
+    # Nilpotent: no full set of eigenvectors.
+    "one way": (on("one way", "sum"), "dense", 2e-3),
+    "all different": (Scene(users=masses(0.1, 0.2, 0.15), **GAINS), "modes", 1e-11),
+    "different on a ring": (
+        Scene(peers=4, weights=weights("ring", 4), users=masses(0.1, 0.2, 0.15, 0.3), **GAINS),
+        *("dense", 1e-11),
+    ),
+    # Who hear the same two may change places.
+    "two alike on a ring": (
+        Scene(peers=4, weights=weights("ring", 4), users=masses(0.1, 0.2, 0.1, 0.3), **GAINS),
+        *("modes", 1e-11),
+    ),
+    "two kinds of five": (
+        Scene(peers=5, users=masses(0.1, 0.2, 0.1, 0.1, 0.2), **GAINS),
+        *("modes", 1e-11),
+    ),
+    "a star of which the middle differs": (
+        Scene(peers=6, weights=weights("star", 6), users=masses(0.25, *[0.1] * 5), **SOFT),
+        *("modes", 1e-9),
+    ),
+    "forks at both ends of a path": (
+        Scene(
+            peers=6,
+            weights={p: 1.0 for a, b in ((0, 2), (1, 2), (2, 3), (3, 4), (3, 5)) for p in ((a, b), (b, a))},
+            **SOFT,
+        ),
+        *("modes", 1e-9),
+    ),
+    "pairs of delays": (Scene(peers=4, late=pairs({(0, 1): 12, (1, 0): 3}), **SOFT), "modes", 1e-11),
+    "pairs of delays in a sum": (
+        Scene("sum", 4, late=pairs({(0, 0): 0, (0, 1): 4}), **{**SOFT, "kt": 60.0}),
+        *("modes", 1e-11),
+    ),
+    "pairs of delays on a ring": (
+        Scene(peers=4, late=pairs({(0, 1): 12, (1, 0): 3}), weights=weights("ring", 4), **SOFT),
+        *("dense", 1e-11),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_modes_are_the_whole_spectrum_of_all_peers(name: str) -> None:
+    scene, method, off = SCENES[name]
+    expected = np.linalg.eigvals(np.array(frame_matrix(scene)))
+    found = apc.analyze(compiled(text_of(scene)))
+    assert found.method == method
+    assert apart(listed(found), expected) < off
+    assert apart(listed(apc.analyze(compiled(text_of(scene)), method="dense")), expected) < max(off, 1e-10)
+
+
+def test_groups_that_differ_in_nothing_that_moves_are_one() -> None:
+    text = replaced(
+        AVERAGE,
+        ("  user: {count: 3}", "  left: {count: 2, set: {device.x: 1 mm}}\n  right: {count: 1}"),
+    )
+    one, other = apc.analyze(compiled(text)), apc.analyze(compiled(AVERAGE))
+    assert {mode.shape for mode in one.modes} == {"common", "difference"}
+    assert [mode.eigenvalue for mode in one.modes] == [mode.eigenvalue for mode in other.modes]
+    column = replaced(AVERAGE, ("{count: 3}", "{set: {contact.damping: [0 N*s/m, -0 N*s/m, 1 N*s/m]}}"))
+    assert {mode.multiplicity for mode in apc.analyze(compiled(column)).modes} == {1}
+    assert len({mode.shape for mode in apc.analyze(compiled(column)).modes}) == 2
+
+
+@pytest.mark.parametrize("peers", [2, 5, 20])
+def test_full_mesh_is_the_average_with_gains_times_the_others(peers: int) -> None:
+    gains = {"kt": 900.0 / (peers - 1), "bt": 3.0 / (peers - 1)}
+    mesh = apc.analyze(compiled(text_of(Scene("sum", peers, comm=11 * MS, **gains))))
+    mean = apc.analyze(compiled(text_of(Scene("mean", peers, comm=11 * MS, kt=900.0, bt=3.0))))
+    assert mesh.spectral_radius == pytest.approx(mean.spectral_radius, abs=1e-12)
+    assert len(mesh.modes) == len(mean.modes)
+
+
+# ---- very many ----
+
+
+def radius_by_hand(heard: NDArray[np.float64], **values: Any) -> float:
+    """Return the largest eigenvalue but that of the common shift, of peers who hear so many times themselves.
+
+    In a pair each hears the other: what one's own state and what the other's makes of one's next state.
+    """
+    whole = frame_matrices(Scene(peers=2, **values), 1)[0]
+    n = len(whole) // 2
+    own, other = whole[:n, :n], whole[:n, n:]
+    sizes = np.abs(np.linalg.eigvals(own + heard[:, None, None] * other))
+    return float(np.sort(sizes[sizes < 1 - 1e-12] if sizes.max() < 1 + 1e-9 else sizes.ravel())[-1])
+
+
+def on_graph(peers: int, graph: str, **values: Any) -> str:
+    text = text_of(Scene(peers=peers, **values))
+    return replaced(text, ("clock: network, delay", f"graph: {graph}, clock: network, delay"))
+
+
+RINGS: list[dict[str, Any]] = [
+    {},
+    {"comp": Fraction(0), "comm": Fraction(0), "kt": 2000.0},
+    {"kc": 2400.0},
+    {"kc": 1500.0, "kt": 5000.0},
+]
+
+
+@pytest.mark.parametrize("values", RINGS, ids=str)
+@pytest.mark.parametrize(("peers", "graph"), [(301, "ring"), (1_000_000, "complete")])
+def test_very_many_alike_have_the_radius_of_all_their_modes(
+    peers: int, graph: str, values: dict[str, Any]
+) -> None:
+    """Each hears the mean of its neighbours: cos(2πk/N) of itself; of all others: 1, or −1/(N − 1)."""
+    angles = 2 * np.pi * np.arange(peers // 2 + 1 if graph == "ring" else 1) / peers
+    heard = np.cos(angles) if graph == "ring" else np.array([1.0, -1 / (peers - 1)])
+    found = apc.analyze(compiled(on_graph(peers, graph, **values)))
+    assert abs(found.spectral_radius - radius_by_hand(heard, **values)) <= 1e-11 + found.spectral_radius_error
+    assert found.rigid_modes == 1 and found.stable == (found.spectral_radius < 1)
+    assert found.spectral_radius_error < 1e-11
+
+
+def test_a_ring_of_a_hundred_thousand_peers_is_held_by_the_slowest_of_its_differences() -> None:
+    found = apc.analyze(compiled(on_graph(100_000, "ring")))
+    assert (found.verdict, found.rigid_modes) == ("stable up to a common translation", 1)
+    slow = 1 - apc.analyze(compiled(on_graph(1000, "ring"))).spectral_radius
+    share = (1 - np.cos(2 * np.pi / 100_000)) / (1 - np.cos(2 * np.pi / 1000))
+    assert 1 - found.spectral_radius == pytest.approx(slow * share, rel=1e-3)
+    assert found.spectral_radius_error < 1e-12
+
+
+def different(peers: int, graph: str = "complete", **values: Any) -> str:
+    """Return peers whose masses and contacts all differ."""
+    random = np.random.default_rng(0)
+    gains = {"kt": 400.0, "bt": 1.0, "bc": 1.0} | values
+    if gains.get("operator") == "sum":
+        gains |= {"kt": gains["kt"] / peers, "bt": gains["bt"] / peers}
+    own = {
+        "device.mass": [f"{0.1 * (1 + 0.3 * one):.6f} kg" for one in random.random(peers)],
+        "contact.stiffness": [f"{1000 * (1 + 0.3 * one):.3f} N/m" for one in random.random(peers)],
+    }
+    listed = ", ".join(f"{name}: [{', '.join(rows)}]" for name, rows in own.items())
+    return replaced(on_graph(peers, graph, **gains), (f"{{count: {peers}}}", f"{{set: {{{listed}}}}}"))
+
+
+LARGE: list[tuple[str, str]] = [
+    (different(12), "determinant"),
+    (different(5, operator="sum"), "determinant"),
+    (different(12, kt=6000.0), "determinant"),
+    (different(5, comp=Fraction(0), comm=Fraction(0)), "determinant"),
+    (different(5, comp=MS * 5 / 2, comm=4 * MS), "determinant"),
+    (different(2, haptic=2 * MS, network=3 * MS), "determinant"),
+    (different(5, comm=30 * MS), "determinant"),
+    (different(16, "ring"), "krylov"),
+    (different(16, "star", operator="sum"), "krylov"),
+]
+
+
+@pytest.mark.parametrize(("text", "method"), LARGE)
+def test_ways_for_very_many_who_differ_have_the_modes_of_the_whole_matrix(text: str, method: str) -> None:
+    found, whole = (apc.analyze(compiled(text), method=way) for way in (method, "dense"))  # type: ignore[arg-type] # a method
+    assert (found.verdict, found.rigid_modes) == (whole.verdict, whole.rigid_modes)
+    off = abs(found.spectral_radius - whole.spectral_radius)
+    assert off <= found.spectral_radius_error + whole.spectral_radius_error < 1e-7
+    for mode in found.modes:
+        same = min(whole.modes, key=lambda one: abs(one.eigenvalue - mode.eigenvalue))
+        assert abs(same.eigenvalue - mode.eigenvalue) <= mode.error + same.error
+        assert mode.frequency_hz == pytest.approx(same.frequency_hz, abs=1e-8)
+        assert mode.damping_ratio == pytest.approx(same.damping_ratio, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "method"),
+    [
+        (text_of(Scene(peers=1_000_000)), "modes"),
+        (different(3), "modes"),
+        (different(60), "determinant"),
+        (different(60, "ring"), "krylov"),
+        (on_graph(1000, "ring"), "modes"),
+        (text_of(Scene(comm=8000 * MS)), "determinant"),
+        (text_of(Scene(comm=80 * MS)), "modes"),
+    ],
+    ids=["a million", "three", "sixty", "sixty on a ring", "a ring", "8 s late", "80 ms late"],
+)
+def test_the_method_is_chosen_by_what_differs(text: str, method: str) -> None:
+    assert apc.analyze(compiled(text)).method == method
+
+
+@pytest.mark.parametrize(
+    ("text", "method", "message"),
+    [
+        (
+            text_of(Scene(peers=200)),
+            "dense",
+            "E804 200 peers make one system of 1,600 states; the matrix of one",
+        ),
+        (different(3, "ring"), "modes", "E850 method modes can't serve this scene: all peers as one system"),
+        (different(60, "ring"), "determinant", "E850 method determinant .* hear all others over lan"),
+        (different(600), "krylov", "E850 method krylov .* all of 600 peers hear each other over lan"),
+    ],
+)
+def test_a_method_that_cannot_serve_is_refused(text: str, method: str, message: str) -> None:
+    with pytest.raises(ApcError, match=message):
+        apc.analyze(compiled(text), method=method)  # type: ignore[arg-type] # a method
+
+
+def test_what_one_peer_is_free_to_do_that_others_are_not_leaves_the_verdict_open() -> None:
+    rows = ", ".join(f"{k} N/m" for k in (0, 1000, 1000, 1000, 1000))
+    text = replaced(on_graph(5, "ring"), ("{count: 5}", f"{{set: {{contact.stiffness: [{rows}]}}}}"))
+    found = apc.analyze(compiled(text), method="krylov")
+    assert found.stable is None and found.spectral_radius_error >= found.spectral_radius

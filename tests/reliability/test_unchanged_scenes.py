@@ -1,0 +1,168 @@
+"""What was compiled serves as long as everything it was made from is the same, by content alone."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import apc
+from apc.__main__ import run
+from apc.compiler import cache, files
+from tests.topologies import replaced, told
+
+SCENE, MODEL, TABLE = Path("scene.yaml"), Path("scene.apc"), Path("users.csv")
+PART = """\
+component: Tie
+about: A spring to where the device is at rest.
+connectors: {flange: Flange}
+parameters: {stiffness: {unit: N/m, min: 0}}
+equations: [flange.f = stiffness*flange.x]
+"""
+TEXT = """\
+topology: scene
+library: parts
+peers: {user: {table: users.csv}}
+masses: {device: {mass: 1 kg, damping: 2 N*s/m}}
+couplers: {tie: {type: Tie, flange: device, stiffness: 3 N/m}}
+"""
+ROWS = "device.mass [kg]\n1\n2\n"
+
+
+@pytest.fixture(autouse=True)
+def compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compile a scene that names a table and a folder of components."""
+    (tmp_path / "folder").mkdir()
+    monkeypatch.chdir(tmp_path / "folder")
+    Path("parts").mkdir()
+    write("parts/tie.yaml", PART)
+    write("users.csv", ROWS)
+    write("scene.yaml", TEXT)
+    assert run(["compile"]) == 0
+
+
+def write(name: str, text: str) -> None:
+    Path(name).write_text(text, encoding="utf-8")
+
+
+def is_unchanged(capsys: pytest.CaptureFixture[str]) -> bool:
+    capsys.readouterr()
+    assert run(["compile"]) == 0
+    return "unchanged" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("change", "shown"),
+    [
+        (lambda: write("scene.yaml", replaced(TEXT, ("3 N/m", "4 N/m"))), "scene.yaml"),
+        (lambda: write("users.csv", f"{ROWS}3\n"), "users.csv"),
+        (lambda: write("parts/tie.yaml", replaced(PART, ("= stiffness", "= 2*stiffness"))), "parts/"),
+        (lambda: write("parts/mass.yaml", replaced(PART, ("Tie", "Spring"))), "parts/"),
+        (lambda: Path("parts/tie.yaml").rename("parts/renamed.yaml"), "parts/"),
+    ],
+)
+def test_a_change_of_anything_it_was_made_from_is_noticed(
+    change: Callable[[], None], shown: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert is_unchanged(capsys)
+    change()
+    message = f"scene.apc: E605 is stale: {shown} has changed since it was compiled."
+    assert told(apc.load, MODEL) == [f"{message} Write: apc compile scene.yaml"]
+    assert not is_unchanged(capsys)
+    assert apc.load(MODEL).peers == len(TABLE.read_text(encoding="utf-8").splitlines()) - 1
+    assert is_unchanged(capsys)
+
+
+def move_the_folder() -> None:
+    Path("../folder").rename("../moved")
+    os.chdir("../moved")
+
+
+def touch_everything() -> None:
+    for path in (SCENE, TABLE, Path("parts/tie.yaml")):
+        os.utime(path, (4e9, 4e9))
+    os.utime(MODEL, (0, 0))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        touch_everything,
+        move_the_folder,
+        lambda: (write("users.csv", "other"), write("users.csv", ROWS)),
+        lambda: write("parts/note.txt", "not read"),
+        lambda: os.mkfifo("Mass"),  # a pipe named as a definition of the library
+    ],
+)
+def test_what_is_no_change_is_none(change: Callable[[], None], capsys: pytest.CaptureFixture[str]) -> None:
+    change()
+    assert is_unchanged(capsys)
+
+
+@pytest.mark.parametrize(
+    ("name", "digest", "shown"),
+    [
+        ("builtin_digest", lambda name: "other" if name == "Mass" else "", "the library's "),
+        ("program_digest", lambda: "other", "apc itself has changed"),
+        ("library_digest", lambda name: "other" if name == "casadi" else name, "casadi has changed"),
+    ],
+)
+def test_a_change_of_the_library_or_of_the_program_is_noticed(
+    name: str, digest: Callable[..., str], shown: str, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    with monkeypatch.context() as patch:
+        patch.setattr(cache, name, digest)
+        assert f"is stale: {shown}" in told(apc.load, MODEL)[0]
+        assert not is_unchanged(capsys)
+
+
+def test_compiling_again_says_unchanged_and_force_compiles_to_the_same_bytes(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    before = MODEL.read_bytes()
+    capsys.readouterr()
+    assert run(["compile"]) == 0
+    assert capsys.readouterr().out == (
+        "scene.yaml → scene.apc: unchanged, not compiled again (--force does)\n"
+    )
+    assert run(["compile", "--force"]) == 0
+    assert "unchanged" not in capsys.readouterr().out
+    assert MODEL.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "put",
+    [
+        os.mkfifo,
+        lambda name: Path(name).symlink_to("/dev/zero"),
+        lambda name: Path(name).symlink_to("/proc/cpuinfo"),
+    ],
+    ids=["pipe", "device", "kernel"],
+)
+@pytest.mark.parametrize("name", ["users.csv", "parts/tie.yaml", "parts/more.yaml", "scene.apc"])
+def test_what_is_no_file_is_not_read_and_is_a_change(name: str, put: Callable[[str], None]) -> None:
+    """Who reads the pipe waits for ever, and who reads the device never ends."""
+    Path(name).unlink(missing_ok=True)
+    put(name)
+    assert re_load() in ("E602", "E605")
+    assert run(["analyze", "scene.yaml"]) == (0 if name == "scene.apc" else 1)
+
+
+def re_load() -> str:
+    return told(apc.load, MODEL)[0].split()[1]
+
+
+def test_a_folder_that_grew_is_not_walked_to_its_end_and_is_a_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "MOST_ENTRIES", 0)
+    assert "E605 is stale: parts/ has changed" in told(apc.load, MODEL)[0]
+
+
+def test_what_could_not_be_read_either_time_is_no_proof() -> None:
+    record = cache.record_of(cache.read_archive(MODEL))
+    assert cache.changed(record, Path()) == ""
+    texts = tuple((name, "" if name == "./users.csv" else digest) for name, digest in record.texts)
+    TABLE.unlink()
+    assert cache.changed(cache.Record(record.topology, texts), Path()) == "users.csv"

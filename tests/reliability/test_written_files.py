@@ -1,0 +1,497 @@
+"""What is no bounded file is not read, and what is written is whole and replaces nothing but a file."""
+
+from __future__ import annotations
+
+import os
+import signal
+import stat
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import click
+import pytest
+
+import apc
+from apc.__main__ import run
+from apc.cli.commands import apc as group
+from apc.compiler import files
+from apc.compiler.errors import ApcError
+from apc.compiler.files import (
+    RefusedError,
+    begin_file,
+    drop_file,
+    finish_file,
+    read_file,
+    write_file,
+    write_texts,
+)
+from tests.commands import Cli, folder, write
+from tests.topologies import AVERAGE, ROOT, replaced, told
+
+FIFO = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+OUT = Path("r.csv")
+
+
+@pytest.fixture(autouse=True)
+def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def fill(text: str) -> Callable[[Path], object]:
+    return lambda temporary: temporary.write_text(text, encoding="utf-8")
+
+
+def test_a_file_is_read_up_to_its_limit_and_nothing_is_opened_that_is_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    write("a", "x" * 100)
+    for name, target in (("link", "a"), ("zero", "/dev/zero"), ("cpu", "/proc/cpuinfo")):
+        Path(name).symlink_to(target)
+    os.mkfifo("pipe")
+    assert read_file(Path("link"), 100) == b"x" * 100
+    with pytest.raises(RefusedError, match="is larger than 99 bytes, the most it may have"):
+        read_file(Path("link"), 99)
+    monkeypatch.setattr(files, "_without_waiting", None)  # opening anything would fail otherwise
+    for name, words in (
+        ("pipe", "is a device, pipe or socket"),
+        ("zero", "is a device, pipe or socket"),
+        ("cpu", "is an answer of the system's kernel"),
+        ("", "is a folder"),
+        ("none", "does not exist"),
+        ("n" * 300, "File name too long"),
+    ):
+        with pytest.raises(RefusedError, match=words):
+            read_file(Path(name), 100)
+
+
+# ---- one file ----
+
+
+def test_a_file_keeps_its_mode_and_a_new_one_has_that_of_the_mask() -> None:
+    before = os.umask(0o027)
+    try:
+        write_file(OUT, fill("one"))
+        assert stat.S_IMODE(OUT.stat().st_mode) == 0o640
+        OUT.chmod(0o604)
+        write_file(OUT, fill("two"))
+    finally:
+        os.umask(before)
+    assert (stat.S_IMODE(OUT.stat().st_mode), OUT.read_text(), folder()) == (0o604, "two", ["r.csv"])
+
+
+def test_a_link_stays_and_its_file_is_written() -> None:
+    Path("there").mkdir()
+    OUT.symlink_to("there/real.csv")
+    write_file(OUT, fill("new"))
+    assert OUT.is_symlink()
+    assert [(one.name, one.read_text()) for one in Path("there").iterdir()] == [("real.csv", "new")]
+
+
+@pytest.mark.parametrize("fault", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_of_a_failure_nothing_is_seen(fault: BaseException) -> None:
+    write("r.csv", "before")
+
+    def fail(temporary: Path) -> None:
+        temporary.write_text("half", encoding="utf-8")
+        raise fault
+
+    with pytest.raises((ApcError, KeyboardInterrupt)) as raised:
+        write_file(OUT, fail)
+    assert str(raised.value) in ("r.csv: E601 can't be written: No space left on device.", "")
+    assert (OUT.read_text(), folder()) == ("before", ["r.csv"])
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("", "it is a folder"),
+        ("none/r.csv", "No such file or directory"),
+        ("x" * 300, "File name too long"),
+        ("\0", "embedded null"),
+        ("round", "its links lead to one another"),
+    ],
+)
+def test_where_nothing_can_be_written_is_told(name: str, why: str) -> None:
+    Path("round").symlink_to("round")
+    (message,) = told(write_file, Path(name), fill(""))
+    assert f": E601 can't be written: {why}" in message
+
+
+def test_texts_that_belong_together_are_written_all_or_none() -> None:
+    Path("b.h").mkdir()
+    with pytest.raises(ApcError, match="E601"):
+        write_texts({Path("a.c"): "one", Path("b.h"): "two"})
+    assert folder() == ["b.h"]
+    write_texts({Path("a.c"): "one", Path("b.c"): "two"})
+    assert (Path("a.c").read_text(), Path("b.c").read_text()) == ("one", "two")
+
+
+# ---- what is no file ----
+
+
+@FIFO
+def test_a_pipe_is_written_to_and_stays_a_pipe() -> None:
+    os.mkfifo(OUT)
+    read: list[bytes] = []
+    other = threading.Thread(target=lambda: read.append(OUT.read_bytes()))
+    other.start()
+    write_file(OUT, fill("through"))
+    other.join()
+    assert (read, stat.S_ISFIFO(OUT.stat().st_mode), folder()) == ([b"through"], True, ["r.csv"])
+    there, here = os.pipe()
+    Path("link.csv").symlink_to(f"/dev/fd/{here}")  # what `--out >(gzip)` leads to
+    write_file(Path("link.csv"), fill("through"))
+    os.close(here)
+    with os.fdopen(there, "rb") as stream:
+        assert stream.read() == b"through"
+
+
+def test_a_device_is_written_to_and_stays_a_device() -> None:
+    OUT.symlink_to(os.devnull)
+    null = Path(os.devnull)
+    before = null.stat()
+    write_file(OUT, fill("gone"))
+    temporary = begin_file(null)
+    assert temporary.parent != null.parent, "nothing is made among the devices"
+    finish_file(temporary, null)
+    assert not temporary.exists()
+    assert (before.st_ino, before.st_mode) == (null.stat().st_ino, null.stat().st_mode)
+    assert OUT.is_symlink()
+
+
+def test_standard_output_is_written_to_whatever_it_is_and_goes_on(capfd: pytest.CaptureFixture[str]) -> None:
+    write("r.csv", "kept\n")
+    before = os.dup(1)
+    with OUT.open("ab") as stream:  # as `>> r.csv` does
+        os.dup2(stream.fileno(), 1)
+    try:
+        for path in (Path("/dev/stdout"), OUT):
+            write_file(path, fill("rows\n"))
+        assert files.partial_name(OUT) == OUT
+        os.write(1, b"more\n")
+    finally:
+        os.dup2(before, 1)
+        os.close(before)
+    assert (OUT.read_text(), folder()) == ("kept\nrows\nrows\nmore\n", ["r.csv"])
+    assert capfd.readouterr() == ("", "")
+
+
+# ---- what a writer that was killed has left, and what others write ----
+
+KILLED = """
+import os, signal
+from pathlib import Path
+from apc.compiler.files import write_file
+
+def write(temporary):
+    temporary.write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+
+write_file(Path("r.csv"), write)
+"""
+
+
+def kill_a_writer() -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    assert (
+        subprocess.run([sys.executable, "-c", KILLED], env=environment, check=False).returncode
+        == -signal.SIGKILL
+    )
+
+
+def test_what_killed_writers_left_goes_with_the_next() -> None:
+    held = begin_file(OUT)
+    kill_a_writer()
+    kill_a_writer()  # which takes the place of the one before
+    assert len(folder()) == 2
+    drop_file(held)
+    kill_a_writer()
+    assert len(folder()) == 1
+    write_file(OUT, fill("whole"))
+    assert (OUT.read_text(), folder()) == ("whole", ["r.csv"])
+
+
+def test_what_others_are_writing_stays() -> None:
+    first, second = begin_file(OUT), begin_file(OUT)
+    first.write_text("first", encoding="utf-8")
+    write_file(OUT, fill("third"))
+    second.write_text("second", encoding="utf-8")
+    for temporary, text in ((first, "first"), (second, "second")):
+        finish_file(temporary, OUT)
+        assert OUT.read_text() == text
+    assert folder() == ["r.csv"]
+
+
+@FIFO
+def test_what_is_no_file_of_ours_is_no_temporary() -> None:
+    name = begin_file(OUT)
+    drop_file(name)
+    write("mine.txt", "mine")
+    for make in (os.mkfifo, Path.mkdir, lambda one: one.symlink_to("mine.txt")):
+        make(name)
+        write_file(OUT, fill("whole"))
+        assert os.path.lexists(name)
+        name.rmdir() if name.is_dir() else name.unlink()
+    assert Path("mine.txt").read_text() == "mine"
+
+
+def test_of_many_writers_at_once_each_writes_it_whole() -> None:
+    texts = {str(number) * 10_000 for number in range(8)}
+
+    def write_often(text: str) -> None:
+        for _ in range(20):
+            write_file(OUT, fill(text))
+            assert OUT.read_text() in texts
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(write_often, texts))
+    assert folder() == ["r.csv"]
+
+
+# ---- through the command line ----
+
+TABLE = "device.mass [kg]\n0.1\n0.2\n"
+WITH_TABLE = replaced(AVERAGE, ("{count: 3}", "{table: users.csv}"))
+
+
+@pytest.fixture
+def scene(cli: Cli) -> Cli:
+    write("scene.yaml", AVERAGE)
+    return cli
+
+
+@FIFO
+def test_a_pipe_as_a_model_or_as_a_table_is_not_waited_for(scene: Cli) -> None:
+    os.mkfifo("scene.apc")
+    assert scene("analyze scene.yaml").code == 0
+    assert "E602 is a device, pipe or socket, not a compiled model." in scene("analyze scene.apc").err
+    os.mkfifo("users.csv")
+    write("scene.yaml", WITH_TABLE)
+    assert "E701 the table users.csv is a device, pipe or socket." in scene("check").err
+
+
+@FIFO
+def test_a_model_is_never_compiled_into_what_is_none(scene: Cli) -> None:
+    """Whoever packed a folder may have put anything under the model's name."""
+    model = Path("scene.apc")
+    write("own.txt", "mine")
+    os.mkfifo("pipe")
+    link, special = (
+        f"scene.apc: E601 can't be written: it is {what}. Write: rm scene.apc\n"
+        for what in ("a link to what is no compiled model", "a device, pipe or socket")
+    )
+    for target, message in (("own.txt", link), ("new.txt", link), ("pipe", special), ("/dev/zero", special)):
+        model.symlink_to(target)
+        assert scene("compile scene.yaml") == (1, "", message)
+        model.unlink()
+    os.mkfifo(model)
+    assert scene("compile scene.yaml") == (1, "", special)
+    model.unlink()
+    assert Path("own.txt").read_text() == "mine" and not Path("new.txt").exists()
+    model.symlink_to("other.apc")
+    assert scene("compile scene.yaml").code == 0
+    assert model.is_symlink() and Path("other.apc").is_file()
+
+
+@pytest.mark.parametrize(
+    ("library", "message"),
+    [
+        ("/proc/self", "E214 the library folder /proc/self is an answer of the system's kernel."),
+        ("/", "E214 the library folder / holds more than 3 files and folders. Write: library: ./parts"),
+        ("deep", "E214 the library folder deep is more than 2 folders deep"),
+    ],
+)
+def test_a_folder_without_end_is_no_library(
+    scene: Cli, monkeypatch: pytest.MonkeyPatch, library: str, message: str
+) -> None:
+    Path("deep/a/b/c").mkdir(parents=True)
+    write("scene.yaml", f"library: {library}\n{AVERAGE}")
+    monkeypatch.setattr(files, "MOST_ENTRIES", 9 if library == "deep" else 3)
+    monkeypatch.setattr(files, "MOST_DEPTH", 2)
+    assert message in scene("check scene.yaml").err
+
+
+SECRET = "root:$6$abc:19000:0:99999:7:::"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{SECRET}\ndaemon:*:19000:0:99999:7:::\n",
+        f"ghp_{'S' * 30}\n",
+        f"ghp_S\n{SECRET}\n",
+        f"[{SECRET}]\nuser = {SECRET}\n",
+        f"KEY={SECRET},1\n2\n",
+        '"unclosed' + "S" * 200_000,
+        f"token: [{SECRET}\nroot: {{\n",
+    ],
+)
+def test_a_file_about_something_else_is_told_without_its_text(scene: Cli, text: str) -> None:
+    Path("parts").mkdir()
+    for name, changed in (
+        ("users.csv", WITH_TABLE),
+        ("users.csv", replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, trace: users.csv}"))),
+        ("parts/config.yaml", f"library: ./parts\n{AVERAGE}"),
+    ):
+        write(name, text)
+        write("scene.yaml", changed)
+        ran = scene("check")
+        wanted = "E70" if name == "users.csv" else "E219" if "token" in text else ""
+        assert wanted in ran.err
+        assert not any(word in ran.err for word in ("root", "SS", "ghp"))
+
+
+# Every option that names a file to write, with what else its command wants.
+SHORT = "scene.yaml --duration 40ms"
+WRITING = {
+    ("analyze", "--plot"): ("scene.yaml", "new.svg"),
+    ("bench", "--plot"): ("scene.yaml", "new.svg"),
+    ("compare", "--out"): ("scene.yaml", "new.json"),
+    ("critical", "--plot"): ("contact.stiffness scene.yaml", "new.svg"),
+    ("export", "--out"): ("scene.yaml", "new.npz"),
+    ("feel", "--out"): ("scene.yaml", "new.csv"),
+    ("network", "--out"): ("delays.csv", "new.csv"),
+    ("region", "--out"): (
+        "scene.yaml --x contact.stiffness=1N/m:2N/m --y coordination.stiffness=1N/m:2N/m",
+        "new.csv",
+    ),
+    ("report", "--out"): ("scene.yaml", "new.html"),
+    ("schema", "--out"): ("", "new.json"),
+    ("show", "--out"): ("scene.yaml", "new.txt"),
+    ("simulate", "--out"): (SHORT, "new.csv"),
+    ("simulate", "--plot"): (SHORT, "new.svg"),
+    ("simulate", "--still"): (SHORT, "new.svg"),
+    ("sweep", "--out"): ("scene.yaml --over contact.stiffness=1N/m:2N/m:2 --jobs 1", "new.csv"),
+}
+# A folder, which has a test of its own; read and not written.
+OTHERS = {("play", "--out"), ("play", "--device"), ("play", "--secret-file"), ("bench", "--hard"),
+          ("report", "--check")}  # fmt: skip
+
+
+def test_every_option_that_names_a_file_to_write_is_known_here() -> None:
+    context = click.Context(group)
+    options = {
+        (name, option.opts[0])
+        for name in group.list_commands(context)
+        for option in group.get_command(context, name).params  # type: ignore[union-attr] # it is listed
+        if isinstance(option.type, click.Path)
+    }
+    assert options == {*WRITING, *OTHERS}
+
+
+INPUTS = ("scene.yaml", "users.csv", "scene.apc", "delays.csv")  # a recording last
+
+
+@pytest.fixture
+def inputs(scene: Cli) -> Cli:
+    """Run commands where there are a topology, its table and compiled model, and a recording."""
+    write("users.csv", TABLE)
+    write("scene.yaml", WITH_TABLE)
+    write("delays.csv", "delay [ms]\n1\n2\nlost\n3\n")
+    assert scene("compile scene.yaml").code == 0
+    return scene
+
+
+@pytest.mark.parametrize("command", WRITING)
+def test_a_link_to_what_a_command_reads_is_refused_and_a_file_that_is_read_only_stays(
+    inputs: Cli, command: tuple[str, str]
+) -> None:
+    before = [Path(one).read_bytes() for one in INPUTS]
+    words, name = WRITING[command]
+    line, target = f"{command[0]} {words} {command[1]} {name}", Path(name)
+    for read in {"network": INPUTS[3:], "schema": ()}.get(command[0], INPUTS[:3]):
+        for link in (target.symlink_to, target.hardlink_to):
+            link(read)
+            assert inputs(line).err.startswith(f"{target}: E616 is read by this command")
+            target.unlink()
+    assert [Path(one).read_bytes() for one in INPUTS] == before
+    write(name, "mine")
+    target.chmod(0o444)
+    assert inputs(line) == (1, "", f"{target}: E601 can't be written: it is read-only.\n")
+    assert target.read_text() == "mine"
+    assert not list(Path().glob(".*"))
+
+
+@pytest.mark.parametrize(
+    ("line", "beside"),
+    [
+        ("export scene.yaml --peer user[1] --out new.c", "new.h"),
+        ("export scene.yaml --peer user[1] --out new.c", "new_test.c"),
+        (f"simulate {SHORT} --out new.csv", "new.csv.json"),
+    ],
+)
+def test_beside_what_is_asked_for_nothing_that_is_read_is_replaced(
+    inputs: Cli, line: str, beside: str
+) -> None:
+    Path(beside).symlink_to("scene.apc")
+    ran = inputs(line)
+    assert ran.code == 1 and f"{beside}: E616 is read by this command" in ran.err
+    assert "E973 holds the scene that is played" in inputs(f"play {SHORT} --out .").err
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (
+            "sweep scene.yaml --over contact.stiffness=1N/m:2N/m:2 --out users.csv",
+            "users.csv: E616 is read by this command: --out would replace it. Write: --out users-result.csv",
+        ),
+        (
+            "show scene.txt --out scene.txt",
+            "scene.txt: E616 is read by this command: --out would replace it. Write: --out scene-result.txt",
+        ),
+        (
+            "simulate scene.yaml --duration 1s --plot a.png --still ./a.png",
+            "a.png: E616 is given to --plot and to --still: the second would replace the first. "
+            "Write: --still a-result.png",
+        ),
+    ],
+)
+def test_what_a_command_reads_it_never_replaces(inputs: Cli, line: str, message: str) -> None:
+    write("scene.txt", AVERAGE)
+    assert inputs(line) == (1, "", f"{message}\n")
+    assert (Path("users.csv").read_text(), Path("scene.txt").read_text()) == (TABLE, AVERAGE)
+    over = {"contact.stiffness": "1 N/m:2 N/m:2"}
+    assert told(lambda: apc.sweep("scene.yaml", over, out="users.csv")) == [
+        'users.csv: E616 is read by this command: out would replace it. Write: out="users-result.csv"'
+    ]
+
+
+@pytest.mark.parametrize(
+    ("line", "start"),
+    [
+        ("sweep --over contact.stiffness=1N/m:2N/m:2 --jobs 1", "contact.stiffness [N/m],verdict"),
+        ("simulate --duration 10ms --no-jit", "time [s],"),
+        ("region --x contact.stiffness=0N/m:9N/m --y coordination.stiffness=0N/m:9N/m", "panel,topology,"),
+        ("show", "three-users-average"),
+        ("schema", "{"),
+    ],
+)
+def test_a_device_takes_the_text_of_a_command_and_its_words_stand_beside(
+    capfd: pytest.CaptureFixture[str], line: str, start: str
+) -> None:
+    write("scene.yaml", AVERAGE)
+    assert run([*line.split(), "--out", "/dev/stdout"]) == 0
+    out, err = capfd.readouterr()
+    assert out.startswith(start)
+    assert "/dev/stdout" in err and "/dev/stdout" not in out
+    assert run([*line.split(), "--out", os.devnull]) == 0
+    assert folder() == ["scene.yaml"]
+    assert not Path(f"{os.devnull}.parts").exists() and not Path(f"{os.devnull}.json").exists()
+
+
+@pytest.mark.whole
+def test_two_outputs_may_be_one_device(scene: Cli) -> None:
+    assert scene(f"simulate {SHORT} --plot /dev/null --still /dev/null").code == 0
+    assert Path("/dev/null").is_char_device()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere every name is a text")
+def test_a_scene_whose_name_is_no_text_is_simulated(cli: Cli) -> None:
+    name = os.fsdecode(b"b\xff.yaml")
+    write(name, AVERAGE)
+    assert cli("simulate --duration 20ms --no-jit", name, "--out", f"{name}.csv").code == 0

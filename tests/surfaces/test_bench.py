@@ -1,0 +1,370 @@
+"""`apc bench`: what is measured, what counts as better, what is printed; hard cases, whose truth is known."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import sys
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import pytest
+
+import apc
+from apc.benchmark.bench import SAME, Bench, Measured, bench, bench_analysis, bench_simulation, pareto_front
+from apc.benchmark.hard import compare, run_hard_cases
+from apc.benchmark.scale import scale
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.present.bench import bench_picture
+from apc.simulation.settings import EXACT, Method
+from tests.commands import Cli, write
+from tests.hard.truths import HERE, TRUTHS, truth_of
+from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
+
+
+@pytest.fixture(scope="module")
+def found() -> Bench:
+    return bench(compiled(AVERAGE), rounds=1, duration=Fraction(1, 50))
+
+
+def _one(name: str, seconds: float, error: float | None, spread: float = 0.0) -> Measured:
+    return Measured(name, seconds, spread, 3, error, None, False)
+
+
+@pytest.mark.parametrize(
+    ("measured", "front"),
+    [
+        (
+            [_one("b", 2.0, 1e-5), _one("c", 3.0, 1e-4), _one("a", 1.0, 1e-3), _one("d", 4.0, 1e-9)],
+            {"a": True, "b": True, "c": False, "d": True},
+        ),
+        ([_one("a", 1.0, 1e-9, 0.2), _one("b", 1.1, 1e-9, 0.1)], {"a": True, "b": True}),  # within spread
+        ([_one("a", 1.0, SAME / 2), _one("b", 2.0, 0.0)], {"a": True, "b": False}),  # but for rounding
+        ([_one("a", 1.0, None), _one("b", 2.0, None)], {"a": False, "b": False}),
+    ],
+)
+def test_the_front_is_what_nothing_beats_in_both_ways(
+    measured: list[Measured], front: dict[str, bool]
+) -> None:
+    marked = {one.name: one.front for one in pareto_front(measured)}
+    assert marked == front
+    assert [*marked] == sorted(marked)
+
+
+@pytest.mark.whole
+def test_every_method_that_serves_the_scene_is_measured_beside_its_error(found: Bench) -> None:
+    analysis, simulation = found.comparisons
+    names = {"modes", "dense", "determinant", "krylov", "certified", "paper"}
+    assert {one.name for one in analysis.measured} == names
+    assert analysis.reference.startswith("the same equations in 512-bit balls")
+    assert "spectral radius 0.957171389625094952208279125575" in analysis.reference
+    for one in analysis.measured:
+        assert one.error is not None
+        assert one.bound is not None
+        assert one.error <= one.bound
+    assert analysis.chosen is not None
+    assert analysis.chosen.name == "modes"
+    errors = {one.name: one.error for one in simulation.measured}
+    assert errors["exact"] is not None
+    assert errors["exact"] < 1e-14
+    assert simulation.reference.startswith("the exact transition")
+    assert simulation.chosen is not None
+    assert simulation.chosen.name == "exact"
+    # Of order four and one: a step of a quarter and of a tenth.
+    assert errors["rk4:1 ms"] / errors["rk4:0.25 ms"] > 100  # type: ignore[operator] # no error is None here
+    assert 5 < errors["semi-implicit:1 ms"] / errors["semi-implicit:0.1 ms"] < 20  # type: ignore[operator] # likewise
+    note = "nothing moves in this scene: device.x of its first peer starts 0.001 m elsewhere"
+    assert simulation.notes == (note,)
+
+
+PUSHED = """\
+topology: pushed
+clocks: {haptic: 1 ms}
+peers: {user: {count: 1}}
+masses: {device: {mass: 0.25 kg, damping: 2 N*s/m}}
+couplers:
+  idle: {type: SampledSpringDamper, a: device, b: ground, stiffness: 9 N/m, clock: haptic}
+"""
+
+
+BETWEEN = """\
+hands:
+  on: {type: StepForce, flange: device, force: 3 N, start: 10.25 ms}
+  off: {type: StepForce, flange: device, force: -3 N, start: 10.75 ms}
+"""
+
+
+ROTOR = """\
+component: Rotor
+about: A wheel that turns about its axis.
+connectors: {flange: Flange}
+parameters:
+  inertia: {unit: kg*m^2, above: 0}
+  drag: {unit: N*m*s, min: 0}
+  radius: {unit: m, above: 0}
+variables:
+  angle: {unit: rad, start: 0 rad}
+  rate: {unit: rad/s, start: 0 rad/s}
+equations:
+  - der(angle) = rate
+  - inertia*der(rate) = radius*flange.f - drag*rate
+  - flange.x = radius*angle
+"""
+
+
+@pytest.fixture
+def played_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave all other methods of simulation out: they say nothing of how a scene is set in motion."""
+    monkeypatch.setattr("apc.benchmark.bench._methods", lambda _: [Method(EXACT)])
+
+
+@pytest.mark.usefixtures("played_exactly")
+def test_a_push_between_two_ticks_is_no_rest() -> None:
+    assert "nothing moves" in bench_simulation(compiled(PUSHED), Fraction(1, 50), rounds=1).notes[0]
+    pushed = bench_simulation(compiled(PUSHED + BETWEEN), Fraction(1, 50), rounds=1)
+    assert pushed.notes == ()
+    assert pushed.chosen is not None
+    assert pushed.chosen.error is not None
+    assert pushed.chosen.error < 1e-12
+
+
+@pytest.mark.usefixtures("played_exactly")
+def test_what_rests_is_moved_by_its_own_scale_in_its_own_unit(tmp_path: Path) -> None:
+    wheel = "{type: Rotor, inertia: 1 kg*m^2, drag: 1 N*m*s, radius: 5 mm}"
+    turning = replaced(PUSHED, ("{mass: 0.25 kg, damping: 2 N*s/m}", wheel))
+    found = bench_simulation(compiled(turning, library(tmp_path, ROTOR)), Fraction(1, 50), rounds=1)
+    assert found.notes == (
+        "nothing moves in this scene: device.angle of its first peer starts 0.001 rad elsewhere",
+    )
+    wide = replaced(PUSHED, ("{count: 1}", "{count: 2, set: {device.x: [20 mm, 30 mm]}}"))
+    still = compiled(replaced(wide, ("9 N/m", "0 N/m")))
+    [note] = bench_simulation(still, Fraction(1, 50), rounds=1).notes
+    assert "device.x of its first peer starts 0.03 m" in note
+
+
+@pytest.mark.whole
+def test_a_method_that_cannot_serve_is_left_out_and_says_why() -> None:
+    text = replaced(
+        AVERAGE,
+        ("haptic: 1 ms", "haptic: 1 ms\n  slow: 2 ms"),
+        ("clock: haptic, delay: 1 ms, link", "clock: slow, delay: 1 ms, link"),
+    )
+    bench_of_two = apc.bench(compiled(text), set={"coordination.stiffness": "400 N/m"}, rounds=1)
+    assert isinstance(bench_of_two, apc.Bench)
+    [(name, reason)] = bench_of_two.comparisons[0].refused
+    assert name == "paper"
+    assert "one clock of forces (here are haptic and slow)" in reason
+    many = bench_analysis(compiled(replaced(AVERAGE, ("count: 3", "count: 1000000"))), rounds=1)
+    reasons = dict(many.refused)
+    assert "8,000,000 states" in reasons["dense"]
+    assert not any("Write:" in reason for reason in reasons.values())
+    assert "modes" in {one.name for one in many.measured}
+
+
+def test_what_is_too_large_to_be_played_is_analysed_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("apc.simulation.simulation.NUMBER", 1e20)
+    text = str(apc.bench(compiled(AVERAGE), rounds=1))
+    assert "analyze chooses modes" in text
+    assert "every method left out: 3 peers hold" in text and "--signals" not in text
+
+
+def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
+    text = str(found)
+    assert max(map(len, text.splitlines())) <= 80
+    assert "analyze chooses modes, which is" in text
+    assert "simulate chooses exact, which is" in text
+    analysis = found.comparisons[0]
+    for one in analysis.measured:
+        assert one.error is None or one.bound is None or one.error <= one.bound
+    assert "spectral radius 0.957171389625094952208279125575" in analysis.reference
+    json.dumps(found.to_dict(), allow_nan=False)
+    axes = bench_picture(found).axes
+    assert [ax.get_title() for ax in axes] == ["apc analyze", "apc simulate"]
+    assert "exact (default)" in [text.get_text() for text in axes[1].texts]
+
+
+# ---- more peers ----
+
+
+def test_more_peers_are_measured_each_in_a_process_of_its_own(cli: Cli) -> None:
+    """The text with another count, of the group that grows; a number is measured once."""
+    write("scene.yaml", replaced(AVERAGE, ("user: {count: 3}", "one: {count: 1}\n  many: {count: 4}")))
+    grown = scale(Path("scene.yaml"), [5, 3000, 5])
+    assert [(row.count, row.peers) for row in grown.rows] == [(5, 6), (3000, 3001)]
+    assert all(row.error is not None and row.error <= row.bound for row in grown.rows)
+    assert all(row.memory > 10 * 2**20 for row in grown.rows)
+    text = str(grown)
+    assert max(map(len, text.splitlines())) <= 80
+    assert "peers of group many, beside 1 of other groups" in text and "3,000" in text
+
+
+@pytest.mark.parametrize(
+    ("scene", "counts", "message"),
+    [
+        ("three-users-average", [1], r"E921 leaves nothing to measure: 1 peer of user: .* 2 peers"),
+        ("users-table", [3], "no group of this topology has a count that could grow"),
+        ("three-users-average", [], "E921"),
+        ("three-users-average", [0], "E921"),
+        ("three-users-average", [3, -1], "E921"),
+    ],
+)
+def test_numbers_of_peers_that_are_none_are_refused(scene: str, counts: list[int], message: str) -> None:
+    with pytest.raises(ApcError, match=message):
+        scale(SCENES / f"{scene}.yaml", counts)
+
+
+@pytest.mark.parametrize("words", ["many", "3,,4", "3.5", "nan", "1e400", "0", "1e10"])
+def test_a_list_that_is_none_of_peers_is_refused(words: str, cli: Cli) -> None:
+    ran = cli(f"bench '{SCENES}/template.yaml' --scale {words}")
+    assert ran.code == 1 and ran.err.startswith("--scale: E921 the list wants numbers ")
+
+
+# ---- the command ----
+
+
+@pytest.mark.parametrize(
+    ("plot", "message"),
+    [
+        ("bench.txt", "E878 the suffix of --plot"),
+        ("bench.png", "E875 matplotlib is not installed"),
+        ("nowhere/bench.png", "E601 can't be written: No such file or directory"),
+        (".", "E601 can't be written: it is a folder"),
+        ("''", "E601 can't be written: it is a folder"),
+    ],
+)
+def test_a_picture_that_cannot_be_is_refused_before_anything_is_measured(
+    plot: str, message: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("apc.benchmark.bench.bench", lambda *_: pytest.fail("it is measured"))
+    if "E875" in message:
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
+    ran = cli(f"bench '{SCENES}/template.yaml' --plot {plot}")
+    assert ran.code == 1 and message in ran.err
+
+
+def test_what_goes_wrong_in_the_end_costs_no_figures(
+    found: Bench, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise ApcError(Mistake("E601", Place("bench.png"), "can't be written: no space"))
+
+    assert found.faults == ()
+    note = "WRONG: the bound of dense does not hold"
+    first, *rest = found.comparisons
+    broken = replace(found, comparisons=(replace(first, notes=(note,)), *rest))
+    monkeypatch.setattr("apc.present.bench.save_bench", full)
+    for measured, plot, messages in (
+        (found, "--plot bench.png", ["E601 can't be written"]),
+        (broken, "", ["E922", note]),
+    ):
+        monkeypatch.setattr("apc.benchmark.bench.bench", lambda *_, measured=measured: measured)
+        ran = cli(f"bench '{SCENES}/template.yaml' {plot}")
+        assert ran.code == 1 and all(one in ran.err for one in messages)
+        assert "analyze chooses modes" in ran.out
+
+
+# ---- hard cases ----
+
+STORED: dict[str, dict[str, object]] = json.loads(TRUTHS.read_text(encoding="utf-8"))
+NAMES = sorted(path.stem for path in HERE.glob("*.yaml"))
+
+
+def test_every_scene_has_its_truth_and_says_where_it_comes_from_and_what_is_hard() -> None:
+    assert sorted(STORED) == NAMES
+    for name in NAMES:
+        text = (HERE / f"{name}.yaml").read_text(encoding="utf-8")
+        assert f"topology: {name}\nabout: " in text
+        assert "\n# From: " in text
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_hard_case_gets_the_right_verdict_and_a_bound_that_holds(name: str) -> None:
+    system = apc.compile(HERE / f"{name}.yaml")
+    case = compare(system, apc.analyze(system), STORED[name], 0.0, name)
+    assert case.failed == ""
+    assert case.verdict == STORED[name]["verdict"], "none of these is left undecided"
+    assert math.isfinite(case.bound)
+
+
+@pytest.mark.parametrize("name", ["coasting", "stiff-contact", "two-clusters", "million-peers"])
+def test_the_stored_truth_is_what_its_script_computes(name: str) -> None:
+    assert truth_of(apc.compile(HERE / f"{name}.yaml")) == STORED[name]
+
+
+def _one_case(**changes: object) -> str:
+    """Make the working folder one of one hard case, its truth changed; return its text."""
+    shutil.copy(HERE / "tiny-device.yaml", ".")
+    truth = STORED["tiny-device"] | changes
+    write("truths.json", json.dumps({"tiny-device": truth}))
+    return str(truth["spectral_radius"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"spectral_radius": "0.968810016486"}, "the bound does not hold"),
+        ({"verdict": "stable"}, "the verdict is wrong: stable"),
+        ({"rigid_modes": 0}, "0 rigid modes, not 1"),
+    ],
+)
+def test_a_case_that_is_wrong_fails(cli: Cli, changes: dict[str, object], message: str) -> None:
+    _one_case(**changes)
+    ran = cli("bench --hard .")
+    assert ran.code == 1 and f"FAILED tiny-device: {message}" in ran.out
+    assert "E922 not every hard case came out right: tiny-device" in ran.err
+
+
+OPEN = "the bound says nothing; the verdict is left open: stable up to a common translation"
+
+
+@pytest.mark.parametrize(
+    ("changes", "failed"),
+    [
+        ({"spectral_radius_error": math.inf, "stable": None, "verdict": "undecided: …"}, OPEN),
+        ({"spectral_radius": math.nan}, "there is no spectral radius"),
+        ({"spectral_radius_error": math.nan}, "the bound says nothing"),
+    ],
+)
+def test_what_is_no_number_or_no_verdict_fails_and_is_counted(
+    changes: dict[str, object], failed: str, cli: Cli
+) -> None:
+    def solve(system: CompiledSystem) -> apc.Analysis:
+        return replace(apc.analyze(system), **changes)  # type: ignore[arg-type] # some fields of it
+
+    _one_case()
+    report = run_hard_cases(Path(), solve=solve, repeats=1)
+    assert [case.failed for case in report.failures] == [failed]
+    assert "1 of 1 scene failed" in str(report)
+    assert report.to_dict()["undecided"] == (["tiny-device"] if "stable" in changes else [])
+
+
+def test_the_report_of_hard_cases_fits_a_terminal(cli: Cli) -> None:
+    write("other.yaml", "topology: other\n")
+    _one_case()
+    ran = cli("bench --hard .")
+    assert ran.code == 0 and max(map(len, ran.out.splitlines())) <= 80
+    assert "every bound holds; every verdict is right" in ran.out
+    assert "stable*: stable up to a common translation" in ran.out
+    assert "other.yaml has no truth beside it: left out" in ran.out
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "does not exist"),
+        ("{", "is not JSON"),
+        ("[]", "the truths wants spectral_radius"),
+        ('{"a": {"spectral_radius": "much"}}', "a wants spectral_radius"),
+        ('{"a": {"spectral_radius": "1/0", "rigid_modes": 1, "verdict": "stable"}}', "a wants spectral"),
+        ('{"a": {"spectral_radius": "1", "rigid_modes": "one", "verdict": "stable"}}', "a wants spectral"),
+        ("{}", "holds no topology whose truth is known"),
+    ],
+)
+def test_truths_that_are_none_are_refused(cli: Cli, text: str | None, message: str) -> None:
+    if text is not None:
+        write("truths.json", text)
+    ran = cli("bench --hard .")
+    assert ran.code == 1 and f"E920 {message}" in " ".join(ran.err.split())

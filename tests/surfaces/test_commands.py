@@ -1,0 +1,362 @@
+"""The command line: what it prints and writes, how it ends, and that nothing acts on the terminal."""
+
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+
+import apc
+from apc.cli import progress
+from apc.cli.commands import apc as group
+from apc.cli.options import Command
+from apc.cli.progress import at_work, progress_bar, status_line
+from apc.compiler.errors import ApcError, Mistake, Place, visible
+from apc.present.forms import document, json_text
+from tests.commands import Cli, Ran, folder, write
+from tests.topologies import AVERAGE, ROOT, SCENES, replaced
+
+
+@pytest.fixture
+def scene(cli: Cli) -> Cli:
+    """Run commands in a folder with the paper's scene alone."""
+    write("scene.yaml", AVERAGE)
+    return cli
+
+
+def test_from_nothing_to_a_verdict_in_three_commands(cli: Cli) -> None:
+    assert cli("new") == Ran(0, "topology.yaml is written. Next: apc compile topology.yaml\n", "")
+    compiled, analyzed = cli("compile"), cli("analyze")
+    assert (compiled.code, compiled.err, analyzed.code, analyzed.err) == (0, "", 0, "")
+    assert compiled.out.startswith("topology → topology.apc\n  8 states a peer")
+    assert analyzed.out.startswith("topology: stable up to a common translation\n")
+    assert folder() == ["topology.apc", "topology.yaml"]
+
+
+def test_new_writes_under_the_name_given_and_overwrites_nothing(cli: Cli) -> None:
+    assert cli("new my-scene").code == 0
+    assert Path("my-scene.yaml").read_text(encoding="utf-8").count("topology: my-scene") == 1
+    write("my-scene.yaml", "mine")
+    message = "my-scene.yaml: E613 exists already and is left as it is. Write: apc new another-name\n"
+    assert cli("new my-scene") == Ran(1, "", message)
+    assert Path("my-scene.yaml").read_text(encoding="utf-8") == "mine"
+
+
+@pytest.mark.parametrize("name", ["../evil", "a/b", "a b", ".hidden", "x" * 64, "", "a\nb"])
+def test_new_takes_a_plain_name_only(cli: Cli, name: str) -> None:
+    ran = cli("new", name)
+    assert (ran.code, ran.out) == (1, "")
+    assert "E612 a scene's name wants letters, digits, - and _, 63 at most" in ran.err
+    assert folder() == []
+
+
+def test_check_builds_nothing_and_reports_every_mistake(scene: Cli) -> None:
+    assert scene("check") == Ran(0, "scene.yaml: no mistakes. three-users-average, 3 peers.\n", "")
+    write("scene.yaml", AVERAGE.replace("0.1 kg", "0.1").replace("link: lan", "link: lam"))
+    ran = scene("check")
+    assert (ran.code, ran.out) == (1, "")
+    assert [line for line in ran.err.splitlines() if line.startswith("scene.yaml")] == [
+        "scene.yaml:9:18: E204 mass wants kg, got 0.1 (no unit). Write: mass: 0.1 kg",
+        "scene.yaml:13:109: E206 coordination names link lam, which isn't in links; the nearest is lan. "
+        "Write: lan",
+    ]
+    assert folder() == ["scene.yaml"]
+
+
+@pytest.mark.parametrize("stage", ["source", "scene", "flat", "clocked", "sorted"])
+def test_until_prints_a_stage_and_writes_nothing(scene: Cli, stage: str) -> None:
+    ran = scene(f"compile scene.yaml --until {stage}")
+    assert (ran.code, ran.err) == (0, "")
+    assert len(ran.out.splitlines()) > 10
+    assert folder() == ["scene.yaml"]
+
+
+def test_json_is_one_document_and_nothing_else(scene: Cli) -> None:
+    ran = scene("analyze --json")
+    assert (ran.code, ran.err) == (0, "")
+    told = json.loads(ran.out)
+    assert (told["topology"], told["peers"], told["frame_s"]) == ("three-users-average", 3, 0.008)
+    assert (told["stable"], told["rigid_modes"]) == (True, 1)
+    assert 0 < told["spectral_radius_error"] < 1e-9
+    assert set(told["modes"][0]) >= {
+        *("eigenvalue", "magnitude", "multiplicity", "frequency_hz", "damping_ratio", "shape"),
+        "participation",
+    }
+    unstable = scene("analyze --json --set 'coordination.stiffness=5000 N/m'")
+    assert (unstable.code, json.loads(unstable.out)["stable"]) == (0, False), "which is an answer"
+
+
+def test_set_may_be_repeated_and_the_section_may_be_named(scene: Cli) -> None:
+    one = scene("analyze --json --set couplers.contact.stiffness=1.5N/mm --set links.lan.delay=0s")
+    write("scene.yaml", replaced(AVERAGE, ("1000 N/m", "1500 N/m"), ("delay: 8 ms", "delay: 0 s")))
+    two = scene("analyze --json")
+    assert (one.code, two.code) == (0, 0)
+    assert json.loads(one.out) == json.loads(two.out)
+
+
+def test_a_model_works_without_its_topology_and_a_stale_one_is_refused(scene: Cli) -> None:
+    scene("compile")
+    again = "scene.apc: E614 is compiled already. Write: apc analyze scene.apc\n"
+    assert scene("compile scene.apc") == Ran(1, "", again)
+    fresh = scene("analyze --json")
+    write("scene.yaml", AVERAGE.replace("500 N/m,", "5000 N/m,"))
+    stale = (
+        "scene.apc: E605 is stale: scene.yaml has changed since it was compiled. "
+        "Write: apc compile scene.yaml\n"
+    )
+    assert scene("analyze scene.apc") == Ran(1, "", stale)
+    assert json.loads(scene("analyze scene.yaml --json").out)["stable"] is False, "the text decides"
+    Path("scene.yaml").unlink()
+    assert scene("analyze --json") == fresh
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("analyse", "No such command 'analyse'."),
+        ("compile --until nowhere", "Invalid value for '--until'"),
+        ("analyze --method schur", "Invalid value for '--method'"),
+        ("analyze --jsn", "No such option '--jsn'"),
+        ("compile a b", "Got unexpected extra argument (b)"),
+        ("simulate --jobs 1_0", "is not a whole number"),
+        ("simulate --jobs ١", "is not a whole number"),
+        ("bench scene.yaml --hard", "--hard has scenes of its own"),
+    ],
+)
+def test_a_wrong_call_ends_with_two(cli: Cli, words: str, message: str) -> None:
+    ran = cli(words)
+    assert (ran.code, ran.out) == (2, "")
+    assert message in ran.err.replace("option: --jsn", "option '--jsn'")
+
+
+def test_a_bug_of_ours_ends_with_three_and_keeps_a_report(
+    scene: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr("apc.compiler.pipeline.compile_topology", lambda path: 1 // 0)
+    ran = scene("check scene.yaml")
+    assert (ran.code, ran.out) == (3, "")
+    assert ran.err.startswith("apc: this is a bug of apc, not of your input; a report is in ")
+    assert "Traceback" not in ran.err
+    text = Path(ran.err.split(" a report is in ")[1].strip()).read_text(encoding="utf-8")
+    assert "ZeroDivisionError" in text
+    assert "arguments: ['check', 'scene.yaml']" in text
+
+
+def test_help_fits_a_terminal_and_every_command_is_one_of_ours(cli: Cli) -> None:
+    """So that each asks for one thread before it loads anything, and prints by what escapes."""
+    context = click.Context(group)
+    for command in ("", *group.list_commands(context)):
+        ran = cli(f"{command} --help")
+        assert (ran.code, ran.err) == (0, ""), command
+        assert max(len(line) for line in ran.out.splitlines()) <= 80
+        assert "-h, --help" in ran.out
+        assert not command or type(group.get_command(context, command)) is Command, command
+    assert cli("--version") == Ran(0, f"apc {apc.__version__}\n", "")
+
+
+def test_the_module_runs_like_the_command(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "apc", "new"]
+    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert [path.name for path in tmp_path.iterdir()] == ["topology.yaml"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a shell of another kind")
+@pytest.mark.parametrize(
+    ("line", "code", "told"),
+    [
+        ("{apc} schema | head -c 1 >/dev/null; exit ${{PIPESTATUS[0]}}", 0, ""),
+        ("{apc} schema >&-", 1, "there is no stdout"),
+    ],
+)
+def test_an_output_that_is_closed_is_no_bug(line: str, code: int, told: str) -> None:
+    command = line.format(apc=f"{sys.executable} -m apc")
+    ran = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert ran.returncode == code, ran.stderr
+    assert told in ran.stderr and "bug" not in ran.stderr
+
+
+# ---- numbers ----
+
+
+def _finite(word: str) -> float:
+    pytest.fail(f"{word} is no JSON")
+
+
+@pytest.mark.few(6)
+@pytest.mark.parametrize(
+    "command",
+    [
+        "analyze",
+        "critical contact.stiffness",
+        "feel",
+        "region --x 'contact.stiffness=1 N/m:100 N/m' --y 'device.mass=1 g:1 kg'",
+        "simulate --duration 16ms",
+    ],
+)
+@pytest.mark.parametrize(
+    "value", ["device.damping=1e30 N*s/m", "device.mass=1e-300 kg", "device.mass=1e300 kg"]
+)
+def test_json_has_no_number_that_is_not_finite(cli: Cli, command: str, value: str) -> None:
+    ran = cli(command, str(SCENES / "three-users-average.yaml"), "--set", value, "--json")
+    assert ran.code in (0, 1)
+    if not ran.code:
+        json.loads(ran.out, parse_constant=_finite)
+
+
+def test_what_is_not_finite_is_null_wherever_it_stands() -> None:
+    values = {"a": float("nan"), "b": [float("inf"), 1.0], "c": np.array([1.0, -np.inf])}
+    assert json.loads(json_text(document(values))) == {"a": None, "b": [None, 1.0], "c": [1.0, None]}
+    assert json.loads(json_text({"a": [float("nan")]})) == {"a": [None]}
+
+
+# ---- the terminal ----
+
+ESCAPES = "\x1b[31m\x9b2J\x7f\u202e"
+
+
+def test_what_is_not_printed_is_written_out_as_json_has_it() -> None:
+    assert visible("a b\u00a0ü\n\t→") == "a b\u00a0ü\n\t→"
+    assert visible(ESCAPES) == r"\u001b[31m\u009b2J\u007f\u202e"
+    assert json.loads(visible(json.dumps({"a": ESCAPES}, ensure_ascii=False))) == {"a": ESCAPES}
+    assert json.loads(f'"{visible(chr(0xE0001))}"') == chr(0xE0001)
+    text = str(ApcError(Mistake("E101", Place(f"{ESCAPES}.yaml", 3, 1), "this", "that", ESCAPES, ESCAPES)))
+    assert text.isprintable()
+    assert text.count(r"\u001b") == 3
+
+
+@pytest.mark.parametrize("words", ["check", "compile", "analyze", "analyze --json", "show"])
+def test_a_name_in_a_file_does_not_act_on_the_terminal(cli: Cli, words: str) -> None:
+    write("scene.yaml", replaced(AVERAGE, ("topology: three-users-average", r'topology: "a\e[31mb"')))
+    ran = cli(f"{words} scene.yaml")
+    assert ran.code == 0 and "\x1b" not in ran.out and r"\u001b[31m" in ran.out
+    for code, names in ((1, ("\x1b[2J.yaml",)), (2, ("a", "\x1b[2J.yaml"))):
+        ran = cli("analyze", *names)
+        assert ran.code == code and "\x1b" not in ran.err
+
+
+def test_every_command_prints_by_what_escapes() -> None:
+    for path in sorted((ROOT / "runtime" / "cli").glob("*.py")):
+        nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        printing = {node.attr for node in nodes if isinstance(node, ast.Attribute)} & {"echo", "secho"}
+        assert path.name == "options.py" or not printing, path.name
+
+
+LONG = "n" * 300
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "compile .",
+        "compile /",
+        "analyze .",
+        f"compile {LONG}.yaml",
+        f"analyze {LONG}.apc",
+        f"show scene.yaml --out {LONG}.txt",
+        f"schema --out {LONG}.json",
+        f"simulate scene.yaml --duration 1ms --out {LONG}.csv",
+        f"sweep scene.yaml --over contact.stiffness=1N/m:2N/m:2 --out {LONG}.csv",
+        f"sweep scene.yaml --jobs 1 --over contact.stiffness=1N/m:2N/m:2 --out {LONG[:249]}.csv",
+        f"region scene.yaml --out {LONG}.csv",
+    ],
+)
+def test_a_name_that_can_be_none_is_one_message(scene: Cli, words: str) -> None:
+    ran = scene(words)
+    assert (ran.code, ran.out, len(ran.err.splitlines())) == (1, "", 1)
+
+
+def test_two_topologies_of_one_model_are_refused_naming_both(cli: Cli) -> None:
+    for name in ("x.yaml", "x.yml"):
+        write(name, AVERAGE)
+    message = "x.yml: E617 and x.yaml would both be compiled to x.apc. Write: mv x.yml x-2.yml\n"
+    assert cli("compile x.yml") == Ran(1, "", message)
+    assert not Path("x.apc").exists()
+
+
+# ---- how far it is, and how long it takes ----
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        ("compile --force", ["source", "scene", "flat", "clocked", "sorted", "compiled", "save"]),
+        ("analyze --json", ["read", "analysis", "print"]),
+        ("critical contact.stiffness", ["read", "critical", "print"]),
+        ("simulate --duration 0.1s", ["read", "prepare", "play", "print"]),
+    ],
+)
+def test_every_command_says_what_its_parts_take_on_stderr(scene: Cli, words: str, parts: list[str]) -> None:
+    plain, timed = scene(words), scene(f"{words} --timings")
+    assert (plain.code, timed.code, timed.out) == (0, 0, plain.out)
+    rows = [line.rsplit(maxsplit=2) for line in timed.err.splitlines()]
+    names = [row[0].strip() for row in rows]
+    assert [name for name in names if name in parts] == parts
+    assert (names[0], names[-2:]) == ("start", ["imports, rest", "all"])
+    numbers = [float(row[1]) for row in rows]
+    assert sum(numbers[:-1]) == pytest.approx(numbers[-1], abs=1.0)
+
+
+def test_what_is_no_terminal_sees_a_line_now_and_then_of_long_work_alone(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with status_line() as told, progress_bar("sweep", "points") as show:
+        told("looking")
+        show(1, 2)
+    assert capsys.readouterr() == ("", "")
+    monkeypatch.setattr(progress, "QUIET", 10.0)
+    clock = iter([0.0, 5.0, 11.0, 15.0, 23.0])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
+    with status_line() as told:
+        for text in ("after 5 s", "after 11 s", "after 15 s", "after 23 s"):
+            told(text)
+    assert capsys.readouterr() == ("", "after 11 s\nafter 23 s\n")
+    monkeypatch.setattr(progress.time, "monotonic", iter([0.0, 0.0, 60.0, 60.0]).__next__)
+    with progress_bar("sweep", "points") as show:
+        show(1000, 4000)
+    assert capsys.readouterr().err == "sweep: 1,000 of 4,000 points, about 3 min left\n"
+
+
+def test_a_terminal_sees_a_line_that_is_gone_and_a_bar_once_the_work_takes_long(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with pytest.raises(KeyboardInterrupt), status_line() as told:
+        told("looking at 3 values")
+        told("x" * 500)
+        raise KeyboardInterrupt
+    out, err = capsys.readouterr()
+    lines = err.split("\r\x1b[K")
+    assert (out, lines[1], lines[-1]) == ("", "looking at 3 values", "")
+    assert len(lines[2]) < 500, "no wider than the terminal"
+    for after, shown in ((float("inf"), False), (0.0, True)):
+        with progress_bar("sweep", "points", after=after) as show:
+            show(1, 4)
+            show(3, 4)
+        assert ("of 4 points" in capsys.readouterr().err) == shown
+
+
+def test_long_work_says_that_it_goes_on_and_what_may_take_long_is_said_first(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits: list[float] = []
+
+    def ended(seconds: float) -> bool:
+        waits.append(seconds)
+        return len(waits) == 3
+
+    monkeypatch.setattr(progress, "QUIET", 10.0)
+    progress._watch("analysing", ended)
+    assert capsys.readouterr().err == "analysing: at work for 10 s\nanalysing: at work for 20 s\n"
+    assert waits == [10.0, 10.0, 20.0]
+    monkeypatch.setattr(progress, "QUIET", 1000.0)  # no machine is so busy that a second passes for these
+    with at_work("analysing", about=7500.0), at_work("compiling", about=75.0), at_work("measuring"):
+        pass
+    assert capsys.readouterr() == ("", "analysing: this may take 7,500 s\n")

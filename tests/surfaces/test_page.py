@@ -1,0 +1,669 @@
+"""The page of a scene: its sliders say what they set, its answers are the API's, and nobody else gets in."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import http.client
+import json
+import logging
+import re
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from fractions import Fraction
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+import pytest
+
+import apc
+from apc.compiler.compiled import CompiledSystem
+from apc.frame.names import Free
+from apc.frame.overrides import parse_override
+from tests.commands import Cli, write
+from tests.surfaces.pages import CHROMIUM, MODEL, VERDICT, Tab, launched, served
+from tests.topologies import AVERAGE, SCENES
+
+pytest.importorskip("bokeh")
+
+from bokeh.document import Document
+
+from apc.explore import sections
+from apc.explore.desk import Desk
+from apc.explore.motion import STRUCK, motion_of
+from apc.explore.page import Page, scene_of
+from apc.explore.sections import Task, Told, compute
+from apc.explore.server import MOST, _shortened
+from apc.explore.sliders import (
+    Slider,
+    axes_of,
+    is_number,
+    overrides_of,
+    place_of,
+    set_to,
+    sliders_of,
+    with_value,
+)
+from apc.explore.written import with_values
+from apc.processes import Workers, model_bytes
+
+NOTHING = "topology: none\npeers: {user: {count: 1}}\nmasses: {}\n"
+LOSSY = AVERAGE.replace("delay: 8 ms}", "delay: 8 ms, loss: 10 %, jitter: 1 ms}")
+
+
+def compiled(text: str, folder: Path) -> CompiledSystem:
+    (folder / "scene.yaml").write_text(text, encoding="utf-8")
+    return apc.compile(folder / "scene.yaml")
+
+
+def named(sliders: tuple[Slider, ...], label: str) -> Slider:
+    return next(one for one in sliders if one.label == label)
+
+
+# The sliders.
+
+
+@pytest.mark.parametrize(
+    "name", ["three-users-average", "experiment-average", "mixed-clocks", "lossy-average"]
+)
+def test_what_a_slider_says_is_what_set_takes(name: str) -> None:
+    system = apc.compile(SCENES / f"{name}.yaml")
+    for one in sliders_of(system):
+        assert list(one.values) == sorted(set(one.values)), one.label
+        for value, text in zip(one.values, one.texts, strict=True):
+            assert parse_override(system, f"{one.label}={text}").value == value
+
+
+def test_every_number_of_the_paper_s_scene_has_a_slider(tmp_path: Path) -> None:
+    sliders = sliders_of(compiled(AVERAGE, tmp_path))
+    assert [one.label for one in sliders] == [
+        *("contact.stiffness", "coordination.stiffness", "contact.damping", "coordination.damping"),
+        *("device.mass", "device.damping", "cube.mass", "cube.damping"),
+        *("contact.delay", "coordination.delay", "lan.delay", "haptic.period", "network.period"),
+        *("haptic.phase", "network.phase", "user.count"),
+    ]
+    stiffness, mass = named(sliders, "contact.stiffness"), named(sliders, "device.mass")
+    assert (stiffness.texts[stiffness.start], stiffness.span) == ("1000 N/m", (0, 5000))  # the study's
+    ratios = [float(b / a) for a, b in zip(mass.values, mass.values[1:], strict=False)]
+    assert mass.values[0] == Fraction(1, 1000) and mass.values[-1] == 10  # four decades
+    assert max(ratios) / min(ratios) < 1.02  # even on a logarithmic scale, but for three digits
+    assert named(sliders, "user.count").texts == tuple(str(k) for k in range(2, 13))
+    for label, other in (("haptic.period", Fraction(8, 1000)), ("network.period", Fraction(1, 1000))):
+        for period in named(sliders, label).values:  # one is a multiple of the other: frames stay short
+            assert (max(period, other) / min(period, other)).denominator == 1
+
+
+def test_a_value_that_a_slider_has_not_gets_a_place_of_its_own(tmp_path: Path) -> None:
+    system = compiled(AVERAGE, tmp_path)
+    sliders = sliders_of(system)
+    place, value = set_to(system, sliders, "contact.stiffness=1234.5 N/m")
+    moved, at = with_value(sliders[place], value)
+    assert moved.texts[at] == "1234.5 N/m" and moved.values[moved.start] == 1000
+    (override,) = overrides_of([moved], [at])
+    assert override.value == Fraction("1234.5")
+    assert overrides_of([moved], [moved.start]) == []
+    assert moved.values[place_of(moved, 1234.0)] == Fraction("1234.5")
+
+
+def test_what_follows_from_others_has_no_slider(tmp_path: Path) -> None:
+    text = AVERAGE.replace("stiffness: 500 N/m", "stiffness: kt/(peers - 1)")
+    system = compiled(text.replace("clocks:", "parameters: {kt: 1000 N/m}\nclocks:"), tmp_path)
+    sliders = sliders_of(system)
+    assert "kt" in [one.label for one in sliders]
+    with pytest.raises(apc.ApcError, match=r"E980 coordination\.stiffness has no slider"):
+        set_to(system, sliders, "coordination.stiffness=500 N/m")
+
+
+# What is computed.
+
+
+def test_sections_tell_what_the_api_tells(tmp_path: Path) -> None:
+    system = compiled(AVERAGE, tmp_path)
+    sliders, model = sliders_of(system), model_bytes(system)
+    places = [one.start for one in sliders]
+    places[sliders.index(named(sliders, "lan.delay"))] += 40
+    overrides = tuple(overrides_of(sliders, places))
+    setting = {one.free.label: f"{float(one.value) * 1e3!r} ms" for one in overrides}
+
+    def told(section: str, asked: Any = None) -> dict[str, Any]:
+        answer = compute(model, Task(section, overrides, asked)).found
+        assert answer is not None
+        return answer
+
+    analysis, whole = apc.analyze(system, set=setting), apc.region(system, set=setting)
+    verdict, feel = told("verdict"), told("feel")
+    assert verdict["radius"] == analysis.spectral_radius and verdict["text"] == str(analysis)
+    region = told("region", (*axes_of(sliders, places, (0, 1)), "nominal"))
+    assert region["share"] == pytest.approx(whole.stable_area / (5000 * 1500), rel=1e-4)  # drawn to 1e-5
+    assert told("margins")["text"] == str(apc.margins(system, set=setting))
+    felt = apc.feel(system, feel["frequency"], set=setting)
+    assert np.array_equal(feel["magnitude"], np.abs(felt.impedance))
+
+
+@pytest.mark.parametrize("label", ["coordination.stiffness", "user.count"])
+def test_the_roots_of_a_slider_are_the_eigenvalues_of_analyses(label: str, tmp_path: Path) -> None:
+    system = compiled(AVERAGE, tmp_path)
+    slider = named(sliders_of(system), label)
+    found = compute(model_bytes(system), Task("roots", (), (slider.free, slider.values))).found
+    assert found is not None and found["slider"] == label
+    for text in (slider.texts[0], slider.texts[-1]):
+        roots = (found["real"] + 1j * found["imag"])[np.array(found["name"]) == text]
+        modes = apc.analyze(system, set={label: text}).modes
+        leading = [one.eigenvalue for one in modes if one.magnitude > 1e-2]
+        for one in leading:
+            assert np.abs(roots - one).min() < 1e-9
+
+
+def test_a_section_that_a_scene_has_nothing_for_says_so(tmp_path: Path) -> None:
+    model = model_bytes(compiled(AVERAGE, tmp_path))
+    told = compute(model, Task("network", ()))
+    assert told.found is None
+    assert "no link here loses packets" in told.why and "loss: 1 %" in told.why
+    unstable = (parse_override(compiled(AVERAGE, tmp_path), "contact.stiffness=5000 N/m"),)
+    why = compute(model, Task("feel", unstable)).why
+    assert "unstable" in why and "--" not in why  # a page has no command line
+
+
+@pytest.mark.whole
+def test_loss_and_jitter_are_the_critical_ones(tmp_path: Path) -> None:
+    system = compiled(LOSSY.replace(", jitter: 1 ms", ""), tmp_path)
+    found = compute(model_bytes(system), Task("network", ())).found
+    assert found is not None
+    assert str(apc.judge_network(system)) in found["text"]
+    assert str(apc.critical(system, "lan.loss")) in found["text"]
+
+
+def test_a_struck_device_moves_as_its_equation_says(tmp_path: Path) -> None:
+    """m v' = −b v from v(0) = 0.1 m/s: x = v m/b (1 − e^(−b t/m))."""
+    text = "topology: one\npeers: {user: {count: 1}}\nmasses: {device: {mass: 2 kg, damping: 3 N*s/m}}\n"
+    motion = motion_of(compiled(text, tmp_path), struck=True)
+    (body,) = motion.bodies
+    expected = 1e3 * STRUCK * 2 / 3 * (1 - np.exp(-1.5 * motion.time))
+    assert np.allclose(body.x, expected, rtol=1e-9, atol=1e-12)
+    with pytest.raises(apc.ApcError, match="E983"):
+        motion_of(compiled(NOTHING, tmp_path), struck=True)
+
+
+def test_what_goes_wrong_in_a_section_is_told_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> dict[str, Any]:
+        raise ValueError("shapes differ")
+
+    monkeypatch.setitem(sections.SECTIONS, "feel", broken)
+    told = compute(model_bytes(compiled(AVERAGE, tmp_path)), Task("feel", ()))
+    assert told.why == "This is a bug of apc, not of your scene: ValueError: shapes differ"
+
+
+# Who computes it.
+
+
+class Held:
+    """Workers that do nothing until they are told to."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Task, Future[Told]]] = []
+
+    def submit(self, task: Task) -> Future[Told]:
+        self.asked.append((task, Future()))
+        return self.asked[-1][1]
+
+    def finish(self, place: int) -> None:
+        task, future = self.asked[place]
+        future.set_result(Told({"of": task.asked}))
+
+
+def at_once(call: Callable[[], None], seconds: float) -> None:
+    if not seconds:
+        call()
+
+
+def test_an_old_answer_never_takes_the_place_of_a_newer_one() -> None:
+    held, shown = Held(), []
+    desk = Desk(b"", ("a", "b"), at_once, lambda section, told: shown.append((section, told.found)))
+    desk.workers = Workers(held.submit, 1, lambda _: None)
+    assert desk.ask(Task("b", (), 1)) and not desk.ask(Task("b", (), 1))
+    for number in (2, 3, 4):  # while it computes, the newest waits in the place of those before it
+        desk.ask(Task("b", (), number))
+    desk.ask(Task("a", (), 5))
+    held.finish(0)
+    held.finish(1)
+    held.finish(2)
+    assert shown == [("b", {"of": 1}), ("a", {"of": 5}), ("b", {"of": 4})]
+    desk.ask(Task("b", (), 6))
+    desk.forget("b")
+    held.finish(3)
+    assert len(shown) == 3
+
+
+def test_what_comes_later_waits_for_the_first_desk_but_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A slider that is moved without a stop keeps the first desk busy; the other gets its turn."""
+    now, timers = [100.0], []
+    monkeypatch.setattr("apc.explore.desk.time.monotonic", lambda: now[0])
+
+    def later(call: Callable[[], None], seconds: float) -> None:
+        timers.append((seconds, call)) if seconds else call()
+
+    held = Held(), Held()
+    quick, slow = (Desk(b"", (name,), later, lambda section, told: None) for name in "ab")
+    for desk, workers in zip((quick, slow), held, strict=True):
+        desk.workers = Workers(workers.submit, 1, lambda _: None)
+    quick.put_before(slow)
+    for number in range(3):
+        quick.ask(Task("a", (), number))
+        slow.ask(Task("b", (), number))
+    seconds, look = timers[-1]
+    look()
+    assert len(held[1].asked) == 0
+    now[0] += seconds
+    look()
+    assert [task.asked for task, _ in held[1].asked] == [2]
+
+
+# The topology with other values.
+
+
+@pytest.mark.parametrize(
+    ("label", "value", "line"),
+    [
+        ("contact.stiffness", "800 N/m", "stiffness: 800 N/m, clock: haptic"),
+        ("contact.damping", "2 N*s/m", "delay: 1 ms, damping: 2 N*s/m}"),
+        ("network.period", "4 ms", "network: 4 ms"),
+        ("network.phase", "1 ms", "network: {period: 8 ms, phase: 1 ms}"),
+        ("lan.delay", "3 ms", "delay: 3 ms}"),
+        ("user.count", "5", "user: {count: 5}"),
+    ],
+)
+def test_a_value_is_written_where_it_stands(label: str, value: str, line: str, tmp_path: Path) -> None:
+    system = compiled(AVERAGE, tmp_path)
+    text = with_values(AVERAGE, system, {Free(label): value})
+    assert line in text
+    changed = compiled(text, tmp_path)
+    expected = apc.analyze(system, set={label: value})
+    assert apc.analyze(changed).spectral_radius == pytest.approx(expected.spectral_radius, rel=1e-12)
+    assert len(text.splitlines()) == len(AVERAGE.splitlines())  # and comments stay where they were
+    assert "# a copy at each peer" in text
+
+
+def test_a_number_of_one_group_is_written_there() -> None:
+    path = SCENES / "experiment-average.yaml"
+    system = apc.compile(path)
+    text = with_values(path.read_text("utf-8"), system, {Free("hand.force", "left"): "3 N"})
+    assert re.search(r"left:.*hand\.force: 3 N", text)
+
+
+# What can't be.
+
+
+def test_what_can_t_be_explored_is_told_before_a_page_is_served(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write("scene.yaml", AVERAGE)
+    assert "E204" in cli("explore scene.yaml --set 'contact.stiffness=5 kg'").err
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        message = f"--port: E982 port {port} is taken. Write: --port 0  (any that is free)\n"
+        assert cli(f"explore scene.yaml --no-browser --port {port}") == (1, "", message)
+    monkeypatch.setitem(sys.modules, "bokeh.server.server", None)
+    message = "E875 bokeh.server.server is not installed. Write: pip install '.[explore]'"
+    assert message in cli("explore scene.yaml").err
+
+
+# In a browser.
+
+
+@pytest.fixture(scope="module")
+def link(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    path = tmp_path_factory.mktemp("explore") / "scene.yaml"
+    path.write_text(AVERAGE, encoding="utf-8")
+    with served(path) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    if CHROMIUM is None:
+        pytest.skip("no Chromium on this machine")
+    pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with launched() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def tab(browser: Any, link: str) -> Iterator[Tab]:
+    """Open a tab that several tests use, whichever values it has come to."""
+    found = Tab(browser, link)
+    yield found
+    found.close(link)
+
+
+def test_a_slider_that_is_moved_changes_region_and_verdict_to_what_the_api_says(
+    browser: Any, link: str, tab: Tab, tmp_path: Path
+) -> None:
+    system = compiled(AVERAGE, tmp_path)
+    first, second = Tab(browser, link), tab
+    first.radius(apc.analyze(system).spectral_radius)
+    text = first.press("lan.delay", "PageUp", 3).replace("·", "*")
+    setting = {"lan.delay": text}
+    assert text != "8 ms"
+    first.radius(apc.analyze(system, set=setting).spectral_radius)
+    share = apc.region(system, set=setting).stable_area / (5000 * 1500)
+    first.page.wait_for_function(f"{MODEL}('region-words').text.includes('{100 * share:.3g} %')")
+    # An axis of the region: the point moves, and the verdict becomes another.
+    text = first.press("contact.stiffness", "End", 1).replace("·", "*")
+    found = apc.analyze(system, set=setting | {"contact.stiffness": text})
+    assert found.stable is False
+    first.radius(found.spectral_radius)
+    assert "class='unstable'" in first.page.evaluate(VERDICT)
+    # The link holds the values, and opens with them; the second tab knows nothing of it.
+    first.page.wait_for_function("location.search.includes('contact.stiffness=5000')")
+    assert parse_qs(urlsplit(first.page.url).query)["lan.delay"] == [setting["lan.delay"]]
+    url = first.page.url
+    first.close(link)
+    third = Tab(browser, url)
+    third.radius(found.spectral_radius)
+    third.close(link)
+    second.radius(apc.analyze(system).spectral_radius)
+    assert second.press("lan.delay", "Tab", 1) == "8 ms"
+    second.check(link)
+
+
+@pytest.mark.whole
+def test_a_motion_is_played_stopped_and_taken_to_any_time(tab: Tab, link: str) -> None:
+    tab.page.wait_for_function(f"{MODEL}('motion-words').text.includes('is struck')")
+    assert tab.press("time", "End", 1) == "1.000 s"
+    tab.press("time", "Home", 1)
+    tab.page.get_by_role("button", name="Play").click()
+    tab.page.wait_for_function(f"{MODEL}('time').value > 5")
+    tab.page.get_by_role("button", name="Pause").click()
+    at = tab.page.evaluate(f"{MODEL}('time').value")
+    tab.page.wait_for_timeout(300)
+    assert tab.page.evaluate(f"{MODEL}('time').value") == at
+    tab.check(link)
+
+
+@pytest.mark.whole
+def test_a_click_in_the_region_sets_both_sliders(tab: Tab, link: str) -> None:
+    tab.page.wait_for_function(f"{MODEL}('region-words').text.includes('Stable in')")
+    inner = tab.page.evaluate(
+        f"""(() => {{
+          window.scrollTo(0, 0)
+          const view = Bokeh.index.get_one({MODEL}('region-plot'))
+          const box = view.canvas_view.el.getBoundingClientRect(), frame = view.frame.bbox
+          return [box.x + frame.x + 0.8 * frame.width, box.y + frame.y + 0.4 * frame.height]
+        }})()"""
+    )
+    tab.page.mouse.click(*inner)
+    names = ("contact.stiffness", "coordination.stiffness")
+    tab.page.wait_for_function(f"{[*names]}.every(name => location.search.includes(name))")
+    chosen = parse_qs(tab.page.evaluate("location.search.slice(1)"))
+    x, y = (float(chosen[name][0].split()[0]) for name in names)
+    assert x == pytest.approx(0.8 * 5000, abs=50) and y == pytest.approx(0.6 * 1500, abs=15)
+    tab.check(link)
+
+
+@pytest.mark.whole
+def test_topology_and_numbers_are_downloaded_with_the_values(tab: Tab, link: str, tmp_path: Path) -> None:
+    text = tab.press("device.damping", "PageUp", 3).replace("·", "*")
+    found = {}
+    for label in ("Topology", "Picture", "Numbers"):
+        with tab.page.expect_download() as waited:
+            tab.page.get_by_role("button", name=label).click()
+        found[label] = tmp_path / waited.value.suggested_filename
+        waited.value.save_as(found[label])
+    numbers = json.loads(found["Numbers"].read_text("utf-8"))
+    assert numbers["set"]["device.damping"] == text
+    expected = apc.analyze(compiled(AVERAGE, tmp_path), set=numbers["set"])
+    assert apc.analyze(found["Topology"]).spectral_radius == expected.spectral_radius
+    assert found["Picture"].read_bytes().startswith(b"\x89PNG")
+    assert numbers["analyze"]["spectral_radius"] == expected.spectral_radius
+    assert numbers["region"]["x"]["parameter"] == "contact.stiffness"
+    tab.check(link)
+
+
+@pytest.mark.whole
+def test_whoever_sees_no_pictures_and_has_no_mouse_finds_everything_by_name(tab: Tab, link: str) -> None:
+    names = [one.get_attribute("aria-label") for one in tab.page.get_by_role("slider").all()]
+    assert None not in names and {"lan.delay", "user.count", "time"} <= set(names)
+    headings = [one.inner_text() for one in tab.page.get_by_role("heading").all()]
+    assert {"Verdict", "Stable region", "Eigenvalues", "Response", "What the hand feels"} <= set(headings)
+    for width in (1280, 800):
+        tab.page.set_viewport_size({"width": width, "height": 900})
+        tab.page.wait_for_timeout(500)
+        assert tab.page.evaluate("document.documentElement.scrollWidth") <= width
+    tab.check(link)
+
+
+@pytest.mark.whole
+def test_a_scene_without_two_axes_is_shown_without_a_region(browser: Any, tmp_path: Path) -> None:
+    (tmp_path / "none.yaml").write_text(NOTHING, encoding="utf-8")
+    with served(tmp_path / "none.yaml") as link:
+        tab = Tab(browser, f"{link}&x-axis=user.count")
+        tab.page.wait_for_function(f"{MODEL}('region-words').text.includes('this scene has fewer')")
+        assert "user.count can be no axis" in tab.page.evaluate(f"{MODEL}('message').text")
+        assert tab.page.get_by_role("combobox", name="Region: horizontal axis").count() == 0
+        assert tab.press("user.count", "ArrowRight", 1) == "2"
+        tab.page.wait_for_function("location.search.includes('user.count=2')")
+        tab.page.wait_for_function(f"{MODEL}('motion-words').text.includes('velocity')")
+        assert not tab.page.get_by_role("button", name="Play").is_visible()
+        tab.close(link)
+
+
+@pytest.mark.whole
+def test_a_scene_may_name_its_numbers_as_the_link_does(browser: Any, tmp_path: Path) -> None:
+    text = AVERAGE.replace("clocks:", "parameters: {x: 1000 N/m, y: 500 N/m, token: 5 N*s/m}\nclocks:", 1)
+    text = text.replace("stiffness: 1000 N/m", "stiffness: x").replace("stiffness: 500 N/m", "stiffness: y")
+    system = compiled(
+        text.replace("mass: 0.1 kg, damping: 5 N*s/m", "mass: 0.1 kg, damping: token"), tmp_path
+    )
+    with served(tmp_path / "scene.yaml") as link:
+        tab = Tab(browser, link)
+        setting = {name: tab.press(name, "PageDown", 1).replace("·", "*") for name in ("x", "token")}
+        radius = apc.analyze(system, set=setting).spectral_radius
+        tab.radius(radius)
+        tab.page.wait_for_function("new URLSearchParams(location.search).getAll('token').length == 2")
+        url = tab.page.url
+        tab.close(link)
+        again = Tab(browser, url)
+        again.radius(radius)
+        assert again.page.evaluate(f"{MODEL}('message').text") == ""
+        again.close(link)
+
+
+SERVED = """
+import os, webbrowser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+from tornado.httpclient import AsyncHTTPClient
+from apc.explore.server import bound, run
+
+async def opened(url):
+    path = Path(unquote(urlsplit(url).path))
+    print(url.startswith("file:///"), oct(path.stat().st_mode), link in path.read_text(), path)
+    await AsyncHTTPClient().fetch(link)
+    raise KeyboardInterrupt
+
+webbrowser.open = opened
+server, link = bound(lambda tab: tab.on_session_destroyed(lambda session_context: print("closed")), 0)
+run(server, link, browser=True)
+"""
+
+
+def test_the_browser_opens_a_file_of_ours_and_ctrl_c_closes_the_tabs_that_are_open() -> None:
+    """What a browser is started with, all users see: the link's token is not in it."""
+    ended = subprocess.run([sys.executable, "-c", SERVED], capture_output=True, text=True, check=False)
+    opened, *closed = ended.stdout.splitlines()
+    own, mode, leads, path = opened.split()
+    assert (own, mode, leads) == ("True", "0o100600", "True")
+    assert not Path(path).exists()
+    assert (closed, ended.stderr) == (["closed"], "")
+
+
+FLOODED = """
+import resource, socket
+from tornado.httpclient import AsyncHTTPClient
+from apc.explore.server import MOST, bound, run
+
+async def opened():
+    port = int(link.rpartition(":")[2].partition("/")[0])
+    silent = [socket.socket() for _ in range({silent})]
+    for one in silent:
+        one.setblocking(False)
+        one.connect_ex(("127.0.0.1", port))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (silent[-1].fileno() + {left}, 4096))
+    for _ in range(3):
+        print((await AsyncHTTPClient().fetch(link)).code)
+    raise KeyboardInterrupt
+
+server, link = bound(lambda tab: None, 0)
+server.io_loop.add_callback(opened)
+run(server, link, browser=False)
+"""
+
+
+@pytest.mark.parametrize(
+    "left", [40, pytest.param(MOST + 20, marks=pytest.mark.whole)], ids=["few", "enough"]
+)
+def test_connections_that_ask_for_nothing_keep_nobody_out(left: int) -> None:
+    """More than are taken, or than there are descriptors for: those that came first go, without a word."""
+    script = FLOODED.format(silent=2 * MOST, left=left)
+    ended = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert (ended.stdout, ended.stderr) == ("200\n" * 3, "")
+
+
+class Asked:
+    """What stands in the place of a `Desk`: it keeps what it is asked."""
+
+    asked: ClassVar[list[Task]] = []
+
+    def __init__(self, model: bytes, order: Sequence[str], *_: object) -> None:
+        self.order, self.busy = order, None
+
+    def ask(self, task: Task) -> bool:
+        self.asked.append(task)
+        return True
+
+    def forget(self, section: str) -> None:
+        pass
+
+    def put_before(self, other: Asked) -> None:
+        pass
+
+
+@pytest.fixture
+def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Page:
+    """Give the page of a tab without a browser, and without those who compute for it."""
+    monkeypatch.setattr("apc.explore.page.Desk", Asked)
+    monkeypatch.setattr(Asked, "asked", [])
+    document, request = Document(), SimpleNamespace(arguments={})
+    context = SimpleNamespace(request=request)
+    document._session_context = lambda: context  # type: ignore[assignment]
+    found = Page(scene_of(compiled(LOSSY, tmp_path), (), None), document)
+    found._deliver("verdict", Told(None, "none"))
+    names = ["user[1].device.x", "user[1].cube.x"]
+    found._deliver(
+        "feel", Told({"names": names, "at": names[0], "notes": ()} | {one: np.ones(2) for one in FELT})
+    )
+    Asked.asked.clear()
+    return found
+
+
+FELT = ("frequency", "magnitude", "phase")
+NAN, INFINITY = {"type": "number", "value": "nan"}, {"type": "number", "value": "+inf"}
+ZEROS = {"type": "bytes", "data": base64.b64encode(gzip.compress(bytes(8))).decode()}
+ARRAY = {"type": "ndarray", "array": ZEROS, "dtype": "float64", "shape": [1], "order": "little"}
+WRONG = [NAN, INFINITY, -5, -0.6, 10**6, 10**400, 1e308, True, None, "", "text", [1], {"type": "map"}, ARRAY]
+
+
+def says(page: Page, model: Any, value: Any) -> None:
+    """Have the browser say a value, as Bokeh reads it; where that refuses it, nobody of the page is asked."""
+    event = {"kind": "ModelChanged", "model": {"id": model.id}, "attr": "value", "new": value}
+    try:
+        page.document.apply_json_patch({"events": [event]})
+    except ValueError as error:
+        record = logging.makeLogRecord({"msg": "", "exc_info": (type(error), error, error.__traceback__)})
+        assert _shortened(record) and record.exc_info is None
+        assert record.getMessage().startswith("a message of the page was ignored: ValueError(")
+
+
+def test_what_the_browser_can_t_say_changes_nothing(page: Page) -> None:
+    models = [*page.handles, *page.selects, page.begins, page.meant, page.at]
+    before = [one.value for one in models]
+    for value in WRONG:
+        for model in models:
+            says(page, model, value)
+        for x, y in ((value, 1.0), (1.0, value)):
+            if not is_number(value):  # of those the nearest values are taken
+                values = [["model", {"id": page.region.plot.id}], ["x", x], ["y", y]]
+                tap = {"type": "event", "name": "tap", "values": {"type": "map", "entries": values}}
+                told = {"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": tap}
+                page.document.apply_json_patch({"events": [told]})
+        assert [one.value for one in models] == before, value
+    assert page.places == [one.start for one in page.sliders]
+    assert not Asked.asked
+
+
+def status(link: str, **headers: str) -> int:
+    parts = urlsplit(link)
+    connection = http.client.HTTPConnection(parts.netloc, timeout=60)
+    try:
+        connection.request("GET", f"{parts.path}?{parts.query}", headers=headers)
+        return connection.getresponse().status
+    finally:
+        connection.close()
+
+
+def test_what_the_browser_may_say_is_computed(page: Page) -> None:
+    """A slider to its last value, an axis, what is played and what stable means, a hand, a click."""
+    last = len(page.sliders[0].values) - 1
+    for model, value in (
+        (page.handles[0], last),
+        (page.selects[0], "device.mass"),
+        (page.meant, "packets as they are lost and late (takes long)"),
+        (page.begins, "as the scene begins"),
+        (page.at, "user[1].cube.x"),
+    ):
+        says(page, model, value)
+    assert page.places[0] == last
+    assert page.sliders[page.chosen[0]].label == "device.mass"
+    assert page.meant.value.startswith("packets")
+    assert next(one for one in reversed(Asked.asked) if one.section == "motion").asked is False
+    assert Asked.asked[-1].asked == "user[1].cube.x"
+    says(page, page.handles[0], last + 1)
+    assert "contact.stiffness can&#x27;t be" in page.message.model.text
+
+
+UPGRADE = {
+    "Connection": "Upgrade",
+    "Upgrade": "websocket",
+    "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+}
+
+
+def test_only_this_machine_with_the_token_and_no_other_origin_gets_in(link: str) -> None:
+    bare, query = link.partition("?")[0], urlsplit(link).query
+    assert link.startswith("http://127.0.0.1:")
+    assert status(link) == 200
+    for wrong in (bare, f"{bare}?token=", f"{link}x", f"{bare}?token=%ff"):
+        assert status(wrong) in (400, 403)
+    foreign = {"Origin": "http://example.org"}
+    for asked, headers in (
+        (link, foreign),
+        (link, {"Host": "example.org"}),
+        (f"{bare}metadata", {}),
+        (f"{bare}autoload.js?bokeh-autoload-element=1", {}),
+        (f"{bare}ws", UPGRADE),
+        (f"{bare}ws?{query}", UPGRADE | foreign),
+    ):
+        assert status(asked, **headers) == 403
+    for path in ("etc/passwd", "static/../../../../../../etc/passwd", "scene.yaml", "static/extensions/x/y"):
+        assert status(f"{bare}{path}?{query}") in (403, 404)

@@ -1,0 +1,256 @@
+"""Pictures say what they show: no two lines alike, nothing covered, nothing left out unsaid."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib.colors
+import matplotlib.figure
+import numpy as np
+import pytest
+
+import apc
+from apc.compiler.errors import ApcError
+from apc.present import animation
+from apc.present.eigenvalues import eigenvalues_picture
+from apc.present.pictures import colours_of, write_figure
+from apc.present.region_picture import panels_picture
+from apc.present.simulation import played_picture
+from apc.regions.panels import compare_regions
+from tests.commands import Cli, folder
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced
+
+SCENE = str(SCENES / "three-users-average.yaml")
+X, Y = "contact.stiffness=0 N/m:3000 N/m", "coordination.stiffness=0 N/m:3000 N/m"
+
+
+def test_eight_scenes_have_eight_lines_and_one_that_is_another_says_so() -> None:
+    names = [*(f"scheme-{place}" for place in range(8)), "again"]
+    systems = [
+        compiled(
+            replaced(AVERAGE, ("three-users-average", name), ("delay: 8 ms}", f"delay: {4 + at % 8} ms}}"))
+        )
+        for at, name in enumerate(names)
+    ]
+    [ax] = panels_picture(compare_regions(systems, x=X, y=Y, panels=((),), cells=4)).axes
+    lines = [line for line in ax.lines if not line.get_label().startswith("_")]
+    assert [line.get_label() for line in lines] == names
+    assert (
+        len({(line.get_color(), line.get_linestyle(), line._unscaled_dash_pattern[1]) for line in lines}) == 9
+    )
+    assert "again: identical to scheme-0" in " ".join(ax.get_title().split())
+    assert ax.get_title().count("identical") == 1
+
+
+@pytest.mark.parametrize("count", [1, 10, 11, 31, 100])
+def test_as_many_colours_as_are_asked_for(count: int) -> None:
+    assert len(set(colours_of(count))) == count
+
+
+def test_the_word_stable_covers_no_curve() -> None:
+    found = compare_regions([compiled(AVERAGE), compiled(MESH)], x=X, y=Y, panels=((),), cells=4)
+    figure = panels_picture(found)
+    figure.draw_without_rendering()
+    [ax] = figure.axes
+    [word] = ax.texts
+    box = word.get_window_extent()
+    for line in ax.lines:
+        points = ax.transData.transform(line.get_xydata())
+        inside = (points > [box.x0, box.y0]).all(axis=1) & (points < [box.x1, box.y1]).all(axis=1)
+        assert not inside.any()
+
+
+def test_where_the_word_has_no_room_the_title_says_what_is_hatched() -> None:
+    found = compare_regions(
+        [compiled(AVERAGE)],
+        x="contact.stiffness=0 N/m:90000 N/m",
+        y="coordination.stiffness=0 N/m:90000 N/m",
+        panels=((),),
+        cells=32,
+    )
+    [ax] = panels_picture(found).axes
+    assert not ax.texts
+    assert "hatched: stable" in ax.get_title()
+
+
+PUSHED = replaced(
+    AVERAGE,
+    ("user: {count: 3}", "left: {count: 1, set: {device.x: 3 mm}}\n  right: {count: 2}"),
+)
+
+
+def test_curves_that_are_one_are_said_to_be() -> None:
+    found = apc.simulate(compiled(PUSHED), duration="20 ms", signals=["cube.x"], jit=False)
+    [ax] = played_picture(found).axes
+    labels = [" ".join(line.get_label().split()) for line in ax.lines]
+    assert labels == ["left[1].cube.x", "right[1].cube.x, right[2].cube.x: identical"]
+
+
+def test_of_more_than_ten_peers_a_group_has_a_colour_and_the_extremes_are_named(tmp_path: Path) -> None:
+    rows = "\n".join(f"{0.05 + 0.01 * n}, {n}" for n in range(14))
+    text = replaced(
+        AVERAGE,
+        ("user: {count: 3}", "few: {count: 1}\n  many: {count: 14, set: {device.x: 1 mm}}"),
+    )
+    same = played_picture(apc.simulate(compiled(text), duration="20 ms", signals=["device.x"], jit=False))
+    assert [line.get_label() for line in same.axes[0].lines] == [
+        "few.device.x: 1 peer",
+        "many.device.x: 14 peers, identical",
+    ]
+    (tmp_path / "t.csv").write_text(f"device.mass [kg], device.x [mm]\n{rows}\n", encoding="utf-8")
+    (tmp_path / "scene.yaml").write_text(
+        replaced(AVERAGE, ("user: {count: 3}", "user: {table: t.csv}")), encoding="utf-8"
+    )
+    system = apc.compile(tmp_path / "scene.yaml")
+    [ax] = played_picture(apc.simulate(system, duration="20 ms", signals=["device.x"], jit=False)).axes
+    labels = [line.get_label() for line in ax.lines]
+    assert labels == ["user[14].device.x: highest", "user[1].device.x: lowest"]
+    assert [one.get_label() for one in ax.collections] == ["user.device.x: all 14 peers"]
+
+
+def test_the_eigenvalues_drawn_are_those_of_the_analysis_within_the_circle() -> None:
+    found = apc.analyze(compiled(AVERAGE))
+    ax = eigenvalues_picture(found)
+    drawn = np.concatenate([line.get_xydata() for line in ax.lines if line.get_marker() != "None"])
+    wanted = [mode.eigenvalue for mode in found.modes]
+    assert len(drawn) >= len(wanted)
+    for value in wanted:
+        assert np.abs(drawn @ [1, 1j] - value).min() < 1e-12
+    (low, high), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    assert low < -1 < 1 < high and bottom < -1 < 1 < top
+    assert "settles within 2 % in" in " ".join(ax.get_title().split())
+
+
+def test_text_in_an_svg_is_text(tmp_path: Path) -> None:
+    write_figure(eigenvalues_picture(apc.analyze(compiled(AVERAGE))).figure, tmp_path / "e.svg")
+    text = (tmp_path / "e.svg").read_text(encoding="utf-8")
+    assert re.search(r"<text[^>]*>real part</text>", text)
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(animation, "RATE", 2)
+    monkeypatch.setattr(animation, "SHORTEST", 2.0)
+
+
+@pytest.mark.usefixtures("short")
+def test_every_frame_shows_what_stands_and_what_moved(tmp_path: Path) -> None:
+    image = pytest.importorskip("PIL.Image")
+    system = compiled(replaced(AVERAGE, ("device: {", "device: {v: 2 m/s, ")))
+    out = tmp_path / "run.gif"
+    animation.save_animation(system, apc.simulate(system, duration="1 s", jit=False), out)
+    with image.open(out) as run:
+        frames = []
+        for number in (0, run.n_frames - 1):
+            run.seek(number)
+            frames.append(np.asarray(run.convert("L"), dtype=float))
+    assert run.n_frames == 5
+    dark = [one < 100 for one in frames]
+    assert min(one.sum() for one in dark) > 0.9 * max(one.sum() for one in dark)  # axes, ticks and names
+    assert (dark[0] != dark[1]).any() and (dark[0] & dark[1]).sum() > 0.5 * dark[0].sum()
+
+
+def test_a_picture_has_the_size_words_and_style_that_are_asked_for() -> None:
+    found = apc.analyze(compiled(AVERAGE))
+    ax = found.plot()
+    word = ax.get_xlabel()
+    assert word
+    other = found.plot(size=(3.0, 2.0), labels={word: "Realteil"}, style={"axes.facecolor": "#123456"})
+    assert tuple(other.figure.get_size_inches()) == (3.0, 2.0)
+    assert other.get_xlabel() == "Realteil"
+    assert matplotlib.colors.to_hex(other.get_facecolor()) == "#123456"
+    assert ax.get_xlabel() == word
+    assert matplotlib.colors.to_hex(ax.get_facecolor()) != "#123456"
+    own = matplotlib.figure.Figure().subplots()
+    assert found.plot(own, labels={word: "Realteil"}) is own
+    assert own.get_xlabel() == "Realteil"
+
+
+def test_a_root_locus_passes_the_circle_where_stability_changes() -> None:
+    system = compiled(AVERAGE)
+    critical = apc.critical(system, "coordination.stiffness")
+    axes = critical.plot(size=(4, 3), labels={"real part": "Re"})
+    assert axes.get_xlabel() == "Re" and tuple(axes.figure.get_size_inches()) == (4, 3)
+    texts = [one.get_text() for one in axes.get_legend().get_texts()]
+    assert texts == ["now, 500 N/m", "changes at 1096.41 N/m, 20.29 Hz"]
+    points = np.asarray(axes.collections[0].get_offsets()) @ [1, 1j]
+    assert np.abs(points).max() > 1.01
+    for value in (500, 1096):
+        modes = apc.analyze(system, set={"coordination.stiffness": f"{value} N/m"}).modes
+        for mode in modes:
+            assert np.abs(points - mode.eigenvalue).min() < 0.02
+    passive = apc.critical(system, "coordination.stiffness", criterion="passive")
+    with pytest.raises(ApcError, match="E930 what every passive hand can draw has no eigenvalues"):
+        passive.plot()
+
+
+def test_what_settles_is_told_in_seconds() -> None:
+    """Of ρ a frame T seconds long: ρ^(t/T) = 1/50."""
+    stable = apc.analyze(compiled(AVERAGE))
+    assert stable.settling_s is not None
+    assert stable.spectral_radius ** (stable.settling_s / stable.frame_s) == pytest.approx(0.02)
+    assert apc.analyze(compiled(AVERAGE), set={"coordination.stiffness": "5000 N/m"}).settling_s is None
+
+
+@pytest.mark.parametrize(
+    ("suffix", "magic"), [("gif", b"GIF89a"), pytest.param("mp4", b"ftyp", marks=pytest.mark.whole)]
+)
+@pytest.mark.usefixtures("short")
+def test_a_run_is_written_as_a_moving_picture(suffix: str, magic: bytes, cli: Cli) -> None:
+    if suffix == "mp4" and not pytest.importorskip("matplotlib.animation").writers.is_available("ffmpeg"):
+        pytest.skip("ffmpeg is not installed")
+    ran = cli(f"simulate '{SCENES}/planar-users.yaml' --duration 20ms --out run.{suffix}")
+    assert ran.code == 0 and f"run.{suffix} is written" in ran.out
+    assert magic in Path(f"run.{suffix}").read_bytes()[:8]
+    assert folder() == [f"run.{suffix}"]
+
+
+def test_without_ffmpeg_it_says_what_to_do(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    writers = pytest.importorskip("matplotlib.animation").writers
+    monkeypatch.setattr(type(writers), "is_available", lambda self, name: False)
+    ran = cli(f"simulate '{SCENES}/planar-users.yaml' --out run.mp4")
+    message = "E875 ffmpeg is not installed, which writes .mp4. Write: --out run.gif, or install ffmpeg"
+    assert ran.code == 1 and message in ran.err
+    assert folder() == []
+
+
+@pytest.mark.parametrize("words", [f"analyze '{SCENE}'", f"critical lan.delay '{SCENE}'"])
+def test_pictures_beside_answers_are_refused_before_anything_is_computed(words: str, cli: Cli) -> None:
+    assert "E878 the suffix of --plot" in cli(f"{words} --plot a.txt").err
+    assert "E930" in cli(f"{words} --hands passive --plot a.svg").err
+    assert "a.svg is written" in cli(f"{words} --plot a.svg").out
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        None,
+        pytest.param("animation.ffmpeg_path: ./ran", marks=pytest.mark.whole),
+        pytest.param("\udcff\udcfe", marks=pytest.mark.whole),
+    ],
+)
+def test_a_picture_is_drawn_without_the_settings_in_the_working_folder(
+    tmp_path: Path, settings: str | None
+) -> None:
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    if settings is None:
+        os.mkfifo(tmp_path / "matplotlibrc")  # who opens it waits for ever
+    else:
+        (tmp_path / "matplotlibrc").write_text(settings, errors="surrogateescape")
+    made = "from apc.__main__ import run; failed = run(['show', 'scene.yaml', '--out', 'scene.png'])"
+    told = f"{made}\nimport matplotlib; print(failed, matplotlib.rcParams['animation.ffmpeg_path'])"
+    ran = subprocess.run(
+        [sys.executable, "-c", told], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
+    )
+    assert ran.stdout.splitlines()[-1:] == ["0 ffmpeg"], ran.stderr
+    assert (tmp_path / "scene.png").is_file()
+
+
+def test_settings_that_somebody_made_in_python_stay(cli: Cli) -> None:
+    with matplotlib.rc_context({"animation.ffmpeg_path": "mine"}):
+        assert cli(f"show '{SCENE}' --out a.png").code == 0
+        assert matplotlib.rcParams["animation.ffmpeg_path"] == "mine"

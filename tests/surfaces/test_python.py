@@ -1,0 +1,161 @@
+"""`apc`: plain functions with frozen results, the same as the commands."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+import apc
+from apc.arguments import _fits, _hints
+from tests.topologies import SCENES, replaced, told
+
+PATH = SCENES / "three-users-average.yaml"
+
+
+@pytest.fixture(scope="module")
+def model() -> apc.CompiledSystem:
+    return apc.compile(PATH)
+
+
+def test_every_public_name_is_there_and_nothing_else() -> None:
+    assert set(apc.__all__) <= set(dir(apc))
+    assert all(getattr(apc, name).__doc__ for name in apc.__all__)
+    assert apc.__version__
+    with pytest.raises(AttributeError, match="nothing"):
+        apc.nothing  # noqa: B018 # looking it up is the test
+
+
+def test_a_saved_model_analyses_as_the_one_it_was(model: apc.CompiledSystem, tmp_path: Path) -> None:
+    path = tmp_path / "scene.apc"
+    apc.save(model, path)
+    assert apc.analyze(apc.load(path)) == apc.analyze(model)
+    assert apc.analyze(path) == apc.analyze(str(PATH)) == apc.analyze(model)
+
+
+def test_setting_changes_a_copy_and_is_as_good_as_writing(model: apc.CompiledSystem, tmp_path: Path) -> None:
+    settings = {"coordination.stiffness": "5 N/mm", "lan.delay": "16 ms"}
+    changed = apc.set_parameters(model, settings)
+    for system, value in ((changed, 5000), (model, 500)):
+        assert {p.name: p.value for p in system.parameters}["coordination.stiffness"] == value
+    path = tmp_path / "scene.yaml"
+    text = PATH.read_text(encoding="utf-8")
+    path.write_text(replaced(text, ("500 N/m,", "5 N/mm,"), ("delay: 8 ms", "delay: 16 ms")), "utf-8")
+    assert apc.analyze(changed) == apc.analyze(model, set=settings) == apc.analyze(path)
+    assert apc.analyze(changed).verdict == "unstable"
+
+
+def test_results_are_frozen_and_plain_data(model: apc.CompiledSystem) -> None:
+    result = apc.analyze(model)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        result.verdict = "stable"  # type: ignore[misc] # that it can't be done is the test
+    document = result.to_dict()
+    assert set(document) >= {
+        *("topology", "peers", "frame_s", "states_per_peer", "method", "verdict", "stable"),
+        *("spectral_radius", "spectral_radius_error", "rigid_modes", "modes"),
+    }
+    assert sum(mode["multiplicity"] for mode in document["modes"]) == 3 * 8 - 1, "all but the translation"
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"coordination.stifness": "1 N/m"},
+            "override: E622 coordination.stifness is no parameter of three-users-average. "
+            "Write: coordination.stiffness",
+        ),
+        ({"device.mass": "0 kg"}, "override: E624 device.mass wants more than 0 kg, got 0 kg."),
+        (
+            {"device.mass": "1"},
+            "override: E204 device.mass wants kg, got 1 (no unit). Write: device.mass=1 kg",
+        ),
+        (
+            {"peers": "4"},
+            "override: E623 peers is the number of all peers, which follows from the groups'. "
+            "Write: user.count",
+        ),
+        ({"haptic.period": "0 s"}, "override: E625 haptic.period wants a time above 0 s, got 0.0 s."),
+    ],
+)
+def test_a_setting_that_cannot_be_is_told(
+    model: apc.CompiledSystem, settings: dict[str, str], message: str
+) -> None:
+    assert told(apc.set_parameters, model, settings) == [message]
+
+
+def test_a_list_of_no_scenes_is_refused_and_one_scene_needs_no_list(model: apc.CompiledSystem) -> None:
+    assert told(apc.compare, []) == [
+        'compare: E610 no scene is given. Write: apc.compare(["average.yaml", "mesh.yaml"])'
+    ]
+    assert told(apc.report, []) == [
+        'report: E610 no scene is given. Write: apc.report(["average.yaml", "mesh.yaml"])'
+    ]
+    for one in (model, PATH, str(PATH)):
+        assert [scheme.topology for scheme in apc.compare(one).schemes] == ["three-users-average"]
+    assert told(apc.prove_box, model, {}) == [
+        "box: E830 no parameter is left open. Write: contact.stiffness=±1%"
+    ]
+
+
+def test_what_tells_of_texts_refuses_a_compiled_model(model: apc.CompiledSystem) -> None:
+    for function, given in ((apc.report, model), (apc.report, [model]), (apc.show, model)):
+        [mistake] = told(function, given)
+        assert mistake.startswith("three-users-average.apc: E615 is a compiled model")
+
+
+FUNCTIONS = [name for name in apc.__all__ if inspect.isfunction(getattr(apc, name))]
+GIVEN = {"values": {"contact.stiffness": [1.0]}, "parameter": "contact.stiffness", "hands": "held"}
+GIVEN |= {"over": {"contact.stiffness": ["1 N/m"]}, "ranges": {"contact.stiffness": "±1%"}}
+GIVEN |= {"frequencies": [1.0], "box": {"contact.stiffness": "±1%"}, "to": "json", "file": str(PATH)}
+WRONG = [None, 7, ("contact.stiffness", "10 N/m", "3000 N/m"), {"a": 1}, [3], object(), b"x"]
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_an_argument_of_a_wrong_type_is_said_to_be_one(
+    name: str, model: apc.CompiledSystem, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Each argument of each function; what is of a right type, as None for an option, is left out."""
+    monkeypatch.chdir(tmp_path)
+    function = getattr(apc, name)
+    parameters = inspect.signature(function).parameters
+    needed = {
+        one: GIVEN.get(one, model if one in ("model", "models") else str(PATH))
+        for one, parameter in parameters.items()
+        if parameter.default is inspect.Parameter.empty
+    }
+    for one in parameters:
+        for wrong in WRONG:
+            if _fits(wrong, _hints(inspect.unwrap(function))[one]):
+                continue
+            with pytest.raises((TypeError, apc.ApcError)) as raised:
+                function(**{**needed, one: wrong})
+            assert isinstance(raised.value, apc.ApcError) or f"apc.{name}: {one} wants" in str(raised.value)
+
+
+def test_a_range_that_is_no_text_is_refused(model: apc.CompiledSystem) -> None:
+    wants = r"apc.region: x wants str \| None, got tuple: \('contact.stiffness', '10 N/m', '3000 N/m'\)"
+    with pytest.raises(TypeError, match=wants):
+        apc.region(model, x=("contact.stiffness", "10 N/m", "3000 N/m"))  # type: ignore[arg-type] # it is wrong
+
+
+@pytest.mark.parametrize("wrong", [7, None, ("1 N/m", "2 N/m"), {"a": "b"}, [3]], ids=repr)
+@pytest.mark.parametrize("call", ["set", "critical", "sweep", "analyze_many", "prove_box"])
+def test_of_a_value_of_a_wrong_type_nothing_else_is_raised(
+    call: str, wrong: object, model: apc.CompiledSystem
+) -> None:
+    values: dict[str, Any] = {"contact.stiffness": wrong}
+    calls: dict[str, Callable[[], object]] = {
+        "set": lambda: apc.analyze(model, set=values),
+        "critical": lambda: apc.critical(model, "contact.stiffness", lower="1 N/m", upper=cast(Any, wrong)),
+        "sweep": lambda: apc.sweep(model, values),
+        "analyze_many": lambda: apc.analyze_many(model, values),
+        "prove_box": lambda: apc.prove_box(model, values),
+    }
+    with contextlib.suppress(TypeError, apc.ApcError):  # a number in SI is a value of `analyze_many`
+        calls[call]()

@@ -1,0 +1,282 @@
+"""A report: one page that holds everything in itself, whose numbers are those of the commands."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+import apc
+from apc.compiler.errors import Mistake, Place
+from apc.present import report as pages
+from apc.present.report import kept_report, report_page
+from apc.reports import contents
+from apc.reports.contents import Report, Table, differences
+from tests.commands import Cli, folder, write
+from tests.topologies import AVERAGE, SCENES, replaced
+
+SCENE = SCENES / "three-users-average.yaml"
+
+
+LONE = "topology: lone\npeers: {user: {count: 1}}\nmasses: {device: {mass: 1 kg, damping: 1 N*s/m}}\n"
+
+
+@functools.cache
+def paper() -> Report:
+    return apc.report(SCENE)
+
+
+@functools.cache
+def page() -> str:
+    return report_page(paper())
+
+
+class Reader(HTMLParser):
+    """What of a page would be loaded or run; every element must be closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.wanted: list[str] = []
+        self.scripts: list[str | None] = []
+        self.open: list[str] = []
+        self.feed(text)
+        assert not self.open
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Note what an element names."""
+        for name, value in attrs:
+            self.wanted += (
+                [value] if name in ("src", "href", "xlink:href", "data", "action") and value else []
+            )
+            assert not name.startswith("on"), name
+        self.scripts += [dict(attrs).get("type")] if tag == "script" else []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Note that an element begins."""
+        self.handle_startendtag(tag, attrs)
+        self.open += [tag] if tag not in ("meta", "link", "br", "img", "input") else []
+
+    def handle_endtag(self, tag: str) -> None:
+        """Check that what ends had begun last."""
+        assert self.open.pop() == tag
+
+
+def test_a_page_loads_nothing_runs_nothing_and_names_nothing_twice() -> None:
+    reader = Reader(page())
+    assert all(one.startswith(("#", "data:")) for one in reader.wanted)
+    assert reader.scripts == ["application/json"]
+    assert "default-src 'none'" in page()
+    assert len(page().encode("utf-8")) < 5 * 2**20
+    named = re.findall(r'id="([^"]+)"', page())
+    assert len(named) == len(set(named))
+    assert set(re.findall(r'(?:xlink:href="#|url\(#)([^")]+)', page())) <= set(named)
+
+
+def test_every_section_is_there_with_its_picture_table_and_command() -> None:
+    for key, title in pages.TITLES.items():
+        [section] = re.findall(rf'<section id="{key}">.*?</section>', page(), re.DOTALL)
+        assert f"<h2>{title.replace('&', '&amp;')}</h2>" in section
+        if key == "network":
+            assert "no packet can get lost" in section
+            continue
+        assert "<table>" in section and "As by <code>apc " in section
+        assert ("<svg" in section) == (key != "compiled")
+    assert AVERAGE.splitlines()[0] in page()  # the scene's own text
+    assert "prefers-color-scheme: dark" in page()
+
+
+def test_the_numbers_are_those_of_the_commands() -> None:
+    model = apc.compile(SCENE)
+    sections = {one.key: one for one in paper().scenes[0].sections}
+
+    def value(key: str, table: int, name: str, column: int = 1) -> object:
+        return next(row[column] for row in sections[key].tables[table].rows if row[0] == name)
+
+    radius = value("verdict", 0, "spectral radius a frame")
+    assert radius == pytest.approx(apc.analyze(model).spectral_radius, abs=1e-12)
+    limit = value("limits", 0, "coordination.stiffness", 2)
+    assert limit == apc.critical(model, "coordination.stiffness").value
+    area = value("region", 0, "stable share of the rectangle")
+    assert area == pytest.approx(apc.region(model).stable_area / (5000 * 1500))
+
+
+def test_what_a_scene_says_is_text_and_no_markup(cli: Cli) -> None:
+    evil = "</pre></script><script>alert(1)</script><img src=x>"
+    write("scene.yaml", replaced(LONE, ("lone\n", f'lone\nabout: "{evil}"\n')))
+    assert cli("report scene.yaml --out r.html").code == 0
+    text = Path("r.html").read_text("utf-8")
+    reader = Reader(text)
+    assert reader.scripts == ["application/json"]
+    assert "<script>alert" not in text and "x" not in reader.wanted
+    assert kept_report(Path("r.html"))["scenes"][0]["about"] == evil
+
+
+def test_sections_that_a_scene_cannot_fill_say_why(cli: Cli) -> None:
+    write("scene.yaml", LONE)
+    report = apc.report("scene.yaml")
+    why = {one.key: one.refused for one in report.scenes[0].sections if one.refused}
+    assert why["region"] == "the scene has fewer than two stiffnesses, and says no studies: region:"
+    assert why["network"] == "loss: there is no link"
+    text = report_page(report).replace("&#x27;", "'")
+    assert all(f"Not here: {reason}" in text for reason in why.values())
+
+
+def test_over_an_unreliable_link_loss_and_jitter_are_looked_at_and_the_region_says_what_stable_means(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def refusing(system: apc.CompiledSystem, name: str) -> apc.Critical:  # what it answers takes minutes
+        asked.append(name)
+        raise apc.ApcError(Mistake("E898", Place("here"), f"{name} takes too long"))
+
+    monkeypatch.setattr(contents, "critical", refusing)
+    path = tmp_path / "scene.yaml"
+    lossy = ("delay: 8 ms}", "delay: 8 ms, loss: 10 %, jitter: 1 ms}")
+    path.write_text(replaced(AVERAGE, lossy, ("count: 3", "count: 2")), "utf-8")
+    [scene] = apc.report(path).scenes
+    sections = {one.key: one for one in scene.sections}
+    assert {"lan.loss", "lan.jitter"} <= set(asked)
+    told = " ".join((sections["network"].refused, *sections["network"].told))
+    assert "loss: lan.loss takes too long" in told and "jitter: lan.jitter takes too long" in told
+    assert "with every packet on time" in sections["region"].told[-1]
+    assert "--in mean-square --out region.svg" in sections["region"].told[-1]
+    assert "--in nominal" in sections["region"].command
+
+
+def test_from_python_a_report_is_a_result_and_a_page(cli: Cli) -> None:
+    write("scene.yaml", LONE)
+    report = apc.report("scene.yaml", "r.html", set={"device.mass": "2 kg"})
+    assert isinstance(report, apc.Report) and report.scenes[0].settings == ("device.mass=2 kg",)
+    assert kept_report(Path("r.html"))["scenes"][0]["settings"] == ["device.mass=2 kg"]
+    again = apc.report(["scene.yaml"], set={"device.mass": "2 kg"})
+    assert Path("r.html").read_text("utf-8") == report_page(again) + "\n"
+    with pytest.raises(apc.ApcError, match="E616"):
+        apc.report("scene.yaml", "scene.yaml")
+
+
+def test_a_report_is_computed_anew_from_itself_alone(cli: Cli) -> None:
+    write("scene.yaml", replaced(LONE, ("{count: 1}", "{table: users.csv}")))
+    write("users.csv", "device.mass [kg]\n0.1\n0.12\n")
+    assert cli("report scene.yaml --set 'device.damping=2 N*s/m' --out r.html").code == 0
+    for name in ("scene.yaml", "users.csv"):
+        Path(name).unlink()
+    assert "r.html: every number is the same, computed anew" in cli("report --check r.html").out
+    assert folder() == ["r.html"]
+    text = Path("r.html").read_text(encoding="utf-8")
+    kept = kept_report(Path("r.html"))
+    name, old = kept["scenes"][0]["sections"][1]["tables"][0]["rows"][1][:2]
+    assert name.startswith("spectral radius")
+    version = f'"apc": "{apc.__version__}"'
+    assert version in text
+    write("r.html", text.replace(f"{old!r},", f"{old + 0.001!r},").replace(version, '"apc": "0.0.1"'))
+    ran = cli("report --check r.html")
+    assert ran.code == 1
+    assert f"note: apc was 0.0.1, and is {apc.__version__} here" in ran.err
+    assert f"E991 Verdict, modes and margins: Verdict: value of {name} is {old:.12g}, not" in ran.err
+
+
+Rows = list[tuple[object, ...]]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ([("a", 1.0, 1e-9)], [("a", 1.0 + 1e-8, 1e-3)], []),
+        ([("a", 1.0, 0.2)], [("a", 1.1, None)], []),
+        ([("a", 1.0, None), ("b", 1e-17, None)], [("a", 1.0, None), ("b", -3e-16, None)], []),
+        ([("a", 1.0, 1e-9)], [("a", 1.1, 1e-9)], ["T: value of a is 1.1, not 1"]),
+        ([("a", None, None)], [("a", 2.0, None)], ["T: value of a is 2, not nothing"]),
+        ([], [("a", 1.0, None)], ["T: 1 row, not the 0 that it has"]),
+        (None, [], ["T is new"]),
+        ([], None, ["T is gone"]),
+    ],
+)
+def test_differences_are_by_more_than_roundings_and_their_own_errors(
+    old: Rows | None, new: Rows | None, told: list[str]
+) -> None:
+    columns = ["what", "value", "error"]
+    tables = [
+        [] if rows is None else [{"title": "T", "columns": columns, "rows": [list(row) for row in rows]}]
+        for rows in (old, new)
+    ]
+    assert differences(*tables) == told
+
+
+SCRIPT = '<script type="application/json" id="apc-report">'
+
+
+@pytest.mark.parametrize(
+    "kept",
+    ["", "<html></html>", f"{SCRIPT}[]</script>", f'{SCRIPT}{{"scenes": [{{"name": 3}}]}}</script>', None],
+)
+def test_what_is_no_report_is_refused(kept: str | None, cli: Cli) -> None:
+    if kept is not None:
+        write("r.html", kept)
+    ran = cli("report --check r.html")
+    assert ran.code == 1 and "E990" in ran.err
+    assert kept is None or "E990 is no report that apc has written, or is damaged" in ran.err
+
+
+@pytest.mark.parametrize(
+    "name", ["../out.yaml", "/tmp/out.yaml", "a/../../out.yaml", "C:out.yaml", "a\\..\\b"]
+)
+def test_a_report_from_somebody_writes_nowhere_else(name: str, cli: Cli) -> None:
+    old = json.dumps(["three-users-average.yaml", "x"])[:-5]
+    assert old in page()
+    write("r.html", page().replace(old, json.dumps([name, "x"])[:-5]))
+    ran = cli("report --check r.html")
+    assert ran.code == 1 and "E990 names a file outside of the scene's folder" in ran.err
+    assert folder() == ["r.html"]
+
+
+def test_a_number_that_there_is_not_is_a_dash() -> None:
+    table = Table("T", ("where", "frequency [Hz]"), (("a", math.nan), ("b", None), ("c", 2.5)))
+    shown = re.findall(r"<td[^>]*>([^<]*)</td>", pages._table(table))
+    assert shown == ["a", "–", "b", "–", "c", "2.5"]
+
+
+def test_several_scenes_stand_side_by_side(cli: Cli) -> None:
+    for name in ("one", "two"):
+        write(f"{name}.yaml", replaced(LONE, ("lone", name)))
+    text = report_page(apc.report(["one.yaml", "two.yaml"]))
+    [section] = re.findall(r'<section id="verdict">.*?</section>', text, re.DOTALL)
+    assert "<h3>one</h3>" in section and "<h3>two</h3>" in section
+    assert '<section id="compared">' in text and "apc compare one.yaml two.yaml" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (f"'{SCENE}' --out r.txt", 1, "E878 the suffix of --out"),
+        (f"'{SCENE}' --out no/r.html", 1, "E601"),
+        (
+            f"'{SCENE}' --out r.pdf",
+            1,
+            "E875 Chromium is not installed, which prints a .pdf. Write: --out r.html",
+        ),
+        (f"'{SCENE}'", 2, "--out"),
+        ("scene.apc --out r.html", 1, "E615"),
+    ],
+)
+def test_what_cannot_be_written_or_read_is_refused_before_anything_is_computed(
+    words: str, code: int, message: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    ran = cli(f"report {words}")
+    assert ran.code == code and message in ran.err
+    assert folder() == []
+
+
+@pytest.mark.skipif(not any(map(shutil.which, pages.BROWSERS)), reason="there is no Chromium")
+def test_a_pdf_is_printed(tmp_path: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(LONE, encoding="utf-8")
+    pages.save_report(apc.report([tmp_path / "scene.yaml"]), tmp_path / "r.pdf")
+    assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["r.pdf", "scene.yaml"]

@@ -1,0 +1,260 @@
+"""`show`: graph, equations and schedule of a scene, as text, document, Graphviz text and picture."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+import apc
+from apc.compiler.view.listing import show_page
+from apc.present.graph import graph_picture
+from tests.commands import Cli, Ran, folder, write
+from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, replaced, told
+
+FILE = SCENES / "three-users-average.yaml"
+MANY = """\
+topology: many
+about: A chain on the ground, a rod of two masses, a long array, and groups that differ in much.
+clocks: {haptic: 1 ms, video: {period: 1/90 s, phase: 1 ms}, network: 8 ms, wide: 50 ms}
+parameters: {kt: 2000 N/m}
+peers:
+  right: {count: 1, set: {hand.force: -4 N, device.x: 30 mm, contact.clock: video, contact.delay: 2 ms}}
+  left:  {set: {hand.force: 2 N, device.x: -30 mm, device.mass: [0.1 kg, 0.2 kg], near.stiffness: 1 N/m}}
+masses:
+  device: {mass: 0.1 kg, damping: 5 N*s/m}
+  cube:   {mass: 0.3 kg, damping: 5 N*s/m, shared: true}
+  chain:  {count: 3, mass: 10 g}
+  long:   {count: 40, mass: 1 g}
+  end:    {mass: 1 g, flange: cube}
+couplers:
+  contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 39 N/m, damping: 1 N*s/m, clock: haptic}
+  near: {type: FullMesh, object: device, stiffness: kt/(peers - 1), clock: haptic, link: lan, delays: own}
+  far: {type: AveragePosition, object: cube, stiffness: 7 N/m, clock: haptic, link: wan, at: [left]}
+  tail: {type: SampledSpringDamper, count: 2, a: "chain[1:2]", b: "chain[2:3]", stiffness: 1 N/m, clock: wide}
+  leash: {type: SampledSpringDamper, a: "chain[3]", b: ground, stiffness: 10 N/m, clock: wide}
+  links: {type: SampledSpringDamper, count: 39, a: "long[1:39]", b: "long[2:40]", stiffness: 1 N/m,
+          clock: wide}
+links:
+  lan: {clock: network, delay: 8 ms, delays: {left: {right: 12 ms}}}
+  wan: {clock: wide, graph: star}
+hands:
+  hand: {type: ConstantForce, flange: device, force: 0 N}
+"""
+TEXTS = {
+    "average": AVERAGE,
+    "mesh": MESH,
+    "one": ONE_MASS,
+    "ring": replaced(AVERAGE, ("count: 3", "count: 8"), ("lan: {", "lan: {graph: ring, ")),
+    "star": replaced(AVERAGE, ("count: 3", "count: 300"), ("lan: {", "lan: {graph: star, ")),
+    "arcs": replaced(AVERAGE, ("lan: {", "lan: {graph: {arcs: [[1, 2], [2, 3], [3, 1, 0.5]]}, ")),
+    "many": MANY,
+}
+
+
+def shown(text: str, form: str, path: Path) -> str:
+    path.joinpath("scene.yaml").write_text(text, encoding="utf-8")
+    return apc.show(path / "scene.yaml", format=form)  # type: ignore[arg-type] # a word
+
+
+def words_of(svg: str) -> list[str]:
+    return ["".join(one.itertext()) for one in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")]
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_no_text_of_a_picture_stands_over_another_or_leaves_the_page(name: str, tmp_path: Path) -> None:
+    words = words_of(shown(TEXTS[name], "svg", tmp_path))
+    figure = graph_picture(show_page(tmp_path / "scene.yaml"))
+    drawn = figure.axes[0].texts
+    assert {one.get_text() for one in drawn} == set(words)
+    renderer = FigureCanvasAgg(figure).get_renderer()  # one for all: each is as large as the picture
+    boxes = {one: one.get_window_extent(renderer) for one in drawn}
+    for box in boxes.values():
+        assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y0 >= 0 and box.y1 <= figure.bbox.height
+    for one, two in itertools.combinations(drawn, 2):
+        assert not boxes[one].overlaps(boxes[two]), (one.get_text(), two.get_text())
+
+
+def test_the_picture_names_every_part_with_its_type_and_numbers() -> None:
+    words = words_of(apc.show(FILE, format="svg"))
+    for word in (
+        *("three-users-average", "one of 3 peers", "device", "mass 0.1 kg", "cube", "shared: 0.2 kg a copy"),
+        *("contact", "SampledSpringDamper", "stiffness 1000 N/m", "delay 1 ms", "coordination"),
+        *("AveragePosition", "lan", "available 8 ms later", "3 peers, complete graph"),
+        *("clock haptic: every 1 ms", "one frame, 8 ms"),
+    ):
+        assert word in words, word
+
+
+def test_text_of_a_scene_cannot_break_out_of_the_picture(tmp_path: Path) -> None:
+    mark = '"<script>alert(1)</script> & Three'
+    drawn = shown(
+        replaced(AVERAGE, ("about: Three", f"about: {mark}"), ("others.  ", 'others."  ')), "svg", tmp_path
+    )
+    assert "<script>" not in drawn
+    ET.fromstring(drawn)
+
+
+def test_parts_are_joined_as_the_topology_says(tmp_path: Path) -> None:
+    def joints(text: str) -> set[frozenset[str]]:
+        dot = shown(text, "dot", tmp_path)
+        return {frozenset(pair) for pair in re.findall(r'^ *"([^"]+)" -> "([^"]+)"', dot, re.MULTILINE)}
+
+    average = joints(AVERAGE)
+    for pair in (("device", "contact"), ("cube", "contact"), ("cube", "coordination")):
+        assert frozenset(pair) in average
+    assert frozenset(("device", "coordination")) not in average
+    many = joints(MANY)
+    for pair in (("leash", "chain[3]"), ("long", "links"), ("end and cube", "end"), ("cube", "end and cube")):
+        assert frozenset(pair) in many or pair[0] == "leash", pair
+    words = " ".join(words_of(shown(MANY, "svg", tmp_path)))
+    assert "40 of them" in words and "only at left" in words
+
+
+def test_peers_that_a_picture_leaves_out_are_counted(tmp_path: Path) -> None:
+    for count in (300, 1_000_000):
+        drawn = shown(replaced(TEXTS["star"], ("count: 300", f"count: {count}")), "svg", tmp_path)
+        assert len(drawn) < 40_000
+        assert "peers, star graph" in drawn and f"{count - 16} left out" in drawn.replace(",", "")
+    assert "left out" not in apc.show(FILE, format="svg")
+
+
+def test_the_text_tells_graph_equations_and_schedule() -> None:
+    lines = apc.show(FILE).splitlines()
+    for line in (
+        "    device: mass 0.1 kg, damping 5 N·s/m",
+        "      joins device and cube",
+        "      hears the others over lan",
+        "  18 equations, 18 unknowns",
+        "    device.mass*der(device.v) = device.flange.f - device.damping*device.v",
+        "    der(device.v) := (device.flange.f - device.damping*device.v)/device.mass",
+        "  frame of 8 ms, after which every clock stands as before",
+        "  network ticks every 8 ms, once a frame: packets leave over lan",
+        "  contact.f acts from 1 ms after its tick, held for 1 ms until the next one acts",
+    ):
+        assert line in lines, line
+    schedule = " ".join(" ".join(lines[lines.index("SCHEDULE") :]).split())
+    assert (
+        "lan: a packet (coordination.x, coordination.v) every 8 ms, available 8 ms later; "
+        "1 packet of each sender on the way; the newest one heard is 8 ms to 16 ms old"
+    ) in schedule
+
+
+@pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_scene_can_be_shown_in_80_columns(path: Path) -> None:
+    assert max(map(len, apc.show(path).splitlines())) <= 80
+    ET.fromstring(apc.show(path, format="svg"))
+
+
+@pytest.mark.parametrize(
+    ("delay", "number", "age"),
+    [
+        ("0 s", 0, (0, 8)),
+        ("1 ms", 1, (1, 9)),
+        ("8 ms", 1, (8, 16)),
+        ("9 ms", 2, (9, 17)),
+        ("24 ms", 3, (24, 32)),
+    ],
+)
+def test_the_packets_on_their_way_are_counted(
+    tmp_path: Path, delay: str, number: int, age: tuple[int, int]
+) -> None:
+    text = replaced(AVERAGE, ("delay: 8 ms", f"delay: {delay}"))
+    (link,) = json.loads(shown(text, "json", tmp_path))["schedule"]["links"]
+    assert link["on_the_way"] == number
+    assert link["age_s"] == [pytest.approx(age[0] / 1e3), pytest.approx(age[1] / 1e3)]
+
+
+def test_the_document_holds_what_the_text_tells(tmp_path: Path) -> None:
+    document = json.loads(apc.show(FILE, format="json"))
+    (kind,) = document["kinds"]
+    assert len(kind["equations"]) == len(kind["unknowns"]) == 18
+    assert kind["states"] == ["device.x", "device.v", "cube.x", "cube.v"]
+    assert [p["clock"] for p in kind["partitions"]] == ["continuous", "haptic"]
+    assert {c["clock"]: c["ticks"] for c in document["schedule"]["clocks"]} == {"haptic": 8, "network": 1}
+    names = [part["name"] for part in document["graph"]["parts"]]
+    assert names == ["device", "cube", "contact", "coordination"]
+    assert "  No clock ticks: everything is continuous." in shown(ONE_MASS, "text", tmp_path).splitlines()
+
+
+FURTHEST = """\
+component: Furthest
+about: Pulls by tanh of each distance.
+connectors: {object: Flange}
+sends: {x: sample(object.x)}
+parameters: {stiffness: {unit: N/m}, reach: {unit: m, default: 1}, delay: {unit: s}, clock: clock, link: link}
+equations:
+  - f = stiffness*sum(reach*tanh((sample(object.x) - others.x)/reach))
+  - object.f = hold(f, delay)
+"""
+
+
+def test_what_costs_a_pair_is_said(cli: Cli) -> None:
+    text = replaced(AVERAGE, ("topology: three-users-average", "topology: furthest\nlibrary: ."))
+    write(
+        "scene.yaml", replaced(text, ("type: AveragePosition", "type: Furthest"), ("1 ms, link", "0 s, link"))
+    )
+    write("furthest.yaml", FURTHEST)
+    assert "over lan; one evaluation a pair of peers" in " ".join(cli("show scene.yaml").out.split())
+    ran = cli("compile scene.yaml")
+    assert ran.code == 0, ran.err
+    assert re.search(
+        r"costs N²: sum\(.*others\.coordination\.x.*\) is evaluated once a pair of peers, as what it "
+        "runs over is not linear in what the others send over lan",
+        " ".join(ran.out.split()),
+    )
+
+
+def test_graphviz_text_has_every_node_once_and_closes_every_quote() -> None:
+    text = apc.show(FILE, format="dot")
+    assert text.startswith('digraph "three-users-average" {\n') and text.endswith("\n}")
+    for name in ("device", "cube", "contact", "coordination"):
+        assert len(re.findall(rf'^ *"{name}" \[', text, re.MULTILINE)) == 1
+    assert all(len(re.findall(r'(?<!\\)"', line)) % 2 == 0 for line in text.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("suffix", "start"),
+    [
+        *(("svg", b"<"), ("SVG", b"<"), ("dot", b"digraph"), ("json", b"{"), ("txt", b"three")),
+        *(("pdf", b"%PDF-"), ("png", b"\x89PNG")),
+    ],
+)
+def test_the_file_says_the_format(suffix: str, start: bytes, cli: Cli) -> None:
+    assert cli("show", str(FILE), "--out", f"scene.{suffix}") == Ran(0, f"scene.{suffix} is written\n", "")
+    assert Path(f"scene.{suffix}").read_bytes().startswith(start)
+
+
+KINDS = ".txt, .json, .dot, .gv, .svg, .png, .pdf"
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "wanted"),
+    [
+        ((), "scene.jpg", f"one of {KINDS}, got .jpg. Write: --out scene.txt"),
+        ((), "scene", f"one of {KINDS}, got none. Write: --out scene.txt"),
+        (("--format", "svg"), "scene.png", ".svg, got .png. Write: --out scene.svg"),
+        (("--format", "dot"), "scene.svg", "one of .dot, .gv, got .svg. Write: --out scene.dot"),
+    ],
+)
+def test_no_file_is_written_as_what_its_name_does_not_say(
+    words: tuple[str, ...], name: str, wanted: str, cli: Cli
+) -> None:
+    message = f"{name}: E878 the suffix of --out wants {wanted}\n"
+    assert cli("show", str(FILE), *words, "--out", name) == Ran(1, "", message)
+    assert folder() == []
+
+
+def test_the_command_prints_what_the_function_returns(cli: Cli) -> None:
+    for form in ("text", "json", "dot", "svg"):
+        printed = apc.show(FILE, format=form) + "\n"  # type: ignore[arg-type] # a word
+        assert cli(f"show '{FILE}' --format {form}") == Ran(0, printed, "")
+    assert told(apc.show, "scene.apc") == [
+        "scene.apc: E615 is a compiled model, which no longer has the equations as they were written. "
+        "Write: apc show scene.yaml"
+    ]

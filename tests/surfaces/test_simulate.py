@@ -1,0 +1,121 @@
+"""The command `simulate`: what it prints, what it writes, how it ends."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from apc.simulation import blocks, simulation
+from tests.commands import Cli, folder, write
+from tests.topologies import AVERAGE, SCENES, replaced
+
+MOVED = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: 5 mm}}"))
+
+
+@pytest.fixture
+def moved(cli: Cli) -> Cli:
+    write("scene.yaml", MOVED)
+    return cli
+
+
+def test_the_only_scene_of_a_folder_is_played_for_as_long_as_it_says(cli: Cli) -> None:
+    write("scene.yaml", (SCENES / "experiment-average.yaml").read_text(encoding="utf-8"))
+    ran = cli("simulate")
+    assert (ran.code, ran.err) == (0, "")
+    assert ran.out.startswith("experiment-average: settles\n")
+    assert "3001 rows of 18 signals until 3 s" in ran.out
+
+
+def test_rows_and_picture_are_written_and_named(moved: Cli) -> None:
+    pytest.importorskip("matplotlib")
+    ran = moved("simulate scene.yaml --duration 50ms --signals cube.x --out run.csv --plot run.svg")
+    assert ran.code == 0
+    assert ran.out.endswith("  run.csv is written\n  run.svg is written\n")
+    lines = Path("run.csv").read_text(encoding="utf-8").splitlines()
+    assert lines[0] == "time [s],user[1].cube.x [m],user[2].cube.x [m],user[3].cube.x [m]"
+    assert len(lines) == 52
+    assert Path("run.svg").read_text(encoding="utf-8").startswith("<?xml")
+
+
+def test_json_is_one_document_with_what_made_it(moved: Cli) -> None:
+    ran = moved("simulate --json --duration 0.1s --set 'contact.stiffness=800 N/m' --no-jit")
+    told = json.loads(ran.out)
+    assert (told["topology"], told["rows"], told["diverged"]) == ("three-users-average", 101, None)
+    assert told["provenance"]["parameters"]["contact.stiffness"]["value"] == 800
+    assert told["provenance"]["duration_s"] == "1/10"
+    assert told["signals"][0].keys() >= {"name", "unit", "first", "last", "low", "high"}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("", "scene.yaml: E877 the scene says no duration."),
+        ("--duration 3", '--duration: E204 duration wants s, got 3 (no unit). Write: --duration "3 s"'),
+        ("--duration '-1 s'", "scene.yaml: E877 the duration wants more than 0 s, got -1 s."),
+        ("--duration 1e9s", "scene.yaml: E915 the duration wants at most 1e+06 s"),
+        ("--duration 1s --signals cube.y", "scene.yaml: E873 no signal fits 'cube.y';"),
+        ("--duration 1s --out run.doc", "run.doc: E878 the suffix of --out wants one of .csv,"),
+        ("--duration 1s --still run.doc", "run.doc: E878 the suffix of --still wants one of"),
+        ("--duration 1s --plot run.doc", "run.doc: E878 the suffix of --plot wants one of .png,"),
+        ("--duration 1s --out no/run.csv", "no/run.csv: E601 can't be written: No such file"),
+        ("--duration 1s --method euler:1ms", "--method: E910 the method wants one of exact,"),
+        ("--duration 1s --method 'rk4:-1 ms'", "--method: E911 the step of rk4 wants more than 0 s"),
+        ("--duration 1s --method rk4:3ms", "scene.yaml: E913 the step of rk4 wants at"),
+        (
+            "--duration 1s --method rk4:0",
+            "--method: E204 the step of rk4 wants s, got 0 (no unit). Write: rk4:0.1ms",
+        ),
+    ],
+)
+def test_what_is_wrong_is_told_in_one_line(words: str, said: str, moved: Cli) -> None:
+    ran = moved(f"simulate {words}")
+    assert (ran.code, ran.out) == (1, "")
+    assert ran.err.startswith(said)
+    assert folder() == ["scene.yaml"]
+
+
+def test_a_scene_at_rest_is_said_to_rest_and_an_unstable_one_is_an_answer(cli: Cli) -> None:
+    write("scene.yaml", AVERAGE)
+    assert cli("simulate --duration 1s").out.splitlines() == [
+        "three-users-average: rests",
+        "",
+        "  Nothing moves: no force and no start value sets it in motion.",
+        "",
+        "  recorded       1001 rows of 24 signals until 1 s",
+    ]
+    write("scene.yaml", replaced(MOVED, ("stiffness: 500 N/m", "stiffness: 50 kN/m")))
+    ran = cli("simulate --duration 10s --out run.csv")
+    assert ran.code == 0 and "three-users-average: diverges" in ran.out
+    text = Path("run.csv").read_text(encoding="utf-8")
+    assert "nan" not in text and "inf" not in text
+
+
+def test_ctrl_c_keeps_what_is_done(moved: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulation, "MOST_FRAMES", 5)
+    step = blocks._Runner.run
+
+    def interrupted(self: blocks._Runner, first: int, last: int) -> blocks.Block:
+        if first >= 10:
+            raise KeyboardInterrupt
+        return step(self, first, last)
+
+    monkeypatch.setattr(blocks._Runner, "run", interrupted)
+    ran = moved("simulate --duration 1s --out run.csv")
+    assert ran.code == 130 and "run.csv is written" in ran.out
+    assert ran.err.startswith("stopped at 0.079 s of 1 s; what was done is kept")
+    assert len(Path("run.csv").read_text(encoding="utf-8").splitlines()) == 81
+
+
+def test_the_error_and_the_method_are_told_if_asked_for(moved: Cli) -> None:
+    exact = moved("simulate --duration 0.1s --error").out
+    assert "  error          none but rounding; about " in exact and "method" not in exact
+    out = moved("simulate --duration 0.1s --error --method semi-implicit:1/2ms").out
+    assert "  method         semi-implicit:0.5 ms\n" in out
+    assert "(half the step, semi-implicit:0.25 ms)" in " ".join(out.split())
+    assert all(len(line) <= 80 for line in out.splitlines())
+    told = json.loads(moved("simulate --duration 0.1s --error --method rk4:1ms --json").out)
+    assert told["provenance"]["method"] == "rk4:1 ms"
+    assert told["error_estimate"]["kind"] == "method"
+    assert len(told["error_estimate"]["signals"]) == len(told["signals"])

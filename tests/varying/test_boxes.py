@@ -1,0 +1,206 @@
+"""Stability proved over a box of numbers: limits on either side, points inside, what is open or refused."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import apc
+from apc.__main__ import run
+from apc.compiler.errors import ApcError
+from tests.bruteforce import Scene
+from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, library, replaced
+from tests.truths import text_of
+
+LIMIT = 1096.410868365630  # tests.reference: the largest stable K_T at K_C = 1000
+GROUPS = replaced(
+    AVERAGE,
+    (
+        "  user: {count: 3}",
+        "  left: {count: 2, set: {contact.stiffness: 1000 N/m}}\n"
+        "  right: {count: 1, set: {contact.stiffness: 1000 N/m}}",
+    ),
+)
+SQUARED = replaced(
+    AVERAGE,
+    ("peers:", "parameters: {kt: 500 N/m, unit: 2 N/m}\npeers:"),
+    ("stiffness: 500 N/m", "stiffness: kt*kt/unit/(peers + 247)"),
+)
+DIFFERENT = text_of(Scene(users=({"device": 0.1}, {"device": 0.2}, {"device": 0.15})))
+COLUMN = replaced(AVERAGE, ("{count: 3}", "{set: {device.mass: [0.1 kg, 0.2 kg, 0.15 kg]}}"))
+ROOT_OF = (LIMIT * 500) ** 0.5  # kt²/500 is the limit
+
+
+def following(formula: str) -> str:
+    """Return the scene with a stiffness that follows kt by a formula."""
+    return replaced(
+        AVERAGE,
+        ("peers:", "parameters: {kt: 500 N/m}\npeers:"),
+        ("stiffness: 500 N/m", f"stiffness: {formula}"),
+    )
+
+
+PROVED = [
+    (AVERAGE, {"contact.stiffness": "±1%"}),
+    (AVERAGE, {"contact.stiffness": "±10%", "coordination.stiffness": "+-10 %"}),
+    (AVERAGE, {"coordination.stiffness": "100 N/m:1 N/mm"}),
+    (AVERAGE, {"device.mass": "±2%", "cube.mass": "±2%", "cube.damping": "±5%"}),
+    (AVERAGE, {"couplers.contact.damping": "0 N*s/m:0.5 N*s/m"}),
+    (AVERAGE, {"coordination.stiffness": f"1050 N/m:{LIMIT - 0.005} N/m"}),
+    (MESH, {"coordination.stiffness": f"100 N/m:{LIMIT / 2 - 0.01} N/m"}),
+    # Groups of the same numbers, of which one is opened, or both, are alike on a diagonal of the box at most.
+    (GROUPS, {"left.contact.stiffness": "±5%"}),
+    (GROUPS, {"left.contact.stiffness": "±5%", "right.contact.stiffness": "±5%"}),
+    (DIFFERENT, {"contact.stiffness": "±1%"}),
+    (SQUARED, {"kt": "490 N/m:510 N/m"}),
+    (SQUARED, {"kt": f"{ROOT_OF * 0.99} N/m:{ROOT_OF * 0.9999} N/m"}),
+    # What the box doesn't ask for may be no rational function.
+    (following("if peers > 2 then kt else sqrt(kt*kt)/(peers - 3)"), {"kt": "±1%"}),
+]
+
+UNSTABLE = [
+    (AVERAGE, {"coordination.stiffness": f"1050 N/m:{LIMIT + 0.1} N/m"}, LIMIT),
+    # The contact alone allows 1865 N/m: the point is between the middle and the end.
+    (AVERAGE, {"contact.stiffness": "1 N/m:3000 N/m"}, 1645),
+    (GROUPS, {"left.contact.stiffness": "1000 N/m:2500 N/m"}, 1645),
+    (SQUARED, {"kt": f"{ROOT_OF * 0.99} N/m:{ROOT_OF * 1.0001} N/m"}, ROOT_OF),
+]
+
+
+@pytest.mark.parametrize("place", range(len(PROVED)))
+def test_a_box_is_proved_and_every_point_of_it_is_stable(place: int) -> None:
+    text, box = PROVED[place]
+    found = apc.prove_box(compiled(text), box)
+    assert (found.stable, found.verdict, found.open_share) == (True, "stable up to a common translation", 0.0)
+    generator = np.random.default_rng(place)
+    for _ in range(3):
+        point = {}
+        for one in found.ranges:
+            share = Fraction(float(generator.choice([0.0, 1.0, 0.3, 0.77])))
+            unit = "" if one.unit == "1" else f" {one.unit}"
+            point[one.free.label] = f"{one.low + share * (one.high - one.low)}{unit}"
+        assert apc.analyze(compiled(text), set=point).stable
+
+
+@pytest.mark.parametrize(("text", "box", "limit"), UNSTABLE)
+def test_a_box_beyond_the_limit_is_unstable_at_a_point(text: str, box: dict[str, str], limit: float) -> None:
+    found = apc.prove_box(compiled(text), box)
+    [point], [name] = found.point, box
+    assert found.stable is False and point > limit
+    assert apc.analyze(compiled(text), set={name: f"{point!r} N/m"}).stable is False
+    assert "proved unstable at" in str(found)
+
+
+@settings(max_examples=8, deadline=None)
+@given(share=st.floats(0.05, 0.9), width=st.floats(0.01, 0.2))
+def test_a_box_across_the_boundary_is_never_proved_and_one_below_it_is(share: float, width: float) -> None:
+    across = f"{LIMIT * (1 - width)} N/m:{LIMIT * (1 + width)} N/m"
+    assert not apc.prove_box(compiled(AVERAGE), {"coordination.stiffness": across}).stable
+    below = f"{LIMIT * share} N/m:{LIMIT * min(share + width, 0.98)} N/m"
+    box = {"coordination.stiffness": below, "device.mass": "±0.5%"}
+    assert apc.prove_box(compiled(AVERAGE), box).stable
+
+
+@settings(max_examples=12, deadline=None)
+@given(centre=st.floats(-1e-3, 1e-3), exponent=st.integers(-9, -4))
+def test_cells_as_small_as_their_distance_from_the_limit_are_never_wrong(
+    centre: float, exponent: int
+) -> None:
+    low, high = (LIMIT * (1 + centre + side * 10.0**exponent) for side in (-1, 1))
+    found = apc.prove_box(compiled(AVERAGE), {"coordination.stiffness": f"{low!r} N/m:{high!r} N/m"})
+    if high < LIMIT * (1 - 1e-9):
+        assert found.stable is not False
+    else:
+        assert found.stable is not True or high < LIMIT
+    assert found.stable is not None or low < LIMIT < high or abs(centre) < 1e-8
+
+
+def test_what_can_not_be_proved_is_left_open_and_says_where() -> None:
+    """At K_T = 0 nothing ties the copies: no box that holds this point is stable in the same sense."""
+    found = apc.prove_box(compiled(AVERAGE), {"coordination.stiffness": "0 N/m:200 N/m"}, cells=100)
+    assert (found.stable, found.verdict) == (None, "undecided")
+    assert 0 < found.open_share < 0.1 and 0 < found.point[0] < 20
+    assert max(len(line) for line in str(found).splitlines()) <= 80
+    assert found.to_dict()["open_around"] == list(found.point)
+    loose = replaced(
+        *(AVERAGE, ("damping: 5 N*s/m", "damping: 0 N*s/m"), ("damping: 5 N*s/m", "damping: 0 N*s/m")),
+        ("500 N/m", "0 N/m"),
+    )
+    assert apc.prove_box(compiled(loose), {"contact.stiffness": "±1%"}).stable is not True
+
+
+def test_a_box_stands_before_the_answer_and_says_that_more_cells_may_decide_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+    words = ["analyze", str(tmp_path / "scene.yaml"), "--box", "coordination.stiffness=100 N/m:1 N/mm"]
+    assert run([*words, "--cells", "1"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("three-users-average:\nundecided, 100 % of the box is left open (2 cells)")
+    assert "--cells 20\n" in text
+    assert run(words) == 0
+    assert capsys.readouterr().out.startswith("three-users-average:\nproved stable")
+
+
+@pytest.mark.parametrize(
+    ("text", "box", "message"),
+    [
+        (AVERAGE, "contact.stiffness=900 N/m", "E830"),
+        (AVERAGE, "contact.stiffness=±1", "E830"),
+        (AVERAGE, "contact.stiffness=±x%", "E830"),
+        (AVERAGE, "contact.stiffness=±0%", "E833"),
+        (AVERAGE, "contact.damping=±1%", "E833 contact.damping is 0, and any share of it is 0 as well"),
+        (
+            AVERAGE,
+            "contact.stiffness=5 N/m:1 N/m",
+            "E833 the box of contact.stiffness wants a low below the high, got 5 N/m to 1 N/m",
+        ),
+        (AVERAGE, "contact.stiffness=-5 N/m:1 N/m", "E833"),
+        (AVERAGE, "device.mass=0 kg:1 kg", "E833"),
+        (AVERAGE, "lan.delay=±1%", "E831 lan.delay is a time"),
+        (AVERAGE, "peers=±1%", "E623"),
+        (AVERAGE, "contact.stiffnes=±1%", "E622"),
+        (AVERAGE, "contact.stiffness=900:1100", "E204"),
+        (AVERAGE, "contact.stiffness=900 kg:1100 kg", "E204"),
+        (AVERAGE, "contact.stiffness=±1%|couplers.contact.stiffness=±2%", "E831"),
+        (COLUMN, "device.mass=±1%", "E831 device.mass is not the same for all"),
+        (COLUMN, "user.device.mass=±1%", "E831 device.mass differs from peer to peer"),
+        ("experiment-average", "contact.stiffness=±1%", "E832"),
+        (
+            following("sqrt(kt*kt)"),
+            "kt=±1%",
+            "E832 coordination.stiffness = sqrt(kt*kt) takes sqrt() of a parameter that is left open.",
+        ),
+    ],
+)
+def test_a_box_that_can_not_be_is_refused_in_one_message(text: str, box: str, message: str) -> None:
+    system = compiled(text) if "\n" in text else apc.compile(SCENES / f"{text}.yaml")
+    with pytest.raises(ApcError) as caught:
+        apc.prove_box(system, dict(one.split("=") for one in box.split("|")))
+    [mistake] = caught.value.mistakes
+    assert f"{mistake.code} {mistake.sentence}".startswith(message)
+    assert "Write: contact.stiffness: " not in str(caught.value)
+
+
+def test_a_memory_that_nobody_reads_is_no_translation_of_a_box(tmp_path: Path) -> None:
+    part = """\
+component: Sum
+about: A spring, and a sum of errors that nothing reads while ki is 0.
+connectors: {a: Flange, b: Flange}
+parameters: {k: {unit: N/m}, ki: {unit: N/m}, clock: clock}
+variables: {s: {unit: m, start: 0 m}}
+equations:
+  - s = previous(s) + sample(a.x) - sample(b.x)
+  - a.f = hold(k*(sample(a.x) - sample(b.x)) + ki*s)
+  - b.f = -a.f
+"""
+    text = replaced(ONE_MASS, ("peers:", "clocks: {tick: 1 ms}\npeers:"))
+    text += "couplers:\n  own: {type: Sum, a: device, b: ground, k: 100 N/m, ki: 0 N/m, clock: tick}\n"
+    system = compiled(text, library(tmp_path, part))
+    found = apc.prove_box(system, {"own.k": "±1%"})
+    assert (found.verdict, found.stable, apc.analyze(system).verdict) == ("stable", True, "stable")

@@ -1,0 +1,372 @@
+"""Schemes side by side: the numbers of their own commands, and the cost counted by hand."""
+
+from __future__ import annotations
+
+import csv
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import casadi
+import numpy as np
+import pytest
+
+import apc
+from apc.__main__ import run
+from apc.comparison.comparison import Comparison, Scheme
+from apc.compiler.errors import ApcError
+from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, replaced
+
+LOSSLESS = replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 0 %}"))
+LOSSY = replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 10 %}"))
+SHAKING = replaced(MESH, ("stiffness: 500 N/m", "stiffness: 700 N/m"))
+# Two couplers that hear others, over one link.
+LEASH = "  leash: {type: FullMesh, object: device, stiffness: 20 N/m, clock: haptic, link: lan}\nlinks:"
+TWO_SPRINGS = replaced(AVERAGE, ("links:", LEASH))
+FOLLOWING = replaced(
+    AVERAGE,
+    ("peers:", "parameters: {kt: 250 N/m, late: 8 ms}\npeers:"),
+    ("stiffness: 500 N/m", "stiffness: 2*kt"),
+    ("delay: 8 ms}", "delay: late}"),
+)
+ARM = "hands: {arm: {type: SpringDamperArm, flange: device, stiffness: 100 N/m}}\nlinks:"
+BOUNCING = """\
+topology: bouncing
+clocks: {tick: 1 ms}
+peers: {user: {count: 1}}
+masses: {device: {mass: 0.1 kg, damping: 1 N*s/m}}
+couplers:
+  wall: {type: VirtualWall, flange: device, position: 5 mm, stiffness: 500 N/m, clock: tick}
+hands: {push: {type: ConstantForce, flange: device, force: 1 N}}
+"""
+
+
+@cache
+def compared(*texts: str) -> Comparison:
+    return apc.compare([compiled(text) for text in texts])
+
+
+def scheme(text: str) -> Scheme:
+    return compared(text).schemes[0]
+
+
+# ---- the numbers ----
+
+
+@pytest.mark.parametrize("text", [AVERAGE, SHAKING, LOSSY], ids=["average", "shaking", "lossy"])
+def test_each_number_is_that_of_its_own_command(text: str) -> None:
+    system, found = compiled(text), scheme(text)
+    assert found.analysis == apc.analyze(system) and found.network == apc.judge_network(system)
+    assert found.stiffness == apc.critical(system, "coordination.stiffness")
+    assert found.delay is None or found.delay == apc.critical(system, "lan.delay")
+    assert found.loss is None or found.loss == apc.critical(system, "lan.loss")
+    if found.feel is not None:
+        felt = apc.feel(system, found.feel.frequency_hz.tolist())
+        assert np.array_equal(found.feel.impedance, felt.impedance) and found.feel.at == felt.at
+
+
+def test_the_verdict_is_of_the_network_nominal_or_with_passive_hands_as_asked() -> None:
+    system = compiled(LOSSY)
+    assert scheme(LOSSY).verdict == "stable in mean square"
+    (nominal,) = apc.compare([system], criterion="nominal").schemes
+    assert (nominal.verdict, nominal.network) == ("stable up to a common translation", None)
+    assert nominal.delay == apc.critical(system, "lan.delay", criterion="nominal")
+    system = compiled(AVERAGE)
+    (found,) = apc.compare([system], criterion="passive").schemes
+    assert found.passive == apc.passive_hands(system)
+    assert found.verdict == "unstable with some passive hands"
+    assert found.stiffness == apc.critical(system, "coordination.stiffness", criterion="passive")
+
+
+def test_a_scheme_that_is_not_linear_is_judged_in_time_beside_its_linearization() -> None:
+    """A wall is in no linearization about a start before it; in time 1 N rests 2 mm in 500 N/m."""
+    system = compiled(f"{BOUNCING}experiment: {{duration: 3 s}}\n")
+    found = apc.compare([system, compiled(AVERAGE)])
+    (one, linear) = found.schemes
+    assert one.analysis is not None and one.analysis.linearized and linear.played is None
+    played = apc.simulate(system)
+    assert one.played is not None and one.played.to_dict() == played.to_dict()
+    words = str(found).splitlines()
+    place = words.index("     in time                            played")
+    settled = f"settles at {played.summary.settled:.3g} s"
+    assert words[place + 1 : place + 3] == [
+        f"  1  {settled:<33}  3 s",
+        "  2  as its verdict says: it is linear",
+    ]
+    column = found.to_dataframe()["in time"]
+    assert column[0] == "settles" and column.isna()[1]
+
+
+@pytest.mark.parametrize(
+    ("experiment", "message"),
+    [
+        ("", "apc simulate: the scene says no duration."),  # what to write is for that command
+        ("experiment: {duration: 1e12 s}\n", "apc simulate: the duration wants at most 1e+06 s"),
+    ],
+)
+def test_what_is_not_played_says_why(experiment: str, message: str) -> None:
+    found = scheme(BOUNCING + experiment)
+    assert found.played is None and dict(found.missing)["played"].startswith(message)
+    assert "in time" not in str(compared(AVERAGE, MESH))
+
+
+def test_a_scheme_that_refuses_has_its_place_and_says_why(tmp_path: Path) -> None:
+    files = []
+    for name, text in (("free", AVERAGE), ("held", replaced(AVERAGE, ("links:", ARM)))):
+        (tmp_path / name).mkdir()
+        files.append(str(tmp_path / name / "scene.yaml"))
+        Path(files[-1]).write_text(text, encoding="utf-8")
+    out = tmp_path / "found.json"
+    assert run(["compare", *files, "--hands", "passive", "--out", str(out)]) == 0
+    one, other = json.loads(out.read_text(encoding="utf-8"))["schemes"]
+    assert one["analysis"] is not None and not one["refused"]
+    assert (other["analysis"], other["stiffness"], other["feel"], other["stable"]) == (None,) * 4
+    assert (other["verdict"], other["refused"]) == (
+        "refused",
+        "--hands passive: user has a hand already, arm.",
+    )
+    found = apc.compare(files, criterion="passive")
+    assert "  2  refused" in str(found) and found.schemes[1].effort == scheme(AVERAGE).effort
+    assert found.to_dataframe()["missing"][1] == other["refused"]
+
+
+@pytest.mark.whole
+def test_a_hand_feels_where_it_is_asked_to() -> None:
+    planar = SCENES / "planar-users.yaml"
+    (one,) = apc.compare([planar], at="user[2].device.x[1]").schemes
+    assert one.feel is not None and one.feel.at == "user[2].device.x[1]"
+    assert apc.compare([planar]).schemes[0].feel is None
+    (proxied,) = apc.compare([SCENES / "two-users-proxies.yaml"]).schemes
+    assert proxied.feel is not None
+    assert proxied.feel.at == "left[1].device"  # which the hands are joined to, not the proxy
+
+
+# ---- what it costs ----
+
+
+def operations(function: casadi.Function) -> int:
+    """Count by CasADi's own list of instructions: what is neither input, output nor constant."""
+    idle = {casadi.OP_INPUT, casadi.OP_OUTPUT, casadi.OP_CONST}
+    return sum(function.instruction_id(k) not in idle for k in range(function.n_instructions()))
+
+
+def test_a_tick_takes_its_arithmetic_and_one_operation_for_each_number_heard() -> None:
+    """Position and velocity of two others are four; what is evaluated pair by pair counts once a pair."""
+    arcs = "delay: 8 ms, graph: {arcs: [[1, 2], [1, 3], [2, 1]]}}"  # two hear the first, nobody hears two
+    for text, heard in ((AVERAGE, 2), (MESH, 2), (replaced(AVERAGE, ("delay: 8 ms}", arcs)), 1)):
+        effort = scheme(text).effort
+        tick = operations(compiled(text).kinds[0].clocks[0].tick)
+        assert (effort.clock, effort.operations) == ("haptic", tick + 2 * heard)
+    pairs = replaced(MESH, ("FullMesh", "SaturatedMesh"), ("stiffness: 500", "limit: 9 N, stiffness: 500"))
+    (clock,) = compiled(pairs).kinds[0].clocks
+    (heard,) = clock.receives
+    assert heard.edge is not None
+    total = operations(clock.tick) + 2 * (1 + operations(heard.edge))
+    assert scheme(pairs).effort.operations == total
+
+
+FIVE = replaced(AVERAGE, ("count: 3", "count: 5"))
+GUESTS = replaced(
+    AVERAGE,
+    ("user: {count: 3}", "user: {count: 3}\n  guest: {count: 2}"),
+    ("stiffness: 500 N/m,", "stiffness: 500 N/m, at: [user],"),
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "graph", "busiest", "arcs"),
+    [
+        (FIVE, "complete", 4, 20),
+        (FIVE, "ring", 2, 10),
+        (FIVE, "star", 4, 8),
+        (FIVE, "{edges: [[1, 2], [2, 3], [2, 4], [4, 5]]}", 3, 8),
+        (
+            FIVE,
+            "{arcs: [[1, 2, 0.5], [2, 1, 1], [2, 3, 1], [3, 4, 1], [4, 5, 1], [5, 1, 1]]}",
+            *(2, 6),
+        ),
+        (GUESTS, "complete", 2, 6),  # who have no coupler neither send nor hear
+        (replaced(AVERAGE, ("count: 3", "count: 1000000000")), "complete", 10**9 - 1, 10**9 * (10**9 - 1)),
+    ],
+)
+def test_two_numbers_a_packet_go_to_everybody_who_hears_them(
+    text: str, graph: str, busiest: int, arcs: int
+) -> None:
+    """125 packets a second of a position and a velocity each."""
+    effort = scheme(replaced(text, ("delay: 8 ms}", f"delay: 8 ms, graph: {graph}}}"))).effort
+    assert (effort.sent, effort.sent_by_all) == pytest.approx((2 * 125 * busiest, 2 * 125 * arcs), rel=1e-14)
+
+
+def test_a_scene_without_ticks_costs_nothing() -> None:
+    effort = scheme(ONE_MASS).effort
+    assert (effort.operations, effort.clock, effort.sent, effort.sent_by_all) == (0, "", 0, 0)
+
+
+# ---- which stiffness, delay and loss ----
+
+
+def test_the_stiffness_is_of_the_coupler_that_hears_others_or_of_what_it_follows_from() -> None:
+    for text, names in (
+        (LOSSLESS, ["coordination.stiffness", "lan.delay", "lan.loss"]),
+        (FOLLOWING, ["kt", "late", ""]),
+    ):
+        one = scheme(text)
+        parts = (one.stiffness, one.delay, one.loss)
+        assert [part.parameter if part else "" for part in parts] == names
+
+
+@pytest.mark.parametrize(
+    ("texts", "over", "message"),
+    [
+        (
+            [TWO_SPRINGS],
+            [],
+            "scene.yaml: E941 has 2 numbers that could be compared as its stiffness: coordination.stiffness, "
+            "leash.stiffness. Write: --over coordination.stiffness",
+        ),
+        (
+            [AVERAGE],
+            ["leash.stifness"],
+            "--over: E622 leash.stifness is no parameter of three-users-average. ",
+        ),
+        (
+            [AVERAGE, MESH],
+            ["cube.mass"],
+            "--over: E940 cube.mass of three-users-average wants a stiffness, a delay or a loss, got ",
+        ),
+    ],
+)
+def test_a_name_that_is_missing_or_serves_no_scene_is_told(
+    texts: list[str], over: list[str], message: str
+) -> None:
+    with pytest.raises(ApcError) as caught:
+        apc.compare([compiled(text) for text in texts], over=over)
+    assert str(caught.value).startswith(message)
+
+
+def test_a_name_serves_the_scenes_that_have_it() -> None:
+    found = apc.compare([compiled(TWO_SPRINGS), compiled(MESH)], over=["leash.stiffness"])
+    assert [one.stiffness.parameter for one in found.schemes if one.stiffness] == [
+        *("leash.stiffness", "coordination.stiffness")
+    ]
+
+
+# ---- what is said ----
+
+
+def test_a_cell_that_cant_be_had_says_why_below_its_dash() -> None:
+    found = compared(SHAKING, LOSSY, ONE_MASS)
+    missing = [dict(one.missing) for one in found.schemes]
+    assert [sorted(one) for one in missing] == [
+        ["feel", "loss"],
+        ["delay"],
+        ["delay", "feel", "loss", "stiffness"],
+    ]
+    assert missing[0]["loss"] == "no packet can get lost; loss: 0 % written to lan lets its loss be varied"
+    assert missing[1]["delay"].startswith("apc critical lan.delay: lan.delay can't be varied in mean square")
+    text = " ".join(str(found).split())
+    assert all(" ".join(why.split()) in text for one in missing for why in one.values())
+    rows = [line.split() for line in str(found).splitlines()]
+    dashed = [row for row in rows if len(row) > 1 and row[0].isdigit() and row[1] == "–"]
+    assert len(dashed) == 7 and all(row[2].startswith("[") for row in dashed)
+
+
+def test_schemes_that_differ_in_more_than_their_coupling_are_told_of_and_what_is_left_out_first() -> None:
+    longer = replaced(AVERAGE, ("network: 8 ms", "network: 10 ms"), ("count: 3", "count: 4"))
+    assert compared(AVERAGE, MESH).notes == ()
+    found = compared(AVERAGE, longer, LOSSY)
+    assert found.notes == (
+        "they have different numbers of peers: 3, 4",
+        "their frames differ, and with them what a spectral radius is of: 8 ms, 10 ms",
+        "some are judged in mean square over the network as it is, some with every packet on time",
+    )
+    assert found.left_out == (
+        "3: left out: packet loss (10 %) of lan; here every packet takes the nominal 8 ms",
+    )
+    assert str(found).splitlines()[1].startswith("  of a link that is, or becomes, unreliable: ")
+
+
+def test_a_line_fits_a_terminal_whatever_names_are_used() -> None:
+    name = "a-scene-with-a-very-long-name-that-fills-most-of-a-line-by-itself"
+    text = replaced(AVERAGE, ("three-users-average", name))
+    for old in ("coordination", "lan"):
+        text = text.replace(old, f"{old}_of_{'long' * 10}")
+    assert max(len(line) for line in str(compared(text, SHAKING)).splitlines()) <= 80
+
+
+# ---- the command ----
+
+
+@pytest.fixture
+def scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    monkeypatch.chdir(tmp_path)
+    Path("average.yaml").write_text(AVERAGE, encoding="utf-8")
+    Path("mesh.yaml").write_text(MESH, encoding="utf-8")
+    return ["average.yaml", "mesh.yaml"]
+
+
+def test_json_holds_each_part_as_the_json_of_its_command_with_the_same_settings(
+    scenes: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def document(*words: str) -> Any:
+        assert run([*words, "--json"]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    told = document("compare", *scenes)["schemes"]
+    assert [one["topology"] for one in told] == ["three-users-average", "three-users-mesh"]
+    assert document("critical", "coordination.stiffness", scenes[0]) == told[0]["stiffness"]
+    assert document("critical", "lan.delay", scenes[0]) == told[0]["delay"]
+    felt = document("feel", scenes[0], "--frequencies", "1 Hz, 10 Hz")
+    assert felt["impedance"] == told[0]["feel"]["impedance"]
+    words = ("--set", "contact.stiffness=900 N/m", "--hands", "clamped")
+    told = document("compare", *scenes, *words)["schemes"]
+    for file, one in zip(scenes, told, strict=True):
+        assert document("analyze", file, *words)["spectral_radius"] == one["analysis"]["spectral_radius"]
+
+
+def test_a_table_has_a_row_a_scheme_and_a_picture_is_the_same_each_time(scenes: list[str]) -> None:
+    assert run(["compare", *scenes, "--out", "out.csv"]) == 0
+    with Path("out.csv").open(encoding="utf-8") as file:
+        row = list(csv.DictReader(file))[1]
+    assert float(row["stiffness [N/m]"]) == apc.critical(compiled(MESH), "coordination.stiffness").value
+    assert row["delay parameter"] == "lan.delay"
+    felt = [float(row[f"impedance at 10 Hz {part} [N*s/m]"]) for part in ("real", "imaginary")]
+    assert complex(*felt) == pytest.approx(complex(apc.feel(compiled(MESH), 10.0).impedance[0]), rel=1e-12)
+    pytest.importorskip("matplotlib")
+    for name in ("one.svg", "two.svg"):
+        assert run(["compare", *scenes, "--out", name]) == 0
+    assert Path("one.svg").read_bytes() == Path("two.svg").read_bytes()
+    texts = [text.get_text() for ax in compared(AVERAGE, MESH).plot().axes for text in ax.texts]
+    assert texts[:7] == ["0.9572", "0.9926", "0.715", "4.207", "1096", "548.2", "> 64"]
+    assert texts[8:10] == ["–", "–"]
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        ("average.yaml wrong.yaml", 1, "wrong.yaml:13:66: E204 stiffness wants N/m, got 500 (no unit)."),
+        ("average.yaml --out out.doc", 1, "E878"),
+        (
+            "average.yaml --out m.csv --set nothing.there=1_N",
+            *(1, "E622 nothing.there is no parameter of three-users-average"),
+        ),
+        ("", 2, "Missing argument 'FILE...'"),
+    ],
+)
+def test_what_is_at_fault_is_told_as_everywhere(
+    words: str, code: int, message: str, scenes: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("wrong.yaml").write_text(replaced(AVERAGE, ("500 N/m", "500")), encoding="utf-8")
+    assert run(["compare", *(word.replace("_", " ") for word in words.split())]) == code
+    told = capsys.readouterr()
+    assert told.out == "" and message in told.err
+
+
+def test_the_function_does_what_the_command_does(
+    scenes: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = apc.compare(scenes, set={"lan.delay": "16 ms"}, over=["contact.stiffness"])
+    assert run(["compare", *scenes, "--set", "lan.delay=16 ms", "--over", "contact.stiffness"]) == 0
+    assert capsys.readouterr().out.rstrip("\n") == str(found)
+    assert found.to_dataframe()["stiffness parameter"].tolist() == ["contact.stiffness"] * 2

@@ -1,0 +1,112 @@
+"""The number of peers as a number like others: set, it gives the scene that compiles with it."""
+
+from __future__ import annotations
+
+import pytest
+
+import apc
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from tests.topologies import AVERAGE, MESH, compiled, replaced
+
+NAMED = replaced(MESH, ("count: 3", "count: 2*n - 1"), ("peers:", "parameters: {n: 2, kt: 2000 N/m}\npeers:"))
+GROUPS = replaced(
+    AVERAGE, ("  user: {count: 3}", "  left: {count: 2, set: {device.mass: 0.2 kg}}\n  right: {count: 3}")
+)
+RING, STAR = (replaced(MESH, ("delay: 8 ms}", f"delay: 8 ms, graph: {name}}}")) for name in ("ring", "star"))
+EDGES = "{edges: [[1, 2], [2, 3]]}"
+
+
+def plain(system: CompiledSystem) -> tuple[object, ...]:
+    """Return what a scene is made of and how it moves."""
+    groups = [(group.name, group.count) for group in system.groups]
+    found = apc.analyze(system)
+    modes = [(one.eigenvalue, one.multiplicity, one.shape) for one in found.modes]
+    return groups, apc.parameters(system).rows, found.peers, found.spectral_radius, modes
+
+
+@pytest.mark.parametrize("count", [2, 7, 40])
+@pytest.mark.parametrize("text", [AVERAGE, RING, STAR], ids=["average", "ring", "star"])
+def test_a_model_with_another_count_is_the_one_that_compiles(text: str, count: int) -> None:
+    changed = apc.set_parameters(compiled(text), {"user.count": str(count)})
+    assert plain(changed) == plain(compiled(replaced(text, ("count: 3", f"count: {count}"))))
+
+
+def test_so_it_is_with_groups_and_with_counts_that_follow_from_numbers() -> None:
+    changed = apc.set_parameters(compiled(GROUPS), {"right.count": "9", "left.count": "1"})
+    assert plain(changed) == plain(
+        compiled(replaced(GROUPS, ("count: 3", "count: 9"), ("count: 2", "count: 1")))
+    )
+    changed = apc.set_parameters(compiled(NAMED), {"n": "4"})
+    assert plain(changed) == plain(compiled(replaced(NAMED, ("n: 2", "n: 4"))))
+    assert [group.count for group in changed.groups] == [7]
+    # What a count follows from is no number that a margin could be of.
+    assert {"n", "user.count"}.isdisjoint(one.parameter for one in apc.margins(compiled(NAMED)).rows)
+
+
+@pytest.mark.parametrize(
+    ("text", "setting", "message"),
+    [
+        (AVERAGE, "user.count=2.5", "E626 user.count wants a whole number from 1 to 1,000,000,000, got 2.5."),
+        (
+            AVERAGE,
+            "user.count=1",
+            "E626 the number of all peers wants at least 2: parts follow the others, got 1.",
+        ),
+        (
+            replaced(AVERAGE, ("{count: 3}", "{set: {device.mass: [0.1 kg, 0.2 kg]}}")),
+            "user.count=3",
+            "E626 device.mass has one value for each of the 2 peers of user: their count follows from them.",
+        ),
+        (
+            replaced(AVERAGE, ("delay: 8 ms}", f"delay: 8 ms, graph: {EDGES}}}")),
+            "user.count=4",
+            "E626 the graph of lan names its peers: user.count is what it is in the topology.",
+        ),
+        (
+            RING,
+            "user.count=1000001",
+            "E626 user.count wants at most 1,000,000 peers where lan isn't complete, got 1,000,001.",
+        ),
+        (
+            AVERAGE,
+            "peers=4",
+            "E623 peers is the number of all peers, which follows from the groups'. Write: user.count",
+        ),
+        (
+            NAMED,
+            "user.n=4",
+            "E622 user.count is one number of the scene, and depends on what is set for user. "
+            "Write: the same without the group, or a group with a set of its own",
+        ),
+    ],
+)
+def test_a_count_that_cannot_be_is_refused(text: str, setting: str, message: str) -> None:
+    name, _, value = setting.partition("=")
+    with pytest.raises(ApcError) as caught:
+        apc.set_parameters(compiled(text), {name: value})
+    assert str(caught.value).partition(": ")[2] == message
+
+
+@pytest.mark.parametrize(
+    ("count", "message"),
+    [
+        ("count: kt", " count wants 1, got kt, which is in N/m. Write: count: 1 1"),
+        ("count: m", "count wants a whole number, or an expression over numbers of parameters, got m."),
+        ("count: n/2", "count wants a whole number from 1 to 1000000000, got n/2, which is 1.5"),
+        ("count: peers", "peers depends on peers, which it is a part of. Write: count: 3"),
+        ("count: twice", "twice depends on peers, which it is a part of. Write: count: 3"),
+    ],
+)
+def test_a_count_by_names_is_read_with_care(count: str, message: str) -> None:
+    text = replaced(
+        MESH, ("count: 3", count), ("peers:", "parameters: {n: 3, kt: 2000 N/m, twice: 2*peers}\npeers:")
+    )
+    with pytest.raises(ApcError) as caught:
+        compiled(text)
+    assert message in str(caught.value)
+
+
+def test_a_count_is_asked_for_by_name_only_where_it_varies() -> None:
+    with pytest.raises(ApcError, match=r"E623 user.count is a number of peers, which doesn't vary here"):
+        apc.prove_box(compiled(NAMED), {"user.count": "±50%"})

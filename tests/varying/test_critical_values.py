@@ -1,0 +1,468 @@
+"""Where a verdict changes as one number grows: closed forms, and analyses on both sides of each value."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import flint
+import numpy as np
+import pytest
+
+import apc
+from apc.__main__ import run
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.eigen.balls import precision
+from apc.vary.critical import Critical
+from tests.bench import random_scans
+from tests.bruteforce import Scene, as_ball, frame_matrices, frame_matrix
+from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced
+from tests.truths import STORED
+from tests.varying.closed_forms import followers, late, sprung
+
+HARD = ROOT / "tests" / "hard"
+LIMIT = 1096.410868365630  # tests.reference, of the paper's scene
+STIFFNESS = "coordination.stiffness"
+PRESSED = replaced(
+    AVERAGE,
+    ("count: 3", "count: 3, set: {device.x: -10 mm}"),
+    (
+        "type: SampledSpringDamper, a: device, b: cube",
+        "type: OneSidedContact, a: device, b: cube, half_width: 20 mm, side: left",
+    ),
+)
+SOFT = replaced(AVERAGE, ("500 N/m", "690 N/m"), ("1000 N/m", "100 N/m"))
+NAMED = replaced(AVERAGE, ("peers:", "parameters: {late: 8 ms}\npeers:"), ("delay: 8 ms}", "delay: late}"))
+PHASED = replaced(AVERAGE, ("network: 8 ms", "network: {period: 4 ms, phase: 1 ms}"))
+OWN = ("link: lan", "link: lan, delays: own")
+# Equal at present; one group's limit is not everybody's.
+GROUPS = replaced(
+    AVERAGE,
+    ("  user: {count: 3}", "  one: {count: 1, set: {contact.stiffness: 1000 N/m}}\n  two: {count: 2}"),
+)
+DIFFERENT = replaced(
+    MESH, ("{count: 3}", "{count: 2}\n  other: {count: 1, set: {coordination.stiffness: 150 N/m}}")
+)
+
+
+def scene(text: str) -> CompiledSystem:
+    """Return the scene of a text, or by its name."""
+    if "\n" in text:
+        return compiled(text)
+    path = SCENES / f"{text}.yaml"
+    return apc.compile(path if path.exists() else HARD / f"{text}.yaml")
+
+
+def stable_at(system: CompiledSystem, found: Critical, value: Fraction) -> bool | None:
+    """Return the verdict of an analysis with the number that was searched at a value."""
+    unit = "" if found.unit == "1" else f" {found.unit}"
+    return apc.analyze(system, set={found.parameter: f"{value}{unit}"}).stable
+
+
+def check(system: CompiledSystem, found: Critical, values: Sequence[Fraction] = ()) -> None:
+    """Assert that analyses on both sides of every crossing, and at more values, say what the search says."""
+    for one in found.crossings:
+        # Bounds of an analysis may be wider than a crossing's own, that is proved with more digits.
+        aside = 2 * Fraction(one.error) + Fraction(max(abs(one.value), 1e-3)) / 10**9
+        sides = [stable_at(system, found, Fraction(one.value) + side * aside) for side in (-1, 1)]
+        assert sides == ([True, False] if one.stable_side == "below" else [False, True]), one
+    edges = [Fraction(one.value) for one in found.crossings]
+    first = found.crossings[0].stable_side == "below" if edges else found.verdict.startswith("stable")
+    for value in values:
+        assert stable_at(system, found, value) is (first == (sum(e < value for e in edges) % 2 == 0)), value
+
+
+# ---- closed forms ----
+
+
+@pytest.mark.parametrize("ticks", [0, 1, 2, 7, 30, pytest.param(100, marks=pytest.mark.whole)])
+def test_an_integrator_pulled_back_late_is_stable_up_to_its_closed_form(ticks: int) -> None:
+    """p < 2 sin(π/(2(2d + 1))): Levin and May, Theoretical Population Biology 9, 1976."""
+    limit = 2000 * np.sin(np.pi / (2 * (2 * ticks + 1)))
+    found = apc.critical(late(ticks), "it.pull", upper=f"{3 * limit} Hz")
+    (one,) = found.crossings
+    assert one.value == pytest.approx(limit, rel=1e-12) and one.stable_side == "below"
+    assert one.frequency_hz == pytest.approx(500 / (2 * ticks + 1), rel=1e-9)
+    assert one.error <= 1e-9 * limit and found.whole and found.value == one.value
+
+
+@pytest.mark.parametrize("ticks", [1, 8, pytest.param(64, marks=pytest.mark.whole)])
+def test_what_grows_by_itself_is_held_between_two_values(ticks: int) -> None:
+    """A pull too weak leaves it unstable at ζ = 1, one too strong further on, or always."""
+    growth = 1000 / (2 * ticks + 2)
+    pole = np.exp(growth / 1000)
+    found = apc.critical(late(ticks, growth), "it.pull", upper=f"{10 * growth} Hz")
+    grid = np.geomspace(growth / 100, 9.9 * growth, 1500)
+    shares = grid * (pole - 1) / growth
+    brute = [np.abs(np.roots([1.0, -pole, *np.zeros(ticks - 1), p])).max() < 1 for p in shares]
+    places = np.flatnonzero(np.diff(brute))
+    assert [one.stable_side == "below" for one in found.crossings] == [brute[place] for place in places]
+    for one, place in zip(found.crossings, places, strict=True):
+        assert grid[place] <= one.value <= grid[place + 1]
+    assert found.crossings[0].value == pytest.approx(growth, rel=1e-9)
+
+
+@pytest.mark.parametrize("packets", [2, 12, 40, 300, pytest.param(1000, marks=pytest.mark.whole)])
+def test_where_all_eigenvalues_cross_at_once_the_value_is_that(packets: int) -> None:
+    found = apc.critical(followers(packets), "it.pull", upper="3000 Hz")
+    (one,) = found.crossings
+    assert abs(one.value - 1000) <= max(one.error, 1e-9) and one.error <= 1e-2
+    assert one.stable_side == "below"
+
+
+@pytest.mark.parametrize("name", ["c.u", "dial"])
+def test_a_bump_between_two_samples_is_found_at_its_closed_form(name: str) -> None:
+    """k(u) crosses the spring's own limit K at u₀ ± w (h/(K − low) − 1)^¼."""
+    bound = apc.critical(sprung("Straight", "low: 500 N/m, high: 1 N/m, u: 700"), "c.u").value
+    assert bound is not None
+    reach = 50 * (8000 / bound - 1) ** 0.25
+    found = apc.critical(sprung("Bump"), name)
+    assert [one.value for one in found.crossings] == pytest.approx([1237 - reach, 1237 + reach], rel=1e-9)
+    assert [one.stable_side for one in found.crossings] == ["below", "above"]
+
+
+@pytest.mark.parametrize(
+    ("shape", "middle", "width"),
+    [
+        *(("Narrow", 1237, 0.02), ("Narrower", 1237, 2e-4), ("Step", 1001, 1.1), ("Kink", 1001, 3)),
+        *(("Bell", 1001, 4), ("Plateau", 1002, 3), ("Angle", 1002, 4)),
+    ],
+)
+def test_no_window_is_too_narrow_and_steps_and_kinks_hide_nothing(
+    shape: str, middle: float, width: float
+) -> None:
+    system = sprung(shape)
+    found = apc.critical(system, "dial")
+    assert [one.stable_side for one in found.crossings] == ["below", "above"]
+    assert all(abs(one.value - middle) < width for one in found.crossings)
+    inside = Fraction(sum(one.value for one in found.crossings) / 2)
+    assert [stable_at(system, found, value) for value in (Fraction(700), inside, Fraction(1500))] == [
+        *(True, False, True)
+    ]
+
+
+def test_a_delay_that_stands_in_a_force_moves_the_force_as_well() -> None:
+    system = sprung("Straight", "low: 100 N/m, high: 1 N/m, u: 0, rate: 1e6 N/m/s")
+    found = apc.critical(system, "c.delay")
+    assert len(found.crossings) == 1
+    check(system, found)
+
+
+@pytest.mark.parametrize(
+    ("system", "name", "value", "off"),
+    [
+        # (N − 1) times less each is the average's limit.
+        (
+            compiled(
+                replaced(
+                    MESH,
+                    ("masses:", "parameters: {kt: 500 N/m}\nmasses:"),
+                    ("stiffness: 500 N/m", "stiffness: kt/(peers - 1)"),
+                )
+            ),
+            *("kt", LIMIT, 1e-9),
+        ),
+        # The half width of the cube, 20 mm: beyond it a device moves freely, which is one motion more.
+        pytest.param(*(scene("experiment-average"), "left.device.x", -0.02, 1e-12), marks=pytest.mark.whole),
+        # The contact closes where its half width is how far the device begins from the cube.
+        (
+            compiled(replaced(PRESSED, ("-10 mm", "-15 mm"), (", side: left", ""), ("1000 N/m", "3000 N/m"))),
+            *("contact.half_width", 0.015, 1e-12),
+        ),
+    ],
+    ids=["an expression", "a start value", "a half width"],
+)
+def test_what_a_number_reaches_by_other_ways_has_its_known_value(
+    system: CompiledSystem, name: str, value: float, off: float
+) -> None:
+    found = apc.critical(system, name, upper="40 mm" if "width" in name else None)
+    (one,) = found.crossings
+    assert one.value == pytest.approx(value, abs=off) and found.enters
+    if name != "kt":
+        assert "the scene is not linear" in str(found)
+
+
+def test_the_error_holds_against_the_full_map_in_50_digits() -> None:
+    """At value ± error the eigenvalue of all peers' own map lies on either side of the circle."""
+    found = apc.critical(compiled(AVERAGE), STIFFNESS)
+    assert found.value is not None and found.error is not None and found.error < 1e-12 * found.value
+    assert found.crossings[0].proof.startswith("proved") and found.whole
+    mode = np.exp(2j * np.pi * found.crossings[0].frequency_hz * 0.008)
+    sizes = []
+    with precision(200):
+        for sign in (-1, 1):
+            k_t = flint.arb(found.value) + sign * flint.arb(found.error)
+            beside = Scene(kt=k_t, kc=flint.arb(1000))  # type: ignore[arg-type] # a scene of balls
+            rows = frame_matrix(beside, number=as_ball, exp=lambda value: value.exp())
+            matrix = flint.acb_mat([[flint.acb(entry.mid()) for entry in row] for row in rows])
+            values = matrix.eig(algorithm="approx")
+            sizes.append(abs(min(values, key=lambda value: abs(complex(value.mid()) - mode))).mid())
+        assert sizes[0] < 1 < sizes[1]
+
+
+@pytest.mark.parametrize("frames", [13, pytest.param(40, marks=pytest.mark.whole), 100])
+def test_a_long_delay_has_the_crossing_of_all_peers_by_hand(frames: int) -> None:
+    """The spectral radius of the full map, a packet a state, is 1 between the ends of the error."""
+    delay = Fraction(8 * frames, 1000)
+    found = apc.critical(compiled(AVERAGE), STIFFNESS, set={"lan.delay": f"{delay} s"})
+    assert found.value is not None and found.error is not None and found.error < 1e-9 * found.value
+
+    def largest(k_t: float) -> float:
+        sizes = np.abs(np.linalg.eigvals(frame_matrices(Scene(kt=k_t, comm=delay), 1)[0]))
+        return float(np.sort(sizes)[-2])  # all can move together
+
+    aside = 1e-6 * found.value
+    assert largest(found.value - aside) < 1 < largest(found.value + aside)
+
+
+def test_a_defective_cluster_is_held_where_its_eigenvalue_alone_crosses() -> None:
+    """Four equal peers in a chain have one eigenvector; floats scatter their eigenvalue by a part in 10⁴.
+
+    Each of them is a part of its own, which has it once.
+    """
+    text = (HARD / "defective.yaml").read_text(encoding="utf-8")
+    # One of them behind the first moves as each of them does; a copy keeps its share of the mass.
+    alone = replaced(
+        *(text, ("count: 4", "count: 1"), ("mass: 1 kg", "mass: 0.4 kg")),
+        ("[1, 2, 1], [2, 3, 1], [3, 4, 1], [4, 5, 1]", "[1, 2, 1]"),
+    )
+    chain, single = (apc.critical(compiled(one), STIFFNESS).crossings[0] for one in (text, alone))
+    assert chain.proof.startswith("proved") and single.proof.startswith("proved")
+    assert abs(chain.value - single.value) <= chain.error + single.error < 1e-10 * chain.value
+
+
+# ---- verdicts along a scan ----
+
+MS = [Fraction(k, 1000) for k in range(200)]
+HALVES = [one + Fraction(1, 2000) for one in MS]
+
+# What varies, what else is set, and values at which analyses are asked besides both sides of each crossing.
+ALONG = {
+    # Stable, unstable, stable again, unstable for good.
+    "an island": (AVERAGE, "coordination.damping", {}, [Fraction(k) for k in (30, 70, 90, 200)], 3),
+    "a mass": (AVERAGE, "device.mass", {}, [], 2),
+    "a damping": (AVERAGE, "device.damping", {}, [], 1),
+    "a computational delay": (AVERAGE, "contact.delay", {"upper": "4 ms"}, MS[:4], 1),
+    "a link's delay": (SOFT, "lan.delay", {"upper": "16 ms"}, [*MS[:17], *HALVES[:16]], 0),
+    "nearly on the boundary": ("boundary-inside-13", "lan.delay", {"upper": "16 ms"}, HALVES[:16], 2),
+    "a clock with a phase": (PHASED, "lan.delay", {"upper": "160 ms"}, HALVES[:160:7], 0),
+    "users that differ": (DIFFERENT, "lan.delay", {"upper": "160 ms"}, HALVES[:160:7], 0),
+    "a delay by its name": (NAMED, "late", {"upper": "160 ms"}, HALVES[:160:13], 0),
+    "peers that all differ": ("different-peers", "contact.stiffness", {}, [], 0),
+    "a finger": ("finger", "wall.delay", {"upper": "3 ms", "set": {"wall.stiffness": "5000 N/m"}}, [], 0),
+    "linearized at its start": ("experiment-average", STIFFNESS, {}, [], 0),
+    "a motor within its limits": ("limited-motor", "wall.stiffness", {}, [], 0),
+    "a force against itself": (replaced(AVERAGE, OWN), STIFFNESS, {}, [], 1),
+    "one of several groups": (GROUPS, "one.contact.stiffness", {}, [], 0),
+}
+
+
+@pytest.mark.parametrize("name", ALONG)
+def test_the_verdict_along_a_scan_is_what_analyses_say(name: str) -> None:
+    text, parameter, asked, values, count = ALONG[name]
+    system = scene(text)
+    found = apc.critical(system, parameter, **asked)
+    assert found.crossings and (not count or len(found.crossings) == count)
+    assert found.value in [one.value for one in found.crossings]
+    check(apc.set_parameters(system, asked.get("set", {})), found, values)
+
+
+def test_how_many_users_is_answered_as_each_scene_alone_would() -> None:
+    found = apc.critical(compiled(MESH), "user.count", lower="2", upper="40")
+    ends = [int(one.boundary) for one in found.crossings]
+    alone = [apc.analyze(compiled(MESH), set={"user.count": str(count)}).stable for count in range(2, 41)]
+    expected = [alone[0] is (sum(end < count for end in ends) % 2 == 0) for count in range(2, 41)]
+    assert ends and expected == alone and found.looked <= 39
+
+
+FIRST = [SCENES / "finger.yaml"]
+OTHERS = sorted({*SCENES.glob("*.yaml"), *HARD.glob("*.yaml")} - {*FIRST})
+
+
+@pytest.mark.parametrize(
+    "path",
+    [*FIRST, *(pytest.param(one, marks=pytest.mark.whole) for one in OTHERS)],
+    ids=lambda one: one.stem,
+)
+def test_every_crossing_that_is_answered_is_one_between_two_analyses(path: Path) -> None:
+    """Of each delay and the first stiffness: other verdicts on its two sides, none of them open."""
+    system = apc.compile(path)
+    names = [one.name for one in apc.parameters(system).rows]
+    stiff = [name for name in names if name.endswith("stiffness")]
+    for name in [*(one for one in names if one.endswith(".delay")), *stiff[:1]]:
+        try:
+            found = apc.critical(system, name, criterion="nominal")
+        except ApcError as error:
+            assert error.mistakes[0].code in ("E804", "E805", "E844", "E845", "E846"), error
+            continue
+        check(system, found)
+
+
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.whole)])
+def test_no_crossing_is_invented_and_none_is_missed_in_random_scenes(seed: int) -> None:
+    """Against eigenvalues of all peers' matrix on a grid and beside each crossing."""
+    tally = random_scans.run(4, seed=seed)
+    assert tally.wrong == [] and tally.scans == 4
+
+
+def test_a_link_delay_jumps_where_a_packet_comes_a_tick_later() -> None:
+    found = apc.critical(compiled(SOFT), "lan.delay", upper="16 ms")
+    first = found.crossings[0]
+    assert (first.kind, first.error, first.stable_side) == ("jump", 0.0, "below")
+    assert 1000 * first.value == round(1000 * first.value)
+    assert found.stretches == 16, "a packet comes a tick later after every millisecond"
+    # A packet that comes with a tick is seen by it: the jump's own value is one with what is below.
+    moved = apc.set_parameters(compiled(SOFT), {"lan.delay": f"{first.value!r} s"})
+    assert apc.analyze(moved).stable and apc.critical(moved, "lan.delay").value == first.value
+    row = next(one for one in apc.margins(moved).rows if one.parameter == "lan.delay")
+    assert (row.value, row.factor, row.kind) == (first.value, 1.0, "jump")
+
+
+def test_jumps_of_a_scene_within_a_part_in_10_13_of_its_boundary_are_exact() -> None:
+    assert STORED["boundary-inside-13"]["spectral_radius"].startswith("0.9999999999")
+    found = apc.critical(HARD / "boundary-inside-13.yaml", "lan.delay", upper="16 ms")
+    assert [(one.value, one.error) for one in found.crossings] == [(0.002, 0.0), (0.007, 0.0)]
+    assert found.whole and not found.left_open
+
+
+@pytest.mark.whole
+def test_a_search_of_two_seconds_ends_where_a_short_one_does() -> None:
+    long, short = (apc.critical(compiled(AVERAGE), "lan.delay", upper=upper) for upper in ("2 s", "140 ms"))
+    assert long.crossings == short.crossings and long.whole
+    (edge,) = long.crossings
+    assert (edge.kind, edge.stable_side) == ("jump", "below")
+
+
+@pytest.mark.parametrize("low", [0, 14])
+def test_where_a_search_of_delays_begins_is_looked_at_by_itself(low: int) -> None:
+    """A packet due at a tick is heard at it, and one a microsecond later at the next."""
+    system = apc.set_parameters(scene("star-lecture"), {STIFFNESS: "873.3965451925634 N/m"})
+    found = apc.critical(system, "lecture.delay", lower=f"{low} ms", upper="18 ms")
+    at, above = (stable_at(system, found, Fraction(low, 1000) + more) for more in (0, Fraction(1, 10**6)))
+    assert at is not above
+    first = found.crossings[0]
+    assert (first.value, first.error, first.stable_side) == (low / 1000, 0.0, "below" if at else "above")
+
+
+def test_stretches_of_which_no_analysis_decides_are_said_to_be_left_open() -> None:
+    """Every eigenvalue of those who move together is on the circle, exactly, as soon as packets are late."""
+    found = apc.critical(followers(2, 1000.0), "lan.delay", upper="3 ms")
+    assert not found.whole and found.left_open[-1] == (0.002, 0.003)
+    assert "the verdict is left open from" in " ".join(str(found).split())
+    assert found.to_dict()["left_open"] == [list(one) for one in found.left_open]
+
+
+def test_the_frequency_is_that_of_the_motion_that_decides() -> None:
+    for name in ("contact.stiffness", "contact.delay"):
+        [one, *_] = (found := apc.critical(compiled(AVERAGE), name)).crossings
+        mode = apc.analyze(compiled(AVERAGE), set={name: f"{one.value!r} {found.unit}"}).modes[0]
+        assert one.frequency_hz == pytest.approx(mode.frequency_hz, rel=1e-6)
+    # Eight ticks make a frame: a sign that changes at each, (−1)⁸ = 1, is no common translation.
+    found = apc.critical(
+        scene("experiment-average"), "coordination.damping", lower="100 N*s/m", upper="300 N*s/m"
+    )
+    assert [one.frequency_hz for one in found.crossings] == pytest.approx([500], rel=1e-9)
+
+
+def test_delays_of_a_scene_with_contact_are_those_of_the_springs_it_starts_with() -> None:
+    """Pressed at the start, a contact that only pushes is a spring; let go, it is none."""
+    springs, contacts = (
+        apc.critical(compiled(text), "contact.delay", upper="4 ms") for text in (AVERAGE, PRESSED)
+    )
+    assert contacts.value == pytest.approx(springs.value, abs=springs.error + contacts.error)
+    assert contacts.left_out and not springs.left_out
+    loose = compiled(replaced(PRESSED, ("device.x: -10 mm", "device.x: -30 mm")))
+    assert apc.critical(loose, "contact.delay", upper="4 ms").crossings == ()
+    rows = {one.parameter: one.value for one in apc.margins(compiled(PRESSED)).rows}
+    assert rows["contact.delay"] == pytest.approx(springs.value, rel=1e-12)
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("name", ["contact.delay", "coordination.delay", "lan.delay"])
+@pytest.mark.parametrize("times", [("0.13", "1", "8"), ("1.37", "0.61", "7.19")])
+def test_a_scan_of_a_delay_goes_beyond_the_present_value(name: str, times: tuple[str, str, str]) -> None:
+    """However many decimals the other times have: events don't coincide at every common divisor of all."""
+    names = ("contact.delay", "coordination.delay", "lan.delay")
+    settings = {key: f"{time} ms" for key, time in zip(names, times, strict=True)}
+    system = apc.set_parameters(compiled(AVERAGE), settings)
+    found = apc.critical(system, name)
+    assert found.scanned[0] == 0.0 and found.scanned[1] >= 2 * found.present
+    check(system, found)
+
+
+# ---- what is said ----
+
+
+def test_no_crossing_is_an_answer_in_words() -> None:
+    found = apc.critical(compiled(AVERAGE), STIFFNESS, upper="900 N/m")
+    assert (found.value, found.error, found.stable_side, found.scanned) == (None, None, None, (0.0, 900.0))
+    assert found.verdict == "stable at every value scanned" and found.enters
+    above = apc.critical(compiled(AVERAGE), STIFFNESS, lower="1200 N/m", upper="2000 N/m")
+    assert above.verdict == "unstable at every value scanned"
+    # A wave impedance of 0 divides by zero: the least value scanned is above it.
+    waves = apc.set_parameters(scene("two-users-waves"), {"lan.delay": "72 ms"})
+    found = apc.critical(waves, "coordination.impedance", upper="1 N*s/m")
+    assert found.verdict == "stable at every value scanned" and 0 < found.scanned[0] < 1e-9
+    idle = apc.critical(compiled(AVERAGE), "cube.x")
+    assert not idle.enters and idle.value is None
+    assert "stable whatever its value: nothing that decides stability depends on it" in str(idle)
+
+
+def test_a_delay_where_what_is_heard_at_the_start_decides_is_refused() -> None:
+    text = replaced(MESH, ("type: FullMesh", "type: SaturatedMesh, limit: 3 N"))
+    with pytest.raises(ApcError, match="E845 how the scene moves hangs on what is heard at the start"):
+        apc.critical(compiled(text), "contact.delay")
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
+
+
+ORDER = "apc critical: E841 the command wants a parameter or delay, then the scene, got "
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("peers", "E623 peers is the number of all peers"),
+        ("contact.stifness", "E622 contact.stifness is no parameter"),
+        ("haptic.period", "E844 haptic.period sets the rhythm of a clock"),
+        ("haptic.phase", "E844 haptic.phase sets the rhythm of a clock"),
+        ("user.contact.delay", "contact.delay is one time for all groups. Write: contact.delay"),
+        ("", "E622 an empty name is no parameter of"),
+        ("links.", "E622 links. is no parameter of"),
+        ("contact.stiffness|--upper|3 kg", "E204 contact.stiffness wants N/m, got 3 kg"),
+        ("contact.stiffness|--upper|900", "--upper: E204 contact.stiffness wants N/m, got 900 (no"),
+        ("contact.stiffness|--upper|900", 'Write: --upper "900 N/m"'),
+        (
+            "contact.stiffness|--lower|9 N/m|--upper|3 N/m",
+            "E842 the range of contact.stiffness wants",
+        ),
+        ("contact.stiffness|--lower|-5 N/m", "E843 a limit of contact.stiffness wants at least 0"),
+        (
+            "scene.yaml|lan.delay",
+            f"{ORDER}scene.yaml, then lan.delay. Write: apc critical lan.delay scene.yaml\n",
+        ),
+        ("scene.yaml", f"{ORDER}scene.yaml alone. Write: apc critical contact.stiffness scene.yaml\n"),
+    ],
+)
+def test_a_mistake_is_one_message(words: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["critical", *words.split("|")]) == 1
+    written = capsys.readouterr()
+    assert message in written.err and written.out == ""
+
+
+def test_the_command_prints_one_document_or_lines_of_80_columns(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(["critical", STIFFNESS, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["value"] == pytest.approx(LIMIT, rel=1e-12) and document["unit"] == "N/m"
+    assert document["crossings"][0]["stable_side"] == "below"
+    assert run(["critical", STIFFNESS, "--set", "contact.stiffness=2000 N/m"]) == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80

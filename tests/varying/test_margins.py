@@ -1,0 +1,153 @@
+"""How far each number may grow: rows that hold, notes where one was not looked for."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import pytest
+
+import apc
+from apc.__main__ import run
+from apc.compiler.compiled import CompiledSystem
+from apc.vary.margins import Margin
+from tests.topologies import AVERAGE, SCENES, compiled, replaced
+from tests.varying.test_critical_values import HARD, PRESSED
+
+SAMPLED = "stiffness: 1000 N/m, clock: haptic, delay: 1 ms"
+
+DEAD_RECKONING = """
+topology: dead-reckoning
+clocks: {haptic: 1 ms, network: 8 ms}
+peers: {user: {count: 2}}
+masses:
+  device: {mass: 0.1 kg, damping: 5 N*s/m}
+  cube:   {mass: 0.6 kg, damping: 5 N*s/m, shared: true}
+couplers:
+  contact:      {type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic,
+                 delay: 1 ms}
+  coordination: {type: DeadReckoning, object: cube, stiffness: 200 N/m, damping: 5 N*s/m,
+                 threshold: 0.1 mm, clock: haptic, delay: 1 ms, link: lan}
+links: {lan: {clock: network, delay: 8 ms, loss: 0 %}}
+hands: {arm: {type: SpringDamperArm, flange: device, stiffness: 100 N/m, damping: 2 N*s/m}}
+"""
+
+
+def hasty(delay: str, stiffness: str = "60 N/m") -> str:
+    """Return two users whose frame is a tick, so that many packets are on their way."""
+    return replaced(
+        *(AVERAGE, ("count: 3", "count: 2"), ("network: 8 ms", "network: 1 ms")),
+        *(("delay: 8 ms", f"delay: {delay}"), ("stiffness: 500 N/m", f"stiffness: {stiffness}")),
+    )
+
+
+def rows_of(system: CompiledSystem) -> dict[str, Margin]:
+    return {one.parameter: one for one in apc.margins(system).rows}
+
+
+def holds(system: CompiledSystem, one: Margin) -> None:
+    """Assert that analyses decide otherwise on both sides of a margin."""
+    assert one.value is not None and one.error is not None
+    assert one.value > one.present and one.error <= 1e-6 * one.value
+    aside = max(2 * one.error, 1e-8 * one.value)
+    sides = [
+        apc.analyze(system, set={one.parameter: f"{Fraction(one.value + side * aside)} {one.unit}"}).stable
+        for side in (-1, 1)
+    ]
+    assert sides == [True, False]
+    assert one.factor == (one.value / one.present if one.present else None)
+
+
+def test_every_stiffness_damping_and_delay_of_a_coupler_has_a_row() -> None:
+    assert list(rows_of(compiled(AVERAGE))) == [
+        *("contact.stiffness", "contact.damping", "coordination.stiffness", "coordination.damping"),
+        *("contact.delay", "coordination.delay", "lan.delay"),
+    ]
+    assert all(
+        one.value is not None or one.scanned > one.present for one in rows_of(compiled(AVERAGE)).values()
+    )
+
+
+@pytest.mark.parametrize(
+    ("scene", "names"),
+    [
+        (AVERAGE, ["contact.stiffness", "contact.damping", "coordination.damping", "contact.delay"]),
+        (PRESSED, ["contact.delay"]),
+        # Its equations ask how old packets are: a delay moves where a kind starts.
+        (DEAD_RECKONING, ["contact.delay"]),
+        (hasty("12 ms"), ["contact.stiffness", "coordination.stiffness", "contact.delay"]),
+        (hasty("30 ms"), ["contact.stiffness", "contact.delay"]),
+        # 250 states, 200 of them packets on their way.
+        (hasty("50 ms"), ["contact.delay"]),
+        # 72 states, of which each number moves as many.
+        ("different-peers", ["contact.stiffness", "coordination.damping"]),
+    ],
+    ids=["average", "pressed", "dead reckoning", "12 ms", "30 ms", "50 ms", "different"],
+)
+def test_a_margin_lies_between_two_analyses(scene: str, names: Sequence[str]) -> None:
+    system = compiled(scene) if "\n" in scene else apc.compile(HARD / f"{scene}.yaml")
+    rows = rows_of(system)
+    for name in names:
+        assert not rows[name].note
+        holds(system, rows[name])
+
+
+def test_a_delay_without_a_margin_is_stable_as_far_as_it_was_scanned() -> None:
+    system = compiled(DEAD_RECKONING)
+    row = rows_of(system)["coordination.delay"]
+    assert row.value is None
+    for share in (0.3, 0.6, 0.9):
+        assert apc.analyze(system, set={row.parameter: f"{share * row.scanned} s"}).stable
+
+
+def test_a_scene_that_is_not_stable_has_no_margins_and_says_so() -> None:
+    found = apc.margins(compiled(AVERAGE), set={"coordination.stiffness": "2000 N/m"})
+    assert found.rows == () and "not stable" in str(found)
+
+
+def test_a_delay_is_scanned_far_enough_or_said_not_to_be() -> None:
+    text = replaced(AVERAGE, (SAMPLED, SAMPLED.replace("1 ms", "0.13 ms")))
+    for one in rows_of(compiled(text)).values():
+        assert (one.value is not None or one.scanned >= 1.5 * one.present) and one.note == ""
+    # 0.95 ms and 1 ms meet at every twentieth of a millisecond.
+    found = apc.margins(compiled(replaced(text, ("network: 8 ms", "network: 0.95 ms"))))
+    row = next(one for one in found.rows if one.parameter == "lan.delay")
+    assert row.value is None and re.fullmatch(r"\d+ orders of events up to 0\.012\d* s", row.note)
+    assert f"not looked for: {row.note}" in str(found)
+
+
+@pytest.mark.whole
+def test_of_very_large_systems_delays_are_said_not_to_be_looked_for() -> None:
+    notes = {one.parameter: one.note for one in rows_of(apc.compile(HARD / "very-long-delay.yaml")).values()}
+    assert {notes[name] for name in ("contact.delay", "coordination.delay")} == {
+        "2,006 states in each order of events"
+    }
+
+
+def test_in_passing_what_takes_long_is_named_with_the_option_that_asks_for_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two users 100 ms apart: 400 packets on their way, in whose matrices a delay takes some 20 seconds."""
+    text = replaced(hasty("100 ms", "30 N/m"), ("1000 N/m", "100 N/m"))
+    (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
+    assert run(["analyze", str(tmp_path / "scene.yaml")]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"contact.delay +0.001 s +not looked for: takes long \(--margins\)", text)
+    assert "apc analyze --margins looks for what takes long" in " ".join(text.split())
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_margins_are_those_of_the_function_and_left_out_where_they_are_not_wanted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = str(tmp_path / "scene.yaml")
+    Path(path).write_text(AVERAGE.replace("delay: 8 ms}", "delay: 8 ms, loss: 1 %}"), "utf-8")
+    assert run(["analyze", path, "--no-margins"]) == 0
+    assert "margins not looked for: they were not wanted" in capsys.readouterr().out
+    text = str(apc.margins(compiled(AVERAGE)))
+    assert "none found up to" in text and max(map(len, text.splitlines())) <= 80
+    for words in ([], ["--margins"]):
+        assert run(["analyze", str(SCENES / "three-users-average.yaml"), *words]) == 0
+        assert text.rstrip() in capsys.readouterr().out

@@ -1,0 +1,239 @@
+"""What moves the spectral radius most: derivatives against 320 bits, and what is not told and why."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import apc
+from apc.compiler.compiled import CompiledSystem
+from apc.vary.sensitivity import Sensitivities
+from tests.bench.sensitivity_truth import check_sensitivities, run
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
+
+NAMES = sorted(path.stem for path in SCENES.glob("*.yaml") if path.stem != "template")
+GRAPH = ("delay: 8 ms}", "delay: 8 ms, graph: {edges: [[1, 2, 0.3], [1, 3, 0.3], [2, 3, 0.5]]}}")
+OWN = ("link: lan}", "link: lan, delays: own}")
+GROUPS = replaced(
+    AVERAGE, ("  user: {count: 3}", "  one: {count: 1, set: {device.mass: 0.14 kg}}\n  two: {count: 2}")
+)
+EQUAL = replaced(
+    AVERAGE,
+    ("  user: {count: 3}", "  one: {count: 1, set: {contact.stiffness: 1000 N/m}}\n  two: {count: 2}"),
+)
+UNCLOCKED = """\
+topology: unclocked
+peers: {{user: {{count: 2}}}}
+masses:
+  device: {{mass: {} kg, damping: {} N*s/m}}
+  cube: {{mass: {} kg, damping: {} N*s/m, shared: true}}
+couplers:
+  spring: {{type: SpringDamper, a: device, b: cube, stiffness: {} N/m, damping: {} N*s/m}}
+"""
+
+# A frame of 1 s, in which masses on a stiff damper settle 10³ to 10⁴ times over.
+SETTLING = [
+    ("0.012024990784370273", "0.0021282909", "2.024910856889678", "0.040052959", "88.04437", "63.6466"),
+    ("0.017405540793130555", "3.17138972e-6", "0.0118822421", "2.86345e-5", "0.74912642", "1.096408"),
+    ("0.0012563506546329", "0.0011384141", "0.01866965", "0.0101767", "0", "11.29332081"),
+]
+
+SCENE = {
+    "average": AVERAGE,
+    "mesh": MESH,
+    "a damped contact": replaced(AVERAGE, ("contact:      {", "contact:      {damping: 1 N*s/m, ")),
+    "groups": GROUPS,
+    "equal groups": EQUAL,
+    # With `delays: own` what is free follows the stiffnesses; without one of them there is more of it.
+    "held": replaced(MESH, GRAPH, OWN),
+    "held without contact": replaced(MESH, GRAPH, OWN, ("1000 N/m", "0 N/m")),
+    "held apart": replaced(MESH, GRAPH, OWN, ("500 N/m", "0 N/m")),
+    **{f"settling {place}": UNCLOCKED.format(*numbers) for place, numbers in enumerate(SETTLING)},
+}
+
+
+def shipped(name: str) -> CompiledSystem:
+    return apc.compile(SCENES / f"{name}.yaml")
+
+
+def rates(found: Sensitivities) -> dict[str, float | None]:
+    return {row.parameter: row.derivative for row in found.rows}
+
+
+@pytest.mark.parametrize("name", SCENE)
+def test_every_derivative_is_that_of_the_scene_in_320_bits(name: str) -> None:
+    found = apc.sensitivities(compiled(SCENE[name]))
+    assert found.rows or found.note
+    assert check_sensitivities(compiled(SCENE[name]), found) == ""
+
+
+@pytest.mark.parametrize("seed", [3, pytest.param(5, marks=pytest.mark.whole)])
+def test_every_derivative_and_frequency_of_random_scenes_is_right(seed: int) -> None:
+    assert run(3, seed=seed) == []
+
+
+def test_where_the_groups_differ_each_has_a_derivative_of_its_own() -> None:
+    own = replaced(GROUPS, ("two: {count: 2}", "two: {count: 2, set: {device.mass: 0.1 kg}}"))
+    found, other = (rates(apc.sensitivities(compiled(text))) for text in (GROUPS, own))
+    assert "device.mass" not in found.keys() | other.keys() and "cube.mass" in found
+    for name in ("one.device.mass", "two.device.mass"):
+        assert found[name] == pytest.approx(other[name], rel=1e-9)
+
+
+def changed(system: CompiledSystem, every: int) -> str:
+    """Set the number of every so many rows 1 ‰ off, as `--set` does; compare the radius with its row."""
+    found = apc.sensitivities(system)
+    radius = apc.analyze(system).spectral_radius
+    for name in [*dict.fromkeys(row.parameter for row in found.rows)][::every]:
+        rows = [row for row in found.rows if row.parameter == name]
+        if not rows[0].value:
+            continue
+        unit = "" if rows[0].unit == "1" else f" {rows[0].unit}"
+        low, high = (
+            apc.analyze(system, set={name: f"{rows[0].value * (1 + side)!r}{unit}"}).spectral_radius
+            for side in (-1e-3, 1e-3)
+        )
+        up, down, said = (high - radius) / 1e-3, (radius - low) / 1e-3, [row.relative for row in rows]
+        # The largest of those that share the radius decides on either side.
+        off = abs((up + down) / 2 - said[0])
+        if len(found.active) > 1:
+            off = max(abs(up - max(said)), abs(down - min(said)))
+        if not off <= 2e-3 * max(map(abs, said)) + 2e-6 + abs(up - down):
+            return f"{name}: {said}, but {down} and {up}"
+    return ""
+
+
+@pytest.mark.few(12)
+@pytest.mark.parametrize("every", [3, 1])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_row_says_what_setting_its_name_does(name: str, every: int) -> None:
+    assert changed(shipped(name), every) == ""
+
+
+@pytest.mark.parametrize("name", ["cube.mass", "coordination.stiffness", "coordination.damping"])
+def test_what_is_linearized_where_it_starts_is_differentiated_as_closely_as_what_is_linear(name: str) -> None:
+    system = shipped("experiment-average")
+    row = next(one for one in apc.sensitivities(system).rows if one.parameter == name)
+    step = 1e-4 * row.value
+    low, high = (
+        apc.analyze(system, set={name: f"{Fraction(row.value + side * step)} {row.unit}"}).spectral_radius
+        for side in (-1, 1)
+    )
+    # Off by step²/6 of the third derivative, some 1e-8, and by the roundings of ρ over the step.
+    assert row.derivative == pytest.approx((high - low) / (2 * step), rel=1e-5)
+
+
+def test_a_scene_linearized_within_its_limits_is_the_linear_one() -> None:
+    """Inside of its limits a saturated mesh is a mesh."""
+    text = replaced(GROUPS, ("AveragePosition", "FullMesh"))
+    bent = replaced(text, ("FullMesh,", "SaturatedMesh, limit: 2 N,"))
+    found, same = (apc.sensitivities(compiled(one)) for one in (bent, text))
+    for row in same.rows:
+        assert rates(found)[row.parameter] == pytest.approx(row.derivative, rel=1e-6, abs=1e-9)
+
+
+def test_where_the_radius_is_large_it_is_differentiated_all_the_same() -> None:
+    """A full mesh of 1,000: radius 6e7, of which a distance of 1e-10 is no float; by central differences."""
+    system = compiled(replaced(MESH, ("count: 3", "count: 1000")))
+    found = apc.sensitivities(system)
+    assert found.radius > 1e7 and found.active
+    for row in found.rows:
+        if row.parameter in ("contact.stiffness", "coordination.stiffness", "cube.mass"):
+            step = Fraction(row.value) / 10**6
+            low, high = (
+                apc.analyze(system, set={row.parameter: f"{Fraction(row.value) + side * step} {row.unit}"})
+                for side in (-1, 1)
+            )
+            rate = (high.spectral_radius - low.spectral_radius) / (2 * float(step))
+            assert row.derivative == pytest.approx(rate, rel=1e-6)
+
+
+def test_equal_groups_have_an_active_set_and_no_single_gradient() -> None:
+    """The difference modes of three equal users are two; changing one user alone moves them apart."""
+    found = apc.sensitivities(compiled(EQUAL))
+    assert len(found.active) == 2 and "share the radius" in found.note
+    told = sorted(row.derivative for row in found.rows if row.parameter == "one.contact.stiffness")
+    low, here, high = (
+        apc.analyze(compiled(EQUAL), set={"one.contact.stiffness": f"{1000 + side} N/m"}).spectral_radius
+        for side in (-1e-3, 0, 1e-3)
+    )
+    assert [(here - low) / 1e-3, (high - here) / 1e-3] == pytest.approx(told, rel=1e-4, abs=1e-9)
+
+
+def test_a_damping_of_nothing_has_the_derivative_of_what_it_adds_up_with() -> None:
+    """A finger's tip and the device it holds move as one: their dampings act as their sum, at 0 too."""
+    found = {row.parameter: row for row in apc.sensitivities(shipped("finger")).rows}
+    nothing, whole = found["finger.tip.damping"], found["device.damping"]
+    assert nothing.value == 0 and nothing.derivative == pytest.approx(whole.derivative, rel=1e-7)
+
+
+# ---- what is said ----
+
+
+def test_the_table_names_what_moves_most_in_80_columns_and_no_time_start_or_count() -> None:
+    found = apc.sensitivities(compiled(AVERAGE))
+    text = str(found)
+    assert "device.damping" in text.splitlines()[1] and max(map(len, text.splitlines())) <= 80
+    relative = [abs(row.relative) for row in found.rows]
+    assert relative == sorted(relative, reverse=True) and not np.isnan(relative).any()
+    assert rates(found).keys() == {
+        *("device.mass", "device.damping", "cube.mass", "cube.damping"),
+        *("contact.stiffness", "contact.damping", "coordination.stiffness", "coordination.damping"),
+    }
+
+
+def test_eigenvalues_that_change_alike_are_told_in_one_row() -> None:
+    lines = str(apc.sensitivities(shipped("experiment-average"))).splitlines()
+    names = [line.split()[0] for line in lines[1:-1]]
+    assert len(names) == len(set(names))
+    assert not any("mode" in line or "+0.00e+00" in line for line in lines[1:-1])
+    assert lines[-1] == "  2 eigenvalues share the radius: the largest of their changes decides"
+
+
+def test_a_radius_below_every_float_has_no_derivative() -> None:
+    """Rates of 10⁶/s over a frame of 1 s: e^(−10⁶) is no float."""
+    text = UNCLOCKED.format("1e-4", "100", "1e-4", "100", "1e6", "1")
+    arm = "hands: {arm: {type: SpringDamperArm, flange: device, stiffness: 1 N/um, damping: 100 N*s/m}}\n"
+    found = apc.sensitivities(compiled(replaced(text + arm, ("count: 2", "count: 1"))))
+    assert (found.radius, found.rows) == (0.0, ())
+    assert str(found) == "  what moves it most: nothing, as every motion dies out to 0 within a frame"
+
+
+def test_what_would_move_a_motion_left_out_is_named_and_not_differentiated(tmp_path: Path) -> None:
+    """An integrator nobody reads stands still where its leak is 1, and nowhere else."""
+    part = """\
+component: Integrator
+about: Adds up where it is.
+connectors: {a: Flange}
+parameters: {kp: {unit: N/m}, ki: {unit: N/m}, leak: {unit: 1}, clock: clock}
+variables: {s: {unit: m, start: 0 m}, f: {unit: N}}
+equations:
+  - s = leak*previous(s) + sample(a.x)
+  - f = kp*sample(a.x) + ki*s
+  - a.f = hold(f)
+"""
+    text = """\
+topology: unread
+clocks: {haptic: 1 ms}
+peers: {user: {count: 1}}
+masses:
+  device: {mass: 0.1 kg, damping: 5 N*s/m}
+couplers:
+  p: {type: Integrator, a: device, kp: 100 N/m, ki: 0 N/m, leak: 1, clock: haptic}
+"""
+    system = compiled(text, library(tmp_path, part))
+    found = apc.sensitivities(system)
+    assert found.note == "p.ki, p.leak would move what was left out, and are not among these"
+    assert rates(found).keys() == {"device.mass", "device.damping", "p.kp"}
+    assert check_sensitivities(system, found) == ""
+    analysis = apc.analyze(system)
+    assert (analysis.verdict, analysis.rigid_modes, analysis.translations) == ("stable", 1, 0)
+    assert analysis.unfelt == ("p.s",) and "Nothing ties" not in str(analysis)
+    # Without the spring the device translates, and the integrator adds up where to: no drift.
+    loose = apc.analyze(system, set={"p.kp": "0 N/m"})
+    assert (loose.verdict, loose.stable, loose.translations) == ("stable up to a common translation", True, 1)
+    felt = apc.analyze(system, set={"p.ki": "1 N/m"})
+    assert (felt.rigid_modes, felt.unfelt) == (0, ())
