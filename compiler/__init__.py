@@ -5,9 +5,9 @@ files                       what is read and written, whoever named it
 multiples                   common multiples and divisors of exact times
 weights                     exact sums of the decimals by which peers weigh one another
 source                      nodes, yaml_faults, compose: YAML to nodes; reading: typed values out of nodes
-language                    expression, lexer, grammar: text to trees; evaluation: trees to formulas and
+language                    expression, parsing, grammar: text to trees; evaluation: trees to formulas and
                             values
-                            dimensions, si_forms, unit_grammar, unit_names, units, unit_text, unit_check
+                            dimensions, si_forms, units, unit_text, unit_check
                             vectors; values, tables, recordings: numbers of a scene, and in CSV files
                             probes: of what ping and irtt wrote
 components                  component, parts, declarations, component_check, definitions, library
@@ -21,11 +21,11 @@ equations                   connections: where connectors meet; flatten
                             and states; structure
 functions                   casadi_writer, reached: what is written; exchange: what lies beside;
                             functions
-compiled, plain, formula    the compiled model; its functions as data; numbers that follow from others
+compiled, plain, formula    the compiled model; operations of its functions; numbers that follow from others
 interpolation               tables over time in these functions
 crowd                       how many peers there are, and how many each hears
 store                       the compiled model on disk
 seal, cache                 what this user's apc wrote; whether it still is what its texts compile to
 pipeline                    the stages one after another
-view                        schema; catalogue: the library; diagram; svg, layers, picture; stages, listing
+view                        schema; catalogue: the library; diagram; stages, listing
 """

@@ -1,19 +1,22 @@
 """Whether a compiled model on disk is still what its texts compile to.
 
-Takes: the path of a NAME.apc. Gives: `read_archive`, its document and arrays as they are; `Record`, what it
-was made from, and `changed`, the first of it that is different now.
-Guarantees: decided by content alone: no modification time, nothing unpickled, no algebra imported; nothing is
-unpacked that is larger than a model; a file that is damaged or of another format has no record.
-Does not: compile, or read what a model holds (see `store`).
+Takes: the path of a NAME.apc. Gives: `Origin`, what a model was made from, and `origin_of`, `replayable`;
+`packed` and `read_archive`, the file and its parts; `changed`, the first text that is different now;
+`builtin_files`, `program_digest`.
+Guarantees: decided by content alone: no modification time, no algebra imported; a model is handed on unread,
+and only what this user's seal says is this user's counts as such.
+Does not: compile, or read the model itself (see `store`).
 
-What a model was made from, by name:
+A text has the name by which the topology gives it:
 
-    scene.yaml      the topology, beside the model
-    ./users.csv     a table the topology names, from the topology's folder
-    ./parts/        a folder of the user's own components: all definitions in it
-    Mass            a definition of the built-in library
-    apc             the compiler itself: all its modules
-    casadi          the library that writes the functions, by its version
+    scene.yaml         the topology, beside the model
+    ./users.csv        a table it names, from the topology's folder
+    ./parts/           a folder of the user's own components: the names of its files, a line each
+    ./parts/tie.yaml   one of these
+    Mass               a definition of the built-in library
+
+The file is four lines: `apc`, the format and whether the model is as its texts compile ("compiled") or may
+have been changed since ("saved"); the seal of all else; the origin as JSON; the model.
 """
 
 from __future__ import annotations
@@ -21,215 +24,173 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib.util
-import io
-import json
-import lzma
 import os
 import re
-import struct
-import zipfile
-import zlib
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
-from typing import Any
 
+import msgspec
+
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, files_below, read_file
-from apc.compiler.seal import is_sealed
+from apc.compiler.seal import is_sealed, seal
 
-FORMAT = 12  # of NAME.apc
-MEMBER = "model.json"  # of the archive: structure, numbers and the digests of the other members
-FIELDS = {"format", "system", "members"}  # of the document
-SEAL = "seal"  # of the archive: who wrote the document, see `seal`
-LARGEST = 256 * 2**20  # bytes of the file, and of all members
-MOST_LISTED = 2**22  # bytes of the archive's list of members: each takes ten times that of memory
-MOST_VALUES = 2**22  # in the document: each takes up to a hundred bytes of memory
+FORMAT = 13  # of NAME.apc
+LARGEST = 256 * 2**20  # bytes of the file
+LARGEST_ORIGIN = 64 * 2**20  # bytes of its third line, each of which takes up to ten of memory
 SUFFIX = ".yaml"  # of the files in a folder of components
-PROGRAM = "apc"
-LIBRARIES = ("casadi",)  # a newer one may write other functions
-# What zipfile, its decompressors, json and our own reading of the document raise at what isn't theirs.
-DAMAGE = (
-    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, NotImplementedError),
-    *(AttributeError, KeyError, IndexError, ValueError, TypeError, RuntimeError, ArithmeticError),
-)
+HANDS_CHANGE = "hands"  # what stands in the place of a number's name where hands were put to devices
+_RATIONAL = re.compile(r"-?[0-9]{1,4000}(/[1-9][0-9]{,4000})?")
+FOREIGN = "is damaged: it is not what apc compile writes"
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
-    """What a model says it was made from: its topology's name, and the digest of every text by name."""
+class Origin:
+    """What a model was made from.
+
+    `texts` are the topology, whose name is `topology`, and all it needs, in bytes by name; `program` is the
+    digest of what compiled them. `changes` were made afterwards, each at once: names of numbers with values
+    in SI, or `HANDS_CHANGE` and which hands (see `frame.devices`).
+    """
 
     topology: str
-    texts: tuple[tuple[str, str], ...]
+    texts: tuple[tuple[str, bytes], ...] = ()
+    program: str = ""
+    changes: tuple[tuple[tuple[str, str], ...], ...] = ()
+
+    @property
+    def digests(self) -> tuple[tuple[str, str], ...]:
+        """The SHA-256 of every text, and of the program, by name."""
+        texts = ((name, hashlib.sha256(text).hexdigest()) for name, text in self.texts)
+        return (*texts, ("apc", self.program))
+
+    def after(self, *change: tuple[str, str]) -> Origin:
+        """Return the origin of a model that is changed once more."""
+        return replace(self, changes=(*self.changes, change))
 
 
 @dataclass(frozen=True, slots=True)
 class Archive:
-    """A model's file, unpacked: its JSON, the bytes of its arrays by name, and whether this user wrote it."""
+    """A model's file in its parts; `sealed` if this user wrote it, `compiled` if it is as it was compiled."""
 
-    document: Any
-    members: dict[str, bytes]
+    origin: Origin
+    model: bytes
     sealed: bool
+    compiled: bool
 
 
-class DamageError(ValueError):
-    """What is wrong with a file, for a person."""
+def packed(origin: Origin, model: bytes, *, compiled: bool) -> bytes:
+    """Return the content of a model's file, under this user's seal."""
+    head = f"apc {FORMAT} {'compiled' if compiled else 'saved'}".encode()
+    body = msgspec.json.encode(origin) + b"\n" + model
+    return b"\n".join((head, seal(head + b"\n" + body).encode(), body))
 
 
 def read_archive(path: Path) -> Archive:
-    """Unpack a compiled model.
+    """Take a model's file apart.
 
     Raises
     ------
-    RefusedError
-        The file can't be read.
-    DamageError
-        It unpacks to more than a model can be, or a member was changed.
-    ValueError
-        Or another of DAMAGE: it is none. A document of another format is returned without members.
+    ApcError
+        E602 it can't be read, E603 it is of another format, E604 it is damaged.
     """
-    members = unzipped(read_file(path, LARGEST), LARGEST)
-    text = members.pop(MEMBER)
-    found = members.pop(SEAL, b"").decode()
-    if sum(map(text.count, (b"[", b"{", b","))) > MOST_VALUES:
-        raise DamageError(f"it holds more than {MOST_VALUES} values")
-    document = json.loads(text)
-    if document["format"] != FORMAT:
-        return Archive(document, {}, sealed=False)
-    if members.keys() != document["members"].keys() or document.keys() != FIELDS:
-        raise ValueError("it holds what nothing names")
-    for name, digest in document["members"].items():
-        if hashlib.sha256(members[name]).hexdigest() != digest:
-            raise DamageError(f"its member {name} was changed")
-    return Archive(document, members, is_sealed(text, found))
+    try:
+        data = read_file(path, LARGEST)
+    except RefusedError as refused:
+        hint = "apc compile" if refused.why == "missing" else ""
+        other = ", not a compiled model" if refused.why in ("folder", "special") else ""
+        raise ApcError(Mistake("E602", Place(str(path)), f"{refused.words}{other}", hint=hint)) from None
+    hint = f"apc compile {path.with_suffix(SUFFIX)}"
+    head, mark, origin, model = (*data.split(b"\n", 3), b"", b"", b"")[:4]
+    form = re.fullmatch(rb"apc ([0-9]{1,6}) (compiled|saved)", head)
+    if form and int(form[1]) != FORMAT:
+        what = f"has format version {int(form[1])}, this program reads version {FORMAT}"
+        raise ApcError(Mistake("E603", Place(str(path)), what, hint=hint))
+    try:
+        if form is None or len(origin) > LARGEST_ORIGIN:
+            raise ValueError
+        made_from = msgspec.json.decode(origin, type=Origin)
+        name = made_from.topology
+        if name in ("", "..") or PurePath(name).name != name or name not in dict(made_from.texts):
+            raise ValueError
+        numbers = (one for change in made_from.changes for one in change if one[0] != HANDS_CHANGE)
+        if not all(_RATIONAL.fullmatch(value) for _, value in numbers):
+            raise ValueError
+    except ValueError:
+        raise ApcError(Mistake("E604", Place(str(path)), FOREIGN, hint=hint)) from None
+    whole = b"\n".join((head, origin, model))
+    return Archive(made_from, model, is_sealed(whole, mark.decode("latin-1")), form[2] == b"compiled")
 
 
-def unzipped(data: bytes, most: int, names: re.Pattern[str] | None = None) -> dict[str, bytes]:
-    """Return the members of a ZIP archive.
-
-    Parameters
-    ----------
-    data
-        The archive.
-    most
-        How many bytes all of them may have.
-    names
-        What each must be called.
-
-    Raises
-    ------
-    DamageError
-        It unpacks to more, or a member is called otherwise.
-    ValueError
-        Or another of DAMAGE: it is none, or holds a name twice.
-    """
-    _check_end(data)
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        listed = archive.infolist()
-        if any(one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for one in listed):
-            raise ValueError("it is packed otherwise")
-        if sum(one.file_size for one in listed) > most:
-            raise DamageError(f"it unpacks to more than {most >> 20} MiB")
-        if names is not None and not all(names.fullmatch(one.filename) for one in listed):
-            raise DamageError("it holds what does not belong there")
-        if len({one.filename for one in listed}) < len(listed):
-            raise ValueError("it holds a name twice")
-        return {one.filename: _member(archive, one) for one in listed}
-
-
-def _check_end(data: bytes) -> None:
-    """Check that an archive ends where its file does, and that its list of members is no larger than said.
-
-    The last bytes of a ZIP archive: a mark, four numbers of disks and members, how long the list is and where
-    it begins, how long a comment. A longer form of the same may be pointed at before: no model needs it.
-    """
-    end = struct.Struct("<4s4H2LH")
-    mark, *_, size, begin, comment = end.unpack(data[-end.size :])
-    longer = data[-end.size - 20 :].startswith(b"PK\x06\x07")
-    if mark != b"PK\x05\x06" or comment or longer or begin + size + end.size != len(data):
-        raise ValueError("there is something else in it")
-    if size > MOST_LISTED:
-        raise DamageError(f"its list of members is larger than {MOST_LISTED >> 20} MiB")
-
-
-def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    """Return a member, no more of it than the archive's list says, whatever it would unpack to."""
-    with archive.open(member) as stream:
-        return stream.read(member.file_size)
-
-
-def record_of(archive: Archive) -> Record:
-    """Return what an unpacked model was made from, as far as it may be looked up.
-
-    What has no seal may name any file or folder of the machine: of its texts only the topology beside it is
-    looked at, and what comes with the program. Raises one of DAMAGE if it doesn't say.
-    """
-    origin = archive.document["system"]["origin"]
-    topology = str(origin["topology"])
-    if topology in ("", "..") or PurePath(topology).name != topology or "\0" in topology:
-        raise ValueError("the topology is not beside it")
-    texts = tuple((str(name), str(digest)) for name, digest in origin["texts"])
-    if not archive.sealed:
-        texts = tuple(one for one in texts if one[0] == topology or not _is_path(one[0]))
-    return Record(topology, texts)
-
-
-def changed(record: Record, folder: Path) -> str:
+def changed(archive: Archive, folder: Path) -> str:
     """Return the name of the first text that is different now, in words; empty when none is.
 
+    What has no seal may name any file or folder of the machine: of its texts only the topology is looked at.
+
     Parameters
     ----------
-    record
-        What the model was made from.
+    archive
+        A model's file.
     folder
         Where its topology is.
     """
-    if not {PROGRAM, *LIBRARIES, record.topology} <= dict(record.texts).keys():
-        return "apc itself"  # a model that doesn't say what it was made from wasn't made by this one
-    for name, digest in record.texts:
-        if name == PROGRAM:
-            now, shown = program_digest(), "apc itself"
-        elif name in LIBRARIES:
-            now, shown = library_digest(name), name
-        elif name == record.topology or _is_path(name):
-            now, shown = _path_digest(folder / name), name.removeprefix("./")
-        else:
-            now, shown = builtin_digest(name), f"the library's {name}"
-        if now != digest or not now:
-            return shown
+    for name, text in archive.origin.texts:
+        path = builtin_files().get(name)
+        if (archive.sealed or name == archive.origin.topology) and _now(path or folder / name, name) != text:
+            return f"the library's {name}" if path else name.removeprefix("./")
     return ""
 
 
-def origin_texts(
-    topology: tuple[str, str],
-    files: Iterable[tuple[str, str]],
-    folders: Iterable[str],
-    definitions: Iterable[tuple[str, str]],
-    where: Path,
-) -> tuple[tuple[str, str], ...]:
-    """Return what a model is made from, in the form `changed` compares.
+def _now(path: Path, name: str) -> bytes | None:
+    """Return a text as it is now, None if it can't be read."""
+    try:
+        if name.endswith("/"):
+            return "\n".join(str(file.relative_to(path)) for file in files_below(path, SUFFIX)).encode()
+        return read_file(path, LARGEST)
+    except (RefusedError, ValueError):  # ValueError: a name that is no text
+        return None
+
+
+def origin_of(topology: Path, read: Mapping[str, bytes]) -> Origin:
+    """Return what a model was made from.
 
     Parameters
     ----------
     topology
-        The topology's file name and digest.
-    files
-        The tables the topology names, as it names them, and their digests.
-    folders
-        The folders of components it names.
-    definitions
-        The components and connectors read and their digests; those that are not the built-in library's are
-        counted with their folder.
-    where
-        The topology's folder.
+        Its file.
+    read
+        What `files.recorded` noted.
     """
-    texts = [topology]
-    texts += [(_relative(name), digest) for name, digest in files]
-    for name in folders:
-        shown = _relative(name).rstrip("/") + "/"
-        texts.append((shown, _path_digest(where / shown)))
-    texts += [(name, digest) for name, digest in definitions if builtin_digest(name) == digest]
-    libraries = [(name, library_digest(name)) for name in LIBRARIES]
-    return (*dict.fromkeys(texts), *libraries, (PROGRAM, program_digest()))
+    builtin = {str(path): name for name, path in builtin_files().items()}
+    texts = {builtin.get(path) or _name(path, topology): text for path, text in read.items()}
+    return Origin(topology.name, tuple(sorted(texts.items())), program_digest())
+
+
+def _name(path: str, topology: Path) -> str:
+    """Return a file's name from the topology's folder, with a slash at its end for a folder."""
+    plain = PurePath(path)
+    if plain == topology or not plain.is_relative_to(topology.parent):
+        return topology.name if plain == topology else path
+    return f"./{plain.relative_to(topology.parent).as_posix()}{'/' * path.endswith('/')}"
+
+
+def replayable(origin: Origin, folder: Path) -> dict[str, bytes]:
+    """Return a model's texts, and the built-in library, by the paths where `files.replayed` looks for them.
+
+    Parameters
+    ----------
+    origin
+        What the model was made from.
+    folder
+        Where its topology is thought to be.
+    """
+    builtin = builtin_files()
+    texts = {str(path): path.read_bytes() for path in builtin.values()}
+    for name, text in origin.texts:
+        path = os.path.abspath(builtin.get(name, folder / name))  # noqa: PTH100 -- Path keeps what is above
+        texts[path + "/" * name.endswith("/")] = text
+    return texts
 
 
 @functools.cache
@@ -244,59 +205,17 @@ def builtin_files() -> dict[str, Path]:
     }
 
 
-def builtin_digest(name: str) -> str:
-    """Return the SHA-256 of a definition of the built-in library; empty if there is none of that name."""
-    path = builtin_files().get(name)
-    return "" if path is None else _path_digest(path)
-
-
 @functools.cache
 def program_digest() -> str:
-    """Return the SHA-256 of what compiles: every module of the compiler."""
-    whole = hashlib.sha256()
-    compiler = Path(__file__).resolve().parent
+    """Return the SHA-256 of what compiles: every module of the compiler, and the version of CasADi.
+
+    The version is in the name of a folder beside it: importing it would take longer than all else here.
+    """
+    compiler, casadi = Path(__file__).resolve().parent, importlib.util.find_spec("casadi")
+    assert casadi is not None and casadi.origin is not None
+    versions = sorted(path.name for path in Path(casadi.origin).parents[1].glob("casadi-*-info"))
+    whole = hashlib.sha256("/".join(versions).encode())
     for path in sorted(compiler.rglob("*.py")):
         whole.update(f"\0{path.relative_to(compiler)}\0".encode())
         whole.update(path.read_bytes())
     return whole.hexdigest()
-
-
-@functools.cache
-def library_digest(name: str) -> str:
-    """Return the SHA-256 of an installed library's version; empty if it is not installed.
-
-    The version is in the name of the folder beside it, such as `casadi-3.7.0.dist-info`: importing the
-    library, or `importlib.metadata`, takes longer than all else here. One that was built by hand may have no
-    such folder, and then has no version.
-    """
-    spec = importlib.util.find_spec(name)
-    if spec is None or spec.origin is None:
-        return ""
-    folder = Path(spec.origin).parent.parent
-    versions = sorted(path.name for path in folder.glob(f"{name}-*-info"))
-    return hashlib.sha256("/".join(versions).encode()).hexdigest()
-
-
-def _is_path(name: str) -> bool:
-    return name.startswith(("./", "../")) or PurePath(name).is_absolute()
-
-
-def _relative(name: str) -> str:
-    plain = PurePath(name).as_posix()
-    return plain if _is_path(plain) else f"./{plain}"
-
-
-def _path_digest(path: Path) -> str:
-    """Return the SHA-256 of a file, or of a folder's YAML files and their names; empty if it isn't read."""
-    try:
-        if not os.path.isdir(path):  # noqa: PTH112 -- of any name, even one that no file can have
-            return hashlib.sha256(read_file(path, LARGEST)).hexdigest()
-        whole, rest = hashlib.sha256(), LARGEST
-        for file in files_below(path, SUFFIX):
-            content = read_file(file, rest)
-            rest -= len(content)
-            digest = hashlib.sha256(content).hexdigest()
-            whole.update(f"{file.relative_to(path).as_posix()}\0{digest}\n".encode())
-        return whole.hexdigest()
-    except (RefusedError, ValueError):  # ValueError: a name that is no text
-        return ""

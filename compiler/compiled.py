@@ -1,7 +1,8 @@
 """The compiled model: CasADi functions of one site per kind, and the exchange between sites as structure.
 
 Takes: nothing (these are the data types the stage `functions` fills and the runtime reads).
-Gives: `CompiledSystem` and its parts; `PEERS`, `count_of`, `group_count`, `counts_peers`; `LENGTH`, `ANGLES`.
+Gives: `CompiledSystem` and its parts, but `Origin` (see `cache`);
+`PEERS`, `count_of`, `group_count`, `counts_peers`; `LENGTH`, `ANGLES`.
 Guarantees: plain frozen data; numbers in SI; periods, phases and delays exact rationals of a second.
 Does not: evaluate anything, or read or write files (see `store`).
 
@@ -19,10 +20,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
 
+import casadi
 import numpy as np
 from numpy.typing import NDArray
+
+from apc.compiler.cache import Origin
+from apc.compiler.plain import PlainFunction
 
 # The units of positions: a length; an angle, or what stands for one where a body turns in space.
 LENGTH, ANGLES = "m", ("rad", "1")
@@ -148,7 +152,7 @@ class Formula:
     text: str
     names: tuple[str, ...]
     numbers: tuple[Fraction, ...]
-    function: Any  # plain.PlainFunction
+    function: PlainFunction
     spans: tuple[tuple[int, int], ...]
 
 
@@ -232,7 +236,7 @@ class Receive:
     operator: str
     link: str
     channel: int
-    edge: Any | None = None  # casadi.Function
+    edge: casadi.Function | None = None
     age: str = ""
     before: bool = False
 
@@ -253,7 +257,7 @@ class ClockPartition:
     memories: tuple[int, ...]
     starts: tuple[str, ...]
     receives: tuple[Receive, ...]
-    tick: Any  # casadi.Function
+    tick: casadi.Function
     variants: tuple[int, ...] = ()
 
 
@@ -264,7 +268,7 @@ class SendPartition:
     link: str
     channels: tuple[str, ...]
     units: tuple[str, ...]
-    send: Any  # casadi.Function
+    send: casadi.Function
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,7 +280,7 @@ class Ports:
     """
 
     parts: tuple[str, ...]
-    port: Any  # casadi.Function
+    port: casadi.Function
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,7 +293,7 @@ class Limit:
     name: str
     unit: str
     limit: str
-    value: Any | None  # casadi.Function
+    value: casadi.Function | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -305,7 +309,7 @@ class Kind:
     states: tuple[State, ...]
     holds: tuple[Hold, ...]
     parameters: tuple[str, ...]
-    derivative: Any  # casadi.Function
+    derivative: casadi.Function
     clocks: tuple[ClockPartition, ...]
     sends: tuple[SendPartition, ...]
     ports: Ports | None = None
@@ -336,14 +340,6 @@ class Group:
     kind: int
     values: tuple[Parameter, ...] = ()
     columns: tuple[Column, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Origin:
-    """What the model was compiled from: the topology's path and the SHA-256 of every text read."""
-
-    topology: str
-    texts: tuple[tuple[str, str], ...]  # (path or library name, hexadecimal digest)
 
 
 @dataclass(frozen=True, slots=True)

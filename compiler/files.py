@@ -1,8 +1,9 @@
 """What is read from disk and written to it, whoever named the file.
 
-Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `same_file`;
-`write_file`, `write_text`, `write_texts`, `check_target`, `unwritable`, `is_special`, `is_stdout`, and for
-what is written piece by piece `begin_file`, `finish_file`, `drop_file`, `partial_name`; `unlink_link`.
+Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `same_file`; `recorded`,
+`replayed`; `write_file`, `write_bytes`, `write_text`, `write_texts`, `check_target`, `unwritable`,
+`is_special`, `is_stdout`, and for what is written piece by piece `begin_file`, `finish_file`, `drop_file`,
+`partial_name`; `unlink_link`.
 Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
 waited for. What is written is there whole or not at all, and what a writer left that was killed goes with the
 next: a file is replaced by one of its mode and owner unless it is read-only, a link stays and its file is
@@ -16,7 +17,9 @@ import os
 import shutil
 import stat
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Literal
 
@@ -45,8 +48,49 @@ class RefusedError(Exception):
         self.why, self.words = why, words
 
 
+# What is read is put into the one by its path, and comes from the other alone (see `recorded`, `replayed`).
+_record: ContextVar[dict[str, bytes] | None] = ContextVar("record", default=None)
+_replay: ContextVar[Mapping[str, bytes] | None] = ContextVar("replay", default=None)
+
+
+@contextmanager
+def recorded(texts: dict[str, bytes]) -> Iterator[None]:
+    """Put the bytes of every file that is read meanwhile into `texts`, by its path.
+
+    Of a folder, by its path and a slash, these are the files that were listed of it, a line each.
+    """
+    token = _record.set(texts)
+    try:
+        yield
+    finally:
+        _record.reset(token)
+
+
+@contextmanager
+def replayed(texts: Mapping[str, bytes]) -> Iterator[None]:
+    """Read meanwhile what was recorded, by absolute path, instead of any file or folder."""
+    token = _replay.set(texts)
+    try:
+        yield
+    finally:
+        _replay.reset(token)
+
+
+def _replayed(path: str, texts: Mapping[str, bytes]) -> bytes:
+    """Return what stands for a file or, with a slash at its end, for a folder. Raises RefusedError."""
+    key = os.path.abspath(path) + "/" * path.endswith("/")  # noqa: PTH100 -- a folder's slash would be lost
+    if key not in texts:
+        raise RefusedError("missing", "does not exist")
+    return texts[key]
+
+
+def _note(path: str, data: bytes) -> None:
+    if (texts := _record.get()) is not None:
+        texts[path] = data
+
+
 def read_file(path: Path, most: int) -> bytes:
-    """Return the bytes of a regular file.
+    """Return the bytes of a regular file, or what stands for it (see `replayed`).
 
     Parameters
     ----------
@@ -60,6 +104,15 @@ def read_file(path: Path, most: int) -> bytes:
     RefusedError
         It isn't there, is no regular file, is larger, or can't be read.
     """
+    texts = _replay.get()
+    data = _read(path, most) if texts is None else _replayed(str(path), texts)
+    if len(data) > most:  # it grew meanwhile
+        raise _too_large(most)
+    _note(str(path), data)
+    return data
+
+
+def _read(path: Path, most: int) -> bytes:
     try:
         check_file(path, most)  # first, as opening a device can already do something
         with open(path, "rb", opener=_without_waiting) as stream:
@@ -70,8 +123,6 @@ def read_file(path: Path, most: int) -> bytes:
                 data += stream.read(most + 1 - len(data))
     except (OSError, ValueError) as error:
         raise _refusal(error) from None
-    if len(data) > most:  # it grew meanwhile
-        raise _too_large(most)
     return data
 
 
@@ -135,6 +186,16 @@ def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
         It can't be read, is or holds a folder of the kernel's, has more than `MOST_ENTRIES` entries, or is
         more than `MOST_DEPTH` folders deep.
     """
+    texts = _replay.get()
+    if texts is None:
+        names = "\n".join(str(path.relative_to(folder)) for path in _walked(folder, suffix))
+    else:
+        names = os.fsdecode(_replayed(f"{folder}/", texts))
+    _note(f"{folder}/", os.fsencode(names))
+    return tuple(folder / name for name in names.split("\n") if name)
+
+
+def _walked(folder: Path, suffix: str) -> tuple[Path, ...]:
     kernels = _kernels_devices()
     found: list[Path] = []
     seen = 0
@@ -198,13 +259,18 @@ def write_file(path: Path, write: Callable[[Path], None]) -> None:
         raise
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text and the end of its last line, whole or not at all. Raises ApcError (E601) if it can't."""
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file, whole or not at all. Raises ApcError (E601) if it can't be written."""
 
     def write(temporary: Path) -> None:
-        temporary.write_bytes(f"{text}\n".encode())
+        temporary.write_bytes(content)
 
     write_file(path, write)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text and the end of its last line, whole or not at all. Raises ApcError (E601) if it can't."""
+    write_bytes(path, f"{text}\n".encode())
 
 
 def write_texts(texts: Mapping[Path, str]) -> None:

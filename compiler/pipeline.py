@@ -11,16 +11,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
-from apc.compiler.cache import origin_texts
-from apc.compiler.compiled import CompiledSystem, Origin
+from apc.compiler.cache import Origin, origin_of, replayable
+from apc.compiler.compiled import CompiledSystem
 from apc.compiler.components.library import Library, definition_of
 from apc.compiler.equations.clocks import ClockedSystem, check_alone, partition
 from apc.compiler.equations.flatten import FlatSystem, flatten
 from apc.compiler.equations.structure import SortedSystem, sort
 from apc.compiler.errors import ApcError, Mistakes, Place
+from apc.compiler.files import recorded, replayed
 from apc.compiler.functions.functions import build_functions
 from apc.compiler.scene.scene import Scene, build_scene, library_folders
-from apc.compiler.source.nodes import Mapping, Scalar, Sequence
 from apc.compiler.source.source import Source, read_source
 from apc.compiler.timings import part
 
@@ -34,6 +34,25 @@ def compile_topology(path: Path) -> CompiledSystem:
     value = run_stages(path, until="compiled")
     assert isinstance(value, CompiledSystem)
     return value
+
+
+def compile_again(origin: Origin, folder: Path) -> CompiledSystem:
+    """Compile the texts that a model was made from; no file of theirs is read.
+
+    Parameters
+    ----------
+    origin
+        The texts.
+    folder
+        Where they are said to stand in messages.
+
+    Raises
+    ------
+    ApcError
+        Their mistakes.
+    """
+    with replayed(replayable(origin, folder)):
+        return compile_topology(folder / origin.topology)
 
 
 def check_definition(path: Path) -> str:
@@ -76,17 +95,26 @@ def run_stages(path: Path, *, until: Stage) -> StageValue:
 
 def each_stage(path: Path) -> Iterator[tuple[Stage, StageValue]]:
     """Run the stages one by one, yielding each one's name and value as soon as it is done."""
-    with part("source"):
+    texts: dict[str, bytes] = {}
+    with part("source"), recorded(texts):
         source = read_source(path)
-    yield from stages_of(source)
+    yield from stages_of(source, texts)
 
 
-def stages_of(source: Source) -> Iterator[tuple[Stage, StageValue]]:
-    """Run the stages one by one on a source that has a path, whether or not its text is what stands there."""
+def stages_of(source: Source, texts: dict[str, bytes] | None = None) -> Iterator[tuple[Stage, StageValue]]:
+    """Run the stages one by one on a source that has a path.
+
+    Parameters
+    ----------
+    source
+        The topology.
+    texts
+        What was read for it by path, if that is what stands there; gets what else is read.
+    """
     assert source.path is not None
-    path = source.path
+    path, texts = source.path, {} if texts is None else texts
     yield "source", source
-    with part("scene"):
+    with part("scene"), recorded(texts):
         library = Library(library_folders(source))
         scene = build_scene(source, library)
     yield "scene", scene
@@ -100,16 +128,5 @@ def stages_of(source: Source) -> Iterator[tuple[Stage, StageValue]]:
         sorted_system = sort(clocked)
     yield "sorted", sorted_system
     with part("compiled"):
-        texts = origin_texts(
-            (path.name, source.digest), scene.texts, _folders_named(source), library.texts, path.parent
-        )
-        system = build_functions(sorted_system, Origin(path.name, texts))
+        system = build_functions(sorted_system, origin_of(path, texts))
     yield "compiled", system
-
-
-def _folders_named(source: Source) -> Iterator[str]:
-    """Yield the folders of components as the topology names them."""
-    node = source.root.get("library") if isinstance(source.root, Mapping) else None
-    for item in node.items if isinstance(node, Sequence) else (node,):
-        if isinstance(item, Scalar):
-            yield item.text

@@ -23,33 +23,16 @@ from __future__ import annotations
 import functools
 import math
 import operator
-import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import casadi
-import numpy as np
 
 from apc.compiler.interpolation import TABLE, Interpolation, function_of, table_of
 
-_UNARY = {
-    name: getattr(casadi, f"OP_{name.upper()}")
-    for name in (
-        *("neg", "sq", "twice", "inv", "sqrt", "exp", "log", "fabs", "sign", "floor", "ceil", "not"),
-        *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
-    )
-}
-_BINARY = {
-    name: getattr(casadi, f"OP_{name.upper()}")
-    for name in (
-        *("add", "sub", "mul", "div", "pow", "constpow", "fmin", "fmax", "atan2"),
-        *("lt", "le", "eq", "ne", "and", "or", "if_else_zero"),
-    )
-}
-_NAMES = {code: name for name, code in (_UNARY | _BINARY).items()}
-LOOK = "interpolate"  # in a table, whose number comes first; "slope" is in what is derived from a function
+LOOK, SLOPE = "interpolate", "slope"  # of a table, whose number comes first, and of its lines
 
 
 def _quotient(above: Any, below: Any) -> Any:
@@ -83,8 +66,8 @@ RULES: dict[str, Callable[..., Any]] = {
     "or": lambda a, b: int(a != 0 or b != 0),
     # The product with a condition: zero whatever b is, when the condition is false.
     "if_else_zero": lambda a, b: b if a != 0 else 0 * b,
-    "interpolate": lambda table, at: table.value(at, float),
-    "slope": lambda table, at: table.slope(at, float),
+    LOOK: lambda table, at: table.value(at, float),
+    SLOPE: lambda table, at: table.slope(at, float),
 }
 
 # Those that have no rational value of a rational number.
@@ -95,70 +78,31 @@ ROUNDED: dict[str, Callable[..., float]] = {
         "atan2",
     )
 }
-_WORD = re.compile(r"[a-zA-Z][a-zA-Z0-9]*(_[a-zA-Z0-9]+)*\Z", re.ASCII)  # what CasADi takes as a name
-LONGEST_WORD = 200
+_CODES = {
+    word: getattr(casadi, f"OP_{word.upper()}")
+    for word in (*RULES, *ROUNDED, "pow", "constpow")
+    if word not in (LOOK, SLOPE)
+}
+_NAMES = {code: word for word, code in _CODES.items()}
 # CasADi's Newton iteration ends before it takes a step smaller than this, in SI. That step is taken
 # afterwards and squares the error: the rest is rounding. A bound on the residual would depend on its scale.
+POLISH = "polish"  # what that step is called
 NEWTON = {"abstol": 0.0, "abstolStep": 1e-11, "max_iter": 100, "show_eval_warnings": False}
-
-_Columns = tuple[tuple[str, int], ...]  # of each: its name and how many entries it has
 
 
 @dataclass(frozen=True, slots=True)
 class PlainFunction:
     """A function of columns to columns.
 
-    `operations` are (name, value) or (name, value, value); `results` the values that make up each output;
-    `tables` what some of them look up.
-    `loops` are pairs (given, residual), each without loops; with them the constants, operations and results
-    are those of the result, whose further inputs are what the loops find.
+    `inputs` are (name, number of entries); `operations` are (word, value) or (word, value, value); `results`
+    the values that make up each output; `tables` what some of them look up.
     """
 
-    name: str
-    inputs: _Columns
-    outputs: tuple[str, ...]
+    inputs: tuple[tuple[str, int], ...]
     constants: tuple[float, ...]
     operations: tuple[tuple[Any, ...], ...]
     results: tuple[tuple[int, ...], ...]
-    loops: tuple[tuple[PlainFunction, PlainFunction], ...] | None
     tables: tuple[Interpolation, ...] = ()
-
-    @property
-    def sizes(self) -> tuple[list[int], list[int]]:
-        """How many entries each input and each output has."""
-        return [rows for _, rows in self.inputs], [len(values) for values in self.results]
-
-    def document(self) -> dict[str, Any]:
-        """Return it as JSON's data."""
-        loops = self.loops
-        return {
-            "name": self.name,
-            "inputs": [list(one) for one in self.inputs],
-            "outputs": list(self.outputs),
-            "constants": list(self.constants),
-            "operations": [list(one) for one in self.operations],
-            "results": [list(one) for one in self.results],
-            "loops": None if loops is None else [[one.document() for one in loop] for loop in loops],
-            "tables": [[one.times.tolist(), one.numbers.tolist()] for one in self.tables],
-        }
-
-    def build(self) -> Any:
-        """Return the CasADi function."""
-        if self.loops is None:
-            return self._straight(self.name, self.inputs)
-        built = [Loop(given.build(), residual.build()) for given, residual in self.loops]
-        found = tuple((f"z{place}", one.residual.numel_in(0)) for place, one in enumerate(built))
-        result = self._straight("result", (*self.inputs, *found))
-        return composed(self.name, built, result, [name for name, _ in self.inputs])
-
-    def _straight(self, name: str, inputs: _Columns) -> Any:
-        columns = [casadi.SX.sym(word, rows) for word, rows in inputs]
-        entries = [entry for column in columns if column.numel() for entry in casadi.vertsplit(column)]
-        values = walk(self, [*entries, *map(casadi.SX, self.constants)], symbolic)
-        # A structural zero is a zero like another.
-        listed = [[values[place] for place in places] for places in self.results]
-        results = [casadi.densify(casadi.vertcat(*one)) if one else casadi.SX(0, 1) for one in listed]
-        return casadi.Function(name, columns, results, [word for word, _ in inputs], list(self.outputs))
 
 
 def walk(
@@ -169,7 +113,7 @@ def walk(
     Parameters
     ----------
     function
-        A function without loops.
+        The function.
     values
         The entries of its inputs, then its constants; its tables follow as they are.
     rule
@@ -186,9 +130,8 @@ def symbolic(word: str) -> Callable[..., Any]:
     """Return what an operation is of CasADi's expressions."""
     if word == LOOK:
         return lambda table, at: function_of(table)(at)
-    unary = word in _UNARY
-    return functools.partial(
-        casadi.SX.unary if unary else casadi.SX.binary, (_UNARY if unary else _BINARY)[word]
+    return lambda *operands: (casadi.SX.unary if len(operands) == 1 else casadi.SX.binary)(
+        _CODES[word], *operands
     )
 
 
@@ -220,38 +163,10 @@ def composed(name: str, loops: Sequence[Loop], result: Any, words: Sequence[str]
         residual = loop.residual(z, given)
         solver = casadi.rootfinder(f"loop{place}", "newton", {"x": z, "p": given, "g": residual}, NEWTON)
         last_step = casadi.solve(casadi.jacobian(residual, z), residual)
-        polish = casadi.Function("polish", [z, given], [z - last_step])
+        polish = casadi.Function(POLISH, [z, given], [z - last_step])
         found.append(polish(solver(x0=begin, p=q)["x"], q))
     outputs = result.call([*inputs, *found])
     return casadi.Function(name, inputs, outputs, list(words), result.name_out())
-
-
-def plain(function: Any) -> PlainFunction:
-    """Return a function's plain data: an SX function's, or one's that `composed` made."""
-    assert all(function.nnz_out(i) == function.numel_out(i) for i in range(function.n_out()))
-    if function.is_a("SXFunction"):
-        return straight(function)
-    called = [
-        function.instruction_MX(k).which_function()
-        for k in range(function.n_instructions())
-        if function.instruction_id(k) == casadi.OP_CALL
-    ]
-    by_name = {one.name(): one for one in called}
-    loops = [
-        (straight(by_name[f"given{k}"]), straight(by_name[f"loop{k}"].oracle()))
-        for k in range(sum(name.startswith("given") for name in by_name))
-    ]
-    result = straight(by_name["result"])
-    return PlainFunction(
-        function.name(),
-        tuple((word, function.numel_in(i)) for i, word in enumerate(function.name_in())),
-        result.outputs,
-        result.constants,
-        result.operations,
-        result.results,
-        tuple(loops),
-        result.tables,
-    )
 
 
 def straight(function: Any) -> PlainFunction:
@@ -264,9 +179,8 @@ def straight(function: Any) -> PlainFunction:
     ]
     numbers = [function.instruction_constant(k) for code, _, _, k in instructions if code == casadi.OP_CONST]
     constants = {number: first[-1] + place for place, number in enumerate(dict.fromkeys(map(_key, numbers)))}
-    called = _tables(function, [k for code, _, _, k in instructions if code == casadi.OP_CALL])
+    called = _called(function, [k for code, _, _, k in instructions if code == casadi.OP_CALL])
     tables = tuple(dict.fromkeys(table for _, table in called.values()))
-    places = {table: first[-1] + len(constants) + place for place, table in enumerate(tables)}
     before = first[-1] + len(constants) + len(tables)
     work = [0] * function.sz_w()
     operations: list[tuple[Any, ...]] = []
@@ -281,7 +195,8 @@ def straight(function: Any) -> PlainFunction:
         elif code == casadi.OP_CALL:
             name, table = called[k]
             at, by = work[taken[0]], work[taken[-1]]
-            operations.append((LOOK if name == TABLE else "slope", places[table], at))
+            number = first[-1] + len(constants) + tables.index(table)
+            operations.append((LOOK if name == TABLE else SLOPE, number, at))
             if name != TABLE:  # a derivative, of any order, is the slope times what it is taken by
                 operations.append(("mul", before + len(operations) - 1, by))
             work[given[0]] = before + len(operations) - 1
@@ -291,103 +206,21 @@ def straight(function: Any) -> PlainFunction:
             operations.append((_NAMES[code], *(work[place] for place in taken)))
             work[given[0]] = before + len(operations) - 1
     return PlainFunction(
-        function.name(),
-        inputs,
-        tuple(function.name_out()),
-        tuple(float(number) for number in constants),
-        tuple(operations),
-        tuple(tuple(listed) for listed in results),
-        None,
-        tables,
+        inputs, tuple(map(float, constants)), tuple(operations), tuple(map(tuple, results)), tables
     )
 
 
-def _tables(function: Any, calls: Sequence[int]) -> dict[int, tuple[str, Interpolation]]:
+def _called(function: Any, calls: Sequence[int]) -> dict[int, tuple[str, Interpolation]]:
     """Return what an SX function's calls, by their instructions, call, and the table that is looked up."""
-    found: dict[int, tuple[str, Interpolation]] = {}
-    read: dict[int, Interpolation] = {}  # of each function, which may be called many times
-    known: dict[tuple[bytes, bytes], Interpolation] = {}  # of equal rows, which are one table
     expressions: Any = function.instructions_sx() if calls else None
-    for k in calls:
-        one = expressions[k].which_function()
-        if one.__hash__() not in read:
-            table = table_of(one)
-            rows = table.times.tobytes(), table.numbers.tobytes()
-            read[one.__hash__()] = known.setdefault(rows, table)
-        found[k] = one.name(), read[one.__hash__()]
+    functions = {k: expressions[k].which_function() for k in calls}
+    known: dict[bytes, Interpolation] = {}  # of equal rows, which are one table
+    found = {}
+    for k, one in functions.items():
+        table = table_of(one)
+        found[k] = one.name(), known.setdefault(table.times.tobytes() + table.numbers.tobytes(), table)
     return found
 
 
 def _key(number: float) -> str:
     return repr(float(number))  # zeros of both signs are two constants; NaN is one
-
-
-def read_function(document: Any) -> PlainFunction:
-    """Return the function that data of JSON tells. Raises ValueError, KeyError or TypeError if none."""
-    loops = document["loops"]
-    if loops is None:
-        return _read(document, ())
-    found: list[tuple[str, int]] = []
-    pairs: list[tuple[PlainFunction, PlainFunction]] = []
-    inputs = _columns(document["inputs"])
-    for given, residual in loops:
-        one, other = _read(given, ()), _read(residual, ())
-        _must(one.inputs == (*inputs, *found) and len(other.inputs) == 2 and len(one.results) == 2)
-        n = other.inputs[0][1]
-        _must(n > 0 and one.sizes[1] == [n, other.inputs[1][1]] and other.sizes[1] == [n])
-        found.append((f"z{len(pairs)}", n))
-        pairs.append((one, other))
-    return _read(document, tuple(found), tuple(pairs))
-
-
-def _read(document: Any, found: _Columns, loops: tuple[Any, ...] | None = None) -> PlainFunction:
-    inputs = _columns(document["inputs"])
-    outputs = tuple(map(_word, document["outputs"]))
-    constants = tuple(document["constants"])
-    _must(all(type(one) is float for one in constants))
-    tables = tuple(map(_table, document["tables"]))
-    first = sum(rows for _, rows in (*inputs, *found)) + len(constants)
-    count = first + len(tables)
-    listed = range(first, count)
-    operations = tuple(map(tuple, document["operations"]))
-    for word, *places in operations:
-        if word == LOOK:
-            _must(len(places) == 2 and places[0] in listed)
-            del places[0]
-        else:
-            known = _UNARY if len(places) == 1 else _BINARY
-            _must(len(places) in (1, 2) and word in known)
-        for place in places:
-            _must(type(place) is int and 0 <= place < count and place not in listed)
-        count += 1
-    results = tuple(map(tuple, document["results"]))
-    values = (place for places in results for place in places)
-    _must(all(type(place) is int and 0 <= place < count and place not in listed for place in values))
-    names = [*outputs, *(name for name, _ in (*inputs, *found))]
-    _must(len(outputs) == len(results) and len(set(names)) == len(names))
-    _must(loops is not None or document["loops"] is None)
-    name = _word(document["name"])
-    return PlainFunction(name, inputs, outputs, constants, operations, results, loops, tables)
-
-
-def _table(rows: Any) -> Interpolation:
-    _must(len(rows) == 2 and all(type(one) is float for column in rows for one in column))
-    table = Interpolation(*map(np.array, rows))
-    _must(table.is_consistent)
-    return table
-
-
-def _columns(listed: Any) -> _Columns:
-    columns = tuple((_word(name), rows) for name, rows in listed)
-    _must(all(type(rows) is int and rows >= 0 for _, rows in columns))
-    return columns
-
-
-def _word(word: Any) -> str:
-    _must(isinstance(word, str) and len(word) <= LONGEST_WORD and bool(_WORD.match(word)))
-    return str(word)
-
-
-def _must(holds: bool) -> None:
-    if not holds:
-        raise ValueError("no function of plain data")

@@ -12,8 +12,9 @@ import functools
 import hmac
 import os
 import stat
-import sys
 from pathlib import Path
+
+import platformdirs
 
 SECRET = "secret"  # its file in the folder
 LENGTH = 32  # bytes of the secret
@@ -28,13 +29,14 @@ def cache_folder() -> Path | None:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if os.name == "posix":
-            found = folder.lstat()
-            if not (stat.S_ISDIR(found.st_mode) and _is_safe(found) and found.st_uid == os.geteuid()):
+            everyone = (one.stat() for one in (folder, *folder.resolve().parents))
+            if (
+                folder.is_symlink()
+                or folder.stat().st_uid != os.geteuid()
+                or not all(map(_is_safe, everyone))
+            ):
                 return None  # what others have put into it can't be told from what is the user's
-            if not all(_is_safe(above.stat()) for above in folder.resolve().parents):
-                return None
-            if stat.S_IMODE(found.st_mode) != 0o700:
-                folder.chmod(0o700)
+            folder.chmod(0o700)
     except OSError:
         return None
     return folder
@@ -53,19 +55,13 @@ def is_sealed(content: bytes, found: str) -> bool:
 
 
 def _folder() -> Path:
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA", "")
-        return Path(base) / "apc" if base else Path.home() / "AppData" / "Local" / "apc"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "apc"
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    return Path(base) / "apc" if base and Path(base).is_absolute() else Path.home() / ".cache" / "apc"
+    return Path(platformdirs.user_cache_dir("apc", appauthor=False))
 
 
-def _is_safe(found: os.stat_result) -> bool:
+def _is_safe(folder: os.stat_result) -> bool:
     """Return whether nobody but the user and root can replace what of the user's is in a folder."""
-    others = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not found.st_mode & stat.S_ISVTX
-    return found.st_uid in (0, os.geteuid()) and not others
+    others = folder.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not folder.st_mode & stat.S_ISVTX
+    return folder.st_uid in (0, os.geteuid()) and not others
 
 
 @functools.lru_cache(maxsize=1)
@@ -75,25 +71,23 @@ def _secret(folder: Path) -> bytes:
         return b""
     path = folder / SECRET
     try:
-        if path.exists() and (found := _read(path)):
-            return found
-        made = folder / f".{SECRET}{os.getpid()}"
-        made.unlink(missing_ok=True)
-        handle = os.open(made, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(handle, "wb") as file:
-            file.write(os.urandom(LENGTH))
-        made.replace(path)  # of two at once the second stays: what the first has sealed is compiled again
-        return _read(path)
+        if not (secret := _read(path)):
+            made = folder / f".{SECRET}{os.getpid()}"
+            made.unlink(missing_ok=True)
+            made.touch(0o600, exist_ok=False)
+            made.write_bytes(os.urandom(LENGTH))
+            made.replace(path)  # of two at once the second stays: what the first has sealed is compiled again
+            secret = _read(path)
     except OSError:
         return b""
+    return secret
 
 
 def _read(path: Path) -> bytes:
-    """Return the secret in a file; empty if it is none, or others may have seen it."""
-    handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
-    with os.fdopen(handle, "rb") as file:
-        found = os.fstat(handle)
-        if os.name == "posix" and (found.st_uid != os.geteuid() or stat.S_IMODE(found.st_mode) != 0o600):
-            return b""
-        content = file.read(LENGTH + 1) if stat.S_ISREG(found.st_mode) else b""
-    return content if len(content) == LENGTH else b""
+    """Return the secret in a file; empty if there is none, or others may have seen it."""
+    if path.is_symlink() or not path.is_file():
+        return b""
+    found = path.stat()
+    if os.name == "posix" and (found.st_uid != os.geteuid() or stat.S_IMODE(found.st_mode) != 0o600):
+        return b""
+    return path.read_bytes() if found.st_size == LENGTH else b""

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from apc.vary.sensitivity import Sensitivities
 
 _Scene = CompiledSystem | str | Path
-Format = Literal["text", "json", "dot", "svg"]
+Format = Literal["text", "json", "dot", "mermaid", "svg"]
 Criterion = Literal["mean-square", "nominal", "passive"]
 
 
@@ -637,7 +637,7 @@ def _several(scenes: _Scene | Iterable[_Scene], function: str) -> list[_Scene]:
 
 
 def _path(scene: _Scene, function: str) -> Path:
-    """Return the path of a topology; refuse a compiled model, which no longer has its text."""
+    """Return the path of a topology; refuse a compiled model, beside which it stands."""
     from apc.inputs import refuse_model
 
     if isinstance(scene, CompiledSystem):
@@ -867,15 +867,15 @@ def show(path: str | Path, *, format: Format = "text") -> str:
     path
         The topology, a YAML file.
     format
-        "text" for a person; "json", the same as one document; "dot", the graph in Graphviz's language;
-        "svg", the graph as a picture.
+        "text" for a person; "json", the same as one document; "dot" and "mermaid", the graph in the
+        languages of Graphviz and Mermaid; "svg", the graph as a picture.
 
     Raises
     ------
     ApcError
-        The file is at fault, or is a compiled model, which no longer has the equations as written.
+        The file is at fault, or is a compiled model: its topology is meant.
     """
-    from apc.compiler.view import listing
+    from apc.compiler.view import diagram, listing
     from apc.present.forms import json_text
 
     path = _path(path, "show")
@@ -885,9 +885,14 @@ def show(path: str | Path, *, format: Format = "text") -> str:
         case "json":
             return json_text(listing.show_document(path))
         case "dot":
-            return listing.show_dot(path)
+            return diagram.draw_dot(listing.diagram_of(path))
+        case "mermaid":
+            return diagram.draw_mermaid(listing.diagram_of(path))
         case "svg":
-            return listing.show_svg(path)
+            from apc.present.graph import graph_picture
+            from apc.present.pictures import svg_text
+
+            return svg_text(graph_picture(listing.diagram_of(path)))
 
 
 @checked

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apc.compiler.cache import DAMAGE, LARGEST, SUFFIX, Archive, changed, read_archive, record_of
+from apc.compiler.cache import LARGEST, SUFFIX, Archive, changed, program_digest, read_archive
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import (
     RefusedError,
@@ -28,6 +28,7 @@ from apc.compiler.files import (
     same_file,
 )
 from apc.compiler.timings import part
+from apc.opening import opened
 from apc.suffixes import written
 
 if TYPE_CHECKING:
@@ -85,15 +86,13 @@ def _is_topology(path: Path) -> bool:
 
 def load_fresh(path: Path) -> CompiledSystem:
     """Read a compiled model. Raises ApcError if it is damaged, or if what it was made from has changed."""
-    from apc.compiler.store import load_with_record
-
-    system, record = load_with_record(path)
-    now = changed(record, path.parent) if path.with_name(record.topology).is_file() else ""
+    archive = read_archive(path)
+    topology = path.with_name(archive.origin.topology)
+    now = changed(archive, path.parent) if topology.is_file() else ""
     if now:
         what = f"is stale: {now} has changed since it was compiled"
-        hint = f"apc compile {path.with_name(record.topology)}"
-        raise ApcError(Mistake("E605", Place(str(path)), what, hint=hint))
-    return system
+        raise ApcError(Mistake("E605", Place(str(path)), what, hint=f"apc compile {topology}"))
+    return opened(archive, path.parent)
 
 
 def load_or_compile(path: Path) -> CompiledSystem:
@@ -107,15 +106,10 @@ def load_or_compile(path: Path) -> CompiledSystem:
     ApcError
         The file is at fault.
     """
-    from apc.compiler.store import unpacked
-
     if path.suffix == ".apc":
         return load_fresh(path)
     if (archive := compiled_already(path)) is not None:
-        try:
-            return unpacked(archive, path.with_suffix(".apc"))
-        except (ApcError, *DAMAGE):
-            pass  # it is only a saving of time; the topology itself decides
+        return opened(archive, path.parent)
     from apc.analysis.selfcheck import check_frame
     from apc.compiler.pipeline import compile_topology
 
@@ -175,7 +169,7 @@ def open_scene(
 def refuse_model(path: Path, command: str) -> None:
     """Refuse a compiled model (E615) where a command tells of equations and texts as they were written."""
     if path.suffix == ".apc":
-        what = "is a compiled model, which no longer has the equations as they were written"
+        what = "is a compiled model, and this reads the topology that it was made from"
         hint = f"apc {command} {path.with_suffix('.yaml')}"
         raise ApcError(Mistake("E615", Place(str(path)), what, hint=hint))
 
@@ -291,10 +285,13 @@ def compiled_already(topology: Path) -> Archive | None:
     """
     try:
         archive = read_archive(topology.with_suffix(".apc"))
-        if not archive.sealed:
-            return None
-        record = record_of(archive)
-        fresh = record.topology == topology.name and not changed(record, topology.parent)
-    except (RefusedError, *DAMAGE):
+    except (ApcError, ValueError):  # ValueError: "." and "/" have no suffix
         return None
+    fresh = (
+        archive.sealed
+        and archive.compiled
+        and archive.origin.topology == topology.name
+        and archive.origin.program == program_digest()
+        and not changed(archive, topology.parent)
+    )
     return archive if fresh else None

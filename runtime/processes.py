@@ -16,7 +16,6 @@ import hashlib
 import multiprocessing
 import os
 import signal
-import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -24,7 +23,6 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from apc.compiler import store
@@ -236,21 +234,15 @@ def _compute(task: Any) -> Any:
 
 
 def model_bytes(system: CompiledSystem) -> bytes:
-    """Return a compiled model as the bytes of its file; equal models give equal bytes."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.apc"
-        store.save(system, path)
-        return path.read_bytes()
+    """Return a compiled model as bytes for another process of this program; equal models give equal bytes."""
+    return store.encoded(system)
 
 
 def digest_of(system: CompiledSystem) -> bytes:
     """Return the SHA-256 of a compiled model, its numbers included."""
-    return hashlib.sha256(model_bytes(system)).digest()
+    return hashlib.sha256(store.model_of(system)).digest()
 
 
 def model_of_bytes(model: bytes) -> CompiledSystem:
-    """Return the compiled model whose file has these bytes."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.apc"
-        path.write_bytes(model)
-        return store.load(path)
+    """Return the compiled model of bytes that another process of this program made."""
+    return store.decoded(model)

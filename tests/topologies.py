@@ -6,7 +6,8 @@ import functools
 from collections.abc import Callable
 from pathlib import Path
 
-from apc.compiler.compiled import CompiledSystem, Origin
+from apc.compiler.cache import Origin, program_digest
+from apc.compiler.compiled import CompiledSystem
 from apc.compiler.components.library import Library
 from apc.compiler.equations.clocks import ClockedSystem, partition
 from apc.compiler.equations.flatten import FlatSystem, flatten
@@ -76,7 +77,9 @@ def ordered(text: str, library: Library | None = None) -> SortedSystem:
 @functools.lru_cache(maxsize=32)
 def compiled(text: str, library: Library | None = None) -> CompiledSystem:
     """Compile a text; the same text gives the same model, with all that it keeps."""
-    return build_functions(ordered(text, library), Origin("scene.yaml", ()))
+    return build_functions(
+        ordered(text, library), Origin("scene.yaml", (("scene.yaml", text.encode()),), program_digest())
+    )
 
 
 def wall(mass: float, damping: float, delay: float, stiffness: float, virtual: float = 0.0) -> CompiledSystem:

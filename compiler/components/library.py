@@ -32,7 +32,6 @@ class Library:
 
     def __init__(self, folders: tuple[Path, ...] = (), aside: list[ApcError] | None = None) -> None:
         self._sources: dict[str, Source] = {}
-        self._texts: dict[str, str] = {}
         self._components: dict[str, Component] = {}
         self._connectors: dict[str, Connector] = {}
         self._files: dict[str, Path] = dict(builtin_files())
@@ -50,7 +49,7 @@ class Library:
             _, name = definition_of(source)
             if not name:
                 continue
-            if not same_file(own.setdefault(name, path), path):
+            if own.setdefault(name, path) != path and not same_file(own[name], path):
                 what = f"{brief(name)} is defined in {own[name]} already"
                 raise ApcError(
                     Mistake("E218", source.root.place, what, hint="another name in one of the two")
@@ -67,11 +66,6 @@ class Library:
     def component_names(self) -> tuple[str, ...]:
         """The names of the components among them."""
         return tuple(name for name in self.names if _is_definition(self._source(name), "component"))
-
-    @property
-    def texts(self) -> tuple[tuple[str, str], ...]:
-        """The name and SHA-256 of each text handed out so far."""
-        return tuple(sorted(self._texts.items()))
 
     def component(self, name: str) -> Component | None:
         """Return a component, or None if there is no such name. Raises ApcError if its text is at fault."""
@@ -115,7 +109,6 @@ class Library:
         if name not in self._sources:
             path = self._files[name]
             self._sources[name] = read_source(path, shown=path.name)
-        self._texts[name] = self._sources[name].digest
         return self._sources[name]
 
 

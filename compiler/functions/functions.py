@@ -15,13 +15,13 @@ from typing import Any
 
 import casadi
 
+from apc.compiler.cache import Origin
 from apc.compiler.compiled import (
     ClockPartition,
     CompiledSystem,
     Hold,
     Kind,
     Limit,
-    Origin,
     Ports,
     Receive,
     SendPartition,

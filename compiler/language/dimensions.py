@@ -44,7 +44,8 @@ def product(factors: tuple[tuple[str, Fraction | int], ...]) -> Dimension:
     total: dict[str, Fraction | int] = {}
     for base, power in factors:
         total[base] = total.get(base, 0) + power
-    return Dimension(tuple((base, total[base]) for base in sorted(total) if total[base]))
+    whole = ((base, int(power) if power.denominator == 1 else power) for base, power in total.items())
+    return Dimension(tuple(sorted((base, power) for base, power in whole if power)))
 
 
 DIMENSIONLESS = Dimension(())

@@ -9,7 +9,7 @@ Does not: know units, or values that change with time or with the peers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import reduce
@@ -30,11 +30,11 @@ from apc.compiler.language.expression import (
     Negate,
     Not,
     Number,
-    children,
     fold,
     format_expression,
     walk,
 )
+from apc.compiler.language.grammar import parse_expression
 from apc.compiler.plain import PlainFunction
 from apc.compiler.words import cut
 
@@ -71,29 +71,10 @@ def formula_of(expr: Expr) -> Formula:
         E332 a function that has no value in a parameter.
     """
     text = format_expression(expr)
-    listed = _listed(expr, Place("an expression", 1, 1, text))
-    spans = dict(_spans(expr, 0, text))
-    return Formula(
-        text, listed.names, listed.numbers, listed.function, tuple(spans[id(node)] for node in listed.nodes)
-    )
-
-
-def _spans(node: Expr, start: int, text: str) -> Iterator[tuple[int, tuple[int, int]]]:
-    """Give from where to where a node and all below it stand in a text, each by its identity."""
-    yield id(node), (start, start + len(format_expression(node)))
-    words: tuple[str, ...] = ("", getattr(node, "operator", ""))
-    match node:
-        case Not():
-            words = ("not", "")
-        case Call():
-            words, start = ("",) * len(node.arguments), start + len(node.function)
-        case Conditional():
-            words = ("if", "then", "else")
-    for word, part in zip(words, children(node), strict=False):
-        start = text.index(word, start) + len(word)
-        start = text.index(format_expression(part), start)  # behind a parenthesis
-        yield from _spans(part, start, text)
-        start += len(format_expression(part))
+    place = Place("an expression", 1, 1, text)
+    listed = _listed(parse_expression(text, place), place)
+    spans = tuple((node.start, node.end) for node in listed.nodes)
+    return Formula(text, listed.names, listed.numbers, listed.function, spans)
 
 
 def evaluate(
@@ -200,5 +181,5 @@ def _listed(expr: Expr, place: Place) -> _Listed:
 
     result = fold(expr, leaf, operation)
     inputs = (("p", len(names)), ("c", len(numbers)))
-    function = PlainFunction("formula", inputs, ("y",), (), tuple(operations), ((result,),), None)
+    function = PlainFunction(inputs, (), tuple(operations), ((result,),))
     return _Listed(tuple(names), tuple(numbers), function, tuple(nodes))

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from decimal import Context, Decimal, Inexact
 from enum import IntEnum
 from fractions import Fraction
 from typing import TypeVar
@@ -105,6 +106,7 @@ class Vector(Spanned):
     entries: tuple[Expr, ...]
 
 
+_EXACT = Context(prec=5000, traps=[Inexact])  # of more digits than any number in a text has
 INTERVAL = "interval("  # how the name of a clock's period begins, see `interval_of`
 V = TypeVar("V")
 
@@ -200,11 +202,7 @@ def _format(expr: Expr) -> tuple[str, int]:
         case Negate():
             return "-" + _inside(expr.operand, Level.SIGN), Level.SIGN
         case Binary("^", base, exponent):
-            text = _format(exponent)[0]
-            wrapped = (
-                text if isinstance(exponent, Number) and _format(exponent)[1] == Level.ATOM else f"({text})"
-            )
-            return f"{_inside(base, Level.ATOM)}^{wrapped}", Level.POWER
+            return f"{_inside(base, Level.ATOM)}^{_inside(exponent, Level.ATOM)}", Level.POWER
         case Binary() | Logic() | Compare():
             level = LEVELS[expr.operator]
             # Both sides of a comparison bind tighter than it: a < b < c is not in the language.
@@ -234,24 +232,16 @@ def _format_number(value: Fraction) -> tuple[str, int]:
     if value == PI:
         return "pi", Level.ATOM
     sign, level = ("-", Level.SIGN) if value < 0 else ("", Level.ATOM)
-    numerator, denominator = abs(value.numerator), value.denominator
-    twos = (denominator & -denominator).bit_length() - 1
-    rest, fives = denominator >> twos, 0
-    while rest % 5 == 0:
-        rest, fives = rest // 5, fives + 1
-    if rest != 1:
-        return f"{sign}{numerator}/{denominator}", Level.PRODUCT
-    places = max(twos, fives)
-    digits = str(numerator * 10**places // denominator)
-    if not places and len(digits) > 16:
-        short = digits.rstrip("0")
-        digits, places = short, len(short) - len(digits)
-    if places <= 0:
-        return sign + digits + (f"e{-places}" if places else ""), level
-    if places - len(digits) > 4:  # more than four zeros behind the point
-        return f"{sign}{digits}e-{places}", level
-    padded = digits.rjust(places + 1, "0")
-    return f"{sign}{padded[:-places]}.{padded[-places:]}", level
+    try:
+        number = _EXACT.divide(Decimal(abs(value.numerator)), Decimal(value.denominator)).normalize(_EXACT)
+    except Inexact:
+        return f"{sign}{abs(value.numerator)}/{value.denominator}", Level.PRODUCT
+    _, digits, exponent = number.as_tuple()
+    assert isinstance(exponent, int)
+    # An exponent stands for more than four zeros behind the point, and in a number of more than 16 digits.
+    if exponent + len(digits) < -4 or (exponent > 0 and exponent + len(digits) > 16):
+        return f"{sign}{''.join(map(str, digits))}e{exponent}", level
+    return f"{sign}{number:f}", level
 
 
 def children(expr: Expr) -> tuple[Expr, ...]:

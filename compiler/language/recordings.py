@@ -118,12 +118,14 @@ def read_trace(path: Path, named_at: Place) -> Trace:
     mistakes = Mistakes()
     delays = array("d")
     with open_table(path, named_at, known=(DELAY,)) as opened:
-        own = _delay_column(opened.headings)
-        faults = 0
+        column = _delay_column(opened.headings)
+        scale, faults = float(opened.headings[column][1].scale), 0
         for line, cells in opened.numbered():
             if not cells or (len(cells) == 1 and cells[0].isspace()):
                 continue
-            delay = _delay(cells, own, opened.headings, Place(opened.file, line), mistakes)
+            delay = math.nan
+            if opened.is_whole(cells, line, mistakes):
+                delay = _delay(cells, column, scale, Place(opened.file, line, 1), mistakes)
             delays.append(delay)
             faults += math.isnan(delay)
             if faults >= MOST_MISTAKES:
@@ -146,22 +148,18 @@ def _delay_column(names: Headings) -> int:
     raise ApcError(Mistake("E702", place, "a trace", expected, brief(got), "delay [ms]"))
 
 
-def _delay(cells: list[str], own: int, names: Headings, row: Place, mistakes: Mistakes) -> float:
-    """Return a packet's delay in seconds: infinite if it was lost, not a number if its row is at fault."""
-    if len(cells) != len(names):
-        what = f"the row has {len(cells)} cells and there are {len(names)} headings"
-        mistakes.add("E703", row.shifted(1), what)
-        return math.nan
-    cell = cells[own].strip()
+def _delay(cells: list[str], column: int, scale: float, row: Place, mistakes: Mistakes) -> float:
+    """Return a packet's delay in seconds: infinite if it was lost, not a number if its cell is at fault."""
+    cell = cells[column].strip()
     if cell in ("", LOST):
         return math.inf
     try:
-        number = plain_float(cell)
+        delay = plain_float(cell) * scale
     except ValueError:
-        number = math.nan
-    if 0 <= (delay := number * float(names[own][1].scale)) <= LATEST_DELAY:
+        delay = math.nan
+    if 0 <= delay <= LATEST_DELAY:
         return delay
-    place = row.shifted(sum(len(other) + 1 for other in cells[:own]) + 1)
+    place = row.shifted(sum(len(other) + 1 for other in cells[:column]))
     expected = f"a time from 0 to {LATEST_DELAY:.0e} s, or {LOST}"
     mistakes.add("E703", place, "a delay", expected=expected, got=brief(cell))
     return math.nan

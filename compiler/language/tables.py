@@ -20,7 +20,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,18 +40,6 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.\[\]]*\Z")
 _HEADING = re.compile(r"(?P<name>[^\[\]]*(\[[0-9]+\][^\[\]]*)*?)(\[(?P<unit>[^\[\]]*)\])?\Z")
 
 Headings = tuple[tuple[str, Unit, Place], ...]  # name, unit and where it stands
-
-
-class Reader(Protocol):
-    """A reader of the module `csv`, whose type has no public name."""
-
-    @property
-    def line_num(self) -> int:
-        """The line read last."""
-
-    def __iter__(self) -> Iterator[list[str]]: ...
-
-    def __next__(self) -> list[str]: ...
 
 
 class Digested(Protocol):
@@ -146,7 +134,7 @@ class Opened:
     file: str
     digest: str
     headings: Headings
-    rows: Reader
+    rows: Any  # a reader of the module csv, whose type has no public name
 
     def numbered(self) -> Iterator[tuple[int, list[str]]]:
         """Yield each row with the line it begins in: a cell in quotes may go over several."""
@@ -154,6 +142,13 @@ class Opened:
         for cells in self.rows:
             yield begin, cells
             begin = self.rows.line_num + 1
+
+    def is_whole(self, cells: list[str], line: int, mistakes: Mistakes) -> bool:
+        """Say whether a row has as many cells as there are headings, and record it if not."""
+        if len(cells) != len(self.headings):
+            what = f"the row has {len(cells)} cells and there are {len(self.headings)} headings"
+            mistakes.add("E703", Place(self.file, line, 1), what)
+        return len(cells) == len(self.headings)
 
 
 @contextmanager
@@ -175,7 +170,7 @@ def open_table(path: Path, named_at: Place, known: Collection[str] = ()) -> Iter
     """
     data, digest = read_bytes(path, named_at)
     file = str(path)
-    rows: Reader = csv.reader(io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig"))
+    rows = csv.reader(io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig"))
     first: list[str] = []
     try:
         first = next(rows, [])
@@ -271,35 +266,29 @@ def _heading(text: str, place: Place, mistakes: Mistakes) -> tuple[str, Unit]:
 
 def _rows(opened: Opened, mistakes: Mistakes) -> tuple[array[float], array[int]]:
     """Return all numbers, row after row, and the line of each row."""
-    width = len(opened.headings)
     numbers, lines = array("d"), array("q")
-    found = 0
+    faults = 0
     for line, cells in opened.numbered():
         if not any(cell.strip() for cell in cells):
             continue
-        if len(cells) != width:
-            what = f"the row has {len(cells)} cells and there are {width} headings"
-            mistakes.add("E703", Place(opened.file, line, 1), what)
-            found += 1
-        else:
-            try:
-                numbers.extend([plain_float(cell) for cell in cells])
-                lines.append(line)
-                continue
-            except ValueError:
-                _add_bad_cells(cells, opened.file, line, mistakes)
-                found += 1
-        if found >= MOST_MISTAKES:
+        try:
+            whole = opened.is_whole(cells, line, mistakes)
+            numbers.extend([plain_float(cell) for cell in cells] if whole else [])
+            lines.append(line)
+        except ValueError:
+            _add_bad_cells(cells, opened.file, line, mistakes)
+            whole = False
+        faults += not whole
+        if faults >= MOST_MISTAKES:
             break
     return numbers, lines
 
 
 def _add_bad_cells(cells: list[str], file: str, line: int, mistakes: Mistakes) -> None:
-    column = 1
+    place = Place(file, line, 1)
     for cell in cells:
         try:
             plain_float(cell)
         except ValueError:
-            place, got = Place(file, line, column), brief(cell) or "nothing"
-            mistakes.add("E703", place, "a cell", expected="a finite number", got=got)
-        column += len(cell) + 1
+            mistakes.add("E703", place, "a cell", expected="a finite number", got=brief(cell) or "nothing")
+        place = place.shifted(len(cell) + 1)

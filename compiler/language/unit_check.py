@@ -28,6 +28,7 @@ from apc.compiler.language.expression import (
     Not,
     Number,
     Vector,
+    children,
     format_expression,
 )
 from apc.compiler.language.unit_text import format_dimension
@@ -35,6 +36,8 @@ from apc.compiler.language.unit_text import format_dimension
 ANY = Dimension((("any", 1),))
 """The dimension of the literal 0, which fits every other."""
 
+# What the arguments behind the first have to be.
+_TIMES = {"hold": "s, as a delay", "interpolate": "s, as tables are over time"}
 Lookup = Callable[[Name], Dimension | None]
 
 
@@ -95,6 +98,10 @@ def _terms(expr: Expr) -> list[Expr]:
             return [expr]
 
 
+def _said(dimension: Dimension) -> str:
+    return "a plain number" if dimension == DIMENSIONLESS else format_dimension(dimension)
+
+
 class _Checker:
     """Finds dimensions and collects mistakes; a part with a mistake counts as unknown, to say it once."""
 
@@ -109,31 +116,26 @@ class _Checker:
 
     def add(self, code: str, expr: Expr, expected: str, got: Dimension) -> None:
         place = place_in(self.place, self.text, expr.start)
-        unit = "a plain number" if got == DIMENSIONLESS else format_dimension(got)
-        self.mistakes.add(code, place, self.said(expr), expected=expected, got=unit)
+        self.mistakes.add(code, place, self.said(expr), expected=expected, got=_said(got))
 
     def agree(self, code: str, parts: list[Expr]) -> Dimension | None:
         """Return the dimension most parts have, the first of them in a tie; report the others."""
         found = [(part, self.dimension(part)) for part in parts]
         known = [(part, dimension) for part, dimension in found if dimension not in (None, ANY)]
         if not known:
-            unknown = any(dimension is None for _, dimension in found)
-            return None if unknown else ANY
+            return None if any(dimension is None for _, dimension in found) else ANY
         usual = Counter(dimension for _, dimension in known).most_common(1)[0][0]
-        assert usual is not None
         like = next(part for part, dimension in known if dimension == usual)
-        unit = "a plain number" if usual == DIMENSIONLESS else format_dimension(usual)
         for part, dimension in known:
-            if dimension is not None and (dimension != usual or dimension.clashes(usual)):
-                self.add(code, part, f"{unit} like {self.said(like)}", dimension)
+            if dimension and usual and (dimension != usual or dimension.clashes(usual)):
+                self.add(code, part, f"{_said(usual)} like {self.said(like)}", dimension)
         return usual
 
-    def plain(self, expr: Expr) -> None:
-        """Report an argument that is no plain number."""
+    def fits(self, expr: Expr, due: Dimension, code: str, expected: str) -> None:
+        """Report an argument that has to be of one dimension and is not."""
         dimension = self.dimension(expr)
-        if dimension not in (None, ANY, DIMENSIONLESS):
-            assert dimension is not None
-            self.add("E403", expr, "a plain number", dimension)
+        if dimension is not None and dimension not in (ANY, due):
+            self.add(code, expr, expected, dimension)
 
     def factor(self, expr: Expr) -> Dimension | None:
         """Return the dimension of a part of a product, in which a literal 0 is a number like any other."""
@@ -153,12 +155,9 @@ class _Checker:
             case Compare(_, left, right):
                 self.agree("E404", [left, right])
                 return DIMENSIONLESS
-            case Logic(_, left, right):
-                self.dimension(left)
-                self.dimension(right)
-                return DIMENSIONLESS
-            case Not(operand):
-                self.dimension(operand)
+            case Logic() | Not():
+                for part in children(expr):
+                    self.dimension(part)
                 return DIMENSIONLESS
             case Conditional(condition, then, otherwise):
                 self.dimension(condition)
@@ -172,9 +171,9 @@ class _Checker:
         left = self.factor(expr.left)
         if expr.operator == "^":
             if isinstance(expr.right, Number):
-                return None if left is None else left.power(expr.right.value)
-            self.plain(expr.right)
-            self.plain(expr.left)  # x^n has a unit only for a written n
+                return left and left.power(expr.right.value)
+            for part in (expr.right, expr.left):  # x^n has a unit only for a written n
+                self.fits(part, DIMENSIONLESS, "E403", "a plain number")
             return DIMENSIONLESS
         right = self.factor(expr.right)
         if left is None or right is None:
@@ -182,40 +181,23 @@ class _Checker:
         return left.multiply(right) if expr.operator == "*" else left.divide(right)
 
     def call(self, expr: Call) -> Dimension | None:
-        first = expr.arguments[0]
-        match expr.function:
-            case "max" | "min":
-                return self.agree("E404", list(expr.arguments))
-            case name if name == "floor" or name in SMOOTH:
-                self.plain(first)
-                return DIMENSIONLESS
-            case "atan2":  # of the sides of a triangle, whatever their unit
-                self.agree("E404", list(expr.arguments))
+        function, (first, *others) = expr.function, expr.arguments
+        if function in ("dot", "cross"):
+            return self.product(Binary("*", *expr.arguments))
+        if function in ("floor", *SMOOTH):
+            self.fits(first, DIMENSIONLESS, "E403", "a plain number")
+            return DIMENSIONLESS
+        alike = function in ("max", "min", "atan2")  # atan2: of the sides of a triangle, whatever their unit
+        found = self.agree("E404", list(expr.arguments)) if alike else self.dimension(first)
+        for time in others if function in _TIMES else ():
+            self.fits(time, SECOND, "E405", _TIMES[function])
+        match function:
+            case "atan2" | "sign" | "count":
                 return DIMENSIONLESS
             case "age":
-                self.dimension(first)
                 return SECOND
-            case "sign" | "count":
-                self.dimension(first)
-                return DIMENSIONLESS
-            case "dot" | "cross":
-                return self.product(Binary("*", *expr.arguments))
             case "sqrt":
-                inside = self.factor(first)
-                return None if inside is None else inside.power(Fraction(1, 2))
+                return DIMENSIONLESS if found == ANY else found and found.power(Fraction(1, 2))
             case "der":
-                inside = self.dimension(first)
-                return inside if inside is None or inside == ANY else inside.divide(SECOND)
-            case "hold":
-                for delay in expr.arguments[1:]:
-                    if (found := self.dimension(delay)) not in (None, ANY, SECOND):
-                        assert found is not None
-                        self.add("E405", delay, "s, as a delay", found)
-                return self.dimension(first)
-            case "interpolate":
-                if (found := self.dimension(expr.arguments[1])) not in (None, ANY, SECOND):
-                    assert found is not None
-                    self.add("E405", expr.arguments[1], "s, as tables are over time", found)
-                return self.dimension(first)
-            case _:  # sample, previous, initial, mean, sum, abs, norm: the same quantity
-                return self.dimension(first)
+                return found if found == ANY else found and found.divide(SECOND)
+        return found  # of max, min, hold, interpolate, sample, previous, initial, mean, sum, abs and norm

@@ -1,34 +1,98 @@
 """The text of a unit or of a quantity to exact SI numbers.
 
 Takes: a text (`N*s/m`, `500 N/m`), and where it stands.
-Gives: `Unit`, `Quantity`; `parse_unit`, `parse_quantity`, and `quantity`, which has to fit a unit.
-Guarantees: values are exact rationals (0.1 kg is 1/10); the cost of a text is bounded.
+Gives: `Unit`, `Quantity`; `parse_unit`, `parse_quantity`, and `quantity`, which has to fit a unit; `COMMON`.
+Guarantees: values are exact rationals (0.1 kg is 1/10, an angle in degrees uses π to 50 digits); the cost of
+a text is bounded; a unit that is not in units.txt, as a grain, is not taken for one that is meant.
 Does not: know which quantity wants which unit, or check expressions (see `unit_check`).
 
-The grammar of a quantity, whose unit is that of `unit_grammar`:
-
-    quantity = number ["/" number] [unit]
+A quantity is `number ["/" number] [unit]`; unit.lark is the grammar of a unit, Pint knows what its names are.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import lru_cache
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any, NoReturn
 
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
+import pint
+from lark import Token
+from lark.exceptions import UnexpectedCharacters, UnexpectedToken
+
+from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension, product
 from apc.compiler.language.expression import PI
-from apc.compiler.language.unit_grammar import NAME, FaultError, parse_factor
-from apc.compiler.language.unit_names import COMMON, look_up, spelled, turning
+from apc.compiler.language.parsing import TREE, FaultError, exponent_of, kind_of, parser, unclosed
 from apc.compiler.words import cut
 
 TURN = 2 * PI  # a cycle in radians
 MAX_LENGTH = 200  # characters of a quantity
 MAX_NUMBER_EXPONENT = 300  # of 1e300: still a float
+MAX_EXPONENT = 9  # of a unit: m^9
 
+# What a scene is likely to use: proposed for a misspelt name, and told apart by case.
+COMMON = (
+    "N",
+    "mN",
+    "kN",
+    "kg",
+    "g",
+    "m",
+    "mm",
+    "cm",
+    "um",
+    "s",
+    "ms",
+    "us",
+    "min",
+    "Hz",
+    "kHz",
+    "rad",
+    "deg",
+    "A",
+    "mA",
+    "V",
+    "W",
+    "kW",
+    "J",
+    "K",
+    "Pa",
+    "mol",
+    "cd",
+    "lb",
+    "inch",
+    "ft",
+    "kgf",
+    "rpm",
+    "percent",
+    "newton",
+    "meter",
+    "second",
+    "gram",
+    "kilogram",
+    "hertz",
+    "radian",
+    "degree",
+    "millisecond",
+    "millimeter",
+)
+_BASES = {
+    "[mass]": "kg",
+    "[length]": "m",
+    "[time]": "s",
+    "[current]": "A",
+    "[temperature]": "K",
+    "[substance]": "mol",
+    "[luminosity]": "cd",
+}
+_ANGLES = ("radian", "degree", "arcminute", "arcsecond", "turn", "_per_minute", "_per_second")
+_LONG = ("hecto", "kilo", "mega", "giga", "tera")  # no prefix of a second
+NAME = re.compile(r"[^\W\d_²³][^\W²³]*|[%°]")  # as in the grammar
 _NUMBER = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _QUANTITY_START = re.compile(rf"\s*[+-]?{_NUMBER}(?:\s*/\s*{_NUMBER})?")
 _EXPONENT = re.compile(r"\^-?[0-9]+|\*\*-?[0-9]+|[²³]")
@@ -51,6 +115,13 @@ class Quantity:
     value: Fraction
     unit: Unit
     text: str
+
+    @property
+    def number(self) -> str:
+        """The number as written, without its unit."""
+        found = _QUANTITY_START.match(self.text)
+        assert found is not None
+        return found.group().strip()
 
 
 NO_UNIT = Unit("1", Fraction(1), DIMENSIONLESS)
@@ -105,70 +176,53 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
         E204 a unit that does not fit, or none; and those of `parse_quantity`.
     """
     wanted = parse_unit(unit, place)
-    named = "a plain number" if wanted.text == "1" else unit
+    named = "a plain number" if unit == "1" else unit
     try:
         found = _quantity(text)
     except FaultError as fault:
-        if fault.code == "E221" and not fault.hint:
-            example = "1" if wanted.text == "1" else f"1 {unit}"
-            got = cut(text) or "nothing"
-            raise ApcError(Mistake("E221", place, what, named, got, f"{what}: {example}")) from None
+        if fault.mistake.code == "E221" and not fault.mistake.hint:
+            example = f"{what}: 1" if unit == "1" else f"{what}: 1 {unit}"
+            raise ApcError(Mistake("E221", place, what, named, cut(text) or "nothing", example)) from None
         raise fault.placed(text, place) from None
-    if found.unit.dimension == wanted.dimension and (
-        found.unit != NO_UNIT or wanted.dimension == DIMENSIONLESS
-    ):
-        if found.unit.dimension.clashes(wanted.dimension):
-            raise ApcError(_other_turning(found, wanted, place, what))
-        return found
-    number = _QUANTITY_START.match(text.strip())
-    assert number is not None
+    its, due = found.unit.dimension, wanted.dimension
     got, right = cut(text.strip()), unit
-    if found.unit == NO_UNIT:
-        got += " (no unit)"
-    elif (confused := _confused(found.unit, wanted.dimension)) is not None:
-        name, right = confused
-        got += f" ({name} is {spelled(name)}: case matters)"
+    if its == due and (found.unit != NO_UNIT or due == DIMENSIONLESS):
+        if not its.clashes(due):
+            return found
+        # 20 Hz are 125.66 rad/s.
+        turns = TURN if due.turning == "rad" else 1 / TURN
+        same = f"{float(found.value * turns / wanted.scale):.9g} {unit}"
+        got += f", which is {same}"
+        hint = f"{what}: {same}, or {what}: {found.number} {unit}"
     else:
-        right = _meant(found.unit, wanted)
-    shown = number.group().strip()
-    hint = f"{what}: {shown} {right}".removesuffix(" 1") if right else ""
+        if found.unit == NO_UNIT:
+            got += " (no unit)"
+        else:
+            right, slip = _meant(found.unit, wanted)
+            got += f" ({slip} is {_long_name(slip)}: case matters)" if slip else ""
+        hint = f"{what}: {found.number} {right}".removesuffix(" 1") if right else ""
     raise ApcError(Mistake("E204", place, what, named, got, hint))
 
 
-def _meant(unit: Unit, wanted: Unit) -> str:
+def _meant(unit: Unit, wanted: Unit) -> tuple[str, str]:
     """Return a unit of the dimension that is wanted in which the number as written may be meant.
 
-    That is the unit without one of its exponents, or with a letter more, or failing that the one that is
-    wanted, if a value in it is as large: 5 N/mm^2 are not proposed as 5 N/m, a millionth of it.
+    That is the unit with a name in another case, which is returned as well, MS for ms; without one of its
+    exponents, or with a letter more; or failing that the one that is wanted, if a value in it is as large:
+    5 N/mm^2 are not proposed as 5 N/m, a millionth of it.
     """
-    texts = [unit.text[: one.start()] + unit.text[one.end() :] for one in _EXPONENT.finditer(unit.text)]
-    for name in NAME.findall(unit.text):
-        longer = (other for other in COMMON if other.startswith(name) and len(other) == len(name) + 1)
-        texts += [re.sub(rf"\b{re.escape(name)}\b", other, unit.text) for other in longer]
-    fitting = (text for text in texts if _is_of(text, wanted.dimension))
-    return next(fitting, wanted.text if unit.scale == wanted.scale else "")
-
-
-def _other_turning(found: Quantity, wanted: Unit, place: Place, what: str) -> Mistake:
-    """Return what is told of cycles where radians are due, or the reverse: 20 Hz are 125.66 rad/s."""
-    number = _QUANTITY_START.match(found.text.strip())
-    assert number is not None
-    turns = TURN if wanted.dimension.turning == "rad" else 1 / TURN
-    same = f"{float(found.value * turns / wanted.scale):.9g} {wanted.text}"
-    got = f"{cut(found.text.strip())}, which is {same}"
-    hint = f"{what}: {same}, or {what}: {number.group().strip()} {wanted.text}"
-    return Mistake("E204", place, what, wanted.text, got, hint)
-
-
-def _confused(unit: Unit, wanted: Dimension) -> tuple[str, str] | None:
-    """Return a name of the unit that fits in another case, and the unit written with it: MS for ms."""
-    for name in NAME.findall(unit.text):
-        for other in COMMON:
-            if other != name and other.lower() == name.lower():
-                text = unit.text.replace(name, other)
-                if _is_of(text, wanted):
-                    return name, text
-    return None
+    others = [(name, other) for name in NAME.findall(unit.text) for other in COMMON if other != name]
+    texts = [
+        *((unit.text.replace(name, other), name) for name, other in others if other.lower() == name.lower()),
+        *((unit.text[: one.start()] + unit.text[one.end() :], "") for one in _EXPONENT.finditer(unit.text)),
+        *(
+            (re.sub(rf"\b{re.escape(name)}\b", other, unit.text), "")
+            for name, other in others
+            if other[:-1] == name
+        ),
+    ]
+    fitting = (found for found in texts if _is_of(found[0], wanted.dimension))
+    return next(fitting, (wanted.text if unit.scale == wanted.scale else "", ""))
 
 
 def _is_of(text: str, wanted: Dimension) -> bool:
@@ -182,64 +236,194 @@ def _is_of(text: str, wanted: Dimension) -> bool:
 @lru_cache(maxsize=4096)
 def _quantity(text: str) -> Quantity:
     if len(text) > MAX_LENGTH:
-        raise FaultError(
-            "E221", 0, "a quantity", expected=f"at most {MAX_LENGTH} characters", got=f"{len(text)}"
-        )
-    if _NOT_FINITE.match(text.strip()):
-        raise FaultError("E221", 0, "a quantity", expected="a finite number", got=cut(text.strip()))
+        raise FaultError("E221", 0, "a quantity", f"at most {MAX_LENGTH} characters", f"{len(text)}")
     found = _QUANTITY_START.match(text)
     if found is None:
-        hint = text.strip().replace("−", "-") if text.strip().startswith("−") else ""
-        got = cut(text.strip()) or "nothing"
-        raise FaultError("E221", 0, "a quantity", expected="a number and its unit", got=got, hint=hint)
-    value = _number(found.group(), len(found.group()) - len(found.group().lstrip()))
-    rest = text[found.end() :]
+        bare = text.strip()
+        expected = "a finite number" if _NOT_FINITE.match(bare) else "a number and its unit"
+        hint = bare.replace("−", "-") if bare.startswith("−") else ""
+        raise FaultError("E221", 0, "a quantity", expected, cut(bare) or "nothing", hint=hint)
+    number, rest, end = found.group().strip(), text[found.end() :], found.end()
     if re.match(r",[0-9]", rest):
-        hint = f"{found.group().strip()}.{rest[1:].strip()}"
-        raise FaultError("E221", found.end(), "a number has a decimal point, not a comma", hint=cut(hint))
+        hint = cut(f"{number}.{rest[1:].strip()}")
+        raise FaultError("E221", end, "a number has a decimal point, not a comma", hint=hint)
+    value = _number(number, end - len(number))
     if re.match(r"\s*/", rest):
-        hint = f"{found.group().strip()} 1{rest.strip()}"
-        raise FaultError(
-            "E222", found.end(), "a unit", expected="something above the /", got="nothing", hint=hint
-        )
+        hint = f"{number} 1{rest.strip()}"
+        raise FaultError("E222", end, "a unit", "something above the /", "nothing", hint=hint)
     try:
         unit = _unit(rest) if rest.strip() else NO_UNIT
+        float(value * unit.scale)
     except FaultError as fault:
-        fault.offset += found.end()
+        fault.offset += end
         raise
-    return Quantity(_finite(value * unit.scale), unit, text)
+    except OverflowError:
+        raise FaultError("E226", 0, "this quantity is too large for a number") from None
+    return Quantity(value * unit.scale, unit, text)
 
 
 def _number(text: str, offset: int) -> Fraction:
     """Return the exact value of a number or of a quotient of two."""
-    above, _, below = text.strip().partition("/")
-    values = []
-    for part in filter(None, (above.strip(), below.strip())):
-        mantissa, _, exponent = part.lower().partition("e")
-        if exponent and abs(int(exponent)) > MAX_NUMBER_EXPONENT:
+    for exponent in re.findall(r"[eE]([+-]?[0-9]+)", text):
+        if abs(int(exponent)) > MAX_NUMBER_EXPONENT:
             limit = f"an exponent from -{MAX_NUMBER_EXPONENT} to {MAX_NUMBER_EXPONENT}"
-            raise FaultError("E226", offset, "a number", expected=limit, got=cut(exponent))
-        values.append(Fraction(mantissa) * Fraction(10) ** int(exponent or 0))
-    if len(values) == 1:
-        return values[0]
-    if values[1] == 0:
-        raise FaultError("E221", offset, f"{cut(text.strip())} divides by zero")
-    return values[0] / values[1]
-
-
-def _finite(value: Fraction) -> Fraction:
+            raise FaultError("E226", offset, "a number", limit, cut(exponent))
+    above, _, below = text.partition("/")
     try:
-        rounded = float(value)
-    except OverflowError:
-        rounded = math.inf
-    if math.isinf(rounded):
-        raise FaultError("E226", 0, "this quantity is too large for a number")
-    return value
+        return Fraction(above) / Fraction(below or "1")
+    except ZeroDivisionError:
+        raise FaultError("E221", offset, f"{cut(text)} divides by zero") from None
 
 
 @lru_cache(maxsize=1024)
 def _unit(text: str) -> Unit:
+    """Return a unit: what its names come to by Pint."""
     if len(text) > MAX_LENGTH:
-        raise FaultError("E222", 0, "a unit", expected=f"at most {MAX_LENGTH} characters", got=f"{len(text)}")
-    scale, dimension = parse_factor(text, look_up)
-    return Unit(text.strip(), scale, replace(dimension, turning=turning(text)))
+        raise FaultError("E222", 0, "a unit", f"at most {MAX_LENGTH} characters", f"{len(text)}")
+    try:
+        powers = _grammar()(text, "unit")
+    except UnexpectedCharacters as fault:
+        expected = "names joined by * and /, with exponents such as ^2"
+        raise FaultError("E222", fault.pos_in_stream, "a unit", expected, repr(fault.char)) from None
+    except UnexpectedToken as fault:
+        _refuse(text, fault)
+    dimensions = registry().get_dimensionality(powers)
+    if any(abs(power) > MAX_EXPONENT for power in (*powers.values(), *dimensions.values())):
+        what = f"{cut(text.strip())} is no unit of this world: an exponent or its scale is too large"
+        raise FaultError("E225", 0, what)
+    square: Fraction | float = Fraction(1)  # of the scale, so that the root of a square is exact
+    for name, power in powers.items():
+        grams = Fraction(1000) ** int(registry().get_dimensionality(name)["[mass]"])  # Pint's unit of mass
+        its = Fraction(registry().get_root_units(name)[0]) / grams
+        square *= 1 if its == 1 else its ** (2 * power)
+    rational = Fraction(square)
+    scale = Fraction(math.isqrt(rational.numerator), math.isqrt(rational.denominator))
+    if isinstance(square, float) or scale**2 != square:
+        expected = "a root whose scale is a rational number"
+        raise FaultError("E222", len(text.rstrip()), "a unit", expected, "its end")
+    dimension = product(tuple((_BASES[base], power) for base, power in dimensions.items()))
+    return Unit(text.strip(), scale, replace(dimension, turning=_turning(text)))
+
+
+def _refuse(text: str, fault: UnexpectedToken) -> NoReturn:
+    """Raise E222 for what cannot follow in a unit."""
+    token, bare, hint = fault.token, text.strip(), ""
+    if "NAME" in fault.expected:
+        expected = "a name such as N, m or s"
+    elif "$END" not in fault.expected and "NUMBER" in fault.expected:
+        expected = f"a whole exponent up to {MAX_EXPONENT}"
+    elif unclosed(fault.state.value_stack) >= 0:
+        expected = ")"
+    else:
+        expected, joined = "* or / between two names", re.sub(r"(\w)\s+(?=\w)", r"\1*", bare)
+        hint = joined if joined != bare else ""
+    at = len(text.rstrip()) if token.type == "$END" else token
+    got = {"$END": "its end", "POWER": "^"}.get(token.type, str(token))
+    raise FaultError("E222", at, "a unit", expected, got, hint)
+
+
+def _turning(text: str) -> str:
+    """Return whether a unit counts cycles ("Hz") or radians ("rad"); an empty text if it tells of neither."""
+    for name in map(_long_name, NAME.findall(text)):
+        if name.endswith("hertz"):
+            return "Hz"
+        if name.endswith(_ANGLES):
+            return "rad"
+    return ""
+
+
+class _Units(TREE):
+    """What the rules of unit.lark come to: Pint's products of powers of names."""
+
+    def NAME(self, token: Token) -> Any:
+        return registry().UnitsContainer({_looked_up(token): Fraction(1)})
+
+    def one(self, parts: list[Token]) -> Any:
+        if parts[0] != "1":
+            expected = "a name such as N, m or s"
+            raise FaultError("E222", parts[0], "a unit", expected, str(parts[0]))
+        return registry().UnitsContainer()
+
+    def times(self, parts: list[Any]) -> Any:
+        return parts[0] * parts[2]
+
+    def over(self, parts: list[Any]) -> Any:
+        return parts[0] / parts[1]
+
+    def raised(self, parts: list[Any]) -> Any:
+        exponent = parts[-1]
+        return parts[0] ** (Fraction(2 + "²³".index(exponent)) if kind_of(exponent) else exponent)
+
+    def exponent(self, parts: list[Token]) -> Fraction:
+        for part in parts:
+            if part.type == "NUMBER" and int(part) > MAX_EXPONENT:
+                expected = f"a whole exponent up to {MAX_EXPONENT}"
+                raise FaultError("E222", part, "a unit", expected, str(part))
+        try:
+            return exponent_of(parts)
+        except ZeroDivisionError:
+            expected = "an exponent that does not divide by zero"
+            raise FaultError("E222", parts[-1].end_pos, "a unit", expected, ")") from None
+
+
+@cache
+def _grammar() -> Callable[[str, str], Any]:
+    return parser("unit.lark", ["unit"], _Units())
+
+
+@cache
+def registry() -> Any:
+    """Return Pint's registry of the units there are, with exact numbers."""
+    return pint.UnitRegistry(str(Path(__file__).with_name("units.txt")), non_int_type=Fraction)
+
+
+@cache
+def _everything() -> Any:
+    """Return Pint's registry of every unit it knows, for messages: it takes a third of a second to build."""
+    return pint.UnitRegistry(non_int_type=Fraction)
+
+
+def _long_name(name: str) -> str:
+    """Return Pint's long name of a unit: `megasiemens` for MS; an empty text if there is none."""
+    for prefix, unit, _ in registry().parse_unit_name(name)[:1]:
+        prefixed = unit in registry().get_group("Prefixed").members
+        if not prefix or (prefixed and not (unit == "second" and prefix in _LONG)):
+            return str(registry().get_name(name))
+    return ""
+
+
+def _looked_up(name: Token) -> str:
+    """Return the long name of a unit. Raises FaultError: E223 no such unit, E224 no multiple of SI."""
+    if found := _long_name(name):
+        return found
+    every = _everything()
+    # Nm is a yarn count to Pint, and a slip for N*m to everyone else.
+    others = [(prefix, unit) for prefix, unit, _ in every.parse_unit_name(name) if unit != "number_meter"]
+    if not others:
+        raise FaultError("E223", name, f"there is no unit {cut(name)}", hint=_proposal(name))
+    (prefix, unit), *_ = others
+    spelled = f"{prefix}{unit}".replace("_", " ")
+    roots = every.get_root_units(unit)[1]._units
+    if not every._units[unit].is_multiplicative or any(root not in registry() for root in roots):
+        what = f"{name} ({prefix}{unit}) is no multiple of an SI unit"
+        raise FaultError("E224", name, what, hint="K" if "degree_" in unit else "")
+    dimension = every.get_dimensionality(unit)
+    like = [other for other in COMMON if registry().get_dimensionality(other) == dimension]
+    told = f"; there are {', '.join(like[:3])}" if like else ""
+    what = f"there is no unit {name} here: {spelled} is out of use{told}"
+    lower = name.lower()
+    alike = (other for other in like if lower == other.lower() or lower.startswith(other))
+    raise FaultError("E223", name, what, hint=next(alike, ""))
+
+
+def _proposal(name: str) -> str:
+    """Return what was probably meant: another case, an exponent, a product, or the nearest common name."""
+    for other in COMMON:
+        if other.lower() == name.lower():
+            return other
+    if (power := re.fullmatch(r"([^\W\d_]+)([2-9])", name)) and power.group(1) in COMMON:
+        return f"{power.group(1)}^{power.group(2)}"
+    for at in range(1, len(name)):
+        if name[:at] in COMMON and name[at:] in COMMON:
+            return f"{name[:at]}*{name[at:]}"
+    return nearest(name, COMMON)

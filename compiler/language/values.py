@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from graphlib import CycleError, TopologicalSorter
 
@@ -224,16 +224,15 @@ def _expression(
     tree = number_of(parse_expression(text, place), text, place)
     check_names(tree, text, place, what, known, names_known)
     found = dimension_of(tree, lambda name: known(name.parts), text, place)
-    if found not in (None, ANY, dimension):
-        its = "has no unit" if found == DIMENSIONLESS else f"is in {format_dimension(found or dimension)}"
-        got = f"{brief(text)}, which {its}"
-        raise ApcError(Mistake("E204", place, what, unit, got, f"{what}: 1 {unit}"))
-    if found is not None and found.clashes(dimension):  # of a name, a sum or a choice: no product has it
-        got = f"{brief(text)}, which is in {format_dimension(found)}"
+    if found is None or found == ANY or (found == dimension and not found.clashes(dimension)):
+        return tree
+    its, hint = f"is in {format_dimension(found)}", f"1 {unit}"
+    if found == DIMENSIONLESS != dimension:
+        its = "has no unit"
+    elif found == dimension:  # of a name, a sum or a choice: no product counts cycles or radians
         whole = format_expression(tree) if isinstance(tree, Name) else f"({format_expression(tree)})"
-        turned = f"2*pi*{whole}" if dimension.turning == "rad" else f"{whole}/(2*pi)"
-        raise ApcError(Mistake("E204", place, what, unit, got, f"{what}: {turned}"))
-    return tree
+        hint = f"2*pi*{whole}" if dimension.turning == "rad" else f"{whole}/(2*pi)"
+    raise ApcError(Mistake("E204", place, what, unit, f"{brief(text)}, which {its}", f"{what}: {hint}"))
 
 
 def check_names(
@@ -317,59 +316,45 @@ def resolve_in_order(
     faulty
         The names without one; each fault was reported once, where it is.
     """
-    settled: dict[str, Value] = {}
-    faulty: set[str] = set()
-
-    def dimension(parts: tuple[str, ...]) -> Dimension | None:
-        if parts == PEERS:
-            return DIMENSIONLESS
-        name = ".".join(parts)
-        return settled[name].dimension if name in settled else None
-
-    def number(parts: tuple[str, ...]) -> Fraction:
-        return Fraction(peers) if parts == PEERS else settled[".".join(parts)].number
-
-    needs = {name: {n for n in _needed(binding) if n in waiting} for name, binding in waiting.items()}
-    sorter = TopologicalSorter(needs)
+    needs = {
+        name: {".".join(node.parts) for node in names(binding.expression)} if binding.expression else set()
+        for name, binding in waiting.items()
+    }
     try:
-        order = list(sorter.static_order())
+        order = [*TopologicalSorter(needs).static_order()]
     except CycleError as error:
-        chain = list(reversed(error.args[1]))
-        first = min(range(len(chain) - 1), key=lambda i: list(waiting).index(chain[i]))
-        chain = [*chain[first:-1], *chain[:first], chain[first]]
+        chain = error.args[1][:0:-1]
+        first = min(range(len(chain)), key=lambda k: [*waiting].index(chain[k]))
+        chain = [*chain[first:], *chain[:first], chain[first]]
         mistakes.add("E209", waiting[chain[0]].place, f"parameters depend in a circle: {' → '.join(chain)}")
         return {}, set(waiting)
+    settled = {"peers": Value(Fraction(peers), DIMENSIONLESS, None, Place(""))}
+    faulty: set[str] = set()
     for name in order:
-        if needs[name] & faulty:
-            faulty.add(name)
+        if name not in waiting or needs[name] & faulty:
+            faulty |= {name} & waiting.keys()
             continue
         try:
-            settled[name] = _settled(name, waiting[name], dimension, number, ("peers", *settled))
+            settled[name] = _settled(name, waiting[name], settled)
         except ApcError as error:
             faulty.add(name)
             mistakes.take(error)
     return {name: settled[name] for name in waiting if name in settled}, faulty
 
 
-def _settled(
-    name: str,
-    binding: Binding,
-    dimension: Callable[[tuple[str, ...]], Dimension | None],
-    number: Callable[[tuple[str, ...]], Fraction],
-    known: Collection[str],
-) -> Value:
-    if binding.expression is None:
-        return settle(binding, number)
-    text = format_expression(binding.expression)
-    place = binding.place
-    check_names(binding.expression, text, place, name, dimension, known)
-    found = dimension_of(binding.expression, lambda n: dimension(n.parts), text, place)
-    known_dimension = DIMENSIONLESS if found is None or found == ANY else found
-    return settle(Binding(None, binding.expression, known_dimension, place), number)
+def _settled(name: str, binding: Binding, settled: Mapping[str, Value]) -> Value:
+    tree, place = binding.expression, binding.place
 
+    def dimension(parts: tuple[str, ...]) -> Dimension | None:
+        value = settled.get(".".join(parts))
+        return None if value is None else value.dimension
 
-def _needed(binding: Binding) -> list[str]:
-    return [] if binding.expression is None else [".".join(n.parts) for n in names(binding.expression)]
+    if tree is not None:
+        text = format_expression(tree)
+        check_names(tree, text, place, name, dimension, settled)
+        found = dimension_of(tree, lambda node: dimension(node.parts), text, place)
+        binding = replace(binding, dimension=DIMENSIONLESS if found in (None, ANY) else found)
+    return settle(binding, lambda parts: settled[".".join(parts)].number)
 
 
 def renamed(tree: Expr, whole: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Expr:

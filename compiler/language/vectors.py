@@ -14,7 +14,7 @@ or `cross`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial, reduce
@@ -31,7 +31,6 @@ from apc.compiler.language.expression import (
     Expr,
     Logic,
     Name,
-    Negate,
     Not,
     Number,
     Vector,
@@ -100,8 +99,8 @@ def written_out(expr: Expr, size_of: SizeOf, text: str, place: Place) -> Written
     """
     writer = _Writer(size_of, text, place)
     found = writer.written(expr)
-    for one in found if isinstance(found, tuple) else (found,) if found is not None else ():
-        if one is not expr and len(list(islice(walk(one), MAX_LENGTH + 1))) > MAX_LENGTH:
+    for one in found if isinstance(found, tuple) else (found or expr,):
+        if len(list(islice(walk(one), MAX_LENGTH + 1))) > MAX_LENGTH:
             what = f"entry by entry this has more than {MAX_LENGTH} terms: give a part of it a name"
             writer.fail("E328", expr, what)
     return found
@@ -154,35 +153,35 @@ class _Writer:
                     got = f"{len(expr.entries)}"
                     self.fail("E406", expr, self.said(expr), f"{_or(SIZES)} entries", got)
                 return tuple(self.number(one) for one in expr.entries)
-            case Binary("+" | "-"):
-                parts = [self.written(expr.left), self.written(expr.right)]
-                self.agree((expr.left, expr.right), parts)
-                return self.each(expr, parts)
             case Binary("*"):
                 parts = [self.written(expr.left), self.written(expr.right)]
                 if all(isinstance(part, tuple) for part in parts):
                     hint = f"dot({format_expression(expr.left)}, {format_expression(expr.right)})"
                     self.fail("E407", expr, self.said(expr), "one vector at most in a product", "two", hint)
                 return self.each(expr, parts)
-            case Binary("/"):
-                return self.each(expr, [self.written(expr.left), self.number(expr.right)])
-            case Binary():
-                inner = format_expression(expr.left)
-                square = isinstance(expr.right, Number) and expr.right.value == 2
-                hint = (
-                    f"dot({inner}, {inner})" if square else f"norm({inner})^{format_expression(expr.right)}"
-                )
+            case Binary("^"):
+                inner, power = format_expression(expr.left), format_expression(expr.right)
+                hint = f"dot({inner}, {inner})" if power == "2" else f"norm({inner})^{power}"
                 return self.each(expr, [self.number(expr.left, hint), expr.right])
-            case Negate():
-                return self.each(expr, [self.written(expr.operand)])
-            case Conditional():
-                branches = [self.written(expr.then), self.written(expr.otherwise)]
-                self.agree((expr.then, expr.otherwise), branches)
-                return self.each(expr, [self.number(expr.condition), *branches])
             case Compare() | Logic() | Not():
-                return self.each(expr, [self.number(part) for part in children(expr)])
+                return self.of_parts(expr, numbers=range(2))
+            case Conditional():
+                return self.of_parts(expr, numbers=(0,))
             case Call():
                 return self.call(expr)
+            case _:
+                divided = isinstance(expr, Binary) and expr.operator == "/"
+                return self.of_parts(expr, numbers=(1,) if divided else ())
+
+    def of_parts(self, expr: Expr, *, numbers: Container[int]) -> Written:
+        """Write a node out whose parts have to be numbers at some places, and of one size at the others."""
+        parts = children(expr)
+        found = [self.number(p) if k in numbers else self.written(p) for k, p in enumerate(parts)]
+        alike = [k for k in range(len(parts)) if k not in numbers]
+        if isinstance(expr, Call):  # which takes numbers beside vectors
+            alike = [k for k in alike if isinstance(found[k], tuple)]
+        self.agree([parts[k] for k in alike], [found[k] for k in alike])
+        return self.each(expr, found)
 
     def call(self, expr: Call) -> Written:
         first, *others = expr.arguments
@@ -196,14 +195,9 @@ class _Writer:
                 return replace(expr, arguments=found[:1]) if isinstance(found, tuple) else expr
             case "sample":
                 return self.each(expr, [self.written(first), *others])  # the second is a clock
-            case "hold":
-                return self.each(expr, [self.written(first), *(self.number(one) for one in others)])
             case "interpolate":
-                return self.each(expr, [first, *(self.number(one) for one in others)])
-        parts = [self.written(one) for one in expr.arguments]
-        vectors = [k for k, part in enumerate(parts) if isinstance(part, tuple)]
-        self.agree([expr.arguments[k] for k in vectors], [parts[k] for k in vectors])
-        return self.each(expr, parts)
+                return self.each(expr, [first, *map(self.number, others)])
+        return self.of_parts(expr, numbers=(1,) if expr.function == "hold" else ())
 
     def product(self, expr: Call) -> Written:
         """Write out `dot`, `cross` and `norm`, each piece of which stands where the whole does."""
@@ -222,16 +216,15 @@ class _Writer:
         def binary(operator: str, one: Expr, two: Expr) -> Expr:
             return Binary(operator, one, two, start=expr.start, end=expr.end)
 
-        def turned(i: int, j: int) -> Expr:
-            return binary("-", binary("*", a[i], b[j]), binary("*", a[j], b[i]))
-
         a, b = vectors[0], vectors[-1]
-        if expr.function == "norm":
-            squares = reduce(partial(binary, "+"), (binary("^", one, Number(Fraction(2))) for one in a))
-            return replace(expr, function="sqrt", arguments=(squares,))
-        if expr.function == "dot":
-            return reduce(partial(binary, "+"), (binary("*", x, y) for x, y in zip(a, b, strict=True)))
-        return turned(0, 1) if len(a) == 2 else (turned(1, 2), turned(2, 0), turned(0, 1))
+        if expr.function == "cross":
+            pairs = ((0, 1),) if len(a) == 2 else ((1, 2), (2, 0), (0, 1))
+            turned = [binary("-", binary("*", a[i], b[j]), binary("*", a[j], b[i])) for i, j in pairs]
+            return tuple(turned) if len(a) > 2 else turned[0]
+        norm, two = expr.function == "norm", Number(Fraction(2))
+        terms = (binary("^", x, two) if norm else binary("*", x, y) for x, y in zip(a, b, strict=True))
+        total = reduce(partial(binary, "+"), terms)
+        return replace(expr, function="sqrt", arguments=(total,)) if norm else total
 
     def number(self, expr: Expr, hint: str = "") -> Expr:
         """Return an expression that has to be a number."""
@@ -245,34 +238,26 @@ class _Writer:
         known = [(part, one) for part, one in zip(parts, found, strict=True) if one is not None]
         for part, one in known[1:]:
             like, first = known[0]
-            if _length(one) == _length(first):
+            size, its = _length(first), _length(one)
+            if its == size:
                 continue
-            hint = ""
-            if not isinstance(one, tuple) and len(format_expression(part)) <= LONGEST_REPEATED:
-                hint = "{" + ", ".join([format_expression(part)] * _length(first)) + "}"
-            elif isinstance(one, tuple) and not isinstance(first, tuple):
-                hint = self.of_vector(part)
-            self.fail(
-                "E406", part, self.said(part), f"{_size(first)} like {self.said(like)}", _size(one), hint
-            )
+            text, hint = format_expression(part), "" if size else self.of_vector(part)
+            if not its and len(text) <= LONGEST_REPEATED:
+                hint = "{" + ", ".join([text] * size) + "}"
+            expected = f"{_size(first)} like {self.said(like)}"
+            self.fail("E406", part, self.said(part), expected, _size(one), hint)
 
     def each(self, node: Expr, parts: Sequence[Written]) -> Written:
         """Return a node of other parts: one for each entry, where one of them is a vector."""
-        old = children(node)
         size = max(map(_length, parts), default=0)
-        if not size:
-            if None in parts:
-                return None
-            same = all(one is two for one, two in zip(parts, old, strict=True))
-            return node if same else rebuild(node, tuple(one for one in parts if isinstance(one, Expr)))
-
-        def of(k: int, part: Written, before: Expr) -> Expr:
-            return part[k] if isinstance(part, tuple) else before if part is None else part
-
-        return tuple(
-            rebuild(node, tuple(of(k, part, before) for part, before in zip(parts, old, strict=True)))
-            for k in range(size)
+        if None in parts and not size:
+            return None
+        known = (before if part is None else part for part, before in zip(parts, children(node), strict=True))
+        rows = zip(
+            *(part if isinstance(part, tuple) else (part,) * (size or 1) for part in known), strict=True
         )
+        found = tuple(rebuild(node, row) for row in rows)
+        return found if size else found[0]
 
     def of_vector(self, expr: Expr) -> str:
         """Return numbers that somebody may have meant who wrote a vector."""

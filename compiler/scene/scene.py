@@ -126,8 +126,6 @@ def library_folders(source: Source) -> tuple[Path, ...]:
         if text is not None:
             folder = _folder_of(source) / text
             try:
-                if not _is_folder(folder):
-                    raise RefusedError("missing", "does not exist")
                 files_below(folder, SUFFIX)
             except RefusedError as refused:
                 mistakes.add(
@@ -140,14 +138,6 @@ def library_folders(source: Source) -> tuple[Path, ...]:
                 found.append(folder)
     mistakes.raise_if_any()
     return tuple(found)
-
-
-def _is_folder(path: Path) -> bool:
-    """Return whether a path is a folder; one that no file system can hold is none."""
-    try:
-        return path.is_dir()
-    except (OSError, ValueError):  # a name too long; a NUL in the name
-        return False
 
 
 def _folder_of(source: Source) -> Path:

@@ -30,14 +30,6 @@ from apc.compiler.words import WIDTH, beside, wrapped
 TEMPLATE = "template"  # the scene that `apc new` writes where no other is asked for
 
 
-def _rooms() -> dict[str, list[str]]:
-    """Return what the library has, by the folder it stands in."""
-    rooms: dict[str, list[str]] = {}
-    for name, path in builtin_files().items():
-        rooms.setdefault(path.parent.name, []).append(name)
-    return rooms
-
-
 def _line(name: str, width: int, about: str) -> str:
     """Return a name and what it is, cut to one line."""
     line = f"  {name:<{width}}  {about}"
@@ -46,12 +38,10 @@ def _line(name: str, width: int, about: str) -> str:
 
 def library_lines() -> Iterator[str]:
     """Yield the components and connectors of the library, a line each, by folder."""
-    library = Library()
-    for room, names in _rooms().items():
+    for room, rows in library_document().items():
         yield room
-        width = max(map(len, names))
-        for name in names:
-            yield _line(name, width, _found(library, name).about)
+        width = max(len(row["name"]) for row in rows)
+        yield from (_line(row["name"], width, row["about"]) for row in rows)
         yield ""
     yield "apc library NAME shows one: its parameters with units and limits, its equations."
 
@@ -59,10 +49,11 @@ def library_lines() -> Iterator[str]:
 def library_document() -> dict[str, Any]:
     """Return the same as plain data, what each is about in full."""
     library = Library()
-    return {
-        room: [{"name": name, "about": _found(library, name).about} for name in names]
-        for room, names in _rooms().items()
-    }
+    rooms: dict[str, list[dict[str, str]]] = {}
+    for name, path in builtin_files().items():
+        row = {"name": name, "about": _found(library, name).about}
+        rooms.setdefault(path.parent.name, []).append(row)
+    return rooms
 
 
 def _found(library: Library, name: str) -> Component | Connector:

@@ -1,8 +1,9 @@
-"""A scene as a graph: parts joined within a peer, peers joined over links; as text for Graphviz.
+"""A scene as a graph: parts joined within a peer, peers joined over links; as text for Graphviz and Mermaid.
 
-Takes: `Scene`. Gives: `Diagram`, `build_diagram`; `draw_dot`; `one_of`, `seconds`.
+Takes: `Scene`. Gives: `Diagram`, `build_diagram`; what is drawn of it, `boxes_of` and `edges_of`; `draw_dot`,
+`draw_mermaid`; `one_of`, `shape_of`, `seconds`.
 Guarantees: every part of the topology is in it, a long array as one node; the same scene gives the same text.
-Does not: place anything on a page: `picture` does, or Graphviz.
+Does not: place anything on a page: `present.graph` does, or Graphviz, or Mermaid.
 """
 
 from __future__ import annotations
@@ -10,10 +11,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from html import escape
 
 from apc.compiler.components.component import Number, Reference
 from apc.compiler.components.parts import GROUND
-from apc.compiler.language.dimensions import SECOND, Dimension
+from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.unit_text import format_si
 from apc.compiler.language.values import Value
@@ -25,10 +27,9 @@ from apc.compiler.scene.sections import DEFAULT_TYPES
 from apc.compiler.words import counted
 
 ROLES = {"masses": "mass", "couplers": "coupler", "hands": "hand"}
-STIFFNESS = Dimension((("kg", 1), ("s", -2)))
-DAMPING = Dimension((("kg", 1), ("s", -1)))
 LONGEST_ARRAY = 4  # with more elements an array is one node
 MOST_LINES = 7  # of numbers in one node
+MOST_CROWDS = 8  # groups that are drawn
 LONGEST_EXPRESSION = 24  # characters shown beside its value
 
 
@@ -36,31 +37,29 @@ LONGEST_EXPRESSION = 24  # characters shown beside its value
 class Vertex:
     """A part, or where parts meet.
 
-    `role` is mass, coupler, hand, ground or joint; `lines` are what to write below its name: its type, then
-    its numbers; `spring` and `damper` say what it is drawn with.
+    `role` is mass, coupler, hand, ground or joint; `about` are its type, then its numbers; `links` those over
+    which it hears.
     """
 
     name: str
     role: str
-    lines: tuple[str, ...]
+    about: tuple[str, ...]
     clock: str
     links: tuple[str, ...]
-    spring: bool = False
-    damper: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Net:
-    """A link: what to write below its name, and who hears whom, peers counted from 0.
+    """A link: the shape of its graph, what is told of it, and who hears whom, peers counted from 0.
 
-    `pairs` are (sender, receiver) of a graph given arc by arc, and empty for the other shapes.
+    `arcs` are (sender, receiver) of a graph given arc by arc, and empty for the other shapes.
     """
 
     name: str
-    lines: tuple[str, ...]
     clock: str
-    shape: str
-    pairs: tuple[tuple[int, int], ...]
+    graph: str
+    arcs: tuple[tuple[int, int], ...]
+    about: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,20 +82,20 @@ class Pulse:
 
 @dataclass(frozen=True, slots=True)
 class Diagram:
-    """One peer's parts, and the peers. `joints` are pairs of nodes by name."""
+    """One peer's parts, and the peers. `joints` are pairs of parts by name."""
 
     title: str
     about: str
-    nodes: tuple[Vertex, ...]
+    parts: tuple[Vertex, ...]
     joints: tuple[tuple[str, str], ...]
-    nets: tuple[Net, ...]
-    crowds: tuple[Crowd, ...]
+    links: tuple[Net, ...]
+    groups: tuple[Crowd, ...]
     pulses: tuple[Pulse, ...]
 
     @property
     def peers(self) -> int:
         """The number of peers."""
-        return sum(crowd.count for crowd in self.crowds)
+        return sum(group.count for group in self.groups)
 
 
 def build_diagram(scene: Scene) -> Diagram:
@@ -162,15 +161,12 @@ def _node(scene: Scene, part: Part, name: str, count: int) -> Vertex:
         numbers = [*numbers[: MOST_LINES - 1], f"… and {len(numbers) - MOST_LINES + 1} more"]
     by_role = {p.name: p.role for p in component.parameters if isinstance(p, Reference)}
     named = [(by_role.get(own), word) for own, word in part.references]
-    dimensions = {p.unit.dimension for p in component.numbers}
     return Vertex(
         name,
         role,
         (*lines, *numbers),
         next((word for its_role, word in named if its_role == "clock"), ""),
         tuple(dict.fromkeys(word for its_role, word in named if its_role == "link")),
-        spring=STIFFNESS in dimensions and role != "mass",
-        damper=DAMPING in dimensions and role != "mass",
     )
 
 
@@ -239,7 +235,7 @@ def _net(link: SceneLink) -> Net:
     lines += [f"{d.sender} to {d.receiver}: {seconds(d.delay.number)} later" for d in link.delays]
     lines += [] if link.channel is None else link.channel.told
     pairs = tuple((int(sender), int(receiver)) for sender, receiver in link.graph.arcs)
-    return Net(link.name, tuple(lines), link.clock, link.graph.shape, pairs)
+    return Net(link.name, link.clock, link.graph.shape, pairs, tuple(lines))
 
 
 def _crowds(scene: Scene) -> Iterator[Crowd]:
@@ -259,43 +255,95 @@ def one_of(diagram: Diagram) -> str:
     return "the only peer" if diagram.peers == 1 else f"one of {diagram.peers} peers"
 
 
-_SHAPES = {"mass": "box", "coupler": "box", "hand": "cds", "ground": "underline", "joint": "point"}
+@dataclass(frozen=True, slots=True)
+class Box:
+    """What is drawn of a part, a link or a group: its `lines`, of which the first is its name.
+
+    `role` is that of a part, or link or group.
+    """
+
+    key: str
+    role: str
+    lines: tuple[str, ...]
+    clock: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """What joins two boxes, by their keys; `sent` if it is a link that does."""
+
+    one: str
+    two: str
+    sent: bool
+
+
+def boxes_of(diagram: Diagram) -> tuple[Box, ...]:
+    """Return what is drawn of a scene, of many groups the first."""
+    found = [
+        Box(part.name, part.role, (GROUND if part.role == GROUND else part.name, *part.about), part.clock)
+        for part in diagram.parts
+    ]
+    found += [
+        Box(f"link {net.name}", "link", (net.name, shape_of(net), *net.about), net.clock)
+        for net in diagram.links
+    ]
+    for crowd in diagram.groups[:MOST_CROWDS]:
+        name = f"{crowd.name}: {counted(crowd.count, 'peer', ',')}"
+        found.append(Box(f"group {crowd.name}", "group", (name, *crowd.settings[:MOST_LINES])))
+    if len(diagram.groups) > MOST_CROWDS:
+        found.append(Box("groups", "group", (f"and {len(diagram.groups) - MOST_CROWDS} more groups",)))
+    return tuple(found)
+
+
+def edges_of(diagram: Diagram) -> tuple[Edge, ...]:
+    """Return what joins the boxes of a scene."""
+    joined = [Edge(one, two, sent=False) for one, two in diagram.joints]
+    heard = [Edge(node.name, f"link {link}", sent=True) for node in diagram.parts for link in node.links]
+    groups = [box.key for box in boxes_of(diagram) if box.role == "group"]
+    told = [Edge(f"link {net.name}", group, sent=True) for net in diagram.links for group in groups]
+    return (*joined, *heard, *told)
+
+
+def shape_of(net: Net) -> str:
+    """Return who hears whom over a link, in words."""
+    return counted(len(net.arcs), "arc") if net.graph == "arcs" else f"{net.graph} graph"
+
+
+_DOT = {
+    "mass": "box",
+    "hand": "cds",
+    GROUND: "underline",
+    "joint": "point",
+    "link": "ellipse",
+    "group": "box3d",
+}
 
 
 def draw_dot(diagram: Diagram) -> str:
     """Return a diagram in Graphviz's language."""
-    title = diagram.title if not diagram.about else f"{diagram.title}\n{diagram.about}"
-    lines = [
-        f"digraph {_quoted(diagram.title)} {{",
-        "  rankdir=LR",
-        '  node [fontname="Helvetica", fontsize=10]',
-        "  edge [dir=none]",
-        f'  label={_quoted(title)}; labelloc=t; fontname="Helvetica"',
-        "  subgraph cluster_peer {",
-        f"    label={_quoted(one_of(diagram))}; style=rounded",
-    ]
-    for node in diagram.nodes:
-        text = "\n".join((node.name, *node.lines, *([f"clock {node.clock}"] if node.clock else [])))
-        label = "ground" if node.role == GROUND else text
-        style = ', style="filled", fillcolor="#e8eff8"' if node.role == "mass" else ""
-        lines.append(f"    {_quoted(node.name)} [label={_quoted(label)}, shape={_SHAPES[node.role]}{style}]")
-    lines += [f"    {_quoted(one)} -> {_quoted(two)}" for one, two in diagram.joints]
-    lines.append("  }")
-    for net in diagram.nets:
-        text = "\n".join((net.name, f"graph {net.shape}", *net.lines))
-        lines.append(f"  {_quoted(net.name)} [label={_quoted(text)}, shape=ellipse, style=dashed]")
-        for crowd in diagram.crowds:
-            lines.append(
-                f"  {_quoted(net.name)} -> {_quoted(f'peers {crowd.name}')} [dir=both, style=dashed]"
-            )
-    for node in diagram.nodes:
-        lines += [
-            f"  {_quoted(node.name)} -> {_quoted(link)} [dir=both, style=dashed]" for link in node.links
-        ]
-    for crowd in diagram.crowds:
-        text = "\n".join((f"{crowd.name}: {counted(crowd.count, 'peer')}", *crowd.settings))
-        lines.append(f"  {_quoted(f'peers {crowd.name}')} [label={_quoted(text)}, shape=box3d]")
+    lines = [f"digraph {_quoted(diagram.title)} {{", "  rankdir=LR; edge [dir=none]"]
+    lines.append(f"  label={_quoted(f'{diagram.title}, {one_of(diagram)}. {diagram.about}')}; labelloc=t")
+    for box in boxes_of(diagram):
+        label, shape = _quoted("\n".join(box.lines)), _DOT.get(box.role, "box")
+        lines.append(f"  {_quoted(box.key)} [label={label}, shape={shape}]")
+    for edge in edges_of(diagram):
+        style = " [dir=both, style=dashed]" if edge.sent else ""
+        lines.append(f"  {_quoted(edge.one)} -> {_quoted(edge.two)}{style}")
     return "\n".join([*lines, "}"])
+
+
+def draw_mermaid(diagram: Diagram) -> str:
+    """Return a diagram in Mermaid's language."""
+    number = {box.key: f"n{place}" for place, box in enumerate(boxes_of(diagram))}
+    lines = ["flowchart LR"]
+    for box in boxes_of(diagram):
+        text = "<br>".join(escape(line) for line in box.lines)
+        lines.append(f'  {number[box.key]}["{text}"]')
+    lines += [
+        f"  {number[edge.one]} {'-.-' if edge.sent else '---'} {number[edge.two]}"
+        for edge in edges_of(diagram)
+    ]
+    return "\n".join(lines)
 
 
 def _quoted(text: str) -> str:

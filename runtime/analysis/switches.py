@@ -287,10 +287,10 @@ def _changed(kind: Kind, one: _Opened, symbol: Any, operands: Sequence[Any]) -> 
     if what == "edge":
         partition = kind.clocks[p]
         inputs = partition.tick.sx_in()
-        outputs = partition.tick(*inputs)
-        every = partition.outputs * (outputs.numel() // len(partition.outputs))  # of all variants
+        computed = partition.tick(*inputs)
+        every = partition.outputs * (computed.numel() // len(partition.outputs))  # of all variants
         heard = inputs[3][place]
-        found = (name for row, name in enumerate(every) if casadi.depends_on(outputs[row], heard))
+        found = (name for row, name in enumerate(every) if casadi.depends_on(computed[row], heard))
         return list(dict.fromkeys(found))
     # A continuous force has no name in the equations of motion; the part whose parameters decide has.
     symbols = casadi.vertsplit(one.inputs[2]) if kind.parameters else []

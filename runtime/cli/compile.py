@@ -90,5 +90,5 @@ def _compile(path: Path) -> None:
 
     system = compile_topology(path)
     difference = check_frame(system)
-    save(system, target := path.with_suffix(".apc"), sealed=True)
+    save(system, target := path.with_suffix(".apc"), compiled=True)
     tell(compile_text(system, needs(system), target, difference))

@@ -17,8 +17,9 @@ from apc.compiler.files import write_text
 from apc.present.forms import json_text
 from apc.suffixes import check_suffix
 
-FORMATS = {".txt": "text", ".json": "json", ".dot": "dot", ".gv": "dot", ".svg": "svg"}
+FORMATS = {".txt": "text", ".json": "json", ".dot": "dot", ".gv": "dot", ".mmd": "mermaid", ".svg": "svg"}
 FORMATS |= {".png": "picture", ".pdf": "picture"}
+PICTURES = (".svg", ".png", ".pdf")
 
 
 @click.command("show", cls=Command)
@@ -26,16 +27,16 @@ FORMATS |= {".png": "picture", ".pdf": "picture"}
 @click.option(
     "--format",
     "format_",
-    type=click.Choice(["text", "json", "dot", "svg"]),
-    help="text: graph, equations, schedule. json: the same as one document. dot: the graph for Graphviz. "
-    "svg: the graph as a picture. Taken from --out if not given, else text.",
+    type=click.Choice(["text", "json", "dot", "mermaid", "svg"]),
+    help="text: graph, equations, schedule. json: the same as one document. dot, mermaid: the graph for "
+    "Graphviz and Mermaid. svg: the graph as a picture. Taken from --out if not given, else text.",
 )
 @click.option(
     "--parameters",
     is_flag=True,
     help="List what may be set instead: names, values, units, limits; as text or json.",
 )
-@file_option("--out", "Write to this file: .txt .json .dot .svg, or as a picture .png .pdf.")
+@file_option("--out", "Write to this file: .txt .json .dot .mmd, or as a picture .svg .png .pdf.")
 def show_command(file: str | None, format_: str | None, parameters: bool, out: Path | None) -> None:
     """Show what a scene is made of: its graph, equations and schedule.
 
@@ -56,11 +57,13 @@ def show_command(file: str | None, format_: str | None, parameters: bool, out: P
         return
     path = Path(file) if file else find_input(compiled_too=False)
     check_topology_outputs(path, {"--out": out})
-    if wanted == "picture":
-        from apc.present.graph import save_graph
+    if out is not None and out.suffix.lower() in PICTURES:
+        from apc.compiler.view.listing import diagram_of
+        from apc.present.graph import graph_picture
+        from apc.present.pictures import check_format, write_figure
 
-        assert out is not None
-        save_graph(path, out)
+        check_format(out, "--out")
+        write_figure(graph_picture(diagram_of(path)), out)
         tell(f"{out} is written", err=beside(out))
         return
     _print_or_write(shown(path, format=wanted), out)  # type: ignore[arg-type] # click checked the word

@@ -10,12 +10,13 @@ Does not: measure time (see `benchmark`), or count the headers of packets.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind, Link, Receive
-from apc.compiler.plain import PlainFunction, plain
+from apc.compiler.plain import POLISH, straight
 from apc.frame.exchange import arcs
 from apc.frame.parameters import resolve
 
@@ -60,7 +61,7 @@ def effort(system: CompiledSystem) -> Effort:
         every += channels * total * rates[link.clock]
     ticks = [
         (
-            _operations(plain(clock.tick))
+            _operations(clock.tick)
             + sum(_to_hear(one, int(heard[one.link][place])) for one in clock.receives),
             clock.clock,
         )
@@ -111,10 +112,12 @@ def _ways(
 
 def _to_hear(one: Receive, peers: int) -> int:
     """Return the operations of a reduction over so many peers."""
-    return peers if one.edge is None else peers * (1 + _operations(plain(one.edge)))
+    return peers if one.edge is None else peers * (1 + _operations(one.edge))
 
 
-def _operations(function: PlainFunction) -> int:
-    """Return how many operations a function has; inputs, outputs and constants are none."""
-    inside = sum(_operations(one) for loop in function.loops or () for one in loop)
-    return len(function.operations) + inside
+def _operations(function: Any) -> int:
+    """Return how many operations a function has, with those of its loops; inputs and constants are none."""
+    if function.is_a("SXFunction"):
+        return len(straight(function).operations)
+    called = {one.name(): one for one in function.find_functions(0) if one.name() != POLISH}
+    return sum(_operations(one if one.is_a("SXFunction") else one.oracle()) for one in called.values())

@@ -120,7 +120,8 @@ def c_peer(peer: Peer, name: str = "") -> CPeer:
 
 def title(peer: Peer) -> str:
     """Return the comment that a text begins with."""
-    texts = "\n".join(f"     {comment(digest)}  {comment(path)}" for path, digest in peer.system.origin.texts)
+    made_of = peer.system.origin.digests
+    texts = "\n".join(f"     {comment(digest)}  {comment(path)}" for path, digest in made_of)
     clocks = {partition.clock for partition in peer.kind.clocks}
     timings = {one.name: one.value for one in peer.system.timings}
     periods = ", ".join(

@@ -328,8 +328,8 @@ def _outside(system: CompiledSystem, name: str, site: SiteJacobians, device: str
 
 def _held(kind: Kind) -> frozenset[int]:
     """Return the states whose rates depend on a number of what the scene calls a hand."""
-    x, u, p, t = kind.derivative.sx_in() if kind.derivative.is_a("SXFunction") else kind.derivative.mx_in()
-    rates_of = kind.derivative(x, u, p, t)
+    inputs: Any = kind.derivative.sx_in() if kind.derivative.is_a("SXFunction") else kind.derivative.mx_in()
+    rates_of, p = kind.derivative(*inputs), inputs[2]
     hands = tuple(f"{hand}." for hand in kind.hands)
     own = [p[place] for place, one in enumerate(kind.parameters) if hands and one.startswith(hands)]
     if not own or not rates_of.numel():

@@ -26,6 +26,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.cache import HANDS_CHANGE
 from apc.compiler.compiled import PEERS, CompiledSystem, Kind, Parameter, Ports, Receive
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.interpolation import jacobian
@@ -353,18 +354,19 @@ def with_hands(system: CompiledSystem, hands: str) -> CompiledSystem:
         E930 no such hands; E931 no device; E932 hands in the scene.
     """
     option = f"--hands {hands}"
-    if hands not in HANDS:
-        usual = {name: numbers[2] for name, numbers in published(hands).items()}
-        one = held(system, option=option)
-        one = apply(one, [parse_override(one, f"{name}={value}") for name, value in usual.items()])
-        return replace(one, name=f"{system.name}, hands {hands}")
     if hands == PASSIVE:
         refuse_hands(system, option)
     if hands in (FREE, PASSIVE):
         return system
     if hands == CLAMPED:
-        return replace(clamped(system, option=option), name=f"{system.name}, devices clamped")
-    return replace(held(system, option=option), name=f"{system.name}, devices held")
+        one, name = clamped(system, option=option), "devices clamped"
+    elif hands in HANDS:
+        one, name = held(system, option=option), "devices held"
+    else:
+        usual = {name: numbers[2] for name, numbers in published(hands).items()}
+        one, name = held(system, option=option), f"hands {hands}"
+        one = apply(one, [parse_override(one, f"{name}={value}") for name, value in usual.items()])
+    return replace(one, name=f"{system.name}, {name}", origin=system.origin.after((HANDS_CHANGE, hands)))
 
 
 def clamped(system: CompiledSystem, *, option: str = "--hands clamped") -> CompiledSystem:

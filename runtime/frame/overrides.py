@@ -116,6 +116,7 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
         )
     found = replace(
         system,
+        origin=system.origin.after(*((one.free.label, str(one.value)) for one in overrides)),
         parameters=tuple(_renewed(one, common, everywhere) for one in system.parameters),
         timings=tuple(_renewed(one, common, everywhere) for one in system.timings),
         groups=tuple(groups),

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import casadi
 import numpy as np
 from numpy.typing import NDArray
 
@@ -204,8 +205,8 @@ def with_ports(
         kind,
         clocks=(
             *kind.clocks,
-            ClockPartition(INPUTS, of_inputs, ("1",) * (2 * inputs), (), (), (), None),
-            ClockPartition(READINGS, of_readings, ("1",) * outputs, (), (), (), None),
+            ClockPartition(INPUTS, of_inputs, ("1",) * (2 * inputs), (), (), (), casadi.Function()),
+            ClockPartition(READINGS, of_readings, ("1",) * outputs, (), (), (), casadi.Function()),
         ),
     )
     count, taken = len(drawn_at), len(read_at)

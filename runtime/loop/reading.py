@@ -9,18 +9,17 @@ Does not: ask whether it was so.
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler import store
-from apc.compiler.cache import DAMAGE, DamageError
+from apc.compiler.cache import read_archive
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, read_file
 from apc.compiler.words import counted
@@ -28,7 +27,8 @@ from apc.loop.packets import DROPPED
 from apc.loop.peer import live_scene
 from apc.loop.run import ARRAYS, PLAIN, SCENE, PeerRun, Run
 from apc.network.timetable import START, Route
-from apc.npz import read_arrays
+from apc.npz import DamageError, read_arrays
+from apc.opening import opened
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 
@@ -61,7 +61,7 @@ class _Told:
     emulated: bool
     outside: bool
     signals: tuple[str, ...]
-    dropped: tuple[tuple[str, int], ...]
+    dropped: dict[str, int]
     not_given: tuple[str, ...]
     sent: tuple[tuple[int, int, int], ...]
     offsets: tuple[tuple[int, float, float], ...]
@@ -88,7 +88,8 @@ def read_run(folder: Path) -> Run:
     if not (folder / SCENE).is_file() or not files:
         what = f"holds no run: {SCENE} and a file a peer, as apc play writes them"
         raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out RUN"))
-    system = store.load(folder / SCENE)
+    archive = read_archive(folder / SCENE)
+    system = opened(archive, folder)
     if len(files) > system.peers:
         what = f"holds {counted(len(files), 'peer', ',')} of a scene with {system.peers:,}"
         raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
@@ -99,7 +100,7 @@ def read_run(folder: Path) -> Run:
     if len({(one.digest, one.session) for one in peers}) > 1:
         what = "holds peers that did not play together: of other runs, of other scenes, or with another --set"
         raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
-    if peers[0].digest != hashlib.sha256(read_file(folder / SCENE, LARGEST)).hexdigest():
+    if peers[0].digest != hashlib.sha256(archive.model).hexdigest():
         what = f"its {SCENE} is not the scene that was played"
         raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
     if len({one.number for one in peers}) < len(peers):
@@ -131,15 +132,13 @@ def _peer(found: dict[str, NDArray[Any]]) -> PeerRun:
     _want({"told", *ARRAYS} <= found.keys(), f"it lacks one of {', '.join(('told', *ARRAYS))}")
     _want(found["told"].size <= LONGEST, "it tells too much")
     try:
-        document = json.loads(found["told"].tobytes())
-        document["dropped"] = [list(one) for one in document["dropped"].items()]
-        told = store.typed(_Told, document, {})
-    except DAMAGE:
+        told = msgspec.json.decode(found["told"].tobytes(), type=_Told)
+        _want(all(map(str.isprintable, told.not_given)), "")  # it is shown in a terminal
+    except ValueError:
         raise DamageError("what it tells is not what apc play writes") from None
     routed = {f"{name}{at}" for name in ("packets", "missing") for at in range(min(told.routes, len(found)))}
     _want(found.keys() == {"told", *ARRAYS, *routed}, "its links are not those it tells of")
     plain: dict[str, Any] = {name: getattr(told, name) for name in PLAIN}
-    plain["dropped"] = dict(told.dropped)
     plain["sent"] = {(link, other): count for link, other, count in told.sent}
     plain["offsets"] = {other: (trip, ahead) for other, trip, ahead in told.offsets}
     arrays: dict[str, Any] = {name: found[name] for name in ARRAYS}

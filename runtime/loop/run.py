@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler import store
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import check_target, same_file, unwritable
 from apc.loop.peer import NANO, Loop
-from apc.processes import model_bytes
 from apc.simulation.blocks import instants_of
 
 Floats = NDArray[np.float64]
@@ -168,7 +168,7 @@ def write_run(folder: Path, system: CompiledSystem, peers: Sequence[PeerRun], *,
     try:
         with tempfile.TemporaryDirectory(prefix=f".{folder.name[:64]}.", dir=here) as temporary:
             ready = Path(temporary)
-            (ready / SCENE).write_bytes(model_bytes(system))
+            store.save(system, ready / SCENE)
             for one in peers:
                 _write_peer(ready, one, system)
             folder.mkdir(exist_ok=True)

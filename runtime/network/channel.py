@@ -24,17 +24,19 @@ import math
 import zlib
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.network.philox import words
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
+
+BLOCK = 4  # words of one counter
 
 # netem's Pareto table (iproute2, netem/pareto.c): shape 3, its mean 3/2 taken off, times 4/3, and no more
 # than 4, the largest number that the table can hold (32767/8192).
@@ -169,9 +171,9 @@ class PacketSource:
         self.law = law
         self.taken = 0  # packets of each way
         self._key = luck_key(link, seed, run)
-        self._pairs = np.asarray(pairs, np.int64).reshape(-1, 2, 1)
+        self._pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
         self.ways = len(self._pairs)
-        self._bad: Flags = self._uniforms(np.array([1]))[:, 0, 0] < law.bad
+        self._bad: Flags = self._uniforms(1, 1)[:, 0, 0] < law.bad
 
     def take(self, count: int) -> Floats:
         """Return the delays (M, count) in seconds of the next packets, infinite for those that get lost."""
@@ -180,16 +182,23 @@ class PacketSource:
         if law.trace is not None:
             recorded = law.trace[np.arange(first, first + count) % law.trace.size]
             return np.broadcast_to(recorded, (self.ways, count))
-        uniforms = self._uniforms(np.arange(first, first + count) + 2)
+        uniforms = self._uniforms(first + 2, count)
         bad = self._states(uniforms[..., 0])
         lost = uniforms[..., 1] < np.where(bad, law.one_minus_h, law.one_minus_k)
         late = deviates(law.distribution, uniforms[..., 2], uniforms[..., 3]) if law.jitter else 0.0
         # Nothing arrives before it was sent: as in netem, a delay that would be negative is none.
         return np.where(lost, np.inf, np.maximum(law.delay + law.jitter * late, 0.0))
 
-    def _uniforms(self, blocks: Integers) -> Floats:
-        """Return the numbers (M, blocks, BLOCK) of some blocks, from 0 to less than 1, of 53 bits each."""
-        found = words(self._key, (blocks, self._pairs[:, 0], self._pairs[:, 1]))
+    def _uniforms(self, first: int, count: int) -> Floats:
+        """Return the numbers (M, count, BLOCK) of so many blocks, from 0 to less than 1, of 53 bits each."""
+        generator = np.random.Philox(key=np.array(self._key, np.uint64))
+        state: Any = generator.state
+        words = np.empty((self.ways, count * BLOCK), np.uint64)
+        for row, pair in zip(words, self._pairs, strict=True):
+            state["state"]["counter"] = np.array([first - 1, *pair, 0], np.uint64)  # it counts, then gives
+            generator.state = state
+            row[:] = generator.random_raw(count * BLOCK)
+        found = words.reshape(self.ways, count, BLOCK)
         return np.asarray((found >> np.uint64(11)) * 2.0**-53, dtype=np.float64)
 
     def _states(self, uniforms: Floats) -> Flags:

@@ -1,110 +1,213 @@
-"""A scene's graph as PNG or PDF: what `apc show` writes as SVG, drawn by matplotlib.
+"""A scene's graph as a picture: what `apc show` writes as SVG, PNG or PDF, drawn by matplotlib.
 
-Takes: a topology's path. Gives: `graph_picture`, `save_graph`.
-Guarantees: the marks stand where they stand in the SVG, a unit of the page being 1/96 inch.
-Does not: place anything (see `compiler.view.picture`).
+Takes: the graph of a topology. Gives: `graph_picture`.
+Guarantees: no two boxes overlap and no line crosses one; of many peers and groups only the first are drawn,
+and the others are counted.
+Does not: look at equations.
 
-matplotlib is loaded when something is drawn and not before.
+Boxes stand in columns, each one column behind the nearest that it is joined to (layers by breadth-first
+search). As masses and links are joined only to couplers, hands and groups, every line runs between two
+columns that are neighbours.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
+import textwrap
+from collections.abc import Sequence
 from typing import Any
 
-from apc.compiler.view.listing import show_page
-from apc.compiler.view.svg import Box, Dot, Line, Mark, Picture, Text
+from apc.compiler.multiples import common_multiple
+from apc.compiler.view.diagram import (
+    Box,
+    Diagram,
+    Edge,
+    Net,
+    boxes_of,
+    edges_of,
+    one_of,
+    seconds,
+    shape_of,
+)
+from apc.compiler.words import counted
 from apc.optional import need
-from apc.present.pictures import check_format, write_figure
+from apc.present.pictures import COLOURS
 
-INCH, POINT = 96.0, 96.0 / 72.0  # units of the page
-DASHES = (0, (5 / POINT, 3 / POINT))
-HEAD = (7.0, 3.5)  # of an arrow: length, half of its width
+# All in points.
+SIZE, TITLE = 8.0, 12.0  # of letters
+LINE, PAD = 12.0, 7.0  # from one line to the next, inside a box
+GAP, BETWEEN, MARGIN = 46.0, 16.0, 12.0  # between columns, between boxes, around all
+HEAD = 42.0  # of the title and what the scene is about
+BELOW, BESIDE = 140.0, 170.0  # height and width of the pictures of who hears whom, and of the clocks
+MOST_PEERS = 16  # in a picture of who hears whom
+MOST_TICKS = 120  # of one clock along the frame
+FILLS = {"mass": "#e8eff8", "hand": "#fdf3e0", "link": "#f2f2f2"}
+INK, FAINT = "#1f2933", "#6b7785"
 
-
-def save_graph(topology: Path, path: Path) -> None:
-    """Draw the graph of a topology into a file, its format chosen by the suffix.
-
-    Raises
-    ------
-    ApcError
-        The topology is at fault; E878 no such format, E601 it can't be written, E875 matplotlib is missing.
-    """
-    check_format(path, "--out")
-    write_figure(graph_picture(show_page(topology)), path)
+_Places = dict[str, tuple[float, float, float, float]]  # left, top, width and height of each box
 
 
-def graph_picture(page: Picture) -> Any:
-    """Draw a page of marks; return the matplotlib Figure.
+def graph_picture(diagram: Diagram) -> Any:
+    """Draw a scene; return the matplotlib Figure.
 
     Raises
     ------
     ApcError
-        E875 matplotlib is not installed.
+        E875 matplotlib or networkx is not installed.
     """
-    figures = need("matplotlib.figure", "plot")
-    figure = figures.Figure(figsize=(page.width / INCH, page.height / INCH))
-    ax = figure.add_axes((0, 0, 1, 1))
+    boxes, edges = boxes_of(diagram), edges_of(diagram)
+    places = _places(boxes, edges)
+    title = f"{diagram.title}, {one_of(diagram)}"
+    below = BESIDE * (len(diagram.links) + 2 * bool(diagram.pulses))
+    right = max(left + wide for left, _, wide, _ in places.values())
+    width = max(below, max(right, _width(title, TITLE)) + 2 * MARGIN)
+    graph = max(top + high for _, top, _, high in places.values()) + BETWEEN
+    small = BELOW if diagram.pulses or diagram.links else 0.0
+    height = HEAD + graph + small + MARGIN
+    figure = need("matplotlib.figure", "plot").Figure(figsize=(width / 72, height / 72))
+    ax = figure.add_axes((0, (small + MARGIN) / height, 1, (graph + HEAD) / height), xlim=(0, width))
+    ax.set_ylim(graph, -HEAD)
     ax.set_axis_off()
-    ax.set_xlim(0, page.width)
-    ax.set_ylim(page.height, 0)
-    for order, mark in enumerate(page.marks):
-        _draw(ax, mark, order)
+    about = textwrap.shorten(diagram.about, int(width / 4.6), placeholder="…")
+    ax.text(MARGIN, 18 - HEAD, title, size=TITLE, weight="bold", color=INK, parse_math=False)
+    ax.text(MARGIN, 32 - HEAD, about, size=SIZE, color=FAINT, parse_math=False)
+    for edge in edges:
+        (x, y, wide, high), (left, top, _, tall) = sorted((places[edge.one], places[edge.two]))
+        style = {"color": FAINT, "linestyle": "--"} if edge.sent else {"color": INK}
+        ax.plot((MARGIN + x + wide, MARGIN + left), (y + high / 2, top + tall / 2), lw=1, **style)
+    colours = _colours(diagram)
+    for box in boxes:
+        _draw(ax, box, places[box.key], colours)
+    _draw_below(figure, diagram, small / height, colours)
     return figure
 
 
-def _draw(ax: Any, mark: Mark, order: int) -> None:
-    """Draw a mark over those before it."""
+def _places(boxes: Sequence[Box], edges: Sequence[Edge]) -> _Places:
+    """Return where each box stands, what is joined to one another in columns of its own."""
+    networkx = need("networkx", "plot")
+    by_key = {box.key: box for box in boxes}
+    graph = networkx.Graph()
+    graph.add_nodes_from(by_key)
+    graph.add_edges_from((edge.one, edge.two) for edge in edges)
+    found: _Places = {}
+    below = 0.0
+    for box in boxes:
+        if box.key in found:
+            continue
+        joined = networkx.node_connected_component(graph, box.key)
+        hands = [key for key in by_key if key in joined and by_key[key].role == "hand"]
+        columns = networkx.bfs_layers(graph, hands or [box.key])
+        columns = [[by_key[key] for key in column] for column in columns]
+        heights = [sum(_height(one) + BETWEEN for one in column) - BETWEEN for column in columns]
+        left = 0.0
+        for column, height in zip(columns, heights, strict=True):
+            width = max(_width(line, SIZE) for one in column for line in one.lines) + 2 * PAD
+            top = below + (max(heights) - height) / 2
+            for one in column:
+                found[one.key] = left, top, width, _height(one)
+                top += _height(one) + BETWEEN
+            left += width + GAP
+        below += max(heights) + 2 * BETWEEN
+    return found
+
+
+def _width(text: str, size: float) -> float:
+    """Return how wide a line in bold letters is."""
+    bold = need("matplotlib.font_manager", "plot").FontProperties(weight="bold")
+    path = need("matplotlib.textpath", "plot").TextPath((0, 0), text.replace("$", "s"), size, prop=bold)
+    return float(path.get_extents().width) if text.strip() else 0.0
+
+
+def _height(box: Box) -> float:
+    return LINE * len(box.lines) + 2 * PAD
+
+
+def _draw(ax: Any, box: Box, place: tuple[float, float, float, float], colours: dict[str, str]) -> None:
     patches = need("matplotlib.patches", "plot")
-    paths = need("matplotlib.path", "plot")
-    match mark:
-        case Text():
-            side, weight = "center" if mark.middle else "left", "bold" if mark.bold else "normal"
-            look = {
-                "fontsize": mark.size / POINT,
-                "color": mark.colour,
-                "fontweight": weight,
-                "zorder": order,
-            }
-            ax.text(mark.x, mark.y, mark.text, ha=side, va="baseline", parse_math=False, **look)
-        case Box():
-            round_ = min(mark.round, mark.width / 2, mark.height / 2)
-            style = patches.BoxStyle("Round", pad=0, rounding_size=round_)
-            dash = DASHES if mark.dashed else "-"
-            look = {
-                "facecolor": mark.fill,
-                "edgecolor": mark.stroke,
-                "linewidth": 1.3 / POINT,
-                "zorder": order,
-            }
-            corner = (mark.x, mark.y)
-            box = patches.FancyBboxPatch(
-                corner, mark.width, mark.height, boxstyle=style, linestyle=dash, **look
+    left, top, width, height = place[0] + MARGIN, *place[1:]
+    style = "round,pad=0,rounding_size=6" if box.role != "mass" else "square,pad=0"
+    edge = colours.get(box.key) or colours.get(f"clock {box.clock}", FAINT)
+    fill, dash = FILLS.get(box.role, "white"), "--" if box.role == "link" else "-"
+    look = {"facecolor": fill, "edgecolor": edge, "linestyle": dash, "linewidth": 1.3}
+    ax.add_patch(patches.FancyBboxPatch((left, top), width, height, boxstyle=style, zorder=3, **look))
+    for row, line in enumerate(box.lines):
+        weight, y = "bold" if row == 0 else "normal", top + PAD + LINE * (row + 0.75)
+        look = {"size": SIZE, "ha": "center", "weight": weight, "color": INK, "parse_math": False}
+        ax.text(left + width / 2, y, line, zorder=4, **look)
+
+
+def _colours(diagram: Diagram) -> dict[str, str]:
+    """Return the colours of clocks, and from the other end those of groups."""
+    clocks = {f"clock {pulse.name}": COLOURS[1 + i % 6] for i, pulse in enumerate(diagram.pulses)}
+    groups = {f"group {crowd.name}": COLOURS[-1 - i % 6] for i, crowd in enumerate(diagram.groups)}
+    return clocks | groups
+
+
+def _draw_below(figure: Any, diagram: Diagram, height: float, colours: dict[str, str]) -> None:
+    """Draw who hears whom over each link, and the ticks of each clock along a frame."""
+    owners = [crowd.name for crowd in diagram.groups for _ in range(min(crowd.count, MOST_PEERS))][
+        :MOST_PEERS
+    ]
+    shares = [*(1 for _ in diagram.links), *([2] if diagram.pulses else [])]
+    start = 0.02
+    for share, net in zip(shares, [*diagram.links, None], strict=False):
+        width = 0.96 * share / sum(shares)
+        if net is None:
+            ax = figure.add_axes((start + 0.35 * width, 0.3 * height, 0.62 * width, 0.5 * height))
+            _draw_ticks(ax, diagram, colours)
+        else:
+            ax = figure.add_axes((start, 0.04 * height, width, 0.74 * height), aspect="equal", anchor="S")
+            _draw_peers(ax, diagram, net, [colours[f"group {name}"] for name in owners])
+        start += width
+
+
+def _draw_peers(ax: Any, diagram: Diagram, net: Net, fills: list[str]) -> None:
+    networkx = need("networkx", "plot")
+    number = len(fills)
+    shapes = {
+        "complete": networkx.complete_graph,
+        "ring": networkx.cycle_graph,
+        "star": lambda peers: networkx.star_graph(peers - 1),
+    }
+    if net.graph in shapes:
+        graph = shapes[net.graph](number)
+    else:
+        graph = networkx.DiGraph(pair for pair in net.arcs if max(pair) < number)
+        graph.add_nodes_from(range(number))
+    inner = [0] if net.graph == "star" else []
+    shells = [one for one in (inner, [peer for peer in range(number) if peer not in inner]) if one]
+    look = {"node_size": 40, "edge_color": FAINT, "width": 0.7, "with_labels": False}
+    places = networkx.shell_layout(graph, shells)
+    networkx.draw_networkx(graph, places, ax=ax, nodelist=range(number), node_color=fills, **look)
+    told = f"{net.name}: {counted(diagram.peers, 'peer', ',')}, {shape_of(net)}"
+    if diagram.peers > number:
+        told += f"\n{number} drawn, {diagram.peers - number:,} left out"
+    ax.set_title(told, size=SIZE, color=INK)
+    ax.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2))
+    ax.set_axis_off()
+
+
+def _draw_ticks(ax: Any, diagram: Diagram, colours: dict[str, str]) -> None:
+    frame = common_multiple(pulse.period for pulse in diagram.pulses)
+    for row, pulse in enumerate(diagram.pulses):
+        count, colour = int(frame / pulse.period), colours[f"clock {pulse.name}"]
+        ticks = (
+            [float(pulse.phase + k * pulse.period) * 1e3 for k in range(count)] if count <= MOST_TICKS else []
+        )
+        ax.eventplot(ticks, lineoffsets=-row, linelengths=0.6, colors=colour)
+        if not ticks:
+            ax.text(
+                float(frame) * 5e2,
+                -row,
+                f"{count:,} ticks",
+                size=SIZE,
+                ha="center",
+                va="center",
+                color=colour,
             )
-            ax.add_patch(box)
-        case Dot():
-            look = {
-                "facecolor": mark.fill,
-                "edgecolor": mark.stroke,
-                "linewidth": 0.8 / POINT,
-                "zorder": order,
-            }
-            ax.add_patch(patches.Circle((mark.x, mark.y), mark.radius, **look))
-        case Line():
-            path = paths.Path(mark.points)
-            (x0, y0), (x1, y1) = mark.points[0], mark.points[-1]
-            if mark.curved:
-                half = (x1 - x0) / 2
-                codes = [paths.Path.MOVETO, *[paths.Path.CURVE4] * 3]
-                path = paths.Path([(x0, y0), (x0 + half, y0), (x1 - half, y1), (x1, y1)], codes)
-            dash = DASHES if mark.dashed else "-"
-            look = {
-                "edgecolor": mark.colour,
-                "linewidth": mark.width / POINT,
-                "linestyle": dash,
-                "zorder": order,
-            }
-            ax.add_patch(patches.PathPatch(path, facecolor="none", **look))
-            for x, y, way in ((x0, y0, 1), (x1, y1, -1)) if mark.arrows else ():
-                tip = [(x, y), (x + HEAD[0] * way, y - HEAD[1]), (x + HEAD[0] * way, y + HEAD[1])]
-                ax.add_patch(patches.Polygon(tip, facecolor=mark.colour, edgecolor="none", zorder=order))
+    names = [f"{pulse.name}: every {seconds(pulse.period)}" for pulse in diagram.pulses]
+    ax.set_yticks([-row for row in range(len(names))], names, size=SIZE)
+    ax.set_xlim(0, float(frame) * 1e3)
+    ax.set_ylim(0.5 - len(names), 0.5)
+    ax.tick_params(labelsize=SIZE, length=2)
+    ax.set_xlabel(f"ms of one frame, {seconds(frame)}", size=SIZE, color=FAINT)
+    ax.spines[["top", "right", "left"]].set_visible(False)

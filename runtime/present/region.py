@@ -118,7 +118,7 @@ def region_document(found: Region) -> dict[str, Any]:
         "finest_cell": found.finest,
         "criterion": found.criterion,
         "left_out": list(found.left_out),
-        "origin": dict(found.system.origin.texts),
+        "origin": dict(found.system.origin.digests),
     }
 
 
@@ -201,7 +201,7 @@ def write_panels(path: Path, found: Panels) -> None:
 
 
 def _origins(found: Panels) -> dict[str, Any]:
-    return {one.topology: dict(one.system.origin.texts) for panel in found.panels for one in panel.regions}
+    return {one.topology: dict(one.system.origin.digests) for panel in found.panels for one in panel.regions}
 
 
 def _columns(found: Region) -> list[Column]:

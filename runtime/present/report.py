@@ -182,14 +182,15 @@ def _row(key: str, title: str, cells: Sequence[str]) -> list[str]:
 
 
 def _scene(one: SceneReport, draw: _Pictures) -> str:
-    from apc.compiler.view.listing import show_page  # of the topology as written
+    from apc.compiler.view.listing import diagram_of  # of the topology as written
 
-    page = show_page(one.path)
+    diagram = diagram_of(one.path)
+    title = f"{diagram.title}. {diagram.about}".strip()
     texts = "".join(f"<h3>{escape(name)}</h3><pre>{escape(text)}</pre>" for name, text in one.texts)
     settings = "".join(f"<li>{_code(text)}</li>" for text in one.settings)
     told = f"<p>{escape(one.about)}</p>" + (f"<p>Set first:</p><ul>{settings}</ul>" if settings else "")
     command = f"<p>As by {_code(f'apc show {one.path.name} --out scene.svg')}.</p>"
-    return f"<h3>{escape(one.name)}</h3>{told}{draw.of(graph_picture(page), page.title)}{command}{texts}"
+    return f"<h3>{escape(one.name)}</h3>{told}{draw.of(graph_picture(diagram), title)}{command}{texts}"
 
 
 def _section(one: SceneReport, key: str, draw: _Pictures, several: bool) -> str:

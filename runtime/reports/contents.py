@@ -14,7 +14,7 @@ import shlex
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,6 @@ from apc.comparison.choice import DELAY, LOSS, STIFFNESS, choose
 from apc.comparison.comparison import Comparison, compare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.compiler.files import files_below
 from apc.compiler.timings import part
 from apc.compiler.words import counted, with_unit
 from apc.distribution import versions
@@ -165,9 +164,9 @@ def _scene(path: Path, system: CompiledSystem, settings: Sequence[str]) -> Scene
             sections.append(make(system, call))
         except ApcError as error:
             sections.append(Section(key, "", refused=_why(error)))
-    texts = tuple(_texts(path, system))
+    texts = tuple(_texts(system))
     about = (system.name, system.about, path)
-    return SceneReport(*about, tuple(settings), texts, system.origin.texts, tuple(sections))
+    return SceneReport(*about, tuple(settings), texts, system.origin.digests, tuple(sections))
 
 
 def _why(error: ApcError) -> str:
@@ -177,15 +176,11 @@ def _why(error: ApcError) -> str:
     return f"{one.what}{wanted}"
 
 
-def _texts(path: Path, system: CompiledSystem) -> Iterable[tuple[str, str]]:
-    """Yield the texts of a scene's own: the topology, its tables, its folders of components."""
-    for name, _ in system.origin.texts:
-        found = path.parent / name
-        if name.endswith("/"):
-            for one in files_below(found, ".yaml"):
-                yield f"{name}{one.relative_to(found)}", one.read_text(encoding="utf-8")
-        elif found.suffix and found.is_file():
-            yield name, found.read_text(encoding="utf-8")
+def _texts(system: CompiledSystem) -> Iterable[tuple[str, str]]:
+    """Yield the texts of a scene's own: the topology, its tables, its components."""
+    for name, text in system.origin.texts:
+        if PurePath(name).suffix and not name.endswith("/"):
+            yield name, text.decode()
 
 
 # ---- the sections ----

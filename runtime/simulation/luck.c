@@ -19,7 +19,7 @@ static inline uint64_t high(uint64_t a, uint64_t b, uint64_t *low) {
 #endif
 }
 
-/* Philox-4x64-10, as in `network.philox`: numbers from 0 to less than 1 of so many ways at once, at most SIDE, each
+/* Philox-4x64-10, as NumPy's, see `network.channel`: numbers from 0 to less than 1 of so many ways at once, at most SIDE, each
    with its second word of the key. A number's rounds wait for one another, those of several ways do not. */
 #define SIDE 4
 static inline void chances(const int ways, uint64_t key, const uint64_t *keys, whole block, const whole *senders,

@@ -183,7 +183,7 @@ def _table(name: str, each: str, parameters: str, count: int) -> str:
 def _kernel(place: int, kernel: Kernel) -> str:
     """Return a segment's kernel as a loop over peers."""
     function, recorded = kernel.function, kernel.recorded
-    carry, heard, constants, impulses, _ = function.sizes[0]
+    carry, heard, constants, impulses, _ = (rows for _, rows in function.inputs)
     inputs = [
         *(f"carry[{k} * n + i]" for k in range(carry)),
         *(f"heard[{k} * n + i]" for k in range(heard)),
@@ -221,7 +221,7 @@ CLONES static void kernel{place}({PARAMETERS.format(own="int own, ")}) {{
 
 def _look(place: int, function: PlainFunction) -> str:
     """Return a function of pairs as a loop over arcs, and what their values are joined to."""
-    own, sent, _, _ = function.sizes[0]
+    own, sent, _, _ = (rows for _, rows in function.inputs)
     inputs = [
         *(f"((const double *)own[{2 * k}])[own[{2 * k + 1}] * r]" for k in range(own)),
         *(f"sent[{k} * width + s]" for k in range(sent)),

@@ -141,7 +141,7 @@ def parameters_of(system: CompiledSystem) -> tuple[tuple[str, float, str], ...]:
 
 def texts_of(system: CompiledSystem) -> str:
     """Return the SHA-256 of all texts of a scene."""
-    texts = "\n".join(f"{name} {digest}" for name, digest in system.origin.texts)
+    texts = "\n".join(f"{name} {digest}" for name, digest in system.origin.digests)
     return hashlib.sha256(texts.encode("utf-8", "surrogateescape")).hexdigest()
 
 

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import RefusedError, read_file, unlink_link, unwritable, write_file
+from apc.compiler.files import RefusedError, read_file, unlink_link, unwritable, write_bytes
 from apc.compiler.seal import seal
 from apc.npz import read_arrays
 from apc.sweeps.quantities import Cells
@@ -52,7 +52,7 @@ class Parts:
         try:
             self.folder.mkdir(exist_ok=True)
             unlink_link(self._path(part))
-            write_file(self._path(part), lambda path: _fill(path, content))
+            write_bytes(self._path(part), content)
         except OSError as error:
             raise unwritable(self.folder, error) from error
         except ApcError:
@@ -128,10 +128,6 @@ def _unpacked(found: Mapping[str, NDArray[Any]]) -> Cells:
     numbers, codes = iter(found["numbers"]), iter(found["codes"])
     texts = np.array([*json.loads(found["texts"].tobytes()), None], dtype=object)
     return tuple(texts[next(codes)] if text else next(numbers) for text in found["is_text"].tolist())
-
-
-def _fill(path: Path, content: bytes) -> None:
-    path.write_bytes(content)
 
 
 def open_parts(target: Path, description: Mapping[str, Any]) -> Parts:

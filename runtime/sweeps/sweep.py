@@ -250,7 +250,7 @@ def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
             for axis in work.grid.axes
         ],
         "parameters": parameters,
-        "texts": dict(system.origin.texts),
+        "texts": dict(system.origin.digests),
         "model": hashlib.sha256(work.model).hexdigest(),
         "part_points": work.part_points,
         "versions": dict(program_versions()),

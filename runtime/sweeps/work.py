@@ -30,7 +30,7 @@ _ONE_AT_A_TIME = threading.Lock()
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """A whole sweep: the compiled model as the bytes of NAME.apc, what to compute, and where.
+    """A whole sweep: the compiled model as bytes (see `processes`), what to compute, and where.
 
     Part i holds the points from i·`part_points` on, `part_points` of them or what is left.
     """

@@ -1,16 +1,15 @@
 # ruff: noqa: E501 -- scenes, and lists of hostile values, read best as they are
 """Damaged and forged files: compiled models, what `apc play` recorded of a peer, parts of a sweep.
 
-Takes: a seed. Gives: `FORGERIES`; `zipped`, `packed`, `recorded`.
-Guarantees: of equal seed comes equal input, but for what a clock says in a recording; every digest of a model
-is that of what it stands for, as whoever forges a file makes it.
+Takes: a seed. Gives: `FORGERIES`; `zipped`, `recorded`.
+Guarantees: of equal seed comes equal input, but for what a clock says in a recording; no forged model has a
+seal, as whoever forges a file has none.
 Does not: watch over what it runs (see `running`).
 """
 
 from __future__ import annotations
 
 import functools
-import hashlib
 import io
 import json
 import random
@@ -24,13 +23,15 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
-import apc
-from apc.compiler import store
-from apc.compiler.cache import MEMBER
+from apc.api import analyze, critical, simulate
+from apc.compiler.cache import FORMAT, Origin
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
+from apc.compiler.store import model_of
+from apc.inputs import load_fresh
 from apc.loop.beside import compare_run
 from apc.loop.peer import Loop
 from apc.loop.reading import read_run
@@ -42,41 +43,13 @@ from tests.fuzz.trees import Pairs, Tree, as_json, changed, of_json
 from tests.topologies import AVERAGE, replaced
 
 FILE = "scene.apc"
-_PART = """\
-component: Cubic
-about: A spring that hardens, given the wrong way round.
-connectors: {flange: Flange}
-parameters: {stiffness: {unit: N/m, min: 0}, soft: {unit: N^-2, min: 0}}
-variables: {f: {unit: N}}
-equations:
-  - f + soft*f^3 = stiffness*flange.x
-  - flange.f = f
-"""
-_LOOP = """\
-topology: scene
-library: parts
-clocks: {tick: 1 ms}
-peers: {user: {count: 2}}
-masses: {device: {mass: 1 kg, damping: 2 N*s/m, x: 1 mm}}
-couplers:
-  tie: {type: Cubic, flange: device, stiffness: 3 N/m, soft: 0.1 N^-2}
-  wall: {type: VirtualWall, flange: device, stiffness: 900 N/m, clock: tick}
-"""
-_EDGES = """\
-topology: scene
-clocks: {haptic: 1 ms, network: 8 ms}
-parameters: {kt: 500 N/m}
-peers:
-  one: {count: 1, set: {device.mass: 1 kg}}
-  two: {count: 2, set: {device.mass: [0.1 kg, 0.2 kg]}}
-masses: {device: {mass: 0.1 kg, damping: 5 N*s/m}, cube: {mass: 0.6 kg, damping: 5 N*s/m, shared: true}}
-couplers:
-  contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic, delay: 1 ms}
-  coordination: {type: SaturatedMesh, object: cube, stiffness: "max(kt, 0.3*kt)/(peers - 1)", limit: 1 N, clock: haptic, link: lan}
-links: {lan: {graph: {edges: [[1, 2], [2, 3], [3, 1]]}, clock: network, delay: 8 ms, loss: 10 %, jitter: 1 ms}}
-hands: {hand: {type: ConstantForce, flange: device, force: 1 N, at: [one]}}
-experiment: {duration: 20 ms}
-"""
+_SCENES = ("three-users-average", "users-table", "finger", "mixed-clocks", "experiment-mesh")
+# In place of a text, a name, a number or all that a model was made from.
+_HOSTILE = (
+    *("", "..", "/etc/passwd", "../../x", "./users.csv", "/dev/zero", "x\0", "\x1b[31m", "Mass", "./parts/"),
+    *("id > PWNED", "__import__('os').system('touch PWNED')", "1e999999999", "9" * 5000, "1/0", "held"),
+    *(None, True, -1, 10**400, [], {}, [[]], [["a", "b"]], [[["hands", "held"]]], [[["device.mass", "1/0"]]]),
+)
 RUN, PEER = "a.run", "a.run/user-1.npz"
 TARGET, SWEEP = Path("r.csv"), {"model": "abc"}
 _CELLS = (np.array(["stable", "unstable"] * 20, dtype=object), np.linspace(0.0, 1.0, 40))
@@ -99,21 +72,6 @@ def _unzipped(content: bytes) -> dict[str, bytes]:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-def packed(document: Any, members: dict[str, bytes], *, kind: int = zipfile.ZIP_DEFLATED) -> bytes:
-    """Return the file of a compiled model: its document and its arrays, with the digests that they have."""
-    return zipped(_digested({MEMBER: json.dumps(document).encode(), **members}), kind=kind)
-
-
-def _digested(members: dict[str, bytes]) -> dict[str, bytes]:
-    """Return the members of a model, the digests in its document those of the others."""
-    tree = of_json(members[MEMBER])
-    others = {name: content for name, content in members.items() if name != MEMBER}
-    for pair in tree if isinstance(tree, Pairs) else ():
-        if pair[0] == "members" and isinstance(pair[1], Pairs):
-            pair[1] = Pairs([[name, hashlib.sha256(one).hexdigest()] for name, one in others.items()])
-    return {MEMBER: as_json(tree).encode(), **others}
-
-
 def array(value: Any) -> bytes:
     """Return an array as a member of a file."""
     file = io.BytesIO()
@@ -124,21 +82,17 @@ def array(value: Any) -> bytes:
 # ---- forging ----
 
 
-def _forged(
-    rng: random.Random, content: bytes, donor: bytes, *, name: str, digested: bool
-) -> tuple[str, bytes]:
+def _forged(rng: random.Random, content: bytes, *, name: str) -> tuple[str, bytes]:
     """Return what sort of forgery it is, and a forged archive.
 
     Parameters
     ----------
     rng
         The luck of it.
-    content, donor
-        An archive, and one from whose document a part may come.
+    content
+        An archive.
     name
         Of the member that holds a document: JSON, or an array of its bytes.
-    digested
-        Whether the document holds the others' digests, which are made to fit.
     """
     sort = rng.choice(_SORTS)
     if sort == "bytes":
@@ -146,10 +100,9 @@ def _forged(
     members = _unzipped(content)
     for _ in range(rng.choice((1, 1, 1, 2, 5))):
         try:
-            _change(rng, sort, members, _document(_unzipped(donor)[name]), name)
+            _change(rng, sort, members, _document(_unzipped(content)[name]), name)
         except (IndexError, KeyError, ValueError):
             break  # what it changes is gone already, or damaged
-    members = _digested(members) if digested else members
     return sort, zipped(members, kind=rng.choice((zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED)))
 
 
@@ -201,28 +154,44 @@ def _changed_array(rng: random.Random, content: bytes) -> bytes:
 
 
 @functools.cache
-def bases() -> tuple[bytes, ...]:
-    """Return whole models to start from."""
-    files = []
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "parts").mkdir()
-        (folder / "parts" / "cubic.yaml").write_text(_PART, encoding="utf-8")
-        scenes = ("three-users-average", "users-table", "finger", "mixed-clocks", "experiment-mesh")
-        paths = [MODELS / "scenes" / f"{scene}.yaml" for scene in scenes]
-        for place, text in enumerate((_LOOP, _EDGES)):
-            paths.append(folder / f"scene{place}.yaml")
-            paths[-1].write_text(text, encoding="utf-8")
-        for path in paths:
-            store.save(compile_topology(path), folder / FILE)
-            files.append((folder / FILE).read_bytes())
-    return tuple(files)
+def bases() -> tuple[tuple[Origin, bytes], ...]:
+    """Return whole models to start from: what each was made from, and itself."""
+    found = (compile_topology(MODELS / "scenes" / f"{scene}.yaml") for scene in _SCENES)
+    return tuple((system.origin, model_of(system)) for system in found)
+
+
+def unsealed(origin: bytes, model: bytes) -> bytes:
+    """Return the file of a model that nobody has sealed."""
+    return b"\n".join((f"apc {FORMAT} compiled".encode(), b"0" * 64, origin, model))
 
 
 def _forge_model(seed: str) -> Input:
-    rng = random.Random(seed)
-    sort, content = _forged(rng, rng.choice(bases()), rng.choice(bases()), name=MEMBER, digested=True)
-    return Input(sort, ((FILE, content),))
+    """Return a model that says it was made from something else, or is something else."""
+    chance = random.Random(seed)
+    origin, model = chance.choice(bases())
+    text = msgspec.json.encode(origin)
+    sort = chance.choice(("origin", "origin", "model", "bytes"))
+    if sort == "origin":
+        document = json.loads(text)
+        for _ in range(chance.choice((1, 1, 2))):
+            document[chance.choice(list(document))] = chance.choice(_HOSTILE)
+            texts = document["texts"]
+            if isinstance(texts, list) and texts and isinstance(texts[0], list):
+                row = chance.choice(texts)
+                row[:1] = [chance.choice(_HOSTILE)] if chance.random() < 0.3 else row[:1]
+        text = json.dumps(document).encode()
+    elif sort == "model":
+        model = chance.randbytes(chance.choice((0, 1, 100, len(model))))
+    content = bytearray(unsealed(text, model))
+    if sort == "bytes":
+        for _ in range(chance.randint(1, 4)):
+            content[chance.randrange(len(content))] ^= 1 << chance.randrange(8)
+    return Input(sort, ((FILE, bytes(content)),))
+
+
+def _whole_models() -> list[Input]:
+    """Return models that nobody sealed and nobody changed."""
+    return [Input("", ((FILE, unsealed(msgspec.json.encode(origin), model)),)) for origin, model in bases()]
 
 
 def ask(path: Path, *, everything: bool = False) -> str:
@@ -232,17 +201,16 @@ def ask(path: Path, *, everything: bool = False) -> str:
     would take many times as long, and `analyze` asks what it asks of the network.
     """
     try:
-        system = store.load(path)
-    except ApcError as error:
-        assert {one.code for one in error.mistakes} <= {"E602", "E603", "E604"}, str(error)
+        system = load_fresh(path)
+    except ApcError:
         return "refused"
     first = system.parameters[0].name if system.parameters else "device.mass"
     questions: list[Callable[[], object]] = [
-        lambda: apc.analyze(system),
-        lambda: apc.simulate(system, duration="20 ms", jit=False),
+        lambda: analyze(system),
+        lambda: simulate(system, duration="20 ms", jit=False),
     ]
     if everything or path.stat().st_size % 8 == 0:
-        questions.append(lambda: apc.critical(system, first, criterion="nominal"))
+        questions.append(lambda: critical(system, first, criterion="nominal"))
     for question in questions:
         try:
             question()
@@ -286,7 +254,7 @@ def _forge_recording(seed: str) -> Input:
     sort = ""
     if seed:
         peer = files[PEER]
-        sort, files[PEER] = _forged(random.Random(seed), peer, peer, name="told.npy", digested=False)
+        sort, files[PEER] = _forged(random.Random(seed), peer, name="told.npy")
     return Input(sort, tuple(files.items()))
 
 
@@ -323,7 +291,7 @@ def _forge_part(seed: str) -> Input:
     if not seed:
         return Input("", ((name, content),))
     mark, _, body = content.partition(b"\n")
-    sort, forged = _forged(rng, body, body, name="texts.npy", digested=False)
+    sort, forged = _forged(rng, body, name="texts.npy")
     line = rng.choice((mark + b"\n", mark + b"\n", mark, b"\n", b"", b"0" * 64 + b"\n"))
     return Input(sort, ((name, line + forged),))
 
@@ -349,7 +317,7 @@ FORGERIES = {
     "models": Forgery(
         _forge_model,
         lambda: ask(Path(FILE)),
-        lambda: [Input("", ((FILE, one),)) for one in bases()],
+        _whole_models,
     ),
     "recordings": Forgery(_forge_recording, _ask_recording, lambda: [_forge_recording("")]),
     "parts": Forgery(_forge_part, _ask_part, lambda: [_forge_part("")]),

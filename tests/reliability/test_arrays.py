@@ -14,8 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from apc.compiler.cache import DamageError
-from apc.npz import read_arrays
+from apc.npz import DamageError, read_arrays
 from tests.fuzz.models import zipped
 
 KINDS = {"time": ("<f8", 1), "packets[0-9]": ("<i8", 2), "missing": ("|b1", 2), "told": ("|u1", 1)}

@@ -84,3 +84,9 @@ def test_every_component_of_the_library_stands_in_its_reference() -> None:
         found = re.match(r"component: (\w+)", text)
         if found:
             assert f"[`{found.group(1)}`]({path.relative_to(ROOT / 'models')})" in page, path
+
+
+def test_the_reference_shows_the_grammar() -> None:
+    rules = (ROOT / "compiler" / "language" / "expression.lark").read_text(encoding="utf-8")
+    shown = rules[rules.index("expression: ") : rules.index("NUMBER: /")].strip()
+    assert shown in (ROOT / "models" / "README.md").read_text(encoding="utf-8")

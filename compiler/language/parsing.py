@@ -1,0 +1,72 @@
+"""The grammars of the language, read by Lark.
+
+Takes: a grammar beside this module, and what its rules build.
+Gives: `parser`, `FaultError`, `TREE`, `kind_of`, `unclosed`, `exponent_of`.
+Guarantees: a mistake knows the offset in its text, and its place once it is placed.
+Does not: bound a text: whoever parses it does, before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from lark import Lark, Token, Transformer
+
+from apc.compiler.errors import ApcError, Mistake, Place, place_in
+
+TREE = Transformer[Token, Any]
+_OPENED_BY = {"RPAR": "LPAR", "RBRACE": "LBRACE", "ELSE": "IF"}
+_OPENERS = ("LPAR", "LBRACE", "IF", "THEN", "ELSEIF")
+
+
+class FaultError(Exception):
+    """A mistake that does not know yet where its text stands, so that results can be kept by text."""
+
+    def __init__(
+        self, code: str, at: int | Token | None, what: str, expected: str = "", got: str = "", hint: str = ""
+    ) -> None:
+        super().__init__(what)
+        self.offset = (at.start_pos if isinstance(at, Token) else at) or 0
+        self.mistake = Mistake(code, Place(""), what, expected, got, hint)
+
+    def placed(self, text: str, place: Place) -> ApcError:
+        """Return the mistake of a text that starts at `place`."""
+        return ApcError(replace(self.mistake, place=place_in(place, text, self.offset)))
+
+
+def parser(grammar: str, starts: list[str], builder: TREE) -> Callable[[str, str], Any]:
+    """Return what parses a text by a grammar's file, from one of several starts.
+
+    Its rules and tokens call the methods of `builder`.
+    """
+    text = Path(__file__).with_name(grammar).read_text(encoding="utf-8")
+    return Lark(text, start=starts, parser="lalr", lexer="basic", transformer=builder).parse
+
+
+def kind_of(value: object) -> str:
+    """Return the kind of a token on the parser's stack, an empty text for what is built already."""
+    return value.type if isinstance(value, Token) else ""
+
+
+def unclosed(stack: Sequence[object]) -> int:
+    """Return where on the parser's stack the innermost parenthesis, brace or `if` is open; -1 if none is."""
+    awaited = ""
+    for at in reversed(range(len(stack))):
+        kind = kind_of(stack[at])
+        if awaited:
+            awaited = "" if kind == awaited else awaited
+        elif kind in _OPENERS:
+            return at
+        else:
+            awaited = _OPENED_BY.get(kind, "")
+    return -1
+
+
+def exponent_of(parts: Sequence[Token]) -> Fraction:
+    """Return the number that the tokens of an exponent are. Raises ZeroDivisionError."""
+    above, *below = (Fraction(part) for part in parts if part.type == "NUMBER")
+    return (-above if "-" in parts else above) / (below[0] if below else 1)
