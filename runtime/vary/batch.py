@@ -182,7 +182,7 @@ class BatchEvaluator:
         lifted = self.lifted(values + (STEP * 1j) * along)
         found = (reduced(wiring, closed_loop(wiring, lifted), len(values)) for wiring in self.wirings)
         # Squares of the step stand where nothing should: balancing would take them for entries.
-        return tuple((np.where(np.abs(one.real) > STEP, one.real, 0.0), one.imag / STEP) for one in found)
+        return tuple((np.where(np.abs(one.real) <= STEP, 0.0, one.real), one.imag / STEP) for one in found)
 
     def vectors(self, group: PeerGroup, values: Matrices) -> Matrices:
         """Return the parameter vectors (k, n_p) of a group, or (1, n_p) when no value reaches it."""

@@ -56,8 +56,8 @@ HALF, WIDER, TRIES = 1e-13, 16.0, 12
 # Steps of Newton's method.
 NEWTON = 12
 
-# A bracket that took wider tries is halved until it is hardly wider than the first.
-HARDLY = 1.5
+# A bracket that took more than two tries is halved until it is as wide as the second.
+HARDLY = WIDER
 
 # A bracket this wide, relative to the value, with one verdict on both sides has no crossing.
 NOWHERE = 1e-6
@@ -219,7 +219,10 @@ def search(line: Line, *, first: bool = False, told: Told | None = None) -> Sear
         looked, whole = looked + len(samples.points), whole and cleared
         if told:
             told(f"looking at {counted(looked, 'value')} of {line.label}")
-        ends += [float(stretch.low), float(stretch.high)] if not why else samples.points[[0, -1]].tolist()
+        if len(stretch.points) > 1 and len(samples.points):
+            ends += samples.points[[0, -1]].tolist()
+        else:
+            ends += [float(stretch.low), float(stretch.high)]
         enters |= number > 0 or bool(
             np.nan_to_num(samples.slopes).any() or (samples.values != samples.values[:1]).any()
         )
@@ -227,6 +230,7 @@ def search(line: Line, *, first: bool = False, told: Told | None = None) -> Sear
         sided &= not missing[1:-1].any()
         if not len(samples.points):
             if stretch.high > stretch.low:
+                whole = False
                 left_open.append((float(stretch.low), float(stretch.high)))
             continue
         side = (samples.growth < 0).tolist()

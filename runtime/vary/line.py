@@ -47,8 +47,9 @@ PLACE = Place("critical value")
 # present value or, where that is 0, the change that would move an eigenvalue by 1 if it went on as it starts.
 SPAN = 1e3
 
-# Values in each factor of 10 to begin with: neighbours differ by half. Of a piece of a delay.
-SAMPLES, PIECE_SAMPLES = 6, 3
+# Values in each factor of 10 to begin with: neighbours differ by half; at least so many in a range, so that a
+# narrow one is looked at closely. Of a piece of a delay.
+SAMPLES, FEWEST, PIECE_SAMPLES = 6, 17, 3
 
 # How far inside a piece of a delay, relative to its length, it is analysed in the place of its end, but for
 # the order of events that coincide there.
@@ -97,7 +98,7 @@ def spread(bottom: float, top: float, scale: float) -> Floats:
 
     def ratios(low: float, high: float) -> Floats:
         least = max(low, min(scale, high) / SPAN)
-        count = max(2, math.ceil(SAMPLES * math.log10(high / least)) + 1) if high > least else 1
+        count = max(FEWEST, math.ceil(SAMPLES * math.log10(high / least)) + 1) if high > least else 1
         return np.geomspace(least, high, count)
 
     parts = [np.array([bottom, top])]

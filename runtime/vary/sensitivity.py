@@ -19,11 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, prepare, prepare_at_start
+from apc.analysis.analysis import Prepared, lifted_groups, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.timings import part
 from apc.compiler.words import counted
 from apc.eigen.eigenpairs import eigenpairs
+from apc.eigen.modes import split
+from apc.eigen.spectrum import solve_spectrum
 from apc.finite_equations import finite_equations
 from apc.frame.discretize import UNIT
 from apc.frame.names import Free, parameter_of
@@ -48,6 +50,9 @@ WORST = 1e8
 
 # How far, relatively, a parameter is moved to see whether what was left out as rigid stays so.
 BESIDE = 2.0**-10
+
+# Roundings of an entry of a frame's matrix and its derivative, estimated: of some dozen ticks and exponentials.
+ROUNDINGS = 4096
 
 NO_MATRIX = "what moves it most: not looked for: the present values have no frame matrix of their own"
 
@@ -110,22 +115,32 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         free, prepared = varied(system), prepared or prepare(system)
-        zero = [one for one in free if not parameter_of(system, one).value]
-        listed = [[one for one in free if one not in zero], *([one] for one in zero)]
         start = prepare_at_start(system, prepared) or prepared
+        systems = split(*lifted_groups(system, prepared=start)).systems
+        most = solve_spectrum(systems, in_balls=False).spectral_radius + SHARED
+
+        def clusters_of(together: Sequence[Free]) -> list[_Cluster] | None:
+            found = _clusters(system, together, start)
+            # Equations have edges that points step over.
+            return _clusters(system, together, prepared) if found is None and start is not prepared else found
+
+        def frees(together: Sequence[Free]) -> bool:
+            """Say whether something that is rigid in the scene as it is moves where these vary."""
+            return any(np.abs(one.values).max() > most for one in clusters_of(together) or ())
+
+        zero = [one for one in free if not parameter_of(system, one).value]
+        rest = [one for one in free if one not in zero]
+        loose = [one for one in zero if frees([one])]
+        loose += [one for one in rest if frees([one])] if frees(rest) else []
+        listed = [[one for one in rest if one not in loose], *([one] for one in zero if one not in loose)]
         rows: list[Sensitivity] = []
         clusters: list[_Cluster] = []
-        notes, untied = [], list[str]()
+        notes, untied = [], [one.label for one in loose]
         for together in listed:
-            found = _clusters(system, together, start)
-            if found is None and start is not prepared:  # equations have edges that points step over
-                found = _clusters(system, together, prepared)
+            found = clusters_of(together)
             if found is None:
                 return Sensitivities(0.0, (), (), NO_MATRIX)
             clusters, first = clusters or found, 0
-            if found and np.abs(found[0].values).max() > np.abs(clusters[0].values).max() + SHARED:
-                untied += [one.label for one in together]
-                continue
             for one in found:
                 if not one.condition < WORST:
                     continue
@@ -263,7 +278,7 @@ def _of_system(
         if condition < WORST:
             left = np.linalg.solve(product, own.left)
             rates = left @ slopes @ own.right
-            rounded = 16 * len(matrix) * UNIT
+            rounded = ROUNDINGS * len(matrix) * UNIT
             felt = np.abs(left) @ np.abs(slopes) @ np.abs(own.right)
             # A change by all of the value that is less than the matrix is rounded by can't be told.
             told = np.divide(float(sizes.max()), np.abs(here), out=np.zeros(len(here)), where=here != 0)
