@@ -1,6 +1,6 @@
 """Alias elimination: equations a = b, a = -b and a = 0 taken out, and what stands for what.
 
-Takes: residuals and the symbols of their variables. Gives: `Aliases`.
+Takes: residuals and the names of their variables. Gives: `Aliases`.
 Guarantees: of two names that mean the same the one to be preferred as a state is kept, and of both one value.
 Does not: look at equations of more than two unknowns.
 """
@@ -9,115 +9,92 @@ from __future__ import annotations
 
 from collections.abc import Sequence, Set
 
-from apc.compiler.equations.derivatives import Derivative, Derivatives
+from sympy import Add
+
+from apc.compiler.equations.derivatives import Derivative, Moving, derivative
 from apc.compiler.equations.residuals import Residual
 from apc.compiler.equations.solution import Assignment
-from apc.compiler.equations.terms import ZERO, Symbol, Term, terms_of
+from apc.compiler.equations.terms import Term, symbol
 
 
 class Aliases:
     """The equations a = b, a = -b and a = 0 between unknowns taken out, and what stands for what.
 
     Of two, the one with a start value stays; then the one a component declares, not the connector's:
-    `device.x`, not `device.flange.x`; then the one named first. The equations der(x) = v are taken out too:
-    v is then the name of the derivative, so that masses with one position are seen to have one velocity.
+    `device.x`, not `device.flange.x`; then the one named first. By der(x) = v, v stands for der(x), so that
+    masses with one position are seen to have one velocity; it is shown by its name.
     """
 
-    def __init__(self, derivatives: Derivatives, names: Sequence[str], started: Set[str]) -> None:
-        self.derivatives = derivatives
-        self.names = names
-        self.rank = {name: (name not in started, name.count("."), j) for j, name in enumerate(names)}
-        self.parent: dict[str, tuple[str, int]] = {}  # name -> ± another; sign 0: zero
-        self.velocities: dict[str, str] = {}  # x -> v
-        self._position: dict[str, str] = {}  # v -> x
-        self._row: dict[str, int] = {}  # x -> the row that says der(x) = v
+    def __init__(self, moving: Moving, names: Sequence[str], started: Set[str]) -> None:
+        self.moving = moving
+        self.names = sorted(names, key=lambda name: (name not in started, name.count(".")))
+        self.rank = {name: place for place, name in enumerate(self.names)}
+        self.stands: dict[str, tuple[int, str, int]] = {}  # name: ± (or 0 times) a derivative of another
+        self.velocities: dict[Derivative, str] = {}  # derivatives that have names of their own
 
-    @property
-    def kept(self) -> list[str]:
-        """The names that stand for themselves."""
-        return [name for name in self.names if name not in self.parent]
+    def _velocities(self) -> dict[Derivative, str]:
+        found: dict[Derivative, str] = {}
+        for name in self.names:
+            sign, x, order = self._meaning(name, 0)
+            if sign == 1 and order:
+                found.setdefault((x, order), name)
+        return found
 
-    @property
-    def assignments(self) -> tuple[Assignment, ...]:
-        """What each of the other names stands for."""
-        return tuple((name, self._stands_for(name, 0)) for name in self.names if name in self.parent)
+    def value(self, name: str, order: int = 0) -> Term:
+        """Return what a derivative of a variable is, in the variables that stand for themselves."""
+        sign, name, order = self._meaning(name, order)
+        return sign * derivative(name, order)
 
     def substitute(self, expression: Term) -> Term:
         """Return the expression in the names kept."""
-        derivatives = self.derivatives.derivatives(expression)
-        other = {
-            s: one for s, derivative in derivatives.items() if (one := self._stands_for(*derivative)) is not s
-        }
-        return expression.replace(other) if other else expression  # putting it together anew takes longest
+        held = self.moving.derivatives(expression)
+        return expression.xreplace({s: self.value(*one) for s, one in held.items() if one[0] in self.stands})
+
+    def shown(self, expression: Term) -> Term:
+        """Return an expression in which derivatives have their own names."""
+        names = {}
+        for s, (x, order) in self.moving.derivatives(expression).items():
+            known = next((k for k in range(order, 0, -1) if (x, k) in self.velocities), 0)
+            names[s] = derivative(self.velocities.get((x, known), x), order - known)
+        return expression.xreplace(names)
+
+    def assignments(self) -> tuple[Assignment, ...]:
+        """Return what each name stands for that isn't shown."""
+        values = ((name, self.shown(self.value(name))) for name in self.moving.variables)
+        return tuple((name, value) for name, value in values if value is not symbol(name))
 
     def remove(self, residuals: Sequence[Residual]) -> list[Residual]:
         """Take the alias equations out, pass by pass until none is left; return the others, rewritten."""
-        rows = dict(enumerate(residuals))
-        changed = True
-        while changed:
-            changed = False
-            said = set(self._row.values())
-            for row, residual in list(rows.items()):
-                if row in said:
-                    continue
-                expression = self.substitute(residual.expression)
-                rows[row] = Residual(expression, residual.equation)
-                match self._pair(expression):
-                    case ((one, 0), (two, 0), sign):
-                        said -= self._join(one, two, sign)
-                        del rows[row]
-                        changed = True
-                    case ((x, 1), (v, 0), 1) | ((v, 0), (x, 1), 1) if self._can_name(x, v):
-                        self.velocities[x], self._position[v], self._row[x] = v, x, row
-                        said.add(row)
-                        changed = True
-        said = set(self._row.values())
-        return [residual for row, residual in rows.items() if row not in said]
+        before, left = -1, list(residuals)
+        while before != len(left):
+            before = len(left)
+            left = [
+                Residual(expression, residual.equation)
+                for residual in left
+                if not self._takes(expression := self.substitute(residual.expression))
+            ]
+        self.velocities = self._velocities()
+        return left
 
-    def _pair(self, expression: Term) -> tuple[Derivative, Derivative, int] | None:
-        """Return a, b and the sign of a = ±b; for a = 0, a twice and the sign 0; else None."""
-        terms = terms_of(expression)
-        if not 0 < len(terms) <= 2:
-            return None
-        derivatives = self.derivatives.derivatives(expression)
-        (one, factor), (two, other_factor) = terms[0], terms[-1]
-        if not (isinstance(one, Symbol) and isinstance(two, Symbol) and {one, two} <= derivatives.keys()):
-            return None
-        if len(terms) == 1:
-            return derivatives[one], derivatives[one], 0
-        if abs(factor) != abs(other_factor):
-            return None
-        return derivatives[one], derivatives[two], -1 if factor == other_factor else 1
-
-    def _join(self, one: str, two: str, sign: int) -> set[int]:
-        """Let one name stand for the other; return the rows der(x) = v to be read again in the new names."""
-        goes, stays = (one, two) if self.rank[one] >= self.rank[two] else (two, one)
-        self.parent[goes] = (stays, sign)
-        reopened = set()
-        for x in [name for name in (goes, self._position.get(goes)) if name in self._row]:
-            assert x is not None
-            del self._position[self.velocities.pop(x)]
-            reopened.add(self._row.pop(x))
-        return reopened
-
-    def _can_name(self, x: str, v: str) -> bool:
-        """Return whether v may be the name of der(x): each once, and not in a circle."""
-        if x in self.velocities or v in self._position:
+    def _takes(self, expression: Term) -> bool:
+        """Note a = ±b or a = 0, if that is what an equation says, and it may be."""
+        held = self.moving.derivatives(expression)
+        parts = [part.as_coeff_Mul() for part in Add.make_args(expression)]
+        if len(parts) > 2 or any(name not in held for _, name in parts):
             return False
-        follows = v
-        while follows in self.velocities:
-            follows = self.velocities[follows]
-        return follows != x
+        (factor, one), (other, two) = parts[0], parts[-1]
+        pair = sorted((held[one], held[two]), key=lambda it: (it[1], -self.rank[it[0]]))
+        (goes, low), (stays, high) = pair
+        sign = 0 if len(parts) == 1 else -1 if factor == other else 1
+        named = sign == 1 or high == 0 or (stays, high) in self._velocities()
+        if low or abs(factor) != abs(other) or not named or (goes == stays and sign):
+            return False
+        self.stands[goes] = (sign, stays, high)
+        return True
 
-    def _stands_for(self, name: str, order: int) -> Term:
+    def _meaning(self, name: str, order: int) -> tuple[int, str, int]:
         sign = 1
-        while sign:
-            if name in self.parent:
-                name, its_sign = self.parent[name]
-                sign *= its_sign
-            elif order and name in self.velocities:
-                name, order = self.velocities[name], order - 1
-            else:
-                found = self.derivatives.symbol(name, order)
-                return found if sign == 1 else -found
-        return ZERO
+        while sign and name in self.stands:
+            its, name, more = self.stands[name]
+            sign, order = sign * its, order + more
+        return sign, name, order

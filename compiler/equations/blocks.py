@@ -4,15 +4,20 @@ Takes: equations as residuals, and the unknowns. Gives: `solve_blocks`: assignme
 Guarantees: every unknown is assigned once, from what was assigned before; linear blocks come out explicit.
 Does not: differentiate anything (see `index`), or know of states and clocks.
 
-Matched and sorted by `matching`; a block of linear equations is solved by `elimination`, a nonlinear loop is
-left to an iteration over the few unknowns that `tearing` chooses.
+Matched and sorted by `matching`, the usual way of Modelica compilers (Cellier and Kofman, Continuous System
+Simulation, ch. 7); a block of linear equations is solved by `elimination`, a nonlinear loop is left to an
+iteration over the few unknowns that `tearing` chooses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-from apc.compiler.equations.elimination import ZeroTests, eliminate
+import sympy
+from sympy.matrices import dotprodsimp
+
+from apc.compiler.equations.elimination import eliminate
 from apc.compiler.equations.matching import match_columns, strong_components
 from apc.compiler.equations.residuals import (
     MOST_LISTED,
@@ -22,17 +27,11 @@ from apc.compiler.equations.residuals import (
     report_no_number,
     report_singular,
 )
-from apc.compiler.equations.solution import Assignment, ImplicitBlock, Step
-from apc.compiler.equations.symbolic import (
-    NoDerivativeError,
-    differential,
-    is_no_number,
-    linear_form,
-    smooth_pieces,
-)
+from apc.compiler.equations.solution import Step, expressions
+from apc.compiler.equations.symbolic import is_no_number, linear_form, slope, smooth_pieces
 from apc.compiler.equations.tearing import tear
-from apc.compiler.equations.terms import ONE, ZERO, Symbol, Term, add, scaled, symbol
-from apc.compiler.equations.zero_test import NOTHING_VANISHES, Vanishing, ZeroTest
+from apc.compiler.equations.terms import NoDerivativeError, Symbol, Term, symbol
+from apc.compiler.equations.zero_test import Divisors
 from apc.compiler.errors import Mistakes, Place
 
 # A loop of more guesses, or with more pieces between its corners, is not asked whether it has one solution.
@@ -44,9 +43,7 @@ def solve_blocks(
     unknowns: Sequence[Symbol],
     where: str,
     mistakes: Mistakes,
-    *,
-    nonzero: Collection[Symbol] = (),
-    vanishes: Vanishing = NOTHING_VANISHES,
+    divisors: Divisors | None = None,
     place: Place = SCENE,
 ) -> tuple[Step, ...]:
     """Match, sort and solve.
@@ -59,11 +56,9 @@ def solve_blocks(
         What to call the equations in a message: "the continuous equations".
     mistakes
         Takes E502 equations or unknowns left over, E503 a loop without an unknown to solve for, E511 linear
-        equations that depend on each other.
-    nonzero
-        Parameters that no number can make zero; divisors stay when all others are zero, where possible.
-    vanishes
-        Whether an expression is zero with the scene's numbers; what is divided by must not be.
+        equations that depend on each other, E512 what is no number.
+    divisors
+        What may be divided by.
     place
         Where to point when there is no equation.
     """
@@ -73,44 +68,31 @@ def solve_blocks(
     if len(residuals) != len(unknowns) or None in match:
         report_singular(residuals, [u.name for u in unknowns], incidence, match, where, mistakes, place)
         return ()
-    computes = {row: column for column, row in enumerate(match) if row is not None}
-    # Row i computes column computes[i]; it needs the rows that compute its other unknowns.
+    # Row i needs the rows that compute its other unknowns.
     needs = [
-        [row for j in columns_of if (row := match[j]) is not None and row != i]
-        for i, columns_of in enumerate(incidence)
+        [row for j in held if (row := match[j]) is not None and row != i] for i, held in enumerate(incidence)
     ]
-    tests = ZeroTests(ZeroTest(), ZeroTest(frozenset(nonzero)), vanishes)
-    solver = _Solver(where, mistakes, tests)
+    solver = _Solver(where, mistakes, divisors or Divisors())
     steps: list[Step] = []
-    for block in strong_components(needs):
-        rows = sorted(block)
-        own = [unknowns[column] for column in sorted(computes[row] for row in rows)]
-        steps += solver.checked([residuals[row] for row in rows], own)
+    for block in map(set, strong_components(needs)):
+        own = [unknown for unknown, row in zip(unknowns, match, strict=True) if row in block]
+        steps += solver.checked([residuals[row] for row in sorted(block)], own)
     return tuple(steps)
 
 
+@dataclass(frozen=True, slots=True)
 class _Solver:
-    """Solves blocks; keeps what they share: the zero tests, and where mistakes go."""
+    """Solves blocks; keeps what they share: what may be divided by, and where mistakes go."""
 
-    def __init__(self, where: str, mistakes: Mistakes, tests: ZeroTests) -> None:
-        self.where = where
-        self.mistakes = mistakes
-        self.tests = tests
+    where: str
+    mistakes: Mistakes
+    divisors: Divisors
 
     def checked(self, block: Sequence[Residual], unknowns: Sequence[Symbol]) -> list[Step]:
         """Solve one block; its expressions must be numbers: what was divided may cancel."""
         steps = self.solve(block, unknowns)
-        expressions = (
-            expression
-            for step in steps
-            for expression in (
-                (*step.residuals, *(value for _, value in step.inner))
-                if isinstance(step, ImplicitBlock)
-                else (step[1],)
-            )
-        )
-        if any(is_no_number(expression) for expression in expressions):
-            report_no_number([residual.shown for residual in block], block[0].equation.place, self.mistakes)
+        if any(is_no_number(expression) for step in steps for expression in expressions(step)):
+            report_no_number(block, self.mistakes)
             return []
         return steps
 
@@ -121,78 +103,42 @@ class _Solver:
         linear = [form for form in forms if form is not None]
         if len(linear) < len(forms):
             return self._loop(block, unknowns)
-        if len(block) > 1:
-            steps, free = eliminate(linear, unknowns, self.tests)
-            if free:
-                self._report_dependent(block, free)
-            return list(steps)
-        [(coefficients, rest)] = linear
-        coefficient = coefficients[unknowns[0]]
-        if self.tests.is_zero(coefficient) or self.tests.vanishes(coefficient):
-            self._report_dependent(block, unknowns)
-            return []
-        return [(unknowns[0].name, -rest / coefficient)]
+        steps, free = eliminate(linear, unknowns, self.divisors)
+        if free:
+            what = f"depend on each other and don't determine {listed([u.name for u in free])}"
+            self._report("E511", block, f"{what}: {listed([residual.shown for residual in block])}")
+        return list(steps)
 
     def _loop(self, block: Sequence[Residual], unknowns: Sequence[Symbol]) -> list[Step]:
         """Tear a nonlinear block; every residual of it must be one that the guesses can make zero."""
-        made = tear(block, unknowns, self.tests.is_zero)
-        residuals = [_put_in(residual, made.inner) for residual in made.residuals]
+        made = tear(block, unknowns, self.divisors)
+        residuals = made.residuals
+        if len(made.inner) <= MOST_LISTED:
+            for name, value in reversed(made.inner):
+                residuals = tuple(residual.xreplace({symbol(name): value}) for residual in residuals)
+        fault = ""
         if not all(residual.free_symbols for residual in residuals):
-            self._report_loop(block, made, "hold a loop without an unknown left to solve for")
-            return []
-        if self._is_open(residuals, [symbol(name) for name in made.tearing]):
-            self._report_loop(block, made, "hold a loop that many values solve, or none")
-            return []
-        return [made]
+            fault = "hold a loop without an unknown left to solve for"
+        elif self._is_open(residuals, [symbol(name) for name in made.tearing]):
+            fault = "hold a loop that many values solve, or none"
+        if fault:
+            self._report("E503", block, f"{fault}: {made.chain}, by {listed(made.equations)}")
+        return [] if fault else [made]
 
     def _is_open(self, residuals: Sequence[Term], guesses: Sequence[Symbol]) -> bool:
         """Return whether between corners the residuals don't depend on the guesses, or only on some."""
         if len(guesses) > MOST_GUESSES:
             return False
-        pieces = smooth_pieces(residuals, MOST_PIECES)
-        for piece in pieces or ():
+        for piece in smooth_pieces(residuals, MOST_PIECES) or ():
             try:
-                slopes = [[_slope(one, guess) for guess in guesses] for one in piece]
+                slopes = sympy.Matrix([[slope(one, guess) for guess in guesses] for one in piece])
             except NoDerivativeError:
                 continue
-            determinant = _determinant(slopes)
-            if self.tests.is_zero(determinant) or self.tests.vanishes(determinant):
+            with dotprodsimp(False):  # which would expand it
+                determinant = slopes.det(method="laplace")
+            if not self.divisors.allow(determinant):
                 return True
         return False
 
-    def _report_loop(self, block: Sequence[Residual], made: ImplicitBlock, fault: str) -> None:
-        what = f"{self.where} {fault}: {made.chain}, by {listed(made.equations)}"
-        self.mistakes.add("E503", block[0].equation.place, what)
-
-    def _report_dependent(self, block: Sequence[Residual], unknowns: Sequence[Symbol]) -> None:
-        what = (
-            f"{self.where} depend on each other and don't determine {listed([u.name for u in unknowns])}: "
-            f"{listed([residual.shown for residual in block])}"
-        )
-        self.mistakes.add("E511", block[0].equation.place, what)
-
-
-def _slope(residual: Term, by: Symbol) -> Term:
-    """Return the derivative of a residual. Raises NoDerivativeError if it has none."""
-    return differential(residual, lambda s: ONE if s == by else ZERO)
-
-
-def _determinant(rows: Sequence[Sequence[Term]]) -> Term:
-    """Return the determinant of a few rows, by Laplace's expansion along the first."""
-    if not rows:
-        return ONE
-    minors = (_determinant([[*row[:j], *row[j + 1 :]] for row in rows[1:]]) for j in range(len(rows)))
-    return add(
-        *(
-            scaled(entry * minor, (-1) ** j)
-            for j, (entry, minor) in enumerate(zip(rows[0], minors, strict=True))
-        )
-    )
-
-
-def _put_in(residual: Term, inner: Sequence[Assignment]) -> Term:
-    """Return a residual with the inner values put in, when they are few."""
-    if len(inner) <= MOST_LISTED:
-        for name, expression in reversed(inner):
-            residual = residual.replace({symbol(name): expression})
-    return residual
+    def _report(self, code: str, block: Sequence[Residual], what: str) -> None:
+        self.mistakes.add(code, block[0].equation.place, f"{self.where} {what}")

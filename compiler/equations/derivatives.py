@@ -1,91 +1,54 @@
 """The symbols of variables and of their time derivatives, both ways, and differentiation by them.
 
-Takes: names of variables, and which of them are others' derivatives. Gives: `Derivative`, `Derivatives`.
-Guarantees: one symbol for each derivative of each variable.
+Takes: names of variables, and which values jump. Gives: `Derivative`, `derivative`, `Moving`.
+Guarantees: one symbol for each derivative of each variable: `x`, `der(x)`, `der(der(x))`.
 Does not: choose states (see `index`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Set
+from dataclasses import dataclass
 
-from apc.compiler.equations.symbolic import (
-    NoDerivativeError,
-    derivative_symbol,
-    differential,
-)
-from apc.compiler.equations.terms import ONE, ZERO, Symbol, Term, symbol
+from apc.compiler.equations.symbolic import differential
+from apc.compiler.equations.terms import ONE, ZERO, NoDerivativeError, Symbol, Term, in_order, symbol
 
 TIME = symbol("time")
 Derivative = tuple[str, int]  # a variable and how often it is differentiated
 
 
-class Derivatives:
-    """The symbols of variables and of their derivatives, `x`, `der(x)`, `der(der(x))`, both ways.
+def derivative(name: str, order: int = 1) -> Symbol:
+    """Return the symbol of a time derivative of a variable."""
+    return symbol("der(" * order + name + ")" * order)
 
-    `velocities` gives derivatives their own names: with {x: v} they are `x`, `v`, `der(v)`, and v is no
-    variable of its own. `jumping` are the symbols of held forces.
-    """
 
-    def __init__(
-        self, names: Iterable[str], jumping: Iterable[str], velocities: Mapping[str, str] | None = None
-    ) -> None:
-        velocities = velocities or {}
-        derived = set(velocities.values())
-        self.names = [name for name in names if name not in derived]
-        self._derivatives: dict[Symbol, Derivative] = {}
-        self._named: dict[str, int] = {}
-        for name in self.names:
-            self._derivatives[symbol(name)] = (name, 0)
-            own, order = name, 0
-            while own in velocities:
-                own, order = velocities[own], order + 1
-                self._derivatives[symbol(own)] = (name, order)
-                self._named[name] = order
-        self._symbols = {derivative: s for s, derivative in self._derivatives.items()}
-        self._jumping = {symbol(name) for name in jumping}
+@dataclass(frozen=True, slots=True)
+class Moving:
+    """The names of what moves: `variables`, and those of held forces, which jump."""
 
-    def renamed(self, names: Iterable[str], velocities: Mapping[str, str]) -> Derivatives:
-        """Return the derivatives of some of the variables, where `velocities` name derivatives."""
-        kept = Derivatives(names, (), velocities)
-        kept._jumping = self._jumping
-        for name, order in self._symbols:
-            if symbol(name) in kept._derivatives:
-                root, first = kept._derivatives[symbol(name)]
-                kept.symbol(root, first + order)
-        return kept
-
-    def named_order(self, name: str) -> int:
-        """Return how many derivatives of a variable have names of their own."""
-        return self._named.get(name, 0)
-
-    def add(self, name: str) -> Symbol:
-        """Add a variable and return its symbol."""
-        self.names.append(name)
-        return self.symbol(name, 0)
-
-    def symbol(self, name: str, order: int) -> Symbol:
-        """Return the symbol of a derivative of a variable."""
-        known = self._symbols.get((name, order))
-        if known is None:
-            known = derivative_symbol(self.symbol(name, order - 1).name) if order else symbol(name)
-            self._derivatives[known] = (name, order)
-            self._symbols[name, order] = known
-        return known
+    variables: Set[str]
+    jumping: Set[str]
 
     def derivatives(self, expression: Term) -> dict[Symbol, Derivative]:
         """Return the variables and derivatives an expression holds, in the order of their names."""
-        found = [s for s in expression.free_symbols if s in self._derivatives]
-        return {s: self._derivatives[s] for s in sorted(found, key=lambda s: s.name)}
+        found = {}
+        for s in in_order(expression.free_symbols):
+            order = s.name.count("der(")
+            name = s.name[4 * order : len(s.name) - order]
+            if name in self.variables:
+                found[s] = (name, order)
+        return found
 
     def differentiate(self, expression: Term) -> Term:
         """Return the time derivative. Raises NoDerivativeError if a held force would have to give it."""
-        return differential(expression, self._rate)
+        held = self.derivatives(expression)
 
-    def _rate(self, s: Symbol) -> Term:
-        if s in self._jumping:
-            raise NoDerivativeError(s.name, "a force that jumps at its ticks")
-        if s in self._derivatives:
-            name, order = self._derivatives[s]
-            return self.symbol(name, order + 1)
-        return ONE if s == TIME else ZERO
+        def rate(s: Symbol) -> Term:
+            if s.name in self.jumping:
+                raise NoDerivativeError(s.name, "a force that jumps at its ticks")
+            if s in held:
+                name, order = held[s]
+                return derivative(name, order + 1)
+            return ONE if s is TIME else ZERO
+
+        return differential(expression, rate)

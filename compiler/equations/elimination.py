@@ -1,54 +1,131 @@
 """A block of linear equations solved by Gaussian elimination with sparse symbolic rows.
 
-Takes: the linear forms of a block's equations, its unknowns, and the tests of what may be divided by.
-Gives: `ZeroTests`, `eliminate`.
+Takes: linear forms, and the tests of what may be divided by. Gives: `Elimination`, `eliminate`.
 Guarantees: what is divided by is never zero with the scene's numbers; a long entry gets a name of its own, so
 that a chain of a thousand equations stays as long as it was.
 Does not: know sizes: numbers come in when a model runs.
 
-The next pivot is one that stays when every parameter that may be zero is, if there is one; of these the one
-that fills in least (Markowitz, Management Science 1957), and of several a number.
+The next pivot is one that stays when every parameter that may be zero is, if there is one; of these one of a
+short row and column, which fills in little (Markowitz, Management Science 1957), and of several a number.
+Where none stays and few equations are left, they are solved by Cramer's rule, which divides by nothing but
+their determinant: the inertia of a mechanism is regular in every position, and each of its entries may vanish
+in some.
 """
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Sequence
-from dataclasses import dataclass
+import sys
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+
+import sympy
+from sympy.matrices import dotprodsimp
 
 from apc.compiler.equations.solution import Assignment
 from apc.compiler.equations.symbolic import LinearForm
-from apc.compiler.equations.terms import ZERO, Number, Symbol, Term, add, symbol
-from apc.compiler.equations.zero_test import Vanishing, ZeroTest
+from apc.compiler.equations.terms import ONE, ZERO, Symbol, Term, size, symbol
+from apc.compiler.equations.zero_test import Divisors
 
 # An entry with more nodes than this gets a name of its own: substituted into one another, the entries of a
 # chain of a thousand equations would grow without end.
 LARGEST_ENTRY = 40
+MOST_BY_CRAMER = 3  # equations: the terms of a determinant grow with the factorial
 
-_Cost = tuple[bool, bool, int, bool, int, int]  # ends with the row and the column
 
+class Elimination:
+    """Rows Σ coefficient·unknown + rest = 0, the rest under `ONE`, and what was taken out of the others.
 
-@dataclass(frozen=True, slots=True)
-class ZeroTests:
-    """What is asked of a coefficient before it is divided by.
-
-    `is_zero`: whether it is zero for all values; `can_vanish`: when every parameter that may be zero is;
-    `vanishes`: with the scene's numbers.
+    Entries with more nodes than `longest` get names that begin with `name`.
     """
 
-    is_zero: ZeroTest
-    can_vanish: ZeroTest
-    vanishes: Vanishing
+    def __init__(
+        self, rows: Iterable[Mapping[Term, Term]], divisors: Divisors, name: str, longest: int
+    ) -> None:
+        self.divisors = divisors
+        self.name = name
+        self.longest = longest
+        self.rows: dict[int, dict[Term, Term]] = {}  # those that are open
+        self.holders: defaultdict[Term, set[int]] = defaultdict(set)  # the open rows that hold an unknown
+        self.named: list[Assignment] = []
+        self.pivots: list[tuple[Symbol, dict[Term, Term]]] = []
+        for i, row in enumerate(rows):
+            self.rows[i] = {}
+            for unknown, value in row.items():
+                self._put(i, unknown, value)
 
-    def define(self, name: Symbol, expression: Term) -> None:
-        """Let a symbol stand for an expression."""
-        self.is_zero.define(name, expression)
-        self.can_vanish.define(name, expression)
-        self.vanishes.define(name, expression)
+    def next_pivot(self, *, stays: bool) -> tuple[int, Symbol] | None:
+        """Return the shortest row that may be divided by a coefficient, and of these the one in fewest rows.
+
+        With `stays` only by what stays when every parameter is zero that may be. None if there is nothing.
+        """
+        for i in sorted(self.rows, key=lambda i: len(self.rows[i])):
+            usable = [
+                (len(self.holders[unknown]), not factor.is_number, unknown.name)
+                for unknown, factor in self.rows[i].items()
+                if unknown is not ONE and not self.divisors.vanishes(factor)
+                if not (stays and self.divisors.can_vanish(factor))
+            ]
+            if usable:
+                return i, symbol(min(usable)[-1])
+        return None
+
+    def clear(self, i: int, unknown: Symbol) -> None:
+        """Take an unknown out of every other open row, by row i."""
+        pivot = self.rows.pop(i)
+        self.pivots.append((unknown, pivot))
+        for column in pivot:
+            self.holders[column].discard(i)
+        for other in sorted(self.holders.pop(unknown)):
+            row = self.rows[other]
+            factor = self._short(row.pop(unknown) / pivot[unknown])
+            for column, value in pivot.items():
+                if column is not unknown:
+                    self._put(other, column, row.get(column, ZERO) - factor * value)
+
+    def by_cramer(self) -> list[Assignment]:
+        """Solve the open rows by their determinant; nothing where that is zero."""
+        rows = list(self.rows.values())
+        columns = list(dict.fromkeys(column for row in rows for column in row if column is not ONE))
+        if len(columns) != len(rows):
+            return []
+        with dotprodsimp(False):
+            matrix = sympy.Matrix([[row.get(column, ZERO) for column in columns] for row in rows])
+            determinant = matrix.det(method="laplace")
+            if not self.divisors.allow(determinant):
+                return []
+            right = sympy.Matrix([-row.get(ONE, ZERO) for row in rows])
+            solved = matrix.adjugate(method="laplace") * right
+        divisor = self._short(determinant)
+        return [(column.name, value / divisor) for column, value in zip(columns, solved, strict=True)]
+
+    def solution(self) -> list[Assignment]:
+        """Return what gives each unknown of a pivot, by back substitution."""
+        return [
+            (unknown.name, -sympy.Add(*(c * u for u, c in row.items() if u is not unknown)) / row[unknown])
+            for unknown, row in reversed(self.pivots)
+        ]
+
+    def _put(self, i: int, unknown: Term, value: Term) -> None:
+        value = self._short(value)
+        if self.divisors.is_zero(value):
+            self.rows[i].pop(unknown, None)
+            self.holders[unknown].discard(i)
+            return
+        self.rows[i][unknown] = value
+        self.holders[unknown].add(i)
+
+    def _short(self, entry: Term) -> Term:
+        """Return an entry, or the name it gets when it is long."""
+        if size(entry) <= self.longest:
+            return entry
+        short = symbol(f"{self.name} by elimination {len(self.named) + 1}")
+        self.divisors.define(short, entry)
+        self.named.append((short.name, entry))
+        return short
 
 
 def eliminate(
-    forms: Sequence[LinearForm], unknowns: Sequence[Symbol], tests: ZeroTests
+    forms: Sequence[LinearForm], unknowns: Sequence[Symbol], divisors: Divisors
 ) -> tuple[list[Assignment], list[Symbol]]:
     """Solve as many linear equations as unknowns.
 
@@ -58,7 +135,7 @@ def eliminate(
         For each equation the coefficients of the unknowns and the rest; their sum is zero.
     unknowns
         What to solve for.
-    tests
+    divisors
         What may be divided by.
 
     Returns
@@ -68,103 +145,18 @@ def eliminate(
     free
         The unknowns that the equations leave open; if there are any, nothing is assigned.
     """
-    system = _Elimination(forms, unknowns, tests)
-    while (pivot := system.next_pivot()) is not None:
-        system.clear_column(*pivot)
-    free = system.free()
-    return ([] if free else system.solution()), free
-
-
-class _Elimination:
-    """The rows as they are eliminated: `rows[i][j]` is the coefficient of unknown j in equation i."""
-
-    def __init__(self, forms: Sequence[LinearForm], unknowns: Sequence[Symbol], tests: ZeroTests) -> None:
-        place = {unknown: j for j, unknown in enumerate(unknowns)}
-        self.unknowns = unknowns
-        self.tests = tests
-        self.rows = [
-            {place[u]: c for u, c in coefficients.items() if not tests.is_zero(c)}
-            for coefficients, _ in forms
-        ]
-        self.right = [-rest for _, rest in forms]
-        self.holders: list[set[int]] = [set() for _ in unknowns]  # the open rows that hold a column
-        for i, row in enumerate(self.rows):
-            for j in row:
-                self.holders[j].add(i)
-        self.named: list[Assignment] = []
-        self.pivots: list[tuple[int, int]] = []
-        self.heap = [self._cost(i, j) for i, row in enumerate(self.rows) for j in row]
-        heapq.heapify(self.heap)
-
-    def next_pivot(self) -> tuple[int, int] | None:
-        """Return the row and column to go on with; None when there is nothing left to divide by."""
-        while self.heap:
-            entry = heapq.heappop(self.heap)
-            i, j = entry[-2:]
-            if i not in self.holders[j]:
-                continue
-            if (current := self._cost(i, j)) > entry:
-                heapq.heappush(self.heap, current)  # the pattern has filled in since
-            elif current[0]:
-                return None
-            else:
-                return i, j
-        return None
-
-    def clear_column(self, i: int, j: int) -> None:
-        """Take unknown j out of every other open row, by row i."""
-        self.pivots.append((i, j))
-        for column in self.rows[i]:
-            self.holders[column].discard(i)
-        for other in sorted(self.holders[j]):
-            factor = self._named(self.rows[other].pop(j) / self.rows[i][j])
-            for column, value in self.rows[i].items():
-                if column != j:
-                    self._subtract(other, column, factor * value)
-            self.right[other] = self._named(self.right[other] - factor * self.right[i])
-        self.holders[j].clear()
-
-    def free(self) -> list[Symbol]:
-        """Return the unknowns without a pivot."""
-        solved = {column for _, column in self.pivots}
-        return [unknown for j, unknown in enumerate(self.unknowns) if j not in solved]
-
-    def solution(self) -> list[Assignment]:
-        """Return what gives each unknown, by back substitution."""
-        solved = []
-        for i, j in reversed(self.pivots):
-            others = add(
-                *(value * self.unknowns[column] for column, value in self.rows[i].items() if column != j)
-            )
-            solved.append((self.unknowns[j].name, (self.right[i] - others) / self.rows[i][j]))
-        return self.named + solved
-
-    def _cost(self, i: int, j: int) -> _Cost:
-        entry, fill = self.rows[i][j], (len(self.rows[i]) - 1) * (len(self.holders[j]) - 1)
-        return (
-            self.tests.vanishes(entry),
-            self.tests.can_vanish(entry),
-            fill,
-            not isinstance(entry, Number),
-            i,
-            j,
-        )
-
-    def _subtract(self, row: int, column: int, value: Term) -> None:
-        left = self._named(self.rows[row].get(column, ZERO) - value)
-        if self.tests.is_zero(left):
-            self.rows[row].pop(column, None)
-            self.holders[column].discard(row)
-        else:
-            self.rows[row][column] = left
-            self.holders[column].add(row)
-            heapq.heappush(self.heap, self._cost(row, column))
-
-    def _named(self, entry: Term) -> Term:
-        """Return an entry, or the name it gets when it is long."""
-        if entry.size <= LARGEST_ENTRY:
-            return entry
-        short = symbol(f"{self.unknowns[0].name} by elimination {len(self.named) + 1}")
-        self.tests.define(short, entry)
-        self.named.append((short.name, entry))
-        return short
+    rows = ({**coefficients, ONE: rest} for coefficients, rest in forms)
+    longest = LARGEST_ENTRY if len(unknowns) > 1 else sys.maxsize  # what is not put into another may be long
+    system = Elimination(rows, divisors, unknowns[0].name, longest)
+    while system.rows:
+        pivot = system.next_pivot(stays=True)
+        if pivot is None and 1 < len(system.rows) <= MOST_BY_CRAMER and (solved := system.by_cramer()):
+            return system.named + solved + system.solution(), []
+        pivot = pivot or system.next_pivot(stays=False)
+        if pivot is None:
+            break
+        system.clear(*pivot)
+    free = set(unknowns) - {unknown for unknown, _ in system.pivots}
+    if free:
+        return [], [unknown for unknown in unknowns if unknown in free]
+    return system.named + system.solution(), []

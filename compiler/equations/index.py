@@ -1,7 +1,7 @@
 """Index reduction: equations differentiated until every derivative can be solved for, and states chosen.
 
-Takes: residuals in variables and their derivatives (see `derivatives`). Gives: `reduce_index`: the equations
-to solve, their unknowns, and the states.
+Takes: residuals in variables and their derivatives (see `derivatives`). Gives: `IndexReduction`, whose result
+are the equations to solve, their unknowns, and the states.
 Guarantees: as many equations as unknowns; the states are independent and chosen once and for all.
 Does not: solve anything (see `blocks`).
 
@@ -17,24 +17,25 @@ start value of a chosen state counts; the variables that depend on it follow, wh
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 
-from apc.compiler.equations.derivatives import TIME, Derivative, Derivatives
-from apc.compiler.equations.matching import match_columns
-from apc.compiler.equations.residuals import SCENE, Residual, report_singular
-from apc.compiler.equations.symbolic import NoDerivativeError, linear_form
-from apc.compiler.equations.terms import ZERO, Number, Symbol, Term
-from apc.compiler.equations.zero_test import NOTHING_VANISHES, Vanishing, ZeroTest
+from apc.compiler.equations.derivatives import TIME, Derivative, Moving, derivative
+from apc.compiler.equations.elimination import Elimination
+from apc.compiler.equations.matching import alternating, match_columns
+from apc.compiler.equations.residuals import Residual, report_no_derivative, report_singular
+from apc.compiler.equations.symbolic import derivative_size, linear_form
+from apc.compiler.equations.terms import NoDerivativeError, Symbol, Term, text_of
+from apc.compiler.equations.zero_test import Divisors
 from apc.compiler.errors import Mistakes, Place
 
 # More derivatives than this of one variable: no mechanical model needs them (a constraint on a position
 # needs two), so the equations do not end.
 HIGHEST_ORDER = 8
 
-# Nodes of a derivative: that of a product of nonlinear factors is longer than the product. The derivatives
-# of the joints of a mechanism have some hundreds of them.
-LARGEST = 20_000
+# Nodes a derivative may have, at most: that of a product of nonlinear factors is longer than the product. The
+# derivatives of the joints of a mechanism have some hundreds of them.
+LARGEST = 100_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,158 +47,136 @@ class Reduced:
     states: tuple[Symbol, ...]
 
 
-def reduce_index(
-    residuals: Sequence[Residual],
-    names: Sequence[str],
-    started: Set[str],
-    derivatives: Derivatives,
-    where: str,
-    mistakes: Mistakes,
-    vanishes: Vanishing = NOTHING_VANISHES,
-    place: Place = SCENE,
-) -> Reduced | None:
-    """Differentiate what must be and choose the states; None if the equations can't be solved.
+class IndexReduction:
+    """The equations as they grow: each may have a derivative, which then takes its place in the matching.
 
     Parameters
     ----------
-    residuals, names
-        The equations, and the variables they hold, in the order of preference as states.
-    started
-        The variables with a declared start value.
-    derivatives
-        Knows the symbols of `names` and of their derivatives.
+    residuals
+        The equations.
+    orders
+        The variables they hold, in the order of preference as states, and how many derivatives of each are
+        asked for even if no equation holds them.
+    moving
+        Knows the derivatives of the variables.
     where
         What to call the equations in a message.
     mistakes
         Takes E502 equations or unknowns left over or constraints that say the same, E508 the derivative of a
         value that jumps, E509 states that can't be chosen once and for all.
-    vanishes
-        Whether an expression is zero with the scene's numbers.
-    place
-        Where to point when there is no equation left.
+    divisors
+        What may be divided by.
     """
-    column = {name: j for j, name in enumerate(names)}
-    incidence = [
-        sorted({column[n] for n, _ in derivatives.derivatives(r.expression).values()}) for r in residuals
-    ]
-    match = match_columns(incidence, len(names))
-    if len(residuals) != len(names) or None in match:
-        report_singular(residuals, names, incidence, match, where, mistakes, place)
-        return None
-    system = _System(residuals, names, derivatives, vanishes)
-    if not system.differentiate_constraints(mistakes):
-        return None
-    dummies = system.choose_dummies(started, where, mistakes)
-    if dummies is None:
-        return None
-    states: list[Symbol] = []
-    unknowns: list[Symbol] = []
-    for name in names:
-        top = system.order[name]
-        # The orders made unknowns of begin here; the one below is solved for as the derivative of a state.
-        first = min((k for k in range(top + 1) if (name, k) in dummies), default=top + 1)
-        split = max(first - 1, 0)
-        states += [derivatives.symbol(name, k) for k in range(split)]
-        unknowns += [derivatives.symbol(name, k) for k in range(split, top + 1)]
-    return Reduced(tuple(system.residuals), tuple(unknowns), tuple(states))
-
-
-class _System:
-    """The equations as they grow: each may have a derivative, which then takes its place in the matching."""
 
     def __init__(
         self,
         residuals: Sequence[Residual],
-        names: Sequence[str],
-        derivatives: Derivatives,
-        vanishes: Vanishing,
+        orders: Mapping[str, int],
+        moving: Moving,
+        where: str,
+        mistakes: Mistakes,
+        divisors: Divisors,
     ) -> None:
-        self.vanishes = vanishes
-        self.residuals = list(residuals)
-        self.names = names
-        self.derivatives = derivatives
+        self.moving = moving
+        self.where = where
+        self.mistakes = mistakes
+        self.divisors = divisors
+        self.order = dict(orders)  # the highest of each variable
+        self.residuals: list[Residual] = []
         self.held: list[dict[str, int]] = []  # for each equation, its variables and their highest orders
-        self.derivative: dict[int, int] = {}  # equation -> its derivative
-        self.integral: dict[int, int] = {}  # and back
-        # A derivative with a name of its own is asked for, even if no equation holds it.
-        self.order = {name: derivatives.named_order(name) for name in names}
+        self.integral: dict[int, int] = {}  # of each derivative, the equation it is of
         for residual in residuals:
-            self._hold(residual)
-        for orders in self.held:
-            for name, order in orders.items():
+            self._add(residual)
+            for name, order in self.held[-1].items():
                 self.order[name] = max(self.order[name], order)
 
-    def _hold(self, residual: Residual) -> None:
-        orders: dict[str, int] = {}
-        for name, order in self.derivatives.derivatives(residual.expression).values():
-            orders[name] = max(orders.get(name, 0), order)
-        self.held.append(orders)
+    def reduced(self, started: Set[Symbol], place: Place) -> Reduced | None:
+        """Differentiate what must be and choose the states; None if the equations can't be solved.
+
+        Parameters
+        ----------
+        started
+            The variables and derivatives with a declared start value.
+        place
+            Where to point when there is no equation left.
+        """
+        names = list(self.order)
+        incidence = [[j for j, name in enumerate(names) if name in held] for held in self.held]
+        match = match_columns(incidence, len(names))
+        if len(self.residuals) != len(names) or None in match:
+            report_singular(self.residuals, names, incidence, match, self.where, self.mistakes, place)
+            return None
+        dummies = self.choose_dummies(started) if self.differentiate_constraints() else None
+        if dummies is None:
+            return None
+        states: list[Symbol] = []
+        unknowns: list[Symbol] = []
+        for name, top in self.order.items():
+            # The orders made unknowns of begin here; the one below is solved for as a state's derivative.
+            first = min((k for k in range(top + 1) if (name, k) in dummies), default=top + 1)
+            split = max(first - 1, 0)
+            states += [derivative(name, k) for k in range(split)]
+            unknowns += [derivative(name, k) for k in range(split, top + 1)]
+        return Reduced(tuple(self.residuals), tuple(unknowns), tuple(states))
+
+    def _add(self, residual: Residual) -> None:
+        self.residuals.append(residual)
+        self.held.append({})
+        for name, order in self.moving.derivatives(residual.expression).values():
+            self.held[-1][name] = max(self.held[-1].get(name, 0), order)
 
     # ---- Pantelides ----
 
-    def differentiate_constraints(self, mistakes: Mistakes) -> bool:
+    def differentiate_constraints(self) -> bool:
         """Match every equation to a highest derivative, differentiating those that hold none of their own."""
-        computed_by: dict[str, int] = {}
-        computes: dict[int, str] = {}
-        for start in range(len(self.residuals)):
-            row = start
-            while (stuck := self._augment(row, computed_by, computes)) is not None:
-                rows, names = stuck
-                if still := [one for one in rows if not self._moves_on(one)]:
-                    self._report_empty(still[0], mistakes)
-                    return False
-                for name in names:
-                    self.order[name] += 1
-                    if self.order[name] > HIGHEST_ORDER:
-                        self._report_endless(rows, mistakes)
+        names = list(self.order)
+        column = {name: j for j, name in enumerate(names)}
+        while True:
+            done = set(self.integral.values())
+            newest = [row for row in range(len(self.residuals)) if row not in done]
+            incidence = [
+                [column[name] for name, order in self.held[row].items() if order == self.order[name]]
+                for row in newest
+            ]
+            partner = {j: i for j, i in enumerate(match_columns(incidence, len(names))) if i is not None}
+            left = sorted(set(range(len(newest))) - set(partner.values()))
+            if not left:
+                return True
+            passed: set[int] = set()
+            for start in left:
+                rows, columns = alternating([start], incidence, partner)
+                if passed.isdisjoint(columns):
+                    passed.update(columns)
+                    if not self._pass_on([newest[i] for i in rows], [names[j] for j in columns]):
                         return False
-                for each in rows:
-                    if not self._differentiate(each, mistakes):
-                        return False
-                for name in names:
-                    computed_by[name] = self.derivative[computed_by[name]]
-                    computes[computed_by[name]] = name
-                row = self.derivative[row]
-        return True
 
-    def _augment(
-        self, start: int, computed_by: dict[str, int], computes: dict[int, str]
-    ) -> tuple[list[int], list[str]] | None:
-        """Match one more equation; else return the equations and variables that block one another."""
-        came_from: dict[str, int] = {}
-        queue = [start]
-        for row in queue:
-            for name, order in self.held[row].items():
-                if name in came_from or order < self.order[name]:
-                    continue
-                came_from[name] = row
-                if name in computed_by:
-                    queue.append(computed_by[name])
-                    continue
-                while True:
-                    row = came_from[name]
-                    before = computes.get(row)
-                    computed_by[name], computes[row] = row, name
-                    if row == start:
-                        return None
-                    assert before is not None
-                    name = before
-        return queue, list(came_from)
+    def _pass_on(self, rows: Sequence[int], names: Sequence[str]) -> bool:
+        """Differentiate equations that block one another, and with them the order of what they hold."""
+        for row in rows:
+            if not self._moves_on(row):
+                what = (
+                    "holds no unknown once what the connections and other equations say is put in: "
+                    "it says what they say already, or contradicts them"
+                )
+                self._report("E502", row, f"{self.residuals[row].shown} {what}")
+                return False
+        for name in names:
+            self.order[name] += 1
+        if any(self.order[name] > HIGHEST_ORDER for name in names):
+            return self._report_endless(rows)
+        return all(self._differentiate(row) for row in rows)
 
-    def _differentiate(self, row: int, mistakes: Mistakes) -> bool:
+    def _differentiate(self, row: int) -> bool:
         residual = self.residuals[row]
+        if derivative_size(residual.expression) > LARGEST:
+            return self._report_endless([row])
         try:
-            expression = self.derivatives.differentiate(residual.expression)
+            expression = self.moving.differentiate(residual.expression)
         except NoDerivativeError as missing:
-            report_no_derivative(residual, missing, mistakes)
+            report_no_derivative(residual, missing, self.mistakes)
             return False
-        self.derivative[row], self.integral[len(self.residuals)] = len(self.residuals), row
-        if expression.size > LARGEST:
-            self._report_endless([row], mistakes)
-            return False
-        made = Residual(expression, residual.equation)
-        self.residuals.append(made)
-        self._hold(made)
+        self.integral[len(self.residuals)] = row
+        self._add(Residual(expression, residual.equation))
         return True
 
     def _moves_on(self, row: int) -> bool:
@@ -211,39 +190,30 @@ class _System:
             row, same = before, same + 1
         return bool(held) and same <= max(held.values())
 
-    def _report_empty(self, row: int, mistakes: Mistakes) -> None:
-        """Say that what an equation holds cancels, in itself or in its derivative."""
-        residual = self.residuals[row]
-        what = (
-            f"{residual.shown} holds no unknown once what the connections and other equations say is put in: "
-            "it says what they say already, or contradicts them"
-        )
-        mistakes.add("E502", residual.equation.place, what)
+    def _report_endless(self, rows: Iterable[int]) -> bool:
+        shown = list(dict.fromkeys(self.residuals[row].shown for row in rows))
+        what = f"no number of derivatives of these equations determines what they hold: {', '.join(shown)}"
+        self._report("E509", next(iter(rows)), what)
+        return False
 
-    def _report_endless(self, rows: Iterable[int], mistakes: Mistakes) -> None:
-        roots = list(dict.fromkeys(self.residuals[row].equation for row in rows))
-        texts = ", ".join(f"`{equation.text}` ({equation.origin})" for equation in roots)
-        what = f"no number of derivatives of these equations determines what they hold: {texts}"
-        mistakes.add("E509", roots[0].place, what)
+    def _report(self, code: str, row: int, what: str, hint: str = "") -> None:
+        self.mistakes.add(code, self.residuals[row].equation.place, what, hint=hint)
 
     # ---- dummy derivatives ----
 
-    def choose_dummies(self, started: Set[str], where: str, mistakes: Mistakes) -> set[Derivative] | None:
+    def choose_dummies(self, started: Set[Symbol]) -> set[Derivative] | None:
         """Return the derivatives that become unknowns, level by level from the highest order down.
 
         At each level as many as there are constraints, so that the constraints' Jacobian in them is regular.
         """
-        rank = {name: j for j, name in enumerate(self.names)}
-
-        def wanted_last(derivative: Derivative) -> tuple[bool, int, int]:
-            name, order = derivative
-            return self.derivatives.symbol(name, order - 1).name in started, -order, -rank[name]
-
+        rank = {name: j for j, name in enumerate(self.order)}
         chosen: set[Derivative] = set()
-        rows = [row for row in self.integral if row not in self.derivative]
-        candidates: Iterable[Derivative] = [(name, order) for name, order in self.order.items() if order]
+        done = set(self.integral.values())
+        rows = [row for row in self.integral if row not in done]
+        candidates = [(name, order) for name, order in self.order.items() if order]
         while rows:
-            level = self._regular_columns(rows, sorted(candidates, key=wanted_last), where, mistakes)
+            candidates.sort(key=lambda it: (derivative(it[0], it[1] - 1) in started, -it[1], -rank[it[0]]))
+            level = self._regular_columns(rows, candidates)
             if level is None:
                 return None
             chosen |= set(level)
@@ -252,91 +222,52 @@ class _System:
         return chosen
 
     def _regular_columns(
-        self, rows: Sequence[int], candidates: Sequence[Derivative], where: str, mistakes: Mistakes
+        self, rows: Sequence[int], candidates: Sequence[Derivative]
     ) -> list[Derivative] | None:
         """Return the first columns, in the order given, in which the rows' Jacobian is regular.
 
         Elimination column by column; a factor that moves, such as 2·x, may vanish and is no pivot.
         """
-        symbols = {self.derivatives.symbol(*derivative): derivative for derivative in candidates}
-        is_zero = ZeroTest()
-        matrix: dict[int, dict[Derivative, Term]] = {}
-        for row in rows:
-            form = linear_form(self.residuals[row].expression, symbols.keys())
-            if form is None:  # else a derivative is linear in the highest derivatives
-                self._report_condition(row, where, mistakes)
-                return None
-            matrix[row] = {symbols[s]: c for s, c in form[0].items() if not is_zero(c)}
-        columns: dict[Derivative, dict[int, None]] = {derivative: {} for derivative in candidates}
-        for row, entries in matrix.items():
-            for derivative in entries:
-                columns[derivative][row] = None
-        chosen: list[Derivative] = []
-        for derivative in candidates:
-            still = [row for row in columns[derivative] if row in matrix and derivative in matrix[row]]
-            fixed = [
-                row
-                for row in still
-                if not self._moves(matrix[row][derivative]) and not self.vanishes(matrix[row][derivative])
-            ]
-            if not fixed:
-                continue
-            pivot = min(
-                fixed,
-                key=lambda row: (not isinstance(matrix[row][derivative], Number), len(matrix[row]), row),
-            )
-            entries = matrix.pop(pivot)
-            chosen.append(derivative)
-            for row in still:
-                if row == pivot:
-                    continue
-                factor = matrix[row][derivative] / entries[derivative]
-                for other, value in entries.items():
-                    left = matrix[row].get(other, ZERO) - factor * value
-                    if other == derivative or is_zero(left):
-                        matrix[row].pop(other, None)
-                    else:
-                        matrix[row][other] = left
-                        columns[other][row] = None
-        if matrix:
-            self._report_no_choice(matrix, where, mistakes)
+        symbols = {derivative(*one): one for one in candidates}
+        forms = [linear_form(self.residuals[row].expression, frozenset(symbols)) for row in rows]
+        linear = [form[0] for form in forms if form is not None]
+        if len(linear) < len(rows):  # else a derivative is linear in the highest derivatives
+            row = rows[forms.index(None)]
+            what = "a condition hangs on a derivative that it ties down"
+            what = f"{self.where}: in the constraint {self.residuals[row].shown} {what}"
+            self._report("E509", row, what, "a condition on positions, parameters or time")
             return None
-        return chosen
+        system = Elimination(linear, self.divisors, "", LARGEST)
+        chosen = []
+        for s, one in symbols.items():
+            fixed = [
+                (not system.rows[i][s].is_number, len(system.rows[i]), i)
+                for i in system.holders[s]
+                if self._stays(system.rows[i][s])
+            ]
+            if fixed:
+                system.clear(min(fixed)[-1], s)
+                chosen.append(one)
+        for i, entries in system.rows.items():
+            self._report_no_choice(rows[i], entries)
+        return None if system.rows else chosen
 
-    def _moves(self, expression: Term) -> bool:
-        return TIME in expression.free_symbols or bool(self.derivatives.derivatives(expression))
+    def _stays(self, factor: Term) -> bool:
+        still = TIME not in factor.free_symbols and not self.moving.derivatives(factor)
+        return still and not self.divisors.vanishes(factor)
 
-    def _report_condition(self, row: int, where: str, mistakes: Mistakes) -> None:
-        """Say that a branch of a constraint is chosen by what the constraint's derivatives would give."""
-        residual = self.residuals[row]
+    def _report_no_choice(self, row: int, entries: Mapping[Term, Term]) -> None:
+        """Say that from a constraint no variable follows."""
+        constraint = f"the constraint {self.residuals[row].shown}"
+        if all(self.divisors.vanishes(factor) for factor in entries.values()):
+            self._report("E502", row, f"{self.where}: {constraint} says what other constraints say already")
+            return
+        named = self.moving.derivatives(sum(entries))
+        factors = ", ".join(f"{x} (by the factor {text_of(entries[s])})" for s, (x, _) in named.items())
         what = (
-            f"{where}: in the constraint {residual.shown} a condition hangs on a derivative that it ties down"
+            f"{self.where}: no variable follows from {constraint} in every position, "
+            f"since the factor moves and may vanish: {factors}"
         )
-        mistakes.add(
-            "E509", residual.equation.place, what, hint="a condition on positions, parameters or time"
+        self._report(
+            "E509", row, what, "the constraint with an angle or another coordinate that gives every position"
         )
-
-    def _report_no_choice(
-        self, matrix: dict[int, dict[Derivative, Term]], where: str, mistakes: Mistakes
-    ) -> None:
-        """Say which constraints are left without a variable that follows from them."""
-        for row, entries in matrix.items():
-            residual = self.residuals[row]
-            if entries and not all(self.vanishes(c) for c in entries.values()):
-                factors = ", ".join(f"{name} (by the factor {c})" for (name, _), c in sorted(entries.items()))
-                what = (
-                    f"{where}: no variable follows from the constraint {residual.shown} in every position, "
-                    f"since the factor moves and may vanish: {factors}"
-                )
-                hint = "the constraint with an angle or another coordinate that gives every position"
-                mistakes.add("E509", residual.equation.place, what, hint=hint)
-            else:
-                what = f"{where}: the constraint {residual.shown} says what other constraints say already"
-                mistakes.add("E502", residual.equation.place, what)
-
-
-def report_no_derivative(residual: Residual, missing: NoDerivativeError, mistakes: Mistakes) -> None:
-    """Add the mistake E508: an equation's derivative is needed, and what it holds has none."""
-    what = f"{residual.shown} needs the derivative of {missing}"
-    why = "a position follows such a force only through a mass"
-    mistakes.add("E508", residual.equation.place, f"{what}; {why}")

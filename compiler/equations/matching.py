@@ -1,21 +1,26 @@
 """Which row may be matched to which column: matchings, what they leave over, and the order they imply.
 
 Takes: the incidence of a sparse square system, and graphs, as lists of integers.
-Gives: `match_columns`, `leftovers`, `strong_components`.
-Guarantees: nothing recurses; the same input gives the same matching.
+Gives: `match_columns`, `alternating`, `strong_components`.
+Guarantees: the same input gives the same matching.
 Does not: know what a row or a column stands for.
-
-Matching by augmenting paths (Kuhn's algorithm), blocks by strongly connected components (Tarjan, SIAM J.
-Comput. 1972), what is left over by the coarse decomposition of Dulmage and Mendelsohn (1958); the usual way
-of Modelica compilers (Cellier and Kofman, Continuous System Simulation, ch. 7).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 
-# ---- matching ----
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
+
+
+def _graph(rows: Sequence[Iterable[int]], columns: int) -> csr_array:
+    """Return a sparse matrix with ones where a row lists a column."""
+    lists = [list(row) for row in rows]
+    ends = np.cumsum([0, *map(len, lists)])
+    places = np.array([column for row in lists for column in row], dtype=np.int32)
+    return csr_array((np.ones(len(places)), places, ends), shape=(len(lists), columns))
 
 
 def match_columns(incidence: Sequence[Sequence[int]], columns: int) -> list[int | None]:
@@ -28,111 +33,47 @@ def match_columns(incidence: Sequence[Sequence[int]], columns: int) -> list[int 
     columns
         The number of columns.
     """
-    match: list[int | None] = [None] * columns
-    held: dict[int, int] = {}
-    for start in range(len(incidence)):
-        _augment(start, incidence, match, held)
-    return match
+    if not incidence or not columns:
+        return [None] * columns
+    matched = maximum_bipartite_matching(_graph(incidence, columns), perm_type="row")
+    return [int(row) if row >= 0 else None for row in matched]
 
 
-def _augment(
-    start: int, incidence: Sequence[Sequence[int]], match: list[int | None], held: dict[int, int]
-) -> None:
-    """Try to match one more row, moving matched rows aside: breadth first, so that depth is no limit."""
-    came_from: dict[int, int] = {}
-    queue = [start]
-    for row in queue:
-        for column in incidence[row]:
-            if column in came_from:
-                continue
-            came_from[column] = row
-            owner = match[column]
-            if owner is None:
-                while True:
-                    row = came_from[column]
-                    match[column], before = row, held.get(row)
-                    held[row] = column
-                    if row == start:
-                        return
-                    assert before is not None
-                    column = before
-            queue.append(owner)
+def alternating(
+    starts: Iterable[int], neighbours: Sequence[Iterable[int]], partner: Mapping[int, int]
+) -> tuple[list[int], list[int]]:
+    """Return what alternating paths reach from nodes of one side, on that side and on the other.
 
+    From the rows that a largest matching leaves over these are the equations that are too many, and their
+    unknowns, and from the columns the other way round (Dulmage and Mendelsohn 1958).
 
-@dataclass(frozen=True, slots=True)
-class Leftovers:
-    """The parts of a system that has no perfect matching (Dulmage and Mendelsohn 1958).
-
-    More equations than unknowns in the over-determined part, fewer in the under-determined one.
+    Parameters
+    ----------
+    starts
+        Nodes without a partner.
+    neighbours
+        For each node of this side those of the other.
+    partner
+        For each node of the other side its own on this side.
     """
-
-    over_rows: tuple[int, ...]
-    over_columns: tuple[int, ...]
-    under_rows: tuple[int, ...]
-    under_columns: tuple[int, ...]
-
-
-def leftovers(incidence: Sequence[Sequence[int]], match: Sequence[int | None]) -> Leftovers:
-    """Return what alternating paths reach from the rows and from the columns that are not matched."""
-    held = {row: column for column, row in enumerate(match) if row is not None}
-    rows = [row for row in range(len(incidence)) if row not in held]
-    reached_columns: dict[int, None] = {}
-    seen = set(rows)
-    for row in rows:
-        for column in incidence[row]:
-            reached_columns[column] = None
-            owner = match[column]
-            assert owner is not None, "a matching that can't grow"
-            if owner not in seen:
-                seen.add(owner)
-                rows.append(owner)
-    over = (tuple(sorted(rows)), tuple(sorted(reached_columns)))
-    holders: list[list[int]] = [[] for _ in match]
-    for row, columns in enumerate(incidence):
-        for column in columns:
-            holders[column].append(row)
-    free = [column for column, row in enumerate(match) if row is None]
-    reached_rows: dict[int, None] = {}
-    for column in free:
-        for row in holders[column]:
-            if row not in reached_rows:
-                reached_rows[row] = None
-                if held[row] not in free:
-                    free.append(held[row])
-    return Leftovers(*over, tuple(sorted(reached_rows)), tuple(sorted(free)))
+    near, far = dict.fromkeys(starts), dict.fromkeys(range(0))
+    queue = list(near)
+    for node in queue:
+        for other in neighbours[node]:
+            far[other] = None
+            if (following := partner.get(other)) is not None and following not in near:
+                near[following] = None
+                queue.append(following)
+    return sorted(near), sorted(far)
 
 
 def strong_components(needs: Sequence[Iterable[int]]) -> list[list[int]]:
-    """Return the strongly connected components of a graph, each after all it needs (Tarjan, iterative)."""
-    order: dict[int, int] = {}
-    low: dict[int, int] = {}
-    on_stack: set[int] = set()
-    stack: list[int] = []
-    found: list[list[int]] = []
-    for root in range(len(needs)):
-        if root in order:
-            continue
-        work = [(root, iter(needs[root]))]
-        while work:
-            node, rest = work[-1]
-            if node not in order:
-                order[node] = low[node] = len(order)
-                stack.append(node)
-                on_stack.add(node)
-            for following in rest:
-                if following not in order:
-                    work.append((following, iter(needs[following])))
-                    break
-                if following in on_stack:
-                    low[node] = min(low[node], order[following])
-            else:
-                work.pop()
-                if work:
-                    parent = work[-1][0]
-                    low[parent] = min(low[parent], low[node])
-                if low[node] == order[node]:
-                    cut = stack.index(node)
-                    found.append(stack[cut:])
-                    on_stack.difference_update(stack[cut:])
-                    del stack[cut:]
+    """Return the strongly connected components of a graph, each after all it needs.
+
+    SciPy numbers them as Pearce's algorithm ends with them, which is after all that can be reached from them.
+    """
+    count, labels = connected_components(_graph(needs, len(needs)), connection="strong")
+    found: list[list[int]] = [[] for _ in range(count)]
+    for node, label in enumerate(labels):
+        found[label].append(node)
     return found

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from apc.compiler.equations.flatten import FlatEquation
-from apc.compiler.equations.matching import leftovers
-from apc.compiler.equations.terms import Term
+from apc.compiler.equations.matching import alternating
+from apc.compiler.equations.terms import NoDerivativeError, Term
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.words import counted
 
@@ -33,10 +33,18 @@ class Residual:
         return f"`{self.equation.text}` ({self.equation.origin})"
 
 
-def report_no_number(texts: Sequence[str], place: Place, mistakes: Mistakes) -> None:
+def report_no_number(residuals: Sequence[Residual], mistakes: Mistakes) -> None:
     """Add the mistake E512: equations in which a constant is none, maybe after others are put in."""
-    what = f"{listed(texts)} hold{'s' if len(texts) == 1 else ''} a constant that is no number"
-    mistakes.add("E512", place, f"{what}, such as 1/0 or sqrt(-1)")
+    texts = listed([residual.shown for residual in residuals])
+    what = f"{texts} hold{'s' if len(residuals) == 1 else ''} a constant that is no number"
+    mistakes.add("E512", residuals[0].equation.place, f"{what}, such as 1/0 or sqrt(-1)")
+
+
+def report_no_derivative(residual: Residual, missing: NoDerivativeError, mistakes: Mistakes) -> None:
+    """Add the mistake E508: an equation's derivative is needed, and what it holds has none."""
+    what = f"{residual.shown} needs the derivative of {missing}"
+    why = "a position follows such a force only through a mass"
+    mistakes.add("E508", residual.equation.place, f"{what}; {why}")
 
 
 def report_singular(
@@ -65,26 +73,31 @@ def report_singular(
     place
         Where to point when there is no equation.
     """
-    found = leftovers(incidence, match)
+    rows = {column: row for column, row in enumerate(match) if row is not None}
+    columns = {row: column for column, row in rows.items()}
+    holders: list[list[int]] = [[] for _ in unknowns]
+    for i, held in enumerate(incidence):
+        for j in held:
+            holders[j].append(i)
+    unmatched = [i for i in range(len(residuals)) if i not in columns]
+    over, over_columns = alternating(unmatched, incidence, rows)
+    under_columns, under = alternating([j for j in range(len(unknowns)) if j not in rows], holders, columns)
     parts = []
     place = residuals[0].equation.place if residuals else place
-    if found.over_rows:
-        place = next(r for i, r in enumerate(residuals) if i not in match).equation.place
-        count = counted(len(found.over_columns), "unknown")
-        named = [unknowns[j] for j in found.over_columns]
-        held = f"hold only {count} ({listed(named)})" if named else "hold no unknown"
-        parts.append(
-            f"{counted(len(found.over_rows), 'equation')} {held}: "
-            f"{listed([residuals[i].shown for i in found.over_rows])}"
+    if over:
+        place = residuals[unmatched[0]].equation.place
+        named = [unknowns[j] for j in over_columns]
+        holding = (
+            f"hold only {counted(len(named), 'unknown')} ({listed(named)})" if named else "hold no unknown"
         )
-    if found.under_columns:
-        count = counted(len(found.under_columns), "unknown")
-        shown = [residuals[i].shown for i in found.under_rows]
-        by = f"only {counted(len(shown), 'equation')}, {listed(shown)}" if shown else "no equation"
-        parts.append(
-            f"{count} ({listed([unknowns[j] for j in found.under_columns])}) "
-            f"{'has' if len(found.under_columns) == 1 else 'have'} {by}"
-        )
+        shown = listed([residuals[i].shown for i in over])
+        parts.append(f"{counted(len(over), 'equation')} {holding}: {shown}")
+    if under_columns:
+        named = [unknowns[j] for j in under_columns]
+        texts = [residuals[i].shown for i in under]
+        by = f"only {counted(len(texts), 'equation')}, {listed(texts)}" if texts else "no equation"
+        has = "has" if len(named) == 1 else "have"
+        parts.append(f"{counted(len(named), 'unknown')} ({listed(named)}) {has} {by}")
     mistakes.add("E502", place, f"{where} can't be solved: {'; and '.join(parts)}")
 
 

@@ -1,6 +1,7 @@
 """What solving equations gives: assignments, and loops that an iteration has to solve.
 
-Takes: nothing (data types). Gives: `Assignment`, `ImplicitBlock`, their union `Step`; `assigned`.
+Takes: nothing (data types). Gives: `Assignment`, `ImplicitBlock`, their union `Step`; `assigned`,
+`expressions` of one.
 Guarantees: plain frozen data.
 Does not: solve anything (see `blocks`).
 """
@@ -31,7 +32,7 @@ class ImplicitBlock:
     @property
     def free_symbols(self) -> set[Symbol]:
         """The symbols the block's solution depends on."""
-        found = {s for e in (*self.residuals, *(e for _, e in self.inner)) for s in e.free_symbols}
+        found = {s for expression in expressions(self) for s in expression.free_symbols}
         return found - {symbol(name) for name in self.unknowns}
 
     @property
@@ -46,3 +47,10 @@ Step = Assignment | ImplicitBlock
 def assigned(step: Step) -> tuple[str, ...]:
     """Return the names a step gives a value."""
     return step.unknowns if isinstance(step, ImplicitBlock) else (step[0],)
+
+
+def expressions(step: Step) -> tuple[Term, ...]:
+    """Return the expressions a step consists of."""
+    if isinstance(step, ImplicitBlock):
+        return (*step.residuals, *(value for _, value in step.inner))
+    return (step[1],)

@@ -12,7 +12,7 @@ variables with a start value the one named first; those of the others are not lo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence, Set
+from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -26,16 +26,16 @@ from apc.compiler.equations.clocks import (
     PreviousCrossing,
     ReceiveCrossing,
 )
-from apc.compiler.equations.derivatives import Derivatives
+from apc.compiler.equations.derivatives import Moving, derivative
 from apc.compiler.equations.flatten import FlatEquation
-from apc.compiler.equations.index import reduce_index, report_no_derivative
-from apc.compiler.equations.residuals import SCENE, Residual, report_no_number
+from apc.compiler.equations.index import IndexReduction
+from apc.compiler.equations.residuals import SCENE, Residual, report_no_derivative, report_no_number
 from apc.compiler.equations.solution import Assignment, ImplicitBlock, Step, assigned
-from apc.compiler.equations.symbolic import NoDerivativeError, is_no_number, no_derivative, to_term
-from apc.compiler.equations.terms import ZERO, Symbol, Term, symbol
-from apc.compiler.equations.zero_test import NOTHING_VANISHES, Given, Vanishing
-from apc.compiler.errors import Mistakes
-from apc.compiler.language.expression import Expr, Name, names
+from apc.compiler.equations.symbolic import is_no_number, no_derivative, to_term
+from apc.compiler.equations.terms import ZERO, NoDerivativeError, Symbol, Term, symbol
+from apc.compiler.equations.zero_test import Divisors, Given
+from apc.compiler.errors import Mistakes, Place
+from apc.compiler.language.expression import Name, names
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.scene.scene import Scene
 
@@ -98,21 +98,20 @@ def sort(clocked: ClockedSystem) -> SortedSystem:
     mistakes = Mistakes(clocked.scene.names)
     nonzero = _positive_parameters(clocked.scene)
     kinds = tuple(
-        sort_kind(kind, mistakes, nonzero=nonzero, vanishes=Vanishing(_numbers(clocked.scene, kind)))
-        for kind in clocked.kinds
+        sort_kind(kind, mistakes, Divisors(nonzero, _numbers(clocked.scene, kind))) for kind in clocked.kinds
     )
     mistakes.raise_if_any()
     return SortedSystem(clocked.scene, kinds)
 
 
-def _positive_parameters(scene: Scene) -> list[str]:
+def _positive_parameters(scene: Scene) -> set[Symbol]:
     """Return the parameters that no number can make zero: they are safe to divide by."""
-    return ["peers"] + [
-        f"{part.name}.{declared.name}"
+    return {symbol("peers")} | {
+        symbol(f"{part.name}.{declared.name}")
         for part in scene.parts
         for declared in part.component.parameters
         if getattr(declared, "open_minimum", False) and getattr(declared, "minimum", None) == 0
-    ]
+    }
 
 
 def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[Symbol, Given]]:
@@ -135,13 +134,7 @@ def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[Symbol, Given]]:
     return found
 
 
-def sort_kind(
-    kind: ClockedKind,
-    mistakes: Mistakes,
-    *,
-    nonzero: Collection[str] = (),
-    vanishes: Vanishing = NOTHING_VANISHES,
-) -> SortedKind:
+def sort_kind(kind: ClockedKind, mistakes: Mistakes, divisors: Divisors | None = None) -> SortedKind:
     """Sort and solve one kind; when there are mistakes, the value returned is not whole.
 
     Parameters
@@ -149,37 +142,35 @@ def sort_kind(
     kind
         A kind of peer, partitioned by clock.
     mistakes
-        Takes E502, E503, E508, E509 and E511 as in `solve_blocks` and `reduce_index`, and E510 a state has no
-        start value.
-    nonzero
-        Parameters that no number can make zero.
-    vanishes
-        Whether an expression is zero with the scene's numbers; what is divided by must not be.
+        Takes E502, E503, E508, E509, E511 and E512 as in `solve_blocks` and `IndexReduction`, and E510 a
+        state has no start value.
+    divisors
+        What may be divided by.
     """
-    divisors = [symbol(name) for name in nonzero]
-    continuous = _sort_continuous(kind, divisors, vanishes, mistakes)
+    divisors = divisors or Divisors()
+    continuous = _sort_continuous(kind, divisors, mistakes) or _Continuous()
     partitions = [SortedPartition(CONTINUOUS, continuous.steps)]
     for clock in kind.partitions[1:]:
-        own = _residuals(clock.equations, no_derivative, mistakes)
-        if len(own) < len(clock.equations):
-            continue
-        unknowns = [symbol(name) for name in clock.variables]
-        where = f"the equations of clock {clock.clock}"
-        place = next((one.place for one in (*clock.equations, *kind.flat.equations)), SCENE)
-        found = solve_blocks(own, unknowns, where, mistakes, nonzero=divisors, vanishes=vanishes, place=place)
-        partitions.append(SortedPartition(clock.clock, found))
+        sides = _sides(clock.equations, no_derivative, mistakes)
+        if sides is not None:
+            residuals = _residuals(clock.equations, sides)
+            unknowns = [symbol(name) for name in clock.variables]
+            where, place = f"the equations of clock {clock.clock}", _place(kind, clock.equations)
+            steps = solve_blocks(residuals, unknowns, where, mistakes, divisors, place)
+            partitions.append(SortedPartition(clock.clock, steps))
+    sent = continuous.read[len(kind.samples) :]
     return SortedKind(
         kind,
         continuous.states,
         continuous.aliases,
         tuple(partitions),
-        tuple((s.symbol, s.clock, e) for s, e in zip(kind.samples, continuous.sampled, strict=False)),
+        tuple((s.symbol, s.clock, e) for s, e in zip(kind.samples, continuous.read, strict=False)),
         kind.holds,
         kind.previous,
         kind.receives,
         tuple(
             SortedSend(send.name, send.link, format_dimension(send.dimension), expression)
-            for send, expression in zip(kind.sends, continuous.sent, strict=False)
+            for send, expression in zip(kind.sends, sent, strict=False)
         ),
     )
 
@@ -191,120 +182,89 @@ class _Continuous:
     states: tuple[str, ...] = ()
     aliases: tuple[Assignment, ...] = ()
     steps: tuple[Step, ...] = ()
-    sampled: tuple[Term, ...] = ()
-    sent: tuple[Term, ...] = ()
+    read: tuple[Term, ...] = ()
 
 
-def _sort_continuous(
-    kind: ClockedKind, divisors: Sequence[Symbol], vanishes: Vanishing, mistakes: Mistakes
-) -> _Continuous:
+def _sort_continuous(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> _Continuous | None:
     partition = kind.partitions[0]
     assert partition.clock == CONTINUOUS
-    where = "the continuous equations"
-    held = [hold.symbol for hold in kind.holds]
-    started = {variable.name for variable in kind.flat.variables if variable.start}
-    place = next((one.place for one in (*partition.equations, *kind.flat.equations)), SCENE)
+    where, place = "the continuous equations", _place(kind, partition.equations)
+    variables = dict.fromkeys(partition.variables)
+    moving = Moving(variables.keys(), {hold.symbol for hold in kind.holds})
     # What is read, each as an equation of its own, `sample(x) = x`, for messages.
     reads = [FlatEquation(Name((s.symbol,)), s.expression, s.clock, s.clock, place) for s in kind.samples]
     reads += [FlatEquation(Name((s.name,)), s.expression, s.link, None, s.place) for s in kind.sends]
-    derivatives = Derivatives(partition.variables, held)
-    residuals = _residuals(partition.equations, derivatives.differentiate, mistakes)
-    values = [_value(read, read.right, derivatives.differentiate, mistakes) for read in reads]
-    if len(residuals) < len(partition.equations) or None in values:
-        return _Continuous()
+    sides = _sides(partition.equations, moving.differentiate, mistakes)
+    values = _sides(reads, moving.differentiate, mistakes)
+    if sides is None or values is None:
+        return None
 
-    aliases = Aliases(derivatives, partition.variables, started)
-    residuals = aliases.remove(residuals)
-    read_values = [aliases.substitute(value) for value in values if value is not None]
-    put_in = [Residual(value, read) for value, read in zip(read_values, reads, strict=True)]
-    if none := [one for one in (*residuals, *put_in) if is_no_number(one.expression)]:
-        report_no_number([one.shown for one in none], none[0].equation.place, mistakes)
-        return _Continuous()
-    derivatives = derivatives.renamed(aliases.kept, aliases.velocities)
-    probes = _probes(reads, read_values, derivatives)
-    reduced = reduce_index(
-        [*residuals, *probes.values()],
-        derivatives.names,
-        started,
-        derivatives,
+    started = {variable.name for variable in kind.flat.variables if variable.start}
+    aliases = Aliases(moving, partition.variables, started)
+    residuals = aliases.remove(_residuals(partition.equations, sides))
+    read = [Residual(aliases.substitute(value), at) for (_, value), at in zip(values, reads, strict=True)]
+    if none := [one for one in (*residuals, *read) if is_no_number(one.expression)]:
+        report_no_number(none, mistakes)
+        return None
+    # A derivative that has a name of its own, or that is read, is asked for, even if no equation holds it.
+    asked = [*aliases.velocities, *(it for one in read for it in moving.derivatives(one.expression).values())]
+    orders = {name: 0 for name in variables if name not in aliases.stands}
+    for name, order in asked:
+        orders[name] = max(orders[name], order)
+    begun = {aliases.value(name) for name in started}
+    reduction = IndexReduction(residuals, orders, moving, where, mistakes, divisors)
+    reduced = reduction.reduced(begun, place)
+    if reduced is None:
+        return None
+    states = tuple(aliases.shown(s).name for s in reduced.states)
+    _check_starts(states, started, partition.equations, mistakes)
+    solved = solve_blocks(
+        [Residual(aliases.shown(one.expression), one.equation) for one in reduced.residuals],
+        [aliases.shown(s) for s in reduced.unknowns],
         where,
         mistakes,
-        vanishes,
+        divisors,
         place,
     )
-    if reduced is None:
-        return _Continuous()
-    states = tuple(s.name for s in reduced.states)
-    _check_starts(states, started, partition.equations, mistakes)
-    named = tuple((f"der({x})", symbol(v)) for x, v in aliases.velocities.items() if x in states)
-    solved = solve_blocks(
-        reduced.residuals,
-        reduced.unknowns,
-        where,
-        mistakes,
-        nonzero=divisors,
-        vanishes=vanishes,
-        place=place,
-    )
+    below = {v: aliases.shown(derivative(x, order - 1)).name for (x, order), v in aliases.velocities.items()}
+    named = [(f"der({x})", symbol(v)) for v, x in below.items() if x in states]
     return _Continuous(
         states,
-        aliases.assignments,
+        aliases.assignments(),
         (
             *(step for step in named if step[1].name in states),
-            *(step for step in solved if probes.keys().isdisjoint(assigned(step))),
+            *solved,
             *(step for step in named if step[1].name not in states),
         ),
-        tuple(read_values[: len(kind.samples)]),
-        tuple(read_values[len(kind.samples) :]),
+        tuple(aliases.shown(one.expression) for one in read),
     )
 
 
-def _residuals(
-    equations: Sequence[FlatEquation],
-    differentiate: Callable[[Term], Term],
-    mistakes: Mistakes,
-) -> list[Residual]:
-    """Return the equations as residuals, without those whose derivatives don't exist."""
+def _place(kind: ClockedKind, equations: Sequence[FlatEquation]) -> Place:
+    """Return where to point when nothing better is known."""
+    return next((one.place for one in (*equations, *kind.flat.equations)), SCENE)
+
+
+def _sides(
+    equations: Sequence[FlatEquation], differentiate: Callable[[Term], Term], mistakes: Mistakes
+) -> list[tuple[Term, Term]] | None:
+    """Return both sides of equations; None where a derivative doesn't exist, or a constant is no number."""
     found = []
     for equation in equations:
-        left = _value(equation, equation.left, differentiate, mistakes)
-        right = _value(equation, equation.right, differentiate, mistakes)
-        if left is not None and right is not None:
-            found.append(Residual(left - right, equation))
-    return found
+        try:
+            sides = (to_term(equation.left, differentiate), to_term(equation.right, differentiate))
+        except NoDerivativeError as missing:
+            report_no_derivative(Residual(ZERO, equation), missing, mistakes)
+            continue
+        if any(map(is_no_number, sides)):
+            report_no_number([Residual(ZERO, equation)], mistakes)
+        else:
+            found.append(sides)
+    return found if len(found) == len(equations) else None
 
 
-def _value(
-    equation: FlatEquation,
-    expression: Expr,
-    differentiate: Callable[[Term], Term],
-    mistakes: Mistakes,
-) -> Term | None:
-    try:
-        value = to_term(expression, differentiate)
-    except NoDerivativeError as missing:
-        report_no_derivative(Residual(ZERO, equation), missing, mistakes)
-        return None
-    if is_no_number(value):
-        report_no_number([Residual(value, equation).shown], equation.place, mistakes)
-        return None
-    return value
-
-
-def _probes(
-    reads: Sequence[FlatEquation], values: Sequence[Term], derivatives: Derivatives
-) -> dict[str, Residual]:
-    """Return, for each derivative that is sampled or sent, the equation `sampled der(x) = der(x)`.
-
-    It makes sure that the derivative is computed, even if no other equation holds it.
-    """
-    probes: dict[str, Residual] = {}
-    for read, value in zip(reads, values, strict=True):
-        for derivative, (_, order) in derivatives.derivatives(value).items():
-            name = f"sampled {derivative}"
-            if order and name not in probes:
-                probes[name] = Residual(derivatives.add(name) - derivative, read)
-    return probes
+def _residuals(equations: Sequence[FlatEquation], sides: Sequence[tuple[Term, Term]]) -> list[Residual]:
+    return [Residual(left - right, one) for (left, right), one in zip(sides, equations, strict=True)]
 
 
 def _check_starts(

@@ -7,27 +7,21 @@ Does not: know clocks or crossings, or which symbols move (see `index`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence, Set
-from fractions import Fraction
+import operator
+import sys
+from collections.abc import Callable, Iterable, Sequence, Set
+
+import sympy
 
 from apc.compiler.equations.terms import (
-    HALF,
-    LARGEST,
-    NO_NUMBER,
-    ONE,
+    FUNCTIONS,
     ZERO,
-    Function,
-    Number,
-    Product,
-    Sum,
+    Abs,
+    If,
+    Max,
     Symbol,
     Term,
-    add,
-    apply,
-    multiply,
-    number,
-    power,
-    scaled,
+    in_order,
     symbol,
 )
 from apc.compiler.language.expression import (
@@ -40,9 +34,19 @@ from apc.compiler.language.expression import (
     Name,
     Negate,
     Not,
+    Number,
     fold,
 )
-from apc.compiler.language.expression import Number as ExactNumber
+
+LARGEST = int(sys.float_info.max)
+OPERATORS: dict[str, Callable[[Term, Term], Term]] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "^": operator.pow,
+}
+BENT = (Max, Abs, sympy.Abs, sympy.sign, sympy.floor)  # beside a choice
 
 
 def derivative_symbol(name: str) -> Symbol:
@@ -53,134 +57,82 @@ def derivative_symbol(name: str) -> Symbol:
 def to_term(expression: Expr, differentiate: Callable[[Term], Term]) -> Term:
     """Build the term; `differentiate` gives the time derivative of one, for `der`."""
 
-    def leaf(node: Name | ExactNumber) -> Term:
-        return symbol(".".join(node.parts)) if isinstance(node, Name) else number(node.value)
+    def leaf(node: Name | Number) -> Term:
+        if isinstance(node, Name):
+            return symbol(".".join(node.parts))
+        return sympy.Rational(node.value.numerator, node.value.denominator)
 
     def operation(node: Expr, *operands: Term) -> Term:
         match node:
+            case Binary():
+                return OPERATORS[node.operator](*operands)
             case Negate():
                 return -operands[0]
-            case Binary("^"):
-                assert isinstance(operands[1], Number)
-                return power(operands[0], operands[1].value)
-            case Binary("/"):
-                return operands[0] / operands[1]
-            case Binary("*"):
-                return operands[0] * operands[1]
-            case Binary("-"):
-                return operands[0] - operands[1]
-            case Binary():
-                return operands[0] + operands[1]
-            case Compare() | Logic():
-                return apply(node.operator, *operands)
-            case Not():
-                return apply("not", *operands)
-            case Conditional():
-                return apply("if", *operands)
             case Call("der"):
                 return differentiate(*operands)
-        assert isinstance(node, Call)
-        return apply(node.function, *operands)
+            case Call():
+                return FUNCTIONS[node.function](*operands)
+            case Conditional():
+                return If(*operands)
+            case Not():
+                return FUNCTIONS["not"](*operands)
+        assert isinstance(node, Compare | Logic)
+        return FUNCTIONS[node.operator](*operands)
 
     return fold(expression, leaf, operation)
 
 
+def no_derivative(expression: Term) -> Term:
+    """Stand in for `differentiate` where `der` can't occur."""
+    raise AssertionError(f"der of {expression} stands in a clocked equation")
+
+
 def is_no_number(expression: Term) -> bool:
     """Return whether an expression holds a constant that no float can be: 1/0, sqrt(-1), 1e300^2."""
-    return expression is NO_NUMBER or any(map(_no_float, expression.walk()))
+    return any(map(_is_none, sympy.preorder_traversal(expression)))
 
 
-def _no_float(part: Term) -> bool:
-    """Return whether a number in a term is larger than a float can be."""
-    if isinstance(part, Sum):
-        return any(map(_too_large, (part.constant, *(factor for _, factor in part.terms))))
-    if isinstance(part, Product):
-        return _too_large(part.coefficient)
-    return isinstance(part, Number) and _too_large(part.value)
+def _is_none(node: Term) -> bool:
+    if node.is_Rational:
+        return bool(abs(node.p) > LARGEST * node.q)
+    if node is sympy.nan or isinstance(node, sympy.AccumBounds):
+        return True
+    return bool(node.is_number) and (node.is_extended_real is False or node.is_finite is False)
 
 
-def _too_large(value: int | Fraction) -> bool:
-    return abs(value.numerator) > LARGEST * value.denominator
-
-
-class NoDerivativeError(Exception):
-    """A value was to be differentiated that has no derivative, because it jumps or bends: which, and why."""
-
-    def __init__(self, what: str, why: str) -> None:
-        super().__init__(f"{what}, {why}")
+def slope(expression: Term, by: Symbol) -> Term:
+    """Return the derivative by a symbol, that of the branch taken; what jumps is constant between jumps."""
+    found = expression.diff(by)
+    jumps = found.atoms(sympy.DiracDelta, sympy.Derivative, sympy.Subs)
+    return found.xreplace(dict.fromkeys(jumps, ZERO)) if jumps else found
 
 
 def differential(expression: Term, rate: Callable[[Symbol], Term]) -> Term:
     """Return Σ ∂expression/∂s · rate(s) over the symbols s, by the chain rule.
 
-    Where min, max, abs and if have a corner, the derivative is that of the branch taken; sign, floor and
-    conditions are constant between their jumps. Raises NoDerivativeError for other opaque functions.
+    Raises NoDerivativeError where a table is looked up at what moves, or from `rate`.
     """
-
-    def go(node: Term) -> Term:
-        match node:
-            case Symbol():
-                return rate(node)
-            case Sum():
-                return add(*(scaled(go(term), factor) for term, factor in node.terms))
-            case Product():
-                return add(
-                    *(
-                        multiply(slope, scaled(power(base, exponent - 1), exponent), _without(node, base))
-                        for base, exponent in node.powers
-                        if (slope := go(base)) != ZERO
-                    )
-                )
-            case Function():
-                return of_function(node.name, node)
-        return ZERO
-
-    def of_function(name: str, node: Function) -> Term:
-        if name == "if":
-            condition, then, otherwise = node.arguments
-            return _choice(condition, go(then), go(otherwise))
-        if name in ("min", "max"):
-            best, slope = node.arguments[0], go(node.arguments[0])
-            for argument in node.arguments[1:]:
-                order = (best, argument) if name == "min" else (argument, best)
-                slope = _choice(apply("<=", *order), slope, go(argument))
-                best = apply(name, best, argument)
-            return slope
-        if name in _SLOPES:
-            slope = go(node.arguments[0])
-            return slope if slope == ZERO else _SLOPES[name](node.arguments[0]) * slope
-        if name == "atan2":
-            y, x = node.arguments
-            turned = multiply(x, go(y)) - multiply(y, go(x))
-            return turned if turned == ZERO else turned / add(power(x, 2), power(y, 2))
-        if name in ("sign", "floor"):
-            return ZERO
-        why = "a value that jumps at its ticks" if name in ("hold", "sample") else "which has none"
-        raise NoDerivativeError(str(node), why)
-
-    return go(expression)
+    parts = (
+        along * rate(s)
+        for term in sympy.Add.make_args(expression)
+        for s in in_order(term.free_symbols)
+        if (along := slope(term, s)) != 0
+    )
+    return sympy.Add(*parts)
 
 
-_SLOPES: dict[str, Callable[[Term], Term]] = {
-    "abs": lambda x: apply("sign", x),
-    "exp": lambda x: apply("exp", x),
-    "log": lambda x: power(x, -1),
-    "sin": lambda x: apply("cos", x),
-    "cos": lambda x: -apply("sin", x),
-    "tan": lambda x: ONE + power(apply("tan", x), 2),
-    "asin": lambda x: power(ONE - power(x, 2), -HALF),
-    "acos": lambda x: -power(ONE - power(x, 2), -HALF),
-    "atan": lambda x: power(ONE + power(x, 2), -1),
-    "sinh": lambda x: apply("cosh", x),
-    "cosh": lambda x: apply("sinh", x),
-    "tanh": lambda x: ONE - power(apply("tanh", x), 2),
-}
+def derivative_size(expression: Term) -> int:
+    """Return how many nodes a derivative has at most, about: each factor's stands beside all the others."""
+    return _sizes(expression)[1]
 
 
-def _without(product: Product, base: Term) -> Term:
-    """Return a product without one of its powers."""
-    others = (power(*one) for one in product.powers if one[0] is not base)
-    return multiply(Number(product.coefficient), *others)
+def _sizes(node: Term) -> tuple[int, int]:
+    """Return how many nodes a term has, and its derivative."""
+    if not node.args:
+        return 1, int(node.is_Symbol)
+    sizes, slopes = zip(*map(_sizes, node.args), strict=True)
+    whole = 1 + sum(sizes)
+    return whole, sum(slopes) + (0 if node.is_Add else len(sizes) * whole)
 
 
 def smooth_pieces(expressions: Sequence[Term], most: int) -> list[tuple[Term, ...]] | None:
@@ -190,81 +142,42 @@ def smooth_pieces(expressions: Sequence[Term], most: int) -> list[tuple[Term, ..
     are constant.
     """
     pieces = [tuple(expressions)]
-    while True:
-        bent = next(
-            (node for piece in pieces for one in piece for node in one.walk() if _is_bent(node)), None
-        )
-        if not isinstance(bent, Function):
-            return pieces
-        match bent.name:
-            case "if":
-                choices = bent.arguments[1:]
-            case "min" | "max":
-                choices = bent.arguments
-            case "abs":
-                choices = (bent.arguments[0], -bent.arguments[0])
-            case _:
-                choices = (symbol(f"constant {bent}"),)
+    while bent := next((node for piece in pieces for one in piece for node in _bent(one)), None):
+        if isinstance(bent, If):
+            choices = bent.args[1:]
+        elif isinstance(bent, Max):
+            choices = bent.args
+        elif isinstance(bent, Abs | sympy.Abs):
+            choices = (bent.args[0], -bent.args[0])
+        else:
+            choices = (symbol(f"constant {bent}"),)
         pieces = list(
             dict.fromkeys(
-                tuple(one.replace({bent: choice}) for one in piece) for piece in pieces for choice in choices
+                tuple(one.xreplace({bent: choice}) for one in piece) for piece in pieces for choice in choices
             )
         )
         if len(pieces) > most:
             return None
+    return pieces
 
 
-def _is_bent(node: Term) -> bool:
-    return isinstance(node, Function) and node.name in ("if", "min", "max", "abs", "sign", "floor")
-
-
-def _choice(condition: Term, then: Term, otherwise: Term) -> Term:
-    return then if then == otherwise else apply("if", condition, then, otherwise)
+def _bent(expression: Term) -> Iterable[Term]:
+    return (node for node in sympy.preorder_traversal(expression) if isinstance(node, (If, *BENT)))
 
 
 LinearForm = tuple[dict[Symbol, Term], Term]
 
 
 def linear_form(expression: Term, unknowns: Set[Symbol]) -> LinearForm | None:
-    """Return the coefficients and the rest of Σ coefficient·unknown + rest, or None if it isn't linear.
-
-    Reads the terms as they stand: no differentiation, no expansion, so its cost is the expression's size.
-    """
-    if unknowns.isdisjoint(expression.free_symbols):
-        return {}, expression
-    match expression:
-        case Symbol():
-            return {expression: ONE}, ZERO
-        case Sum():
-            found: dict[Symbol, list[Term]] = {}
-            rests: list[Term] = [Number(expression.constant)] if expression.constant else []
-            for term, factor in expression.terms:
-                form = linear_form(term, unknowns)
-                if form is None:
-                    return None
-                for unknown, coefficient in form[0].items():
-                    found.setdefault(unknown, []).append(scaled(coefficient, factor))
-                rests.append(scaled(form[1], factor))
-            return {u: add(*several) for u, several in found.items()}, add(*rests)
-        case Product():
-            moving = [one for one in expression.powers if not unknowns.isdisjoint(one[0].free_symbols)]
-            base, exponent = moving[0]
-            form = linear_form(base, unknowns) if len(moving) == 1 and exponent == 1 else None
-            if form is None:
-                return None
-            scale = _without(expression, base)
-            return {u: scale * coefficient for u, coefficient in form[0].items()}, scale * form[1]
-        case Function("if", (condition, *branches)) if unknowns.isdisjoint(condition.free_symbols):
-            then, otherwise = (linear_form(branch, unknowns) for branch in branches)
-            if then is None or otherwise is None:
-                return None
-            names = dict.fromkeys((*then[0], *otherwise[0]))
-            return {
-                u: _choice(condition, then[0].get(u, ZERO), otherwise[0].get(u, ZERO)) for u in names
-            }, _choice(condition, then[1], otherwise[1])
-    return None
-
-
-def no_derivative(expression: Term) -> Term:
-    """Stand in for `differentiate` where `der` can't occur."""
-    raise AssertionError(f"der of {expression} stands in a clocked equation")
+    """Return the coefficients and the rest of Σ coefficient·unknown + rest, or None if it isn't linear."""
+    functions = (one for one in expression.atoms(sympy.Function) if not isinstance(one, If))
+    if any(not unknowns.isdisjoint(one.free_symbols) for one in functions):
+        return None
+    slopes: dict[Symbol, list[Term]] = {}
+    for term in sympy.Add.make_args(expression):
+        for unknown in in_order(term.free_symbols & unknowns):
+            slopes.setdefault(unknown, []).append(slope(term, unknown))
+    coefficients = {unknown: sympy.Add(*parts) for unknown, parts in slopes.items()}
+    if any(not unknowns.isdisjoint(coefficient.free_symbols) for coefficient in coefficients.values()):
+        return None
+    return coefficients, expression.xreplace(dict.fromkeys(coefficients, ZERO))

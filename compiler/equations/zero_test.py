@@ -1,156 +1,147 @@
-"""Whether a symbolic expression is zero: for all values of its symbols, or with the scene's numbers.
+"""Whether an expression is zero: for all values of its symbols, with the scene's numbers, or with zeros.
 
-Takes: terms. Gives: `ZeroTest`, `Vanishing`, `NOTHING_VANISHES`.
+Takes: terms, and the numbers of a scene. Gives: `Divisors`.
 Guarantees: a rational expression that is zero is found to be; one that is not is taken for zero with a
-probability below its degree/2⁶¹; the same expressions give the same answers.
-Does not: simplify or expand anything; what function values have in common, as sin(x)² + cos(x)² = 1, is asked
-of `identities`.
+probability below its degree/2⁶¹; the same expressions give the same answers. What function values have in
+common, as sin(x)² + cos(x)² = 1, SymPy is asked, where numbers at random can't tell it from zero.
+Does not: expand anything; find every identity, or look for one in expressions of more than `MOST` nodes.
 """
 
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Collection, Mapping, Sequence
 from fractions import Fraction
 from math import prod
 from typing import TypeAlias
 
 import numpy as np
+import sympy
 from numpy.typing import NDArray
 
-from apc.compiler.equations.identities import is_identity
-from apc.compiler.equations.terms import ZERO, Number, Product, Ratio, Sum, Symbol, Term, number
+from apc.compiler.equations.terms import FUNCTIONS, Symbol, Term, in_order, size
+from apc.compiler.language.expression import SMOOTH
 
 # A number of the scene: one for all peers, one a peer (count,), or an expression over other numbers.
 Given: TypeAlias = Fraction | NDArray[np.float64] | Term
 # A residue, or one a peer: an array of Python's integers, whose products outgrow 64 bits.
 Residue: TypeAlias = int | NDArray[np.object_]
-BITS = 61
-PRIME = (1 << BITS) - 1
-DIGITS = 53  # binary ones of a float
+PRIME = (1 << 61) - 1
+MOST = 200  # nodes beyond which no identity is looked for: simplifying takes its time
+POINTS, NEARLY = 4, 1e-20  # at which an identity must vanish, and how nearly, of 30 digits
+SMOOTH_FUNCTIONS = tuple(FUNCTIONS[name] for name in SMOOTH)
 
 
-class ZeroTest:
-    """Says whether a rational expression is zero for all values of its symbols.
+class Divisors:
+    """Says what may be divided by.
 
-    Each symbol, and each function value, gets a random residue modulo the prime 2⁶¹ − 1; an expression that
-    isn't zero vanishes there with probability below its degree/2⁶¹ (Schwartz 1980, Zippel 1979). Expansion
-    would decide the same at a cost that grows with the number of terms. The generator is seeded.
-
-    With `nonzero`, all other symbols are taken as zero: whether an expression is zero then. With `values`,
-    these symbols have their values: whether it is zero for all values of the others, and for one of the peers
-    where values differ from peer to peer.
+    `nonzero` are the parameters that no number can make zero; `numbers` the numbers of each group of peers.
     """
 
     def __init__(
-        self,
-        nonzero: Set[Symbol] | None = None,
-        values: Mapping[Symbol, Given] | None = None,
+        self, nonzero: Collection[Symbol] = (), numbers: Sequence[Mapping[Symbol, Given]] = ()
     ) -> None:
-        self._nonzero = nonzero
-        self._given = dict(values or {})
-        self._values: dict[Term, Residue] = {}
-        self._arbitrary: dict[Term, int] = {}
-        self._random = random.Random(0)
+        self._any = _Residues({})
+        self._least = _Residues({}, nonzero)
+        self._groups = [_Residues(values) for values in numbers]
 
     def define(self, name: Symbol, expression: Term) -> None:
         """Let a symbol stand for an expression."""
-        self._values[name] = self._value(expression)
+        for one in (self._any, self._least, *self._groups):
+            one.known[name] = one(expression)
 
-    def __call__(self, expression: Term) -> bool:
-        """Return whether the expression is zero."""
-        if isinstance(expression, Number):
-            return expression == ZERO
-        if np.any(np.equal(self._value(expression), 0)):
-            return True
-        if self._nonzero is not None:
-            return False
-        numbers = {name: number(given) for name, given in self._given.items() if isinstance(given, Fraction)}
-        known = expression.replace(numbers) if numbers else expression
-        return known == ZERO or is_identity(known)
+    def is_zero(self, expression: Term) -> bool:
+        """Return whether an expression is zero for all values of its symbols."""
+        return self._any.vanishes(expression)
 
-    def _value(self, node: Term) -> Residue:
-        known = self._values.get(node)
-        if known is None:
-            known = self._compute(node)
-            # Of what differs from peer to peer symbols alone are kept: a million peers' take 40 MB each.
-            if isinstance(node, Symbol) or isinstance(known, int):
-                self._values[node] = known
-        return known
+    def allow(self, expression: Term) -> bool:
+        """Return whether an expression is zero neither for all values nor with the scene's numbers."""
+        return not (self.is_zero(expression) or self.vanishes(expression))
 
-    def _compute(self, node: Term) -> Residue:
-        if isinstance(node, Symbol):
-            if node in self._given:
-                return self._residue(self._given[node])
-            return self._any(node) if self._nonzero is None or node in self._nonzero else 0
-        if isinstance(node, Number):
-            return _modular(node.value)
-        if isinstance(node, Sum):
-            terms = (_modular(factor) * self._value(term) for term, factor in node.terms)
-            return sum(terms, start=_modular(node.constant)) % PRIME
-        if isinstance(node, Product):
-            return prod((self._power(*one) for one in node.powers), start=_modular(node.coefficient)) % PRIME
-        return self._any(node)
+    def can_vanish(self, expression: Term) -> bool:
+        """Return whether an expression is zero when every parameter is that may be."""
+        return self._least.vanishes(expression)
 
-    def _power(self, base: Term, exponent: Ratio) -> Residue:
-        if exponent == 1:
-            return self._value(base)
-        whole = Product(1, ((base, exponent),))
-        if exponent.denominator != 1:
-            return self._any(whole)
-        value, times = self._value(base), int(exponent)
-        if isinstance(value, int):
-            return pow(value, times, PRIME) if value else self._any(whole)
-        return np.array(
-            [pow(one, times, PRIME) if one else self._any(whole) for one in value], dtype=np.object_
-        )
-
-    def _any(self, node: Term) -> int:
-        """Return the random residue of a node, the same each time."""
-        if node not in self._arbitrary:
-            self._arbitrary[node] = self._random.randrange(1, PRIME)
-        return self._arbitrary[node]
-
-    def _residue(self, given: Given) -> Residue:
-        if isinstance(given, Term):
-            return self._value(given)
-        if isinstance(given, Fraction):
-            return _modular(given)
-        fractions, exponents = np.frexp(given)
-        whole = np.ldexp(fractions, DIGITS).astype(np.int64).astype(np.object_)
-        # 2⁶¹ ≡ 1: a power of two is that of its exponent modulo 61, be it negative.
-        residues: NDArray[np.object_] = whole << ((exponents - DIGITS) % BITS).astype(np.object_)
-        residues %= PRIME
-        return residues
+    def vanishes(self, expression: Term) -> bool:
+        """Return whether an expression is zero with the numbers of one of the peers."""
+        return any(group.vanishes(expression) for group in self._groups)
 
 
-def _modular(value: Ratio) -> int:
-    """Return the residue of a rational number."""
-    if value.denominator == 1:
-        return value.numerator
-    return value.numerator * pow(value.denominator, -1, PRIME) % PRIME
+class _Residues:
+    """Expressions modulo the prime 2⁶¹ − 1.
 
-
-class Vanishing:
-    """Says whether an expression is zero with the numbers of some group of peers.
-
-    What is divided by must not be, even though other numbers would do.
+    A symbol of `given` has its value, any other one, and each function value, a random residue: an expression
+    that isn't zero vanishes there with probability below its degree/2⁶¹ (Schwartz 1980, Zippel 1979).
+    Expansion would decide the same at a cost that grows with the number of terms. The generator is seeded.
+    With `nonzero`, all symbols but these are zero.
     """
 
-    def __init__(self, numbers: Sequence[Mapping[Symbol, Given]]) -> None:
-        self._tests = [ZeroTest(values=values) for values in numbers]
-        self._known: dict[Term, bool] = {}
+    def __init__(self, given: Mapping[Symbol, Given], nonzero: Collection[Symbol] | None = None) -> None:
+        self.given = given
+        self.nonzero = nonzero
+        fractions = {name: value for name, value in given.items() if isinstance(value, Fraction)}
+        self.numbers = {
+            name: sympy.Rational(one.numerator, one.denominator) for name, one in fractions.items()
+        }
+        self.known: dict[Term, Residue] = {}
+        self.chosen: dict[Term, int] = {}
+        self.random = random.Random(0)
 
-    def define(self, name: Symbol, expression: Term) -> None:
-        """Let a symbol stand for an expression."""
-        for test in self._tests:
-            test.define(name, expression)
+    def vanishes(self, expression: Term) -> bool:
+        """Return whether an expression is zero, where numbers differ from peer to peer for one of them."""
+        if np.any(np.equal(self(expression), 0)):
+            return True
+        if self.nonzero is not None or not expression.has(sympy.Function):
+            return False
+        return _is_identity(expression.xreplace(self.numbers))
 
-    def __call__(self, expression: Term) -> bool:
-        """Return whether the expression is zero for one of the peers."""
-        if expression not in self._known:
-            self._known[expression] = any(test(expression) for test in self._tests)
-        return self._known[expression]
+    def __call__(self, node: Term) -> Residue:
+        """Return the residue of an expression."""
+        if node not in self.known:
+            value = self._value(node)
+            if not isinstance(value, int) and not node.is_Symbol:
+                return value  # a million peers' would take 40 MB for each node
+            self.known[node] = value
+        return self.known[node]
+
+    def _value(self, node: Term) -> Residue:
+        node = self.numbers.get(node, node)
+        if node in self.given:
+            value = self.given[node]
+            residues = np.frompyfunc(lambda one: _modular(Fraction(one)), 1, 1)
+            return residues(value) if isinstance(value, np.ndarray) else self(value)
+        if node.is_Rational:
+            return _modular(node)
+        if node.is_Add:
+            return sum(map(self, node.args)) % PRIME
+        if node.is_Mul:
+            return prod(map(self, node.args)) % PRIME
+        if node.is_Pow and node.exp.is_Integer:
+
+            def raised(base: int) -> int:
+                return pow(base, int(node.exp), PRIME) if base or node.exp > 0 else self._some(node)
+
+            return np.frompyfunc(raised, 1, 1)(self(node.base))
+        is_none = self.nonzero is not None and node.is_Symbol and node not in self.nonzero
+        return 0 if is_none else self._some(node)
+
+    def _some(self, node: Term) -> int:
+        """Return the random residue of a node, the same each time."""
+        return self.chosen.setdefault(node, self.random.randrange(1, PRIME))
 
 
-NOTHING_VANISHES = Vanishing(())
+def _modular(value: Fraction | Term) -> int:
+    return int(value.numerator * pow(value.denominator, -1, PRIME) % PRIME)
+
+
+def _is_identity(expression: Term) -> bool:
+    """Say whether an expression is zero for all values of its symbols, by what functions have in common."""
+    functions = expression.atoms(sympy.Function)
+    if size(expression) > MOST or not all(isinstance(one, SMOOTH_FUNCTIONS) for one in functions):
+        return bool(expression == 0)
+    chance = random.Random(0)
+    for _ in range(POINTS):
+        point = {s: sympy.Rational(chance.randrange(1, 999), 499) for s in in_order(expression.free_symbols)}
+        if not abs(complex(expression.xreplace(point).evalf(30, maxn=60))) < NEARLY:
+            return False
+    return any(sympy.simplify(one) == 0 for one in (expression, expression.rewrite(sympy.exp)))

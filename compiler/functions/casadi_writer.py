@@ -9,27 +9,17 @@ Does not: choose what is written (see `functions`).
 
 from __future__ import annotations
 
+import functools
 import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, TypeAlias
 
 import casadi
+from sympy import Mul, tan
 
 from apc.compiler.equations.solution import ImplicitBlock
-from apc.compiler.equations.terms import (
-    HALF,
-    Function,
-    Number,
-    Product,
-    Ratio,
-    Sum,
-    Symbol,
-    Term,
-    symbol,
-    terms_of,
-)
+from apc.compiler.equations.terms import HALF, NAMES, ONE, Symbol, Term, in_order, symbol
 from apc.compiler.interpolation import Interpolation, function_of
 from apc.compiler.language.expression import SMOOTH
 from apc.compiler.language.recordings import TimeTable
@@ -40,10 +30,9 @@ MOST_FACTORS = 100  # of a power that is written as a product
 # Functions that are infinite or no number somewhere, or whose slopes are; and where none of them is.
 _SOMEWHERE_NONE = ("exp", "log", "tan", "asin", "acos", "sinh", "cosh", "atan2")
 HARMLESS = 0.5
-_EXTREMES = {"min": casadi.fmin, "max": casadi.fmax}  # of two values each
-# Python's + and * come to the same by way of much that finds out what their operands are.
-_PLUS, _TIMES = partial(casadi.SX.binary, casadi.OP_ADD), partial(casadi.SX.binary, casadi.OP_MUL)
 _CASADI: dict[str, Callable[..., Any]] = {
+    "min": casadi.fmin,
+    "max": casadi.fmax,
     "abs": casadi.fabs,
     "sign": casadi.sign,
     "floor": casadi.floor,
@@ -186,7 +175,7 @@ class Writer:
         return self._build(expression)
 
     def _needed(self, expression: Definition) -> list[Symbol]:
-        return sorted((s for s in expression.free_symbols if s.name not in self.tables), key=str)
+        return in_order(s for s in expression.free_symbols if s.name not in self.tables)
 
     def _build(self, expression: Term, taken: Any = None) -> Any:
         """Return the value of an expression whose symbols are known.
@@ -195,26 +184,29 @@ class Writer:
         one that isn't taken times 0, which is no number where they are infinite. What is singular somewhere
         gets a harmless argument there, where the branch isn't taken.
         """
-        if isinstance(expression, Symbol):
+        if expression.is_Symbol:
             return self.known[expression]
-        if isinstance(expression, Number):
-            return casadi.SX(float(expression.value))
-        if isinstance(expression, Sum):
-            return _fold([self._scaled(*one, taken) for one in terms_of(expression)], _PLUS)
-        if isinstance(expression, Product):
-            return self._scaled(expression, 1, taken)
-        assert isinstance(expression, Function)
-        name = expression.name
+        if expression.is_Rational:
+            return casadi.SX(expression.p / expression.q)
+        if expression.is_NumberSymbol:
+            return casadi.SX(float(expression))
+        if expression.is_Add:
+            return functools.reduce(operator.add, (self._build(one, taken) for one in expression.args))
+        if expression.is_Mul or expression.is_Pow:
+            return self._product(expression, taken)
+        name = NAMES.get(expression.func)
+        if name is None:  # a cotangent, which SymPy makes of some tangents
+            return self._build(expression.rewrite(tan), taken)
         if name == "interpolate":
-            table, time = expression.arguments
-            return self._interpolated(table, time)
+            return self._interpolated(*expression.args)
         if name == "if":
-            condition, then, otherwise = expression.arguments
+            condition, then, otherwise = expression.args
             return self._chosen(condition, then, otherwise, taken)
-        arguments = [self._build(argument, taken) for argument in expression.arguments]
+        arguments = [self._build(argument, taken) for argument in expression.args]
         if taken is not None and name in _SOMEWHERE_NONE:
             arguments = [casadi.if_else(taken, one, HARMLESS) for one in arguments]
-        return _fold(arguments, _EXTREMES[name]) if name in _EXTREMES else _CASADI[name](*arguments)
+        function = _CASADI[name]
+        return functools.reduce(function, arguments) if name in ("max", "min") else function(*arguments)
 
     def _chosen(self, condition: Term, then: Term, otherwise: Term, taken: Any) -> Any:
         """Return the value of a conditional in a branch."""
@@ -226,40 +218,34 @@ class Writer:
 
     def _interpolated(self, table: Term, time: Term) -> Any:
         """Return a table's value, linear between its rows and constant beyond its ends."""
-        assert isinstance(table, Symbol)
         rows = self.tables[table.name]
         return function_of(Interpolation(rows.times, rows.numbers))(self._build(time))
 
-    def _scaled(self, term: Term, factor: Ratio, taken: Any) -> Any:
-        """Return a number times a term, dividing by what has a negative power: a*(1/b) rounds twice."""
-        if not isinstance(term, Product):
-            value = self._build(term, taken)
-            return value if factor == 1 else _TIMES(casadi.SX(float(factor)), value)
-        coefficient = factor * term.coefficient
-        above = [casadi.SX(float(coefficient))] if coefficient != 1 else []
-        above += [self._power(base, size, taken) for base, size in term.powers if size > 0]
-        below = [self._power(base, -size, taken) for base, size in term.powers if size < 0]
-        product = _fold(above, _TIMES) if above else casadi.SX(1)
+    def _product(self, term: Term, taken: Any) -> Any:
+        """Return a product, dividing by what has a negative power: a*(1/b) rounds twice."""
+        above, below = [], []
+        for factor in Mul.make_args(term):
+            base, exponent = factor.args if factor.is_Pow else (factor, ONE)
+            if exponent.is_negative:
+                below.append((base, -exponent))
+            else:
+                above.append((base, exponent))
+        product, divisor = (
+            functools.reduce(operator.mul, [self._power(*one, taken) for one in powers] or [casadi.SX(1)])
+            for powers in (above, below)
+        )
         if not below:
             return product
-        divisor = _fold(below, _TIMES)
-        moving = any(base.free_symbols for base, size in term.powers if size < 0)
+        moving = any(base.free_symbols for base, _ in below)
         return product / (casadi.if_else(taken, divisor, 1) if taken is not None and moving else divisor)
 
-    def _power(self, base: Term, exponent: Ratio, taken: Any) -> Any:
+    def _power(self, base: Term, exponent: Term, taken: Any) -> Any:
         """Return a power with a positive exponent."""
         value = self._build(base, taken)
-        if exponent.denominator != 1 and taken is not None:
+        if not exponent.is_Integer and taken is not None:
             value = casadi.if_else(taken, value, 1)
         if exponent == HALF:
             return casadi.sqrt(value)
-        if exponent.denominator == 1 and exponent <= MOST_FACTORS:
-            return _fold([value] * int(exponent), _TIMES)
-        return value ** float(exponent)
-
-
-def _fold(values: Sequence[Any], join: Callable[[Any, Any], Any]) -> Any:
-    total = values[0]
-    for value in values[1:]:
-        total = join(total, value)
-    return total
+        if exponent.is_Integer and exponent <= MOST_FACTORS:
+            return functools.reduce(operator.mul, [value] * int(exponent))
+        return value ** self._build(exponent, taken)

@@ -460,5 +460,5 @@ def _whole(wanted: Symbol, known: dict[Symbol, Term]) -> Term | None:
         replaceable = expression.free_symbols & known.keys()
         if not replaceable:
             return expression
-        expression = expression.replace({s: known[s] for s in replaceable})
+        expression = expression.xreplace({s: known[s] for s in replaceable})
     return None

@@ -21,6 +21,7 @@ from apc.compiler.equations.clocks import ClockedSystem
 from apc.compiler.equations.flatten import FlatSystem
 from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.structure import SortedSystem
+from apc.compiler.equations.terms import text_of
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.multiples import common_multiple
 from apc.compiler.pipeline import each_stage, run_stages
@@ -79,7 +80,7 @@ def show_document(path: Path) -> dict[str, Any]:
                     {"clock": p.clock, "steps": [_step_document(step) for step in p.assignments]}
                     for p in three.partitions
                 ],
-                "sent": [{"name": s.name, "link": s.link, "is": str(s.expression)} for s in three.sends],
+                "sent": [{"name": s.name, "link": s.link, "is": text_of(s.expression)} for s in three.sends],
             }
             for one, two, three in zip(flat.kinds, clocked.kinds, ordered.kinds, strict=True)
         ],

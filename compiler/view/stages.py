@@ -18,6 +18,7 @@ from apc.compiler.equations.clocks import ClockedSystem, ReceiveCrossing
 from apc.compiler.equations.flatten import FlatKind, FlatSystem
 from apc.compiler.equations.solution import Assignment, ImplicitBlock
 from apc.compiler.equations.structure import SortedSystem
+from apc.compiler.equations.terms import text_of
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import Value
@@ -29,12 +30,12 @@ from apc.compiler.source.source import Source
 def step_lines(step: Assignment | ImplicitBlock) -> Iterator[str]:
     """Yield an assignment, or a nonlinear loop: its chain, then what is computed on the way round."""
     if not isinstance(step, ImplicitBlock):
-        yield f"    {step[0]} := {step[1]}"
+        yield f"    {step[0]} := {text_of(step[1])}"
         return
     yield f"    loop {step.chain}"
     yield from (f"      guess {name}" for name in step.tearing)
-    yield from (f"      {name} := {expression}" for name, expression in step.inner)
-    yield from (f"      until 0 = {expression}" for expression in step.residuals)
+    yield from (f"      {name} := {text_of(expression)}" for name, expression in step.inner)
+    yield from (f"      until 0 = {text_of(expression)}" for expression in step.residuals)
 
 
 @singledispatch
@@ -136,12 +137,12 @@ def _(system: SortedSystem) -> str:
     lines = []
     for kind in system.kinds:
         lines.append(f"kind {kind.clocked.flat.name}: states {', '.join(kind.states)}")
-        lines += [f"  alias {name} = {expression}" for name, expression in kind.aliases]
+        lines += [f"  alias {name} = {text_of(expression)}" for name, expression in kind.aliases]
         for partition in kind.partitions:
             lines.append(f"  {partition.clock}:")
             lines += [line for step in partition.assignments for line in step_lines(step)]
-        lines += [f"  {name} := {expression}" for name, _, expression in kind.samples]
-        lines += [f"  send over {s.link}: {s.name} := {s.expression}" for s in kind.sends]
+        lines += [f"  {name} := {text_of(expression)}" for name, _, expression in kind.samples]
+        lines += [f"  send over {s.link}: {s.name} := {text_of(s.expression)}" for s in kind.sends]
     return "\n".join(lines)
 
 
