@@ -296,7 +296,7 @@ def _too_large(system: CompiledSystem, prepared: Prepared, found: Analysis) -> s
 def _too_many_peers(system: CompiledSystem, found: Analysis) -> str:
     """Return why nothing is varied, "" unless very many peers differ or stand on a graph."""
     complete = all(link.graph.shape == "complete" for link in system.links)
-    apart = found.method in ("determinant", "krylov") or not complete
+    apart = found.method == "determinant" or not complete
     return "not looked for in so large a population" if apart and system.peers > FEW_PEERS else ""
 
 

@@ -152,8 +152,7 @@ def analyze(
         "auto": what serves the scene; "modes": a few systems of a site's size, at a cost that does not grow
         with the number of equal peers; "dense": every peer in one system, the check on the others;
         "determinant": the zeros of a small determinant, for peers that all differ and for long delays;
-        "krylov": a sparse matrix, for peers that differ on a sparse graph; "paper": the lifted matrices of
-        Rakhsha and Constantinescu, eqs. (18) to (20).
+        "paper": the lifted matrices of Rakhsha and Constantinescu, eqs. (18) to (20).
     certify
         Prove the verdict in ball arithmetic.
 

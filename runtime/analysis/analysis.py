@@ -205,8 +205,7 @@ def analyze(
         One of `methods.METHODS`. "modes": a few small systems, where equal peers and the graph allow that;
         "dense": all peers as one matrix, the check on all else, at the cost of N³; "determinant": the
         zeros of a small characteristic function, for peers that all differ on complete graphs and for delays
-        of any length; "krylov": the largest eigenvalues of one sparse matrix, for peers that differ on sparse
-        graphs.
+        of any length.
     prepared
         From `prepare`, of this system with any numbers; saves building the Jacobians again.
     certify
@@ -224,9 +223,7 @@ def analyze(
         exchange = build_exchange(system, numbers.timings)
         plan = make_plan(system, prepared.jacobians, prepared.schedules, numbers, exchange, method)
         if not plan.groups:
-            spectrum, notes = _solve_populations(system, prepared, numbers, exchange, plan.method)
-        elif plan.ring:
-            spectrum, notes = _solve_ring(system, plan.groups, exchange, certify=certify)
+            spectrum, notes = _solve_populations(system, prepared, numbers, exchange)
         elif plan.method == "determinant":
             spectrum, notes = _solve_determinant(plan.loops), ()
             if (
@@ -347,31 +344,17 @@ def _solve_determinant(loops: Sequence[Loop]) -> Spectrum:
     return solve_loops(loops)
 
 
-def _solve_ring(
-    system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange, *, certify: bool
-) -> tuple[Spectrum, tuple[str, ...]]:
-    """Solve equal peers on a large ring: those of its loops that decide."""
-    from apc.large.rings import deciding_loops, with_the_rest
-
-    ring = deciding_loops(groups, exchange)
-    spectrum = _solve_closed(system, ring.arrangement.loops, certify=certify)
-    return with_the_rest(spectrum, ring), ring.arrangement.notes
-
-
 def _solve_populations(
-    system: CompiledSystem, prepared: Prepared, numbers: Numbers, exchange: Exchange, method: str
+    system: CompiledSystem, prepared: Prepared, numbers: Numbers, exchange: Exchange
 ) -> tuple[Spectrum, tuple[str, ...]]:
     """Solve peers that all differ."""
     from apc.large.determinant_spectrum import solve_populations
-    from apc.large.krylov import solve_sparse
     from apc.large.populations import populations
     from apc.large.translation import count_translations
 
     listed = populations(system, prepared.jacobians, prepared.schedules, numbers)
     rounded = "what rounding does to the peers' own motion is estimated here, not bounded"
     notes = (rounded,) if any(population.lifted.estimated for population in listed) else ()
-    if method == "krylov":
-        return solve_sparse(listed, exchange), notes
     rigid = count_translations(listed, exchange)
     spectrum = solve_populations(listed, exchange, rigid=rigid or 0)
     free = "the first peer moves freely in a way that not all others do: left open"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-Method = Literal["auto", "modes", "dense", "determinant", "krylov", "paper"]
+Method = Literal["auto", "modes", "dense", "determinant", "paper"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
 AUTO: Method = "auto"  # that which serves the scene

@@ -30,14 +30,8 @@ from apc.memory import refuse_beyond
 # says more.
 FEW_STATES = 200
 
-# Up to so many peers a complete graph is written out as arcs.
-MOST_FULL = 500
-
-# Equal peers on a graph without a closed form: of so many, its eigenvalues are not computed.
-MANY_PEERS = 1500
-
-# Equal peers on a ring of so many eigenvalues: only of those that decide is a system solved.
-MANY_EIGENVALUES = 128
+# Equal peers on a ring are a system for each pair of its eigenvalues: more than these take minutes.
+LARGEST_RING = 2000
 
 # From so many packets on their way on, leaving them out of the state is quicker.
 LONG_LINES = 60
@@ -53,14 +47,12 @@ KEPT_OF_SITE, SITE_AT_WORK = 200, 6000
 class Plan:
     """The method, and the groups of equal peers with their loops; of peers by the thousand neither.
 
-    `ring` says that of the loops, one an eigenvalue of a large ring, only those that decide are made.
     `systems` are (how many, how large): states, or rows of a determinant.
     """
 
     method: str
     groups: tuple[PeerGroup, ...]
     loops: tuple[Loop, ...]
-    ring: bool
     systems: tuple[tuple[int, int], ...]
     notes: tuple[str, ...]
 
@@ -115,17 +107,14 @@ def make_plan(
     """
     assert method in METHODS and method != PAPER, f"no such method: {method}"
     refuse_varying(system, jacobians)
-    if method in ("auto", "determinant", "krylov"):
-        reason = not_populations(system, jacobians)
-        if method == "krylov" and reason:
-            raise cannot_serve(system, method, reason)
-        whole = method == "krylov" or (method == "determinant" and _prompt(schedules, numbers, exchange))
-        if not reason and (whole or _many(system, jacobians, schedules, numbers, exchange)):
-            return _plan_populations(system, jacobians, schedules, exchange, method)
+    if method in ("auto", "determinant") and not not_populations(system, jacobians):
+        prompt = method == "determinant" and _prompt(schedules, numbers, exchange)
+        if prompt or _many(system, jacobians, schedules, numbers, exchange):
+            return _plan_populations(schedules, exchange)
     groups = peer_groups(system, jacobians, schedules, numbers, exchange)
-    if method in ("auto", "modes") and is_large_ring(groups, exchange):
-        states = states_of(groups[0].schedule, groups[0].jacobians)
-        return Plan("modes", groups, (), True, ((exchange.peers // 2 + 1, states),), ())
+    if is_large_ring(groups, exchange):
+        what = f"a ring of {exchange.peers:,} peers is as many systems, up to {LARGEST_RING:,} are solved"
+        raise ApcError(Mistake("E804", Place(exchange.scene), what, hint=f"count: {LARGEST_RING}"))
     if method == "dense":
         _refuse_dense(groups, exchange)
         loops: tuple[Loop, ...] = (dense_loop(groups, exchange),)
@@ -157,14 +146,14 @@ def make_plan(
         sites = sum(len(loop.sites) for loop in loops)
         what = f"{len(loops):,} determinants of {sites:,} peers that differ"
     refuse_beyond(needed, "E804", Place(exchange.scene), what, "fewer peers that differ, or fewer states")
-    return Plan(found, groups, loops, False, _sizes(loops, found), notes)
+    return Plan(found, groups, loops, _sizes(loops, found), notes)
 
 
 def is_large_ring(groups: Sequence[PeerGroup], exchange: Exchange) -> bool:
-    """Say whether all peers are equal, on one ring of many."""
+    """Say whether all peers are equal, on one ring of too many for a system each."""
     ways = used_ways(group.schedule for group in groups)
     shapes = {exchange.links[way.link].graph.shape for way in ways}
-    if len(groups) > 1 or shapes != {"ring"} or exchange.peers <= 2 * MANY_EIGENVALUES:
+    if len(groups) > 1 or shapes != {"ring"} or exchange.peers <= LARGEST_RING:
         return False
     return not common_graph(ways, exchange)
 
@@ -217,10 +206,9 @@ def _many(
     numbers: Numbers,
     exchange: Exchange,
 ) -> bool:
-    """Say whether so many peers differ, or have so large a graph, that they are not worth an object each."""
-    shapes = {exchange.links[way.link].graph.shape for way in used_ways(schedules)}
-    if shapes - {"complete", "ring", "star"} and exchange.peers > MANY_PEERS:
-        return True
+    """Say whether so many peers differ that all hear all others that they are not worth an object each."""
+    if not all(exchange.is_complete(way.link) for way in used_ways(schedules)):
+        return False
     states = sum(
         len(rows) * len(system.kinds[group.kind].states)
         for rows, group in zip(numbers.parameters, system.groups, strict=True)
@@ -239,35 +227,10 @@ def _prompt(schedules: Sequence[Schedule], numbers: Numbers, exchange: Exchange)
     return complete and short and sum(map(len, numbers.parameters)) > 1
 
 
-def _plan_populations(
-    system: CompiledSystem,
-    jacobians: Sequence[SiteJacobians],
-    schedules: Sequence[Schedule],
-    exchange: Exchange,
-    method: str,
-) -> Plan:
-    """Plan for peers by the thousand."""
-    links = [way.link for way in used_ways(schedules)]
-    sparse = [link for link in links if not exchange.is_complete(link)]
-    full = [link for link in links if exchange.is_complete(link)]
-    if method == "auto":
-        method = "krylov" if sparse else "determinant"
-    if method == "determinant" and sparse:
-        reason = f"the peers differ, and not all of them hear all others over {sparse[0]}"
-        raise cannot_serve(system, method, reason)
-    if method == "krylov" and not links:
-        raise cannot_serve(system, method, "no peer hears another, so each is a small system by itself")
-    if method == "krylov" and full and exchange.peers > MOST_FULL:
-        reason = f"all of {exchange.peers:,} peers hear each other over {full[0]}: nothing is sparse"
-        raise cannot_serve(system, method, reason)
-    if method == "krylov":
-        states = sum(
-            group.count * states_of(schedule, jacobians[group.kind])
-            for group, schedule in zip(system.groups, schedules, strict=True)
-        )
-        return Plan(method, (), (), False, ((1, states),), ("all peers as one sparse matrix",))
+def _plan_populations(schedules: Sequence[Schedule], exchange: Exchange) -> Plan:
+    """Plan for peers by the thousand that all hear all others."""
     rows = len(
         {(exchange.role(place), sent) for place, schedule in enumerate(schedules) for sent in schedule.sent}
     )
     note = "peers of different numbers, by one determinant of what is sent in a frame"
-    return Plan(method, (), (), False, ((1, rows),), (note,))
+    return Plan("determinant", (), (), ((1, rows),), (note,))

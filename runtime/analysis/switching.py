@@ -1,19 +1,14 @@
-"""May contacts open and close: at will, or as far in as they are; by one function that falls all the while.
+"""May contacts open and close at will; by one function that falls all the while.
 
 Takes: a `CompiledSystem` whose peers have parts that switch, and its modes of contact.
 Gives: `Switching`, `switching`.
 Guarantees: what is called stable is proved, for every pattern of contacts that are on, off or anything
 between, each peer and tick by itself: motions die out, but for what drifts with all contacts open, and that
-stays within bounds. What is said to settle is proved for contacts whose force is one function of one number:
-every motion comes to rest where loads that stay leave it one. The cost grows with the different peers, not
-with their number.
-Does not: say that a scene whose proof fails is unstable, unless a mode of contact is, or contacts that close
-and open by turns make it grow.
+stays within bounds. The cost grows with the different peers, not with their number.
+Does not: say that a scene whose proof fails is unstable, unless a mode of contact is.
 
-At will it is proved by one quadratic function, the circle criterion (see `multipliers`). Functions that know
+It is proved by one quadratic function, the circle criterion (see `circle_criterion`). Functions that know
 what was on at the last ticks prove next to nothing more: contacts switch far more often than anything moves.
-Where contacts open and close by themselves, one that is quadratic piece by piece reaches nearly as far as
-contacts that are always closed.
 
 A force that jumps as its contact opens, as a damped one does, is between none and that of a closed one: what
 is proved at will holds of what is linear about it, and loads of constant size leave motions within bounds.
@@ -21,28 +16,21 @@ is proved at will holds of what is linear about it, and loads of constant size l
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from apc.analysis.alternating import alternating
 from apc.analysis.analysis import Prepared, prepare
+from apc.analysis.circle_criterion import Weights, is_proved, least_of, weights_of
 from apc.analysis.contact_modes import ContactModes
-from apc.analysis.multipliers import Weights, is_proved, least_of, weights_of
 from apc.analysis.opened import OpenLoop, open_loops
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
-from apc.compiler.words import counted
 from apc.result import Result
 
 STABLE, CANNOT, OPEN = "stable", "cannot be", "not decided"
-
-# How much the tick before counts, beside the tick itself: tried one after the other, then between the two
-# about the best, halving their distance so many times.
-LAGS, HALVINGS = tuple(4.0**k for k in range(9)), 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +49,6 @@ class Switching(Result):
     reason: str
     reach: float | None = None
     mode: str = ""
-    settles: bool = False
     jumps: str = ""
 
     @property
@@ -101,20 +88,10 @@ def switching(system: CompiledSystem, modes: ContactModes, *, prepared: Prepared
 
 
 def _judge(topology: str, loops: Sequence[OpenLoop]) -> Switching:
-    """Prove that contacts may switch at will, or a pattern by which the scene grows; else that it settles."""
+    """Prove that contacts may switch at will, or say what is open."""
     weights = weights_of(loops)
     jumps = next((one.jumps for one in loops if one.jumps), "")
-    found = _circle(topology, loops, weights)
-    if found.stable:
-        return replace(found, settles=not jumps, jumps=jumps)
-    settles = not isinstance(weights, str) and not jumps and _settles(loops, weights)
-    found = replace(found, settles=settles, jumps=jumps)
-    grows = alternating(loops)
-    if grows is None:
-        return found
-    ticks = f"closed for {counted(grows.closed, 'tick')} and open for {counted(grows.opened, 'tick')}"
-    reason = f"with all contacts {ticks} by turns it grows by {grows.growth:.6g} a frame ({grows.mode} mode)"
-    return replace(found, verdict=CANNOT, reason=reason)
+    return replace(_circle(topology, loops, weights), jumps=jumps)
 
 
 def _circle(topology: str, loops: Sequence[OpenLoop], weights: Weights | str) -> Switching:
@@ -130,28 +107,3 @@ def _circle(topology: str, loops: Sequence[OpenLoop], weights: Weights | str) ->
     else:
         return Switching(topology, STABLE, "", reach, worst)
     return Switching(topology, OPEN, reason, reach, worst)
-
-
-def _settles(loops: Sequence[OpenLoop], weights: Weights) -> bool:
-    """Say whether a function that is quadratic piece by piece is proved to fall.
-
-    Notes
-    -----
-    The least real part is concave in the lag.
-    """
-
-    known: dict[float, float] = {}
-
-    def proved(lag: float) -> bool:
-        known[lag] = min(least_of(one, weights, lag) for one in loops)
-        return known[lag] > -1 and all(is_proved(one, weights, lag) for one in loops)
-
-    if any(proved(lag) for lag in LAGS):
-        return True
-    for _ in range(HALVINGS):
-        tried, best = sorted(known), max(known, key=lambda lag: known[lag])
-        place = tried.index(best)
-        beside = tried[max(place - 1, 0) : place] + tried[place + 1 : place + 2]
-        if any(proved(math.sqrt(best * near)) for near in beside):
-            return True
-    return False

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, analyze
 from apc.analysis.methods import AUTO, METHODS, PAPER
-from apc.analysis.needs import needs
 from apc.analysis.paper import analyze_paper
 from apc.benchmark.timing import spread_of, take_turns, timed
 from apc.benchmark.truth import Truth, spectral_truth
@@ -55,10 +54,6 @@ SAME = 64 * UNIT
 
 # How long the scene is played: longer than any start-up.
 DURATION = Fraction(1, 4)
-
-# States of the one sparse matrix of method krylov, which has no limit of its own: on a complete graph 2,424
-# took 19 s, 3,000 took 74 s. What is too large for another method is refused by that method itself.
-MOST_SPARSE = 2500
 
 FAILED, WRONG = "FAILED, which is a bug", "WRONG"  # how what must not be is said
 
@@ -201,13 +196,7 @@ def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Compariso
     calls[CERTIFIED] = partial(analyze, system, certify=True)
     calls[PAPER] = partial(analyze_paper, system)
     default = analyze(system)
-    states = _states(system)
     left_out = []
-    if states > MOST_SPARSE and default.method != "krylov":
-        del calls["krylov"]
-        left_out.append(
-            ("krylov", f"its matrix of {states:,} states is above the {MOST_SPARSE:,} tried here")
-        )
     truth = spectral_truth(system)
     results, refused, slow = _first(calls)
     if CERTIFIED in results and (reason := _not_proved(results[CERTIFIED])):
@@ -247,12 +236,6 @@ def bench_analysis(system: CompiledSystem, *, rounds: int = ROUNDS) -> Compariso
         notes=tuple(notes),
         left_out=default.left_out,
     )
-
-
-def _states(system: CompiledSystem) -> int:
-    """Return how many states all peers have together."""
-    sites = needs(system).sites
-    return sum(group.count * sites[group.kind].states for group in system.groups)
 
 
 def _not_proved(found: Analysis) -> str:

@@ -46,8 +46,8 @@ SECONDS_A_PEER = 1e-4
     show_default=True,
     metavar="METHOD",
     help="auto: what serves the scene. modes: a few small systems. dense: all peers in one, to check. "
-    "determinant: zeros of a small determinant, for peers that all differ and for long delays. krylov: a "
-    "sparse matrix, for peers that differ on a sparse graph. paper: the lifted matrices of Rakhsha and "
+    "determinant: zeros of a small determinant, for peers that all differ and for long delays. "
+    "paper: the lifted matrices of Rakhsha and "
     "Constantinescu, eqs. (18) to (20).",
 )
 @click.option(

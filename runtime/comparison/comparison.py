@@ -28,8 +28,8 @@ from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare as prepare_to_play
 from apc.simulation.trajectory import Played, duration_of, play, provenance_of
 from apc.vary.critical import Critical, critical
+from apc.vary.crossing import Told
 from apc.vary.growth import NOMINAL, PASSIVE, criterion_of
-from apc.vary.search import Told
 
 if TYPE_CHECKING:
     import pandas

@@ -1,11 +1,9 @@
 """The characteristic polynomial of a loop by a matrix that holds no packet: without poles, for any delay.
 
 Takes: the one-frame maps of the sites of a loop, many at once, and how what they send comes back to them.
-Gives: `Wires`, `wires_of`, `side_by_side`; `Bordered`, `bordered`, `Logarithm`, `logarithm`;
-`beyond_circle`; `map_balls`, `wire_balls`, `proved_zero`.
-Guarantees: `beyond_circle` is right for all maps within the errors given, and a zero lies in the ball of
-`proved_zero`.
-Does not: know where zeros may be (see `vary.plane`).
+Gives: `Wires`, `wires_of`, `side_by_side`; `Bordered`, `bordered`, `Logarithm`, `logarithm`.
+Guarantees: the logarithm is finite wherever the function is not 0, however long the delays.
+Does not: know where zeros may be (see `vary.encirclements`).
 
     F(ζ) = det [ζ − P   −Q W(ζ)]        W(ζ) = Σ_l W_l ζ^(−l)
                [ −S    1 − D W(ζ)]
@@ -22,33 +20,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.balls import frame_steps, site_balls, weight_balls
-from apc.eigen.closing import Coupling, Loop, bounded_weight
+from apc.eigen.closing import Coupling, bounded_weight
 from apc.eigen.peer_group import PeerGroup
-from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS
-from apc.eigen.winding import FIRST_ARCS, Ball, determinant_ball, wind
 from apc.frame.discretize import UNIT
-from apc.frame.lift import FrameMap, compose
+from apc.frame.lift import FrameMap
 from apc.frame.schedule import Way
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 Integers = NDArray[np.intp]
 Matrix = NDArray[Any]
-Balls = NDArray[Any]  # of flint.arb, and whole numbers
 
-# Newton's steps in balls at most, from a root of floats: each doubles its digits.
-NEWTON_STEPS = 6
-
-# Bits of a box that rounding may take.
-ROOM = 16
-
-# Multiples of it, whole numbers left out, are spread evenly and favour no symmetry (Weyl).
-GOLDEN = (5**0.5 - 1) / 2
 
 # Entries of the matrices that are looked at together: they stay in the cache of a processor.
 TOGETHER = 1 << 17
@@ -239,160 +224,3 @@ def logarithm(
 def _product(one: Matrix, other: Floats) -> Matrix:
     """Return the sums of matrices' products entry by entry (z,)."""
     return np.asarray(np.einsum("zij,zij->z", one, other))
-
-
-def beyond_circle(
-    maps: FrameMap, errors: FrameMap, wires: Wires, radius: float, close: Complexes
-) -> int | None:
-    """Return how many zeros F has beyond a circle about 0, None if that can't be told.
-
-    Parameters
-    ----------
-    maps, errors
-        The map of all sites as of one, and what it may be off by.
-    wires
-        How the sites hear each other.
-    radius
-        The circle's.
-    close
-        Zeros (z,) that it passes closely.
-    """
-    n_s, n_z = maps.s.shape
-    unit, place = np.eye(n_s), np.arange(n_z)
-    rounding = PRODUCT_ROUNDINGS * (maps.q.shape[1] + 2) * UNIT
-
-    def within(points: Complexes, reach: Floats) -> Ball:
-        matrix, slope = np.zeros((2, len(points), n_z + n_s, n_z + n_s), np.complex128)
-        doubt = np.zeros(matrix.shape)
-        weight, weight_slope = wires.at(points)
-        size, off = wires.doubt(points, reach)
-        near = size + reach[:, None, None] * np.abs(weight_slope)
-        matrix[:, :n_z, :n_z], doubt[:, :n_z, :n_z] = -maps.p, errors.p + UNIT * np.abs(maps.p)
-        matrix[:, place, place] += points[:, None]
-        doubt[:, place, place] += UNIT * (np.abs(points)[:, None] + np.abs(maps.p[place, place]))
-        slope[:, place, place] = 1.0
-        matrix[:, n_z:, :n_z], doubt[:, n_z:, :n_z] = -maps.s, errors.s
-        for rows, left, error in (
-            (slice(n_z), maps.q, errors.q),
-            (slice(n_z, None), maps.d, errors.d),
-        ):
-            matrix[:, rows, n_z:], slope[:, rows, n_z:] = -(left @ weight), -(left @ weight_slope)
-            doubt[:, rows, n_z:] = error @ (near + off) + np.abs(left) @ (off + rounding * near)
-        matrix[:, n_z:, n_z:] += unit
-        doubt[:, n_z:, n_z:] += UNIT * unit
-        return determinant_ball(matrix, slope, doubt, reach)
-
-    arcs = max(FIRST_ARCS, 2 * max(wires.lags, default=0))
-    with np.errstate(all="ignore"):
-        turns = wind(within, 0.0, radius, arcs=arcs, close=close)
-    return None if turns is None else n_z - turns
-
-
-def wire_balls(loop: Loop) -> list[tuple[int, Balls]]:
-    """Return the lags of a loop with their W in balls at the present precision."""
-    weights = weight_balls(loop)
-    sent = np.cumsum([0, *(len(group.schedule.sent) for group in loop.sites)]).tolist()
-    lines = sum(len(group.schedule.heard) for group in loop.sites)
-    found: dict[int, Balls] = {}
-    line = 0
-    for g, group in enumerate(loop.sites):
-        for heard in group.schedule.heard:
-            own = found.setdefault(heard.lag, np.zeros((lines, sent[-1]), dtype=object))
-            for h, weight in weights[heard.way][g]:
-                own[line, sent[h] + loop.sites[h].schedule.sent.index(heard.sent)] = weight
-            line += 1
-    return list(found.items())
-
-
-def map_balls(loop: Loop) -> FrameMap:
-    """Return the map of all sites of a loop as of one, in balls at the present precision."""
-    pairs = zip(site_balls(loop), loop.sites, strict=True)
-    return side_by_side(
-        [compose(site, group.schedule, frame_steps(site, group.schedule)) for site, group in pairs]
-    )
-
-
-def proved_zero(maps: FrameMap, wires: Sequence[tuple[int, Balls]], guess: complex) -> Any:
-    """Return a ball that a zero of F lies in, about where a root of floats is; None if none is shown.
-
-    Parameters
-    ----------
-    maps
-        The map of all sites as of one, in balls.
-    wires
-        The lags with their W in balls.
-    guess
-        Where it is about.
-
-    Notes
-    -----
-    M(ζ) x = 0 with c x = 1, for u = (x, ζ): Newton's method, then Krawczyk's test. Where
-    u − Y G(u) + (1 − Y J(U)) (U − u) lies within a box U about u, U holds a zero of G.
-    """
-    n = sum(maps.s.shape)
-    matrix, _ = _bordered_balls(maps, wires, flint.acb(guess))
-    start = flint.acb_mat(n, 1, (np.arange(1, n + 1) * GOLDEN % 1 + 0.5).tolist())
-    try:
-        vector = matrix.mid().solve(start, algorithm="approx").entries()
-        largest = max(range(n), key=lambda row: abs(vector[row]).mid())
-        norm = flint.acb_mat(1, n, [1 if row == largest else 0 for row in range(n)])
-        at = flint.acb_mat(n + 1, 1, [*((one / vector[largest]).mid() for one in vector), flint.acb(guess)])
-        for _ in range(NEWTON_STEPS):
-            value, slope = _balanced(maps, wires, norm, at)
-            inverse = slope.mid().inv().mid()
-            step = inverse * value
-            at = (at - step).mid()
-        value, _ = _balanced(maps, wires, norm, at)
-    except ZeroDivisionError:
-        return None
-    moved = inverse * value
-    least = flint.arb(2) ** (ROOM - flint.ctx.prec)
-    wide = max(
-        4 * abs(one).upper() + least * (1 + abs(own).upper()) for one, own in zip(moved, at, strict=True)
-    )
-    box = flint.acb_mat(n + 1, 1, [flint.acb(flint.arb(0, wide), flint.arb(0, wide))] * (n + 1))
-    _, slope = _balanced(maps, wires, norm, at + box)
-    unit = flint.acb_mat([[int(i == j) for j in range(n + 1)] for i in range(n + 1)])
-    image = (unit - inverse * slope) * box - moved
-    held = all(bool(one.contains_interior(other)) for one, other in zip(box, image, strict=True))
-    return at[n, 0] + image[n, 0] if held else None
-
-
-def _balanced(maps: FrameMap, wires: Sequence[tuple[int, Balls]], norm: Any, at: Any) -> tuple[Any, Any]:
-    """Return G = (M x, c x − 1) at (x, ζ) and its Jacobian."""
-    n = norm.ncols()
-    rows = at.entries()
-    vector = flint.acb_mat(n, 1, rows[:n])
-    matrix, slope = _bordered_balls(maps, wires, rows[n])
-    value = [*(matrix * vector).entries(), (norm * vector)[0, 0] - 1]
-    moved = (slope * vector).entries()
-    listed = [[*row, one] for row, one in zip(matrix.tolist(), moved, strict=True)]
-    return flint.acb_mat(n + 1, 1, value), flint.acb_mat([*listed, [*norm.entries(), 0]])
-
-
-def _bordered_balls(maps: FrameMap, wires: Sequence[tuple[int, Balls]], point: Any) -> tuple[Any, Any]:
-    """Return M at a ball, and its derivative there."""
-    n_s, n_z = maps.s.shape
-    q, d = _complex(maps.q), _complex(maps.d)
-    weight, slope = flint.acb_mat(q.ncols(), n_s), flint.acb_mat(q.ncols(), n_s)
-    for lag, one in wires:
-        weight += _complex(one) * point ** (-lag)
-        slope += _complex(one) * (-lag * point ** (-lag - 1))
-    matrix = [
-        [-one for one in left + right]
-        for left, right in (
-            *zip(_complex(maps.p).tolist(), (q * weight).tolist(), strict=True),
-            *zip(_complex(maps.s).tolist(), (d * weight).tolist(), strict=True),
-        )
-    ]
-    moved = [
-        [flint.acb(0)] * n_z + [-one for one in row] for row in (*(q * slope).tolist(), *(d * slope).tolist())
-    ]
-    for place in range(n_z + n_s):
-        matrix[place][place] += point if place < n_z else 1
-        moved[place][place] += 1 if place < n_z else 0
-    return flint.acb_mat(matrix), flint.acb_mat(moved)
-
-
-def _complex(balls: Balls) -> Any:
-    return flint.acb_mat(len(balls), balls.shape[1], [flint.acb(entry) for entry in balls.ravel().tolist()])

@@ -89,7 +89,7 @@ class Proof:
     left: Complexes | None
 
 
-def prove(system: ClosedSystem, free: RigidModes, held: Places) -> Proof:
+def prove(system: ClosedSystem, free: RigidModes, held: Places, *, verdict_only: bool = False) -> Proof:
     """Prove a closed system stable or unstable, in rising precision.
 
     Parameters
@@ -100,6 +100,8 @@ def prove(system: ClosedSystem, free: RigidModes, held: Places) -> Proof:
         Its rigid modes; drifts are looked for only where the eigenvalue 1 remains without them.
     held
         As many places of the state as there are rigid motions, at which these are independent.
+    verdict_only
+        Leave the eigenvalues out: Schur and Cohn decide.
     """
     searched = bool(free.drifts) or not free.names
     best, settled = None, 0
@@ -114,13 +116,19 @@ def prove(system: ClosedSystem, free: RigidModes, held: Places) -> Proof:
                     held = independent_places(free.basis.T)
                     reduced = reduced_balls(matrix, free.exact, held)
                     parts = _parts(reduced)
-            roots = [approach_roots(part.polynomial, part.guesses, bits) for part in parts]
-            values, radii = _enclosed(parts, roots, bits)
+            roots = [
+                approach_roots(part.polynomial, part.guesses, bits) for part in parts if not verdict_only
+            ]
+            values, radii = np.empty(0, np.complex128), np.empty(0)
+            if not verdict_only:
+                values, radii = _enclosed(parts, roots, bits)
             inside = _inside(parts, values, radii) if _stands_still(matrix, free) else None
             settled = settled or (bits if inside is not None else 0)
             if best is not None and inside is None and bits != PRECISIONS[-1]:
                 continue
-            right, left = _vectors_of(parts, roots, reduced if free.exact else None)
+            right = left = None
+            if not verdict_only:
+                right, left = _vectors_of(parts, roots, reduced if free.exact else None)
             best = Proof(inside, settled or bits, free, values, radii, right, left)
         if inside is not None and (_sharp(best) or bits >= SHARPENING * settled):
             break

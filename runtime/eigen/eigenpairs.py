@@ -50,9 +50,6 @@ SAME, NOTHING = 1e-9, 1e-12
 # regular. Each step leaves a share of about SHIFT/gap of the other vectors.
 SHIFT = 1e-7
 
-# The same, where the guess is as good as floats have it.
-NEXT_TO = 1e-9
-
 # Steps of inverse iteration with one inverse. The vectors give the slopes: with a guess right to 1e-4 and
 # other eigenvalues 0.1 away, 1e-9 of what there was of the others is left.
 STEPS = 3
@@ -135,24 +132,6 @@ def _nearest(values: Complexes, found: Complexes) -> NDArray[np.intp]:
             own[place] = np.argmin(apart[place])
             apart[:, own[place]] = np.inf
     return np.asarray(nearest)
-
-
-def pair_near(matrix: Floats, guess: complex) -> Eigenpairs:
-    """Return the one eigenvalue of a matrix (n, n) that is next to a guess, with its vectors.
-
-    By inverse iteration; the value is the quotient w M v / (w v) of both vectors.
-    """
-    linear = load_pool("scipy.linalg")
-    shifted = matrix - (guess * (1 + NEXT_TO)) * np.eye(len(matrix))
-    factors = linear.lu_factor(shifted, check_finite=False)
-    right = left = np.ones(len(matrix), np.complex128)
-    for _ in range(STEPS):
-        right = linear.lu_solve(factors, right, check_finite=False)
-        right = right / np.linalg.norm(right)
-        left = linear.lu_solve(factors, left, trans=1, check_finite=False)
-        left = left / np.linalg.norm(left)
-    value = left @ (matrix @ right) / (left @ right)
-    return Eigenpairs(value[None], right[:, None], left[None])
 
 
 def eigenvalues(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:

@@ -1,7 +1,7 @@
 """The eigenvalues of a graph's weights W: in closed form, or from floats with a bound on their errors.
 
 Takes: a `Graph` of a link and the number of its peers.
-Gives: `GraphMode`, `Surd`, `graph_modes`, `ring_mode`, `ring_values`; `QUICK_PRIME`.
+Gives: `GraphMode`, `Surd`, `graph_modes`, `ring_mode`; `QUICK_PRIME`.
 Guarantees: an eigenvalue that equal row sums make exact, or that is a simple fraction, is exact, with its
 multiplicity proven; any other comes with a bound on its error.
 Does not: know what is sent over the graph, or close a loop (see `graph_loops`).
@@ -110,11 +110,6 @@ def ring_mode(k: int, n: int, *, mean: bool) -> GraphMode:
     times = 1 if 2 * k in (0, n) else 2
     value = 2 * scale * _cosine(k, n)
     return GraphMode(value, Fraction(0), times, _cosine_doubt(k, n), k == 0, Surd(2 * scale, Fraction(k, n)))
-
-
-def ring_values(n: int, *, mean: bool) -> Floats:
-    """Return the values of all `ring_mode`s (n // 2 + 1,), to rounding."""
-    return np.cos(2 * np.pi * np.arange(n // 2 + 1) / n) * (1.0 if mean else 2.0)
 
 
 def _cosine(k: int, n: int) -> Fraction:

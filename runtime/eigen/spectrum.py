@@ -1,8 +1,8 @@
 """Eigenvalues with error bounds, and the verdict.
 
 Takes: the `ClosedSystem`s that make up a whole.
-Gives: `Mode`, `Motion`, `Spectrum`, `solve_spectrum`; `whole_vectors`, `angles_in_frame`, `oscillation`,
-`finite`.
+Gives: `Mode`, `Motion`, `Spectrum`, `solve_spectrum`, `mode_near`; `whole_vectors`, `angles_in_frame`,
+`oscillation`, `finite`.
 Guarantees: rigid modes are removed before any eigenvalue is computed; every reported error bounds what
 rounding did since the site's coefficients. What floats leave open is proved in balls where that can be (see
 `certify`), or else says that it is open.
@@ -135,7 +135,11 @@ class Spectrum:
 
 
 def solve_spectrum(
-    systems: Sequence[ClosedSystem], *, certify: bool = False, in_balls: bool = True
+    systems: Sequence[ClosedSystem],
+    *,
+    certify: bool = False,
+    in_balls: bool = True,
+    verdict_only: bool = False,
 ) -> Spectrum:
     """Compute the spectrum of a whole system given as independent closed systems.
 
@@ -148,6 +152,8 @@ def solve_spectrum(
         open.
     in_balls
         Whether these are worth their time; else they stay open.
+    verdict_only
+        Whether balls leave the eigenvalues as floats have them, which takes less time.
 
     Notes
     -----
@@ -172,7 +178,7 @@ def solve_spectrum(
         elif not reason and (states := _tied(system)) > MOST_PROVED:
             reason = f"it has {states} states, more than the {MOST_PROVED} that are proved"
         if not reason:
-            solved[place] = _prove(system, one)
+            solved[place] = _prove(system, one, verdict_only=verdict_only)
             continue
         if certify or _is_open(one, lowest):
             notes.append(f"{system.name}: not proved, as {reason}")
@@ -198,6 +204,13 @@ def solve_spectrum(
         proof=_proof_in_words(solved, drifts),
         notes=tuple(notes),
     )
+
+
+def mode_near(systems: Sequence[ClosedSystem], eigenvalue: complex) -> Mode:
+    """Return the mode of closed systems whose eigenvalue, or its conjugate, is nearest to a value."""
+    modes = solve_spectrum(systems, in_balls=False).modes
+    value = complex(eigenvalue.real, abs(eigenvalue.imag))
+    return min(modes, key=lambda one: abs(complex(one.eigenvalue.real, abs(one.eigenvalue.imag)) - value))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -340,9 +353,10 @@ def _relative_to(free: RigidModes) -> Relative:
     return relative_coordinates(free.basis)
 
 
-def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
+def _prove(system: ClosedSystem, estimate: _Solved, *, verdict_only: bool) -> _Solved:
     """Solve one system in balls; what these leave open stays as floats found it."""
-    proof = prove(system, estimate.free, independent_places(estimate.free.basis.T))
+    places = independent_places(estimate.free.basis.T)
+    proof = prove(system, estimate.free, places, verdict_only=verdict_only)
     if proof.free.drifts != estimate.free.drifts:
         (estimate,) = _solve([system], [proof.free])
     inside, bits = proof.inside, proof.bits

@@ -1,7 +1,7 @@
 """How many motions nothing holds back, in a population of peers that all differ.
 
 Takes: populations, and the exchange between them.
-Gives: `count_translations`; `FreeMotions`, `free_motions`.
+Gives: `count_translations`.
 Guarantees: a motion counts if it is one in exact arithmetic for every peer, each with its own numbers.
 Does not: find a motion that only some peers of a population are free to make: a count of eigenvalues (see
 `zeros`) then finds one more at 1 than was said, and the verdict is left open.
@@ -13,9 +13,7 @@ of every peer, modulo two primes.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -25,9 +23,9 @@ from numpy.typing import NDArray
 from apc.compiler.weights import exact_weight
 from apc.eigen.closing import Loop
 from apc.eigen.modes import complete_loops
-from apc.eigen.peer_group import PeerGroup, states_of, used_ways
+from apc.eigen.peer_group import PeerGroup
 from apc.eigen.peers import group_of_row
-from apc.eigen.rigid import exact_columns, find_rigid_modes, stays_rigid
+from apc.eigen.rigid import find_rigid_modes, stays_rigid
 from apc.frame.exact import evaluate_exact
 from apc.frame.exchange import Exchange
 from apc.frame.linearize import site_of_entries
@@ -76,117 +74,6 @@ def count_translations(listed: Sequence[Population], exchange: Exchange) -> int 
     return total
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FreeMotions:
-    """What nothing holds back, for each population over the state of one of its peers: z, then its packets.
-
-    `own` (n_g, d_g) are motions of a peer by itself, whoever hears it, and `pivots` for each population the
-    places where one of these is 1 and all others 0. `common` are motions of all peers of a connected part of
-    the graph together, population by population; they are 0 at the pivots.
-    """
-
-    own: tuple[Floats, ...]
-    pivots: tuple[tuple[int, ...], ...]
-    common: tuple[tuple[tuple[Fraction, ...], ...], ...]
-
-    def together(self, populations: Sequence[int]) -> list[tuple[tuple[int, int], dict[int, Floats]]]:
-        """Return the independent common motions of peers of some populations.
-
-        Each with its pivot, a population and a place where it is 1 and all others 0, and its vectors.
-        """
-        lengths = [len(self.own[g]) for g in populations]
-        ends = np.cumsum([0, *lengths]).tolist()
-        basis = _echelon(
-            [list(itertools.chain.from_iterable(one[g] for g in populations)) for one in self.common]
-        )
-        found = []
-        for place, vector in basis.items():
-            at = int(np.searchsorted(ends, place, side="right")) - 1
-            parts = {
-                g: np.array([float(entry) for entry in vector[a:b]])
-                for g, (a, b) in zip(populations, itertools.pairwise(ends), strict=True)
-            }
-            found.append(((populations[at], place - ends[at]), parts))
-        return found
-
-
-def free_motions(listed: Sequence[Population], exchange: Exchange) -> FreeMotions | None:
-    """Return the motions that nothing holds back on any graph; None if that can't be told.
-
-    Parameters
-    ----------
-    listed
-        All peers.
-    exchange
-        The links.
-
-    Notes
-    -----
-    Where all senders send the same, it does not matter which of them a peer hears: the common motions are
-    those of one peer of each population, each hearing all. Motions that stand still whatever the weights of
-    what is heard are those of single peers.
-    """
-    together, apart = _standing_loops(listed, exchange)
-    if not hold_for_all(apart, listed) or not hold_for_all(together, listed, exchange=exchange):
-        return None
-    groups = together.sites
-    ends = np.cumsum([0, *(states_of(group.schedule, group.jacobians) for group in groups)]).tolist()
-    single = find_rigid_modes(apart, with_drifts=False).exact
-    own = [_echelon([vector[a:b] for vector in single]) for a, b in itertools.pairwise(ends)]
-    if sum(map(len, own)) != len(single):
-        return None
-    common = []
-    for vector in find_rigid_modes(together, with_drifts=False).exact:
-        left = list(vector)
-        for start, motions in zip(ends, own, strict=False):
-            for pivot, motion in motions.items():
-                _subtract(left, left[start + pivot], motion, start)
-        common.append(left)
-    rest = list(_echelon(common).values())
-    return FreeMotions(
-        tuple(
-            exact_columns(list(motions.values()), b - a)
-            for motions, (a, b) in zip(own, itertools.pairwise(ends), strict=True)
-        ),
-        tuple(tuple(motions) for motions in own),
-        tuple(tuple(tuple(vector[a:b]) for a, b in itertools.pairwise(ends)) for vector in rest),
-    )
-
-
-def may_drift(listed: Sequence[Population], exchange: Exchange) -> bool:
-    """Say whether nothing brakes some motion of the first peers, alone or together.
-
-    Parameters
-    ----------
-    listed
-        All peers.
-    exchange
-        The links.
-    """
-    return any(find_rigid_modes(loop).drifts for loop in _standing_loops(listed, exchange))
-
-
-def _standing_loops(listed: Sequence[Population], exchange: Exchange) -> tuple[Loop, Loop]:
-    """Return the first peers of all populations hearing as if all moved alike, and hearing anyhow."""
-    groups = representatives(listed, exchange)
-    ways = used_ways(group.schedule for group in groups)
-    shares = {way: _shares(groups, exchange, way) for way in ways}
-    first = {way.link: _first_totals(listed, exchange, way.link) for way in ways if way.operator == "sum"}
-    alike = {
-        way: _weighed(rows, first[way.link]) if way.operator == "sum" else rows
-        for way, rows in shares.items()
-    }
-    # Weights that nothing about the scene explains, so that only what moves nobody else stands.
-    anyhow = {
-        way: tuple(
-            tuple(Fraction(-1, 3 + g * len(row) + h) if share else share for h, share in enumerate(row))
-            for g, row in enumerate(rows)
-        )
-        for way, rows in shares.items()
-    }
-    return Loop("common", 1, tuple(groups), alike), Loop("own", 1, tuple(groups), anyhow)
-
-
 def _shares(groups: Sequence[PeerGroup], exchange: Exchange, way: Way) -> tuple[tuple[Fraction, ...], ...]:
     """Return what each population hears of each on a way, in shares of all that it hears.
 
@@ -222,15 +109,6 @@ def _heard_arcs(listed: Sequence[Population], exchange: Exchange, link: str) -> 
     return pairs[heard, 1], weights[heard]
 
 
-def _first_totals(listed: Sequence[Population], exchange: Exchange, link: str) -> list[Fraction]:
-    """Return what the first peer of each population hears over a link in all: the weights of its senders."""
-    receivers, weights = _heard_arcs(listed, exchange, link)
-    return [
-        sum(map(exact_weight, weights[receivers == exchange.starts[population.group]].tolist()), Fraction(0))
-        for population in listed
-    ]
-
-
 def _all_totals(listed: Sequence[Population], exchange: Exchange, link: str, prime: int) -> Integers:
     """Return what each peer hears over a link in all, modulo a prime (N,)."""
     receivers, weights = _heard_arcs(listed, exchange, link)
@@ -238,23 +116,6 @@ def _all_totals(listed: Sequence[Population], exchange: Exchange, link: str, pri
     exact = [exact_weight(weight) for weight in np.unique(weights).tolist()]
     np.add.at(found, receivers, residues_of_rounded(weights, exact, prime).column)
     return found % prime
-
-
-def _echelon(vectors: Sequence[Sequence[Fraction]]) -> dict[int, list[Fraction]]:
-    """Return a basis of what vectors span, each by its pivot: the place where it is 1 and all others 0."""
-    basis: dict[int, list[Fraction]] = {}
-    for vector in vectors:
-        left = list(vector)
-        for pivot, other in basis.items():
-            _subtract(left, left[pivot], other, 0)
-        place = max(range(len(left)), key=lambda k: abs(left[k]), default=None)
-        if place is None or not left[place]:
-            continue
-        left = [entry / left[place] for entry in left]
-        for other in basis.values():
-            _subtract(other, other[place], left, 0)
-        basis[place] = left
-    return basis
 
 
 def _subtract(vector: list[Fraction], times: Fraction, other: Sequence[Fraction], start: int) -> None:

@@ -49,7 +49,7 @@ MOST_NAMED = 30  # columns of a contact mode's name; a longer one has a line of 
 NOT_PLAYED = "not predicted and played: --buzz"
 SHOWN = 1e-9  # digits of a contact mode's spectral radius that its column has room for
 
-_NOUNS = {"determinant": "determinant", "krylov": "sparse system"}
+_NOUNS = {"determinant": "determinant"}
 
 _WORDS = {
     "stable": "Every motion dies out.",
@@ -446,11 +446,6 @@ def switching_text(found: Switching) -> str:
         said += f"; the criterion holds for contacts up to {times} times as stiff"
     elif reach is not None:
         said += "; the criterion holds however stiff the contacts"
-    if found.settles and not found.stable:
-        said += (
-            ". As they open and close by themselves it is proved to come to rest where its loads let it, by "
-            "a function that is quadratic piece by piece"
-        )
     return "\n".join(wrapped(f"{found.topology}, contacts that open and close at will: {said}", "", "  "))
 
 

@@ -68,17 +68,7 @@ def critical_text(found: Critical) -> str:
         turns = f", {in_hertz(one.frequency_hz)}" if one.frequency_hz == one.frequency_hz else ""
         lines.append(f"    {kind}stable {one.stable_side} it{turns}, {one.proof}")
     lines += ["", f"  scanned from {low} to {high}"]
-    if found.stretches:
-        counts = f"within each of {counted(found.stretches, 'piece', ',d')} nothing depends on it: "
-        beside = "those beside a jump, and " if found.crossings else ""
-        analysed = f"; {beside}those that the count left open, were analysed"
-        lines += wrapped(f"{counts}what grows there was counted in floats{analysed}", "  ", "  ")
-    elif found.known:
-        lines.append(f"  two crossings nearer than {found.cell:.0e} of the value could hide")
-    else:
-        values = counted(found.looked, "value")
-        what = f"{values} were looked at; what the equations do between two of them is not known: "
-        lines += wrapped(f"{what}a narrow change of the verdict could hide there", "  ", "  ")
+    lines.append(f"  {counted(found.looked, 'value')} looked at: two crossings near to each other could hide")
     if found.left_open:
         parts = [" to ".join(with_unit(f"{end:.6g}", found.unit) for end in one) for one in found.left_open]
         rest = f" and {len(parts) - SHOWN} more" if len(parts) > SHOWN else ""
@@ -104,7 +94,7 @@ def _count_lines(found: Critical) -> list[str]:
         lines.append(f"{mark} {name:<{width}}  {'stable' if stable else 'unstable'}")
         stable = not stable
     lines.append("")
-    if found.known:
+    if found.looked == last - first + 1:
         return [*lines, f"  every number from {first:,d} to {last:,d} was looked at"]
     looked = f"{found.looked} numbers from {first:,d} to {last:,d} were looked at, those on either side of a "
     return [

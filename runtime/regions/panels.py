@@ -28,7 +28,7 @@ from apc.regions.overlay import Overlay, overlay_points, parse_overlay
 from apc.regions.region import CELLS, Floats, Region, region
 from apc.result import Look, Result
 from apc.sweeps.grid import with_last_unit
-from apc.vary.search import Told
+from apc.vary.crossing import Told
 
 # By what a parameter is moved to see which weights follow it: no round ratio, so that none of them agree.
 MOVE = Fraction(19, 13)

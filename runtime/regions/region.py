@@ -22,6 +22,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.timings import part
 from apc.compiler.words import counted
+from apc.eigen.spectrum import mode_near
 from apc.finite_equations import finite_equations
 from apc.frame.names import Free, Range, notes_for_all_groups
 from apc.frame.overrides import apply
@@ -37,6 +38,7 @@ from apc.regions.strips import BRANCHES, Striped, trace_strips
 from apc.result import Look, Result
 from apc.threads import single_threaded
 from apc.vary.batch import BatchEvaluator
+from apc.vary.crossing import Told
 from apc.vary.evaluator import (
     PointEvaluator,
     evaluator_of_many,
@@ -54,9 +56,7 @@ from apc.vary.growth import (
     growth_at,
     refuse_time,
 )
-from apc.vary.marginal import marginal_motion, with_rigid
 from apc.vary.ports import PortEvaluator, port_evaluator
-from apc.vary.search import Told
 
 if TYPE_CHECKING:
     import pandas
@@ -444,8 +444,9 @@ def _identify(source: Source, value: Floats, eigenvalue: complex) -> tuple[str, 
     if isinstance(source, PortEvaluator):
         name, hertz, frame_s = source.motion_at(value, abs(float(np.angle(eigenvalue))))
         return name, 2 * np.pi * hertz * frame_s, frame_s
-    found = marginal_motion(with_rigid(source.closed_at(value.tolist())), eigenvalue)
-    return found.name, found.turn, found.frame_s
+    closed = source.closed_at(value.tolist())
+    found, frame_s = mode_near(closed, eigenvalue), closed[0].frame_s
+    return found.shape, 2 * np.pi * found.frequency_hz * frame_s, frame_s
 
 
 def side_of_curves(found: Region, points: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.relative import relative_bounded
+from apc.eigen.spectrum import mode_near
 from apc.frame.names import Range, parameter_of
 from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, relative_to, stable_area, trace
@@ -31,10 +32,10 @@ from apc.regions.eigenpairs import Eigenvalues, largest, log_magnitudes
 from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
 from apc.vary.batch import batch_evaluator
 from apc.vary.counts import count_pieces
+from apc.vary.crossing import ESTIMATE, search
 from apc.vary.delays import Piece, delay_pieces, pace, system_with_delay
 from apc.vary.evaluator import PointEvaluator, evaluator_of_many, generic, reaches_count
-from apc.vary.marginal import marginal_motion, with_rigid
-from apc.vary.search import SPAN, Line, proved_crossing
+from apc.vary.line import MatrixLine
 
 Floats = NDArray[np.float64]
 
@@ -134,7 +135,7 @@ def trace_strips(
 
     def mode_of(arc: Arc) -> str:
         value = rectangle.values(arc.knots)[0].tolist()
-        return marginal_motion(with_rigid(whole.closed_at(value)), complex(arc.values[0])).name
+        return mode_near(whole.closed_at(value), complex(arc.values[0])).shape
 
     listed = _joined([arc for own in arcs for arc in own] + edges, mode_of)
     widest = max(one.end - one.start for one in strips)
@@ -182,34 +183,28 @@ def _strips(
 def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepared) -> _Strip | None:
     """Return a strip in which nothing depends on the delay: straight lines at the other's critical values."""
     low, high, free = float(other.low), float(other.high), other.free
-    line = Line(
-        evaluator_of_many(piece.inside, [free], PLACE, prepared=prepared),
-        np.array([parameter_of(piece.inside, free).value]),
-        0,
-    )
-    scale = line.scale()
-    found = line.scan(line.course, line.samples(low, high, scale)[0], scale / SPAN)
-    if not len(found.points):
+    family = evaluator_of_many(piece.inside, [free], PLACE, prepared=prepared)
+    line = MatrixLine(family, np.array([parameter_of(piece.inside, free).value]), 0, low, high)
+    found = search(line)
+    if not found.stable or any(one.proof == ESTIMATE for one in found.edges):
         return None
     arcs, heights = [], [0.0]
-    for root in found.roots:
-        crossing = proved_crossing(root, line, found)
-        if crossing is None:
-            return None
+    for crossing in found.edges:
         height = min(max((crossing.value - low) / (high - low), 0.0), 1.0)
         heights.append(height)
         middle = np.array([[(ends[0] + ends[1]) / 2, height]])
         # The stable side is on the left: to the west it is below, to the east above.
-        places = ends[::-1] if root.rising else ends
+        places = ends[::-1] if crossing.stable_side == "below" else ends
+        values = line.look(np.array([crossing.value]))[0][0]
         arcs.append(
             _straight(
                 np.array([[places[0], height], [places[1], height]]),
                 middle,
-                root.eigenvalue,
+                complex(values[np.argmax(np.abs(values))]),
                 crossing.error / (high - low) + np.spacing(1.0),
             )
         )
-    first = bool(found.stable[0])
+    first = found.stable[0]
     steps = np.diff([*heights, 1.0])
     area = float(steps[0 if first else 1 :: 2].sum())
     off = sum(float(arc.errors[0]) for arc in arcs)

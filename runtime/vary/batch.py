@@ -27,9 +27,9 @@ from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import Closed, ClosedSystem, Feedback, Loop, close, close_loop
 from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup
-from apc.eigen.relative import Relative, relative, with_doubt
+from apc.eigen.relative import relative, with_doubt
 from apc.eigen.rigid import find_rigid_modes
-from apc.frame.discretize import UNIT, Step, exponential_rows, exponential_values
+from apc.frame.discretize import Step, exponential_rows, exponential_values
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import FrameMap, LiftedSite, compose, composed_bounded, lift
@@ -66,8 +66,6 @@ STEP = 1e-60
 GENERIC_POINT = 0.7390851332151607
 GENERIC_RATIO = 0.6180339887498949
 
-# An error from which nothing stands out; it is finite, so that 0 times it is 0.
-NO_USE = 1e200
 
 # A step shorter than this share of the delays it is the difference of is none.
 VANISHING = 1e-14
@@ -183,7 +181,8 @@ class BatchEvaluator:
         """Return each system's matrices (k, n, n) and their derivatives along directions (k, m)."""
         lifted = self.lifted(values + (STEP * 1j) * along)
         found = (reduced(wiring, closed_loop(wiring, lifted), len(values)) for wiring in self.wirings)
-        return tuple((one.real.copy(), one.imag / STEP) for one in found)
+        # Squares of the step stand where nothing should: balancing would take them for entries.
+        return tuple((np.where(np.abs(one.real) <= STEP, 0.0, one.real), one.imag / STEP) for one in found)
 
     def vectors(self, group: PeerGroup, values: Matrices) -> Matrices:
         """Return the parameter vectors (k, n_p) of a group, or (1, n_p) when no value reaches it."""
@@ -201,15 +200,8 @@ class BatchEvaluator:
 
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems at one point (m,), as an analysis has them: with error bounds."""
-        return tuple(map(close_loop, lifted_here(self.exact_at(value))))
-
-    def exact_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
-        """Return the closed systems with the sites of one point (m,), for exact arithmetic.
-
-        Their matrices in floats are still those of the point that stands for all.
-        """
         assert not self.timed, "another time is another schedule"
-        return self.with_sites(self.closed, value)
+        return tuple(map(close_loop, lifted_here(self.with_sites(self.closed, value))))
 
     def with_sites(self, systems: Sequence[Wired], value: Sequence[float]) -> tuple[Wired, ...]:
         """Return systems with the exact sites of one point (m,); of a time, all but the steps is of it."""
@@ -449,29 +441,6 @@ def _closed_bounded(
         return close(sites, wiring.feedback, system.layout, numbers=RADII)
     heard = [Feedback(alike(one.now), alike(one.before)) for one in wiring.feedback]
     return close(sites, heard, system.layout, numbers=NEARBY)
-
-
-def inverse_size(matrices: Floats) -> Floats:
-    """Return |M⁻¹| of matrices (k, n, n); `NO_USE` where one has none, as more is free at these values."""
-    try:
-        return np.asarray(np.abs(np.linalg.inv(matrices)))
-    except np.linalg.LinAlgError:
-        return np.full(matrices.shape, NO_USE)
-
-
-def relative_here(wiring: Wiring, matrix: Floats, error: Floats) -> Relative:
-    """Return the relative coordinates at each point, with a bound on W to first order where it follows.
-
-    (1 − M_rr) W = M_rp: W is off by (1 − M_rr)⁻¹ times what the errors of M leave, and the solution's own.
-    """
-    at, _ = relative_at(wiring, matrix)
-    if not wiring.moving:
-        return at
-    rest, held, size = at.rest, at.held, np.abs(at.weights)
-    system = np.eye(len(rest)) - matrix[:, rest[:, None], rest]
-    left = error[:, rest[:, None], held] + error[:, rest[:, None], rest] @ size
-    left = left + 8 * (len(rest) + 2) * UNIT * (np.abs(system) @ size)
-    return replace(at, doubt=inverse_size(system) @ left)
 
 
 def lifted_here(systems: Sequence[Wired]) -> tuple[Wired, ...]:

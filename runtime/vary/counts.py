@@ -1,16 +1,15 @@
-"""How many peers a scene bears: the verdict over the count of a group.
+"""Numbers of peers that are looked at: of a search, and along an axis of a region.
 
 Takes: a `CompiledSystem` and the count of one of its groups, or a number that counts follow from.
-Gives: `search_counts`; `count_pieces` for a region with a count along one axis.
-Guarantees: a count is a whole number; a change is told between two neighbouring counts, both judged.
-Does not: know what happens between counts that weren't looked at: that is said.
+Gives: `count_range`, `count_pieces`.
+Guarantees: a count is a whole number.
+Does not: judge a scene (see `line`).
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 
 from apc.compiler.compiled import CompiledSystem, group_count
@@ -19,10 +18,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.names import Free, Range
 from apc.frame.overrides import Override, apply
 from apc.vary.delays import Piece
-from apc.vary.search import COUNT, SPAN, Crossing, Search, Told
-
-# So many counts from the lowest on are each looked at; then each is so many times the one before.
-EVERY, FURTHER = 32, 1.25
+from apc.vary.line import SPAN
 
 # Without a limit, so many times the present count on graphs that aren't complete.
 PLACED_SPAN = 10
@@ -30,47 +26,28 @@ PLACED_SPAN = 10
 # Strips of a region over a count.
 MOST_STRIPS = 200
 
-# What a change of the verdict between two counts rests on.
-JUDGED = "both judged"
 
-
-def search_counts(
-    system: CompiledSystem,
-    free: Free,
-    limits: Sequence[Fraction | None],
-    present: float,
-    judge: Callable[[CompiledSystem], bool | None],
-    place: Place,
-    *,
-    told: Told | None = None,
-) -> Search:
-    """Find between which counts the verdict changes.
+def count_range(
+    system: CompiledSystem, free: Free, limits: Sequence[Fraction | None], present: float, place: Place
+) -> tuple[int, int]:
+    """Return the lowest and the highest count to look at.
 
     Parameters
     ----------
     system, free
         The compiled scene, and a count of it or what counts follow from.
     limits
-        The lowest and highest count, two; where not given, the least that a scene may have, and `SPAN` times
-        the present count, `PLACED_SPAN` on a graph that isn't complete.
+        What was asked for, two; where not given, the least that a scene may have, and `SPAN` times the
+        present count, `PLACED_SPAN` on a graph that isn't complete.
     present
         The present count.
-    judge
-        Says of the scene with another count whether it is stable, None if that is left open.
     place
         Where it was asked for.
-    told
-        Is told how far the search is.
-
-    Returns
-    -------
-    A crossing's value is the count on its stable side, its error 0 (see `Crossing`). Where the verdict is
-    open at a count, that one stands for no change.
 
     Raises
     ------
     ApcError
-        E842 no whole numbers, E626 and others of `overrides.apply`.
+        E842 no whole numbers.
     """
     low, high = limits
     of_group = any(free.name == group_count(group.name) for group in system.groups)
@@ -82,40 +59,7 @@ def search_counts(
         (one.maximum for one in system.parameters if one.name == free.name and one.maximum is not None),
         default=math.inf,
     )
-    last = _whole(high, int(min(max(math.ceil(span * present), first + 1), most)), place)
-    known: dict[int, bool | None] = {}
-
-    def at(count: int) -> bool | None:
-        if count not in known:
-            if told is not None:
-                told(f"looking at {free.label} = {count:,}")
-            known[count] = judge(apply(system, [Override(free, Fraction(count))]))
-        return known[count]
-
-    counts = [count for count in _looked_at(first, last) if at(count) is not None]
-    edges, stable = [], [bool(at(counts[0]))] if counts else []
-    for one, other in itertools.pairwise(counts):
-        if at(one) == at(other):
-            continue
-        below, above, was = one, other, at(one)
-        while above - below > 1:
-            middle = (below + above) // 2
-            if at(middle) is None:
-                break
-            below, above = (middle, above) if at(middle) == was else (below, middle)
-        side, value = ("below", below) if was else ("above", above)
-        proof = JUDGED if above - below == 1 else f"{above - below - 1} between are left open"
-        edges.append(Crossing(float(value), 0.0, side, math.nan, COUNT, proof))
-        stable.append(not was)
-    return Search(
-        edges=tuple(edges),
-        stable=tuple(stable),
-        scanned=(float(first), float(last)),
-        whole=None not in known.values(),
-        known=len(known) == last - first + 1,
-        looked=len(known),
-        enters=True,
-    )
+    return first, _whole(high, int(min(max(math.ceil(span * present), first + 1), most)), place)
 
 
 def _whole(limit: Fraction | None, otherwise: int, place: Place) -> int:
@@ -125,15 +69,6 @@ def _whole(limit: Fraction | None, otherwise: int, place: Place) -> int:
     if limit.denominator != 1:
         raise ApcError(Mistake("E842", place, "a number of peers", "a whole number", f"{float(limit):.12g}"))
     return int(limit)
-
-
-def _looked_at(first: int, last: int) -> Iterator[int]:
-    """Yield the counts to look at to begin with, in order."""
-    count = first
-    while count < last:
-        yield count
-        count = max(count + 1, min(last, math.floor(count * FURTHER)) if count >= first + EVERY else 0)
-    yield last
 
 
 def count_pieces(system: CompiledSystem, axis: Range, place: Place) -> Iterator[Piece]:

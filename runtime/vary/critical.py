@@ -2,16 +2,17 @@
 
 Takes: a `CompiledSystem` and the name of a parameter or delay.
 Gives: `Critical`, `critical`.
-Guarantees: every crossing comes with a bound on its error, proved by ball arithmetic wherever the equations
-can be had exactly; what was scanned, and how finely, is part of the answer.
+Guarantees: every crossing comes with a bound on its error, held by analyses on either side; what was scanned,
+and how finely, is part of the answer.
 Does not: prove that there are no others, or find two nearer to each other than the cell size (see
-`crossings.CELL`).
+`crossing.CELL`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Unpack
 
@@ -24,26 +25,39 @@ from apc.compiler.timings import part
 from apc.compiler.words import with_unit
 from apc.finite_equations import finite_equations
 from apc.frame.names import Free, find, parameter_of, unit_of, values_by_group
+from apc.hands.passivity import passive_hands
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.option_value import option_value
 from apc.result import Look, Result
 from apc.threads import single_threaded
-from apc.vary.counts import search_counts
-from apc.vary.crossings import CELL
-from apc.vary.delays import delay_now
-from apc.vary.evaluator import reaches_count, reaches_start, reaches_time
+from apc.vary.counts import count_range
+from apc.vary.crossing import CELL, Crossing, Line, Search, Told, search
+from apc.vary.delays import delay_now, pace
+from apc.vary.evaluator import (
+    evaluator_of_many,
+    many_packets,
+    reaches_count,
+    reaches_start,
+    reaches_time,
+)
 from apc.vary.growth import (
     BY_GROWTH,
     MEAN_SQUARE,
     NOMINAL,
     PASSIVE,
+    GrowthLine,
     criterion_of,
     growth_at,
-    search_growth,
+    growth_points,
+    refuse_time,
 )
-from apc.vary.search import Crossing, Search, Told, search, search_delay
+from apc.vary.line import SPAN, AnalysedLine, CountLine, DelayLine, MatrixLine, delay_reach
 
 _PLACE = Place("critical value")
+
+# Without a limit given, a delay is looked at over so many stretches at least, each from one coincidence of
+# events to the next, and up to so many times its present value.
+PIECES, FURTHER = 64, 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +67,10 @@ class Critical(Result):
     `crossings` are all that were found from `scanned[0]` to `scanned[1]`, in order. `value` is the one that
     matters: with the present value stable, the first crossing above it or else the first below it; with the
     present value unstable, the lowest crossing at which stability is lost or else the lowest. It is None when
-    there is no crossing; `verdict` then says whether all that was scanned is stable. `known` says
-    whether the equations are enclosed between the `looked` values that were looked at: what could hide then
-    are crossings nearer than `cell` to one another. `enters` says whether
-    anything that decides depends on the parameter: on a start value of a linear scene nothing does.
-    `stretches` and `left_open` are those of `search.Search`. `counted` says that it is a number of peers: a
+    there is no crossing; `verdict` then says whether all that was scanned is stable. `looked` values were
+    looked at, and cells in which another crossing might hide divided down to `cell` of the value. `enters`
+    says whether anything that decides depends on the parameter: on a start value of a linear scene nothing
+    does. `left_open` is that of `crossing.Search`. `counted` says that it is a number of peers: a
     crossing's value is then the number on its stable side.
     `left_out` says what of the scene the answer does not look at. `groups` are the groups' present values
     (None where their peers differ) of a parameter that is set for all groups though they have not all the
@@ -78,7 +91,6 @@ class Critical(Result):
     scanned: tuple[float, float]
     cell: float
     whole: bool
-    known: bool
     looked: int
     enters: bool
     verdict: str
@@ -86,7 +98,6 @@ class Critical(Result):
     left_out: tuple[str, ...] = ()
     criterion: str = NOMINAL
     groups: tuple[tuple[str, float | None], ...] = ()
-    stretches: int = 0
     counted: bool = False
     left_open: tuple[tuple[float, float], ...] = ()
 
@@ -125,7 +136,7 @@ def critical(
     lower, upper
         Quantities between which to look, such as "5000 N/m". Without `lower`, from the least value allowed,
         or 0 (of a negative value, from `SPAN` times it); without `upper`, up to `SPAN` times the present
-        value (of a delay, as far as `search.delay_reach` says).
+        value (of a delay, as far as `line.delay_reach` says).
     criterion
         "mean-square": what becomes of second moments over the network as it is; "nominal": every packet on
         time; "passive": with every passive hand at every device. None: mean square where a link is
@@ -158,22 +169,30 @@ def critical(
                 return growth_at(changed, prepared, [], _PLACE, criterion=chosen_criterion).stable
             return analyze(changed, prepared=prepared).stable
 
-        low, high = (None if one is None else float(one) for one in limits)
         if counted:
-            found = search_counts(system, free, limits, present, stable_of, _PLACE, told=told)
-        elif by_growth:
-            found = search_growth(
-                *(system, free, low, high, present, prepared, _PLACE), told=told, criterion=chosen_criterion
+            found = search(
+                CountLine(system, free, stable_of, *count_range(system, free, limits, present, _PLACE)),
+                told=told,
             )
+        elif by_growth:
+            refuse_time(system, free, _PLACE, chosen_criterion)
+            low, high = (None if one is None else float(one) for one in limits)
+            points = growth_points(system, free, low, high, present)
+            found = search(GrowthLine(system, free, prepared, points, _PLACE, chosen_criterion), told=told)
+            if chosen_criterion == PASSIVE and not passive_hands(system, prepared).why:
+                found = replace(found, enters=True)  # where clamped devices shake all values are one
         elif timed:
             start = _at_start(system, prepared)
-            found = search_delay(system, free, limits[0] or Fraction(0), limits[1], start, told=told)
+            begin = limits[0] or Fraction(0)
+            end = limits[1] or delay_reach(system, free, begin, pieces=PIECES, further=FURTHER)[0]
+            tell = pace(system, free, begin, end, place=_PLACE, told=told)
+            found = search(DelayLine(system, free, start, begin, end, tell))
         else:
             at_start = None if reaches_start(system, free) else prepare_at_start(system, prepared)
-            found = search(system, free, low, high, at_start or prepared, told=told)
+            found = search(_line(system, free, limits, at_start or prepared), told=told)
             if at_start is not None and not found.sided:
                 # Contacts close or open along the way, and other motions are left out of the verdict.
-                found = search(system, free, low, high, prepared, told=told)
+                found = search(_line(system, free, limits, prepared), told=told)
 
         def stable_now() -> bool | None:
             return stable_of(system)
@@ -192,7 +211,6 @@ def critical(
         scanned=found.scanned,
         cell=CELL,
         whole=found.whole,
-        known=found.known,
         looked=found.looked,
         enters=found.enters,
         verdict=verdict,
@@ -203,7 +221,6 @@ def critical(
         ),
         criterion=chosen_criterion,
         groups=values_by_group(system, free),
-        stretches=found.stretches,
         counted=counted,
         left_open=found.left_open,
     )
@@ -221,6 +238,25 @@ def _everywhere(found: Search, present: float, stable_now: Callable[[], bool | N
     if criterion == PASSIVE and side is False:
         return f"{words} whatever its value: apc analyze --hands passive says why"
     return f"{words} whatever its value: nothing that decides stability depends on it"
+
+
+def _line(system: CompiledSystem, free: Free, limits: Sequence[Fraction | None], prepared: Prepared) -> Line:
+    """Return a scene along a parameter that reaches no time: by its matrices, or value by value."""
+    parameter = parameter_of(system, free)
+    low, high = (None if one is None else float(one) for one in limits)
+    low = parameter.minimum if low is None else low
+    try:
+        family = evaluator_of_many(system, [free], _PLACE, prepared=prepared)
+    except ApcError:
+        if not many_packets(system, prepared):
+            raise
+        scale = abs(parameter.value) or 1.0
+        top = min(high or SPAN * scale, math.inf if parameter.maximum is None else parameter.maximum)
+        return AnalysedLine(system, free, prepared, low or 0.0, top, scale)
+    line = MatrixLine(family, np.array([parameter.value]), 0, low, high)
+    if parameter.maximum is None:
+        return line
+    return replace(line, top=min(high or SPAN * line.scale, parameter.maximum))
 
 
 def _at_start(system: CompiledSystem, prepared: Prepared) -> Prepared:

@@ -23,8 +23,8 @@ from apc.eigen.peer_group import states_of
 # Of a parameter: some sixty matrices, their eigenvalues with slopes, and the events of as many frames.
 PARAMETER, PARAMETER_SQUARE, PARAMETER_EVENT = 0.025, 60e-6, 4e-6
 
-# Of a parameter of loops with late packets: of each loop, and of each packet.
-LOOP, LOOP_PACKET = 0.15, 0.5e-3
+# Of an analysis, and of each state that is no packet.
+ANALYSIS, ANALYSIS_STATE = 0.02, 2e-3
 
 # Of a piece of a delay: its schedules, bounded matrices and eigenvalues at three values or more.
 PIECE, PIECE_SQUARE, PIECE_EVENT, PIECE_ENTRY = 0.015, 40e-6, 40e-6, 0.6e-6
@@ -41,20 +41,25 @@ class Effort:
     """What the effort follows from.
 
     `states` are those of each loop, `moving` those that are no packets on their way; `events` happen in a
-    frame, of a peer whose maps have `width` columns. `long` says that packets are left out of the state, see
-    `evaluator.long_loops`.
+    frame, of a peer whose maps have `width` columns.
     """
 
     states: tuple[int, ...]
     moving: tuple[int, ...]
     events: int
     width: int
-    long: bool
+
+    @property
+    def largest(self) -> int:
+        """The states of the largest loop."""
+        return max(self.states, default=0)
+
+    def of_analyses(self, count: int) -> float:
+        """Return the seconds that so many analyses take that leave packets out of the state."""
+        return count * (ANALYSIS + ANALYSIS_STATE * sum(self.moving))
 
     def of_parameter(self) -> float:
         """Return the seconds that a stiffness or damping takes."""
-        if self.long:
-            return len(self.states) * LOOP + LOOP_PACKET * (sum(self.states) - sum(self.moving))
         composed = PARAMETER_EVENT * self.events * self.width
         return PARAMETER + PARAMETER_SQUARE * _squares(self.states) + composed
 
@@ -71,20 +76,20 @@ def _squares(states: Sequence[int]) -> float:
     return sum(one**2 * max(1.0, one / CUBIC) for one in states)
 
 
-def effort_of(system: CompiledSystem, prepared: Prepared, *, long: bool, most: float) -> Effort:
+def effort_of(system: CompiledSystem, prepared: Prepared, *, most: float) -> Effort:
     """Return what the effort follows from; of one peer alone where that takes more than `most` seconds."""
     schedules = prepared.schedules
     kinds = [prepared.jacobians[group.kind] for group in system.groups]
     sizes = [states_of(*pair) for pair in zip(schedules, kinds, strict=True)]
     events = max(len(one.events) for one in schedules)
     width = max(size + len(one.heard) for size, one in zip(sizes, schedules, strict=True))
-    alone = Effort((max(sizes),), (0,), events, width, long=False)
-    if not long and alone.of_parameter() > most:
+    alone = Effort((max(sizes),), (0,), events, width)
+    if alone.of_parameter() > most:
         return alone
     loops = arrange(*lifted_groups(system, prepared=prepared)).loops
     states = tuple(loop.states for loop in loops)
     moving = tuple(loop.states - len(loop.packets) for loop in loops)
-    return Effort(states, moving, events, width, long)
+    return Effort(states, moving, events, width)
 
 
 def affordable(costs: Sequence[float], most: float) -> list[bool]:

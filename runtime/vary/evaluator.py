@@ -1,7 +1,7 @@
 """The evaluator of a system's matrices over some of its parameters, whatever kind of scene it is.
 
 Takes: a `CompiledSystem` and the parameters that vary.
-Gives: `evaluator`, `evaluator_of_many`, `PointEvaluator`; `Asked`; `long_loops`, `mostly_packets`;
+Gives: `evaluator`, `evaluator_of_many`, `PointEvaluator`; `Asked`; `many_packets`;
 `free_parameters`, `reaches_time`, `reaches_count`, `reaches_start`, `start_names`, `overrides_at`.
 Guarantees: peers that are alike at some values only are kept apart.
 Does not: vary times (see `delays`).
@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +20,9 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.compiler.compiled import CompiledSystem, Group, Parameter, group_count
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.eigen.closing import ClosedSystem, Loop
-from apc.eigen.modes import arrange, split
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.modes import split
+from apc.eigen.peer_group import PeerGroup, states_of
 from apc.eigen.relative import relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.frame.discretize import UNIT
@@ -33,9 +32,6 @@ from apc.frame.overrides import Override, apply
 from apc.frame.parameters import free_rows, scope_of
 from apc.vary.batch import BatchEvaluator, batch_evaluator
 from apc.vary.wiring import wire
-
-if TYPE_CHECKING:
-    from apc.vary.loops import LoopEvaluator
 
 Floats = NDArray[np.float64]
 Places = NDArray[np.intp]
@@ -49,9 +45,6 @@ GENERIC = Fraction(1, 1024) + Fraction(1, 65537)
 # what is cut off against rounding (both near 1e-10).
 DIFFERENCE = 2.0**-17
 
-# The step of the differences that say how far they are off, relative to the value: what is cut off, 1e-9 of
-# it, is about what rounding leaves of a matrix that is right to a few times 1e-14.
-WIDE_DIFFERENCE = 2.0**-14
 
 # What CasADi's evaluation of a site's Jacobians at its start rounds, in units of UNIT: each entry is a few
 # dozen operations, and an exponential makes no more of it than the entry is large.
@@ -64,9 +57,6 @@ DRIFT = 1e-6
 # States of one system beyond which no range of values is looked at: a hundred matrices and more are held at a
 # time, each with the vectors of its eigenvalues. Of 250 states a range takes ten seconds and half a GB.
 MOST_STATES = 300
-
-# From so many packets of a loop on their way on, leaving them out of the state is quicker.
-MANY_PACKETS = 24
 
 # Evaluators kept for the next question of the same parameters: another range of theirs, say.
 KEPT = 8
@@ -158,38 +148,6 @@ class PointEvaluator:
         """Return bounds (k, n, n) on the errors of the matrices at values (k, m), entry by entry."""
         return (_filled_up_pairs([self._bounded(value) for value in values])[1],)
 
-    def differences(self, value: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return the matrix (n, n) at a point (m,) and its error, its derivatives (m, n, n) and theirs.
-
-        A difference of two steps and one of twice that cancel what each cuts off; what they differ by, and
-        the matrices' own errors over a step, bound what is left. A derivative is NaN where there is none.
-        """
-        here = self._bounded(value)
-        matrix, error = (one[0] for one in _filled_up_pairs([here]))
-        slopes, errors = np.full((2, len(value), *matrix.shape), np.nan)
-        for place, number in enumerate(value):
-            step = WIDE_DIFFERENCE * (abs(number) or 1.0)  # 0 has no size: its unit's
-            along = step * np.eye(len(value))[place]
-            at = {side: self._bounded(value + side * along) for side in (-2, -1, 1, 2)}
-            good = {side for side, one in at.items() if _shapes(one) == _shapes(here)}
-            way = next((way for way in (1, -1) if {way, 2 * way} <= good), 0)
-            if len(good) == len(at):
-                m, e = _filled_up_pairs([at[side] for side in (-2, -1, 1, 2)])
-                near, far = (m[2] - m[1]) / (2 * step), (m[3] - m[0]) / (4 * step)
-                # What is smooth bends half as much over half the width, a corner as much.
-                bends = [m[2] + m[1] - 2 * matrix, (m[3] + m[0] - 2 * matrix) / 4]
-                doubt = 2 * np.abs(bends[0] - bends[1]) / step
-            elif way and _shapes(last := self._bounded(value + 4 * way * along)) == _shapes(here):
-                m, e = _filled_up_pairs([at[way], at[2 * way], last])  # parabolas on one side
-                near = way * (4 * m[0] - 3 * matrix - m[1]) / (2 * step)
-                far = way * (4 * m[1] - 3 * matrix - m[2]) / (4 * step)
-                doubt = np.zeros_like(near)
-            else:
-                continue
-            slopes[place] = (4 * near - far) / 3
-            errors[place] = np.abs(near - far) / 3 + doubt + 8 * np.maximum(e.max(axis=0), error) / step
-        return matrix, error, slopes, errors
-
     def _alike(self, values: Floats) -> tuple[Places, list[list[Floats]]]:
         """Return which of `alike` takes each point (k,), −1 where none does, and the matrices of each.
 
@@ -261,12 +219,6 @@ def _is_apart(matrices: Floats) -> Truths:
     return np.asarray(sure & (np.abs(values - 1).min(axis=1, initial=np.inf) >= DRIFT))
 
 
-def keeps_size(matrices: Sequence[Floats]) -> bool:
-    """Say whether the largest relative motion keeps its size, to rounding: it may be free here only."""
-    radius = max((float(np.abs(np.linalg.eigvals(one)).max(initial=0.0)) for one in matrices), default=0.0)
-    return abs(radius - 1) < DRIFT
-
-
 def _filled_up(blocks: Sequence[Sequence[Floats]]) -> Floats:
     """Return the blocks of each point as one matrix (k, n, n), all of it NaN where a block is."""
     size = max((sum(len(one) for one in listed) for listed in blocks), default=0)
@@ -293,11 +245,6 @@ def _filled_up_pairs(pairs: Sequence[Sequence[tuple[Floats, Floats]]]) -> tuple[
     """Return the matrices of each point as one (k, n, n), and their errors."""
     matrices, errors = ([[pair[place] for pair in one] for one in pairs] for place in (0, 1))
     return _filled_up(matrices), _filled_up(errors)
-
-
-def _shapes(blocks: Sequence[tuple[Floats, Floats]]) -> list[int]:
-    """Return the sizes of a point's matrices; of a point without any, no size that another has."""
-    return [len(matrix) if np.isfinite(matrix).all() else -1 for matrix, _ in blocks]
 
 
 def evaluator(
@@ -357,31 +304,11 @@ def _evaluator(of: Asked) -> BatchEvaluator | PointEvaluator:
     return batch_evaluator(of.system, of.free, *of.lifted_anywhere())
 
 
-def mostly_packets(loop: Loop) -> bool:
-    """Say whether leaving a loop's packets out of its state is quicker: they are many, and most of it."""
-    return len(loop.packets) > max(MANY_PACKETS, loop.states / 2)
-
-
-def long_loops(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) -> LoopEvaluator | None:
-    """Return the loops of a system without their packets, None unless these are many, and most of the state.
-
-    Parameters
-    ----------
-    system, free, prepared
-        As for `evaluator`, which raises the same.
-    """
-    asked = Asked.of(system, free, prepared)
-    if max(sum(schedule.depths) for schedule in prepared.schedules) * system.peers <= MANY_PACKETS:
-        return None
-    if not asked.parameters_suffice:
-        return None
-    groups, exchange = asked.lifted_anywhere()
-    loops = arrange(groups, exchange).loops
-    if not any(map(mostly_packets, loops)):
-        return None
-    from apc.vary.loops import loop_evaluator  # most scenes have none, and need not load it
-
-    return loop_evaluator(system, free, groups, loops, exchange)
+def many_packets(system: CompiledSystem, prepared: Prepared) -> bool:
+    """Say whether packets on their way are most of a scene's states: an analysis leaves them out."""
+    packets = max(sum(schedule.depths) for schedule in prepared.schedules)
+    used = zip(prepared.schedules, system.groups, strict=True)
+    return packets > max(states_of(one, prepared.jacobians[group.kind]) for one, group in used) / 2
 
 
 def evaluator_of_many(

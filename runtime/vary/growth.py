@@ -1,20 +1,19 @@
 """The values of one parameter at which one number passes 1: in mean square, or with passive hands.
 
 Takes: a `CompiledSystem` and the name of a parameter, or of what its links lose.
-Gives: `MEAN_SQUARE`, `NOMINAL`, `PASSIVE`, `BY_GROWTH`, `criterion_of`, `refuse_time`; `search_growth`;
-`first_lost`, `FirstLost`, `BOUNDED`; `growth_at`, `allowed`; `GrowthEvaluator`.
-Guarantees: on either side of a crossing, by its error, bounds on the growth of second moments decide, or on
-what hands can draw, which counts as a growth (see `passivity.passive_growth`).
-Does not: find two crossings between neighbouring samples; follow a delay, whose pieces are the nominal
-search's (see `delays`).
+Gives: `MEAN_SQUARE`, `NOMINAL`, `PASSIVE`, `BY_GROWTH`, `criterion_of`, `refuse_time`; `GrowthLine`,
+`growth_points`, `BOUNDED`; `growth_at`, `allowed`; `GrowthEvaluator`.
+Guarantees: a verdict is by bounds on the growth of second moments, or on what hands can draw, which counts
+as a growth (see `passivity.passive_growth`).
+Does not: find two crossings between neighbouring samples; follow a delay, whose stretches are the nominal
+search's (see `line`).
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from fractions import Fraction
 
 import numpy as np
@@ -26,13 +25,15 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.ages import aged
 from apc.frame.names import Free, parameter_of, unit_of
 from apc.frame.overrides import Override, apply
-from apc.hands.passivity import passive_growth, passive_hands
+from apc.hands.passivity import passive_growth
 from apc.moments.network import Growth, growth, unreliable
 from apc.network.nominal import channel_numbers
+from apc.vary.crossing import Crossing, Stretch, Verdict
 from apc.vary.evaluator import reaches_time
-from apc.vary.search import SAMPLES, SPAN, Crossing, Search, Told
+from apc.vary.line import SAMPLES, SPAN
 
 Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
 
 # The step of a difference, of a direction, whose cut-off and rounding are then alike; roots above 0.
 DIFFERENCE, LEAST = 1e-5, 1e-9
@@ -47,22 +48,11 @@ BOUNDED = {
     MEAN_SQUARE: "second moments bounded on either side",
     PASSIVE: "what hands can draw bounded on either side",
 }
-ESTIMATED = "an estimate: bounds leave either side open"
 ITERATED = "second moments by iteration in floats, not proved"
 TAGGED = "an estimate, not proved: of second moments that are themselves estimates"
 
 # Values looked at between 0 and 1 of a probability.
 SHARES = 33
-
-# How near a crossing is found at first, relatively, and how far its bounds may be at last.
-NEAR, FAR = 1e-14, 1e-4
-
-# After so many values at which nothing changes, second moments don't depend on a parameter.
-STILL = 4
-
-# The first width at which bounds are asked for; how many times wider the next is where they say nothing of
-# that, where they do beyond what they want, and at most; steps towards a crossing.
-FIRST, WIDER, BEYOND, WIDEST, STEPS = 1e-12, 4.0, 1.5, 64.0, 60
 
 
 def criterion_of(system: CompiledSystem, asked: str | None, place: Place, varied: Sequence[Free] = ()) -> str:
@@ -225,19 +215,60 @@ def allowed(system: CompiledSystem, free: Free) -> tuple[float, float]:
     )
 
 
-def search_growth(
-    system: CompiledSystem,
-    free: Free,
-    low: float | None,
-    high: float | None,
-    present: float,
-    prepared: Prepared,
-    place: Place,
-    *,
-    told: Told | None = None,
-    criterion: str = MEAN_SQUARE,
-) -> Search:
-    """Find where second moments begin or cease to grow as one parameter varies, or what stands for them.
+@dataclass(frozen=True, eq=False)
+class GrowthLine:
+    """A parameter by a criterion of one number, at `points` (k,) to begin with."""
+
+    system: CompiledSystem
+    free: Free
+    prepared: Prepared
+    points: Floats
+    place: Place
+    criterion: str = MEAN_SQUARE
+    known: dict[float, Growth] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """The number that varies."""
+        return self.free.label
+
+    def growth(self, value: float, *, bounded: bool) -> Growth:
+        """Return what second moments grow by at a value, or what stands for that."""
+        overrides = [Override(self.free, Fraction(value))]
+        return growth_at(
+            *(self.system, self.prepared, overrides, self.place), bounded=bounded, criterion=self.criterion
+        )
+
+    def look(self, values: Floats) -> tuple[Complexes, Complexes]:
+        """Return the growth at values (k, 1) without bounds, and no slopes."""
+        for value in values.tolist():
+            if value not in self.known:
+                self.known[value] = self.growth(value, bounded=False)
+        found = np.array([self.known[value].radius for value in values.tolist()], np.complex128)[:, None]
+        return found, np.full(found.shape, np.nan, np.complex128)
+
+    def judge(self, value: Fraction) -> Verdict:
+        """Return the verdict at a value, bounded."""
+        found = self.growth(float(value), bounded=True)
+        proof = BOUNDED[self.criterion] if found.proved else ITERATED
+        error = max(found.high - found.radius, found.radius - found.low)
+        return Verdict(found.stable, found.radius, error, (), proof if found.exact else TAGGED)
+
+    def stretches(self) -> Iterator[Stretch]:
+        """Yield the one stretch."""
+        low, high = Fraction(self.points[0]), Fraction(self.points[-1])
+        least = float(self.points[self.points > 0].min(initial=1.0))
+        yield Stretch(low, high, self.points, least, self.look, self.judge, slow=True)
+
+    def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
+        """There is one stretch."""
+        raise AssertionError("a line of one stretch has no jump")
+
+
+def growth_points(
+    system: CompiledSystem, free: Free, low: float | None, high: float | None, present: float
+) -> Floats:
+    """Return the values to look at first.
 
     Parameters
     ----------
@@ -248,180 +279,17 @@ def search_growth(
         the present value.
     present
         The present value.
-    prepared
-        From `analysis.prepare`.
-    place
-        Where it was asked for.
-    told
-        Is told how far the search is.
-    criterion
-        One of `BY_GROWTH`.
-
-    Raises
-    ------
-    ApcError
-        E898 the network can't be judged, or a delay is to vary; E930 the same with passive hands.
     """
-    refuse_time(system, free, place, criterion)
-    samples = _samples(system, free, low, high, present)
-    looking = _Looking(system, free, prepared, place, {}, criterion)
-    known = looking.known
-    for number, value in enumerate(samples):
-        if told is not None:
-            told(f"{number} of {len(samples)} values")
-        looking.at(value)
-    verdicts = [known[value].radius < 1 for value in samples]
-    edges, stable = [], [verdicts[0]]
-    for place_of, (one, other) in enumerate(itertools.pairwise(samples)):
-        if verdicts[place_of] != verdicts[place_of + 1]:
-            edges.append(looking.crossing(one, other))
-            stable.append(verdicts[place_of + 1])
-    radii = {known[value].radius for value in samples}
-    return Search(
-        edges=tuple(edges),
-        stable=tuple(stable),
-        scanned=(samples[0], samples[-1]),
-        whole=True,
-        known=False,
-        looked=len(known),
-        # Beyond where clamped devices shake all values are one, and tell nothing of what enters.
-        enters=len(radii) > 1 or (criterion == PASSIVE and not passive_hands(system, prepared).why),
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Looking:
-    """A scene looked at for values of one parameter; `known` are those without bounds."""
-
-    system: CompiledSystem
-    free: Free
-    prepared: Prepared
-    place: Place
-    known: dict[float, Growth]
-    criterion: str = MEAN_SQUARE
-
-    def at(self, value: float) -> Growth:
-        """Return what second moments grow by, without bounds."""
-        if value not in self.known:
-            self.known[value] = self._growth(value, bounded=False)
-        return self.known[value]
-
-    def _growth(self, value: float, *, bounded: bool) -> Growth:
-        overrides = [Override(self.free, Fraction(value))]
-        return growth_at(
-            *(self.system, self.prepared, overrides, self.place), bounded=bounded, criterion=self.criterion
-        )
-
-    def crossing(self, low: float, high: float) -> Crossing:
-        """Return the crossing between two values of other verdicts, and how far bounds leave it open.
-
-        By secants that keep a point on either side, one that stays twice counting half (the Illinois rule).
-        """
-        at_low, at_high = math.log(self.at(low).radius), math.log(self.at(high).radius)
-        value, stayed, stable_below = low, 0, at_low < 0
-        for _ in range(STEPS):
-            middle = low - at_low * (high - low) / (at_high - at_low)
-            if not low < middle < high:
-                break
-            value, found = middle, math.log(self.at(middle).radius)
-            if abs(found) < NEAR or high - low <= NEAR * abs(high):
-                break
-            if (found < 0) == (at_low < 0):
-                low, at_low = middle, found
-                at_high, stayed = (at_high / 2, 1) if stayed == 1 else (at_high, 1)
-            else:
-                high, at_high = middle, found
-                at_low, stayed = (at_low / 2, -1) if stayed == -1 else (at_low, -1)
-        width = FIRST * max(abs(value), 1e-300)
-        while width <= FAR * max(abs(value), 1e-300):
-            sides = [self._growth(one, bounded=True) for one in (value - width, value + width)]
-            below, above = (one.stable for one in sides)
-            if None not in (below, above) and below != above:
-                proof = BOUNDED[self.criterion] if all(one.proved for one in sides) else ITERATED
-                proof = proof if all(one.exact for one in sides) else TAGGED
-                return Crossing(value, width, "below" if below else "above", math.nan, "crossing", proof)
-            width *= _wider(sides)
-        side = "below" if stable_below else "above"
-        return Crossing(value, width, side, math.nan, "crossing", ESTIMATED)
-
-
-def _wider(sides: Sequence[Growth]) -> float:
-    """Return how many times farther off bounds decide, as what grows changes evenly near a crossing."""
-    wanted = [
-        ((one.high if one.radius < 1 else one.low) - one.radius) / (1 - one.radius)
-        for one in sides
-        if one.stable is None and one.radius != 1
-    ]
-    return min(max([WIDER] if not wanted else [BEYOND, *(BEYOND * one for one in wanted)]), WIDEST)
-
-
-@dataclass(frozen=True, slots=True)
-class FirstLost:
-    """How far a parameter grows from a stable value until second moments do; `crossing` None: not up to
-    `reached`.
-
-    `enters` says whether second moments depend on it, `looked` at how many values, `why` why not farther.
-    """
-
-    crossing: Crossing | None
-    reached: float
-    enters: bool
-    looked: int
-    why: str
-
-
-def first_lost(
-    system: CompiledSystem,
-    free: Free,
-    samples: Sequence[float],
-    prepared: Prepared,
-    place: Place,
-    here: Growth,
-) -> FirstLost:
-    """Look at values of a parameter, from a stable one on, until second moments grow.
-
-    Parameters
-    ----------
-    system, free
-        The compiled scene and what varies.
-    samples
-        Where to look, the first the present value, a stable one.
-    prepared, place
-        As for `search_growth`.
-    here
-        What second moments grow by as the scene is.
-    """
-    looking, why, reached = _Looking(system, free, prepared, place, {samples[0]: here}), "", samples[0]
-    for one, other in itertools.pairwise(samples):
-        try:
-            grows = looking.at(one).radius < 1 <= looking.at(other).radius
-        except ApcError as error:
-            why = error.mistakes[0].what
-            break
-        reached = other
-        if grows:
-            found = looking.crossing(one, other)
-            return FirstLost(found, reached, True, len(looking.known), "")
-        if len(looking.known) == STILL and len({found.radius for found in looking.known.values()}) == 1:
-            break
-    enters = len({found.radius for found in looking.known.values()}) > 1
-    return FirstLost(None, reached, enters, len(looking.known), why)
-
-
-def _samples(
-    system: CompiledSystem, free: Free, low: float | None, high: float | None, present: float
-) -> list[float]:
-    """Return the values to look at first."""
     if unit_of(system, free.name) == "1" and free.name in channel_numbers(system):
         # Bursts that never end (r = 0) have no long run, and all packets lost neither.
         endless = {link.channel.loss.r for link in system.links if link.channel and link.channel.loss}
         least = 1 / SHARES if free.name in endless else 0.0
         bottom, top = low if low is not None else least, high if high is not None else 1 - 1 / SHARES
-        return [float(one) for one in np.linspace(bottom, top, SHARES)]
+        return np.linspace(bottom, top, SHARES)
     scale = abs(present) or 1.0
     bottom = low if low is not None else scale / SPAN
     top = high if high is not None else max(scale, abs(bottom)) * SPAN
     if bottom > 0:
         count = max(math.ceil(SAMPLES * math.log10(top / bottom)), SAMPLES)
-        return [float(one) for one in np.geomspace(bottom, top, count + 1)]
-    return [float(one) for one in np.linspace(bottom, top, 6 * SAMPLES + 1)]
+        return np.geomspace(bottom, top, count + 1)
+    return np.linspace(bottom, top, 6 * SAMPLES + 1)

@@ -36,8 +36,8 @@ from apc.frame.parameters import resolve
 from apc.frame.schedule import Schedule, Selected, tick_by_tick
 from apc.frame.scheduling import build_schedules, newest
 from apc.vary.delays import INSIDE, reaches_parameters, system_with_delay, timing_slopes
+from apc.vary.encirclements import count_beyond
 from apc.vary.evaluator import Asked
-from apc.vary.plane import count_beyond
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

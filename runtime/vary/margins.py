@@ -13,44 +13,25 @@ a delay by a hold or link that waits for it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, prepare, prepare_at_start
+from apc.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
-from apc.eigen.spectrum import finite
+from apc.eigen.spectrum import DRIFTS, finite
 from apc.finite_equations import finite_equations
 from apc.frame.names import Free, named_times, parameter_of, unit_of, value_now
 from apc.result import Result
 from apc.threads import single_threaded
-from apc.vary.batch import BatchEvaluator
-from apc.vary.crossings import scan_lines
+from apc.vary.crossing import ESTIMATE, Crossing, search
 from apc.vary.delays import delay_now
 from apc.vary.effort import Effort, affordable, effort_of
-from apc.vary.evaluator import (
-    PointEvaluator,
-    evaluator,
-    free_parameters,
-    keeps_size,
-    long_loops,
-)
-from apc.vary.search import (
-    ESTIMATE,
-    Crossing,
-    Line,
-    courses_of,
-    delay_reach,
-    proved_crossing,
-    reach,
-    search_delay,
-)
-
-Floats = NDArray[np.float64]
+from apc.vary.evaluator import evaluator, free_parameters, many_packets
+from apc.vary.line import AnalysedLine, DelayLine, MatrixLine, delay_reach
 
 # Units of a stiffness and of a damping, as components write them.
 STIFFNESSES = ("N/m", "kg/s^2")
@@ -63,8 +44,8 @@ GROWTH = 1e3
 # a tick, and up to so many times its present value; over more pieces than the most it takes too long.
 PIECES, FURTHER, MOST_PIECES = 4, 1.5, 64
 
-# Balls of larger systems take minutes, bounds of floats do.
-FEW_STATES = 60
+# How many analyses a parameter takes where each value has its own.
+VALUES = 30
 
 # In passing so many seconds are spent, as `effort` estimates them; of the rest it is said how to ask for it.
 MOST_IN_PASSING = 2.5
@@ -128,23 +109,25 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
         prepared = prepared or prepare(system)
         start = prepare_at_start(system, prepared)
         free, at = coupler_parameters(system), start or prepared
-        most = MOST_IN_PASSING if quick else math.inf
-        long = long_loops(system, free, at) is not None
-        effort = effort_of(system, at, long=long, most=most)
-        largest = max(effort.states, default=0)
-        fitting = long or largest <= MOST_SCANNED
-        borne = affordable([effort.of_parameter()] * len(free), most if fitting else -1.0)
-        chosen = [one for one, within in zip(free, borne, strict=True) if within]
-        why = IN_PASSING if fitting else f"{largest:,} states"
-        rest = [not_looked(system, one, why) for one in free if one not in chosen]
         delays = _delays(system) if start is not None else []
+        most = MOST_IN_PASSING if quick else math.inf
+        effort = effort_of(system, at, most=most)
+        slow = effort.largest > MOST_SCANNED and many_packets(system, at)
+        fitting = slow or effort.largest <= MOST_SCANNED
+        each = effort.of_analyses(VALUES) if slow else effort.of_parameter()
+        borne = affordable([each] * len(free), most if fitting else -1.0)
+        chosen = [one for one, within in zip(free, borne, strict=True) if within]
+        why = IN_PASSING if fitting else f"{effort.largest:,} states"
+        rest = [not_looked(system, one, why) for one in free if one not in chosen]
         if quick and rest and not chosen:  # and whether the scene is stable is not known
             return Margins((*rest, *(not_looked(system, one, why) for one in delays)), _notes(rest, start))
-        found = _parameter_margins(system, chosen, at)
-        if isinstance(found, str):
-            return Margins((), found)
+        now = analyze(system, prepared=prepared)
+        if not now.stable and now.verdict != DRIFTS:
+            return Margins((), NOT_STABLE.format("stable" if now.stable is False else "proved stable"))
+        lines = _lines(system, chosen, at, slow=slow)
+        found = [row for pair in zip(chosen, lines, strict=True) if (row := _along(system, *pair))]
         found += rest
-        most -= effort.of_parameter() * len(chosen)
+        most -= each * len(chosen)
         for one in delays:
             assert start is not None, "else there are no delays"
             cost, row = _delay_margin(system, one, start, effort, most)
@@ -184,122 +167,45 @@ def _delays(system: CompiledSystem) -> list[Free]:
     return [Free(name) for name in dict.fromkeys(waited) if name in free]
 
 
-def _parameter_margins(
-    system: CompiledSystem, free: Sequence[Free], prepared: Prepared
-) -> list[Margin] | str:
-    """Return the margins of the parameters that matter, or why there are none."""
-    if long_loops(system, free, prepared):
-        return _loop_margins(system, free, prepared)
-    family = evaluator(system, free, prepared=prepared)
-    base = np.array([parameter_of(system, one).value for one in free])
-    here = family.matrices(base[None])
-    largest = max((one.shape[1] for one in here), default=0)
-    if not all(np.isfinite(one).all() for one in here):
-        return "not looked for: the present values have no frame matrix of their own"
-    lines = [Line(family, base, column) for column in range(len(free))]
-    if keeps_size(here) and not base.all():
-        family, lines = _apart(system, free, base, prepared)
-        here = family.matrices(base[None, base != 0])
-    if not _radius(here) < 1:
-        return NOT_STABLE.format("stable")
-    found: list[Margin | None] = [None] * len(free)
-    for which in dict.fromkeys(id(line.family) for line in lines):
-        own = [place for place, line in enumerate(lines) if id(line.family) == which]
-        ways = [(free[i], lines[i]) for i in own]
-        rows = _along(system, ways, in_balls=largest <= FEW_STATES)
-        for place, one in zip(own, rows, strict=True):
-            found[place] = one
-    return [one for one in found if one]
-
-
-def _loop_margins(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) -> list[Margin] | str:
-    """Return the margins of the parameters that matter of loops with long delays, or why there are none.
-
-    What is 0 varies by itself, see `_apart`.
-    """
-    base = np.array([parameter_of(system, one).value for one in free])
-    some = [one for one, value in zip(free, base, strict=True) if value]
-    together = long_loops(system, some, prepared)
-    found: list[Margin] = []
-    for one, start in zip(free, base.tolist(), strict=True):
-        family = together if start else long_loops(system, [one], prepared)
-        assert family is not None, "a delay is as long whatever a stiffness is"
-        own, column = (base[base != 0], some.index(one)) if start else (np.zeros(1), 0)
-        line = Line(family, own, column)
-        here = line.course(own[[column]])
-        if all(not slope.any() for _, slope in here):
-            continue
-        scale = abs(start) or reach(here)
-        limit = parameter_of(system, one).maximum
-        top = min(GROWTH * scale, np.inf if limit is None else limit)
-        if not top > start:
-            continue
-        points, _ = line.samples(start, float(top), scale)
-        scanned = family.scan(points, scale / GROWTH, own, column, first=True)
-        if not scanned.stable[:1].all():
-            return NOT_STABLE.format("stable")
-        roots = [root for root in scanned.roots if root.rising]
-        crossing = proved_crossing(roots[0], line, scanned) if roots else None
-        unit, reached = parameter_of(system, one).unit, float(scanned.points[-1])
-        found.append(_margin(one.label, unit, start, crossing, reached))
-    return found
-
-
-def _along(
-    system: CompiledSystem, ways: Sequence[tuple[Free, Line]], *, in_balls: bool
-) -> list[Margin | None]:
-    """Return the margins of parameters of one evaluator, None where nothing can grow or depends on it.
-
-    Their lines are looked at in step; `in_balls` is as for `proved_crossing`.
-    """
-    courses = courses_of([line for _, line in ways])
-    present = np.array([line.base[line.column] for _, line in ways])
-    here = courses(np.arange(len(ways)), present)
-    scales = [0.0] * len(ways)
-    points: list[Floats] = []
-    for place, (free, _) in enumerate(ways):
-        own = [(matrix[[place]], slope[[place]]) for matrix, slope in here]
-        points.append(np.empty(0))
-        if all(not slope.any() for _, slope in own):
-            continue
-        scales[place] = abs(present[place]) or reach(own)
-        limit = parameter_of(system, free).maximum
-        top = min(GROWTH * scales[place], np.inf if limit is None else limit)
-        if top > present[place]:
-            start, end = float(present[place]), float(top)
-            points[place], _ = ways[place][1].samples(start, end, float(scales[place]))
-    scans = scan_lines(courses, points, [scale / GROWTH for scale in scales], first=True)
-    found: list[Margin | None] = []
-    for (free, line), start, some, scanned in zip(ways, present.tolist(), points, scans, strict=True):
-        roots = [root for root in scanned.roots if root.rising and root.value > start]
-        crossing = proved_crossing(roots[0], line, scanned, in_balls=in_balls) if roots else None
-        reached = float(scanned.points[-1]) if len(scanned.points) else start
-        unit = parameter_of(system, free).unit
-        found.append(_margin(free.label, unit, start, crossing, reached) if len(some) else None)
-    return found
-
-
-def _apart(
-    system: CompiledSystem, free: Sequence[Free], base: Floats, prepared: Prepared
-) -> tuple[BatchEvaluator | PointEvaluator, list[Line]]:
-    """Return the evaluator of the parameters that aren't 0, and lines on which each that is varies alone.
+def _lines(
+    system: CompiledSystem, free: Sequence[Free], prepared: Prepared, *, slow: bool
+) -> Iterator[MatrixLine | AnalysedLine | None]:
+    """Yield the line of each parameter from its present value on, None where it can't grow.
 
     What a stiffness of 0 leaves free is no relative motion of the scene as it is, but one of every scene in
-    which it varies.
+    which it varies: a parameter of 0 varies by itself.
     """
+    base = np.array([parameter_of(system, one).value for one in free])
     some = [one for one, value in zip(free, base, strict=True) if value]
-    family = evaluator(system, some, prepared=prepared)
-    lines = []
-    for column, one in enumerate(free):
-        if base[column]:
-            lines.append(Line(family, base[base != 0], some.index(one)))
+    together = evaluator(system, some, prepared=prepared) if some and not slow else None
+    for one, present in zip(free, base.tolist(), strict=True):
+        limit = parameter_of(system, one).maximum
+        most = math.inf if limit is None else limit
+        if slow:
+            scale = abs(present) or 1.0
+            top = min(GROWTH * scale, most)
+            line = AnalysedLine(system, one, prepared, present, top, scale)
+            yield line if top > present else None
+            continue
+        if present:
+            assert together is not None, "it is among those that are not 0"
+            whole = MatrixLine(together, base[base != 0], some.index(one), present)
         else:
-            lines.append(Line(evaluator(system, [one], prepared=prepared), np.zeros(1), 0))
-    return family, lines
+            whole = MatrixLine(evaluator(system, [one], prepared=prepared), np.zeros(1), 0, present)
+        top = min(GROWTH * whole.scale, most)
+        yield replace(whole, top=top) if top > present else None
 
 
-def _radius(matrices: Sequence[Floats]) -> float:
-    return max((float(np.abs(np.linalg.eigvals(one)).max(initial=0.0)) for one in matrices), default=0.0)
+def _along(system: CompiledSystem, free: Free, line: MatrixLine | AnalysedLine | None) -> Margin | None:
+    """Return the margin of a parameter, None where it can't grow or nothing depends on it."""
+    if line is None:
+        return None
+    found = search(line, first=True)
+    if not found.enters:
+        return None
+    lost = [one for one in found.edges if one.stable_side == "below"]
+    present, unit = value_now(system, free), parameter_of(system, free).unit
+    return _margin(free.label, unit, present, lost[0] if lost else None, found.scanned[1])
 
 
 def _delay_margin(
@@ -312,16 +218,13 @@ def _delay_margin(
         why = f"{count} orders of events up to {float(end):.4g} s"
         return 0.0, not_looked(system, free, why)
     late = all(free.name != hold.delay for kind in system.kinds for hold in kind.holds)
-    states = max(effort.states, default=0)
-    if states > MOST_DELAYED and not late:
-        return 0.0, not_looked(system, free, f"{states:,} states in each order of events")
+    if effort.largest > MOST_DELAYED and not late:
+        return 0.0, not_looked(system, free, f"{effort.largest:,} states in each order of events")
     cost = effort.of_delay(count, late=late)
     if cost > most:
         return 0.0, not_looked(system, free, IN_PASSING)
     try:
-        found = search_delay(
-            system, free, now, end, prepared, from_stable=True, in_balls=states <= FEW_STATES
-        )
+        found = search(DelayLine(system, free, prepared, now, end), first=True)
     except ApcError as error:
         return cost, not_looked(system, free, error.mistakes[0].what)
     crossing = found.edges[0] if found.edges else None

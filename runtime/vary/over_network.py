@@ -30,10 +30,11 @@ from apc.frame.overrides import Override
 from apc.moments.network import Growth, growth
 from apc.network.nominal import channel_numbers
 from apc.threads import single_threaded
+from apc.vary.crossing import Search, search
 from apc.vary.evaluator import free_parameters
-from apc.vary.growth import BOUNDED, MEAN_SQUARE, FirstLost, allowed, first_lost, growth_at
+from apc.vary.growth import BOUNDED, MEAN_SQUARE, GrowthLine, allowed, growth_at
+from apc.vary.line import SAMPLES
 from apc.vary.margins import GROWTH, NOT_STABLE, Margin, Margins, coupler_parameters, not_looked
-from apc.vary.search import SAMPLES
 from apc.vary.sensitivity import Sensitivities, Sensitivity, varied
 
 PLACE = Place("over the network")
@@ -100,15 +101,16 @@ def network_margins(
             if one.label in unscaled and len(samples) == 1:
                 rows.append(not_looked(system, one, "from 0 nothing says how far"))
                 continue
-            found = first_lost(system, one, samples, prepared, PLACE, here)
+            line = GrowthLine(system, one, prepared, np.array(samples), PLACE, known={samples[0]: here})
+            found = search(line, first=True)
             looked += found.looked
             if not found.enters:
                 continue
             rows.append(_margin(system, one, found))
             if found.why:
                 beyond.setdefault(found.why, []).append(one.label)
-            if found.crossing is not None and found.crossing.proof != BOUNDED[MEAN_SQUARE]:
-                open_sides.append(f"{one.label} ({found.crossing.proof})")
+            if found.edges and found.edges[0].proof != BOUNDED[MEAN_SQUARE]:
+                open_sides.append(f"{one.label} ({found.edges[0].proof})")
     notes += [f"farther of {', '.join(labels)}, {why}" for why, labels in beyond.items()]
     if open_sides:
         notes.append(f"not bounded on either side: {', '.join(open_sides)}")
@@ -162,9 +164,9 @@ def _samples(system: CompiledSystem, free: Free, scales: dict[str, float]) -> li
     return [present, *(float(one) for one in ahead if present < one <= most)]
 
 
-def _margin(system: CompiledSystem, free: Free, found: FirstLost) -> Margin:
+def _margin(system: CompiledSystem, free: Free, found: Search) -> Margin:
     """Return a margin that was found, or how far it was looked for."""
-    present, crossing = value_now(system, free), found.crossing
+    present, crossing = value_now(system, free), found.edges[0] if found.edges else None
     return Margin(
         parameter=free.label,
         unit=unit_of(system, free.name),
@@ -174,7 +176,7 @@ def _margin(system: CompiledSystem, free: Free, found: FirstLost) -> Margin:
         factor=crossing.value / present if crossing is not None and present else None,
         frequency_hz=None,
         kind="" if crossing is None else crossing.kind,
-        scanned=found.reached,
+        scanned=found.scanned[1],
     )
 
 

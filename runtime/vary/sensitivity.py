@@ -2,10 +2,10 @@
 
 Takes: a `CompiledSystem`.
 Gives: `Sensitivity`, `Sensitivities`, `sensitivities`; `varied`.
-Guarantees: the derivative is that of the motion that decides, whatever is rigid left out, with a bound on its
-error; each name can be set as it stands; where several eigenvalues share the radius, one row for each of them
-and no gradient that belongs to none.
-Does not: vary times, or the number of peers.
+Guarantees: the derivative is that of the motion that decides, whatever is rigid left out, to rounding; each
+name can be set as it stands; where several eigenvalues share the radius, one row for each of them and no
+gradient that belongs to none.
+Does not: vary times, or the number of peers; prove a derivative: it decides nothing.
 
 For a simple eigenvalue, M v = λ v and w M = λ w,   dλ = w dM v / (w v),   d|λ| = Re(λ̄ dλ)/|λ|. A cluster of
 equal eigenvalues with a full set of vectors moves as the eigenvalues of W dM V, W V = 1.
@@ -13,26 +13,27 @@ equal eigenvalues with a full set of vectors moves as the eigenvalues of W dM V,
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, prepare, prepare_at_start
+from apc.analysis.analysis import Prepared, lifted_groups, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.timings import part
 from apc.compiler.words import counted
-from apc.eigen.eigenpairs import Eigenpairs, eigenpairs
-from apc.eigen.relative import relative_bounded, relative_coordinates
+from apc.eigen.eigenpairs import eigenpairs
+from apc.eigen.modes import split
+from apc.eigen.spectrum import solve_spectrum
 from apc.finite_equations import finite_equations
 from apc.frame.discretize import UNIT
 from apc.frame.names import Free, parameter_of
 from apc.network.nominal import channel_numbers
 from apc.result import Result
 from apc.threads import single_threaded
+from apc.vary.batch import BatchEvaluator
 from apc.vary.evaluator import PointEvaluator, evaluator, free_parameters
-from apc.vary.slopes import Moved, Slopes, Through, moved_systems
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -47,6 +48,12 @@ CLOSE = 1e-7
 # A cluster of vectors worse conditioned than this has no derivative worth the name.
 WORST = 1e8
 
+# How far, relatively, a parameter is moved to see whether what was left out as rigid stays so.
+BESIDE = 2.0**-10
+
+# Roundings of an entry of a frame's matrix and its derivative, estimated: of some dozen ticks and exponentials.
+ROUNDINGS = 4096
+
 NO_MATRIX = "what moves it most: not looked for: the present values have no frame matrix of their own"
 
 
@@ -54,8 +61,9 @@ NO_MATRIX = "what moves it most: not looked for: the present values have no fram
 class Sensitivity:
     """How one of the eigenvalues that make the spectral radius follows one parameter.
 
-    `derivative` is d|λ|/dp in 1/unit, right to `error`; `relative` is p·d|λ|/dp, the change of the radius for
-    a change of the parameter by its own size. `mode` counts the eigenvalues that share the radius, from 0.
+    `derivative` is d|λ|/dp in 1/unit, `error` what rounding leaves open of it; `relative` is p·d|λ|/dp, the
+    change of the radius for a change of the parameter by its own size. `mode` counts the eigenvalues that
+    share the radius, from 0.
     """
 
     parameter: str
@@ -99,28 +107,70 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
     ------
     ApcError
         As `analysis.lifted_groups`.
+
+    Notes
+    -----
+    What a number of 0 leaves free is rigid in the scene as it is, and no longer where that number varies: it
+    is differentiated by itself.
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         free, prepared = varied(system), prepared or prepare(system)
-        here = np.array([parameter_of(system, one).value for one in free])
-        family = evaluator(system, free, prepared=prepare_at_start(system, prepared) or prepared)
-        if not isinstance(family, PointEvaluator):
-            moved = moved_systems(family, here)
-            if _is_known(moved):
-                return _differentiate(system, free, moved)
-            family = evaluator(system, free, prepared=prepared)  # equations have edges that points step over
-        moved = (
-            _by_points(family, here) if isinstance(family, PointEvaluator) else moved_systems(family, here)
-        )
-        return _differentiate(system, free, moved)
+        start = prepare_at_start(system, prepared) or prepared
+        systems = split(*lifted_groups(system, prepared=start)).systems
+        most = solve_spectrum(systems, in_balls=False).spectral_radius + SHARED
 
+        def clusters_of(together: Sequence[Free]) -> list[_Cluster] | None:
+            found = _clusters(system, together, start)
+            # Equations have edges that points step over.
+            return _clusters(system, together, prepared) if found is None and start is not prepared else found
 
-def _is_known(listed: Sequence[Moved]) -> bool:
-    """Say whether all matrices and their derivatives could be had."""
-    return all(
-        np.isfinite(one.matrix).all() and all(np.isfinite(way.slopes.matrices).all() for way in one.through)
-        for one in listed
+        def frees(together: Sequence[Free]) -> bool:
+            """Say whether something that is rigid in the scene as it is moves where these vary."""
+            return any(np.abs(one.values).max() > most for one in clusters_of(together) or ())
+
+        zero = [one for one in free if not parameter_of(system, one).value]
+        rest = [one for one in free if one not in zero]
+        loose = [one for one in zero if frees([one])]
+        loose += [one for one in rest if frees([one])] if frees(rest) else []
+        listed = [[one for one in rest if one not in loose], *([one] for one in zero if one not in loose)]
+        rows: list[Sensitivity] = []
+        clusters: list[_Cluster] = []
+        notes, untied = [], [one.label for one in loose]
+        for together in listed:
+            found = clusters_of(together)
+            if found is None:
+                return Sensitivities(0.0, (), (), NO_MATRIX)
+            clusters, first = clusters or found, 0
+            for one in found:
+                if not one.condition < WORST:
+                    continue
+                for column, own in enumerate(together):
+                    if one.still[column]:
+                        rows += _rows(system, own, one, column, first)
+                    else:
+                        untied.append(own.label)
+                first += len(one.values)
+    radius = max((float(np.abs(one.values).max()) for one in clusters), default=0.0)
+    if not clusters:
+        return Sensitivities(0.0, (), (), "nothing moves: there is no eigenvalue")
+    if not radius:  # e^(λT) is below every float
+        note = "what moves it most: nothing, as every motion dies out to 0 within a frame"
+        return Sensitivities(0.0, (), (), note)
+    notes += [_defective(one) for one in clusters if not one.condition < WORST]
+    active = tuple(
+        (complex(value), one.name) for one in clusters if one.condition < WORST for value in one.values
     )
+    if len(active) > 1:
+        notes.append(f"{len(active)} eigenvalues share the radius: the largest of their changes decides")
+    if untied:
+        names = dict.fromkeys(untied)
+        are = "are" if len(names) > 1 else "is"
+        notes.append(f"{', '.join(names)} would move what was left out, and {are} not among these")
+    if not rows and not notes:
+        why = "no derivative is finite" if free else "there is no parameter to vary"
+        notes.append(f"what moves it most: not told: {why}")
+    rows.sort(key=lambda row: (-abs(row.relative), row.parameter, row.mode))
+    return Sensitivities(radius, active, tuple(rows), "; ".join(notes))
 
 
 def varied(system: CompiledSystem) -> list[Free]:
@@ -131,234 +181,107 @@ def varied(system: CompiledSystem) -> list[Free]:
     return [one for one in free_parameters(system) if one.name not in kept_out]
 
 
-def _by_points(family: PointEvaluator, here: Floats) -> list[Moved]:
-    """Return what moves how in a scene that is linearized anew at every point: all systems as one."""
-    matrix, error, slopes, slope_errors = family.differences(here)
-    names = [one.name for one in family.closed_at(here.tolist())]
-    name = names[0] if len(names) == 1 else "all systems"
-    unit, exact = np.eye(len(matrix)), np.zeros(matrix.shape)
-    whole = Through(Slopes(np.arange(len(here)), slopes, slope_errors), unit, exact, unit, exact)
-    return [Moved(name, matrix, error, (whole,), np.zeros((len(matrix), 0)))]
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cluster:
+    """Eigenvalues (c,) that are one within rounding, of the closed system of this name.
+
+    `rates` (m, c, c) are W M' V for each of m parameters, W V = 1; `rounding` (m,) is what rounding leaves
+    open of them; `still` (m,) says which leave alone what is rigid. `condition` is that of the vectors.
+    """
+
+    name: str
+    values: Complexes
+    rates: Complexes
+    rounding: Floats
+    still: NDArray[np.bool_]
+    condition: float
 
 
-def _differentiate(system: CompiledSystem, free: Sequence[Free], listed: Sequence[Moved]) -> Sensitivities:
-    if not all(np.isfinite(one.matrix).all() for one in listed):
-        return Sensitivities(0.0, (), (), NO_MATRIX)
-    clusters = [cluster for one in listed for cluster in _clusters(one)]
-    if not clusters:
-        return Sensitivities(0.0, (), (), "nothing moves: there is no eigenvalue")
-    radius = max(float(np.abs(one.values).max()) for one in clusters)
-    if not radius:  # e^(λT) is below every float
-        return Sensitivities(
-            0.0, (), (), "what moves it most: nothing, as every motion dies out to 0 within a frame"
+def _rows(system: CompiledSystem, free: Free, one: _Cluster, column: int, first: int) -> list[Sensitivity]:
+    """Return how the magnitudes of a cluster follow one parameter, the fastest first."""
+    parameter = parameter_of(system, free)
+    moves = np.linalg.eigvals(one.rates[column])
+    growth = np.sort((one.values.conj() * moves).real / np.abs(one.values))[::-1]
+    error = float(one.rounding[column])
+    return [
+        Sensitivity(
+            *(free.label, parameter.unit, parameter.value),
+            *(rate, rate * parameter.value, error, first + number),
         )
-    leading = [
-        one
-        for one in clusters
-        if np.abs(one.values).max() >= radius - SHARED * max(1.0, radius) - np.ptp(np.abs(one.values))
+        for number, rate in enumerate(growth.tolist())
+        if np.isfinite(rate) and np.isfinite(error)
     ]
-    leading.sort(key=lambda one: -float(np.abs(one.values).max()))
-    rows: list[Sensitivity] = []
-    active: list[tuple[complex, str]] = []
-    notes, untied = [], dict[str, None]()
-    for one in leading:
-        try:
-            rates = list(_rates(one, len(free))) if one.condition < WORST else None
-        except np.linalg.LinAlgError:  # nothing tells it from another eigenvalue
-            rates = None
-        if rates is None:
-            notes.append(_defective(one))
-            continue
-        first = len(active)
-        active += [(complex(value), one.moved.name) for value in one.values]
-        rounded = 16 * len(one.moved.matrix) * UNIT * float(np.abs(one.values).max())
-        for number, (growth, doubt) in enumerate(rates):
-            parameter = parameter_of(system, free[number])
-            if growth is None:
-                untied[free[number].label] = None
-                continue
-            # A change by all of the value that is less than the matrix is rounded by can't be told.
-            doubt += rounded / abs(parameter.value) if parameter.value else 0.0
-            rows += [
-                Sensitivity(
-                    free[number].label,
-                    parameter.unit,
-                    parameter.value,
-                    float(rate),
-                    float(rate) * parameter.value,
-                    doubt,
-                    first + k,
-                )
-                for k, rate in enumerate(np.sort(growth)[::-1])
-                if np.isfinite(rate) and np.isfinite(doubt)
-            ]
-    if len(active) > 1:
-        notes.append(f"{len(active)} eigenvalues share the radius: the largest of their changes decides")
-    if untied:
-        are = "are" if len(untied) > 1 else "is"
-        notes.append(f"{', '.join(untied)} would move what was left out, and {are} not among these")
-    if not rows and not notes:
-        why = "no derivative is finite" if free else "there is no parameter to vary"
-        notes.append(f"what moves it most: not told: {why}")
-    rows.sort(key=lambda row: (-abs(row.relative), row.parameter, row.mode))
-    return Sensitivities(radius, tuple(active), tuple(rows), "; ".join(notes))
 
 
 def _defective(one: _Cluster) -> str:
     """Say which eigenvalues have no derivative."""
     size, many = float(np.abs(one.values).max()), len(one.values) > 1
-    what = f"{counted(len(one.values), 'eigenvalue')} of {one.moved.name} at magnitude {size:.6g}"
+    what = f"{counted(len(one.values), 'eigenvalue')} of {one.name} at magnitude {size:.6g}"
     return f"{what} {'share' if many else 'shares'} one motion: there the radius has no derivative"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Cluster:
-    """Eigenvalues (c,) that are one within rounding, of a system without its rigid motions V.
+def _clusters(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) -> list[_Cluster] | None:
+    """Return the eigenvalues that share the spectral radius, of each pair one, the largest first.
 
-    `right` (n, c) and `left` (c, n) are their vectors, W X = 1, over the whole state: right ones up to
-    multiples of V, left ones with W V = 0. `condition` is theirs.
+    None where there is no matrix, or no derivative of it.
     """
+    family = evaluator(system, free, prepared=prepared)
+    here = np.array([parameter_of(system, one).value for one in free])
+    unit = np.eye(len(free))
+    pairs = family.slopes(
+        np.repeat(here[None], max(len(free), 1), axis=0), unit if free else np.zeros((1, 0))
+    )
+    if not all(np.isfinite(matrix).all() and np.isfinite(slopes).all() for matrix, slopes in pairs):
+        return None
+    beside = family.matrices(here + np.diag(BESIDE * np.where(here == 0, 1.0, here))) if free else ()
+    still = np.ones(len(free), dtype=np.bool_)
+    for one in beside:
+        still &= np.isfinite(one).all(axis=(1, 2))
+    found = []
+    for name, (matrix, slopes) in zip(_names(family, len(pairs)), pairs, strict=True):
+        if matrix.shape[1]:
+            found += _of_system(name, matrix[0], slopes[: len(free)], here, still)
+    sizes = [float(np.abs(one.values).max()) for one in found]
+    least = max(sizes, default=0.0) - SHARED * max(1.0, *sizes, 0.0)
+    kept = [one for one, size in zip(found, sizes, strict=True) if size >= least]
+    return sorted(kept, key=lambda one: -float(np.abs(one.values).max()))
 
-    moved: Moved
-    values: Complexes
-    right: Complexes
-    left: Complexes
-    condition: float
+
+def _names(family: BatchEvaluator | PointEvaluator, count: int) -> list[str]:
+    """Return the names of the closed systems; of a scene linearized anew at each point all are one."""
+    if isinstance(family, BatchEvaluator):
+        return [one.name for one in family.closed]
+    return ["all systems"] * count
 
 
-def _clusters(moved: Moved) -> list[_Cluster]:
-    """Return the largest eigenvalues, of each pair one, those that are one within rounding together."""
-    at = relative_coordinates(moved.rigid)
-    held, rest, weights = at.held, at.rest, at.weights
-    matrix, error = relative_bounded(moved.matrix, moved.error, at)
-    if not len(matrix):
-        return []
-    size = error + (8 * len(matrix) * UNIT) * np.abs(matrix)
+def _of_system(
+    name: str, matrix: Floats, slopes: Floats, here: Floats, still: NDArray[np.bool_]
+) -> list[_Cluster]:
+    """Return the largest eigenvalues of a matrix (n, n), and what its slopes (m, n, n) do to them."""
     pairs = eigenpairs(matrix)
-    values = pairs.values
-    largest = float(np.abs(values).max())
-    clusters = []
-    least = largest - SHARED * max(1.0, largest) - 2 * CLOSE * max(largest, CLOSE)
-    seen = (values.imag < 0) | (np.abs(values) < least)
-    for place in np.argsort(-np.abs(values), kind="stable"):
-        if seen[place]:
+    sizes = np.abs(pairs.values)
+    least = sizes.max() - SHARED * max(1.0, sizes.max()) - 2 * CLOSE * max(sizes.max(), CLOSE)
+    left_over = set(np.flatnonzero((pairs.values.imag >= 0) & (sizes >= least)).tolist())
+    found = []
+    for place in np.argsort(-sizes, kind="stable").tolist():
+        if place not in left_over:
             continue
-        near = np.flatnonzero(np.abs(values - values[place]) <= CLOSE * max(abs(values[place]), CLOSE))
-        if len(near) > 1 and _resolved(pairs.at(near), size):
-            near = np.array([place])
-        seen[near] = True
-        rows, columns = pairs.left[near], pairs.right[:, near]
-        product = rows @ columns
-        least = float(np.linalg.svd(product, compute_uv=False)[-1])
-        condition = (
-            float(np.linalg.norm(rows, 2) * np.linalg.norm(columns, 2) / least) if least > 0 else np.inf
-        )
-        rows = np.linalg.solve(product, rows).astype(np.complex128) if condition < WORST else rows
-        whole, covector = np.zeros((2, len(moved.matrix), len(near)), np.complex128)
-        whole[rest], covector[rest], covector[held] = columns, rows.T, -(rows @ weights).T
-        clusters.append(_Cluster(moved, values[near], whole, covector.T, condition))
-    return clusters
-
-
-def _resolved(near: Eigenpairs, size: Floats) -> bool:
-    """Say whether eigenvalues near to one another differ by more than the errors of all of them."""
-    off = near.errors(size)
-    apart = np.abs(near.values[:, None] - near.values) + np.diag(np.full(len(near.values), np.inf))
-    return bool((apart > 4 * (off[:, None] + off)).all())
-
-
-def _rates(one: _Cluster, count: int) -> Iterator[tuple[Floats | None, float]]:
-    """Yield for each of so many parameters how fast the magnitudes (c,) grow with it, and their error.
-
-    None for a parameter that moves a rigid motion: what was left out would be a motion like any other then.
-
-    Notes
-    -----
-    A matrix off by E, its eigenvectors by residuals r and l, turns them by S (E X + r) and (W E + l) S, S the
-    resolvent at λ without the cluster: W dM X changes by W dM S (E X + r) + (W E + l) S dM X, to first order.
-    """
-    moved, w, x = one.moved, one.left, one.right
-    n, c = x.shape
-    slopes = _slopes(one, count)
-    middle = complex(one.values.mean())
-    # The rigid motions are left out as the cluster is: W V = 0.
-    span, dual = np.hstack([x, moved.rigid]), np.vstack([w, moved.rigid.T])
-    bordered = np.block([[middle * np.eye(n) - moved.matrix, span], [dual, np.zeros((len(dual),) * 2)]])
-    own = w @ moved.matrix @ x
-    whole = moved.error + (8 * n * UNIT) * np.abs(moved.matrix)
-    right_off = whole @ np.abs(x) + np.abs(_without(moved.matrix @ x - x @ own, moved.rigid))
-    left_off = np.abs(w) @ whole + np.abs(w @ moved.matrix - own @ w)
-    pushed, pulled = slopes.pushed.reshape(n, -1), np.moveaxis(slopes.pulled, 2, 0).reshape(n, -1)
-    nothing = np.zeros((len(bordered) - n, pushed.shape[1]))
-    turned = np.linalg.solve(bordered, np.vstack([pushed, nothing]))[:n].reshape(n, -1, c)
-    weighed = np.linalg.solve(bordered.T, np.vstack([pulled, nothing]))[:n].reshape(n, -1, c)
-    doubt = slopes.doubt + np.abs(np.moveaxis(weighed, 0, 2)) @ right_off
-    doubt += left_off @ np.abs(np.moveaxis(turned, 0, 1))
-    shift = float((np.abs(w) @ whole @ np.abs(x)).max())
-    scale = float(np.abs(one.values).max())
-    for place, rate in enumerate(slopes.rates):
-        if not slopes.known[place]:
-            yield np.full(c, np.nan), np.nan
-            continue
-        if not slopes.still[place]:
-            yield None, np.nan
-            continue
-        moves = np.linalg.eigvals(rate) if c > 1 else rate[0]
-        growth = (one.values.conj() * moves).real / np.abs(one.values)
-        yield growth, 2 * float(doubt[place].sum()) + 2 * float(np.abs(rate).sum()) * shift / scale
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _ClusterSlopes:
-    """What m parameters do to a cluster: W dM X (m, c, c) and its rounding, dM X (n, m, c), W dM (m, c, n).
-
-    `known` says which derivatives there are, `still` which of them leave the rigid motions alone.
-    """
-
-    rates: Complexes
-    doubt: Floats
-    pushed: Complexes
-    pulled: Complexes
-    known: NDArray[np.bool_]
-    still: NDArray[np.bool_]
-
-
-def _slopes(one: _Cluster, count: int) -> _ClusterSlopes:
-    """Return what each of so many parameters does to a cluster, through the sites it stands in."""
-    moved, w, x, rigid = one.moved, one.left, one.right, one.moved.rigid
-    n, c = x.shape
-    rates, doubt = np.zeros((count, c, c), np.complex128), np.zeros((count, c, c))
-    pushed, pulled = np.zeros((n, count, c), np.complex128), np.zeros((count, c, n), np.complex128)
-    known = np.ones(count, dtype=np.bool_)
-    drift, drift_off = np.zeros((2, count, n, rigid.shape[1]))
-    heavy, large, still = np.abs(w), np.abs(x), np.abs(rigid)
-    for way in moved.through:
-        places, within = way.slopes.places, way.slopes.matrices
-        finite = np.asarray(np.isfinite(within).all(axis=(1, 2)))
-        known[places] &= finite
-        within = np.where(finite[:, None, None], within, 0.0)
-        size = np.abs(within)
-        off = np.where(finite[:, None, None], way.slopes.errors, 0.0)
-        off = off + 4 * (sum(within.shape[1:]) + 2) * UNIT * size
-        out, into = np.abs(way.outward), np.abs(way.inward)
-        out_off = way.outward_error + 4 * (n + 2) * UNIT * out
-        into_off = way.inward_error + 4 * (n + 2) * UNIT * into
-        heard, felt = way.inward @ x, w @ way.outward
-        ahead, behind = within @ heard, felt @ within
-        rates[places] += felt @ ahead
-        pushed[:, places] += np.moveaxis(way.outward @ ahead, 0, 1)
-        pulled[places] += behind @ way.inward
-        felt_size, heard_size = np.abs(felt), np.abs(heard)
-        doubt[places] += felt_size @ (off @ heard_size + size @ (into_off @ large))
-        doubt[places] += (heavy @ out_off) @ (size @ heard_size)
-        if rigid.shape[1]:
-            along = into @ still
-            drift[places] += way.outward @ (within @ (way.inward @ rigid))
-            drift_off[places] += out @ (off @ along + size @ (into_off @ still)) + out_off @ (size @ along)
-    stays = np.asarray((np.abs(drift) <= drift_off).all(axis=(1, 2)))
-    return _ClusterSlopes(rates, doubt, pushed, pulled, known, stays)
-
-
-def _without(vectors: Complexes, rigid: Floats) -> Complexes:
-    """Return what of vectors is no rigid motion (of orthonormal ones)."""
-    return vectors - rigid @ (rigid.T @ vectors)
+        value = pairs.values[place]
+        near = np.flatnonzero(np.abs(pairs.values - value) <= CLOSE * max(abs(value), CLOSE))
+        left_over -= set(near.tolist())
+        own = pairs.at(near)
+        product = own.left @ own.right
+        size = float(np.linalg.svd(product, compute_uv=False)[-1])
+        norms = float(np.linalg.norm(own.left, 2) * np.linalg.norm(own.right, 2))
+        condition = norms / size if size > 0 else np.inf
+        rates, rounding = np.zeros((len(slopes), len(near), len(near)), np.complex128), np.zeros(len(slopes))
+        if condition < WORST:
+            left = np.linalg.solve(product, own.left)
+            rates = left @ slopes @ own.right
+            rounded = ROUNDINGS * len(matrix) * UNIT
+            felt = np.abs(left) @ np.abs(slopes) @ np.abs(own.right)
+            # A change by all of the value that is less than the matrix is rounded by can't be told.
+            told = np.divide(float(sizes.max()), np.abs(here), out=np.zeros(len(here)), where=here != 0)
+            rounding = rounded * (condition * felt.max(axis=(1, 2), initial=0.0) + told)
+        found.append(_Cluster(name, own.values, rates, rounding, still, condition))
+    return found

@@ -1,0 +1,434 @@
+"""Where the verdict of a scene changes as one of its numbers varies, held between two verdicts.
+
+Takes: a `Line`, a scene along one of its numbers.
+Gives: `Verdict`, `Crossing`, `Stretch`, `Line`, `Search`; `search`.
+Guarantees: on either side of a crossing, by its error, the scene's own analysis gives another verdict; where
+it gives none, the crossing is called an estimate. A jump is at an exact value.
+Does not: prove that there are no others between two values that were looked at.
+
+A line comes in stretches, on each of which the eigenvalues follow the value continuously: of a stiffness one,
+of a delay one from each coincidence of events to the next, of a number of peers one each. Within a stretch a
+crossing lies between two values of different sides; between two stretches it is a jump.
+
+Between two samples an eigenvalue follows the cubic through its values and slopes at both; half of what the
+tangents of the two ends miss each other by half-way stands for what the cubic doesn't know.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from apc.compiler.errors import ApcError
+from apc.compiler.words import counted
+from apc.eigen.spectrum import Mode
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+# Is told, in words, how far a search is.
+Told = Callable[[str], None]
+
+# A magnitude nearer to 1 than this tells no side: far above the rounding of a few dozen states.
+UNSURE = 1e-11
+
+# Cells narrower than this, relative to the value, are divided no further; where the points to begin with are
+# nearer to one another, not those narrower than this share of what is between them.
+CELL, SHARE = 1e-3, 1 / 16
+
+# A cell is divided into so many parts; cells at a time and levels: what follows the circle would be sampled
+# for ever.
+PARTS, MOST_OPEN, MOST_LEVELS = 8, 64, 12
+
+# Places at which a cubic is looked at.
+PLACES = 9
+
+# Half the bracket first tried, relative to the value; where it decides nothing the next is so much wider.
+HALF, WIDER, TRIES = 1e-13, 16.0, 12
+
+# Steps of Newton's method.
+NEWTON = 12
+
+# A bracket that took more than two tries is halved until it is as wide as the second.
+HARDLY = WIDER
+
+# A bracket this wide, relative to the value, with one verdict on both sides has no crossing.
+NOWHERE = 1e-6
+
+# After so many values at which nothing changes, nothing depends on a number whose every value takes long.
+STILL = 4
+
+# What is said of a crossing that no bounds hold.
+ESTIMATE = "estimated in floats"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The verdict at one value: `stable` is None where it is open; `error` bounds the radius's."""
+
+    stable: bool | None
+    radius: float
+    error: float
+    modes: Sequence[Mode]
+    proof: str
+
+    @property
+    def frequency_hz(self) -> float:
+        """The frequency of the largest mode, NaN where there is none."""
+        return self.modes[0].frequency_hz if len(self.modes) else math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Crossing:
+    """A value at which the spectral radius crosses 1, right to `error`, both in SI.
+
+    `stable_side` is "below" or "above"; `frequency_hz` is that of the motion that grows beside it; `kind` is
+    "crossing", or "jump" where a packet comes a tick later or events change places, or "count" where it is
+    the number of peers on the stable side of a change from one number to the next; `proof` says how the value
+    is known.
+    """
+
+    value: float
+    error: float
+    stable_side: str
+    frequency_hz: float
+    kind: str
+    proof: str
+
+    @property
+    def boundary(self) -> float:
+        """Where the verdict changes: of a number of peers, between it and the next."""
+        if self.kind != "count":
+            return self.value
+        return self.value + (0.5 if self.stable_side == "below" else -0.5)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretch:
+    """Values from `low` to `high` along which the eigenvalues are continuous, to the ends from within.
+
+    `points` (k,) are those to begin with, cells are measured against `least` where the value is smaller.
+    `look` gives eigenvalues (k, n) and their slopes (k, n) at values (k,), NaN where there are none; `judge`
+    the analysis at a value. With `slow` each value takes long.
+    """
+
+    low: Fraction
+    high: Fraction
+    points: Floats
+    least: float
+    look: Callable[[Floats], tuple[Complexes, Complexes]]
+    judge: Callable[[Fraction], Verdict]
+    slow: bool = False
+
+
+class Line(Protocol):
+    """A scene along one of its numbers, named by `label`."""
+
+    @property
+    def label(self) -> str:
+        """The number that varies."""
+
+    def stretches(self) -> Iterator[Stretch]:
+        """Yield the stretches in order."""
+
+    def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
+        """Return the crossing between two stretches, the first stable or the second."""
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """All crossings of one parameter in an interval, with what lies between them.
+
+    `edges` are the crossings in order, and `stable` says of each stretch between them, one more than there
+    are crossings, whether it is stable; it is empty when no sample has a side. `looked` values were looked
+    at; `whole` is False where an eigenvalue kept so near to the circle that not every cell could be cleared;
+    `enters` says whether any eigenvalue changed; `sided` whether each value to begin with, but those next to
+    0, lies on a side; `left_open` are the stretches that no analysis decides; `why` says why the search
+    ended before its end.
+    """
+
+    edges: tuple[Crossing, ...]
+    stable: tuple[bool, ...]
+    scanned: tuple[float, float]
+    whole: bool
+    looked: int
+    enters: bool
+    sided: bool
+    left_open: tuple[tuple[float, float], ...] = ()
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Samples:
+    """Points in order (k,) with the eigenvalues there (k, n) and their slopes (k, n)."""
+
+    points: Floats
+    values: Complexes
+    slopes: Complexes
+
+    @property
+    def growth(self) -> Floats:
+        """The logarithm of the spectral radius (k,)."""
+        return np.asarray(np.log(np.abs(self.values).max(axis=1, initial=1e-300)))
+
+    def chosen(self, which: NDArray[np.bool_]) -> _Samples:
+        return _Samples(self.points[which], self.values[which], self.slopes[which])
+
+    def merged(self, other: _Samples) -> _Samples:
+        """Return both together; rows of fewer states are filled up with zeros, which decide nothing."""
+        wide = max(self.values.shape[1], other.values.shape[1])
+
+        def both(one: Complexes, more: Complexes) -> Complexes:
+            rows = [np.pad(part, ((0, 0), (0, wide - part.shape[1]))) for part in (one, more)]
+            return np.concatenate(rows)
+
+        points = np.concatenate([self.points, other.points])
+        order = np.argsort(points, kind="stable")
+        values, slopes = both(self.values, other.values), both(self.slopes, other.slopes)
+        return _Samples(points[order], values[order], slopes[order])
+
+
+def search(line: Line, *, first: bool = False, told: Told | None = None) -> Search:
+    """Find the crossings of a line.
+
+    Parameters
+    ----------
+    line
+        The scene along one of its numbers.
+    first
+        Go no further than where stability is first lost; a value that can't be judged ends the search
+        then.
+    told
+        Is told how far the search is.
+    """
+    edges: list[Crossing] = []
+    stable: list[bool] = []
+    left_open: list[tuple[float, float]] = []
+    ends: list[float] = []
+    looked, whole, enters, sided, why = 0, True, False, True, ""
+    before: Stretch | None = None
+    for number, stretch in enumerate(line.stretches()):
+        samples, cleared, why = _scanned(stretch, first=first)
+        looked, whole = looked + len(samples.points), whole and cleared
+        if told:
+            told(f"looking at {counted(looked, 'value')} of {line.label}")
+        if len(stretch.points) > 1 and len(samples.points):
+            ends += samples.points[[0, -1]].tolist()
+        else:
+            ends += [float(stretch.low), float(stretch.high)]
+        enters |= number > 0 or bool(
+            np.nan_to_num(samples.slopes).any() or (samples.values != samples.values[:1]).any()
+        )
+        missing = ~np.isin(stretch.points, samples.points) & (np.abs(stretch.points) > stretch.least)
+        sided &= not missing[1:-1].any()
+        if not len(samples.points):
+            if stretch.high > stretch.low:
+                whole = False
+                left_open.append((float(stretch.low), float(stretch.high)))
+            continue
+        side = (samples.growth < 0).tolist()
+        if stable and stable[-1] != side[0]:
+            assert before is not None, "a side comes of a stretch"
+            edges.append(line.change(before, stretch, stable_below=stable[-1]))
+        if not stable or stable[-1] != side[0]:
+            stable.append(side[0])
+        for place in range(len(side) - 1):
+            if side[place] != side[place + 1]:
+                found = _crossing(
+                    stretch,
+                    samples.points[place : place + 2].tolist(),
+                    samples.growth[place : place + 2].tolist(),
+                    rising=side[place],
+                )
+                if found is not None:
+                    edges.append(found)
+                    stable.append(side[place + 1])
+        before = stretch
+        if why or (first and any(one.stable_side == "below" for one in edges)):
+            break
+    scanned = (ends[0], ends[-1]) if ends else (math.nan, math.nan)
+    return Search(
+        *(tuple(edges), tuple(stable), scanned, whole, looked, enters, sided, tuple(left_open)), why=why
+    )
+
+
+def _scanned(stretch: Stretch, *, first: bool) -> tuple[_Samples, bool, str]:
+    """Return the samples of a stretch that have a side, those cells divided in which a crossing might hide.
+
+    Also, whether every cell was cleared, and why the stretch was left before its end.
+    """
+    samples, why = _begun(stretch, first=first)
+    samples = _sided(samples)
+    new = np.ones(len(samples.points), dtype=bool)
+    spacing = np.diff(stretch.points, append=np.inf)
+    for _ in range(MOST_LEVELS):
+        low, high = samples.points[:-1], samples.points[1:]
+        place = np.searchsorted(stretch.points[:-1], low, side="right") - 1
+        size = np.maximum(np.maximum(np.abs(low), np.abs(high)), stretch.least)
+        cells = (new[:-1] | new[1:]) & (high - low > np.minimum(CELL * size, SHARE * spacing[place]))
+        if first:
+            rising = np.flatnonzero((samples.growth[:-1] < 0) & (samples.growth[1:] > 0))
+            cells[rising[0] + 1 if len(rising) else len(cells) :] = False
+        cells[cells] = _may_hide(samples, np.flatnonzero(cells))
+        if not cells.any():
+            return samples, True, why
+        if cells.sum() > MOST_OPEN:
+            break
+        share = np.arange(1, PARTS) / PARTS
+        between = (low[cells, None] + (high - low)[cells, None] * share).ravel()
+        more = _sided(_sampled(stretch, between), ends=False)
+        samples = samples.merged(more)
+        new = np.isin(samples.points, more.points)
+    return samples, False, why
+
+
+def _begun(stretch: Stretch, *, first: bool) -> tuple[_Samples, str]:
+    """Return the samples at the points to begin with, as far as is wanted, and why no further."""
+    if not (first and stretch.slow):
+        return _sampled(stretch, stretch.points), ""
+    samples = _sampled(stretch, stretch.points[:1])
+    for point in stretch.points[1:]:
+        try:
+            samples = samples.merged(_sampled(stretch, np.array([point])))
+        except ApcError as error:
+            return samples, error.mistakes[0].what
+        growth = samples.growth
+        if growth[-1] >= 0 > growth[0] or (len(growth) == STILL and np.ptp(growth) == 0):
+            break
+    return samples, ""
+
+
+def _sampled(stretch: Stretch, points: Floats) -> _Samples:
+    """Return the samples at points that have eigenvalues."""
+    values, slopes = stretch.look(points)
+    known = np.isfinite(values).all(axis=1)
+    return _Samples(points[known], values[known], slopes[known])
+
+
+def _sided(samples: _Samples, *, ends: bool = True) -> _Samples:
+    """Return the samples that lie on a side of the circle; the first and last, too, as they are beside it.
+
+    There an eigenvalue on the circle is moved as it goes just inside the line: as where a stiffness
+    vanishes, and sets free what it holds.
+    """
+    values = samples.values
+    sure = np.abs(np.abs(values).max(axis=1, initial=0.0) - 1) > UNSURE
+    if ends and len(sure) > 1 and not sure[[0, -1]].all():
+        values = values.copy()
+        for place, way in ((0, 1), (-1, -1)):
+            if sure[place]:
+                continue
+            on = np.abs(np.abs(values[place]) - 1) <= UNSURE
+            leaving = way * np.sign((values[place].conj() * samples.slopes[place]).real)
+            if leaving[on].all() and np.isfinite(leaving[on]).all():
+                values[place][on] *= 1 + 2 * UNSURE * leaving[on]
+                sure[place] = True
+    return _Samples(samples.points, values, samples.slopes).chosen(sure)
+
+
+def _may_hide(samples: _Samples, cells: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Say of the cells that begin at these samples whether another crossing than the ends show may hide."""
+    shares = np.linspace(0, 1, PLACES)[:, None]
+    found = np.zeros(len(cells), dtype=bool)
+    for number, place in enumerate(cells):
+        width = samples.points[place + 1] - samples.points[place]
+        (value, end), (slope, end_slope) = (
+            samples.values[place : place + 2],
+            samples.slopes[place : place + 2],
+        )
+        slope, end_slope = slope * width, end_slope * width
+        if not (np.isfinite(slope).all() and np.isfinite(end_slope).all()):
+            continue
+        miss = np.abs((value + slope / 2)[:, None] - (end - end_slope / 2))
+        partner, doubt = miss.argmin(axis=1), miss.min(axis=1) / 2
+        path = _cubic(shares, value, end[partner], slope, end_slope[partner])
+        size = np.abs(path)
+        most, least = size.max(axis=0) + doubt, size.min(axis=0) - doubt
+        if (most < 1).all() or (least > 1).any():
+            continue
+        changes = np.abs(np.diff((size > 1).astype(np.int8), axis=0)).sum(axis=0)
+        through = (changes == 1) & (doubt < np.abs(size[-1] - size[0]))
+        touches = (most >= 1) & (least <= 1) & ~through
+        found[number] = touches.any() or (through & (value.imag >= 0)).sum() > 1
+    return found
+
+
+def _cubic(t: Floats, start: Complexes, end: Complexes, slope: Complexes, end_slope: Complexes) -> Complexes:
+    """Return the cubics with these values and slopes at 0 and 1 (n,) at shares (k, 1)."""
+    straight = (1 + 2 * t) * (1 - t) ** 2 * start + t**2 * (3 - 2 * t) * end
+    return np.asarray(straight + t * (1 - t) ** 2 * slope + t**2 * (t - 1) * end_slope)
+
+
+def _crossing(
+    stretch: Stretch, ends: Sequence[float], growth: Sequence[float], *, rising: bool
+) -> Crossing | None:
+    """Close in on the crossing between two values, and hold it; None where both sides are judged alike.
+
+    `growth` are the logarithms of the spectral radius at the ends.
+    """
+    low, high = ends
+    value = _root(stretch, ends, growth)
+    side = "below" if rising else "above"
+    width = HALF * (abs(value) or high - low)
+    for _ in range(TRIES):
+        left, right = max(value - width, low), min(value + width, high)
+        below, above = stretch.judge(Fraction(left)), stretch.judge(Fraction(right))
+        if None not in (below.stable, above.stable):
+            if below.stable == rising != above.stable:
+                return _held(stretch, (left, right), (below, above), side)
+            if below.stable == above.stable and width > NOWHERE * abs(value):
+                return None
+        if (left, right) == (low, high):
+            break
+        width *= WIDER
+    frequency = (above if rising else below).frequency_hz
+    return Crossing(value, min(width, high - low), side, frequency, "crossing", ESTIMATE)
+
+
+def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float]) -> float:
+    """Return where floats see the largest magnitude pass 1: by Newton's method, or else by Brent's."""
+
+    def at(value: float) -> tuple[float, float]:
+        found = _sampled(stretch, np.array([value]))
+        if not len(found.points):
+            return 0.0, math.nan  # no matrix: what is beside it is judged
+        largest = np.argmax(np.abs(found.values[0]))
+        rate = found.slopes[0, largest] / found.values[0, largest]
+        return float(found.growth[0]), float(rate.real)
+
+    (low, high), (at_low, at_high) = ends, growth
+    value = low + (high - low) * at_low / (at_low - at_high)
+    for _ in range(NEWTON):
+        height, rate = at(value)
+        new = value - height / rate if rate else math.nan
+        if not low <= new <= high:
+            break
+        if abs(new - value) <= HALF * abs(new):
+            return new
+        value = new
+    if at(low)[0] * at(high)[0] >= 0:  # an end lies on the circle as far as floats know
+        return min(low, high, key=lambda end: abs(at(end)[0]))
+    return float(brentq(lambda value: at(value)[0], low, high, xtol=5e-324, rtol=1e-15))
+
+
+def _held(stretch: Stretch, ends: tuple[float, float], sides: tuple[Verdict, Verdict], side: str) -> Crossing:
+    """Return the crossing between two values of other verdicts, halved as long as analyses decide."""
+    (left, right), (below, above) = ends, sides
+    while right - left > HARDLY * 2 * HALF * abs(right):
+        middle = (left + right) / 2
+        found = stretch.judge(Fraction(middle))
+        if found.stable is None or middle in (left, right):
+            break
+        left, below, right, above = (
+            (middle, found, right, above) if found.stable == below.stable else (left, below, middle, found)
+        )
+    grows = above if below.stable else below
+    proof = grows.proof or "bounded in floats"
+    return Crossing((left + right) / 2, (right - left) / 2, side, grows.frequency_hz, "crossing", proof)

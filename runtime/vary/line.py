@@ -1,0 +1,407 @@
+"""A scene along one of its numbers: its eigenvalues at many values, and its analysis at any.
+
+Takes: a `CompiledSystem`, what was prepared of it, and the number that varies.
+Gives: `MatrixLine`, `DelayLine`, `CountLine`; `spread`, `SPAN`, `SAMPLES`.
+Guarantees: `judge` is the scene's own analysis; `look` its matrices in floats.
+Does not: search (see `crossing`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import cached_property, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import Analysis, Prepared, analyze, lifted_groups
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Place
+from apc.eigen.closing import ClosedSystem
+from apc.eigen.eigenpairs import eigenvalues
+from apc.eigen.modes import split
+from apc.eigen.spectrum import DRIFTS, Spectrum, solve_spectrum
+from apc.frame.names import Free
+from apc.frame.overrides import Override, apply
+from apc.vary.batch import BatchEvaluator, Evaluator
+from apc.vary.crossing import ESTIMATE, UNSURE, Crossing, Stretch, Verdict
+from apc.vary.delays import (
+    INSIDE,
+    Piece,
+    borders,
+    delay_now,
+    delay_pieces,
+    system_with_delay,
+)
+from apc.vary.lags import LateStretch, late_stretches
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+PLACE = Place("critical value")
+
+# Without limits given, values from SPAN times smaller to SPAN times larger than the scale are looked at: the
+# present value or, where that is 0, the change that would move an eigenvalue by 1 if it went on as it starts.
+SPAN = 1e3
+
+# Values in each factor of 10 to begin with: neighbours differ by half; at least so many in a range, so that a
+# narrow one is looked at closely. Of a piece of a delay.
+SAMPLES, FEWEST, PIECE_SAMPLES = 6, 17, 3
+
+# How far inside a piece of a delay, relative to its length, it is analysed in the place of its end, but for
+# the order of events that coincide there.
+BESIDE = Fraction(1, 10**6)
+
+# What is said of a jump, and of one among stretches that were left open; of a change between two counts.
+EVENTS = "events coincide there"
+BETWEEN = "analysed on either side; the verdict between them is left open"
+JUDGED = "both judged"
+
+# Counts from the lowest on are each looked at, so many of them; then each is so many times the one before.
+EVERY, FURTHER = 32, 1.25
+
+
+def judged(systems: Sequence[ClosedSystem]) -> Verdict:
+    """Return the verdict of closed systems; what drifts does so on both sides of a crossing."""
+    found = solve_spectrum(systems, verdict_only=True)
+    return _verdict(found, found.stable if found.verdict != DRIFTS else True)
+
+
+def analysed(system: CompiledSystem, prepared: Prepared) -> Verdict:
+    """Return the verdict of a scene, open where it drifts or can't be analysed."""
+    try:
+        found = analyze(system, prepared=prepared)
+    except ApcError:
+        return Verdict(None, math.nan, math.inf, (), "")
+    return _verdict(found, found.stable if found.verdict != DRIFTS else None)
+
+
+def _verdict(found: Spectrum | Analysis, stable: bool | None) -> Verdict:
+    return Verdict(stable, found.spectral_radius, found.spectral_radius_error, found.modes, found.proof)
+
+
+def sided(stable: bool | None) -> Verdict:
+    """Return a verdict of which only the side is known."""
+    return Verdict(stable, 0.5 if stable else 2.0, 0.0, (), "")
+
+
+def _inside(stretch: Piece | LateStretch) -> Fraction:
+    """Return a value within a stretch at which nothing coincides by accident."""
+    return stretch.low + INSIDE * (stretch.high - stretch.low)
+
+
+def spread(bottom: float, top: float, scale: float) -> Floats:
+    """Return values from bottom to top, in even ratios on either side of 0."""
+
+    def ratios(low: float, high: float) -> Floats:
+        least = max(low, min(scale, high) / SPAN)
+        count = max(FEWEST, math.ceil(SAMPLES * math.log10(high / least)) + 1) if high > least else 1
+        return np.geomspace(least, high, count)
+
+    parts = [np.array([bottom, top])]
+    if bottom < 0:
+        parts.append(-ratios(max(-top, 0.0), -bottom))
+    if bottom < 0 < top:
+        parts.append(np.zeros(1))
+    if top > 0:
+        parts.append(ratios(max(bottom, 0.0), top))
+    return np.unique(np.concatenate(parts))
+
+
+@dataclass(frozen=True, eq=False)
+class MatrixLine:
+    """One of an evaluator's free parameters varies, the others stay at `base` (m,): a line of one stretch.
+
+    `bottom` and `top` are its ends, None for those of `SPAN`.
+    """
+
+    family: Evaluator
+    base: Floats
+    column: int
+    bottom: float | None = None
+    top: float | None = None
+
+    @property
+    def label(self) -> str:
+        """The number that varies."""
+        return self.family.free[self.column].label
+
+    def point(self, value: float) -> Floats:
+        """Return the point (m,) of a value."""
+        found = self.base.copy()
+        found[self.column] = value
+        return found
+
+    def look(self, values: Floats) -> tuple[Complexes, Complexes]:
+        """Return the eigenvalues of all systems (k, n) and their slopes at values (k,)."""
+        return matrix_look(self.family, np.array([self.point(value) for value in values]), self.column)
+
+    def judge(self, value: Fraction) -> Verdict:
+        """Return the verdict at a value."""
+        return judged(self.family.closed_at(self.point(float(value)).tolist()))
+
+    @cached_property
+    def scale(self) -> float:
+        """The present value or, where it is 0, the change that would move some eigenvalue by 1."""
+        present = abs(float(self.base[self.column]))
+        if present:
+            return present
+        fastest = float(np.nanmax(np.abs(self.look(np.zeros(1))[1]), initial=0.0))
+        return 1 / fastest if fastest > 0 else 1.0
+
+    def stretches(self) -> Iterator[Stretch]:
+        """Yield the one stretch."""
+        bottom = self.bottom
+        if bottom is None:
+            bottom = -SPAN * self.scale if self.base[self.column] < 0 else 0.0
+        top = self.top if self.top is not None else max(SPAN * self.scale, bottom + self.scale)
+        points = spread(bottom, top, self.scale)
+        yield Stretch(Fraction(bottom), Fraction(top), points, self.scale / SPAN, self.look, self.judge)
+
+    def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
+        """There is one stretch."""
+        raise AssertionError("a line of one stretch has no jump")
+
+
+def matrix_look(family: Evaluator, points: Floats, column: int) -> tuple[Complexes, Complexes]:
+    """Return the eigenvalues of all systems at points (k, m), and their slopes along one of the numbers.
+
+    Returns
+    -------
+    Both (k, n), NaN where a point has no matrix.
+    """
+    along = np.zeros_like(points)
+    along[:, column] = 1.0
+    found = [np.empty((2, len(points), 0), np.complex128)]
+    for matrix, slope in family.slopes(points, along):
+        known = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(slope).all(axis=(1, 2))
+        both = np.full((2, len(points), matrix.shape[1]), np.nan, np.complex128)
+        both[:, known] = eigenvalues(matrix[known], slope[known])
+        found.append(both)
+    values, slopes = np.concatenate(found, axis=2)
+    return values, slopes
+
+
+def _one_by_one(judge: Callable[[Fraction], Verdict], values: Floats) -> tuple[Complexes, Complexes]:
+    """Return the radius at each value (k, 1) as if it were an eigenvalue, without a slope.
+
+    One nearer to the circle than floats can tell has the side that was proved; an open verdict has none.
+    """
+    radii = []
+    for one in (judge(Fraction(value)) for value in values.tolist()):
+        beside = abs(one.radius - 1) <= 2 * UNSURE
+        nearest = 1 - 2 * UNSURE if one.stable else 1 + 2 * UNSURE
+        radii.append(math.nan if one.stable is None else nearest if beside else one.radius)
+    found = np.array(radii, dtype=np.complex128)[:, None]
+    return found, np.full(found.shape, np.nan, np.complex128)
+
+
+@dataclass(frozen=True, eq=False)
+class AnalysedLine:
+    """A parameter of a scene whose matrices are too large for many of them: each value is analysed."""
+
+    system: CompiledSystem
+    free: Free
+    prepared: Prepared
+    bottom: float
+    top: float
+    scale: float
+    known: dict[Fraction, Verdict] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """The number that varies."""
+        return self.free.label
+
+    def judge(self, value: Fraction) -> Verdict:
+        """Return the verdict at a value."""
+        if value not in self.known:
+            changed = apply(self.system, [Override(self.free, value)])
+            self.known[value] = analysed(changed, self.prepared)
+        return self.known[value]
+
+    def stretches(self) -> Iterator[Stretch]:
+        """Yield the one stretch."""
+        points = spread(self.bottom, self.top, self.scale)
+        look = partial(_one_by_one, self.judge)
+        yield Stretch(
+            *(Fraction(self.bottom), Fraction(self.top), points, self.scale / SPAN, look, self.judge),
+            slow=True,
+        )
+
+    def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
+        """There is one stretch."""
+        raise AssertionError("a line of one stretch has no jump")
+
+
+@dataclass(frozen=True, eq=False)
+class DelayLine:
+    """A delay from `low` to `high`: between two coincidences of events what decides is continuous.
+
+    What happens exactly at `low` is a stretch of its own: events may coincide there.
+    """
+
+    system: CompiledSystem
+    free: Free
+    prepared: Prepared
+    low: Fraction
+    high: Fraction
+    told: Callable[[Fraction], None] | None = None
+    known: dict[Fraction, Verdict] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """The delay that varies."""
+        return self.free.label
+
+    def judge(self, value: Fraction) -> Verdict:
+        """Return the verdict at a delay."""
+        if value not in self.known:
+            changed = system_with_delay(self.system, self.free, value)
+            self.known[value] = analysed(changed, self.prepared)
+        return self.known[value]
+
+    def _judge_within(self, value: Fraction) -> Verdict:
+        """Return the verdict at a delay that moves events, of all systems without anything beside."""
+        changed = system_with_delay(self.system, self.free, value)
+        return judged(split(*lifted_groups(changed, prepared=self.prepared)).systems)
+
+    def stretches(self) -> Iterator[Stretch]:
+        """Yield the value at which the line begins, then the stretches from one coincidence to the next."""
+        yield self._constant(self.low, self.low, self.low)
+        late = self._late()
+        if late is not None:
+            for place, one in enumerate(late):
+                # A count in floats is believed where its neighbours agree; else an analysis decides.
+                sides = {other.stable for other in late[max(place - 1, 0) : place + 2]}
+                self._tell(one.high)
+                counted = one.stable if len(sides) == 1 else None
+                yield self._constant(one.low, one.high, _inside(one), counted=counted)
+            return
+        for piece in delay_pieces(
+            self.system, self.free, self.low, self.prepared, place=PLACE, high=self.high
+        ):
+            self._tell(piece.high)
+            if piece.evaluator is None:
+                yield self._constant(piece.low, piece.high, _inside(piece))
+            else:
+                yield self._moving(piece, piece.evaluator)
+
+    def _late(self) -> Sequence[LateStretch] | None:
+        """Return, of a delay of packets only, whether each stretch is stable; else None."""
+        following = borders(self.system, self.free, place=PLACE)
+        return late_stretches(self.system, self.free, self.low, self.high, self.prepared, following)
+
+    def _tell(self, high: Fraction) -> None:
+        if self.told:
+            self.told(min(high, self.high))
+
+    def _constant(
+        self, low: Fraction, high: Fraction, inside: Fraction, *, counted: bool | None = None
+    ) -> Stretch:
+        """Return a stretch within which nothing depends on the delay: one value stands for all."""
+
+        def judge(_: Fraction) -> Verdict:
+            return self.judge(inside) if counted is None else sided(counted)
+
+        point, high = np.array([float(low)]), min(high, self.high)
+        return Stretch(low, high, point, float(high - low), partial(_one_by_one, judge), judge)
+
+    def _moving(self, piece: Piece, family: BatchEvaluator) -> Stretch:
+        """Return a stretch in which events move with the delay."""
+        high = min(piece.high, self.high)
+        points = np.linspace(float(piece.low), float(high), PIECE_SAMPLES)
+
+        def look(values: Floats) -> tuple[Complexes, Complexes]:
+            return matrix_look(family, values[:, None], 0)
+
+        return Stretch(piece.low, high, points, float(high - piece.low), look, self._judge_within)
+
+    def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
+        """Return a jump, exact where analyses just inside both stretches hold it there.
+
+        Where stretches between the two were left open, it lies anywhere in these.
+        """
+        value, error = (before.high + after.low) / 2, (after.low - before.high) / 2
+        below = self.judge(before.high - BESIDE * (before.high - before.low))
+        above = self.judge(after.low + BESIDE * (after.high - after.low))
+        proof = BETWEEN if error else EVENTS
+        if not (below.stable is stable_below and above.stable is (not stable_below)):
+            error, proof = max(error, after.high - after.low), ESTIMATE
+        grows = above if stable_below else below
+        side = "below" if stable_below else "above"
+        return Crossing(float(value), float(error), side, grows.frequency_hz, "jump", proof)
+
+
+def delay_reach(
+    system: CompiledSystem, free: Free, low: Fraction, *, pieces: int, further: float
+) -> tuple[Fraction, int]:
+    """Return how far a delay is looked at where nobody says, and over how many pieces that is.
+
+    Parameters
+    ----------
+    system, free
+        The compiled scene, and what varies.
+    low
+        From which value.
+    pieces, further
+        Over so many pieces at least, and up to so many times the present value.
+    """
+    following = borders(system, free, place=PLACE)
+    most = Fraction(further) * delay_now(system, free)
+    at, count = low, 0
+    while count < pieces or at < most:
+        at, count = following(at), count + 1
+    return at, count
+
+
+@dataclass(frozen=True, eq=False)
+class CountLine:
+    """A number of peers from `first` to `last`: a stretch each, the larger ones looked at less densely."""
+
+    system: CompiledSystem
+    free: Free
+    verdict_of: Callable[[CompiledSystem], bool | None]
+    first: int
+    last: int
+    known: dict[Fraction, Verdict] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """The count that varies."""
+        return self.free.label
+
+    def judge(self, value: Fraction) -> Verdict:
+        """Return the verdict of so many peers."""
+        if value not in self.known:
+            stable = self.verdict_of(apply(self.system, [Override(self.free, value)]))
+            self.known[value] = sided(stable)
+        return self.known[value]
+
+    def stretches(self) -> Iterator[Stretch]:
+        """Yield the counts that are looked at to begin with, in order."""
+        look = partial(_one_by_one, self.judge)
+        count = self.first
+        while True:
+            at = Fraction(count)
+            yield Stretch(at, at, np.array([float(count)]), 0.0, look, self.judge, slow=True)
+            if count >= self.last:
+                return
+            step = math.floor(count * FURTHER) if count >= self.first + EVERY else 0
+            count = max(count + 1, min(self.last, step))
+
+    def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
+        """Return the two neighbouring counts between which the verdict changes, by halving."""
+        below, above = int(before.high), int(after.low)
+        while above - below > 1:
+            middle = (below + above) // 2
+            stable = self.judge(Fraction(middle)).stable
+            if stable is None:
+                break
+            below, above = (middle, above) if stable == stable_below else (below, middle)
+        side, value = ("below", below) if stable_below else ("above", above)
+        proof = JUDGED if above - below == 1 else f"{above - below - 1} between are left open"
+        return Crossing(float(value), 0.0, side, math.nan, "count", proof)
