@@ -76,6 +76,9 @@ MOST_RESOLVED = 4096
 # system that is worth one.
 KEPT, KEPT_ON, MOST_STATES = 64, 8, 120
 
+# Loops of a scene, as of a ring's eigenvalues, beyond which each point is analysed by itself.
+MOST_LOOPS = 128
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Varied:
@@ -345,7 +348,7 @@ def _family(of: Asked, times: tuple[int, ...], given: tuple[Override, ...]) -> _
                 return None
             exchange = build_exchange(there, numbers.timings)
             plan = make_plan(there, shared.jacobians, shared.schedules, numbers, exchange)
-            if not plan.loops or plan.ring or plan.method == "determinant":
+            if not plan.loops or len(plan.loops) > MOST_LOOPS or plan.method == "determinant":
                 return None
             if max(loop.states for loop in plan.loops) > MOST_STATES:
                 return None

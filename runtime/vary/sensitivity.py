@@ -51,7 +51,7 @@ WORST = 1e8
 # How far, relatively, a parameter is moved to see whether what was left out as rigid stays so.
 BESIDE = 2.0**-10
 
-# Roundings of an entry of a frame's matrix and its derivative, estimated: of some dozen ticks and exponentials.
+# Roundings of an entry of a frame's matrix and of its derivative, estimated.
 ROUNDINGS = 4096
 
 NO_MATRIX = "what moves it most: not looked for: the present values have no frame matrix of their own"
@@ -205,8 +205,13 @@ def _rows(system: CompiledSystem, free: Free, one: _Cluster, column: int, first:
     error = float(one.rounding[column])
     return [
         Sensitivity(
-            *(free.label, parameter.unit, parameter.value),
-            *(rate, rate * parameter.value, error, first + number),
+            parameter=free.label,
+            unit=parameter.unit,
+            value=parameter.value,
+            derivative=rate,
+            relative=rate * parameter.value,
+            error=error,
+            mode=first + number,
         )
         for number, rate in enumerate(growth.tolist())
         if np.isfinite(rate) and np.isfinite(error)
