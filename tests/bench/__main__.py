@@ -1,5 +1,4 @@
-"""Every figure by one command: `python -m tests.bench` writes README.md beside it, and what the project's
-README.md shows, its pictures too.
+"""Every figure by one command: `python -m tests.bench` writes README.md beside it.
 
 The page begins with one table of what other programs take for the same work, from the rows that the parts
 print (`tests.bench.judge`): nothing in it is typed, and a part that isn't run keeps its rows.
@@ -62,7 +61,6 @@ TITLES = {
     "sweep": "Sweeps",
 }
 PARTS = (
-    Part("readme", "Pictures and blocks of the README", ("tests.bench.readme",), timed=False),
     Part("process", "Whole processes", ("tests.bench.process",)),
     _bench("bench", "Speed against error on the paper's scene", AVERAGE),
     _bench("hard", "Hard cases", "--hard", "tests/hard"),

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from apc.benchmark.timing import spread_of, waited
-from tests.bench.growing import SCENES, equations, flat, kinds, lossy, ring, row, table
+from tests.bench.growing import SCENES, equations, flat, kinds, lossy, ring, table
 from tests.bench.judge import Judge, parser_of
 
 RUNS = 7
@@ -41,7 +41,6 @@ COMMANDS: tuple[tuple[str, str, float | None], ...] = (
 Growing = tuple[str, tuple[int, ...], Callable[[int, Path], str], str, tuple[int, float, float] | None]
 GROWTH: tuple[Growing, ...] = (
     ("equations", (10, 30, 100, 300, 1000), equations, "analyze scene.apc", (1000, 1.0, 3.0)),
-    ("masses in a row", (4, 12, 40, 120, 400), row, "analyze scene.apc", (400, 2.0, 3.0)),
     ("kinds", (1, 2, 4, 8, 16, 32, 100), kinds, "analyze scene.apc", (32, 0.1, 0.1)),
     ("equal peers", (3, 3000, 1_000_000), flat, "analyze scene.apc", None),
     ("peers in a ring", (1000, 10_000, 100_000), ring, "analyze scene.apc", None),

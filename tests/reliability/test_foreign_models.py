@@ -386,17 +386,6 @@ def test_what_is_no_model_is_refused_and_beside_its_topology_passed_over(
     assert not unchanged(capsys)
 
 
-def test_a_changed_member_is_refused_by_its_name_and_stands_for_no_topology(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    members = members_of(written("paper"))
-    SCENE.write_text(AVERAGE, encoding="utf-8")
-    for name in members:
-        MODEL.write_bytes(zipped({**members, name: members[name] + b" "}))
-        assert outcome() in ("refused", honest("paper")), name
-        assert not unchanged(capsys)
-
-
 def test_another_version_of_the_format_is_refused_by_number() -> None:
     members = members_of(written("paper"))
     (name,) = documents(members)

@@ -6,14 +6,12 @@ import ast
 import importlib
 import importlib.util
 import math
-import re
 from pathlib import Path
 
 import pytest
 
-from tests.bench.__main__ import HERE, PARTS
+from tests.bench.__main__ import HERE
 from tests.bench.judge import NOISE, Judge
-from tests.bench.readme import BLOCK, ERROR, PAGES, ROOT, pictures, printed, whole
 
 
 def _code(judge: Judge) -> int:
@@ -50,32 +48,3 @@ def test_what_a_benchmark_imports_of_the_program_is_there(path: Path) -> None:
 def _module(package: str | None, name: str) -> bool:
     """Say whether a name is that of a module of a package."""
     return importlib.util.find_spec(f"{package}.{name}") is not None
-
-
-def test_a_quick_run_is_of_the_same_program() -> None:
-    for part in PARTS:
-        assert part.command(True)[0] == part.command(False)[0]
-        assert part.words[0] == "apc" or importlib.util.find_spec(part.words[0])
-
-
-def test_every_picture_of_the_pages_is_drawn_by_a_command_that_stands_there() -> None:
-    text = whole()
-    shown = list(dict.fromkeys(re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)))
-    found = pictures(text)
-    assert shown
-    assert list(found) == shown
-    assert {words[1] for words in found.values()} == {"region", "simulate", "compare", "-m"}
-    for picture, words in found.items():
-        assert words[-1] == picture
-        assert all((ROOT / word).is_file() for word in words if word.endswith(".yaml"))
-    assert {path.name for path in (ROOT / "models" / "figures").iterdir()} == {
-        Path(picture).name for picture in shown
-    }
-
-
-def test_every_printed_block_of_the_pages_has_a_maker_that_prints_it() -> None:
-    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
-    assert len(BLOCK.findall(text)) == text.count("```text\n") > 0
-    for words, block in BLOCK.findall(text):
-        if words == ERROR:  # the commands are run by the tests of the README
-            assert printed(words, text) == block

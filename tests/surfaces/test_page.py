@@ -7,7 +7,6 @@ import gzip
 import http.client
 import json
 import logging
-import re
 import socket
 import subprocess
 import sys
@@ -170,15 +169,6 @@ def test_a_section_that_a_scene_has_nothing_for_says_so(tmp_path: Path) -> None:
     assert "unstable" in why and "--" not in why  # a page has no command line
 
 
-@pytest.mark.whole
-def test_loss_and_jitter_are_the_critical_ones(tmp_path: Path) -> None:
-    system = compiled(LOSSY.replace(", jitter: 1 ms", ""), tmp_path)
-    found = compute(model_bytes(system), Task("network", ())).found
-    assert found is not None
-    assert str(apc.judge_network(system)) in found["text"]
-    assert str(apc.critical(system, "lan.loss")) in found["text"]
-
-
 def test_a_struck_device_moves_as_its_equation_says(tmp_path: Path) -> None:
     """m v' = −b v from v(0) = 0.1 m/s: x = v m/b (1 − e^(−b t/m))."""
     text = "topology: one\npeers: {user: {count: 1}}\nmasses: {device: {mass: 2 kg, damping: 3 N*s/m}}\n"
@@ -289,13 +279,6 @@ def test_a_value_is_written_where_it_stands(label: str, value: str, line: str, t
     assert "# a copy at each peer" in text
 
 
-def test_a_number_of_one_group_is_written_there() -> None:
-    path = SCENES / "experiment-average.yaml"
-    system = apc.compile(path)
-    text = with_values(path.read_text("utf-8"), system, {Free("hand.force", "left"): "3 N"})
-    assert re.search(r"left:.*hand\.force: 3 N", text)
-
-
 # What can't be.
 
 
@@ -372,20 +355,6 @@ def test_a_slider_that_is_moved_changes_region_and_verdict_to_what_the_api_says(
     second.radius(apc.analyze(system).spectral_radius)
     assert second.press("lan.delay", "Tab", 1) == "8 ms"
     second.check(link)
-
-
-@pytest.mark.whole
-def test_a_motion_is_played_stopped_and_taken_to_any_time(tab: Tab, link: str) -> None:
-    tab.page.wait_for_function(f"{MODEL}('motion-words').text.includes('is struck')")
-    assert tab.press("time", "End", 1) == "1.000 s"
-    tab.press("time", "Home", 1)
-    tab.page.get_by_role("button", name="Play").click()
-    tab.page.wait_for_function(f"{MODEL}('time').value > 5")
-    tab.page.get_by_role("button", name="Pause").click()
-    at = tab.page.evaluate(f"{MODEL}('time').value")
-    tab.page.wait_for_timeout(300)
-    assert tab.page.evaluate(f"{MODEL}('time').value") == at
-    tab.check(link)
 
 
 @pytest.mark.whole

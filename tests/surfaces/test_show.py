@@ -170,18 +170,6 @@ def test_the_packets_on_their_way_are_counted(
     assert link["age_s"] == [pytest.approx(age[0] / 1e3), pytest.approx(age[1] / 1e3)]
 
 
-def test_the_document_holds_what_the_text_tells(tmp_path: Path) -> None:
-    document = json.loads(apc.show(FILE, format="json"))
-    (kind,) = document["kinds"]
-    assert len(kind["equations"]) == len(kind["unknowns"]) == 18
-    assert kind["states"] == ["device.x", "device.v", "cube.x", "cube.v"]
-    assert [p["clock"] for p in kind["partitions"]] == ["continuous", "haptic"]
-    assert {c["clock"]: c["ticks"] for c in document["schedule"]["clocks"]} == {"haptic": 8, "network": 1}
-    names = [part["name"] for part in document["graph"]["parts"]]
-    assert names == ["device", "cube", "contact", "coordination"]
-    assert "  No clock ticks: everything is continuous." in shown(ONE_MASS, "text", tmp_path).splitlines()
-
-
 FURTHEST = """\
 component: Furthest
 about: Pulls by tanh of each distance.
@@ -208,14 +196,6 @@ def test_what_costs_a_pair_is_said(cli: Cli) -> None:
         "runs over is not linear in what the others send over lan",
         " ".join(ran.out.split()),
     )
-
-
-def test_graphviz_text_has_every_node_once_and_closes_every_quote() -> None:
-    text = apc.show(FILE, format="dot")
-    assert text.startswith('digraph "three-users-average" {\n') and text.endswith("\n}")
-    for name in ("device", "cube", "contact", "coordination"):
-        assert len(re.findall(rf'^ *"{name}" \[', text, re.MULTILINE)) == 1
-    assert all(len(re.findall(r'(?<!\\)"', line)) % 2 == 0 for line in text.splitlines())
 
 
 @pytest.mark.parametrize(

@@ -6,14 +6,13 @@ import os
 import signal
 import socket
 from collections.abc import Iterator
-from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from apc import processes
-from apc.compiler.errors import ApcError, Place
+from apc.compiler.errors import ApcError
 from apc.processes import Patience
 from apc.sweeps import cluster as sweep_cluster
 from apc.sweeps import work as sweep_work
@@ -149,20 +148,6 @@ def test_a_cluster_lost_on_the_way_keeps_what_is_finished(
     with pytest.raises(ApcError, match="E888 the connection to the cluster is lost"):
         sweep(MODEL, OVER, out=target, cluster=lost.scheduler_address, progress=lose)
     assert len(parts(target)) >= 1
-
-
-@pytest.mark.parametrize(
-    ("error", "message"),
-    [
-        (CancelledError(), "the connection to the cluster is lost"),
-        (distributed.KilledWorker("part", None, 3), "several workers of the cluster died on the same part"),
-        (ModuleNotFoundError("No module named 'apc'"), "the workers of the cluster can't load apc"),
-        (RuntimeError("Error during deserialization of the task graph"), "can't load apc"),
-        (AssertionError("ours"), "None"),  # a bug of ours is no trouble of the cluster
-    ],
-)
-def test_what_a_cluster_may_suffer_is_told(error: Exception, message: str) -> None:
-    assert message in str(sweep_cluster._trouble(error, Place("tcp://host:1")))
 
 
 def test_a_frozen_worker_is_waited_for_aloud_and_only_so_long(monkeypatch: pytest.MonkeyPatch) -> None:

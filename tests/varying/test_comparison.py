@@ -6,7 +6,6 @@ import csv
 import json
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import casadi
 import numpy as np
@@ -198,11 +197,6 @@ def test_two_numbers_a_packet_go_to_everybody_who_hears_them(
     assert (effort.sent, effort.sent_by_all) == pytest.approx((2 * 125 * busiest, 2 * 125 * arcs), rel=1e-14)
 
 
-def test_a_scene_without_ticks_costs_nothing() -> None:
-    effort = scheme(ONE_MASS).effort
-    assert (effort.operations, effort.clock, effort.sent, effort.sent_by_all) == (0, "", 0, 0)
-
-
 # ---- which stiffness, delay and loss ----
 
 
@@ -245,13 +239,6 @@ def test_a_name_that_is_missing_or_serves_no_scene_is_told(
     assert str(caught.value).startswith(message)
 
 
-def test_a_name_serves_the_scenes_that_have_it() -> None:
-    found = apc.compare([compiled(TWO_SPRINGS), compiled(MESH)], over=["leash.stiffness"])
-    assert [one.stiffness.parameter for one in found.schemes if one.stiffness] == [
-        *("leash.stiffness", "coordination.stiffness")
-    ]
-
-
 # ---- what is said ----
 
 
@@ -287,14 +274,6 @@ def test_schemes_that_differ_in_more_than_their_coupling_are_told_of_and_what_is
     assert str(found).splitlines()[1].startswith("  of a link that is, or becomes, unreliable: ")
 
 
-def test_a_line_fits_a_terminal_whatever_names_are_used() -> None:
-    name = "a-scene-with-a-very-long-name-that-fills-most-of-a-line-by-itself"
-    text = replaced(AVERAGE, ("three-users-average", name))
-    for old in ("coordination", "lan"):
-        text = text.replace(old, f"{old}_of_{'long' * 10}")
-    assert max(len(line) for line in str(compared(text, SHAKING)).splitlines()) <= 80
-
-
 # ---- the command ----
 
 
@@ -304,25 +283,6 @@ def scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     Path("average.yaml").write_text(AVERAGE, encoding="utf-8")
     Path("mesh.yaml").write_text(MESH, encoding="utf-8")
     return ["average.yaml", "mesh.yaml"]
-
-
-def test_json_holds_each_part_as_the_json_of_its_command_with_the_same_settings(
-    scenes: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    def document(*words: str) -> Any:
-        assert run([*words, "--json"]) == 0
-        return json.loads(capsys.readouterr().out)
-
-    told = document("compare", *scenes)["schemes"]
-    assert [one["topology"] for one in told] == ["three-users-average", "three-users-mesh"]
-    assert document("critical", "coordination.stiffness", scenes[0]) == told[0]["stiffness"]
-    assert document("critical", "lan.delay", scenes[0]) == told[0]["delay"]
-    felt = document("feel", scenes[0], "--frequencies", "1 Hz, 10 Hz")
-    assert felt["impedance"] == told[0]["feel"]["impedance"]
-    words = ("--set", "contact.stiffness=900 N/m", "--hands", "clamped")
-    told = document("compare", *scenes, *words)["schemes"]
-    for file, one in zip(scenes, told, strict=True):
-        assert document("analyze", file, *words)["spectral_radius"] == one["analysis"]["spectral_radius"]
 
 
 def test_a_table_has_a_row_a_scheme_and_a_picture_is_the_same_each_time(scenes: list[str]) -> None:
@@ -361,12 +321,3 @@ def test_what_is_at_fault_is_told_as_everywhere(
     assert run(["compare", *(word.replace("_", " ") for word in words.split())]) == code
     told = capsys.readouterr()
     assert told.out == "" and message in told.err
-
-
-def test_the_function_does_what_the_command_does(
-    scenes: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    found = apc.compare(scenes, set={"lan.delay": "16 ms"}, over=["contact.stiffness"])
-    assert run(["compare", *scenes, "--set", "lan.delay=16 ms", "--over", "contact.stiffness"]) == 0
-    assert capsys.readouterr().out.rstrip("\n") == str(found)
-    assert found.to_dataframe()["stiffness parameter"].tolist() == ["contact.stiffness"] * 2

@@ -159,13 +159,6 @@ def test_a_range_or_list_gives_exact_values(text: str, values: list[Fraction]) -
     assert found.column("it.stiffness [N/m]").tolist() == [float(one) for one in values]
 
 
-def test_equal_ratios_have_the_ends_given_and_short_decimals_between() -> None:
-    found = apc.sweep(WALL, {"couplers.it.stiffness": "10 N/m:3000 N/m:7:log"}, jobs=1)
-    values = found.column("it.stiffness [N/m]")
-    assert (values[0], values[-1]) == (10, 3000)
-    assert values[1:] / values[:-1] == pytest.approx([300 ** (1 / 6)] * 6, rel=1e-14)
-
-
 FORM = "--over contact.stiffness='100 N/m:3000 N/m:30'"
 RANGE = "E881 the range of contact.stiffness wants "
 MANY = "E883 a sweep wants at most 10,000,000 points, got "
