@@ -123,7 +123,7 @@ def _looked_into(system: CompiledSystem, found: Analysis) -> list[str]:
         return []  # a motion that grows with t² leaves an eigenvalue 1, which the reference takes for a translation
     try:
         told = sensitivities_of(system, prepare(system), found)
-        return [check_sensitivities(system, told), check_frequencies(system, found)]
+        return [check_sensitivities(system, told), check_frequencies(found)]
     except Exception as error:  # whatever it is, it is a bug
         return [repr(error)]
 

@@ -74,19 +74,6 @@ def test_what_a_scene_says_is_no_markup_in_a_notebook() -> None:
     assert "<b>" not in model._repr_html_() and "&lt;b&gt;" in model._repr_html_()
 
 
-def test_figures_are_drawn_into_axes_of_ones_own() -> None:
-    figure = pytest.importorskip("matplotlib.figure").Figure()
-    first, second, third, fourth = figure.subplots(2, 2).ravel()
-    model = compiled(AVERAGE)
-    axes = ("contact.stiffness=0 N/m:3000 N/m", "coordination.stiffness=0 N/m:900 N/m")
-    assert apc.analyze(model).plot(ax=first) is first
-    assert apc.region(model, x=axes[0], y=axes[1]).plot(ax=second) is second
-    assert apc.feel(model, [1.0, 10.0, 20.0]).plot(ax=third) is figure
-    run = apc.simulate(model, set={"device.v": "0.1 m/s"}, duration="20 ms", signals=["*.x"], jit=False)
-    assert run.plot(ax=fourth) is figure
-    assert all(ax.lines for ax in (first, second, third, fourth))
-
-
 def test_without_matplotlib_a_notebook_shows_the_text(monkeypatch: pytest.MonkeyPatch) -> None:
     found = apc.analyze(compiled(AVERAGE))
     monkeypatch.setattr("importlib.import_module", _without_matplotlib)

@@ -145,20 +145,6 @@ def test_sections_tell_what_the_api_tells(tmp_path: Path) -> None:
     assert np.array_equal(feel["magnitude"], np.abs(felt.impedance))
 
 
-@pytest.mark.parametrize("label", ["coordination.stiffness", "user.count"])
-def test_the_roots_of_a_slider_are_the_eigenvalues_of_analyses(label: str, tmp_path: Path) -> None:
-    system = compiled(AVERAGE, tmp_path)
-    slider = named(sliders_of(system), label)
-    found = compute(model_bytes(system), Task("roots", (), (slider.free, slider.values))).found
-    assert found is not None and found["slider"] == label
-    for text in (slider.texts[0], slider.texts[-1]):
-        roots = (found["real"] + 1j * found["imag"])[np.array(found["name"]) == text]
-        modes = apc.analyze(system, set={label: text}).modes
-        leading = [one.eigenvalue for one in modes if one.magnitude > 1e-2]
-        for one in leading:
-            assert np.abs(roots - one).min() < 1e-9
-
-
 def test_a_section_that_a_scene_has_nothing_for_says_so(tmp_path: Path) -> None:
     model = model_bytes(compiled(AVERAGE, tmp_path))
     told = compute(model, Task("network", ()))
@@ -228,30 +214,6 @@ def test_an_old_answer_never_takes_the_place_of_a_newer_one() -> None:
     desk.forget("b")
     held.finish(3)
     assert len(shown) == 3
-
-
-def test_what_comes_later_waits_for_the_first_desk_but_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A slider that is moved without a stop keeps the first desk busy; the other gets its turn."""
-    now, timers = [100.0], []
-    monkeypatch.setattr("apc.explore.desk.time.monotonic", lambda: now[0])
-
-    def later(call: Callable[[], None], seconds: float) -> None:
-        timers.append((seconds, call)) if seconds else call()
-
-    held = Held(), Held()
-    quick, slow = (Desk(b"", (name,), later, lambda section, told: None) for name in "ab")
-    for desk, workers in zip((quick, slow), held, strict=True):
-        desk.workers = Workers(workers.submit, 1, lambda _: None)
-    quick.put_before(slow)
-    for number in range(3):
-        quick.ask(Task("a", (), number))
-        slow.ask(Task("b", (), number))
-    seconds, look = timers[-1]
-    look()
-    assert len(held[1].asked) == 0
-    now[0] += seconds
-    look()
-    assert [task.asked for task, _ in held[1].asked] == [2]
 
 
 # The topology with other values.

@@ -285,7 +285,7 @@ def scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ["average.yaml", "mesh.yaml"]
 
 
-def test_a_table_has_a_row_a_scheme_and_a_picture_is_the_same_each_time(scenes: list[str]) -> None:
+def test_a_table_has_a_row_a_scheme(scenes: list[str]) -> None:
     assert run(["compare", *scenes, "--out", "out.csv"]) == 0
     with Path("out.csv").open(encoding="utf-8") as file:
         row = list(csv.DictReader(file))[1]
@@ -293,13 +293,6 @@ def test_a_table_has_a_row_a_scheme_and_a_picture_is_the_same_each_time(scenes: 
     assert row["delay parameter"] == "lan.delay"
     felt = [float(row[f"impedance at 10 Hz {part} [N*s/m]"]) for part in ("real", "imaginary")]
     assert complex(*felt) == pytest.approx(complex(apc.feel(compiled(MESH), 10.0).impedance[0]), rel=1e-12)
-    pytest.importorskip("matplotlib")
-    for name in ("one.svg", "two.svg"):
-        assert run(["compare", *scenes, "--out", name]) == 0
-    assert Path("one.svg").read_bytes() == Path("two.svg").read_bytes()
-    texts = [text.get_text() for ax in compared(AVERAGE, MESH).plot().axes for text in ax.texts]
-    assert texts[:7] == ["0.9572", "0.9926", "0.715", "4.207", "1096", "548.2", "> 64"]
-    assert texts[8:10] == ["–", "–"]
 
 
 @pytest.mark.parametrize(

@@ -358,19 +358,6 @@ def test_the_frequency_is_that_of_the_motion_that_decides() -> None:
     assert [one.frequency_hz for one in found.crossings] == pytest.approx([500], rel=1e-9)
 
 
-def test_delays_of_a_scene_with_contact_are_those_of_the_springs_it_starts_with() -> None:
-    """Pressed at the start, a contact that only pushes is a spring; let go, it is none."""
-    springs, contacts = (
-        apc.critical(compiled(text), "contact.delay", upper="4 ms") for text in (AVERAGE, PRESSED)
-    )
-    assert contacts.value == pytest.approx(springs.value, abs=springs.error + contacts.error)
-    assert contacts.left_out and not springs.left_out
-    loose = compiled(replaced(PRESSED, ("device.x: -10 mm", "device.x: -30 mm")))
-    assert apc.critical(loose, "contact.delay", upper="4 ms").crossings == ()
-    rows = {one.parameter: one.value for one in apc.margins(compiled(PRESSED)).rows}
-    assert rows["contact.delay"] == pytest.approx(springs.value, rel=1e-12)
-
-
 # ---- what is said ----
 
 

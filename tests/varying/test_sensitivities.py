@@ -113,19 +113,6 @@ def test_a_row_says_what_setting_its_name_does(name: str, every: int) -> None:
     assert changed(shipped(name), every) == ""
 
 
-@pytest.mark.parametrize("name", ["cube.mass", "coordination.stiffness", "coordination.damping"])
-def test_what_is_linearized_where_it_starts_is_differentiated_as_closely_as_what_is_linear(name: str) -> None:
-    system = shipped("experiment-average")
-    row = next(one for one in apc.sensitivities(system).rows if one.parameter == name)
-    step = 1e-4 * row.value
-    low, high = (
-        apc.analyze(system, set={name: f"{Fraction(row.value + side * step)} {row.unit}"}).spectral_radius
-        for side in (-1, 1)
-    )
-    # Off by step²/6 of the third derivative, some 1e-8, and by the roundings of ρ over the step.
-    assert row.derivative == pytest.approx((high - low) / (2 * step), rel=1e-5)
-
-
 def test_a_scene_linearized_within_its_limits_is_the_linear_one() -> None:
     """Inside of its limits a saturated mesh is a mesh."""
     text = replaced(GROUPS, ("AveragePosition", "FullMesh"))
