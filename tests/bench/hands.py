@@ -4,7 +4,7 @@ For two, three and five users of the paper's scene: the stiffness of the coordin
 hands, with devices clamped and with every passive hand; the viscosity that the network adds to each copy; how
 far copies are apart a newton of a slow push. The mesh is taken at equal stiffness (dashed) and, as circles,
 at equal effective gain, where it must be the average. Then times: a passive verdict, a thousand frequencies,
-three users and a million; a hundred frequencies of a thousand users who all differ.
+three users and a million.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from apc.present.pictures import COLOURS, write_figure
 from apc.present.region_picture import PANEL
 from tests.bench.by_hand import Floats
 from tests.bench.judge import Judge, Timed, judged, parser_of
-from tests.populations import different
 from tests.topologies import AVERAGE, MESH, compiled, replaced
 
 PEERS = (2, 3, 5)
@@ -41,7 +40,6 @@ KNOWN = {
 NEAR = 2e-5  # what two digits behind the point leave open
 # Seconds: a verdict, a response of so many frequencies; a million users may take so many times what three do.
 VERDICT_S, RESPONSE_S, FREQUENCIES, MILLION = 0.020, 0.050, 1000, 1.5
-DIFFERENT, SOME, DIFFERENT_S = 1000, 100, 6.0  # users who all differ, frequencies, seconds
 Curves = Mapping[
     tuple[str, str], list[float]
 ]  # by the scheme and what is said of it, a value for each of PEERS
@@ -104,9 +102,6 @@ def times(judge: Judge, quick: bool) -> None:
             rows.append(Timed(f"apc, {peers:,} users", median_time(call, 3 if quick else 9)[0]))
         judge.table(what, rows, most_s=most_s)
         judge.in_time(f"{what}: a million users beside three", rows[1].seconds / rows[0].seconds, MILLION)
-    system = different(100 if quick else DIFFERENT)
-    taken, _ = median_time(response(system, np.geomspace(0.1, 60, SOME)), 1 if quick else 3)
-    judge.table(f"{SOME} frequencies felt, users who all differ", [Timed("apc", taken)], most_s=DIFFERENT_S)
 
 
 def picture(curves: Curves) -> Any:

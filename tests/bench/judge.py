@@ -80,21 +80,6 @@ class Judge:
         self.missed.append(f"{what}: {value:.3g}, target {most:.3g}")
         return "missed"
 
-    def beside(self, work: str, ours: tuple[float, str], other: str, theirs: tuple[float, str]) -> None:
-        """Take down what another program takes for the same work.
-
-        Parameters
-        ----------
-        work
-            That both do.
-        ours, theirs
-            The seconds, and the error in words with its unit where it has one.
-        other
-            The other program.
-        """
-        cells = (work, time_of(ours[0]), ours[1], other, time_of(theirs[0]), theirs[1])
-        self.rows.append(f"{ROW}{' | '.join(cells)} | {ours[0] / theirs[0]:.3g} |")
-
     def table(
         self,
         work: str,
@@ -136,8 +121,9 @@ class Judge:
                 )
             print(" ".join(words))
             if not one.program.startswith("apc"):
-                theirs = one.seconds, one.told(unit)
-                self.beside(work, (ours.seconds, ours.told(unit)), one.program, theirs)
+                cells = [work, time_of(ours.seconds), ours.told(unit), one.program, time_of(one.seconds)]
+                cells += [one.told(unit), f"{ours.seconds / one.seconds:.3g}"]
+                self.rows.append(f"{ROW}{' | '.join(cells)} |")
 
     @property
     def code(self) -> int:

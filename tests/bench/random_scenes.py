@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import random
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -128,9 +127,7 @@ def _looked_into(system: CompiledSystem, found: Analysis) -> list[str]:
         return [repr(error)]
 
 
-def run(
-    points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws: int = DRAWS, every: int = 0
-) -> Tally:
+def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws: int = DRAWS) -> Tally:
     """Analyse so many random scenes by each method.
 
     Parameters
@@ -143,16 +140,12 @@ def run(
         See `analysis.analyze`.
     draws
         Of numbers for each structure.
-    every
-        Scenes from one running tally on the other stream to the next, 0 for none.
     """
     generator, tally = random.Random(seed), Tally()
     with single_threaded(), precision(BITS), own_library() as library:
         for number in range(points):
             if number % draws == 0:
                 shape = draw_shape(generator)
-            if every and number and number % every == 0:
-                print(f"{number:,} of {points:,}: {tally}", file=sys.stderr, flush=True)
             text = shape.text
             try:
                 plain = compiled(text, library)
@@ -199,15 +192,14 @@ def _analysed(system: CompiledSystem, method: str, due: str, look: bool, tally: 
 
 
 def main() -> None:
-    """Print what came out, and every scene that is wrong; so far, on the way, on the other stream."""
+    """Print what came out, and every scene that is wrong."""
     parser = parser_of("random_scenes", __doc__)
     parser.add_argument("--count", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--methods", default="auto", help="auto,dense,determinant,krylov")
-    parser.add_argument("--every", type=int, default=0, help="scenes from one running tally to the next")
+    parser.add_argument("--methods", default="auto", help="auto,dense,determinant")
     with judged(parser) as (judge, given):
         count = 200 if given.quick else given.count
-        tally = run(count, seed=given.seed, methods=given.methods.split(","), every=given.every)
+        tally = run(count, seed=given.seed, methods=given.methods.split(","))
         print(tally)
         for one in tally.wrong:
             judge.right(one, holds=False)

@@ -87,14 +87,6 @@ def test_a_push_between_two_ticks_is_no_rest() -> None:
     assert pushed.chosen.error < 1e-12
 
 
-@pytest.mark.usefixtures("played_exactly")
-def test_what_rests_is_moved_by_its_own_scale() -> None:
-    wide = replaced(PUSHED, ("{count: 1}", "{count: 2, set: {device.x: [20 mm, 30 mm]}}"))
-    still = compiled(replaced(wide, ("9 N/m", "0 N/m")))
-    [note] = bench_simulation(still, Fraction(1, 50), rounds=1).notes
-    assert "device.x of its first peer starts 0.03 m" in note
-
-
 @pytest.mark.whole
 def test_a_method_that_cannot_serve_is_left_out_and_says_why() -> None:
     text = replaced(

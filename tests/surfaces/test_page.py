@@ -320,26 +320,6 @@ def test_a_slider_that_is_moved_changes_region_and_verdict_to_what_the_api_says(
 
 
 @pytest.mark.whole
-def test_a_click_in_the_region_sets_both_sliders(tab: Tab, link: str) -> None:
-    tab.page.wait_for_function(f"{MODEL}('region-words').text.includes('Stable in')")
-    inner = tab.page.evaluate(
-        f"""(() => {{
-          window.scrollTo(0, 0)
-          const view = Bokeh.index.get_one({MODEL}('region-plot'))
-          const box = view.canvas_view.el.getBoundingClientRect(), frame = view.frame.bbox
-          return [box.x + frame.x + 0.8 * frame.width, box.y + frame.y + 0.4 * frame.height]
-        }})()"""
-    )
-    tab.page.mouse.click(*inner)
-    names = ("contact.stiffness", "coordination.stiffness")
-    tab.page.wait_for_function(f"{[*names]}.every(name => location.search.includes(name))")
-    chosen = parse_qs(tab.page.evaluate("location.search.slice(1)"))
-    x, y = (float(chosen[name][0].split()[0]) for name in names)
-    assert x == pytest.approx(0.8 * 5000, abs=50) and y == pytest.approx(0.6 * 1500, abs=15)
-    tab.check(link)
-
-
-@pytest.mark.whole
 def test_topology_and_numbers_are_downloaded_with_the_values(tab: Tab, link: str, tmp_path: Path) -> None:
     text = tab.press("device.damping", "PageUp", 3).replace("·", "*")
     found = {}
@@ -525,6 +505,14 @@ def says(page: Page, model: Any, value: Any) -> None:
         assert record.getMessage().startswith("a message of the page was ignored: ValueError(")
 
 
+def tapped(page: Page, x: Any, y: Any) -> None:
+    """Have the browser say that the region was clicked."""
+    values = [["model", {"id": page.region.plot.id}], ["x", x], ["y", y]]
+    tap = {"type": "event", "name": "tap", "values": {"type": "map", "entries": values}}
+    told = {"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": tap}
+    page.document.apply_json_patch({"events": [told]})
+
+
 def test_what_the_browser_can_t_say_changes_nothing(page: Page) -> None:
     models = [*page.handles, *page.selects, page.begins, page.meant, page.at]
     before = [one.value for one in models]
@@ -533,10 +521,7 @@ def test_what_the_browser_can_t_say_changes_nothing(page: Page) -> None:
             says(page, model, value)
         for x, y in ((value, 1.0), (1.0, value)):
             if not is_number(value):  # of those the nearest values are taken
-                values = [["model", {"id": page.region.plot.id}], ["x", x], ["y", y]]
-                tap = {"type": "event", "name": "tap", "values": {"type": "map", "entries": values}}
-                told = {"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": tap}
-                page.document.apply_json_patch({"events": [told]})
+                tapped(page, x, y)
         assert [one.value for one in models] == before, value
     assert page.places == [one.start for one in page.sliders]
     assert not Asked.asked
@@ -570,6 +555,10 @@ def test_what_the_browser_may_say_is_computed(page: Page) -> None:
     assert Asked.asked[-1].asked == "user[1].cube.x"
     says(page, page.handles[0], last + 1)
     assert "contact.stiffness can&#x27;t be" in page.message.model.text
+    says(page, page.selects[0], "contact.stiffness")
+    tapped(page, 1500, 300)
+    moved = {one.label: one.values[at] for one, at in zip(page.sliders, page.places, strict=True)}
+    assert moved["contact.stiffness"] == 1500 and moved["coordination.stiffness"] == 300
 
 
 UPGRADE = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -149,25 +148,6 @@ def test_the_text_tells_graph_equations_and_schedule() -> None:
 def test_every_scene_can_be_shown_in_80_columns(path: Path) -> None:
     assert max(map(len, apc.show(path).splitlines())) <= 80
     ET.fromstring(apc.show(path, format="svg"))
-
-
-@pytest.mark.parametrize(
-    ("delay", "number", "age"),
-    [
-        ("0 s", 0, (0, 8)),
-        ("1 ms", 1, (1, 9)),
-        ("8 ms", 1, (8, 16)),
-        ("9 ms", 2, (9, 17)),
-        ("24 ms", 3, (24, 32)),
-    ],
-)
-def test_the_packets_on_their_way_are_counted(
-    tmp_path: Path, delay: str, number: int, age: tuple[int, int]
-) -> None:
-    text = replaced(AVERAGE, ("delay: 8 ms", f"delay: {delay}"))
-    (link,) = json.loads(shown(text, "json", tmp_path))["schedule"]["links"]
-    assert link["on_the_way"] == number
-    assert link["age_s"] == [pytest.approx(age[0] / 1e3), pytest.approx(age[1] / 1e3)]
 
 
 FURTHEST = """\

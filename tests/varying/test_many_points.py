@@ -10,7 +10,6 @@ from typing import Any
 import flint
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import apc
 from apc.compiler.compiled import CompiledSystem
@@ -19,8 +18,6 @@ from apc.eigen.balls import precision
 from apc.vary.many import Analyses
 from tests.paper_limit import BITS, truth
 from tests.topologies import AVERAGE, MESH, OSCILLATOR, ROOT, SCENES, compiled, replaced, told
-
-Floats = NDArray[np.float64]
 
 
 def as_alone(system: CompiledSystem, given: Mapping[str, Any], points: Any = None) -> Analyses:

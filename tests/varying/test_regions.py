@@ -174,6 +174,18 @@ def test_nearer_to_a_curve_than_its_error_the_eigenvalues_decide_and_outside_nob
         paper().contains(5.0, 100.0)
 
 
+@pytest.mark.parametrize("stiffness", [200, 1000, 3000])
+def test_with_damping_and_no_delay_the_mean_allows_1_51_to_1_76_times_as_much(stiffness: int) -> None:
+    given = {f"{name}.damping": "2 N*s/m" for name in ("contact", "coordination")}
+    given |= dict.fromkeys(("contact.delay", "coordination.delay", "lan.delay"), "0 ms")
+    given |= {"contact.stiffness": f"{stiffness} N/m"}
+    mean, total = (
+        apc.critical(scene(f"three-users-{name}"), "coordination.stiffness", set=given).value
+        for name in ("average", "mesh")
+    )
+    assert mean is not None and total is not None and 1.51 < mean / total < 1.76
+
+
 # ---- any plane ----
 
 APART = ("contact.half_width=25 mm:35 mm", "contact.stiffness=100 N/m:5000 N/m")
@@ -373,7 +385,6 @@ KEEPS = "E905 in part of the rectangle some motion neither grows nor dies out"
             Y,
             "--x: E881 the range of user.count wants whole numbers, got 2 to 5.5",
         ),
-        (AVERAGE, "contact.stiffness=-1 N/m:5 N/m", Y, "--x: E624 contact.stiffness wants at least 0 N/m"),
         (
             AVERAGE.partition("studies:")[0],
             None,
@@ -434,8 +445,6 @@ def test_several_scenes_and_settings_are_panels(said: Callable[..., str]) -> Non
     assert [panel["panel"] for panel in document["panels"]] == ["lan.delay=0 ms", "lan.delay=8 ms"]
     areas = [[one["stable_area"] for one in panel["regions"]] for panel in document["panels"]]
     assert areas[1][0] == pytest.approx(paper().stable_area, rel=1e-9) and areas[1][0] > areas[1][1]
-    document = json.loads(said(*words, "--panel", "lan.delay=0 ms, contact.delay=1 ms", "--json"))
-    assert [one["stable_area"] for one in document["panels"][0]["regions"]] == pytest.approx(areas[0])
     # At equal effective gain the mean and the sum are one curve.
     text = said(*words, "--normalize")
     document = json.loads(said(*words, "--normalize", "--json"))
@@ -482,9 +491,6 @@ def test_tables_and_pictures_are_written_by_their_suffix_and_the_same_each_time(
             "--x|contact.stiffness=5 N/m:1 N/m",
             "--x: E881 the range of contact.stiffness wants its lower end first",
         ),
-        ("--x|contact.stiffness=5 N/m:5 N/m", "--x: E881 the range of contact.stiffness wants its"),
-        ("--x|contact.stiffness=1 kg:5 kg", "--x: E204 contact.stiffness wants N/m"),
-        ("--x|peers=2:5", "E623 peers is the number of all peers"),
         (f"--x|{Y}|--y|{Y}", "E902 coordination.stiffness is on both axes"),
         ("--out|region.bmp", "region.bmp: E878 the suffix of --out wants one of .png, .svg, .pdf,"),
         ("--out|nowhere/region.csv", "E601 can't be written: No such file or directory"),

@@ -132,10 +132,6 @@ def test_files_and_tables_hold_the_rows_that_are_held_without_them(tmp_path: Pat
     about = json.loads(table.schema.metadata[b"apc"])
     assert about["parameters"]["device.mass"] == 2
     assert set(about["versions"]) >= {"apc", "numpy", "casadi"}
-    pytest.importorskip("pandas")
-    frame = held.to_dataframe()
-    assert frame.shape == (200, 9) and frame["device.mass [kg]"].iloc[-1] == 2
-    assert frame["verdict"].value_counts().to_dict() == dict(held.verdicts)
 
 
 # ---- the values ----
@@ -169,19 +165,10 @@ MANY = "E883 a sweep wants at most 10,000,000 points, got "
     [
         ({}, f"E883 nothing is swept. Write: {FORM}"),
         (
-            {"contact.stifness": "0 N/m:1 N/m"},
-            "E622 contact.stifness is no parameter of three-users-average. Write: contact.stiffness",
-        ),
-        (
             {"contact.stiffness": "3 N/m:1 N/m"},
             f"{RANGE}its lower end first, and the upper above it, got 3 N/m to 1 N/m.",
         ),
-        (
-            {"contact.stiffness": "1 N/m:1 N/m:5"},
-            f"{RANGE}its lower end first, and the upper above it, got 1 N/m to 1 N/m.",
-        ),
         ({"contact.stiffness": "1 N/m:9 N/m:0"}, f"{RANGE}2 values or more, got 0. Write: {FORM}"),
-        ({"contact.stiffness": "1 N/m:9 N/m:many"}, f"{RANGE}2 values or more, got many. Write: {FORM}"),
         ({"contact.stiffness": "1 N/m:9 N/m:"}, f"{RANGE}2 values or more, got nothing. Write: {FORM}"),
         (
             {"contact.stiffness": "1 N/m:2 N/m:3:4"},
@@ -196,7 +183,6 @@ MANY = "E883 a sweep wants at most 10,000,000 points, got "
             "E881 the list of contact.stiffness wants different values, got 5 N/m twice.",
         ),
         ({"contact.stiffness": "1 kg:2 kg"}, "E204 contact.stiffness wants N/m, got 1 kg. Write: 1 N/m"),
-        ({"contact.stiffness": "1:2"}, "E204 contact.stiffness wants N/m, got 1 (no unit). Write: 1 N/m"),
         ({"contact.stiffness": "5 N/m,"}, "E221 contact.stiffness wants N/m, got nothing. Write: 1 N/m"),
         (
             {"peers": "2:10"},
