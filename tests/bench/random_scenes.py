@@ -128,19 +128,7 @@ def _looked_into(system: CompiledSystem, found: Analysis) -> list[str]:
 
 
 def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws: int = DRAWS) -> Tally:
-    """Analyse so many random scenes by each method.
-
-    Parameters
-    ----------
-    points
-        How many.
-    seed
-        Of what is drawn.
-    methods
-        See `analysis.analyze`.
-    draws
-        Of numbers for each structure.
-    """
+    """Analyse so many random scenes by each method, so many draws of numbers for each structure."""
     generator, tally = random.Random(seed), Tally()
     with single_threaded(), precision(BITS), own_library() as library:
         for number in range(points):

@@ -60,26 +60,16 @@ def scene(generator: random.Random) -> str:
     return next(text for text in texts if not any(name in text for name in own))
 
 
-def check_sensitivities(
-    system: CompiledSystem, found: Analysis | Sensitivities, *, like: CompiledSystem | None = None
-) -> str:
+def check_sensitivities(system: CompiledSystem, found: Analysis | Sensitivities) -> str:
     """Return what is wrong with the derivatives of a scene's spectral radius, "" if nothing is.
 
-    Parameters
-    ----------
-    system
-        The compiled scene.
-    found
-        Its sensitivities, or its analysis, from which only the radius is compared with theirs.
-    like
-        A scene with the same linearization and names, where the reference refuses this one.
+    Of an analysis the radius is compared with theirs.
     """
     said = found if isinstance(found, Sensitivities) else sensitivities(system)
     if isinstance(found, Analysis) and said.active:
         apart = abs(said.radius - found.spectral_radius)
         if not apart <= 1e-9 + found.spectral_radius_error:
             return f"the radius is {found.spectral_radius}, that of the derivatives {said.radius}"
-    system = like or system
     if refusal(system, in_time=False) or not said.active:
         return ""
     with precision(BITS):

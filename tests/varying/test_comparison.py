@@ -290,24 +290,3 @@ def test_a_table_has_a_row_a_scheme(scenes: list[str]) -> None:
     assert row["delay parameter"] == "lan.delay"
     felt = [float(row[f"impedance at 10 Hz {part} [N*s/m]"]) for part in ("real", "imaginary")]
     assert complex(*felt) == pytest.approx(complex(apc.feel(compiled(MESH), 10.0).impedance[0]), rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "message"),
-    [
-        ("average.yaml wrong.yaml", 1, "wrong.yaml:13:66: E204 stiffness wants N/m, got 500 (no unit)."),
-        ("average.yaml --out out.doc", 1, "E878"),
-        (
-            "average.yaml --out m.csv --set nothing.there=1_N",
-            *(1, "E622 nothing.there is no parameter of three-users-average"),
-        ),
-        ("", 2, "Missing argument 'FILE...'"),
-    ],
-)
-def test_what_is_at_fault_is_told_as_everywhere(
-    words: str, code: int, message: str, scenes: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    Path("wrong.yaml").write_text(replaced(AVERAGE, ("500 N/m", "500")), encoding="utf-8")
-    assert run(["compare", *(word.replace("_", " ") for word in words.split())]) == code
-    told = capsys.readouterr()
-    assert told.out == "" and message in told.err

@@ -428,30 +428,3 @@ def _read(terminal: int) -> bytes:
         return os.read(terminal, 65536)
     except OSError:  # Linux says so when the other end has closed
         return b""
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--over", "it.stiffness"), "sweep: E880 --over wants PATH=VALUES, got it.stiffness."),
-        (("--over", "it.stifness=1,2 N/m"), "sweep: E622 it.stifness is no parameter of wall."),
-        (
-            ("--over", "it.stiffness=1,2 N/m", "--out", "nowhere/r.csv", "--jobs", "1"),
-            "nowhere/r.csv: E601 can't be written: No such file or directory.",
-        ),
-    ],
-)
-def test_bad_input_gets_one_message_and_leaves_nothing(
-    words: tuple[str, ...],
-    message: str,
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(folder)
-    before = sorted(folder.iterdir())
-    capsys.readouterr()
-    assert run(["sweep", "wall.apc", "--out", "r.csv", *words]) == 1
-    out, err = capsys.readouterr()
-    assert out == "" and err.startswith(message) and len(err.splitlines()) == 1
-    assert sorted(folder.iterdir()) == before
