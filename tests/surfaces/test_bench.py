@@ -77,6 +77,7 @@ def played_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("apc.benchmark.bench._methods", lambda _: [Method(EXACT)])
 
 
+@pytest.mark.whole
 @pytest.mark.usefixtures("played_exactly")
 def test_a_push_between_two_ticks_is_no_rest() -> None:
     assert "nothing moves" in bench_simulation(compiled(PUSHED), Fraction(1, 50), rounds=1).notes[0]
@@ -108,6 +109,7 @@ def test_what_is_too_large_to_be_played_is_analysed_all_the_same(monkeypatch: py
     assert "every method left out: 3 peers hold" in text and "--signals" not in text
 
 
+@pytest.mark.whole
 def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
     text = str(found)
     assert max(map(len, text.splitlines())) <= 80
@@ -126,6 +128,7 @@ def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
 # ---- more peers ----
 
 
+@pytest.mark.whole
 def test_more_peers_are_measured_each_in_a_process_of_its_own(cli: Cli) -> None:
     """The text with another count, of the group that grows; a number is measured once."""
     write("scene.yaml", replaced(AVERAGE, ("user: {count: 3}", "one: {count: 1}\n  many: {count: 4}")))
@@ -176,6 +179,7 @@ def test_a_picture_that_cannot_be_is_refused_before_anything_is_measured(
     assert ran.code == 1 and message in ran.err
 
 
+@pytest.mark.whole
 def test_what_goes_wrong_in_the_end_costs_no_figures(
     found: Bench, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 import apc
-from apc.compiler.errors import ApcError
 from apc.present import animation
 from apc.present.eigenvalues import eigenvalues_picture
 from apc.present.pictures import colours_of, write_figure
@@ -28,6 +27,7 @@ SCENE = str(SCENES / "three-users-average.yaml")
 X, Y = "contact.stiffness=0 N/m:3000 N/m", "coordination.stiffness=0 N/m:3000 N/m"
 
 
+@pytest.mark.whole
 def test_eight_scenes_have_eight_lines_and_one_that_is_another_says_so() -> None:
     names = [*(f"scheme-{place}" for place in range(8)), "again"]
     systems = [
@@ -86,7 +86,7 @@ def test_text_in_an_svg_is_text(tmp_path: Path) -> None:
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(animation, "RATE", 2)
-    monkeypatch.setattr(animation, "SHORTEST", 2.0)
+    monkeypatch.setattr(animation, "SHORTEST", 1.0)
 
 
 def test_a_picture_has_the_size_words_and_style_that_are_asked_for() -> None:
@@ -118,9 +118,6 @@ def test_a_root_locus_passes_the_circle_where_stability_changes() -> None:
         modes = apc.analyze(system, set={"coordination.stiffness": f"{value} N/m"}).modes
         for mode in modes:
             assert np.abs(points - mode.eigenvalue).min() < 0.02
-    passive = apc.critical(system, "coordination.stiffness", criterion="passive")
-    with pytest.raises(ApcError, match="E930 what every passive hand can draw has no eigenvalues"):
-        passive.plot()
 
 
 def test_what_settles_is_told_in_seconds() -> None:
@@ -153,7 +150,7 @@ def test_without_ffmpeg_it_says_what_to_do(cli: Cli, monkeypatch: pytest.MonkeyP
     assert folder() == []
 
 
-@pytest.mark.parametrize("words", [f"analyze '{SCENE}'", f"critical lan.delay '{SCENE}'"])
+@pytest.mark.parametrize("words", [f"analyze '{SCENE}'", f"critical coordination.stiffness '{SCENE}'"])
 def test_pictures_beside_answers_are_refused_before_anything_is_computed(words: str, cli: Cli) -> None:
     assert "E878 the suffix of --plot" in cli(f"{words} --plot a.txt").err
     assert "E930" in cli(f"{words} --hands passive --plot a.svg").err

@@ -108,6 +108,7 @@ def test_ctrl_c_keeps_what_is_done(moved: Cli, monkeypatch: pytest.MonkeyPatch) 
     assert len(Path("run.csv").read_text(encoding="utf-8").splitlines()) == 81
 
 
+@pytest.mark.whole
 def test_the_error_and_the_method_are_told_if_asked_for(moved: Cli) -> None:
     exact = moved("simulate --duration 0.1s --error").out
     assert "  error          none but rounding; about " in exact and "method" not in exact

@@ -58,6 +58,7 @@ def test_what_was_begun_by_one_process_is_finished_on_a_cluster_to_the_last_bit(
     assert len(list(tmp_path.iterdir())) == 2
 
 
+@pytest.mark.whole
 def test_workers_with_other_versions_are_refused(
     tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -113,6 +114,7 @@ def test_a_missing_distributed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
 
 
+@pytest.mark.whole
 def test_a_cluster_without_workers_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     def none_comes(*_: object, **__: object) -> None:
         raise TimeoutError
@@ -150,6 +152,7 @@ def test_a_cluster_lost_on_the_way_keeps_what_is_finished(
     assert len(parts(target)) >= 1
 
 
+@pytest.mark.whole
 def test_a_frozen_worker_is_waited_for_aloud_and_only_so_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(processes, "SILENCE", 0.1)
     heard: list[str] = []

@@ -105,7 +105,7 @@ def changed(system: CompiledSystem, every: int) -> str:
     return ""
 
 
-@pytest.mark.few(12)
+@pytest.mark.few(6)
 @pytest.mark.parametrize("every", [3, 1])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_row_says_what_setting_its_name_does(name: str, every: int) -> None:
