@@ -394,7 +394,6 @@ ORDER = "apc critical: E841 the command wants a parameter or delay, then the sce
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("contact.stifness", "E622 contact.stifness is no parameter"),
         ("haptic.period", "E844 haptic.period sets the rhythm of a clock"),
         ("haptic.phase", "E844 haptic.phase sets the rhythm of a clock"),
         ("user.contact.delay", "contact.delay is one time for all groups. Write: contact.delay"),
