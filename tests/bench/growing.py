@@ -1,7 +1,7 @@
 # ruff: noqa: E501 -- scenes are written by long lines
 """Scenes that grow: more peers, different peers, kinds, equations.
 
-Takes: how many, and a folder for what stands beside a scene. Gives: `ring`, `lossy`, `flat`, `table`, `kinds`, `equations`.
+Takes: how many, and a folder for what stands beside a scene. Gives: `flat`, `table`, `kinds`, `equations`.
 Does not: load anything large, so that what measures whole processes can use it.
 """
 
@@ -16,16 +16,6 @@ AVERAGE = (SCENES / "three-users-average.yaml").read_text(encoding="utf-8")
 def flat(peers: int, folder: Path) -> str:
     """Return a scene of equal peers."""
     return _replaced(("count: 3", f"count: {peers}"))
-
-
-def ring(peers: int, folder: Path) -> str:
-    """Return a scene of equal peers in a ring."""
-    return _replaced(("count: 3", f"count: {peers}"), ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
-
-
-def lossy(number: int, folder: Path) -> str:
-    """Return the same scene with a tenth of all packets lost."""
-    return _replaced(("lan: {clock: network, delay: 8 ms", "lan: {clock: network, delay: 8 ms, loss: 10 %"))
 
 
 def table(peers: int, folder: Path) -> str:

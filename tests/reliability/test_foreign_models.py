@@ -202,6 +202,7 @@ def test_forged_files_of_every_sort_do_nothing_else_and_end() -> None:
 NAMES = ("device.x", "haptic", "lan", "contact.stiffness", "coordination.f")
 
 
+@pytest.mark.few(7)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("other", ["../{}", "/{}", "{}*/", "{}'"])
 def test_a_model_with_a_name_that_no_topology_can_give_is_refused(name: str, other: str) -> None:
@@ -213,6 +214,7 @@ def test_a_model_with_a_name_that_no_topology_can_give_is_refused(name: str, oth
     assert outcome() in ("refused", honest("channels"))
 
 
+@pytest.mark.few(10)
 @pytest.mark.parametrize("unit", ["mm", "parsec", "", "N N", "m^", "kg*m/s^2*", "A", "\x1b[31m"])
 @pytest.mark.parametrize("own", ["N/m", "kg", "m", "m/s"])
 def test_a_number_in_another_unit_than_its_own_is_refused(own: str, unit: str) -> None:
@@ -396,7 +398,7 @@ def test_another_version_of_the_format_is_refused_by_number() -> None:
     assert words.endswith("Write: apc compile scene.yaml")
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(place=st.floats(0, 1, exclude_max=True), byte=st.integers(0, 255), cut=st.booleans())
 def test_a_byte_changed_or_an_end_cut_off_is_refused_or_harmless(place: float, byte: int, cut: bool) -> None:
     data = written("paper")

@@ -233,11 +233,9 @@ LONG = "n" * 300
     "words",
     [
         "compile .",
-        "compile /",
         "analyze .",
         f"compile {LONG}.yaml",
         f"analyze {LONG}.apc",
-        f"show scene.yaml --out {LONG}.txt",
         f"schema --out {LONG}.json",
         f"simulate scene.yaml --duration 1ms --out {LONG}.csv",
         f"sweep scene.yaml --over contact.stiffness=1N/m:2N/m:2 --out {LONG}.csv",

@@ -17,6 +17,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
 from apc.vary.critical import Critical
+from apc.vary.margins import Margin
 from tests.bench import random_scans
 from tests.bruteforce import Scene, as_ball, frame_matrices, frame_matrix
 from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced
@@ -56,7 +57,7 @@ def scene(text: str) -> CompiledSystem:
     return apc.compile(path if path.exists() else HARD / f"{text}.yaml")
 
 
-def stable_at(system: CompiledSystem, found: Critical, value: Fraction) -> bool | None:
+def stable_at(system: CompiledSystem, found: Critical | Margin, value: Fraction) -> bool | None:
     """Return the verdict of an analysis with the number that was searched at a value."""
     unit = "" if found.unit == "1" else f" {found.unit}"
     return apc.analyze(system, set={found.parameter: f"{value}{unit}"}).stable

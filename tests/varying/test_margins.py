@@ -14,7 +14,7 @@ from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.vary.margins import Margin
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
-from tests.varying.test_critical_values import HARD, PRESSED
+from tests.varying.test_critical_values import HARD, PRESSED, stable_at
 
 SAMPLED = "stiffness: 1000 N/m, clock: haptic, delay: 1 ms"
 
@@ -52,11 +52,7 @@ def holds(system: CompiledSystem, one: Margin) -> None:
     assert one.value is not None and one.error is not None
     assert one.value > one.present and one.error <= 1e-6 * one.value
     aside = max(2 * one.error, 1e-8 * one.value)
-    sides = [
-        apc.analyze(system, set={one.parameter: f"{Fraction(one.value + side * aside)} {one.unit}"}).stable
-        for side in (-1, 1)
-    ]
-    assert sides == [True, False]
+    assert [stable_at(system, one, Fraction(one.value + side * aside)) for side in (-1, 1)] == [True, False]
     assert one.factor == (one.value / one.present if one.present else None)
 
 
