@@ -197,8 +197,6 @@ KINDS = ".txt, .json, .dot, .gv, .svg, .png, .pdf"
     ("words", "name", "wanted"),
     [
         ((), "scene.jpg", f"one of {KINDS}, got .jpg. Write: --out scene.txt"),
-        ((), "scene", f"one of {KINDS}, got none. Write: --out scene.txt"),
-        (("--format", "svg"), "scene.png", ".svg, got .png. Write: --out scene.svg"),
         (("--format", "dot"), "scene.svg", "one of .dot, .gv, got .svg. Write: --out scene.dot"),
     ],
 )
