@@ -468,15 +468,16 @@ class Asked:
         pass
 
 
-@pytest.fixture
-def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Page:
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Page:
     """Give the page of a tab without a browser, and without those who compute for it."""
-    monkeypatch.setattr("apc.explore.page.Desk", Asked)
-    monkeypatch.setattr(Asked, "asked", [])
     document, request = Document(), SimpleNamespace(arguments={})
     context = SimpleNamespace(request=request)
     document._session_context = lambda: context  # type: ignore[assignment]
-    found = Page(scene_of(compiled(LOSSY, tmp_path), (), None), document)
+    scene = compiled(LOSSY, tmp_path_factory.mktemp("page"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("apc.explore.page.Desk", Asked)
+        found = Page(scene_of(scene, (), None), document)
     found._deliver("verdict", Told(None, "none"))
     names = ["user[1].device.x", "user[1].cube.x"]
     found._deliver(
