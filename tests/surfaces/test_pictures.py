@@ -18,7 +18,6 @@ from apc.present import animation
 from apc.present.eigenvalues import eigenvalues_picture
 from apc.present.pictures import colours_of, write_figure
 from apc.present.region_picture import panels_picture
-from apc.present.simulation import played_picture
 from apc.regions.panels import compare_regions
 from tests.commands import Cli, folder
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
@@ -49,19 +48,6 @@ def test_eight_scenes_have_eight_lines_and_one_that_is_another_says_so() -> None
 @pytest.mark.parametrize("count", [1, 10, 11, 31, 100])
 def test_as_many_colours_as_are_asked_for(count: int) -> None:
     assert len(set(colours_of(count))) == count
-
-
-PUSHED = replaced(
-    AVERAGE,
-    ("user: {count: 3}", "left: {count: 1, set: {device.x: 3 mm}}\n  right: {count: 2}"),
-)
-
-
-def test_curves_that_are_one_are_said_to_be() -> None:
-    found = apc.simulate(compiled(PUSHED), duration="20 ms", signals=["cube.x"], jit=False)
-    [ax] = played_picture(found).axes
-    labels = [" ".join(line.get_label().split()) for line in ax.lines]
-    assert labels == ["left[1].cube.x", "right[1].cube.x, right[2].cube.x: identical"]
 
 
 def test_the_eigenvalues_drawn_are_those_of_the_analysis_within_the_circle() -> None:

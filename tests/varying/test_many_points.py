@@ -166,12 +166,6 @@ def test_times_vary_beside_numbers_each_with_its_own_schedule() -> None:
     assert as_alone(compiled(AVERAGE), given).verdict.shape == (4, 5)
 
 
-def test_a_scene_that_is_not_linear_says_what_is_left_out() -> None:
-    system = apc.compile(SCENES / "experiment-average.yaml")
-    found = as_alone(system, {"contact.stiffness": np.array([500.0, 900.0])})
-    assert found.left_out == apc.analyze(system).left_out
-
-
 def test_no_point_beside_a_double_eigenvalue_has_a_far_wider_bound() -> None:
     """At 1708 N/m and 10 N/m two eigenvalues nearly meet, and the vectors nearly are one."""
     contact, coordination = np.meshgrid(np.linspace(10, 3000, 200), [10.0, 25.0])

@@ -76,9 +76,11 @@ def test_every_stiffness_damping_and_delay_of_a_coupler_has_a_row() -> None:
         (hasty("12 ms"), ["contact.stiffness", "coordination.stiffness", "contact.delay"]),
         (hasty("30 ms"), ["contact.stiffness", "contact.delay"]),
         # 250 states, 200 of them packets on their way.
-        (hasty("50 ms"), ["contact.delay"]),
+        pytest.param(hasty("50 ms"), ["contact.delay"], marks=pytest.mark.whole),
         # 72 states, of which each number moves as many.
-        ("different-peers", ["contact.stiffness", "coordination.damping"]),
+        pytest.param(
+            "different-peers", ["contact.stiffness", "coordination.damping"], marks=pytest.mark.whole
+        ),
     ],
     ids=["average", "pressed", "dead reckoning", "12 ms", "30 ms", "50 ms", "different"],
 )

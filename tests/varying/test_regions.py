@@ -475,7 +475,7 @@ def test_tables_and_pictures_are_written_by_their_suffix_and_the_same_each_time(
     assert list(table.columns[4:6]) == ["contact.stiffness [N/m]", "coordination.stiffness [N/m]"]
     assert len(table) == len(rows)
     pytest.importorskip("matplotlib")
-    heads = {"a.svg": b"<?xml", "b.svg": b"<?xml", "c.png": b"\x89PNG", "d.pdf": b"%PDF"}
+    heads = {"a.svg": b"<?xml", "b.svg": b"<?xml"}
     for name, head in heads.items():
         said("--x", X, "--y", Y, "--compare", "others/mesh.yaml", "--out", name)
         assert head in Path(name).read_bytes()[:200]
