@@ -263,8 +263,6 @@ def test_two_topologies_of_one_model_are_refused_naming_both(cli: Cli) -> None:
     ("words", "parts"),
     [
         ("compile --force", ["source", "scene", "flat", "clocked", "sorted", "compiled", "save"]),
-        ("analyze --json", ["read", "analysis", "print"]),
-        ("critical contact.stiffness", ["read", "critical", "print"]),
         ("simulate --duration 0.1s", ["read", "prepare", "play", "print"]),
     ],
 )
