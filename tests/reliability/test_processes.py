@@ -68,7 +68,7 @@ from apc.inputs import open_scene
 from apc.processes import model_bytes
 
 if __name__ == "__main__":
-    over = ["--over", "contact.stiffness=1 N/m:2 N/m:200"]
+    over = ["--over", "contact.stiffness=1 N/m:2 N/m:130"]
     ran = [run(["sweep", "scene.yaml", *over, "--jobs", "2", "--out", "r.csv"])]
     if sys.argv[1:] == ["sweep"]:
         raise SystemExit(any(ran))
