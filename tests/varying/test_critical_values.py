@@ -307,8 +307,8 @@ def test_every_crossing_that_is_answered_is_one_between_two_analyses(path: Path)
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.whole)])
 def test_no_crossing_is_invented_and_none_is_missed_in_random_scenes(seed: int) -> None:
     """Against eigenvalues of all peers' matrix on a grid and beside each crossing."""
-    tally = random_scans.run(4, seed=seed)
-    assert tally.wrong == [] and tally.scans == 4
+    tally = random_scans.run(2, seed=seed)
+    assert tally.wrong == [] and tally.scans == 2
 
 
 def test_a_link_delay_jumps_where_a_packet_comes_a_tick_later() -> None:

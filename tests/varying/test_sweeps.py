@@ -356,6 +356,7 @@ def folder(tmp_path: Path) -> Path:
 LONG = ("mass.apc", "--over", "device.mass=1 kg:2 kg:125", "--over", "device.damping=1,2,3,4 N*s/m")
 
 
+@pytest.mark.whole
 def test_killed_three_times_it_gives_the_file_of_one_left_alone(folder: Path) -> None:
     left_alone = start(folder, *LONG, "--out", "alone.csv", "--jobs", "1")
     target = folder / "r.csv"
