@@ -102,6 +102,7 @@ def test_a_method_that_cannot_serve_is_left_out_and_says_why() -> None:
     assert "one clock of forces (here are haptic and slow)" in reason
 
 
+@pytest.mark.whole
 def test_what_is_too_large_to_be_played_is_analysed_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("apc.simulation.simulation.NUMBER", 1e20)
     text = str(apc.bench(compiled(AVERAGE), rounds=1))

@@ -124,6 +124,7 @@ def test_sections_that_a_scene_cannot_fill_say_why(cli: Cli) -> None:
     assert all(f"Not here: {reason}" in text for reason in why.values())
 
 
+@pytest.mark.whole
 def test_from_python_a_report_is_a_result_and_a_page(cli: Cli) -> None:
     write("scene.yaml", LONE)
     report = apc.report("scene.yaml", "r.html", set={"device.mass": "2 kg"})

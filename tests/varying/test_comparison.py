@@ -69,6 +69,7 @@ def test_each_number_is_that_of_its_own_command(text: str) -> None:
         assert np.array_equal(found.feel.impedance, felt.impedance) and found.feel.at == felt.at
 
 
+@pytest.mark.whole
 def test_the_verdict_is_of_the_network_nominal_or_with_passive_hands_as_asked() -> None:
     system = compiled(LOSSY)
     assert scheme(LOSSY).verdict == "stable in mean square"
