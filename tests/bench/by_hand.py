@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import math
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -39,35 +37,17 @@ START = 0.01
 # ---- stability ----
 
 
+@functools.cache
 def by_exponential(mass: float, damping: float) -> Floats:
     """Return [F G] (2, 3) of a damped mass over a tick."""
     return np.asarray(expm(np.array([[0, 1, 0], [0, -damping / mass, 1 / mass], [0, 0, 0]]) * TICK)[:2])
 
 
-def by_textbook(mass: float, damping: float) -> Floats:
-    """Return the same by the closed form."""
-    decay = math.exp(-damping * TICK / mass)
-    rise = (1 - decay) / damping
-    return np.array([[1, mass * rise, (TICK - mass * rise) / damping], [0, decay, rise]])
-
-
-def by_control(mass: float, damping: float) -> Floats:
-    """Return the same by python-control."""
-    import control
-
-    plant = control.ss([[0, 1], [0, -damping / mass]], [[0], [1 / mass]], np.eye(2), np.zeros((2, 1)))
-    sampled = control.c2d(plant, TICK, "zoh")
-    return np.hstack([sampled.A, sampled.B])
-
-
 def user(
-    contact: float = K_C,
-    coordination: float = K_T,
-    damping: float = DEVICE_DAMPING,
-    step: Callable[[float, float], Floats] = by_exponential,
+    contact: float = K_C, coordination: float = K_T, damping: float = DEVICE_DAMPING
 ) -> tuple[Floats, Floats]:
     """Return a tick over (x_H, v_H, x_O, v_O, F_C, F_T, packet), and what of the others' packets is heard."""
-    device, cube = step(DEVICE_MASS, damping), step(CUBE_MASS, damping)
+    device, cube = by_exponential(DEVICE_MASS, damping), by_exponential(CUBE_MASS, damping)
     tick, hears = np.zeros((7, 7)), np.zeros((7, 7))
     tick[:2, :2], tick[:2, 4] = device[:, :2], -device[:, 2]
     tick[2:4, 2:4], tick[2:4, 4], tick[2:4, 5] = cube[:, :2], cube[:, 2], -cube[:, 2]
@@ -85,16 +65,16 @@ def whole_frame(tick: Floats, hears: Floats) -> Floats:
     return frame
 
 
-def radius(damping: float, step: Callable[[float, float], Floats]) -> float:
+def radius(damping: float) -> float:
     """Return the spectral radius of a frame of all users, without the eigenvalue nearest to 1."""
-    values = np.linalg.eigvals(whole_frame(*user(damping=damping, step=step)))
+    values = np.linalg.eigvals(whole_frame(*user(damping=damping)))
     return float(np.abs(np.delete(values, np.argmin(np.abs(values - 1)))).max())
 
 
 def stable_grid(low: float, high: float, count: int) -> NDArray[np.bool_]:
     """Return max |λ| < 1, as one would write it, on a grid of K_C (columns) and K_T (rows)."""
-    values, step = np.linspace(low, high, count).tolist(), functools.cache(by_exponential)
-    frames = np.array([[whole_frame(*user(x, y, step=step)) for x in values] for y in values])
+    values = np.linspace(low, high, count).tolist()
+    frames = np.array([[whole_frame(*user(x, y)) for x in values] for y in values])
     return np.asarray(np.abs(np.linalg.eigvals(frames)).max(axis=-1) < 1)
 
 

@@ -6,9 +6,6 @@ First the spectral radius of one frame, without the eigenvalue 1 of the common t
     NumPy by hand   SciPy's exponential of one user, a frame of eight ticks, users joined by hand
     modes by hand   by an expert: equal users are two modes of one, with participation and a disc for every
                     eigenvalue
-    textbook        NumPy by hand with (1 − e^(−bT/m)) m/b instead of an exponential
-    python-control  the plants sampled by its `c2d`; it has no systems of several rates, so that the frame is
-                    again joined by hand
 
 Where an eigenvalue has to be told from 1 by its distance, as by all but apc, it is the one nearest to 1. Then
 the states at every tick while three users' cube swings, by apc, prepared before, by a loop in NumPy whose
@@ -39,10 +36,7 @@ from tests.bench.by_hand import (
     START,
     TICK,
     Floats,
-    by_control,
-    by_exponential,
     by_pathsim,
-    by_textbook,
     modal_radii,
     mode_radius,
     numpy_loop,
@@ -64,14 +58,6 @@ SIDE, KNOWN = 100, 200  # points of the map, and those whose truth is computed
 MOVED = replaced(AVERAGE, ("{count: 3}", f"{{count: 3, set: {{device.x: [{START} m, 0 m, 0 m]}}}}"))
 
 
-def installed(module: str) -> bool:
-    """Return whether another program is there; say it where it is not."""
-    there = importlib.util.find_spec(module) is not None
-    if not there:
-        print(f"{module} is left out: it is not installed (pip install {module})")
-    return there
-
-
 def radii(judge: Judge, damping: float, rounds: int) -> None:
     """Compare the spectral radius of one scene."""
     value = f"{damping!r} N*s/m"
@@ -83,12 +69,9 @@ def radii(judge: Judge, damping: float, rounds: int) -> None:
     first = apc.analyze(system)
     calls: dict[str, Callable[[], float]] = {
         "apc": lambda: apc.analyze(next(others)).spectral_radius,
-        "NumPy by hand": lambda: radius(damping, by_exponential),
+        "NumPy by hand": lambda: radius(damping),
         "modes by hand": lambda: mode_radius(damping),
-        "textbook": lambda: radius(damping, by_textbook),
     }
-    if installed("control"):
-        calls["python-control"] = lambda: radius(damping, by_control)
     values = {name: call() for name, call in calls.items()} | {"apc": first.spectral_radius}
     times = take_turns(calls, rounds)
     bounds = {"apc": first.spectral_radius_error}
@@ -109,7 +92,9 @@ def play(judge: Judge, rounds: int) -> None:
         "apc": median_time(partial(rows_of, ready), rounds),
         "NumPy by hand": median_time(lambda: numpy_loop(ticks)[:, :, :4].reshape(ticks, -1), 3),
     }
-    if installed("pathsim"):
+    if importlib.util.find_spec("pathsim") is None:
+        print("PathSim is left out: pip install pathsim")
+    else:
         runs["PathSim"] = by_pathsim(SECONDS, None)
         runs["PathSim, 1e-10"] = by_pathsim(SECONDS, 1e-10)
     programs = [

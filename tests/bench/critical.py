@@ -18,12 +18,12 @@ from tests.bench.by_hand import K_C
 from tests.bench.judge import Judge, Timed, judged, parser_of
 from tests.bruteforce import Scene, frame_matrices
 from tests.paper_limit import limit
-from tests.topologies import AVERAGE, MESH, SCENES, compiled
+from tests.topologies import AVERAGE, MESH, compiled
 
 STIFFNESS = "coordination.stiffness"
 # Frames that packets are late, and by hand at most; what the longest may take; how near a bisection comes.
 FRAMES, BY_HAND, LONGEST_S, NEAR = (1, 10, 30, 100, 300), 30, 0.5, 1e-9
-UPPER_MS, DELAY_S, MARGINS_S = (200, 2000), 2.0, 0.03
+UPPER_MS, DELAY_S = (200, 2000), 2.0
 
 
 def stable(scene: Scene) -> bool:
@@ -55,7 +55,7 @@ def delay_by_hand(upper_ms: int) -> float | None:
 
 
 def schemes(judge: Judge, repeat: int) -> None:
-    """Print what the critical value of each scheme takes, and margins and sensitivities of one."""
+    """Print what the critical value of each scheme takes."""
     known = float(limit(K_C, 1096.0))
     for name, text, exact in (("AP", AVERAGE, known), ("VC", MESH, known / 2)):
         call = partial(apc.critical, compiled(text), STIFFNESS)
@@ -90,27 +90,11 @@ def delays(judge: Judge, quick: bool) -> None:
         judge.table(title, rows, most_s=DELAY_S)
 
 
-def of_scenes(judge: Judge, quick: bool) -> None:
-    """Print a line a scene: what its margins and sensitivities take."""
-    for path in sorted(SCENES.glob("*.yaml"))[: 3 if quick else None]:
-        system = apc.compile(path)
-        first, _ = timed(partial(apc.margins, system))
-        seconds, _ = median_time(partial(apc.margins, system), 3)
-        analysis, _ = median_time(partial(apc.analyze, system), 3)
-        rows = [
-            Timed("apc", seconds),
-            Timed("apc, the first time", first),
-            Timed("apc, an analysis", analysis),
-        ]
-        judge.table(f"margins of {path.stem}", rows, most_s=MARGINS_S)
-
-
 def main() -> None:
     """Print the tables."""
     with judged(parser_of("critical", __doc__)) as (judge, given):
         schemes(judge, 3 if given.quick else 20)
         delays(judge, given.quick)
-        of_scenes(judge, given.quick)
 
 
 if __name__ == "__main__":

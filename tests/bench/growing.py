@@ -1,7 +1,7 @@
 # ruff: noqa: E501 -- scenes are written by long lines
-"""Scenes that grow: more peers, different peers, kinds, equations, masses in a row.
+"""Scenes that grow: more peers, different peers, kinds, equations.
 
-Takes: how many, and a folder for what stands beside a scene. Gives: `ring`, `lossy`, `flat`, `table`, `kinds`, `equations`, `row`.
+Takes: how many, and a folder for what stands beside a scene. Gives: `flat`, `table`, `kinds`, `equations`.
 Does not: load anything large, so that what measures whole processes can use it.
 """
 
@@ -16,16 +16,6 @@ AVERAGE = (SCENES / "three-users-average.yaml").read_text(encoding="utf-8")
 def flat(peers: int, folder: Path) -> str:
     """Return a scene of equal peers."""
     return _replaced(("count: 3", f"count: {peers}"))
-
-
-def ring(peers: int, folder: Path) -> str:
-    """Return a scene of equal peers in a ring."""
-    return _replaced(("count: 3", f"count: {peers}"), ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
-
-
-def lossy(number: int, folder: Path) -> str:
-    """Return the same scene with a tenth of all packets lost."""
-    return _replaced(("lan: {clock: network, delay: 8 ms", "lan: {clock: network, delay: 8 ms, loss: 10 %"))
 
 
 def table(peers: int, folder: Path) -> str:
@@ -63,21 +53,6 @@ def equations(number: int, folder: Path) -> str:
             f"  - mass*der(v{i}) = f{i} - damping*v{i}" + (f" - f{i + 1}" if i < masses else ""),
         ]
     return _with_chain("\n".join(lines) + "\n  - flange.f = f1\n", variables, folder)
-
-
-def row(masses: int, folder: Path) -> str:
-    """Return a scene with one component of so many masses in a row, springs and dampers between them."""
-    names = range(1, masses + 1)
-    variables = "".join(f"  x{i}: {{unit: m, start: 0}}\n  v{i}: {{unit: m/s, start: 0}}\n" for i in names)
-    lines = []
-    for i in names:
-        before, rate = ("flange.x", "der(flange.x)") if i == 1 else (f"x{i - 1}", f"v{i - 1}")
-        force = f"stiffness*({before} - x{i}) + damping*({rate} - v{i})"
-        if i < masses:
-            force += f" - stiffness*(x{i} - x{i + 1}) - damping*(v{i} - v{i + 1})"
-        lines += [f"  - der(x{i}) = v{i}", f"  - mass*der(v{i}) = {force}"]
-    end = "\n  - flange.f = stiffness*(flange.x - x1) + damping*(der(flange.x) - v1)\n"
-    return _with_chain("\n".join(lines) + end, variables, folder)
 
 
 def _with_chain(lines: str, variables: str, folder: Path) -> str:

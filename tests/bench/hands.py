@@ -3,29 +3,20 @@
 For two, three and five users of the paper's scene: the stiffness of the coordination that is borne with free
 hands, with devices clamped and with every passive hand; the viscosity that the network adds to each copy; how
 far copies are apart a newton of a slow push. The mesh is taken at equal stiffness (dashed) and, as circles,
-at equal effective gain, where it must be the average. Then times: a passive verdict, a thousand frequencies,
-three users and a million; a hundred frequencies of a thousand users who all differ.
+at equal effective gain, where it must be the average.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import apc
-from apc.analysis.analysis import prepare
-from apc.benchmark.timing import median_time
-from apc.hands.feel import feel
 from apc.optional import need
 from apc.present.pictures import COLOURS, write_figure
 from apc.present.region_picture import PANEL
-from tests.bench.by_hand import Floats
-from tests.bench.judge import Judge, Timed, judged, parser_of
-from tests.populations import different
+from tests.bench.judge import Judge, judged, parser_of
 from tests.topologies import AVERAGE, MESH, compiled, replaced
 
 PEERS = (2, 3, 5)
@@ -39,9 +30,6 @@ KNOWN = {
     5: (1101.55, 1052.17, 895.64),
 }
 NEAR = 2e-5  # what two digits behind the point leave open
-# Seconds: a verdict, a response of so many frequencies; a million users may take so many times what three do.
-VERDICT_S, RESPONSE_S, FREQUENCIES, MILLION = 0.020, 0.050, 1000, 1.5
-DIFFERENT, SOME, DIFFERENT_S = 1000, 100, 6.0  # users who all differ, frequencies, seconds
 Curves = Mapping[
     tuple[str, str], list[float]
 ]  # by the scheme and what is said of it, a value for each of PEERS
@@ -81,32 +69,6 @@ def felt(judge: Judge, name: str) -> tuple[list[float], list[float]]:
         what = f"{name} of {peers}: viscosity beside K((T_n − T_c)/2 + T_d) = {formula:.4f}"
         judge.within(what, abs(viscous[-1] / formula - 1), 5e-3)
     return viscous, apart
-
-
-def response(system: apc.CompiledSystem, frequencies: Floats) -> Callable[[], object]:
-    """Return what computes a response of a scene that is prepared, without what stands beside it."""
-    return partial(feel, system, frequencies, quick=True, prepared=prepare(system))
-
-
-def times(judge: Judge, quick: bool) -> None:
-    """Judge how long a passive verdict and a response take, of three users and of a million."""
-    frequencies = np.geomspace(0.1, 60, FREQUENCIES)
-    for what, most_s in (
-        ("a verdict with passive hands", VERDICT_S),
-        (f"{FREQUENCIES} frequencies felt", RESPONSE_S),
-    ):
-        rows = []
-        for peers in (3, 1_000_000):
-            system = scene(AVERAGE, peers, 400.0)
-            passive = partial(apc.passive_hands, system)
-            call = passive if most_s == VERDICT_S else response(system, frequencies)
-            call()
-            rows.append(Timed(f"apc, {peers:,} users", median_time(call, 3 if quick else 9)[0]))
-        judge.table(what, rows, most_s=most_s)
-        judge.in_time(f"{what}: a million users beside three", rows[1].seconds / rows[0].seconds, MILLION)
-    system = different(100 if quick else DIFFERENT)
-    taken, _ = median_time(response(system, np.geomspace(0.1, 60, SOME)), 1 if quick else 3)
-    judge.table(f"{SOME} frequencies felt, users who all differ", [Timed("apc", taken)], most_s=DIFFERENT_S)
 
 
 def picture(curves: Curves) -> Any:
@@ -154,7 +116,6 @@ def main() -> None:
         for (name, what), values in curves.items():
             listed = "  ".join(f"{n} users {v:.4f}" for n, v in zip(PEERS, values, strict=True))
             print(f"  {name:<8} {what:<8} {listed}")
-        times(judge, given.quick)
         if given.out is not None:
             write_figure(picture(curves), given.out)
 

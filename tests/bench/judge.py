@@ -62,38 +62,13 @@ class Judge:
         return self.right(f"{what}: {error:.2g}, at most {bound:.2g}", error <= bound)
 
     def in_time(self, what: str, value: float, most: float, noise: float = NOISE) -> str:
-        """Take down whether a time, or a ratio of times, is at most its target.
-
-        Parameters
-        ----------
-        what
-            Is measured.
-        value, most
-            What it is and its target, in the same unit.
-        noise
-            The factor by which it may be above its target and count as no miss: 1 of what isn't a time.
-        """
+        """Take down whether a time, or a ratio of times, is at most its target, or `noise` times that."""
         if value <= most:
             return "kept"
         if value <= most * noise:
             return "near"
         self.missed.append(f"{what}: {value:.3g}, target {most:.3g}")
         return "missed"
-
-    def beside(self, work: str, ours: tuple[float, str], other: str, theirs: tuple[float, str]) -> None:
-        """Take down what another program takes for the same work.
-
-        Parameters
-        ----------
-        work
-            That both do.
-        ours, theirs
-            The seconds, and the error in words with its unit where it has one.
-        other
-            The other program.
-        """
-        cells = (work, time_of(ours[0]), ours[1], other, time_of(theirs[0]), theirs[1])
-        self.rows.append(f"{ROW}{' | '.join(cells)} | {ours[0] / theirs[0]:.3g} |")
 
     def table(
         self,
@@ -106,19 +81,8 @@ class Judge:
     ) -> None:
         """Print programs that do the same work, the first of them ours, and judge errors and times.
 
-        Parameters
-        ----------
-        work
-            What they do.
-        programs
-            What each takes and is off by; the first is apc, and what has a bound is judged by it. Names that
-            begin with apc are not other programs.
-        unit
-            Of the errors, with a space before it.
-        most_s
-            The seconds that ours may take.
-        most
-            By another program's name, how many times as long as it ours may take.
+        What has a bound is judged by it, ours also by the seconds `most_s` and by how many times as long as
+        another it may take (`most`, by name). Names that begin with apc are no other programs.
         """
         ours = programs[0]
         print(f"\n{work}")
@@ -136,8 +100,9 @@ class Judge:
                 )
             print(" ".join(words))
             if not one.program.startswith("apc"):
-                theirs = one.seconds, one.told(unit)
-                self.beside(work, (ours.seconds, ours.told(unit)), one.program, theirs)
+                cells = [work, time_of(ours.seconds), ours.told(unit), one.program, time_of(one.seconds)]
+                cells += [one.told(unit), f"{ours.seconds / one.seconds:.3g}"]
+                self.rows.append(f"{ROW}{' | '.join(cells)} |")
 
     @property
     def code(self) -> int:
@@ -145,12 +110,9 @@ class Judge:
         return int(bool(self.wrong) or (self.strict and bool(self.missed)))
 
     def end(self) -> None:
-        """Say what was wrong and missed, and end the program.
+        """Say what was wrong and missed, and end the program: with code 1 if a number was wrong.
 
-        Raises
-        ------
-        SystemExit
-            Always: with code 1 if a number was wrong, or if a target was missed and these count.
+        A missed target counts too where it is `strict`.
         """
         print()
         if self.rows:
@@ -170,15 +132,7 @@ def time_of(seconds: float) -> str:
 
 
 def parser_of(name: str, about: str | None) -> argparse.ArgumentParser:
-    """Return the parser of a benchmark that is judged.
-
-    Parameters
-    ----------
-    name
-        Of the module in `tests.bench`.
-    about
-        Its docstring.
-    """
+    """Return the parser of the benchmark in a module of a name, with its docstring."""
     parser = argparse.ArgumentParser(prog=f"python -m tests.bench.{name}", description=about)
     parser.add_argument("--strict", action="store_true", help="a missed target of time is a failure too")
     parser.add_argument("--quick", action="store_true", help="smaller sizes, fewer runs")

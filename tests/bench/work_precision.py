@@ -102,17 +102,7 @@ class Bounce:
 
 
 def positions(bounce: Bounce, ticks: int, rtol: float = RTOL) -> Floats:
-    """Return the positions of device and ball just before each tick, from the first on (ticks + 1, 2).
-
-    Parameters
-    ----------
-    bounce
-        The scene.
-    ticks
-        How many to play.
-    rtol
-        The relative tolerance of each step.
-    """
+    """Return the positions of device and ball just before each tick, from the first on (ticks + 1, 2)."""
     state = np.array([*bounce.start, 0.0, 0.0])
     touching = False
     rows = [state[[0, 2]]]

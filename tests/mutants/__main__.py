@@ -1,18 +1,16 @@
 """Draw mutants of the product and say which of them the tests catch.
 
-    python -m tests.mutants --count 300 --seed 1 [--whole] [--within runtime/frame] [--tests FOLDER]
+    python -m tests.mutants --count 300 --seed 1 [--whole] [--within runtime/frame]
 
 Each mutant is tried in a copy of this checkout, with the tests of every file of which a test ran the changed
 line, those that ran it first, the quickest before the others, for at most `--seconds` of what they took
-unchanged. A test that fails, or that takes ten times that long, has caught it. `--tests` takes the tests of
-another checkout in the place of this one's: what two suites catch of the same mutants is then compared.
+unchanged. A test that fails, or that takes ten times that long, has caught it.
 """
 
 from __future__ import annotations
 
 import argparse
 import concurrent.futures
-import dataclasses
 import json
 import os
 import queue
@@ -34,18 +32,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--whole", action="store_true", help="the tests of `pytest --whole`")
     parser.add_argument("--within", default="", help="only files whose path begins so")
-    parser.add_argument("--tests", type=Path, default=ROOT / "tests", help="the folder of tests to judge")
     parser.add_argument("--seconds", type=float, default=40.0, help="of unchanged tests a mutant")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--reach", type=Path, help="file of who runs what: read, or written if missing")
-    parser.add_argument("--out", type=Path, help="JSON of all mutants and their fates")
     asked = parser.parse_args()
     drawn = draw(ROOT, asked.count, asked.seed, asked.within)
     words = ["--whole"] if asked.whole else []
     with tempfile.TemporaryDirectory() as folder:
         copies: queue.Queue[Path] = queue.Queue()
         for place in range(asked.jobs):
-            copies.put(_copy(Path(folder) / str(place), asked.tests))
+            copies.put(_copy(Path(folder) / str(place)))
         reach = asked.reach or Path(folder) / "reach.json"
         if not reach.exists():
             copy = copies.get()
@@ -70,23 +66,15 @@ def main() -> None:
                 print(f"{fate:12s} {mutant.path}:{mutant.line} {mutant.kind}: {_line(mutant)}", flush=True)
     counted = Counter(fates)
     print(f"{len(drawn)} mutants: " + ", ".join(f"{count} {fate}" for fate, count in sorted(counted.items())))
-    if asked.out:
-        rows = [
-            {**dataclasses.asdict(mutant), "fate": fate} for mutant, fate in zip(drawn, fates, strict=True)
-        ]
-        asked.out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
 
 
-def _copy(folder: Path, tests: Path) -> Path:
+def _copy(folder: Path) -> Path:
     """Copy the product and the tests, and lay `lib/apc` out as the package is installed."""
     keep = shutil.ignore_patterns("__pycache__", "*.apc")
-    for name in ("compiler", "runtime", "models"):
+    for name in ("compiler", "runtime", "models", "tests"):
         shutil.copytree(ROOT / name, folder / name, ignore=keep)
-    shutil.copytree(tests, folder / "tests", ignore=keep)
     for name in ("pyproject.toml", "setup.py", "README.md", "CHANGELOG.md"):
         shutil.copy(ROOT / name, folder / name)
-    # How tests are run and what they run on is this tree's: another suite needs nothing of it.
-    shutil.copytree(Path(__file__).parent, folder / "lib" / "mutants", ignore=keep)
     package = folder / "lib" / "apc"
     package.mkdir(parents=True)
     for path in (folder / "runtime").iterdir():
@@ -106,7 +94,7 @@ def _run(copy: Path, words: list[str], limit: float | None) -> int | None:
         "TMPDIR": str(copy / "tmp"),
     }
     (copy / "tmp").mkdir(exist_ok=True)
-    command = [sys.executable, str(copy / "lib" / "mutants" / "reach.py"), *words]
+    command = [sys.executable, str(copy / "tests" / "mutants" / "reach.py"), *words]
     with (copy / "log.txt").open("w") as log:
         process = subprocess.Popen(
             command, cwd=copy, env=environment, stdout=log, stderr=log, start_new_session=True

@@ -156,7 +156,7 @@ def test_a_function_that_calls_a_command_is_never_read(
     members = members_of(written("paper"))
     forged = forgeries(members, serialized, {"external": f"./{PWNED}.so", **JIT})
     attacks = [content for path, content in forged if not path.endswith("origin.topology")]
-    attacks = attacks[::8] if beside else attacks  # of which nothing is even looked at
+    attacks = attacks[::20] if beside else attacks  # of which nothing is even looked at
     for name in (*members, "function0.casadi"):
         attacks.append({**members})
         put(attacks[-1], name, serialized.encode())
@@ -202,6 +202,7 @@ def test_forged_files_of_every_sort_do_nothing_else_and_end() -> None:
 NAMES = ("device.x", "haptic", "lan", "contact.stiffness", "coordination.f")
 
 
+@pytest.mark.few(7)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("other", ["../{}", "/{}", "{}*/", "{}'"])
 def test_a_model_with_a_name_that_no_topology_can_give_is_refused(name: str, other: str) -> None:
@@ -213,6 +214,7 @@ def test_a_model_with_a_name_that_no_topology_can_give_is_refused(name: str, oth
     assert outcome() in ("refused", honest("channels"))
 
 
+@pytest.mark.few(10)
 @pytest.mark.parametrize("unit", ["mm", "parsec", "", "N N", "m^", "kg*m/s^2*", "A", "\x1b[31m"])
 @pytest.mark.parametrize("own", ["N/m", "kg", "m", "m/s"])
 def test_a_number_in_another_unit_than_its_own_is_refused(own: str, unit: str) -> None:
@@ -386,17 +388,6 @@ def test_what_is_no_model_is_refused_and_beside_its_topology_passed_over(
     assert not unchanged(capsys)
 
 
-def test_a_changed_member_is_refused_by_its_name_and_stands_for_no_topology(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    members = members_of(written("paper"))
-    SCENE.write_text(AVERAGE, encoding="utf-8")
-    for name in members:
-        MODEL.write_bytes(zipped({**members, name: members[name] + b" "}))
-        assert outcome() in ("refused", honest("paper")), name
-        assert not unchanged(capsys)
-
-
 def test_another_version_of_the_format_is_refused_by_number() -> None:
     members = members_of(written("paper"))
     (name,) = documents(members)
@@ -407,7 +398,7 @@ def test_another_version_of_the_format_is_refused_by_number() -> None:
     assert words.endswith("Write: apc compile scene.yaml")
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(place=st.floats(0, 1, exclude_max=True), byte=st.integers(0, 255), cut=st.booleans())
 def test_a_byte_changed_or_an_end_cut_off_is_refused_or_harmless(place: float, byte: int, cut: bool) -> None:
     data = written("paper")

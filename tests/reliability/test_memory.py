@@ -145,11 +145,6 @@ def test_a_process_is_told_before_the_system_would_end_it() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_sizes_are_told_in_three_digits() -> None:
-    told = [memory.size_text(size) for size in (0, 999, 1500, 2.5e7, 6.02e11, 4e14)]
-    assert told == ["0 B", "999 B", "1.5 kB", "25 MB", "602 GB", "400 TB"]
-
-
 def _leave(monkeypatch: pytest.MonkeyPatch, size: float) -> None:
     """Leave so many bytes free, however many this machine has."""
     monkeypatch.setattr(memory, "free_memory", lambda: size)

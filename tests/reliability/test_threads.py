@@ -50,55 +50,11 @@ def test_a_command_of_small_matrices_makes_no_threads() -> None:
     assert _begun({}).strip() == "{1} ['1', '1', '1']"
 
 
-@pytest.mark.whole
-def test_what_the_environment_says_of_threads_stays() -> None:
-    assert "['2', None, None]" in _begun({"OMP_NUM_THREADS": "2"})
-
-
 def test_the_environment_stays_once_the_libraries_are_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in POOLS:
         monkeypatch.delenv(name, raising=False)
     start_single_threaded()
     assert not set(POOLS) & os.environ.keys()
-
-
-_LATER = """
-import importlib, sys
-import numpy, threadpoolctl
-from apc.threads import load_pool, single_threaded
-
-def threads():
-    return {pool["num_threads"] for pool in threadpoolctl.threadpool_info()}
-
-threadpoolctl.ThreadpoolController().limit(limits=3)
-pools = len(threadpoolctl.threadpool_info())
-with single_threaded():
-    assert threads() == {1}
-{load}
-assert len(threadpoolctl.threadpool_info()) > pools, "SciPy brings a pool of its own"
-threadpoolctl.ThreadpoolController().limit(limits=3)
-with single_threaded():
-    with single_threaded():
-        assert threads() == {1}
-    assert threads() == {1}
-assert threads() == {3}
-"""
-
-
-@pytest.mark.whole
-@pytest.mark.parametrize(
-    "load",
-    [
-        "import scipy.linalg",
-        "with single_threaded():\n    with single_threaded():\n        load_pool('scipy.sparse.linalg')\n"
-        "        assert threads() == {1}\n    assert threads() == {1}",
-    ],
-)
-def test_a_pool_that_is_loaded_later_has_one_thread_too(load: str) -> None:
-    kept = {name: value for name, value in os.environ.items() if name not in POOLS}
-    run = [sys.executable, "-c", _LATER.replace("{load}", load)]
-    ran = subprocess.run(run, env=kept, capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stderr
 
 
 def test_what_brings_a_pool_is_loaded_where_it_is_limited() -> None:

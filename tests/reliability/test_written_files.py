@@ -484,12 +484,6 @@ def test_a_device_takes_the_text_of_a_command_and_its_words_stand_beside(
     assert not Path(f"{os.devnull}.parts").exists() and not Path(f"{os.devnull}.json").exists()
 
 
-@pytest.mark.whole
-def test_two_outputs_may_be_one_device(scene: Cli) -> None:
-    assert scene(f"simulate {SHORT} --plot /dev/null --still /dev/null").code == 0
-    assert Path("/dev/null").is_char_device()
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere every name is a text")
 def test_a_scene_whose_name_is_no_text_is_simulated(cli: Cli) -> None:
     name = os.fsdecode(b"b\xff.yaml")

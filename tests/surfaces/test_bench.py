@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import apc
-from apc.benchmark.bench import SAME, Bench, Measured, bench, bench_analysis, bench_simulation, pareto_front
+from apc.benchmark.bench import SAME, Bench, Measured, bench, bench_simulation, pareto_front
 from apc.benchmark.hard import compare, run_hard_cases
 from apc.benchmark.scale import scale
 from apc.compiler.compiled import CompiledSystem
@@ -22,7 +22,7 @@ from apc.present.bench import bench_picture
 from apc.simulation.settings import EXACT, Method
 from tests.commands import Cli, write
 from tests.hard.truths import HERE, TRUTHS, truth_of
-from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
+from tests.topologies import AVERAGE, SCENES, compiled, replaced
 
 
 @pytest.fixture(scope="module")
@@ -54,32 +54,6 @@ def test_the_front_is_what_nothing_beats_in_both_ways(
     assert [*marked] == sorted(marked)
 
 
-@pytest.mark.whole
-def test_every_method_that_serves_the_scene_is_measured_beside_its_error(found: Bench) -> None:
-    analysis, simulation = found.comparisons
-    names = {"modes", "dense", "determinant", "krylov", "certified", "paper"}
-    assert {one.name for one in analysis.measured} == names
-    assert analysis.reference.startswith("the same equations in 512-bit balls")
-    assert "spectral radius 0.957171389625094952208279125575" in analysis.reference
-    for one in analysis.measured:
-        assert one.error is not None
-        assert one.bound is not None
-        assert one.error <= one.bound
-    assert analysis.chosen is not None
-    assert analysis.chosen.name == "modes"
-    errors = {one.name: one.error for one in simulation.measured}
-    assert errors["exact"] is not None
-    assert errors["exact"] < 1e-14
-    assert simulation.reference.startswith("the exact transition")
-    assert simulation.chosen is not None
-    assert simulation.chosen.name == "exact"
-    # Of order four and one: a step of a quarter and of a tenth.
-    assert errors["rk4:1 ms"] / errors["rk4:0.25 ms"] > 100  # type: ignore[operator] # no error is None here
-    assert 5 < errors["semi-implicit:1 ms"] / errors["semi-implicit:0.1 ms"] < 20  # type: ignore[operator] # likewise
-    note = "nothing moves in this scene: device.x of its first peer starts 0.001 m elsewhere"
-    assert simulation.notes == (note,)
-
-
 PUSHED = """\
 topology: pushed
 clocks: {haptic: 1 ms}
@@ -97,30 +71,13 @@ hands:
 """
 
 
-ROTOR = """\
-component: Rotor
-about: A wheel that turns about its axis.
-connectors: {flange: Flange}
-parameters:
-  inertia: {unit: kg*m^2, above: 0}
-  drag: {unit: N*m*s, min: 0}
-  radius: {unit: m, above: 0}
-variables:
-  angle: {unit: rad, start: 0 rad}
-  rate: {unit: rad/s, start: 0 rad/s}
-equations:
-  - der(angle) = rate
-  - inertia*der(rate) = radius*flange.f - drag*rate
-  - flange.x = radius*angle
-"""
-
-
 @pytest.fixture
 def played_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave all other methods of simulation out: they say nothing of how a scene is set in motion."""
     monkeypatch.setattr("apc.benchmark.bench._methods", lambda _: [Method(EXACT)])
 
 
+@pytest.mark.whole
 @pytest.mark.usefixtures("played_exactly")
 def test_a_push_between_two_ticks_is_no_rest() -> None:
     assert "nothing moves" in bench_simulation(compiled(PUSHED), Fraction(1, 50), rounds=1).notes[0]
@@ -129,20 +86,6 @@ def test_a_push_between_two_ticks_is_no_rest() -> None:
     assert pushed.chosen is not None
     assert pushed.chosen.error is not None
     assert pushed.chosen.error < 1e-12
-
-
-@pytest.mark.usefixtures("played_exactly")
-def test_what_rests_is_moved_by_its_own_scale_in_its_own_unit(tmp_path: Path) -> None:
-    wheel = "{type: Rotor, inertia: 1 kg*m^2, drag: 1 N*m*s, radius: 5 mm}"
-    turning = replaced(PUSHED, ("{mass: 0.25 kg, damping: 2 N*s/m}", wheel))
-    found = bench_simulation(compiled(turning, library(tmp_path, ROTOR)), Fraction(1, 50), rounds=1)
-    assert found.notes == (
-        "nothing moves in this scene: device.angle of its first peer starts 0.001 rad elsewhere",
-    )
-    wide = replaced(PUSHED, ("{count: 1}", "{count: 2, set: {device.x: [20 mm, 30 mm]}}"))
-    still = compiled(replaced(wide, ("9 N/m", "0 N/m")))
-    [note] = bench_simulation(still, Fraction(1, 50), rounds=1).notes
-    assert "device.x of its first peer starts 0.03 m" in note
 
 
 @pytest.mark.whole
@@ -157,13 +100,9 @@ def test_a_method_that_cannot_serve_is_left_out_and_says_why() -> None:
     [(name, reason)] = bench_of_two.comparisons[0].refused
     assert name == "paper"
     assert "one clock of forces (here are haptic and slow)" in reason
-    many = bench_analysis(compiled(replaced(AVERAGE, ("count: 3", "count: 1000000"))), rounds=1)
-    reasons = dict(many.refused)
-    assert "8,000,000 states" in reasons["dense"]
-    assert not any("Write:" in reason for reason in reasons.values())
-    assert "modes" in {one.name for one in many.measured}
 
 
+@pytest.mark.whole
 def test_what_is_too_large_to_be_played_is_analysed_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("apc.simulation.simulation.NUMBER", 1e20)
     text = str(apc.bench(compiled(AVERAGE), rounds=1))
@@ -171,6 +110,7 @@ def test_what_is_too_large_to_be_played_is_analysed_all_the_same(monkeypatch: py
     assert "every method left out: 3 peers hold" in text and "--signals" not in text
 
 
+@pytest.mark.whole
 def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
     text = str(found)
     assert max(map(len, text.splitlines())) <= 80
@@ -189,6 +129,7 @@ def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
 # ---- more peers ----
 
 
+@pytest.mark.whole
 def test_more_peers_are_measured_each_in_a_process_of_its_own(cli: Cli) -> None:
     """The text with another count, of the group that grows; a number is measured once."""
     write("scene.yaml", replaced(AVERAGE, ("user: {count: 3}", "one: {count: 1}\n  many: {count: 4}")))
@@ -216,12 +157,6 @@ def test_numbers_of_peers_that_are_none_are_refused(scene: str, counts: list[int
         scale(SCENES / f"{scene}.yaml", counts)
 
 
-@pytest.mark.parametrize("words", ["many", "3,,4", "3.5", "nan", "1e400", "0", "1e10"])
-def test_a_list_that_is_none_of_peers_is_refused(words: str, cli: Cli) -> None:
-    ran = cli(f"bench '{SCENES}/template.yaml' --scale {words}")
-    assert ran.code == 1 and ran.err.startswith("--scale: E921 the list wants numbers ")
-
-
 # ---- the command ----
 
 
@@ -245,6 +180,7 @@ def test_a_picture_that_cannot_be_is_refused_before_anything_is_measured(
     assert ran.code == 1 and message in ran.err
 
 
+@pytest.mark.whole
 def test_what_goes_wrong_in_the_end_costs_no_figures(
     found: Bench, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:

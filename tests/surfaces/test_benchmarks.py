@@ -1,81 +1,27 @@
-"""The benchmarks of this folder's neighbour: they fail on wrong numbers, and know what they import."""
+"""The benchmarks of this folder's neighbour: they fail on wrong numbers, and what they import is there."""
 
 from __future__ import annotations
 
-import ast
 import importlib
-import importlib.util
 import math
-import re
-from pathlib import Path
 
 import pytest
 
-from tests.bench.__main__ import HERE, PARTS
+from tests.bench.__main__ import HERE
 from tests.bench.judge import NOISE, Judge
-from tests.bench.readme import BLOCK, ERROR, PAGES, ROOT, pictures, printed, whole
-
-
-def _code(judge: Judge) -> int:
-    with pytest.raises(SystemExit) as raised:
-        judge.end()
-    assert isinstance(raised.value.code, int)
-    return raised.value.code
 
 
 def test_a_wrong_number_fails_and_a_missed_time_only_when_asked() -> None:
     for error, most in ((1e-9, 1e-12), (math.nan, math.inf)):
         judge = Judge()
         assert judge.right("verdict", True) == "right"
-        assert judge.within("radius", error, most) == "WRONG"
-        assert _code(judge) == 1
+        assert (judge.within("radius", error, most), judge.code) == ("WRONG", 1)
     for strict in (False, True):
         judge = Judge(strict=strict)
-        assert judge.in_time("a", NOISE * 0.99, 1.0) == "near"
-        assert _code(judge) == 0
-        assert judge.in_time("b", math.nan, 1.0) == "missed"
-        assert _code(judge) == strict
+        assert (judge.in_time("a", NOISE * 0.99, 1.0), judge.code) == ("near", 0)
+        assert (judge.in_time("b", math.nan, 1.0), judge.code) == ("missed", strict)
 
 
-@pytest.mark.parametrize("path", sorted(HERE.rglob("*.py")), ids=lambda path: path.stem)
-def test_what_a_benchmark_imports_of_the_program_is_there(path: Path) -> None:
-    for one in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(one, ast.ImportFrom) and (one.module or "").split(".")[0] == "apc":
-            names = [alias.name for alias in one.names]
-            found = importlib.import_module(one.module or "")
-            gone = [name for name in names if not hasattr(found, name) and not _module(one.module, name)]
-            assert not gone, f"{one.module} has no {gone}"
-
-
-def _module(package: str | None, name: str) -> bool:
-    """Say whether a name is that of a module of a package."""
-    return importlib.util.find_spec(f"{package}.{name}") is not None
-
-
-def test_a_quick_run_is_of_the_same_program() -> None:
-    for part in PARTS:
-        assert part.command(True)[0] == part.command(False)[0]
-        assert part.words[0] == "apc" or importlib.util.find_spec(part.words[0])
-
-
-def test_every_picture_of_the_pages_is_drawn_by_a_command_that_stands_there() -> None:
-    text = whole()
-    shown = list(dict.fromkeys(re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)))
-    found = pictures(text)
-    assert shown
-    assert list(found) == shown
-    assert {words[1] for words in found.values()} == {"region", "simulate", "compare", "-m"}
-    for picture, words in found.items():
-        assert words[-1] == picture
-        assert all((ROOT / word).is_file() for word in words if word.endswith(".yaml"))
-    assert {path.name for path in (ROOT / "models" / "figures").iterdir()} == {
-        Path(picture).name for picture in shown
-    }
-
-
-def test_every_printed_block_of_the_pages_has_a_maker_that_prints_it() -> None:
-    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
-    assert len(BLOCK.findall(text)) == text.count("```text\n") > 0
-    for words, block in BLOCK.findall(text):
-        if words == ERROR:  # the commands are run by the tests of the README
-            assert printed(words, text) == block
+@pytest.mark.parametrize("name", sorted(path.stem for path in HERE.glob("*.py")))
+def test_what_a_benchmark_imports_of_the_program_is_there(name: str) -> None:
+    importlib.import_module(f"tests.bench.{name}")

@@ -16,7 +16,7 @@ import apc
 from apc.cli import progress
 from apc.cli.commands import apc as group
 from apc.cli.options import Command
-from apc.cli.progress import at_work, progress_bar, status_line
+from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Mistake, Place, visible
 from apc.present.forms import document, json_text
 from tests.commands import Cli, Ran, folder, write
@@ -69,14 +69,6 @@ def test_check_builds_nothing_and_reports_every_mistake(scene: Cli) -> None:
     assert folder() == ["scene.yaml"]
 
 
-@pytest.mark.parametrize("stage", ["source", "scene", "flat", "clocked", "sorted"])
-def test_until_prints_a_stage_and_writes_nothing(scene: Cli, stage: str) -> None:
-    ran = scene(f"compile scene.yaml --until {stage}")
-    assert (ran.code, ran.err) == (0, "")
-    assert len(ran.out.splitlines()) > 10
-    assert folder() == ["scene.yaml"]
-
-
 def test_json_is_one_document_and_nothing_else(scene: Cli) -> None:
     ran = scene("analyze --json")
     assert (ran.code, ran.err) == (0, "")
@@ -90,14 +82,6 @@ def test_json_is_one_document_and_nothing_else(scene: Cli) -> None:
     }
     unstable = scene("analyze --json --set 'coordination.stiffness=5000 N/m'")
     assert (unstable.code, json.loads(unstable.out)["stable"]) == (0, False), "which is an answer"
-
-
-def test_set_may_be_repeated_and_the_section_may_be_named(scene: Cli) -> None:
-    one = scene("analyze --json --set couplers.contact.stiffness=1.5N/mm --set links.lan.delay=0s")
-    write("scene.yaml", replaced(AVERAGE, ("1000 N/m", "1500 N/m"), ("delay: 8 ms", "delay: 0 s")))
-    two = scene("analyze --json")
-    assert (one.code, two.code) == (0, 0)
-    assert json.loads(one.out) == json.loads(two.out)
 
 
 def test_a_model_works_without_its_topology_and_a_stale_one_is_refused(scene: Cli) -> None:
@@ -159,13 +143,6 @@ def test_help_fits_a_terminal_and_every_command_is_one_of_ours(cli: Cli) -> None
         assert "-h, --help" in ran.out
         assert not command or type(group.get_command(context, command)) is Command, command
     assert cli("--version") == Ran(0, f"apc {apc.__version__}\n", "")
-
-
-def test_the_module_runs_like_the_command(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "apc", "new"]
-    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert (ran.returncode, ran.stderr) == (0, "")
-    assert [path.name for path in tmp_path.iterdir()] == ["topology.yaml"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a shell of another kind")
@@ -256,11 +233,9 @@ LONG = "n" * 300
     "words",
     [
         "compile .",
-        "compile /",
         "analyze .",
         f"compile {LONG}.yaml",
         f"analyze {LONG}.apc",
-        f"show scene.yaml --out {LONG}.txt",
         f"schema --out {LONG}.json",
         f"simulate scene.yaml --duration 1ms --out {LONG}.csv",
         f"sweep scene.yaml --over contact.stiffness=1N/m:2N/m:2 --out {LONG}.csv",
@@ -288,8 +263,6 @@ def test_two_topologies_of_one_model_are_refused_naming_both(cli: Cli) -> None:
     ("words", "parts"),
     [
         ("compile --force", ["source", "scene", "flat", "clocked", "sorted", "compiled", "save"]),
-        ("analyze --json", ["read", "analysis", "print"]),
-        ("critical contact.stiffness", ["read", "critical", "print"]),
         ("simulate --duration 0.1s", ["read", "prepare", "play", "print"]),
     ],
 )
@@ -302,45 +275,6 @@ def test_every_command_says_what_its_parts_take_on_stderr(scene: Cli, words: str
     assert (names[0], names[-2:]) == ("start", ["imports, rest", "all"])
     numbers = [float(row[1]) for row in rows]
     assert sum(numbers[:-1]) == pytest.approx(numbers[-1], abs=1.0)
-
-
-def test_what_is_no_terminal_sees_a_line_now_and_then_of_long_work_alone(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with status_line() as told, progress_bar("sweep", "points") as show:
-        told("looking")
-        show(1, 2)
-    assert capsys.readouterr() == ("", "")
-    monkeypatch.setattr(progress, "QUIET", 10.0)
-    clock = iter([0.0, 5.0, 11.0, 15.0, 23.0])
-    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
-    with status_line() as told:
-        for text in ("after 5 s", "after 11 s", "after 15 s", "after 23 s"):
-            told(text)
-    assert capsys.readouterr() == ("", "after 11 s\nafter 23 s\n")
-    monkeypatch.setattr(progress.time, "monotonic", iter([0.0, 0.0, 60.0, 60.0]).__next__)
-    with progress_bar("sweep", "points") as show:
-        show(1000, 4000)
-    assert capsys.readouterr().err == "sweep: 1,000 of 4,000 points, about 3 min left\n"
-
-
-def test_a_terminal_sees_a_line_that_is_gone_and_a_bar_once_the_work_takes_long(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    with pytest.raises(KeyboardInterrupt), status_line() as told:
-        told("looking at 3 values")
-        told("x" * 500)
-        raise KeyboardInterrupt
-    out, err = capsys.readouterr()
-    lines = err.split("\r\x1b[K")
-    assert (out, lines[1], lines[-1]) == ("", "looking at 3 values", "")
-    assert len(lines[2]) < 500, "no wider than the terminal"
-    for after, shown in ((float("inf"), False), (0.0, True)):
-        with progress_bar("sweep", "points", after=after) as show:
-            show(1, 4)
-            show(3, 4)
-        assert ("of 4 points" in capsys.readouterr().err) == shown
 
 
 def test_long_work_says_that_it_goes_on_and_what_may_take_long_is_said_first(

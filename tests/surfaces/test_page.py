@@ -7,7 +7,6 @@ import gzip
 import http.client
 import json
 import logging
-import re
 import socket
 import subprocess
 import sys
@@ -141,23 +140,8 @@ def test_sections_tell_what_the_api_tells(tmp_path: Path) -> None:
     assert verdict["radius"] == analysis.spectral_radius and verdict["text"] == str(analysis)
     region = told("region", (*axes_of(sliders, places, (0, 1)), "nominal"))
     assert region["share"] == pytest.approx(whole.stable_area / (5000 * 1500), rel=1e-4)  # drawn to 1e-5
-    assert told("margins")["text"] == str(apc.margins(system, set=setting))
     felt = apc.feel(system, feel["frequency"], set=setting)
     assert np.array_equal(feel["magnitude"], np.abs(felt.impedance))
-
-
-@pytest.mark.parametrize("label", ["coordination.stiffness", "user.count"])
-def test_the_roots_of_a_slider_are_the_eigenvalues_of_analyses(label: str, tmp_path: Path) -> None:
-    system = compiled(AVERAGE, tmp_path)
-    slider = named(sliders_of(system), label)
-    found = compute(model_bytes(system), Task("roots", (), (slider.free, slider.values))).found
-    assert found is not None and found["slider"] == label
-    for text in (slider.texts[0], slider.texts[-1]):
-        roots = (found["real"] + 1j * found["imag"])[np.array(found["name"]) == text]
-        modes = apc.analyze(system, set={label: text}).modes
-        leading = [one.eigenvalue for one in modes if one.magnitude > 1e-2]
-        for one in leading:
-            assert np.abs(roots - one).min() < 1e-9
 
 
 def test_a_section_that_a_scene_has_nothing_for_says_so(tmp_path: Path) -> None:
@@ -168,15 +152,6 @@ def test_a_section_that_a_scene_has_nothing_for_says_so(tmp_path: Path) -> None:
     unstable = (parse_override(compiled(AVERAGE, tmp_path), "contact.stiffness=5000 N/m"),)
     why = compute(model, Task("feel", unstable)).why
     assert "unstable" in why and "--" not in why  # a page has no command line
-
-
-@pytest.mark.whole
-def test_loss_and_jitter_are_the_critical_ones(tmp_path: Path) -> None:
-    system = compiled(LOSSY.replace(", jitter: 1 ms", ""), tmp_path)
-    found = compute(model_bytes(system), Task("network", ())).found
-    assert found is not None
-    assert str(apc.judge_network(system)) in found["text"]
-    assert str(apc.critical(system, "lan.loss")) in found["text"]
 
 
 def test_a_struck_device_moves_as_its_equation_says(tmp_path: Path) -> None:
@@ -240,30 +215,6 @@ def test_an_old_answer_never_takes_the_place_of_a_newer_one() -> None:
     assert len(shown) == 3
 
 
-def test_what_comes_later_waits_for_the_first_desk_but_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A slider that is moved without a stop keeps the first desk busy; the other gets its turn."""
-    now, timers = [100.0], []
-    monkeypatch.setattr("apc.explore.desk.time.monotonic", lambda: now[0])
-
-    def later(call: Callable[[], None], seconds: float) -> None:
-        timers.append((seconds, call)) if seconds else call()
-
-    held = Held(), Held()
-    quick, slow = (Desk(b"", (name,), later, lambda section, told: None) for name in "ab")
-    for desk, workers in zip((quick, slow), held, strict=True):
-        desk.workers = Workers(workers.submit, 1, lambda _: None)
-    quick.put_before(slow)
-    for number in range(3):
-        quick.ask(Task("a", (), number))
-        slow.ask(Task("b", (), number))
-    seconds, look = timers[-1]
-    look()
-    assert len(held[1].asked) == 0
-    now[0] += seconds
-    look()
-    assert [task.asked for task, _ in held[1].asked] == [2]
-
-
 # The topology with other values.
 
 
@@ -287,13 +238,6 @@ def test_a_value_is_written_where_it_stands(label: str, value: str, line: str, t
     assert apc.analyze(changed).spectral_radius == pytest.approx(expected.spectral_radius, rel=1e-12)
     assert len(text.splitlines()) == len(AVERAGE.splitlines())  # and comments stay where they were
     assert "# a copy at each peer" in text
-
-
-def test_a_number_of_one_group_is_written_there() -> None:
-    path = SCENES / "experiment-average.yaml"
-    system = apc.compile(path)
-    text = with_values(path.read_text("utf-8"), system, {Free("hand.force", "left"): "3 N"})
-    assert re.search(r"left:.*hand\.force: 3 N", text)
 
 
 # What can't be.
@@ -372,40 +316,6 @@ def test_a_slider_that_is_moved_changes_region_and_verdict_to_what_the_api_says(
     second.radius(apc.analyze(system).spectral_radius)
     assert second.press("lan.delay", "Tab", 1) == "8 ms"
     second.check(link)
-
-
-@pytest.mark.whole
-def test_a_motion_is_played_stopped_and_taken_to_any_time(tab: Tab, link: str) -> None:
-    tab.page.wait_for_function(f"{MODEL}('motion-words').text.includes('is struck')")
-    assert tab.press("time", "End", 1) == "1.000 s"
-    tab.press("time", "Home", 1)
-    tab.page.get_by_role("button", name="Play").click()
-    tab.page.wait_for_function(f"{MODEL}('time').value > 5")
-    tab.page.get_by_role("button", name="Pause").click()
-    at = tab.page.evaluate(f"{MODEL}('time').value")
-    tab.page.wait_for_timeout(300)
-    assert tab.page.evaluate(f"{MODEL}('time').value") == at
-    tab.check(link)
-
-
-@pytest.mark.whole
-def test_a_click_in_the_region_sets_both_sliders(tab: Tab, link: str) -> None:
-    tab.page.wait_for_function(f"{MODEL}('region-words').text.includes('Stable in')")
-    inner = tab.page.evaluate(
-        f"""(() => {{
-          window.scrollTo(0, 0)
-          const view = Bokeh.index.get_one({MODEL}('region-plot'))
-          const box = view.canvas_view.el.getBoundingClientRect(), frame = view.frame.bbox
-          return [box.x + frame.x + 0.8 * frame.width, box.y + frame.y + 0.4 * frame.height]
-        }})()"""
-    )
-    tab.page.mouse.click(*inner)
-    names = ("contact.stiffness", "coordination.stiffness")
-    tab.page.wait_for_function(f"{[*names]}.every(name => location.search.includes(name))")
-    chosen = parse_qs(tab.page.evaluate("location.search.slice(1)"))
-    x, y = (float(chosen[name][0].split()[0]) for name in names)
-    assert x == pytest.approx(0.8 * 5000, abs=50) and y == pytest.approx(0.6 * 1500, abs=15)
-    tab.check(link)
 
 
 @pytest.mark.whole
@@ -558,15 +468,16 @@ class Asked:
         pass
 
 
-@pytest.fixture
-def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Page:
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Page:
     """Give the page of a tab without a browser, and without those who compute for it."""
-    monkeypatch.setattr("apc.explore.page.Desk", Asked)
-    monkeypatch.setattr(Asked, "asked", [])
     document, request = Document(), SimpleNamespace(arguments={})
     context = SimpleNamespace(request=request)
     document._session_context = lambda: context  # type: ignore[assignment]
-    found = Page(scene_of(compiled(LOSSY, tmp_path), (), None), document)
+    scene = compiled(LOSSY, tmp_path_factory.mktemp("page"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("apc.explore.page.Desk", Asked)
+        found = Page(scene_of(scene, (), None), document)
     found._deliver("verdict", Told(None, "none"))
     names = ["user[1].device.x", "user[1].cube.x"]
     found._deliver(
@@ -594,6 +505,14 @@ def says(page: Page, model: Any, value: Any) -> None:
         assert record.getMessage().startswith("a message of the page was ignored: ValueError(")
 
 
+def tapped(page: Page, x: Any, y: Any) -> None:
+    """Have the browser say that the region was clicked."""
+    values = [["model", {"id": page.region.plot.id}], ["x", x], ["y", y]]
+    tap = {"type": "event", "name": "tap", "values": {"type": "map", "entries": values}}
+    told = {"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": tap}
+    page.document.apply_json_patch({"events": [told]})
+
+
 def test_what_the_browser_can_t_say_changes_nothing(page: Page) -> None:
     models = [*page.handles, *page.selects, page.begins, page.meant, page.at]
     before = [one.value for one in models]
@@ -602,10 +521,7 @@ def test_what_the_browser_can_t_say_changes_nothing(page: Page) -> None:
             says(page, model, value)
         for x, y in ((value, 1.0), (1.0, value)):
             if not is_number(value):  # of those the nearest values are taken
-                values = [["model", {"id": page.region.plot.id}], ["x", x], ["y", y]]
-                tap = {"type": "event", "name": "tap", "values": {"type": "map", "entries": values}}
-                told = {"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": tap}
-                page.document.apply_json_patch({"events": [told]})
+                tapped(page, x, y)
         assert [one.value for one in models] == before, value
     assert page.places == [one.start for one in page.sliders]
     assert not Asked.asked
@@ -639,6 +555,10 @@ def test_what_the_browser_may_say_is_computed(page: Page) -> None:
     assert Asked.asked[-1].asked == "user[1].cube.x"
     says(page, page.handles[0], last + 1)
     assert "contact.stiffness can&#x27;t be" in page.message.model.text
+    says(page, page.selects[0], "contact.stiffness")
+    tapped(page, 1500, 300)
+    moved = {one.label: one.values[at] for one, at in zip(page.sliders, page.places, strict=True)}
+    assert moved["contact.stiffness"] == 1500 and moved["coordination.stiffness"] == 300
 
 
 UPGRADE = {

@@ -24,7 +24,7 @@ from apc.__main__ import run
 from apc.compiler.errors import ApcError, Mistake
 from apc.loop.device import device_function
 from apc.loop.reading import read_run
-from apc.loop.run import delays_of, run_of
+from apc.loop.run import run_of
 from apc.loop.start import Part, Play, play_all
 from apc.processes import Workers
 from tests.surfaces.wire import Other, Wire, loop_at, send_packets
@@ -193,16 +193,6 @@ def test_what_cant_be_played_is_told(
     assert run(["play", "many.yaml", "--duration", "1 s"]) == 1
     assert "E975 65 peers would be as many processes: at most 64" in capsys.readouterr().err
     taken.close()
-
-
-def test_a_ways_delays_are_from_the_first_that_came_to_the_last(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    loop = loop_at(Wire(monkeypatch), compiled(MOVING), DIGEST, b"", "1")
-    loop.player.arrivals = [(0, 1, 5, 40, 50), (0, 1, 7, 56, 70), (0, 2, 1, 8, 9)]
-    found = delays_of(run_of(loop, DIGEST, ()), 0, 1)
-    assert np.isinf(found[1])
-    assert found[[0, 2]] == pytest.approx([10e-9, 14e-9])
 
 
 def test_a_peer_that_is_lost_or_silent_takes_nothing_of_the_others_along(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 import re
 import shutil
 from html.parser import HTMLParser
@@ -13,11 +12,9 @@ from pathlib import Path
 import pytest
 
 import apc
-from apc.compiler.errors import Mistake, Place
 from apc.present import report as pages
 from apc.present.report import kept_report, report_page
-from apc.reports import contents
-from apc.reports.contents import Report, Table, differences
+from apc.reports.contents import Report, differences
 from tests.commands import Cli, folder, write
 from tests.topologies import AVERAGE, SCENES, replaced
 
@@ -127,29 +124,7 @@ def test_sections_that_a_scene_cannot_fill_say_why(cli: Cli) -> None:
     assert all(f"Not here: {reason}" in text for reason in why.values())
 
 
-def test_over_an_unreliable_link_loss_and_jitter_are_looked_at_and_the_region_says_what_stable_means(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = []
-
-    def refusing(system: apc.CompiledSystem, name: str) -> apc.Critical:  # what it answers takes minutes
-        asked.append(name)
-        raise apc.ApcError(Mistake("E898", Place("here"), f"{name} takes too long"))
-
-    monkeypatch.setattr(contents, "critical", refusing)
-    path = tmp_path / "scene.yaml"
-    lossy = ("delay: 8 ms}", "delay: 8 ms, loss: 10 %, jitter: 1 ms}")
-    path.write_text(replaced(AVERAGE, lossy, ("count: 3", "count: 2")), "utf-8")
-    [scene] = apc.report(path).scenes
-    sections = {one.key: one for one in scene.sections}
-    assert {"lan.loss", "lan.jitter"} <= set(asked)
-    told = " ".join((sections["network"].refused, *sections["network"].told))
-    assert "loss: lan.loss takes too long" in told and "jitter: lan.jitter takes too long" in told
-    assert "with every packet on time" in sections["region"].told[-1]
-    assert "--in mean-square --out region.svg" in sections["region"].told[-1]
-    assert "--in nominal" in sections["region"].command
-
-
+@pytest.mark.whole
 def test_from_python_a_report_is_a_result_and_a_page(cli: Cli) -> None:
     write("scene.yaml", LONE)
     report = apc.report("scene.yaml", "r.html", set={"device.mass": "2 kg"})
@@ -234,21 +209,6 @@ def test_a_report_from_somebody_writes_nowhere_else(name: str, cli: Cli) -> None
     ran = cli("report --check r.html")
     assert ran.code == 1 and "E990 names a file outside of the scene's folder" in ran.err
     assert folder() == ["r.html"]
-
-
-def test_a_number_that_there_is_not_is_a_dash() -> None:
-    table = Table("T", ("where", "frequency [Hz]"), (("a", math.nan), ("b", None), ("c", 2.5)))
-    shown = re.findall(r"<td[^>]*>([^<]*)</td>", pages._table(table))
-    assert shown == ["a", "–", "b", "–", "c", "2.5"]
-
-
-def test_several_scenes_stand_side_by_side(cli: Cli) -> None:
-    for name in ("one", "two"):
-        write(f"{name}.yaml", replaced(LONE, ("lone", name)))
-    text = report_page(apc.report(["one.yaml", "two.yaml"]))
-    [section] = re.findall(r'<section id="verdict">.*?</section>', text, re.DOTALL)
-    assert "<h3>one</h3>" in section and "<h3>two</h3>" in section
-    assert '<section id="compared">' in text and "apc compare one.yaml two.yaml" in text
 
 
 @pytest.mark.parametrize(

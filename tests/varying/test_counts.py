@@ -69,11 +69,6 @@ def test_so_it_is_with_groups_and_with_counts_that_follow_from_numbers() -> None
             "E626 user.count wants at most 1,000,000 peers where lan isn't complete, got 1,000,001.",
         ),
         (
-            AVERAGE,
-            "peers=4",
-            "E623 peers is the number of all peers, which follows from the groups'. Write: user.count",
-        ),
-        (
             NAMED,
             "user.n=4",
             "E622 user.count is one number of the scene, and depends on what is set for user. "
@@ -105,8 +100,3 @@ def test_a_count_by_names_is_read_with_care(count: str, message: str) -> None:
     with pytest.raises(ApcError) as caught:
         compiled(text)
     assert message in str(caught.value)
-
-
-def test_a_count_is_asked_for_by_name_only_where_it_varies() -> None:
-    with pytest.raises(ApcError, match=r"E623 user.count is a number of peers, which doesn't vary here"):
-        apc.prove_box(compiled(NAMED), {"user.count": "±50%"})

@@ -17,6 +17,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
 from apc.vary.critical import Critical
+from apc.vary.margins import Margin
 from tests.bench import random_scans
 from tests.bruteforce import Scene, as_ball, frame_matrices, frame_matrix
 from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced
@@ -56,7 +57,7 @@ def scene(text: str) -> CompiledSystem:
     return apc.compile(path if path.exists() else HARD / f"{text}.yaml")
 
 
-def stable_at(system: CompiledSystem, found: Critical, value: Fraction) -> bool | None:
+def stable_at(system: CompiledSystem, found: Critical | Margin, value: Fraction) -> bool | None:
     """Return the verdict of an analysis with the number that was searched at a value."""
     unit = "" if found.unit == "1" else f" {found.unit}"
     return apc.analyze(system, set={found.parameter: f"{value}{unit}"}).stable
@@ -165,9 +166,10 @@ def test_a_delay_that_stands_in_a_force_moves_the_force_as_well() -> None:
         # The half width of the cube, 20 mm: beyond it a device moves freely, which is one motion more.
         pytest.param(*(scene("experiment-average"), "left.device.x", -0.02, 1e-12), marks=pytest.mark.whole),
         # The contact closes where its half width is how far the device begins from the cube.
-        (
+        pytest.param(
             compiled(replaced(PRESSED, ("-10 mm", "-15 mm"), (", side: left", ""), ("1000 N/m", "3000 N/m"))),
             *("contact.half_width", 0.015, 1e-12),
+            marks=pytest.mark.whole,
         ),
     ],
     ids=["an expression", "a start value", "a half width"],
@@ -257,6 +259,7 @@ ALONG = {
 }
 
 
+@pytest.mark.few(10)
 @pytest.mark.parametrize("name", ALONG)
 def test_the_verdict_along_a_scan_is_what_analyses_say(name: str) -> None:
     text, parameter, asked, values, count = ALONG[name]
@@ -301,8 +304,8 @@ def test_every_crossing_that_is_answered_is_one_between_two_analyses(path: Path)
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.whole)])
 def test_no_crossing_is_invented_and_none_is_missed_in_random_scenes(seed: int) -> None:
     """Against eigenvalues of all peers' matrix on a grid and beside each crossing."""
-    tally = random_scans.run(4, seed=seed)
-    assert tally.wrong == [] and tally.scans == 4
+    tally = random_scans.run(2, seed=seed)
+    assert tally.wrong == [] and tally.scans == 2
 
 
 def test_a_link_delay_jumps_where_a_packet_comes_a_tick_later() -> None:
@@ -322,14 +325,6 @@ def test_jumps_of_a_scene_within_a_part_in_10_13_of_its_boundary_are_exact() -> 
     found = apc.critical(HARD / "boundary-inside-13.yaml", "lan.delay", upper="16 ms")
     assert [(one.value, one.error) for one in found.crossings] == [(0.002, 0.0), (0.007, 0.0)]
     assert found.whole and not found.left_open
-
-
-@pytest.mark.whole
-def test_a_search_of_two_seconds_ends_where_a_short_one_does() -> None:
-    long, short = (apc.critical(compiled(AVERAGE), "lan.delay", upper=upper) for upper in ("2 s", "140 ms"))
-    assert long.crossings == short.crossings and long.whole
-    (edge,) = long.crossings
-    assert (edge.kind, edge.stable_side) == ("jump", "below")
 
 
 @pytest.mark.parametrize("low", [0, 14])
@@ -352,41 +347,14 @@ def test_stretches_of_which_no_analysis_decides_are_said_to_be_left_open() -> No
 
 
 def test_the_frequency_is_that_of_the_motion_that_decides() -> None:
-    for name in ("contact.stiffness", "contact.delay"):
-        [one, *_] = (found := apc.critical(compiled(AVERAGE), name)).crossings
-        mode = apc.analyze(compiled(AVERAGE), set={name: f"{one.value!r} {found.unit}"}).modes[0]
-        assert one.frequency_hz == pytest.approx(mode.frequency_hz, rel=1e-6)
+    [one, *_] = apc.critical(compiled(AVERAGE), "contact.stiffness").crossings
+    mode = apc.analyze(compiled(AVERAGE), set={"contact.stiffness": f"{one.value!r} N/m"}).modes[0]
+    assert one.frequency_hz == pytest.approx(mode.frequency_hz, rel=1e-6)
     # Eight ticks make a frame: a sign that changes at each, (−1)⁸ = 1, is no common translation.
     found = apc.critical(
         scene("experiment-average"), "coordination.damping", lower="100 N*s/m", upper="300 N*s/m"
     )
     assert [one.frequency_hz for one in found.crossings] == pytest.approx([500], rel=1e-9)
-
-
-def test_delays_of_a_scene_with_contact_are_those_of_the_springs_it_starts_with() -> None:
-    """Pressed at the start, a contact that only pushes is a spring; let go, it is none."""
-    springs, contacts = (
-        apc.critical(compiled(text), "contact.delay", upper="4 ms") for text in (AVERAGE, PRESSED)
-    )
-    assert contacts.value == pytest.approx(springs.value, abs=springs.error + contacts.error)
-    assert contacts.left_out and not springs.left_out
-    loose = compiled(replaced(PRESSED, ("device.x: -10 mm", "device.x: -30 mm")))
-    assert apc.critical(loose, "contact.delay", upper="4 ms").crossings == ()
-    rows = {one.parameter: one.value for one in apc.margins(compiled(PRESSED)).rows}
-    assert rows["contact.delay"] == pytest.approx(springs.value, rel=1e-12)
-
-
-@pytest.mark.few(2)
-@pytest.mark.parametrize("name", ["contact.delay", "coordination.delay", "lan.delay"])
-@pytest.mark.parametrize("times", [("0.13", "1", "8"), ("1.37", "0.61", "7.19")])
-def test_a_scan_of_a_delay_goes_beyond_the_present_value(name: str, times: tuple[str, str, str]) -> None:
-    """However many decimals the other times have: events don't coincide at every common divisor of all."""
-    names = ("contact.delay", "coordination.delay", "lan.delay")
-    settings = {key: f"{time} ms" for key, time in zip(names, times, strict=True)}
-    system = apc.set_parameters(compiled(AVERAGE), settings)
-    found = apc.critical(system, name)
-    assert found.scanned[0] == 0.0 and found.scanned[1] >= 2 * found.present
-    check(system, found)
 
 
 # ---- what is said ----
@@ -425,14 +393,10 @@ ORDER = "apc critical: E841 the command wants a parameter or delay, then the sce
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("peers", "E623 peers is the number of all peers"),
-        ("contact.stifness", "E622 contact.stifness is no parameter"),
         ("haptic.period", "E844 haptic.period sets the rhythm of a clock"),
         ("haptic.phase", "E844 haptic.phase sets the rhythm of a clock"),
         ("user.contact.delay", "contact.delay is one time for all groups. Write: contact.delay"),
         ("", "E622 an empty name is no parameter of"),
-        ("links.", "E622 links. is no parameter of"),
-        ("contact.stiffness|--upper|3 kg", "E204 contact.stiffness wants N/m, got 3 kg"),
         ("contact.stiffness|--upper|900", "--upper: E204 contact.stiffness wants N/m, got 900 (no"),
         ("contact.stiffness|--upper|900", 'Write: --upper "900 N/m"'),
         (

@@ -10,18 +10,14 @@ from typing import Any
 import flint
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import apc
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
 from apc.vary.many import Analyses
-from tests.fifty_digits.truth import spectral_truth
 from tests.paper_limit import BITS, truth
 from tests.topologies import AVERAGE, MESH, OSCILLATOR, ROOT, SCENES, compiled, replaced, told
-
-Floats = NDArray[np.float64]
 
 
 def as_alone(system: CompiledSystem, given: Mapping[str, Any], points: Any = None) -> Analyses:
@@ -68,7 +64,7 @@ EVERY_SCENE = sorted(
 )
 
 
-@pytest.mark.few(24)
+@pytest.mark.few(10)
 @pytest.mark.parametrize("points", [2, 6])
 @pytest.mark.parametrize("path", EVERY_SCENE, ids=lambda path: path.stem)
 def test_every_point_is_as_an_analysis_of_its_own_says(path: Path, points: int) -> None:
@@ -87,7 +83,7 @@ def test_every_point_is_as_an_analysis_of_its_own_says(path: Path, points: int) 
 @pytest.mark.parametrize("mesh", [False, True])
 def test_the_truth_in_sixty_digits_is_within_every_bound(mesh: bool, damping: float) -> None:
     random = np.random.default_rng(int(mesh) + int(damping))
-    k_c, k_t = random.uniform(10, 5000, (2, 120))
+    k_c, k_t = random.uniform(10, 5000, (2, 40))
     given = {"contact.stiffness": k_c, "coordination.stiffness": k_t}
     given |= {"contact.damping": damping, "coordination.damping": damping}
     found = apc.analyze_many(compiled(MESH if mesh else AVERAGE), given)
@@ -97,18 +93,6 @@ def test_the_truth_in_sixty_digits_is_within_every_bound(mesh: bool, damping: fl
             off = float(abs(known.radius - flint.arb(found.spectral_radius[place])).mid())
             assert found.stable[place] == bool(known.radius < 1)
         assert off <= found.spectral_radius_error[place]
-
-
-@pytest.mark.parametrize("name", ["mixed-clocks", "star-lecture"])
-def test_the_truth_of_other_scenes_is_within_every_bound(name: str) -> None:
-    system = apc.compile(SCENES / f"{name}.yaml")
-    values = np.random.default_rng(3).uniform(200, 2500, 6)
-    found = apc.analyze_many(system, {"contact.stiffness": values})
-    for place, value in enumerate(values.tolist()):
-        known = spectral_truth(apc.set_parameters(system, {"contact.stiffness": f"{value!r} N/m"}))
-        assert not isinstance(known, str)
-        off = float(abs(known.radius - flint.arb(found.spectral_radius[place])).mid())
-        assert off <= found.spectral_radius_error[place] and found.rigid_modes[place] == known.rigid
 
 
 def test_where_a_stiffness_of_zero_frees_a_motion_it_is_counted() -> None:
@@ -182,21 +166,6 @@ def test_times_vary_beside_numbers_each_with_its_own_schedule() -> None:
     assert as_alone(compiled(AVERAGE), given).verdict.shape == (4, 5)
 
 
-def test_counts_vary_as_scenes_of_so_many() -> None:
-    counts = np.array([2, 3, 5, 9])
-    found = apc.analyze_many(compiled(MESH), {"user.count": counts})
-    for place, count in enumerate(counts):
-        one = apc.analyze(compiled(replaced(MESH, ("count: 3", f"count: {count}"))))
-        off = abs(one.spectral_radius - found.spectral_radius[place])
-        assert off <= found.spectral_radius_error[place] + one.spectral_radius_error
-
-
-def test_a_scene_that_is_not_linear_says_what_is_left_out() -> None:
-    system = apc.compile(SCENES / "experiment-average.yaml")
-    found = as_alone(system, {"contact.stiffness": np.array([500.0, 900.0])})
-    assert found.left_out == apc.analyze(system).left_out
-
-
 def test_no_point_beside_a_double_eigenvalue_has_a_far_wider_bound() -> None:
     """At 1708 N/m and 10 N/m two eigenvalues nearly meet, and the vectors nearly are one."""
     contact, coordination = np.meshgrid(np.linspace(10, 3000, 200), [10.0, 25.0])
@@ -226,10 +195,6 @@ def test_the_result_is_a_table_a_text_and_plain_data() -> None:
     [
         ({}, 'E883 nothing varies. Write: {"contact.stiffness": [500.0, 1000.0]}'),
         (
-            {"contact.stifness": 1.0},
-            "E622 contact.stifness is no parameter of three-users-average. Write: contact.stiffness",
-        ),
-        (
             {"contact.stiffness": [math.nan]},
             "E881 the values of contact.stiffness wants finite numbers, in N/m, got [nan].",
         ),
@@ -237,7 +202,6 @@ def test_the_result_is_a_table_a_text_and_plain_data() -> None:
             {"contact.stiffness": []},
             "E881 the values of contact.stiffness wants finite numbers, in N/m, got [].",
         ),
-        ({"contact.stiffness": ["5 kg"]}, "E204 contact.stiffness wants N/m, got 5 kg."),
         (
             {"contact.stiffness": [1.0, 2.0], "device.mass": [1.0, 2.0, 3.0]},
             "E881 values of shapes that can't be broadcast wants equal shapes, got (2,) and (3,).",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterable
 
 import pytest
 
@@ -13,34 +12,28 @@ import apc
 from apc.compiler.compiled import CompiledSystem
 from tests.topologies import AVERAGE, ROOT, compiled, replaced
 
+OTHER = "user: {count: 2}\n  other: {count: 1, set: {device.mass: 0.3 kg}}"
 # Each changes one thing that what is kept hangs on: a number, a time, how many, who hears whom, a law.
-CHANGES: tuple[dict[str, str], ...] = (
-    {},
-    {"coordination.stiffness": "700 N/m"},
-    {"coordination.stiffness": "0 N/m"},
-    {"device.mass": "0.2 kg"},
-    {"device.damping": "0 N*s/m", "cube.damping": "0 N*s/m"},
-    {"lan.delay": "24 ms"},
-    {"contact.delay": "0 ms"},
-    {"network.period": "4 ms"},
-    {"user.count": "5"},
+SCENES: tuple[tuple[str, dict[str, str]], ...] = (
+    (AVERAGE, {}),
+    (AVERAGE, {"coordination.stiffness": "700 N/m"}),
+    (AVERAGE, {"coordination.stiffness": "0 N/m"}),
+    (AVERAGE, {"device.mass": "0.2 kg"}),
+    (AVERAGE, {"device.damping": "0 N*s/m", "cube.damping": "0 N*s/m"}),
+    (AVERAGE, {"lan.delay": "24 ms"}),
+    (AVERAGE, {"contact.delay": "0 ms"}),
+    (AVERAGE, {"network.period": "4 ms"}),
+    (AVERAGE, {"user.count": "5"}),
+    (AVERAGE.replace("AveragePosition", "FullMesh"), {}),
+    (replaced(AVERAGE, ("clock: network", "graph: ring, clock: network")), {}),
+    (replaced(AVERAGE, ("user: {count: 3}", OTHER)), {}),
 )
-TEXTS = (
-    AVERAGE,
-    AVERAGE.replace("AveragePosition", "FullMesh"),
-    replaced(AVERAGE, ("clock: network", "graph: ring, clock: network")),
-    replaced(
-        AVERAGE, ("user: {count: 3}", "user: {count: 2}\n  other: {count: 1, set: {device.mass: 0.3 kg}}")
-    ),
-)
-DEEP = (0, 1, 3, 5, 7)
+DEEP, FIRST = (0, 1, 3, 5, 7), (5,)
 
 
 def scene(place: int) -> CompiledSystem:
-    """Return one of the scenes: the first text with each change, then the other texts."""
-    if place < len(CHANGES):
-        return apc.set_parameters(compiled(TEXTS[0]), CHANGES[place])
-    return compiled(TEXTS[place - len(CHANGES) + 1])
+    text, change = SCENES[place]
+    return apc.set_parameters(compiled(text), change)
 
 
 def answers(place: int) -> str:
@@ -53,39 +46,18 @@ def answers(place: int) -> str:
     return "\n".join(listed)
 
 
-def alone(places: Iterable[int]) -> list[str]:
-    """Return what processes tell that are asked for one scene each."""
-    program = (
-        "import sys; from tests.varying.test_nothing_is_kept import answers; print(answers(int(sys.argv[1])))"
-    )
-    return [
-        subprocess.run(
-            [sys.executable, "-c", program, str(place)],
-            cwd=ROOT,
-            check=True,
-            capture_output=True,
-            text=True,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-        ).stdout.removesuffix("\n")
-        for place in places
-    ]
-
-
-COUNT = len(CHANGES) + len(TEXTS) - 1
-
-
 @pytest.mark.parametrize(
-    "places",
-    [
-        (0, 1, 5, 9),
-        *(pytest.param((k,), marks=pytest.mark.whole) for k in range(COUNT) if k not in (0, 1, 5, 9)),
-    ],
-    ids=str,
+    "place",
+    [pytest.param(k, marks=[] if k in FIRST else [pytest.mark.whole]) for k in range(len(SCENES))],
 )
-def test_a_scene_after_others_is_told_as_it_is_alone(places: tuple[int, ...]) -> None:
+def test_a_scene_after_others_is_told_as_it_is_alone(place: int) -> None:
     """Others are asked for first, in either order, and of other texts of as many states."""
-    expected = alone(places)
-    for others in (range(COUNT), reversed(range(COUNT))):
+    program = f"from tests.varying.test_nothing_is_kept import answers; print(answers({place}))"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    ran = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, check=True, capture_output=True, text=True, env=environment
+    )
+    for others in (range(len(SCENES)), reversed(range(len(SCENES)))):
         for other in others:
             apc.analyze(scene(other))
-        assert [answers(place) for place in places] == expected
+        assert answers(place) == ran.stdout.removesuffix("\n")

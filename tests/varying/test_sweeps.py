@@ -29,7 +29,7 @@ from tests.topologies import AVERAGE, ONE_MASS, compiled, told
 
 WALL = compiled(CHEAP)
 MODEL = compiled(ONE_MASS)  # the cheapest of scenes, for what is about files and processes
-OVER = {"device.mass": "1 kg:2 kg:40", "device.damping": "1,2,3,4,5 N*s/m"}
+OVER = {"device.mass": "1 kg:2 kg:26", "device.damping": "1,2,3,4,5 N*s/m"}
 WORDS = [word for name, values in OVER.items() for word in ("--over", f"{name}={values}")]
 
 
@@ -132,10 +132,6 @@ def test_files_and_tables_hold_the_rows_that_are_held_without_them(tmp_path: Pat
     about = json.loads(table.schema.metadata[b"apc"])
     assert about["parameters"]["device.mass"] == 2
     assert set(about["versions"]) >= {"apc", "numpy", "casadi"}
-    pytest.importorskip("pandas")
-    frame = held.to_dataframe()
-    assert frame.shape == (200, 9) and frame["device.mass [kg]"].iloc[-1] == 2
-    assert frame["verdict"].value_counts().to_dict() == dict(held.verdicts)
 
 
 # ---- the values ----
@@ -159,13 +155,6 @@ def test_a_range_or_list_gives_exact_values(text: str, values: list[Fraction]) -
     assert found.column("it.stiffness [N/m]").tolist() == [float(one) for one in values]
 
 
-def test_equal_ratios_have_the_ends_given_and_short_decimals_between() -> None:
-    found = apc.sweep(WALL, {"couplers.it.stiffness": "10 N/m:3000 N/m:7:log"}, jobs=1)
-    values = found.column("it.stiffness [N/m]")
-    assert (values[0], values[-1]) == (10, 3000)
-    assert values[1:] / values[:-1] == pytest.approx([300 ** (1 / 6)] * 6, rel=1e-14)
-
-
 FORM = "--over contact.stiffness='100 N/m:3000 N/m:30'"
 RANGE = "E881 the range of contact.stiffness wants "
 MANY = "E883 a sweep wants at most 10,000,000 points, got "
@@ -176,19 +165,10 @@ MANY = "E883 a sweep wants at most 10,000,000 points, got "
     [
         ({}, f"E883 nothing is swept. Write: {FORM}"),
         (
-            {"contact.stifness": "0 N/m:1 N/m"},
-            "E622 contact.stifness is no parameter of three-users-average. Write: contact.stiffness",
-        ),
-        (
             {"contact.stiffness": "3 N/m:1 N/m"},
             f"{RANGE}its lower end first, and the upper above it, got 3 N/m to 1 N/m.",
         ),
-        (
-            {"contact.stiffness": "1 N/m:1 N/m:5"},
-            f"{RANGE}its lower end first, and the upper above it, got 1 N/m to 1 N/m.",
-        ),
         ({"contact.stiffness": "1 N/m:9 N/m:0"}, f"{RANGE}2 values or more, got 0. Write: {FORM}"),
-        ({"contact.stiffness": "1 N/m:9 N/m:many"}, f"{RANGE}2 values or more, got many. Write: {FORM}"),
         ({"contact.stiffness": "1 N/m:9 N/m:"}, f"{RANGE}2 values or more, got nothing. Write: {FORM}"),
         (
             {"contact.stiffness": "1 N/m:2 N/m:3:4"},
@@ -203,15 +183,8 @@ MANY = "E883 a sweep wants at most 10,000,000 points, got "
             "E881 the list of contact.stiffness wants different values, got 5 N/m twice.",
         ),
         ({"contact.stiffness": "1 kg:2 kg"}, "E204 contact.stiffness wants N/m, got 1 kg. Write: 1 N/m"),
-        ({"contact.stiffness": "1:2"}, "E204 contact.stiffness wants N/m, got 1 (no unit). Write: 1 N/m"),
-        ({"contact.stiffness": "5 N/m,"}, "E221 contact.stiffness wants N/m, got nothing. Write: 1 N/m"),
-        (
-            {"peers": "2:10"},
-            "E623 peers is the number of all peers, which follows from the groups'. Write: user.count",
-        ),
         ({"user.count": "2.5:10"}, "E881 the range of user.count wants whole numbers, got 2.5 to 10."),
         ({"user.device.mass": "-1 kg:1 kg"}, "E624 user.device.mass wants more than 0 kg, got -1 kg."),
-        ({"haptic.period": "0 ms, 1 ms"}, "E625 haptic.period wants a time above 0 s, got 0.0 s."),
         (
             {"contact.stiffness": "1,2 N/m", "couplers.contact.stiffness": "3,4 N/m"},
             "E883 contact.stiffness is swept twice.",
@@ -279,6 +252,7 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
 }
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_part_that_is_not_as_it_was_written_is_computed_again(
     damage: str, tmp_path: Path, whole: bytes
@@ -300,7 +274,7 @@ def test_what_another_user_computed_is_computed_again(
     target = tmp_path / "r.csv"
     with monkeypatch.context() as theirs:
         theirs.setattr(seal, "_folder", lambda: tmp_path / "theirs")
-        assert len(interrupted(target, 200)) == 4
+        assert len(interrupted(target, 130)) == 3
     found = small(out=target, jobs=1)
     assert not any("already" in note for note in found.notes) and target.read_bytes() == whole
 
@@ -379,23 +353,24 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-LONG = ("mass.apc", "--over", "device.mass=1 kg:2 kg:250", "--over", "device.damping=1,2,3,4 N*s/m")
+LONG = ("mass.apc", "--over", "device.mass=1 kg:2 kg:125", "--over", "device.damping=1,2,3,4 N*s/m")
 
 
+@pytest.mark.whole
 def test_killed_three_times_it_gives_the_file_of_one_left_alone(folder: Path) -> None:
     left_alone = start(folder, *LONG, "--out", "alone.csv", "--jobs", "1")
     target = folder / "r.csv"
     before: dict[str, tuple[int, int]] = {}
     for kill in range(3):
         jobs = "1" if kill else "2"  # it may change from run to run
-        running = start_waiting(folder, 3 + kill, *LONG, "--out", "r.csv", "--jobs", jobs)
-        wait_for_parts(running, target, len(before) + 3 + kill)
+        running = start_waiting(folder, 1 + kill, *LONG, "--out", "r.csv", "--jobs", jobs)
+        wait_for_parts(running, target, len(before) + 1 + kill)
         workers = children(running.pid)
         running.kill()
         running.communicate()
         now = parts(target)
         assert before.items() <= now.items(), "a finished part was computed or written again"
-        assert len(now) == len(before) + 3 + kill
+        assert len(now) == len(before) + 1 + kill
         before = now
         while any(alive(pid) for pid in workers):  # for ever, if one outlives the process that started it
             time.sleep(0.01)
@@ -405,7 +380,7 @@ def test_killed_three_times_it_gives_the_file_of_one_left_alone(folder: Path) ->
     assert f"note: {64 * len(before):,} points were there already" in out
     assert left_alone.communicate()[1] == ""
     assert target.read_bytes() == (folder / "alone.csv").read_bytes()
-    assert len(target.read_text(encoding="utf-8").splitlines()) == 1001
+    assert len(target.read_text(encoding="utf-8").splitlines()) == 501
     assert not (folder / "r.csv.parts").exists()
 
 
@@ -417,7 +392,7 @@ def test_an_interrupt_ends_with_what_is_done_and_says_how_to_go_on(folder: Path)
     out, err = running.communicate()
     assert (running.returncode, out) == (130, "")
     first, second = (line for line in err.splitlines() if line)
-    assert first.endswith(" of 1,000 points are kept in r.csv.parts; the same command takes up from there")
+    assert first.endswith(" of 500 points are kept in r.csv.parts; the same command takes up from there")
     assert second == "stopped"
     assert not target.exists() and len(parts(target)) == 2
 
@@ -433,14 +408,14 @@ def test_a_terminal_sees_progress_and_a_file_does_not(
         while chunk := _read(master):
             seen += chunk
     os.close(master)
-    assert b"200 of 200 points" in seen
+    assert b"130 of 130 points" in seen
     monkeypatch.chdir(folder)
     capsys.readouterr()
     assert run(["sweep", "mass.apc", *WORDS, "--out", "s.csv", "--jobs", "1", "--json"]) == 0
     out, err = capsys.readouterr()
     document = json.loads(out)
-    assert (document["points"], document["out"], err) == (200, "s.csv", "")
-    assert sum(document["verdicts"].values()) == 200
+    assert (document["points"], document["out"], err) == (130, "s.csv", "")
+    assert sum(document["verdicts"].values()) == 130
     assert (folder / "r.csv").read_bytes() == (folder / "s.csv").read_bytes()
 
 
@@ -449,30 +424,3 @@ def _read(terminal: int) -> bytes:
         return os.read(terminal, 65536)
     except OSError:  # Linux says so when the other end has closed
         return b""
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--over", "it.stiffness"), "sweep: E880 --over wants PATH=VALUES, got it.stiffness."),
-        (("--over", "it.stifness=1,2 N/m"), "sweep: E622 it.stifness is no parameter of wall."),
-        (
-            ("--over", "it.stiffness=1,2 N/m", "--out", "nowhere/r.csv", "--jobs", "1"),
-            "nowhere/r.csv: E601 can't be written: No such file or directory.",
-        ),
-    ],
-)
-def test_bad_input_gets_one_message_and_leaves_nothing(
-    words: tuple[str, ...],
-    message: str,
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(folder)
-    before = sorted(folder.iterdir())
-    capsys.readouterr()
-    assert run(["sweep", "wall.apc", "--out", "r.csv", *words]) == 1
-    out, err = capsys.readouterr()
-    assert out == "" and err.startswith(message) and len(err.splitlines()) == 1
-    assert sorted(folder.iterdir()) == before
