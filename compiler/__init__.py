@@ -16,7 +16,7 @@ scene                       named_numbers, timebase, instances, sections, channe
 equations                   connections: where connectors meet; flatten
                             reductions: what is heard of the others; clock_inference: what ticks together;
                             clocks
-                            terms, symbolic, identities, zero_test: algebra; solution, matching, residuals,
+                            terms, symbolic, zero_test: SymPy; solution, matching, residuals,
                             elimination, tearing, blocks: solving; derivatives, aliases, index: derivatives
                             and states; structure
 functions                   casadi_writer, reached: what is written; exchange: what lies beside;
