@@ -99,15 +99,6 @@ def test_the_compiler_never_imports_the_runtime() -> None:
     assert not wrong
 
 
-def test_every_result_is_shown_as_text_and_as_data() -> None:
-    for name, module in modules().items():
-        for kind in module.results:
-            room, _, own = getattr(importlib.import_module(name), kind).shown_by.partition(":")
-            shown = importlib.import_module(f"apc.present.{room}")
-            for form in ("text", "document"):
-                assert callable(getattr(shown, f"{own}_{form}")), f"{name}: {kind}"
-
-
 def test_what_is_looked_up_by_name_is_a_result_or_somebody_elses_library() -> None:
     """Or the order would be kept in words only."""
     calling = {name for name, module in modules().items() if "import_module" in module.calls}

@@ -62,18 +62,6 @@ def magnitudes(matrix: Floats) -> Floats:
     return np.sort(np.abs(np.linalg.eigvals(matrix)))[::-1]
 
 
-@pytest.mark.few(4)
-@pytest.mark.parametrize("name", EVERY)
-def test_its_eigenvalues_are_those_of_the_analysis(name: str) -> None:
-    analysis = apc.analyze(made(name))
-    modes = [mode.magnitude for mode in analysis.modes for _ in range(mode.multiplicity)]
-    wanted = np.sort([*modes, *[1.0] * analysis.rigid_modes])[::-1]
-    found = magnitudes(state_space(made(name)).a)
-    large = wanted[wanted > 1e-2]  # defective ones near 0 are known to no digit
-    assert found[: len(large)] == pytest.approx(large, abs=1e-7)  # a pair may be a double root
-    assert (found[len(large) :] < 1.5e-2).all()
-
-
 def cuts(system: apc.CompiledSystem) -> list[str]:
     """Return all that a scene can be cut at."""
     forces = {hold.name.rpartition(".")[0] for kind in system.kinds for hold in kind.holds}

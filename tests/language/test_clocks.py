@@ -38,13 +38,6 @@ def test_a_value_of_the_tick_before_is_a_memory_that_starts_as_is_said(tmp_path:
     assert values(system)["all.s"] == 0.002
 
 
-def test_what_is_held_is_one_value_and_a_memory_that_nobody_reads_is_none(tmp_path: Path) -> None:
-    system = filtered(tmp_path, "s = sample(flange.x)", "w = previous(s)", "k*hold(s - 2*s)")
-    [tick] = system.kinds[0].clocks
-    assert (len(tick.outputs), tick.memories) == (1, ())
-    assert list(ticked(system, {"device.x": 0.25}).values()) == [-0.25]
-
-
 # ---- what is heard ----
 
 FOLLOWER = """\

@@ -51,44 +51,6 @@ def test_an_override_reaches_every_group_or_the_one_named(name: str) -> None:
     assert _value(changed, "contact.stiffness", 1) == _value(system, "contact.stiffness", 1) != 800.0
 
 
-def test_what_depends_on_a_parameter_follows_it() -> None:
-    system = derived(paper(), coordination__stiffness="kt/(peers - 1)", lan__delay="2*wait")
-    changed = apply(system, [Override(Free("kt"), Fraction(3000)), Override(Free("wait"), Fraction(1, 90))])
-    assert _value(changed, "coordination.stiffness") == 1500.0
-    assert resolve(changed).timings["lan.delay"] == Fraction(1, 45)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (
-            "contact.stifness=8 N/m",
-            "E622 contact.stifness is no parameter of paper. Write: contact.stiffness",
-        ),
-        (
-            "contact.stiffness",
-            "E621 an override wants NAME=VALUE, got contact.stiffness. Write: contact.stiffness=800 N/m",
-        ),
-        (
-            "contact.stiffness=800",
-            "E204 contact.stiffness wants N/m, got 800 (no unit). Write: contact.stiffness=800 N/m",
-        ),
-        ("peers=4", "E623 peers is the number of all peers"),
-        ("cube.mass=0 kg", "E624 cube.mass wants more than 0 kg, got 0 kg."),
-        ("contact.damping=-1 N*s/m", "E624 contact.damping wants at least 0 N*s/m, got -1 N*s/m."),
-        ("haptic.period=0 s", "E625 haptic.period wants a time above 0 s, got 0.0 s."),
-        ("lan.delay=-1 ms", "E625 lan.delay wants a time of 0 s or more, got -0.001 s."),
-        ("left.lan.delay=1 ms", "E622 left.lan.delay is no parameter of paper"),
-    ],
-)
-def test_mistakes_say_what_to_write(text: str, message: str) -> None:
-    system = grouped(paper(), ("left", 1, {}), ("right", 1, {}))
-    with pytest.raises(ApcError) as caught:
-        apply(system, [parse_override(system, text)])
-    [mistake] = caught.value.mistakes
-    assert f"{mistake.code} {mistake.sentence}".startswith(message)
-
-
 @pytest.mark.parametrize("name", ["device.mass", "user.device.mass"])
 def test_an_override_replaces_a_column(name: str) -> None:
     system = columned(paper(), device__mass=[0.1, 0.2, 0.1])

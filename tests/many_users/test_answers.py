@@ -7,7 +7,6 @@ import random
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import apc
@@ -252,12 +251,3 @@ def test_what_is_left_out_though_some_of_it_moves_in_modes_is_a_common_shift(tmp
     assert "the common shift of kept.s" in str(found)
 
 
-def test_prepared_work_serves_other_numbers_and_other_times() -> None:
-    for name, value in (
-        ("coordination.stiffness", "900 N/m"),
-        ("lan.delay", "4 ms"),
-        ("haptic.period", "0.5 ms"),
-    ):
-        changed = apc.set_parameters(compiled(AVERAGE), {name: value})
-        assert apc.analyze(changed) == apc.analyze(compiled(AVERAGE), set={name: value})
-        assert not np.isclose(apc.analyze(changed).spectral_radius, 0.95717138962509, atol=1e-6)
