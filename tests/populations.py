@@ -6,11 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from apc.analysis.analysis import prepare
 from apc.compiler.compiled import CompiledSystem
-from apc.frame.exchange import Exchange, build_exchange
-from apc.frame.parameters import resolve
-from apc.large.populations import Population, populations
 from tests.sites import columned, linked, paper
 
 
@@ -34,10 +30,3 @@ def different(
         device__damping=5 * (1 + spread * random.random(peers)),
         contact__stiffness=gains["kc"] * (1 + spread * random.random(peers)),
     )
-
-
-def crowded(system: CompiledSystem) -> tuple[tuple[Population, ...], Exchange]:
-    """Return the populations of a system and the exchange between them."""
-    prepared, numbers = prepare(system), resolve(system)
-    found = populations(system, prepared.jacobians, prepared.schedules, numbers)
-    return found, build_exchange(system, numbers.timings)

@@ -18,15 +18,10 @@ from apc.compiler.compiled import (
     Graph,
     Group,
     PairDelay,
-    Parameter,
     Receive,
     Timing,
 )
 from apc.compiler.components.library import Library
-from apc.compiler.errors import Place
-from apc.compiler.functions.exchange import followers_of
-from apc.compiler.language.evaluation import formula_of
-from apc.compiler.language.grammar import parse_expression
 from tests.bruteforce import Scene
 from tests.topologies import compiled
 from tests.truths import text_of
@@ -136,19 +131,3 @@ def grouped(system: CompiledSystem, *groups: tuple[str, int, dict[str, float]]) 
             for name, count, own in groups
         ),
     )
-
-
-def derived(system: CompiledSystem, **expressions: str) -> CompiledSystem:
-    """Add the parameters kt and wait, and expressions over them for parameters and timings."""
-    formulas = {
-        key.replace("__", "."): formula_of(parse_expression(text, Place("a.yaml", 1, 1, text)))
-        for key, text in expressions.items()
-    }
-    parameters = (
-        Parameter("kt", "N/m", 500.0),
-        Parameter("wait", "s", 0.008),
-        *(replace(p, formula=formulas.get(p.name)) for p in system.parameters),
-    )
-    timings = tuple(replace(t, formula=formulas.get(t.name)) for t in system.timings)
-    followers = followers_of(parameters, timings, system.groups)
-    return replace(system, parameters=parameters, timings=timings, followers=followers)

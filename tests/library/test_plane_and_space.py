@@ -266,5 +266,3 @@ def test_an_array_inside_a_component_is_the_row_that_a_topology_writes_out(tmp_p
     a = np.block([[np.zeros((3, 3)), np.eye(3)], [-k / 2, -np.diag([0, 0, 1]) / 2]])
     known = np.exp(np.linalg.eigvals(a).real).max()
     assert apc.analyze(found).spectral_radius == pytest.approx(known, rel=1e-9)
-
-

@@ -45,5 +45,3 @@ def test_every_scene_compiles_needs_all_it_names_and_has_its_verdict(name: str) 
     if name in VERDICTS:
         result = apc.analyze(system)
         assert (result.verdict, result.rigid_modes) == VERDICTS[name]
-
-

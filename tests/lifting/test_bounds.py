@@ -52,5 +52,3 @@ def test_the_true_one_of_all_that_lie_within_the_radii_lies_within(name: str, se
             for one, off, sign in zip((a, b), (off_a, off_b), corner, strict=True)
         ]
         assert _within(found, exactly(*moved))
-
-

@@ -67,5 +67,3 @@ def test_growth_beyond_a_float_is_refused() -> None:
     a = np.array([[Fraction(10**7)]], dtype=object)
     with pytest.raises(ApcError, match="E806"):
         discretize(a, np.zeros((1, 0), dtype=object), [Fraction(1)])
-
-

@@ -23,7 +23,7 @@ from apc.frame.overrides import Override, apply, parse_override
 from apc.frame.parameters import resolve
 from apc.vary.many import analyze_many
 from apc.vary.margins import margins
-from tests.sites import columned, derived, grouped, paper
+from tests.sites import columned, grouped, paper
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
 
 
@@ -140,14 +140,17 @@ def test_what_a_group_sets_of_a_part_reaches_the_parts_inside(
     assert [kind.holds[0].clock for kind in kinds] == ["haptic", "slow"]
 
 
-def test_what_depends_on_a_column_is_worked_out_peer_by_peer() -> None:
-    text = (
-        "if device.mass > 0.15 and peers == 3 then kt*max(device.mass, 0.3) else -(-sqrt(kt)^2)/(peers - 1)"
+def test_what_depends_on_a_column_is_worked_out_peer_by_peer(tmp_path: Path) -> None:
+    law = ("2*k", '"if k > rest and k < 9*rest then 3*max(k, 2*rest) else -(-k)/2"')
+    part = replaced(OUTER, law, ("{k: {unit: N/m}", "{k: {unit: N/m}, rest: {unit: N/m, default: 2 N/m}"))
+    text = replaced(
+        NESTED,
+        ("{one: {count: 1}, two: {count: 2, set: {o.k: 7 N/m", "{two: {set: {o.k: [1 N/m, 3 N/m, 7 N/m]"),
     )
-    system = columned(derived(paper(), coordination__stiffness=text), device__mass=[0.1, 0.2, 0.4])
-    assert _column(system, "coordination.stiffness") == pytest.approx([250.0, 150.0, 200.0], rel=1e-15)
-    doubled = apply(system, [Override(Free("kt"), Fraction(1000))])
-    assert _column(doubled, "coordination.stiffness") == pytest.approx([500.0, 300.0, 400.0], rel=1e-15)
+    system = compiled(text, library(tmp_path, part))
+    assert _column(system, "o.inner.stiffness") == pytest.approx([0.5, 12.0, 21.0], rel=1e-15)
+    less = apply(system, [parse_override(system, "o.rest=0.5 N/m")])
+    assert _column(less, "o.inner.stiffness") == pytest.approx([3.0, 9.0, 3.5], rel=1e-15)
 
 
 def test_what_is_set_for_all_groups_says_what_each_of_them_has(capsys: pytest.CaptureFixture[str]) -> None:

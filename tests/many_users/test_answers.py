@@ -249,5 +249,3 @@ def test_what_is_left_out_though_some_of_it_moves_in_modes_is_a_common_shift(tmp
     assert found.unfelt == ("the common shift of kept.s, kept.s sent",)
     assert any(share[0].startswith("kept.s") for mode in found.modes for share in mode.participation)
     assert "the common shift of kept.s" in str(found)
-
-

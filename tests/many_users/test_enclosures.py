@@ -225,5 +225,3 @@ def test_schur_and_cohn_tell_where_the_roots_are(roots: tuple[complex, ...], ins
     with precision(256):
         exact = flint.acb_poly.from_roots([flint.acb(root.real, root.imag) for root in map(complex, roots)])
         assert schur_cohn([coefficient.real for coefficient in exact.coeffs()]) is inside
-
-

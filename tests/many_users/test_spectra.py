@@ -180,22 +180,23 @@ def different(peers: int, graph: str = "complete", **values: Any) -> str:
     return replaced(on_graph(peers, graph, **gains), (f"{{count: {peers}}}", f"{{set: {{{listed}}}}}"))
 
 
-LARGE: list[tuple[str, str]] = [
-    (different(12), "determinant"),
-    (different(5, operator="sum"), "determinant"),
-    (different(12, kt=6000.0), "determinant"),
-    (different(5, comp=Fraction(0), comm=Fraction(0)), "determinant"),
-    (different(5, comp=MS * 5 / 2, comm=4 * MS), "determinant"),
-    (different(2, haptic=2 * MS, network=3 * MS), "determinant"),
-    (different(5, comm=30 * MS), "determinant"),
-    (different(16, "ring"), "krylov"),
-    (different(16, "star", operator="sum"), "krylov"),
+LARGE = [
+    different(12),
+    different(5, operator="sum"),
+    different(12, kt=6000.0),
+    different(5, comp=Fraction(0), comm=Fraction(0)),
+    different(5, comp=MS * 5 / 2, comm=4 * MS),
+    different(2, haptic=2 * MS, network=3 * MS),
+    different(5, comm=30 * MS),
 ]
 
 
-@pytest.mark.parametrize(("text", "method"), LARGE)
-def test_ways_for_very_many_who_differ_have_the_modes_of_the_whole_matrix(text: str, method: str) -> None:
-    found, whole = (apc.analyze(compiled(text), method=way) for way in (method, "dense"))  # type: ignore[arg-type] # a method
+@pytest.mark.parametrize("text", LARGE)
+def test_determinants_of_many_who_differ_have_the_modes_of_the_whole_matrix(text: str) -> None:
+    found, whole = (
+        apc.analyze(compiled(text), method="determinant"),
+        apc.analyze(compiled(text), method="dense"),
+    )
     assert (found.verdict, found.rigid_modes) == (whole.verdict, whole.rigid_modes)
     off = abs(found.spectral_radius - whole.spectral_radius)
     assert off <= found.spectral_radius_error + whole.spectral_radius_error < 1e-7
@@ -212,12 +213,11 @@ def test_ways_for_very_many_who_differ_have_the_modes_of_the_whole_matrix(text: 
         (text_of(Scene(peers=1_000_000)), "modes"),
         (different(3), "modes"),
         (different(60), "determinant"),
-        (different(60, "ring"), "krylov"),
         (on_graph(1000, "ring"), "modes"),
         (text_of(Scene(comm=8000 * MS)), "determinant"),
         (text_of(Scene(comm=80 * MS)), "modes"),
     ],
-    ids=["a million", "three", "sixty", "sixty on a ring", "a ring", "8 s late", "80 ms late"],
+    ids=["a million", "three", "sixty", "a ring", "8 s late", "80 ms late"],
 )
 def test_the_method_is_chosen_by_what_differs(text: str, method: str) -> None:
     assert apc.analyze(compiled(text)).method == method
@@ -233,11 +233,8 @@ def test_the_method_is_chosen_by_what_differs(text: str, method: str) -> None:
         ),
         (different(3, "ring"), "modes", "E850 method modes can't serve this scene: all peers as one system"),
         (different(60, "ring"), "determinant", "E850 method determinant .* hear all others over lan"),
-        (different(600), "krylov", "E850 method krylov .* all of 600 peers hear each other over lan"),
     ],
 )
 def test_a_method_that_cannot_serve_is_refused(text: str, method: str, message: str) -> None:
     with pytest.raises(ApcError, match=message):
         apc.analyze(compiled(text), method=method)  # type: ignore[arg-type] # a method
-
-

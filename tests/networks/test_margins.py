@@ -107,5 +107,3 @@ def test_a_box_that_is_not_served_is_refused_by_name(loss: str, box: str, why: s
         apc.prove_box(system_of(scene(3, 500.0, loss=loss)), {box: "±1%"})
     assert why in str(error.value)
     assert error.value.mistakes[0].hint == f"apc critical {box} --in mean-square"
-
-
