@@ -243,14 +243,6 @@ def test_more_peers_than_the_memory_holds_are_refused_before_anything_is_built()
         state_space(unlike)
 
 
-def test_from_python_the_suffix_says_the_format(tmp_path: Path) -> None:
-    found = apc.export(SCENES / "three-users-average.yaml", out=tmp_path / "loop.npz")
-    assert isinstance(found, StateSpace)
-    assert matrices(found) == matrices(state_space(compiled(AVERAGE)))
-    with pytest.raises(ApcError, match="E952"):
-        apc.export(made("average"))
-
-
 FREE = {
     "average": ("coordination.stiffness", "device.mass"),
     "mixed-clocks": ("near.coordination.stiffness",),

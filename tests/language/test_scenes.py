@@ -169,24 +169,6 @@ def test_a_trace_is_a_column_of_delays_lost_ones_infinite_and_stays_in_the_model
 
 # ---- groups, kinds, what is left out ----
 
-GROUPS = ("  user: {count: 3}", "  right: {count: 1, set: {SET}}\n  left: {count: 2}")
-
-
-def grouped(settings: str, more: str = "") -> apc.CompiledSystem:
-    return compiled(replaced(AVERAGE, (GROUPS[0], GROUPS[1].replace("SET", settings))) + more)
-
-
-def test_groups_with_other_parts_or_delays_are_other_kinds() -> None:
-    hand = "hands:\n  hand: {type: ConstantForce, flange: device, force: -4 N, at: [right]}\n"
-    system = grouped("device.mass: 200 g", hand)
-    right, left = (system.kinds[group.kind] for group in system.groups)
-    assert set(right.parameters) - set(left.parameters) == {"hand.force"}
-    system = grouped("contact.delay: 2 ms")
-    delays = [{one.name: one.delay for one in system.kinds[group.kind].holds} for group in system.groups]
-    assert [one["contact.f"] for one in delays] == ["right.contact.delay", "contact.delay"]
-    assert (exact(system)["right.contact.delay"], exact(system)["contact.delay"]) == (2 * MS, MS)
-
-
 LATE = """\
 component: LateMean
 connectors: {object: Flange}

@@ -88,12 +88,6 @@ SCHEMES: dict[str, tuple[str, dict[str, str], tuple[float, float, float], Pull]]
         CUBE,
         damped(200, 3, 40),
     ),
-    "DampedAverage that injects nothing": (
-        "two-users-damped",
-        {"stiffness: 500 N/m, injection: 5": "stiffness: 2000 N/m, injection: 0"},
-        CUBE,
-        damped(2000, 0, 0),
-    ),
     "PredictedAverage": ("three-users-predicted", {}, THIRD, predicted(None)),
     "PredictedAverage by an age": (
         "three-users-predicted",
@@ -102,12 +96,6 @@ SCHEMES: dict[str, tuple[str, dict[str, str], tuple[float, float, float], Pull]]
         predicted(0.012),
     ),
     "ScheduledAverage": ("three-users-scheduled", {}, THIRD, scheduled(5)),
-    "ScheduledAverage of little": (
-        "three-users-scheduled",
-        {"injection: 5 N*s/m, clock": "injection: 1 N*s/m, clock"},
-        THIRD,
-        scheduled(1),
-    ),
 }
 
 

@@ -15,7 +15,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
 from tests.bench.random_scenes import check, truth
-from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, library, replaced
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
 
 
 def test_the_answer_is_plain_data() -> None:
@@ -51,14 +51,6 @@ def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
 
 
 PAPER = SCENES / "three-users-average.yaml"
-
-
-def test_a_verdict_that_hangs_on_a_convention_is_warned_of(said: Callable[..., str]) -> None:
-    path = ROOT / "tests" / "scenes" / "verdict-hangs-on-the-order.yaml"
-    text = said(path)
-    assert "Warning: the verdict hangs on a convention" in text
-    assert all(len(line) <= 80 for line in text.splitlines())
-    assert len(json.loads(said(path, "--json"))["warnings"]) == 1
 
 
 def test_a_box_and_a_proof_stand_beside_the_answer(said: Callable[..., str]) -> None:

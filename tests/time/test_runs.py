@@ -96,15 +96,6 @@ def test_a_mass_that_is_pushed_moves_on_and_one_that_stops_settles(arm: bool) ->
 # ---- rows and columns ----
 
 
-def test_columns_are_found_by_name_and_have_units() -> None:
-    headings = [one.heading for one in AVERAGE_RUN.signals]
-    assert headings[:3] == ["right[1].device.x [m]", "right[1].device.v [m/s]", "right[1].cube.x [m]"]
-    assert "left[2].contact.push [N]" in headings
-    assert AVERAGE_RUN["left[2].device.x"][0] == -0.03
-    with pytest.raises(KeyError):
-        AVERAGE_RUN["left[3].device.x"]
-
-
 @pytest.mark.parametrize("delay", ["0 ms", "0.5 ms", "3 ms"])
 def test_a_force_that_acts_later_has_a_column_of_when_it_acts(delay: str) -> None:
     text = AVERAGE.replace("delay: 1 ms", f"delay: {delay}")
