@@ -168,6 +168,7 @@ def test_a_command_loads_what_it_runs(tmp_path: Path) -> None:
     assert not (OPTIONAL | HEAVY) & loaded(unchanged)
 
 
+@pytest.mark.whole
 def test_no_module_is_imported_under_two_names(tmp_path: Path) -> None:
     code = f"import importlib, sys\nfor name in {[*modules()]!r}:\n    importlib.import_module(name)\n"
     code += "files = [m.__file__ for m in list(sys.modules.values()) if m.__name__.split('.')[0] == 'apc']\n"

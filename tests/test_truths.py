@@ -151,7 +151,8 @@ LEFT_OUT = {
     ("box", "non-commensurate"),
 }
 
-LONG = {(way, "non-commensurate") for way in ("dense", "many", "sweep", "certify")} | {
+LONG = {(way, "non-commensurate") for way in ("point", "dense", "many", "sweep", "certify")} | {
+    ("point", "ring-of-eight"),
     ("box", "stiff-contact"),
     ("box", "a cycle one way"),
 }
@@ -164,7 +165,7 @@ def _pairs() -> list[object]:
         for column, way in enumerate(WAYS):
             if (way, case.name) in LEFT_OUT or (case.source == "closed" and way == "paper"):
                 continue
-            ordinary = way == "point" or ((place + column) % 6 == 0 and (way, case.name) not in LONG)
+            ordinary = (way == "point" or (place + column) % 6 == 0) and (way, case.name) not in LONG
             marks = () if ordinary else pytest.mark.whole
             found.append(pytest.param(name, way, marks=marks, id=f"{name}-{way}"))
     return found

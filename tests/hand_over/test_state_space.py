@@ -97,6 +97,7 @@ def test_the_gain_margin_of_a_coupler_cut_open_is_that_of_its_stiffness(cut: str
     assert grows(found, margin.factor * (1 + 1e-8))
 
 
+@pytest.mark.whole
 def test_python_control_finds_the_poles_and_margins_that_apc_finds() -> None:
     """A loop of one peer and one tick a frame has one input and one output, cut at its wall."""
     control = pytest.importorskip("control")

@@ -343,6 +343,7 @@ def test_what_a_link_does_is_listed_in_words(tmp_path: Path, capsys: pytest.Capt
     assert set(lines) <= set(capsys.readouterr().out.splitlines())
 
 
+@pytest.mark.whole
 def test_the_same_scene_gives_the_same_bytes_whatever_the_order_of_hashes(tmp_path: Path) -> None:
     printed = set()
     for seed in ("0", "4242"):

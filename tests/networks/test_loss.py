@@ -244,6 +244,7 @@ def test_what_cannot_be_varied_is_refused_with_what_can() -> None:
             apc.set_parameters(system, {name: value})
 
 
+@pytest.mark.whole
 def test_the_command_says_what_python_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
