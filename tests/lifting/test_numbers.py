@@ -23,7 +23,6 @@ from apc.frame.overrides import Override, apply, parse_override
 from apc.frame.parameters import resolve
 from apc.vary.many import analyze_many
 from apc.vary.margins import margins
-from tests.sites import columned, grouped, paper
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
 
 
@@ -42,7 +41,12 @@ def _column(system: CompiledSystem, name: str) -> list[float]:
 
 @pytest.mark.parametrize("name", ["contact.stiffness", "couplers.contact.stiffness"])
 def test_an_override_reaches_every_group_or_the_one_named(name: str) -> None:
-    system = grouped(paper(), ("left", 1, {"contact.stiffness": 7.0}), ("right", 1, {}))
+    system = compiled(
+        replaced(
+            AVERAGE,
+            ("user: {count: 3}", "left: {count: 1, set: {contact.stiffness: 7 N/m}}\n  right: {count: 1}"),
+        )
+    )
     override = parse_override(system, f"{name}=0.8 N/mm")
     assert override == Override(Free("contact.stiffness"), Fraction(800))
     changed = apply(system, [override])
@@ -53,7 +57,7 @@ def test_an_override_reaches_every_group_or_the_one_named(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["device.mass", "user.device.mass"])
 def test_an_override_replaces_a_column(name: str) -> None:
-    system = columned(paper(), device__mass=[0.1, 0.2, 0.1])
+    system = compiled(replaced(AVERAGE, ("{count: 3}", "{set: {device.mass: [0.1 kg, 0.2 kg, 0.1 kg]}}")))
     changed = apply(system, [parse_override(system, f"{name}=0.5 kg")])
     assert _column(changed, "device.mass") == [0.5, 0.5, 0.5]
     kept = apply(system, [parse_override(system, "contact.stiffness=5 N/m")])
