@@ -46,7 +46,7 @@ ALL = apart(
     ("text", "part", "jit"),
     [
         (SHAKY, 5, False),
-        pytest.param(SHAKY, 13, True, marks=machine_code),
+        pytest.param(SHAKY, 13, True, marks=[machine_code, pytest.mark.whole]),
         pytest.param(ALL, 13, True, marks=[machine_code, pytest.mark.whole]),
     ],
 )
