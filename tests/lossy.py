@@ -15,7 +15,6 @@ from tests.topologies import AVERAGE, replaced
 LINK = "  lan: {clock: network, delay: 8 ms}"
 RELIABLE = ChannelLaw(0.0, 1.0, 1.0, 0.0, 0.008, 0.0, "uniform", None)
 BURSTS = replace(RELIABLE, p=0.01, r=0.25)
-JITTER = replace(BURSTS, jitter=0.006, distribution="normal")
 STARTS = "[1 mm, 5 mm, -3 mm]"
 APART = ("{count: 3}", f"{{set: {{cube.x: {STARTS}, device.x: {STARTS}}}}}")
 

@@ -1,43 +1,24 @@
-"""Populations for tests: peers of the paper's scene that all differ, and what they are made of."""
+"""Peers of the paper's scene that all differ."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from apc.analysis.analysis import prepare
 from apc.compiler.compiled import CompiledSystem
-from apc.frame.exchange import Exchange, build_exchange
-from apc.frame.parameters import resolve
-from apc.large.populations import Population, populations
-from tests.sites import columned, linked, paper
+from tests.bruteforce import Scene
+from tests.topologies import compiled, replaced
+from tests.truths import text_of
 
 
-def different(
-    peers: int,
-    operator: str = "mean",
-    graph: Any = "complete",
-    *,
-    seed: int = 0,
-    spread: float = 0.3,
-    **values: Any,
-) -> CompiledSystem:
-    """Return peers whose masses, dampings and contacts all differ; the others share a sum's gains."""
-    gains = {"kt": 400.0, "bt": 1.0, "kc": 1000.0, "bc": 1.0, **values}
-    if operator == "sum":
-        gains |= {"kt": gains["kt"] / peers, "bt": gains["bt"] / peers}
-    random = np.random.default_rng(seed)
-    return columned(
-        linked(paper(operator, peers=peers, **gains), graph),
-        device__mass=0.1 * (1 + spread * random.random(peers)),
-        device__damping=5 * (1 + spread * random.random(peers)),
-        contact__stiffness=gains["kc"] * (1 + spread * random.random(peers)),
-    )
-
-
-def crowded(system: CompiledSystem) -> tuple[tuple[Population, ...], Exchange]:
-    """Return the populations of a system and the exchange between them."""
-    prepared, numbers = prepare(system), resolve(system)
-    found = populations(system, prepared.jacobians, prepared.schedules, numbers)
-    return found, build_exchange(system, numbers.timings)
+def different(peers: int) -> CompiledSystem:
+    """Return peers whose masses, dampings and contacts all differ, by up to 30 %."""
+    random, columns = np.random.default_rng(0), []
+    for name, least, unit in (
+        ("device.mass", 0.1, "kg"),
+        ("device.damping", 5.0, "N*s/m"),
+        ("contact.stiffness", 1000.0, "N/m"),
+    ):
+        values = (least * (1 + 0.3 * random.random(peers))).tolist()
+        columns.append(f"{name}: [{', '.join(f'{value!r} {unit}' for value in values)}]")
+    text = text_of(Scene(peers=peers, kt=400.0, bt=1.0, kc=1000.0, bc=1.0))
+    return compiled(replaced(text, (f"{{count: {peers}}}", f"{{set: {{{', '.join(columns)}}}}}")))

@@ -1,38 +1,20 @@
-"""Compiled systems that are changed by hand: the scene of Rakhsha and Constantinescu, one number alone."""
+"""Compiled scenes out of numbers: the paper's, with pairs that look at each other, and one number alone."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import casadi
-import numpy as np
-
-from apc.compiler.compiled import (
-    Column,
-    CompiledSystem,
-    Graph,
-    Group,
-    PairDelay,
-    Parameter,
-    Receive,
-    Timing,
-)
+from apc.compiler.compiled import CompiledSystem
 from apc.compiler.components.library import Library
-from apc.compiler.errors import Place
-from apc.compiler.functions.exchange import followers_of
-from apc.compiler.language.evaluation import formula_of
-from apc.compiler.language.grammar import parse_expression
 from tests.bruteforce import Scene
-from tests.topologies import compiled
+from tests.topologies import compiled, replaced
 from tests.truths import text_of
 
 MS = Fraction(1, 1000)
-COMPLETE = Graph("complete", np.zeros((0, 2), np.int64), np.zeros(0))
 
 
 def paper(operator: str = "mean", **values: Any) -> CompiledSystem:
@@ -41,58 +23,37 @@ def paper(operator: str = "mean", **values: Any) -> CompiledSystem:
     return compiled(text_of(scene).replace("topology: stepped", "topology: paper"))
 
 
-def linked(
-    system: CompiledSystem,
-    graph: str | Sequence[tuple[int, int, float]] = "complete",
-    *,
-    delays: Mapping[tuple[str, str], Fraction] | None = None,
-) -> CompiledSystem:
-    """Return the system with a graph, in words or as (sender, receiver, weight), and delays of pairs."""
-    [link] = system.links
-    if isinstance(graph, str):
-        shape = Graph(graph, COMPLETE.arcs, COMPLETE.weights)
-    else:
-        arcs = np.array([arc[:2] for arc in graph], np.int64).reshape(-1, 2)
-        shape = Graph("arcs", arcs, np.array([arc[2] for arc in graph], np.float64))
-    timed = [
-        (PairDelay(a, b, f"lan.delay {a} {b}"), Timing(f"lan.delay {a} {b}", value))
-        for (a, b), value in (delays or {}).items()
-    ]
-    return replace(
-        system,
-        links=(replace(link, graph=shape, delays=tuple(pair for pair, _ in timed)),),
-        timings=(*system.timings, *(timing for _, timing in timed)),
+EDGE = """\
+component: Edge
+about: Looks at each other one by itself.
+connectors: {object: Flange}
+sends: {x: sample(object.x), v: sample(der(object.x))}
+parameters:
+  stiffness: {unit: N/m}
+  damping: {unit: N*s/m}
+  cubic: {unit: N/m^3, default: 0}
+  clock: clock
+  link: link
+  delay: {unit: s}
+equations:
+  - x = sample(object.x)
+  - v = sample(der(object.x))
+  - pull = OPERATOR(stiffness*(x - others.x) + damping*(v - others.v) + cubic*(x - others.x)^3)
+  - object.f = hold(pull, delay)
+"""
+
+
+def edged(operator: str, starts: Sequence[float], *, cubic: float = 0.0, **values: Any) -> CompiledSystem:
+    """Return the paper's system with F_T an operator over K_T d + B_T ḋ + cubic d³, d to each other user."""
+    text = replaced(
+        text_of(Scene(peers=len(starts), **values)),
+        ("type: AveragePosition", f"type: Edge, cubic: {cubic!r} N/m^3"),
+        (", delays: all", ""),
+        (f"{{count: {len(starts)}}}", f"{{set: {{cube.x: [{', '.join(f'{x!r} m' for x in starts)}]}}}}"),
     )
-
-
-def columned(system: CompiledSystem, **columns: Sequence[float]) -> CompiledSystem:
-    """Return the system, of one group, with parameters that differ from peer to peer (`device__mass=…`)."""
-    [group] = system.groups
-    listed = tuple(
-        Column(name.replace("__", "."), np.array(values, np.float64)) for name, values in columns.items()
-    )
-    return replace(system, groups=(replace(group, columns=listed),))
-
-
-def edged(system: CompiledSystem, operator: str = "sum", *, cubic: float = 0.0) -> CompiledSystem:
-    """Return the system with F_T an operator over the others of K_T d + B_T ḋ + cubic d³, d to each other."""
-    [kind] = system.kinds
-    [partition] = kind.clocks
-    x, p, t = casadi.SX.sym("x", 4), casadi.SX.sym("p", len(kind.parameters)), casadi.SX.sym("t")
-    u, m, s, r = (casadi.SX.sym(name, size) for name, size in (("u", 2), ("m", 0), ("s", 2), ("r", 1)))
-    named = dict(zip(kind.parameters, casadi.vertsplit(p), strict=True))
-    apart = x[2] - s[0]
-    pull = named["coordination.stiffness"] * apart + named["coordination.damping"] * (x[3] - s[1])
-    if cubic:
-        pull += cubic * apart**3
-    edge = casadi.Function("edge", [x, u, m, s, p, t], [pull])
-    contact = partition.tick(x, u, m, casadi.SX.zeros(2), p, t)[0]
-    clock = replace(
-        partition,
-        receives=(Receive("pull", operator, "lan", 0, edge),),
-        tick=casadi.Function("tick", [x, u, m, r, p, t], [casadi.vertcat(contact, r[0])]),
-    )
-    return replace(system, kinds=(replace(kind, clocks=(clock,)),))
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "edge.yaml").write_text(EDGE.replace("OPERATOR", operator), encoding="utf-8")
+        return compiled(text, Library((Path(folder),)))
 
 
 def alone(rate: str, *ticks: str, variables: str = "", delay: str = "0 s") -> CompiledSystem:
@@ -112,43 +73,3 @@ def alone(rate: str, *ticks: str, variables: str = "", delay: str = "0 s") -> Co
             f"masses: {{it: {{type: Alone{ticking}}}}}\n",
             Library((Path(folder),)),
         )
-
-
-def grouped(system: CompiledSystem, *groups: tuple[str, int, dict[str, float]]) -> CompiledSystem:
-    """Return the system with other groups: (name, count, parameter values of its own)."""
-    of_name = {parameter.name: parameter for parameter in system.parameters}
-    total = sum(count for _, count, _ in groups)
-    heard = tuple(replace(one, value=total - 1.0, exact=None) for one in system.groups[0].values)
-    return replace(
-        system,
-        parameters=tuple(
-            replace(p, value=float(total), exact=None) if p.name == "peers" else p
-            for p in system.parameters
-            if p.name != "user.count"
-        ),
-        groups=tuple(
-            Group(
-                name,
-                count,
-                0,
-                (*heard, *(replace(of_name[key], value=value, exact=None) for key, value in own.items())),
-            )
-            for name, count, own in groups
-        ),
-    )
-
-
-def derived(system: CompiledSystem, **expressions: str) -> CompiledSystem:
-    """Add the parameters kt and wait, and expressions over them for parameters and timings."""
-    formulas = {
-        key.replace("__", "."): formula_of(parse_expression(text, Place("a.yaml", 1, 1, text)))
-        for key, text in expressions.items()
-    }
-    parameters = (
-        Parameter("kt", "N/m", 500.0),
-        Parameter("wait", "s", 0.008),
-        *(replace(p, formula=formulas.get(p.name)) for p in system.parameters),
-    )
-    timings = tuple(replace(t, formula=formulas.get(t.name)) for t in system.timings)
-    followers = followers_of(parameters, timings, system.groups)
-    return replace(system, parameters=parameters, timings=timings, followers=followers)

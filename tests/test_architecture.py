@@ -99,15 +99,6 @@ def test_the_compiler_never_imports_the_runtime() -> None:
     assert not wrong
 
 
-def test_every_result_is_shown_as_text_and_as_data() -> None:
-    for name, module in modules().items():
-        for kind in module.results:
-            room, _, own = getattr(importlib.import_module(name), kind).shown_by.partition(":")
-            shown = importlib.import_module(f"apc.present.{room}")
-            for form in ("text", "document"):
-                assert callable(getattr(shown, f"{own}_{form}")), f"{name}: {kind}"
-
-
 def test_what_is_looked_up_by_name_is_a_result_or_somebody_elses_library() -> None:
     """Or the order would be kept in words only."""
     calling = {name for name, module in modules().items() if "import_module" in module.calls}
@@ -177,6 +168,7 @@ def test_a_command_loads_what_it_runs(tmp_path: Path) -> None:
     assert not (OPTIONAL | HEAVY) & loaded(unchanged)
 
 
+@pytest.mark.whole
 def test_no_module_is_imported_under_two_names(tmp_path: Path) -> None:
     code = f"import importlib, sys\nfor name in {[*modules()]!r}:\n    importlib.import_module(name)\n"
     code += "files = [m.__file__ for m in list(sys.modules.values()) if m.__name__.split('.')[0] == 'apc']\n"

@@ -34,7 +34,6 @@ from apc.eigen.balls import rational_ball
 from apc.frame.exact import evaluate_exact, is_rational
 from apc.frame.jacobians import guards_of
 from apc.frame.parameters import exact_numbers, resolve
-from tests.fifty_digits.pushes import Push, impulse, in_the_way, push_of, switches
 
 Number = Any  # flint.arb, an exact 0 or 1, or an array of these
 
@@ -44,8 +43,7 @@ class Peer:
     """One peer: its functions over exact numbers, and what is needed of the past.
 
     `ticks` and `sends` give a list of numbers of (x, u, m, r) and of (x, u); `rate` is [A B c] (n_x, n_x +
-    n_u + 1), exact. `push` is what changes with time alone, instead of c. `back` counts the ticks kept of
-    each clock, `sent_back` the packets of each link.
+    n_u + 1), exact. `back` counts the ticks kept of each clock, `sent_back` the packets of each link.
     """
 
     kind: Kind
@@ -53,7 +51,6 @@ class Peer:
     ticks: tuple[Callable[..., list[Number]], ...]
     sends: tuple[Callable[..., list[Number]], ...]
     rate: Any  # flint.fmpq_mat, square
-    push: Push | None
     delays: tuple[Fraction, ...]
     back: tuple[int, ...]
     sent_back: tuple[int, ...]
@@ -107,8 +104,8 @@ def refusal(system: CompiledSystem, *, in_time: bool) -> str:
             return f"{kind.name} asks for ages, which are counted from time 0 at first"
         if not _is_affine(kind.derivative):
             return f"between its ticks {kind.name} is not linear"
-        if in_time and (reason := in_the_way(kind)):
-            return reason
+        if in_time and _changes_by_itself(kind.derivative):
+            return f"a force on {kind.name} changes with time"
         if in_time and any(_switches_by_time(function) for function in functions):
             return f"at a tick {kind.name} asks whether a moment has come, which a rounding decides"
         # What is heard at the start is not looked up: slopes must not depend on it.
@@ -133,6 +130,12 @@ def _has_exact_slopes(function: Any) -> bool:
         return False
     slopes = jacobian(function(*symbols), casadi.vertcat(*symbols[:-2]))
     return is_rational(casadi.Function("slopes", symbols, [slopes]))
+
+
+def _changes_by_itself(function: Any) -> bool:
+    """Say whether a function changes with the time."""
+    symbols = function.sx_in()
+    return bool(casadi.depends_on(casadi.densify(function(*symbols)), symbols[-1]))
 
 
 def _switches_by_time(function: Any) -> bool:
@@ -198,11 +201,8 @@ def _slopes(
     return lambda time, *parts: [sum((parts[i][j] * k for i, j, k in row), 0) for row in rows]
 
 
-def _rate(kind: Kind, parameters: Sequence[Fraction], *, linear: bool) -> tuple[Any, Push | None]:
-    """Return [A B c; 0 0 0] of the continuous equations, exact, and what pushes if it is not c.
-
-    When `linear` nothing does.
-    """
+def _rate(kind: Kind, parameters: Sequence[Fraction], *, linear: bool) -> Any:
+    """Return [A B c; 0 0 0] of the continuous equations, exact; c is left out when `linear`."""
     n_x, n_u = len(kind.states), len(kind.holds)
     symbols = kind.derivative.sx_in()
     dense = casadi.Function("dense", symbols, [casadi.densify(kind.derivative(*symbols))])
@@ -214,12 +214,10 @@ def _rate(kind: Kind, parameters: Sequence[Fraction], *, linear: bool) -> tuple[
 
     still = speed(-1)
     columns = [[a - b for a, b in zip(speed(i), still, strict=True)] for i in range(n_x + n_u)]
-    a = _rationals([[columns[c][r] for c in range(n_x)] for r in range(n_x)])
-    push = None if linear else push_of(kind, parameters, a)
-    columns.append([Fraction(0)] * n_x if linear or push else still)
+    columns.append([Fraction(0)] * n_x if linear else still)
     size = n_x + n_u + 1
     rows = [[columns[c][r] if r < n_x else Fraction(0) for c in range(size)] for r in range(size)]
-    return _rationals(rows), push
+    return _rationals(rows)
 
 
 def _rationals(rows: Sequence[Sequence[Fraction]]) -> Any:
@@ -256,7 +254,6 @@ def build_peers(
         start_x = tuple(value[state.start] for state in kind.states)
         start_m = tuple(tuple(value[name] for name in clock.starts) for clock in kind.clocks)
         still = [list(start_x), [Fraction(0)] * len(kind.holds)]
-        rate, push = _rate(kind, parameters, linear=linear)
         found.append(
             Peer(
                 kind=kind,
@@ -270,8 +267,7 @@ def build_peers(
                     for clock, m in zip(kind.clocks, start_m, strict=True)
                 ),
                 sends=tuple(_rule(send.send, parameters, still if linear else None) for send in kind.sends),
-                rate=rate,
-                push=push,
+                rate=_rate(kind, parameters, linear=linear),
                 delays=delays,
                 back=tuple(
                     max(
@@ -328,7 +324,7 @@ class Happening:
                     self.delay[link.name, h, g] = self.seconds[late.get((h, g), link.delay)]
 
     def instants(self, start: Fraction, end: Fraction) -> list[Fraction]:
-        """Return all instants in [start, end) at which something ticks acts or switches, and both ends."""
+        """Return all instants in [start, end) at which something ticks or acts, and both ends."""
         found = {start, end}
         for phase, period in self.clocks.values():
             found |= ticks_between(phase, period, start, end)
@@ -336,8 +332,6 @@ class Happening:
             for hold, delay in zip(site.kind.holds, site.delays, strict=True):
                 phase, period = self.clocks[hold.clock]
                 found |= ticks_between((phase + delay) % period, period, start, end)
-            if site.push is not None:
-                found |= switches(site.push, start, end)
         return sorted(found)
 
     def play(self, play: Play, start: Fraction, end: Fraction) -> None:
@@ -359,7 +353,7 @@ class Happening:
                         before.append((now, site.ticks[place](now, play.x[i], held[i], m, r)))
             for i, site in enumerate(self.sites):
                 u = self._held(play, i, now, before=False)
-                play.x[i] = _move(site, play.x[i], u, now, following - now)
+                play.x[i] = _move(site, play.x[i], u, following - now)
 
     def _ticks_now(self, clock: str, now: Fraction) -> bool:
         phase, period = self.clocks[clock]
@@ -407,10 +401,8 @@ def ticks_between(phase: Fraction, period: Fraction, start: Fraction, end: Fract
     return {phase + k * period for k in range(first, math.ceil((end - phase) / period))}
 
 
-def _move(
-    site: Peer, x: Sequence[Number], u: Sequence[Number], start: Fraction, duration: Fraction
-) -> list[Number]:
-    """Let the continuous states run with held inputs, and whatever else pushes."""
+def _move(site: Peer, x: Sequence[Number], u: Sequence[Number], duration: Fraction) -> list[Number]:
+    """Let the continuous states run with held inputs."""
     if duration not in site.steps:
         length = flint.fmpq(duration.numerator, duration.denominator)
         site.steps[duration] = [
@@ -418,7 +410,4 @@ def _move(
             for row in flint.arb_mat(site.rate * length).exp().tolist()[: len(x)]
         ]
     both = [*x, *u, 1]
-    moved = [sum((both[place] * entry for place, entry in row), 0) for row in site.steps[duration]]
-    if site.push is None:
-        return moved
-    return [one + more for one, more in zip(moved, impulse(site.push, start, duration), strict=True)]
+    return [sum((both[place] * entry for place, entry in row), 0) for row in site.steps[duration]]

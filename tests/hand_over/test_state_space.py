@@ -62,18 +62,6 @@ def magnitudes(matrix: Floats) -> Floats:
     return np.sort(np.abs(np.linalg.eigvals(matrix)))[::-1]
 
 
-@pytest.mark.few(4)
-@pytest.mark.parametrize("name", EVERY)
-def test_its_eigenvalues_are_those_of_the_analysis(name: str) -> None:
-    analysis = apc.analyze(made(name))
-    modes = [mode.magnitude for mode in analysis.modes for _ in range(mode.multiplicity)]
-    wanted = np.sort([*modes, *[1.0] * analysis.rigid_modes])[::-1]
-    found = magnitudes(state_space(made(name)).a)
-    large = wanted[wanted > 1e-2]  # defective ones near 0 are known to no digit
-    assert found[: len(large)] == pytest.approx(large, abs=1e-7)  # a pair may be a double root
-    assert (found[len(large) :] < 1.5e-2).all()
-
-
 def cuts(system: apc.CompiledSystem) -> list[str]:
     """Return all that a scene can be cut at."""
     forces = {hold.name.rpartition(".")[0] for kind in system.kinds for hold in kind.holds}
@@ -109,6 +97,7 @@ def test_the_gain_margin_of_a_coupler_cut_open_is_that_of_its_stiffness(cut: str
     assert grows(found, margin.factor * (1 + 1e-8))
 
 
+@pytest.mark.whole
 def test_python_control_finds_the_poles_and_margins_that_apc_finds() -> None:
     """A loop of one peer and one tick a frame has one input and one output, cut at its wall."""
     control = pytest.importorskip("control")
@@ -253,14 +242,6 @@ def test_more_peers_than_the_memory_holds_are_refused_before_anything_is_built()
     unlike = compiled(replaced(AVERAGE, ("{count: 3}", f"{{set: {{device.mass: [{masses}]}}}}")))
     with pytest.raises(ApcError, match=r"E951 400 different peers .* Write: fewer peers"):
         state_space(unlike)
-
-
-def test_from_python_the_suffix_says_the_format(tmp_path: Path) -> None:
-    found = apc.export(SCENES / "three-users-average.yaml", out=tmp_path / "loop.npz")
-    assert isinstance(found, StateSpace)
-    assert matrices(found) == matrices(state_space(compiled(AVERAGE)))
-    with pytest.raises(ApcError, match="E952"):
-        apc.export(made("average"))
 
 
 FREE = {

@@ -112,33 +112,3 @@ def test_what_a_clock_computes_can_have_no_limit(tmp_path: Path) -> None:
         "5:13: E513 eye.seen[1] has a limit and is computed at ticks;"
         " a limit is of what holds at every moment. Write: acting = hold(seen), with the limit of acting"
     )
-
-
-@pytest.mark.parametrize(
-    ("change", "line"),
-    [
-        (
-            ("limit: most", "limit: mots"),
-            "E206 the limit of x is mots, which is no number here; the nearest is most. Write: most",
-        ),
-        (("unit: m, above", "unit: N, above"), "E204 the limit of x wants a parameter in m, got most in N."),
-        (
-            ("for: hands", "for: feet"),
-            "E203 what grip is for wants hands, got feet. Write: grip: {type: Flange, for: hands}",
-        ),
-        (
-            ("{type: Flange, for: hands}", "{type: Flange}"),
-            "E203 what grip is for wants hands, got nothing. Write: grip: {type: Flange, for: hands}",
-        ),
-    ],
-)
-def test_limits_and_grips_that_are_none(tmp_path: Path, change: tuple[str, str], line: str) -> None:
-    part = (
-        "component: Limited\nconnectors: {flange: Flange, grip: {type: Flange, for: hands}}\n"
-        "parameters: {most: {unit: m, above: 0, default: 1}, b: {unit: N*s/m, default: 1}}\n"
-        "variables: {x: {unit: m, start: 0, limit: most}}\n"
-        "equations:\n  - b*der(x) = flange.f + grip.f\n  - flange.x = x\n  - grip.x = x\n"
-    )
-    text = replaced(FALCON, ("type: Falcon", "type: Limited"))
-    [found] = told(compiled, text, library(tmp_path, replaced(part, change)))
-    assert found.partition(" ")[2] == line

@@ -15,9 +15,8 @@ import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
 from apc.hands import answers
-from apc.hands.feel import NO_NORMS, Feel, feel
+from apc.hands.feel import feel
 from tests.hands.handled import responses
-from tests.populations import different
 from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, replaced
 
 
@@ -162,74 +161,6 @@ def test_a_network_feels_viscous_by_as_much_as_dampers_lack(text: str, heard: in
     formula = count * 150.0 * min(heard, count - 1) * ((0.008 - 0.001) / 2 + 0.008)
     assert found.network_viscosity.formula == pytest.approx(formula, rel=1e-12)
     assert network == pytest.approx(formula, rel=0.02)
-
-
-# Groups that differ inside, unlike each other, with a delay of their own between two of them.
-SIDES = replaced(
-    AVERAGE,
-    (
-        "user: {count: 3}",
-        "left: {count: 3, set: {device.mass: [0.1 kg, 0.12 kg, 0.1 kg]}}\n"
-        "  right: {count: 2, set: {device.damping: [4 N*s/m, 6 N*s/m], contact.stiffness: 800 N/m}}",
-    ),
-    ("delay: 8 ms}", "delay: 8 ms, delays: {right: {left: 11 ms}}}"),
-    ("stiffness: 500", "stiffness: 300"),
-)
-
-
-def check_alike(one: Feel, other: Feel) -> None:
-    """Check that two ways agree, and no farther apart than they say."""
-    for name, bound in (
-        ("impedance", "bound"),
-        ("transmitted_admittance", "transmitted_bound"),
-        ("error_per_force", "error_bound"),
-    ):
-        size, off = np.abs(getattr(one, name)), np.abs(getattr(one, name) - getattr(other, name))
-        assert (off <= 1e-9 * size).all(), name
-        assert (off <= 1.1 * size * (getattr(one, bound) + getattr(other, bound))).all(), name
-    np.testing.assert_allclose(one.alias, other.alias, rtol=1e-6)
-    assert one.low_frequency is not None and other.low_frequency is not None
-    for name, place in (("mass", 0), ("damping", 1), ("stiffness", 2)):
-        near = one.low_frequency.errors[place] + other.low_frequency.errors[place]
-        assert abs(getattr(one.low_frequency, name) - getattr(other.low_frequency, name)) <= near
-
-
-@pytest.mark.few(2)
-@pytest.mark.parametrize(
-    ("system", "at", "between"),
-    [
-        (different(3), "user[2]", "user[3]"),
-        (compiled(SIDES), "left[3]", "right[2]"),
-        (different(4, "sum"), "user[2]", "user[3]"),
-        (compiled(SIDES), "left[1]", "left[3]"),
-        (compiled(SIDES), "right[1]", "left[2]"),
-        (compiled(SIDES), "left[2]", "left[2]"),
-        (different(10), "user[2]", "user[3]"),
-    ],
-)
-def test_peer_by_peer_it_is_what_one_system_of_all_says(
-    system: apc.CompiledSystem, at: str, between: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = []
-    for most in (10**6, 1):
-        monkeypatch.setattr(answers, "MOST_TOGETHER", most)
-        found.append(feel(system, (0.7, 2.9, 9.7, 58.3), at=at, between=between))
-    check_alike(*found)
-    assert [NO_NORMS in one.notes for one in found] == [False, True]
-    assert [bool(one.hinf) and bool(one.h2) for one in found] == [True, False]
-
-
-@pytest.mark.whole
-def test_groups_are_as_right_as_all_peers_in_one_and_a_million_users_are_served() -> None:
-    """Two groups of two: classes and differences against one loop of all four, on the same graph as arcs."""
-    groups = "left: {count: 2, set: {device.mass: 0.2 kg}}\n  right: {count: 2}"
-    edges = "graph: {edges: [[1, 2], [1, 3], [1, 4], [2, 3], [2, 4], [3, 4]]}"
-    text = replaced(AVERAGE, ("user: {count: 3}", groups))
-    arcs = replaced(text, ("delay: 8 ms}", f"delay: 8 ms, {edges}}}"))
-    for at, between in (("left[1]", "left[2]"), ("left[2]", "right[1]"), ("right[1]", "left[1]")):
-        check_alike(*(feel(compiled(one), [1.0, 17.0], at=at, between=between) for one in (text, arcs)))
-    many = feel(compiled(users(1_000_000, 500)), [1.0], quick=True)
-    assert abs(many.transmitted_admittance[0]) < 1e-5 and many.bound[0] < 1e-4
 
 
 # Of hands and of sensors, at the first of either group: error and velocity, by an independent program, which

@@ -321,6 +321,7 @@ def test_contacts_that_hands_may_close_are_named() -> None:
     assert found.left_out[-1].startswith("left out: wall") and "as at the start" in found.left_out[-1]
 
 
+@pytest.mark.whole
 def test_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     scene = str(SCENES / "three-users-average.yaml")
 

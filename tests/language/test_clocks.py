@@ -38,13 +38,6 @@ def test_a_value_of_the_tick_before_is_a_memory_that_starts_as_is_said(tmp_path:
     assert values(system)["all.s"] == 0.002
 
 
-def test_what_is_held_is_one_value_and_a_memory_that_nobody_reads_is_none(tmp_path: Path) -> None:
-    system = filtered(tmp_path, "s = sample(flange.x)", "w = previous(s)", "k*hold(s - 2*s)")
-    [tick] = system.kinds[0].clocks
-    assert (len(tick.outputs), tick.memories) == (1, ())
-    assert list(ticked(system, {"device.x": 0.25}).values()) == [-0.25]
-
-
 # ---- what is heard ----
 
 FOLLOWER = """\
@@ -183,6 +176,7 @@ def same(folder: Path, place: str, expression: str, name: str, **variables: str)
     return found[0] == pytest.approx(found[1], rel=1e-9)
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize(("number", "place"), list(enumerate(CLOCKED_PLACES)))
 def test_an_expression_of_a_clock_means_what_a_variable_means(
     number: int, place: str, tmp_path: Path
@@ -192,6 +186,7 @@ def test_an_expression_of_a_clock_means_what_a_variable_means(
         assert same(tmp_path, place, expression, "before", clocked=expression, start=start), expression
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("place", MOVING_PLACES)
 def test_a_continuous_expression_means_what_a_variable_means(place: str, tmp_path: Path) -> None:
     for expression in MOVING if place != "K*(@)" else MOVING[3:4]:

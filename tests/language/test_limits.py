@@ -64,6 +64,7 @@ def test_a_heading_without_end_is_told_in_a_few_words(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("asked", ["10 s", "1285.71 ms", "1001 ms"])
 def test_the_delay_that_is_proposed_for_a_force_is_taken(asked: str, tmp_path: Path) -> None:
     def late(delay: str) -> list[str]:

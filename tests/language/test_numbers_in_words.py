@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from fractions import Fraction
 
@@ -10,25 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apc.compiler.words import WIDTH, known_digits, measured, wrapped
-
-
-@given(st.lists(st.text("abc", min_size=1, max_size=WIDTH - 4), max_size=40))
-def test_lines_are_filled_up_to_the_width_and_no_word_is_lost(words: list[str]) -> None:
-    lines = wrapped(" ".join(words), "  ", "    ")
-    assert " ".join(" ".join(lines).split()) == " ".join(words)
-    assert all(len(line) <= WIDTH for line in lines)
-    for line, following in itertools.pairwise(lines):
-        assert len(line) + 1 + len(following.split()[0]) > WIDTH, "the next word has its place on this line"
-    assert all(line.startswith("    ") for line in lines[1:])
-
-
-def test_a_word_wider_than_a_line_is_broken_behind_an_operator_or_not_at_all() -> None:
-    product = "*".join(["stiffness"] * 12)
-    lines = wrapped(f"f = {product}", "", "  ")
-    assert "".join(line.strip() for line in lines) == f"f = {product}"
-    assert len(lines) == 2 and lines[0].endswith("*") and max(map(len, lines)) <= WIDTH
-    assert wrapped("a" * (WIDTH + 5)) == ["a" * (WIDTH + 5)]
+from apc.compiler.words import known_digits, measured
 
 
 @pytest.mark.parametrize(

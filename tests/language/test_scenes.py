@@ -92,18 +92,6 @@ def test_numbers_and_times_are_exact_in_si(change: tuple[str, str], expected: di
     assert {name: found[name] for name in expected} == expected
 
 
-def test_a_parameter_keeps_its_bounds_its_unit_and_what_it_is_about() -> None:
-    found = {one.name: one for one in compiled(AVERAGE).parameters}
-    assert (found["device.mass"].minimum, found["device.mass"].open_minimum) == (0.0, True)
-    stiffness = found["coordination.stiffness"]
-    assert (stiffness.minimum, stiffness.open_minimum, stiffness.maximum) == (0.0, False, None)
-    assert (stiffness.unit, stiffness.about) == ("N/m", "force per distance from the mean")
-    assert (found["peers"].value, found["device.x"].unit) == (3.0, "m")
-    waves = compiled((SCENES / "two-users-waves.yaml").read_text(encoding="utf-8"))
-    count = next(one for one in waves.parameters if one.name == "user.count")
-    assert (count.minimum, count.maximum) == (1.0, 2.0)
-
-
 SHAKEN = "parameters: {f: 2 Hz, w: 4 rad/s}\nhands: {push: {type: SineForce, flange: device, force: 1 N, "
 SHAKEN += "frequency: FREQUENCY, phase: 90 deg}}\n"
 
@@ -181,32 +169,6 @@ def test_a_trace_is_a_column_of_delays_lost_ones_infinite_and_stays_in_the_model
 
 # ---- groups, kinds, what is left out ----
 
-GROUPS = ("  user: {count: 3}", "  right: {count: 1, set: {SET}}\n  left: {count: 2}")
-
-
-def grouped(settings: str, more: str = "") -> apc.CompiledSystem:
-    return compiled(replaced(AVERAGE, (GROUPS[0], GROUPS[1].replace("SET", settings))) + more)
-
-
-def test_groups_of_one_kind_share_its_functions_and_set_numbers_of_their_own() -> None:
-    system = grouped("device.mass: 200 g, device.x: 30 mm")
-    right, left = system.groups
-    assert (right.kind, left.kind, len(system.kinds), system.peers) == (0, 0, 1, 3)
-    assert [(one.name, one.value) for one in right.values] == [("device.mass", 0.2), ("device.x", 0.03)]
-    assert left.values == ()
-
-
-def test_groups_with_other_parts_or_delays_are_other_kinds() -> None:
-    hand = "hands:\n  hand: {type: ConstantForce, flange: device, force: -4 N, at: [right]}\n"
-    system = grouped("device.mass: 200 g", hand)
-    right, left = (system.kinds[group.kind] for group in system.groups)
-    assert set(right.parameters) - set(left.parameters) == {"hand.force"}
-    system = grouped("contact.delay: 2 ms")
-    delays = [{one.name: one.delay for one in system.kinds[group.kind].holds} for group in system.groups]
-    assert [one["contact.f"] for one in delays] == ["right.contact.delay", "contact.delay"]
-    assert (exact(system)["right.contact.delay"], exact(system)["contact.delay"]) == (2 * MS, MS)
-
-
 LATE = """\
 component: LateMean
 connectors: {object: Flange}
@@ -233,12 +195,6 @@ links: {{lan: {{clock: network, delay: 8 ms}}}}
     system = compiled(text, library(tmp_path, LATE))
     assert len(system.kinds) == 2, "each can be changed on its own"
     assert exact(system)["two.coordination.lag"] == 5 * MS
-
-
-def test_the_number_of_peers_costs_no_equation() -> None:
-    few, many = (compiled(AVERAGE.replace("count: 3", f"count: {count}")) for count in (3, 1_000_000))
-    assert [one.name for one in few.kinds[0].states] == [one.name for one in many.kinds[0].states]
-    assert few.kinds[0].derivative.n_instructions() == many.kinds[0].derivative.n_instructions()
 
 
 def test_what_nobody_reads_or_hears_is_left_out_and_said(tmp_path: Path) -> None:
@@ -366,15 +322,6 @@ for name in {NAMES!r}:
         whole.update(apc.show(path, format=form).encode())
 print(whole.hexdigest())
 """
-LINES = {
-    "scene": ["clock haptic: every 0.001 s, first at 0 s", "masses cube: Mass, shared, at user"],
-    "clocked": [
-        "  sample on haptic: contact.a.x",
-        "  hold of haptic: contact.f, after contact.delay s",
-        "  receive on haptic over lan: mean of others.coordination.x",
-        "  send over lan: coordination.x = coordination.object.x",
-    ],
-}
 
 
 @pytest.mark.parametrize("path", sorted(GOLDEN.iterdir()), ids=lambda path: path.name)
@@ -387,14 +334,6 @@ def test_a_scene_becomes_the_equations_that_were_found_right(
     assert capsys.readouterr().out == path.read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("stage", LINES)
-def test_a_stage_is_told_line_by_line(stage: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")
-    assert run(["compile", str(tmp_path / "scene.yaml"), "--until", stage]) == 0
-    assert set(LINES[stage]) <= set(capsys.readouterr().out.splitlines())
-    assert [path.name for path in tmp_path.iterdir()] == ["scene.yaml"]
-
-
 def test_what_a_link_does_is_listed_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     channel = "8 ms, loss: {p: 1 %, r: 25 %}, jitter: 2 ms, distribution: pareto, reorder: all}"
     (tmp_path / "scene.yaml").write_text(replaced(AVERAGE, ("8 ms}", channel)), encoding="utf-8")
@@ -404,6 +343,7 @@ def test_what_a_link_does_is_listed_in_words(tmp_path: Path, capsys: pytest.Capt
     assert set(lines) <= set(capsys.readouterr().out.splitlines())
 
 
+@pytest.mark.whole
 def test_the_same_scene_gives_the_same_bytes_whatever_the_order_of_hashes(tmp_path: Path) -> None:
     printed = set()
     for seed in ("0", "4242"):

@@ -14,7 +14,7 @@ import pytest
 
 import apc
 from tests.library.parts import CLOCK, TWO, coupled, held, pushes, rates, ticked, values
-from tests.topologies import MESH, ONE_MASS, SCENES, compiled, library, replaced, told
+from tests.topologies import ONE_MASS, compiled, library, replaced, told
 
 EXACT = 1e-13  # a few roundings
 
@@ -169,28 +169,6 @@ def test_a_virtual_wall_pushes_by_depth_and_backward_difference(side: str, x: fl
     assert pushes(system, {}, [6.0]) == pytest.approx([-sign * 6], rel=EXACT)
 
 
-@pytest.mark.parametrize(
-    ("mass", "damping", "delay", "critical"), [(0.1, 5.0, 1, 3378.939), (0.04, 0.8, 0, 1605.351)]
-)
-def test_a_virtual_wall_is_stable_up_to_its_critical_stiffness(
-    mass: float, damping: float, delay: int, critical: float
-) -> None:
-    """In contact, without wall damping; the exact step of the device over 1 ms, computed independently.
-
-    The critical stiffness is printed to three decimals. The linear rule of Gil et al., K < b/(T/2 + delay),
-    lies within 4 % of it.
-    """
-    text = (
-        "topology: wall\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
-        f"masses: {{device: {{mass: {mass} kg, damping: {damping} N*s/m, x: 1 mm}}}}\n"
-        f"couplers: {{it: {{{WALL.replace('900', '%r')}, delay: {delay} ms, x: 1 mm}}}}\n"
-    )
-    found = [apc.analyze(compiled(text % (critical * factor))) for factor in (1 - 1e-6, 1 + 1e-6)]
-    assert [one.verdict for one in found] == ["stable", "unstable"]
-    assert found[0].linearized
-    assert critical == pytest.approx(damping / (0.0005 + 0.001 * delay), rel=0.04)
-
-
 def test_enclosure_walls_push_inwards_from_both_ends() -> None:
     words = "low: -30 mm, high: 30 mm, stiffness: 900 N/m, damping: 2 N*s/m, clock: tick"
     system = coupled(f"type: EnclosureWalls, flange: device, {words}", base=ONE_MASS)
@@ -221,33 +199,7 @@ def test_encoder_quantization_rounds_down_to_whole_steps_and_passes_forces(x: fl
 # ---- coordination ----
 
 
-@pytest.mark.parametrize("scene", ["three-users-average", "three-users-mesh", "planar-users"])
-def test_with_delays_own_the_heard_part_of_a_force_acts_at_once(scene: str) -> None:
-    text = (SCENES / f"{scene}.yaml").read_text(encoding="utf-8")
-    system = compiled(replaced(text, ("link: lan", "link: lan, delays: own")))
-    holds = system.kinds[0].holds
-    assert {one.delay for one in holds if ".own" in one.name} == {"coordination.delay"}
-    assert {one.delay for one in holds if ".received" in one.name} == {"no delay"}
-    held = [1.0 if ".own" in one.name else 10.0 if ".received" in one.name else 0.0 for one in holds]
-    found = [value for name, value in rates(system, {}, held).items() if name.startswith("cube.v")]
-    assert found == pytest.approx([-11 / 0.2] * len(found), rel=EXACT)
-
-
-def test_a_saturated_mesh_is_a_full_mesh_below_its_limit() -> None:
-    """Linearized about a start at rest, the limit is far away: the same radius, by the road of N² pairs."""
-    limits = compiled(replaced(MESH, ("type: FullMesh", "type: SaturatedMesh, limit: 5 N")))
-    found, expected = apc.analyze(limits), apc.analyze(compiled(MESH))
-    assert found.spectral_radius == pytest.approx(expected.spectral_radius, rel=EXACT)
-    assert (expected.linearized, found.linearized) == (False, True)
-
-
 # ---- hands ----
-
-
-def test_constant_forces_on_one_flange_add_up() -> None:
-    two = "hands:\n  one: {type: ConstantForce, flange: device, force: 5 N}\n"
-    system = compiled(f"{ONE_MASS}{two}  two: {{type: ConstantForce, flange: device, force: -1 N}}\n")
-    assert pushes(system, {"device.v": 2.0}) == [4.0]
 
 
 def test_a_spring_damper_arm_holds_its_point() -> None:

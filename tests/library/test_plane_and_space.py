@@ -174,14 +174,6 @@ def test_a_group_gives_a_vector_one_value_for_all_or_a_list_of_lists_one_a_peer(
     assert starts(groups("table: users.csv"), tmp_path) == each
 
 
-def test_an_entry_of_a_vector_is_a_parameter_like_others() -> None:
-    text = f"{PLANE}hands: {{push: {{type: PlanarConstantForce, flange: device, force: [3 N, -4 N]}}}}\n"
-    run = apc.simulate(compiled(text), duration="1 s", set={"push.force[2]": "6 N"}, jit=False)
-    names = [one.name for one in run.signals]
-    end = [run.values[-1, names.index(f"user[1].device.v[{k}]")] for k in (1, 2)]
-    assert end[1] / end[0] == pytest.approx(6 / 3, rel=1e-9)
-
-
 # ---- several pairs at a connector; arrays inside a component ----
 
 SLAB = (
@@ -274,11 +266,3 @@ def test_an_array_inside_a_component_is_the_row_that_a_topology_writes_out(tmp_p
     a = np.block([[np.zeros((3, 3)), np.eye(3)], [-k / 2, -np.diag([0, 0, 1]) / 2]])
     known = np.exp(np.linalg.eigvals(a).real).max()
     assert apc.analyze(found).spectral_radius == pytest.approx(known, rel=1e-9)
-
-
-def test_masses_joined_in_a_plane_move_as_one() -> None:
-    text = PLANE + "  load: {type: PlanarMass, mass: 5 kg, flange: device}\n"
-    text += "couplers: {tie: {type: PlanarSpringDamper, a: device, b: ground, stiffness: 70 N/m}}\n"
-    found = apc.analyze(compiled(text))
-    assert found.spectral_radius == pytest.approx(math.exp(-3 / (2 * 7)), rel=1e-12)
-    assert len(compiled(text).kinds[0].states) == 4

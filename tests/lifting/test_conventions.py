@@ -13,7 +13,7 @@ from apc.analysis.analysis import analyze
 from apc.analysis.conventions import Conventions, Outcome, conventions
 from apc.frame.schedule import ORDER
 from tests import bruteforce
-from tests.sites import MS, columned, edged, paper
+from tests.sites import MS, edged, paper
 from tests.topologies import AVERAGE, ROOT, SCENES, compiled
 
 FLIPPING = (ROOT / "tests" / "scenes" / "verdict-hangs-on-the-order.yaml").read_text(encoding="utf-8")
@@ -88,13 +88,13 @@ def test_the_start_cannot_matter_where_all_is_linear_and_one_line_says_so() -> N
 
 def test_where_the_slope_depends_on_what_is_heard_both_readings_of_the_start_are_analysed() -> None:
     """Between copies 10 mm apart a cubic coupling is stiffer than between a copy and nothing heard at 0."""
-    system = columned(edged(paper(), cubic=1e7), cube__x=[0.0, 0.01, 0.01])
+    system = edged("sum", [0.0, 0.01, 0.01], cubic=1e7)
     found = conventions(system)
     assert found.start_matters
     readings = {one.start: one.spectral_radius for one in found.outcomes if ORDER in one.orders}
     assert set(readings) == {"the sender's start values", "nothing"}
     assert readings["the sender's start values"] == analyze(system).spectral_radius
-    apart = columned(edged(paper(), cubic=1e7), cube__x=[0.0, 0.0, 0.0])
+    apart = edged("sum", [0.0, 0.0, 0.0], cubic=1e7)
     assert readings["nothing"] != readings["the sender's start values"]
     # Everybody at 0 hears 0, as if nothing.
     alike = {one.spectral_radius for one in conventions(apart).outcomes if ORDER in one.orders}
@@ -103,7 +103,7 @@ def test_where_the_slope_depends_on_what_is_heard_both_readings_of_the_start_are
 
 def test_a_reading_that_cannot_be_analysed_says_why() -> None:
     """The largest of all that is heard has no slope where nothing is heard yet: all are equal, zero."""
-    system = columned(edged(paper(), "max"), cube__x=[0.0, 0.01, 0.02])
+    system = edged("max", [0.0, 0.01, 0.02])
     found = conventions(system)
     silent = next(one for one in found.outcomes if one.start == "nothing")
     assert (silent.verdict, silent.stable) == ("", None)

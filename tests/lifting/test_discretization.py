@@ -5,15 +5,12 @@ from __future__ import annotations
 import itertools
 from fractions import Fraction
 
-import flint
 import mpmath
 import numpy as np
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.eigen.balls import precision
 from apc.frame.discretize import (
-    FEW_TOGETHER,
     UNIT,
     discretize,
 )
@@ -70,35 +67,3 @@ def test_growth_beyond_a_float_is_refused() -> None:
     a = np.array([[Fraction(10**7)]], dtype=object)
     with pytest.raises(ApcError, match="E806"):
         discretize(a, np.zeros((1, 0), dtype=object), [Fraction(1)])
-
-
-def chain(masses: int, *, stiffness: int = 1000, damping: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Masses of 10 g in a row between two walls, springs and dampers between them, the ends pushed."""
-    a, b = (np.full((2 * masses, n), Fraction(0), dtype=object) for n in (2 * masses, 2))
-    for i in range(masses):
-        a[2 * i, 2 * i + 1] = Fraction(1)
-        for j, share in ((i - 1, -1), (i, 2), (i + 1, -1)):
-            if 0 <= j < masses:
-                a[2 * i + 1, 2 * j : 2 * j + 2] = [Fraction(-100 * k * share) for k in (stiffness, damping)]
-    b[1, 0] = b[-1, 1] = Fraction(100)
-    return a, b
-
-
-@pytest.mark.few(1)
-@pytest.mark.parametrize(("stiffness", "damping"), [(1000, 1), (1000, 0), (20, 3), (1000, 4)])
-def test_a_chain_of_many_masses_is_within_its_bound(stiffness: int, damping: int) -> None:
-    a, b = chain(FEW_TOGETHER, stiffness=stiffness, damping=damping)
-    (step,) = discretize(a, b, [TIME])
-    both = np.concatenate([np.concatenate([a, b], axis=1), np.full((2, len(a) + 2), Fraction(0))])
-    with precision(200):
-        rows = [[flint.arb(flint.fmpq(one.numerator, one.denominator)) for one in row] for row in both * TIME]
-        truth = np.array(
-            [[float(one) for one in row] for row in flint.arb_mat(rows).exp().tolist()[: len(a)]]
-        )
-    bound = UNIT * step.roundings * step.size
-    assert (np.abs(step.matrix - truth) <= bound + UNIT * np.abs(truth)).all()
-    # In units of length in which velocities are as large as ways, no entry is off by more than composing it
-    # rounds: 130 states and holds.
-    units = np.tile([1.0, np.sqrt(stiffness * 100.0)], FEW_TOGETHER)
-    scaled = bound / units[:, None] * np.concatenate([units, np.full(2, 1 / 100.0)])
-    assert scaled.max() <= 4 * 130 * UNIT

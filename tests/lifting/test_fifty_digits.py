@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from fractions import Fraction
 from typing import Any
 
 import flint
-import numpy as np
 import pytest
 
 from apc.benchmark.truth import spectral_truth as of_balls
@@ -16,10 +14,9 @@ from apc.compiler.pipeline import compile_topology
 from apc.eigen.balls import precision
 from tests.bench.random_scenes import run
 from tests.bruteforce import Scene, as_ball, frame_matrix
-from tests.fifty_digits.truth import Truth, exact_course, spectral_truth
-from tests.schemes import experiment
+from tests.fifty_digits.truth import Truth, spectral_truth
 from tests.sites import MS, paper
-from tests.topologies import ROOT, SCENES, compiled
+from tests.topologies import SCENES
 
 
 def _radius(scene: Scene, rigid: int) -> flint.arb:
@@ -38,22 +35,6 @@ def test_what_bench_compares_with_is_the_truth_of_the_independent_engine(name: s
     found = of_balls(system)
     assert not isinstance(found, str), found
     assert found.digits[:45] == _truth(system).digits[:45]
-
-
-@pytest.mark.whole
-def test_what_bench_compares_with_is_the_stored_truth_of_hard_cases() -> None:
-    folder = ROOT / "tests" / "hard"
-    stored = json.loads((folder / "truths.json").read_text(encoding="utf-8"))
-    for name in (
-        "boundary-inside-13",
-        "coasting",
-        "high-rate-ratio",
-        "nearly-defective",
-        "three-large-groups",
-    ):
-        found = of_balls(compile_topology(folder / f"{name}.yaml"))
-        assert not isinstance(found, str), found
-        assert found.digits[:45] == stored[name]["spectral_radius"][:45]
 
 
 def _truth(system: CompiledSystem) -> Truth:
@@ -80,18 +61,6 @@ def test_fifty_digits_are_those_of_the_brute_force(values: dict[str, Any]) -> No
     assert found.rigid == 1
     with precision(600):
         assert float(abs(found.radius - _radius(Scene(**scene), 1))) < 1e-50
-
-
-def test_a_course_is_that_of_stepping_by_hand() -> None:
-    """The experiment, with contacts that open and close: positions and velocities at every tick."""
-    for name, operator in (("average", "mean"), ("mesh", "sum")):
-        system = compiled((SCENES / f"experiment-{name}.yaml").read_text(encoding="utf-8"))
-        found = exact_course(system, Fraction(1, 5))
-        assert not isinstance(found, str)
-        names, rows = found
-        assert names[0] == "right[1].device.x"
-        by_hand = experiment(operator, len(rows))[:, :, :4]
-        np.testing.assert_allclose(rows.reshape(by_hand.shape), by_hand, rtol=0, atol=1e-12)
 
 
 @pytest.mark.few(1)

@@ -11,7 +11,7 @@ from apc.compiler.errors import ApcError
 from apc.eigen.modes import dense, split
 from tests.bruteforce import Scene, frame_matrix
 from tests.pairing import apart, arcs_of
-from tests.sites import columned, edged, linked, paper
+from tests.sites import edged, paper
 
 GAINS = {"kt": 800.0, "bt": 2.0, "kc": 1500.0, "bc": 2.0}
 
@@ -32,16 +32,9 @@ def _cubic_pairs(starts: list[float], cubic: float) -> dict[tuple[int, int], flo
 @pytest.mark.parametrize("graph", ["complete", "ring", "star", "apart"])
 @pytest.mark.parametrize("starts", [[0.0, 0.0, 0.0, 0.0], [0.01, 0.02, 0.05, 0.02]])
 def test_an_edge_function_is_linearized_pair_by_pair(operator: str, graph: str, starts: list[float]) -> None:
-    base = edged(paper(operator, peers=4, **GAINS), operator, cubic=2e5)
-    arcs = None if graph == "complete" else arcs_of(graph, 4)
-    system = columned(linked(base, arcs or "complete"), cube__x=starts)
-    scene = Scene(
-        operator,
-        4,
-        weights={(i, j): weight for i, j, weight in arcs} if arcs else None,
-        pairs=_cubic_pairs(starts, 2e5),
-        **GAINS,
-    )
+    arcs = None if graph == "complete" else {(i, j): weight for i, j, weight in arcs_of(graph, 4)}
+    system = edged(operator, starts, cubic=2e5, weights=arcs, **GAINS)
+    scene = Scene(operator, 4, weights=arcs, pairs=_cubic_pairs(starts, 2e5), **GAINS)
     expected = np.linalg.eigvals(np.array(frame_matrix(scene)))
     assert apart(_split(system), expected) < 1e-11
     whole = np.linalg.eigvals(dense(*lifted_groups(system)).matrix)
@@ -55,21 +48,16 @@ def _split(system: CompiledSystem) -> np.ndarray:
 
 
 def test_the_largest_of_equal_peers_has_no_linearization() -> None:
-    message = r"E803 pull of user\[1\]: max over equal peers has no linearization"
-    with pytest.raises(ApcError, match=message):
-        analyze(edged(paper(), "max"))
-    apart = columned(edged(paper(), "max"), cube__x=[0.0, 0.01, 0.02])
-    assert analyze(apart).linearized
+    with pytest.raises(ApcError, match=r"E803 .* of user\[1\]: max over equal peers has no linearization"):
+        analyze(edged("max", [0.0] * 3))
+    assert analyze(edged("max", [0.0, 0.01, 0.02])).linearized
     # Two peers: the only other one is the largest, and the smallest, and the mean.
-    two = [analyze(edged(paper(peers=2), operator)).spectral_radius for operator in ("max", "min", "mean")]
+    two = [analyze(edged(operator, [0.0] * 2)).spectral_radius for operator in ("max", "min", "mean")]
     assert two == pytest.approx([two[0]] * 3, abs=1e-12)
 
 
 def test_the_largest_is_the_one_that_starts_furthest_away() -> None:
     """F_T = K max_j (x_i − x_j): everyone hears the lowest, the lowest the next: a graph of arcs."""
-    starts = [0.03, 0.0, 0.01]
-    arcs = [(1, 0, 1.0), (2, 1, 1.0), (1, 2, 1.0)]
-    largest = columned(edged(paper(), "max"), cube__x=starts)
-    assert analyze(largest).spectral_radius == pytest.approx(
-        analyze(linked(paper(), arcs), method="dense").spectral_radius, abs=1e-10
-    )
+    arcs = {(1, 0): 1.0, (2, 1): 1.0, (1, 2): 1.0}
+    expected = analyze(paper(weights=arcs), method="dense").spectral_radius
+    assert analyze(edged("max", [0.03, 0.0, 0.01])).spectral_radius == pytest.approx(expected, abs=1e-10)

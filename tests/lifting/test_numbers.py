@@ -23,7 +23,6 @@ from apc.frame.overrides import Override, apply, parse_override
 from apc.frame.parameters import resolve
 from apc.vary.many import analyze_many
 from apc.vary.margins import margins
-from tests.sites import columned, derived, grouped, paper
 from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
 
 
@@ -42,7 +41,12 @@ def _column(system: CompiledSystem, name: str) -> list[float]:
 
 @pytest.mark.parametrize("name", ["contact.stiffness", "couplers.contact.stiffness"])
 def test_an_override_reaches_every_group_or_the_one_named(name: str) -> None:
-    system = grouped(paper(), ("left", 1, {"contact.stiffness": 7.0}), ("right", 1, {}))
+    system = compiled(
+        replaced(
+            AVERAGE,
+            ("user: {count: 3}", "left: {count: 1, set: {contact.stiffness: 7 N/m}}\n  right: {count: 1}"),
+        )
+    )
     override = parse_override(system, f"{name}=0.8 N/mm")
     assert override == Override(Free("contact.stiffness"), Fraction(800))
     changed = apply(system, [override])
@@ -51,47 +55,9 @@ def test_an_override_reaches_every_group_or_the_one_named(name: str) -> None:
     assert _value(changed, "contact.stiffness", 1) == _value(system, "contact.stiffness", 1) != 800.0
 
 
-def test_what_depends_on_a_parameter_follows_it() -> None:
-    system = derived(paper(), coordination__stiffness="kt/(peers - 1)", lan__delay="2*wait")
-    changed = apply(system, [Override(Free("kt"), Fraction(3000)), Override(Free("wait"), Fraction(1, 90))])
-    assert _value(changed, "coordination.stiffness") == 1500.0
-    assert resolve(changed).timings["lan.delay"] == Fraction(1, 45)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (
-            "contact.stifness=8 N/m",
-            "E622 contact.stifness is no parameter of paper. Write: contact.stiffness",
-        ),
-        (
-            "contact.stiffness",
-            "E621 an override wants NAME=VALUE, got contact.stiffness. Write: contact.stiffness=800 N/m",
-        ),
-        (
-            "contact.stiffness=800",
-            "E204 contact.stiffness wants N/m, got 800 (no unit). Write: contact.stiffness=800 N/m",
-        ),
-        ("peers=4", "E623 peers is the number of all peers"),
-        ("cube.mass=0 kg", "E624 cube.mass wants more than 0 kg, got 0 kg."),
-        ("contact.damping=-1 N*s/m", "E624 contact.damping wants at least 0 N*s/m, got -1 N*s/m."),
-        ("haptic.period=0 s", "E625 haptic.period wants a time above 0 s, got 0.0 s."),
-        ("lan.delay=-1 ms", "E625 lan.delay wants a time of 0 s or more, got -0.001 s."),
-        ("left.lan.delay=1 ms", "E622 left.lan.delay is no parameter of paper"),
-    ],
-)
-def test_mistakes_say_what_to_write(text: str, message: str) -> None:
-    system = grouped(paper(), ("left", 1, {}), ("right", 1, {}))
-    with pytest.raises(ApcError) as caught:
-        apply(system, [parse_override(system, text)])
-    [mistake] = caught.value.mistakes
-    assert f"{mistake.code} {mistake.sentence}".startswith(message)
-
-
 @pytest.mark.parametrize("name", ["device.mass", "user.device.mass"])
 def test_an_override_replaces_a_column(name: str) -> None:
-    system = columned(paper(), device__mass=[0.1, 0.2, 0.1])
+    system = compiled(replaced(AVERAGE, ("{count: 3}", "{set: {device.mass: [0.1 kg, 0.2 kg, 0.1 kg]}}")))
     changed = apply(system, [parse_override(system, f"{name}=0.5 kg")])
     assert _column(changed, "device.mass") == [0.5, 0.5, 0.5]
     kept = apply(system, [parse_override(system, "contact.stiffness=5 N/m")])
@@ -178,14 +144,17 @@ def test_what_a_group_sets_of_a_part_reaches_the_parts_inside(
     assert [kind.holds[0].clock for kind in kinds] == ["haptic", "slow"]
 
 
-def test_what_depends_on_a_column_is_worked_out_peer_by_peer() -> None:
-    text = (
-        "if device.mass > 0.15 and peers == 3 then kt*max(device.mass, 0.3) else -(-sqrt(kt)^2)/(peers - 1)"
+def test_what_depends_on_a_column_is_worked_out_peer_by_peer(tmp_path: Path) -> None:
+    law = ("2*k", '"if k > rest and k < 9*rest then 3*max(k, 2*rest) else -(-k)/2"')
+    part = replaced(OUTER, law, ("{k: {unit: N/m}", "{k: {unit: N/m}, rest: {unit: N/m, default: 2 N/m}"))
+    text = replaced(
+        NESTED,
+        ("{one: {count: 1}, two: {count: 2, set: {o.k: 7 N/m", "{two: {set: {o.k: [1 N/m, 3 N/m, 7 N/m]"),
     )
-    system = columned(derived(paper(), coordination__stiffness=text), device__mass=[0.1, 0.2, 0.4])
-    assert _column(system, "coordination.stiffness") == pytest.approx([250.0, 150.0, 200.0], rel=1e-15)
-    doubled = apply(system, [Override(Free("kt"), Fraction(1000))])
-    assert _column(doubled, "coordination.stiffness") == pytest.approx([500.0, 300.0, 400.0], rel=1e-15)
+    system = compiled(text, library(tmp_path, part))
+    assert _column(system, "o.inner.stiffness") == pytest.approx([0.5, 12.0, 21.0], rel=1e-15)
+    less = apply(system, [parse_override(system, "o.rest=0.5 N/m")])
+    assert _column(less, "o.inner.stiffness") == pytest.approx([3.0, 9.0, 3.5], rel=1e-15)
 
 
 def test_what_is_set_for_all_groups_says_what_each_of_them_has(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import re
-import shutil
-from pathlib import Path
-
 import pytest
 
 from apc.analysis.analysis import analyze
 from apc.analysis.needs import needs
-from apc.compiler.compiled import CompiledSystem
 from apc.compiler.pipeline import compile_topology
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
 
@@ -44,21 +39,6 @@ KEPT = {
 }
 
 
-# Schemes that remember what their laws need, which are played by hand in test_schemes_in_time.
-IN_TIME = (
-    "god-object",
-    "limited-motor",
-    "stiff-wall-passivity",
-    "two-users-dead-reckoning",
-    "two-users-passivity",
-    "two-users-set-position",
-)
-
-
-def test_every_scene_is_listed() -> None:
-    assert sorted([*KEPT, *IN_TIME]) == sorted(path.stem for path in SCENES.glob("*.yaml"))
-
-
 @pytest.mark.few(10)
 @pytest.mark.parametrize("name", KEPT)
 def test_a_scene_keeps_what_it_needs_and_no_more(name: str) -> None:
@@ -66,50 +46,6 @@ def test_a_scene_keeps_what_it_needs_and_no_more(name: str) -> None:
     found = needs(system)
     assert [(site.motion, site.remembered, site.packets) for site in found.sites] == KEPT[name]
     assert system.dropped == ()
-
-
-@pytest.mark.few(2)
-@pytest.mark.parametrize("name", KEPT)
-def test_unused_parts_change_nothing_and_cost_nothing_in_any_scene(name: str, tmp_path: Path) -> None:
-    path = SCENES / f"{name}.yaml"
-    text = path.read_text(encoding="utf-8")
-    spare = {
-        "clocks": "spare_clock: 3 ms",
-        "parameters": "spare_number: 3 N/m",
-        "links": "spare_link: {clock: haptic, delay: 80 s}",
-        "couplers": "spare_force: {type: SampledSpringDamper, a: ground, b: ground, stiffness: 1 N/m, "
-        "clock: haptic, delay: 5 ms}",
-    }
-    for section, entry in spare.items():
-        text = _with(text, section, entry)
-    for table in SCENES.glob("*.csv"):
-        shutil.copy(table, tmp_path)
-    (tmp_path / path.name).write_text(text, encoding="utf-8")
-    more = compile_topology(tmp_path / path.name)
-    _same(compile_topology(path), more)
-    assert sorted({reason for _, reason in more.dropped}) == [
-        "nobody hears what it would carry",
-        "nobody reads this held value",
-        "nothing ticks with it",
-    ]
-
-
-def _with(text: str, section: str, entry: str) -> str:
-    """Return a topology with one more entry in a section, there or not, on one line or several."""
-    found = re.search(rf"^{section}:( *{{)?", text, re.MULTILINE)
-    if found is None:
-        return f"{text}\n{section}:\n  {entry}\n"
-    end = found.end()
-    if found.group(1):
-        return f"{text[:end]}{entry}, {text[end:]}"
-    end = text.index("\n", end)
-    return f"{text[:end]}\n  {entry}{text[end:]}"
-
-
-def _same(plain: CompiledSystem, more: CompiledSystem) -> None:
-    """Assert that two models are the same states and buffers, and the same answer."""
-    assert needs(more) == needs(plain)
-    assert analyze(more).to_dict() == analyze(plain).to_dict()
 
 
 CONTACT, COORDINATION, LINK = "haptic, delay: 1 ms}", "haptic, delay: 1 ms, link", "network, delay: 8 ms}"

@@ -7,7 +7,6 @@ import random
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import apc
@@ -16,7 +15,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.eigen.balls import precision
 from tests.bench.random_scenes import check, truth
-from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, library, replaced
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, library, replaced
 
 
 def test_the_answer_is_plain_data() -> None:
@@ -52,14 +51,6 @@ def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
 
 
 PAPER = SCENES / "three-users-average.yaml"
-
-
-def test_a_verdict_that_hangs_on_a_convention_is_warned_of(said: Callable[..., str]) -> None:
-    path = ROOT / "tests" / "scenes" / "verdict-hangs-on-the-order.yaml"
-    text = said(path)
-    assert "Warning: the verdict hangs on a convention" in text
-    assert all(len(line) <= 80 for line in text.splitlines())
-    assert len(json.loads(said(path, "--json"))["warnings"]) == 1
 
 
 def test_a_box_and_a_proof_stand_beside_the_answer(said: Callable[..., str]) -> None:
@@ -250,14 +241,3 @@ def test_what_is_left_out_though_some_of_it_moves_in_modes_is_a_common_shift(tmp
     assert found.unfelt == ("the common shift of kept.s, kept.s sent",)
     assert any(share[0].startswith("kept.s") for mode in found.modes for share in mode.participation)
     assert "the common shift of kept.s" in str(found)
-
-
-def test_prepared_work_serves_other_numbers_and_other_times() -> None:
-    for name, value in (
-        ("coordination.stiffness", "900 N/m"),
-        ("lan.delay", "4 ms"),
-        ("haptic.period", "0.5 ms"),
-    ):
-        changed = apc.set_parameters(compiled(AVERAGE), {name: value})
-        assert apc.analyze(changed) == apc.analyze(compiled(AVERAGE), set={name: value})
-        assert not np.isclose(apc.analyze(changed).spectral_radius, 0.95717138962509, atol=1e-6)

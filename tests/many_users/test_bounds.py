@@ -75,7 +75,7 @@ def check(values: dict[str, Any]) -> Analysis:
 QUEUE = {"operator": "mean", "kt": 0.05, "kc": 1.0, "bc": 2.0, "network": MS, "comp": Fraction(0)}
 
 
-@settings(max_examples=12, derandomize=True)
+@settings(max_examples=4, derandomize=True)
 @given(scenes())
 @example({**QUEUE, "comm": 11 * MS})
 @example({"operator": "mean", "kt": 0.0, "kc": 1000.0, "bc": 2.0, "comm": 80 * MS})
@@ -136,7 +136,7 @@ def test_conjugates_of_a_real_matrix_are_exact_and_the_upper_one_is_first() -> N
 LOOSE = Scene(device_damping=0.0, cube_damping=0.0)
 
 
-@pytest.mark.few(9)
+@pytest.mark.few(5)
 @pytest.mark.parametrize(
     ("values", "rigid"),
     [

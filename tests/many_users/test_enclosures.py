@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from typing import Any
 
 import flint
@@ -19,7 +18,6 @@ from apc.eigen.certify import schur_cohn
 from apc.eigen.dominant import enclosed, largest_pairs
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.pseudospectrum import pseudospectral_radius
-from apc.eigen.winding import Ball, Bounded, wind
 
 Floats = NDArray[Any]
 
@@ -227,34 +225,3 @@ def test_schur_and_cohn_tell_where_the_roots_are(roots: tuple[complex, ...], ins
     with precision(256):
         exact = flint.acb_poly.from_roots([flint.acb(root.real, root.imag) for root in map(complex, roots)])
         assert schur_cohn([coefficient.real for coefficient in exact.coeffs()]) is inside
-
-
-def _bounded(zeros: Sequence[complex]) -> Bounded:
-    """Return Π (ζ − z) with the bound Π (1 + reach/|ζ − z|) − 1."""
-
-    def function(points: Floats, reach: Floats) -> Ball:
-        factors = points[:, None] - np.array(zeros)
-        with np.errstate(divide="ignore"):
-            change = np.prod(1 + reach[:, None] / np.abs(factors), axis=1) - 1
-        value = np.prod(factors, axis=1)
-        return Ball(value / np.abs(value), np.where(np.isfinite(change), change, np.inf))
-
-    return function
-
-
-ZEROS = (0.5, 0.99, -0.3 + 0.2j, -0.3 - 0.2j, 1.0 + 1e-9, 2.0, 0.6 + 0.8j, 0.6 - 0.8j)
-
-
-@pytest.mark.parametrize(
-    ("centre", "radius", "count"),
-    [
-        *((0, 0.2, 0), (0, 0.45, 2), (0, 0.9, 3), (0, 0.995, 4), (0, 1 - 1e-7, 4), (0, 1 + 5e-10, 6)),
-        *((0, 1 + 1e-6, 7), (0, 3.0, 8), (0.6 + 0.8j, 1e-9, 1), (0.6 + 0.8001j, 1e-9, 0)),
-        (0, 0.5, None),  # one is on the circle
-    ],
-)
-def test_zeros_are_counted_however_near_to_the_circle(
-    centre: complex, radius: float, count: int | None
-) -> None:
-    assert wind(_bounded(ZEROS), centre, radius) == count
-    assert wind(_bounded(ZEROS), centre, radius, close=np.array(ZEROS)) == count

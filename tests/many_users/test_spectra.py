@@ -124,15 +124,6 @@ def test_groups_that_differ_in_nothing_that_moves_are_one() -> None:
     assert len({mode.shape for mode in apc.analyze(compiled(column)).modes}) == 2
 
 
-@pytest.mark.parametrize("peers", [2, 5, 20])
-def test_full_mesh_is_the_average_with_gains_times_the_others(peers: int) -> None:
-    gains = {"kt": 900.0 / (peers - 1), "bt": 3.0 / (peers - 1)}
-    mesh = apc.analyze(compiled(text_of(Scene("sum", peers, comm=11 * MS, **gains))))
-    mean = apc.analyze(compiled(text_of(Scene("mean", peers, comm=11 * MS, kt=900.0, bt=3.0))))
-    assert mesh.spectral_radius == pytest.approx(mean.spectral_radius, abs=1e-12)
-    assert len(mesh.modes) == len(mean.modes)
-
-
 # ---- very many ----
 
 
@@ -175,15 +166,6 @@ def test_very_many_alike_have_the_radius_of_all_their_modes(
     assert found.spectral_radius_error < 1e-11
 
 
-def test_a_ring_of_a_hundred_thousand_peers_is_held_by_the_slowest_of_its_differences() -> None:
-    found = apc.analyze(compiled(on_graph(100_000, "ring")))
-    assert (found.verdict, found.rigid_modes) == ("stable up to a common translation", 1)
-    slow = 1 - apc.analyze(compiled(on_graph(1000, "ring"))).spectral_radius
-    share = (1 - np.cos(2 * np.pi / 100_000)) / (1 - np.cos(2 * np.pi / 1000))
-    assert 1 - found.spectral_radius == pytest.approx(slow * share, rel=1e-3)
-    assert found.spectral_radius_error < 1e-12
-
-
 def different(peers: int, graph: str = "complete", **values: Any) -> str:
     """Return peers whose masses and contacts all differ."""
     random = np.random.default_rng(0)
@@ -198,22 +180,23 @@ def different(peers: int, graph: str = "complete", **values: Any) -> str:
     return replaced(on_graph(peers, graph, **gains), (f"{{count: {peers}}}", f"{{set: {{{listed}}}}}"))
 
 
-LARGE: list[tuple[str, str]] = [
-    (different(12), "determinant"),
-    (different(5, operator="sum"), "determinant"),
-    (different(12, kt=6000.0), "determinant"),
-    (different(5, comp=Fraction(0), comm=Fraction(0)), "determinant"),
-    (different(5, comp=MS * 5 / 2, comm=4 * MS), "determinant"),
-    (different(2, haptic=2 * MS, network=3 * MS), "determinant"),
-    (different(5, comm=30 * MS), "determinant"),
-    (different(16, "ring"), "krylov"),
-    (different(16, "star", operator="sum"), "krylov"),
+LARGE = [
+    different(12),
+    different(5, operator="sum"),
+    different(12, kt=6000.0),
+    different(5, comp=Fraction(0), comm=Fraction(0)),
+    different(5, comp=MS * 5 / 2, comm=4 * MS),
+    different(2, haptic=2 * MS, network=3 * MS),
+    different(5, comm=30 * MS),
 ]
 
 
-@pytest.mark.parametrize(("text", "method"), LARGE)
-def test_ways_for_very_many_who_differ_have_the_modes_of_the_whole_matrix(text: str, method: str) -> None:
-    found, whole = (apc.analyze(compiled(text), method=way) for way in (method, "dense"))  # type: ignore[arg-type] # a method
+@pytest.mark.parametrize("text", LARGE)
+def test_determinants_of_many_who_differ_have_the_modes_of_the_whole_matrix(text: str) -> None:
+    found, whole = (
+        apc.analyze(compiled(text), method="determinant"),
+        apc.analyze(compiled(text), method="dense"),
+    )
     assert (found.verdict, found.rigid_modes) == (whole.verdict, whole.rigid_modes)
     off = abs(found.spectral_radius - whole.spectral_radius)
     assert off <= found.spectral_radius_error + whole.spectral_radius_error < 1e-7
@@ -230,12 +213,11 @@ def test_ways_for_very_many_who_differ_have_the_modes_of_the_whole_matrix(text: 
         (text_of(Scene(peers=1_000_000)), "modes"),
         (different(3), "modes"),
         (different(60), "determinant"),
-        (different(60, "ring"), "krylov"),
         (on_graph(1000, "ring"), "modes"),
         (text_of(Scene(comm=8000 * MS)), "determinant"),
         (text_of(Scene(comm=80 * MS)), "modes"),
     ],
-    ids=["a million", "three", "sixty", "sixty on a ring", "a ring", "8 s late", "80 ms late"],
+    ids=["a million", "three", "sixty", "a ring", "8 s late", "80 ms late"],
 )
 def test_the_method_is_chosen_by_what_differs(text: str, method: str) -> None:
     assert apc.analyze(compiled(text)).method == method
@@ -251,16 +233,8 @@ def test_the_method_is_chosen_by_what_differs(text: str, method: str) -> None:
         ),
         (different(3, "ring"), "modes", "E850 method modes can't serve this scene: all peers as one system"),
         (different(60, "ring"), "determinant", "E850 method determinant .* hear all others over lan"),
-        (different(600), "krylov", "E850 method krylov .* all of 600 peers hear each other over lan"),
     ],
 )
 def test_a_method_that_cannot_serve_is_refused(text: str, method: str, message: str) -> None:
     with pytest.raises(ApcError, match=message):
         apc.analyze(compiled(text), method=method)  # type: ignore[arg-type] # a method
-
-
-def test_what_one_peer_is_free_to_do_that_others_are_not_leaves_the_verdict_open() -> None:
-    rows = ", ".join(f"{k} N/m" for k in (0, 1000, 1000, 1000, 1000))
-    text = replaced(on_graph(5, "ring"), ("{count: 5}", f"{{set: {{contact.stiffness: [{rows}]}}}}"))
-    found = apc.analyze(compiled(text), method="krylov")
-    assert found.stable is None and found.spectral_radius_error >= found.spectral_radius

@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from apc.analysis.analysis import prepare
-from apc.frame.radius import RADII
-from apc.moments.almost_sure import AlmostSure, Chance, almost_sure, exponent, unplayed
-from apc.moments.held import HeldLoop
-from apc.network.channel import ChannelLaw
+from apc.moments.almost_sure import AlmostSure, almost_sure, unplayed
 from tests.held_scenes import scene, system_of
-from tests.lossy import BURSTS, RELIABLE
 from tests.networks.test_loss import judged
 
 
@@ -23,23 +17,6 @@ def estimate(text: str) -> AlmostSure:
     found = almost_sure(system, prepare(system))
     assert found is not None
     return found
-
-
-def of_one_number(law: ChannelLaw, heard: float, lost: float, *, seed: int, frames: int = 240) -> AlmostSure:
-    """Return the exponent of one number that is multiplied by one factor or another."""
-    zero, one, *factors = (RADII.exact(np.array([[value]])) for value in (0.0, 1.0, heard, lost))
-    loop = HeldLoop(zero, one, *factors)
-    return exponent(loop, [Chance(law, (0,))], seed=seed, courses=40, frames=frames)
-
-
-@pytest.mark.whole
-@pytest.mark.parametrize("law", [BURSTS, replace(RELIABLE, p=0.3, r=0.7)])
-def test_intervals_hold_the_exponent_of_one_number_95_times_in_a_hundred(law: ChannelLaw) -> None:
-    known = (1 - law.mean_loss) * math.log(0.7) + law.mean_loss * math.log(1.4)
-    found = [of_one_number(law, 0.7, 1.4, seed=seed) for seed in range(100)]
-    # 95 of 100 give or take three standard deviations of such a count
-    assert 88 <= sum(one.interval[0] <= known <= one.interval[1] for one in found) <= 100
-    assert found[1] == of_one_number(law, 0.7, 1.4, seed=1) != found[2]
 
 
 # Of an independent program, for the paper's users at 10 % loss: peers, stiffness, exponent per frame and half

@@ -9,21 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import apc
 from apc.__main__ import run
-from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.simulation import ensemble
-from apc.simulation.blocks import pushes
 from apc.simulation.ensemble import Ensemble, play_many, share_interval
 from apc.simulation.native import compiler
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
 from apc.simulation.trajectory import play
-from tests.lossy import LINK, apart
-from tests.networks.test_played import ODD
+from tests.lossy import apart
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
 
 SHAKY = apart(AVERAGE, "loss: {p: 10 %, r: 20 %}, jitter: 8 ms")
@@ -40,12 +36,28 @@ def said(found: Ensemble) -> str:
     return " ".join(str(found).split())
 
 
-def test_a_run_does_not_depend_on_how_many_there_are_or_who_plays_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ensemble, "PART", 5)
-    few = runs(SHAKY, 4, "1/2", jit=False).runs
-    together = runs(SHAKY, 9, "1/2", jit=False, jobs=2)
+ALL = apart(
+    AVERAGE, "loss: 20 %, jitter: 9 ms, distribution: normal, reorder: all, on_loss: zero, graph: ring"
+)
+
+
+# Machine code plays 13 side by side: more than are added up at once, and no multiple of it.
+@pytest.mark.parametrize(
+    ("text", "part", "jit"),
+    [
+        (SHAKY, 5, False),
+        pytest.param(SHAKY, 13, True, marks=[machine_code, pytest.mark.whole]),
+        pytest.param(ALL, 13, True, marks=[machine_code, pytest.mark.whole]),
+    ],
+)
+def test_a_run_does_not_depend_on_how_many_there_are_or_who_plays_it(
+    text: str, part: int, jit: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ensemble, "PART", part)
+    few = runs(text, 4, "1/2", jit=jit).runs
+    together = runs(text, 2 * part, "1/2", jit=jit, jobs=1 if jit else 2)
     shared = together.runs
-    assert [one.number for one in shared] == [*range(9)]
+    assert [one.number for one in shared] == [*range(2 * part)]
     assert shared[:4] == few
     assert len({one.settled for one in shared}) > 3, "they are different runs"
     settled = [one.settled for one in shared if one.settled is not None]
@@ -54,33 +66,10 @@ def test_a_run_does_not_depend_on_how_many_there_are_or_who_plays_it(monkeypatch
     assert (of_all.low, of_all.high) == (min(settled), max(settled))
     assert of_all.mean == pytest.approx(np.mean(settled))
     assert of_all.standard_error == pytest.approx(np.std(settled, ddof=1) / math.sqrt(len(settled)))
-    alone, _ = play(prepare(compiled(SHAKY), Settings(Fraction(1, 2), seed=3, jit=False)), [])
+    alone, _ = play(prepare(compiled(text), Settings(Fraction(1, 2), seed=3, jit=jit)), [])
     assert alone.largest_force is not None
     told = (few[0].verdict, few[0].settled, few[0].largest_force)
     assert told == (alone.verdict, alone.settled, alone.largest_force[1])
-
-
-def rows_of_runs(system: CompiledSystem, count: int, first: int) -> NDArray[np.float64]:
-    """Return the rows of some runs that machine code plays side by side (rows, width, runs)."""
-    simulation = prepare(system, Settings(Fraction(1, 10), seed=3), runs=count)
-    player = simulation.player(count)
-    player.begin(first)
-    played = player.play(0, simulation.length, pushes(simulation, 0))
-    return played.rows.reshape(-1, simulation.population.width, count).copy()
-
-
-@pytest.mark.whole
-@machine_code
-@pytest.mark.parametrize(("peers", "more"), [*((3, more) for more in ("", *ODD)), (7, ""), (7, ODD[-1])])
-def test_runs_side_by_side_are_to_the_bit_those_played_alone(peers: int, more: str) -> None:
-    """Of 13, which are more than are added up at once, and no multiple of it."""
-    starts = ", ".join(f"{place} mm" for place in range(peers))
-    link = f"{LINK[:-1]}, {more}}}" if more else LINK
-    many = f"{{set: {{cube.x: [{starts}], device.x: [{starts}]}}}}"
-    system = compiled(replaced(AVERAGE, ("{count: 3}", many), (LINK, link)))
-    together = rows_of_runs(system, 13, 2)
-    for number in (2, 9, 14):
-        np.testing.assert_array_equal(together[:, :, number - 2], rows_of_runs(system, 1, number)[:, :, 0])
 
 
 def test_a_shares_interval_is_wilsons() -> None:

@@ -180,13 +180,6 @@ def test_loss_is_a_parameter_like_others() -> None:
     np.testing.assert_allclose(swept.column("mean_square_radius"), expected, rtol=1e-9)
 
 
-@pytest.mark.few(1)
-@pytest.mark.parametrize("loss", ["20 %, on_loss: zero", "20 %", "{p: 2.5 %, r: 10 %}"])
-def test_a_mesh_is_an_average_of_as_much_more_stiffness(loss: str) -> None:
-    mesh = radius(scene(3, 450.0, coupler="FullMesh", loss=loss))
-    assert mesh == pytest.approx(radius(scene(3, 900.0, loss=loss)), rel=1e-12)
-
-
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("peers", "nominal"), [(2, 0.9028182673009955), (3, 0.9161770691168368), (5, 0.9198995414489803)]
@@ -251,6 +244,7 @@ def test_what_cannot_be_varied_is_refused_with_what_can() -> None:
             apc.set_parameters(system, {name: value})
 
 
+@pytest.mark.whole
 def test_the_command_says_what_python_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

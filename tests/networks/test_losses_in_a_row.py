@@ -90,13 +90,6 @@ def test_every_pattern_of_certified_losses_settles(
     assert growth(listed) < 1
 
 
-def test_a_mesh_is_an_average_of_so_many_times_the_stiffness_and_a_million_users_are_judged() -> None:
-    average, mesh = losses(scene(4, 1000.0)), losses(scene(4, 1000.0 / 3, coupler="FullMesh"))
-    assert (average.certified, average.unstable_pattern) == (mesh.certified, mesh.unstable_pattern)
-    assert average.growth == pytest.approx(mesh.growth, rel=1e-12)
-    assert losses(scene(1_000_000, 100.0)).certified is not None
-
-
 @pytest.mark.whole
 def test_groups_rings_and_stars_are_what_is_written_peer_by_peer_and_edge_by_edge() -> None:
     heavy = "  left: {count: 1, set: {device.mass: 0.2 kg}}\n"

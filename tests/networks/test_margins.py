@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
-from functools import partial
-
-import numpy as np
 import pytest
 
 import apc
 from apc.analysis.analysis import prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.frame.names import Free
-from apc.frame.overrides import Override, apply
-from apc.vary import over_network
 from apc.vary.margins import Margins
 from apc.vary.over_network import network_margins, network_sensitivities
 from tests.bruteforce import Scene
 from tests.held_scenes import scene, system_of
 from tests.networks.second_moments import Law, second_moment_radius
 from tests.networks.test_loss import STIFFNESS
-from tests.topologies import compiled
 
 
 def grown(system: CompiledSystem) -> Margins:
@@ -62,17 +54,6 @@ def test_where_one_value_takes_long_or_is_not_judged_margins_say_so(loss: str) -
     assert not told.rows and told.note.startswith("not looked for: over th")
     why = network_sensitivities(system, prepare(system)).note
     assert why.startswith("what moves it most: not looked for")
-
-
-def test_margins_that_take_long_are_looked_for_if_asked_and_never_of_an_unstable_scene(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    system = system_of(scene(3, 500.0))
-    monkeypatch.setattr(over_network, "MOST_IN_PASSING", 1)
-    in_passing = partial(network_margins, nominal=Margins((), ""), quick=True)
-    assert "(apc analyze --margins does)" in in_passing(system, prepare(system)).note
-    told = grown(system_of(scene(3, 1200.0)))
-    assert not told.rows and told.note == "none: the scene is not stable in mean square as it is"
 
 
 # Largest stiffness of three users by the share lost (brute force over all patterns, to 0.5 N/m): none
@@ -126,38 +107,3 @@ def test_a_box_that_is_not_served_is_refused_by_name(loss: str, box: str, why: s
         apc.prove_box(system_of(scene(3, 500.0, loss=loss)), {box: "±1%"})
     assert why in str(error.value)
     assert error.value.mistakes[0].hint == f"apc critical {box} --in mean-square"
-
-
-ARMED = """\
-topology: armed
-clocks: {haptic: 1 ms, network: 8 ms}
-peers: {user: {count: 2}}
-masses:
-  device: {mass: 0.1 kg, damping: 5 N*s/m}
-  cube:   {mass: 0.6 kg, damping: 20 N*s/m, shared: true}
-couplers:
-  contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic}
-  coordination: {type: AveragePosition, object: cube, stiffness: 500 N/m, clock: haptic, link: lan}
-hands:
-  arm: {type: MassSpringDamperArm, flange: device, mass: 0.2 kg, stiffness: 100 N/m, damping: 5 N*s/m}
-links:
-  lan: {clock: network, delay: 20 ms, loss: 5 %}
-"""
-
-
-@pytest.mark.whole
-def test_a_wide_box_far_inside_is_proved_and_points_of_it_are_stable() -> None:
-    """Its cells are halved where that makes them easier to prove: the mass, which hardly moves the radius."""
-    system = compiled(ARMED)
-    box = {"arm.mass": "±20%", "coordination.stiffness": "500 N/m:600 N/m"}
-    found = apc.prove_box(system, box, cells=50)
-    assert (found.verdict, found.open_share) == ("stable in mean square", 0.0)
-    generator = np.random.default_rng(3)
-    names = ("arm.mass", "coordination.stiffness")
-    for point in generator.uniform([0.16, 500], [0.24, 600], (2, 2)).tolist():
-        at = [Override(Free(name), Fraction(value)) for name, value in zip(names, point, strict=True)]
-        judged = apc.judge_network(apply(system, at))
-        assert judged is not None
-        assert judged.stable
-    beyond = apc.prove_box(system, box | {"coordination.stiffness": "2500 N/m:2650 N/m"}, cells=4)
-    assert not beyond.stable, "the largest stable stiffness is 2569 N/m"

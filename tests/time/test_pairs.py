@@ -21,7 +21,7 @@ from apc.simulation.trajectory import simulate
 from tests.lossy import effective
 from tests.schemes import ByHand, Late, course
 from tests.sites import MS
-from tests.topologies import MESH, compiled, replaced
+from tests.topologies import compiled, replaced
 
 DURATION = Fraction(3, 10)
 K, B, LIMIT = 500.0, 2.0, 1.5
@@ -223,16 +223,6 @@ def test_a_lost_packet_is_missed_by_its_pair_alone(tmp_path: Path, name: str, mo
     expected = by_hand(force, ways, packet, zero="zero" in more)
     for jit in (False, True):
         check(system, expected, seed=3, jit=jit)
-
-
-def test_a_mesh_whose_limit_is_never_reached_is_a_full_mesh() -> None:
-    start = "{count: 3, set: {device.x: [10 mm, 0 mm, -5 mm], cube.x: [2 mm, 0 mm, 1 mm]}}"
-    text = replaced(MESH, ("{count: 3}", start))
-    mesh = simulate(compiled(text), duration=DURATION, jit=False)
-    for limit, alike in (("5 kN", True), ("0.1 N", False)):
-        odd = compiled(replaced(text, ("type: FullMesh", f"type: SaturatedMesh, limit: {limit}")))
-        apart = np.abs(simulate(odd, duration=DURATION, jit=False).values - mesh.values).max()
-        assert (apart < 1e-12 * np.abs(mesh.values).max()) == alike
 
 
 def test_nobody_has_no_maximum(tmp_path: Path) -> None:

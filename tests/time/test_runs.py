@@ -13,7 +13,7 @@ from apc.compiler.errors import ApcError
 from apc.simulation.settings import DEFAULT, Method, Settings, check_step, parse_method
 from apc.simulation.simulation import MOST_ROWS, check_length, prepare, size_note
 from apc.simulation.trajectory import Trajectory, simulate
-from tests.sites import edged, grouped, paper
+from tests.sites import edged
 from tests.topologies import AVERAGE, ONE_MASS, SCENES, compiled, replaced, told
 
 MS = Fraction(1, 1000)
@@ -96,15 +96,6 @@ def test_a_mass_that_is_pushed_moves_on_and_one_that_stops_settles(arm: bool) ->
 # ---- rows and columns ----
 
 
-def test_columns_are_found_by_name_and_have_units() -> None:
-    headings = [one.heading for one in AVERAGE_RUN.signals]
-    assert headings[:3] == ["right[1].device.x [m]", "right[1].device.v [m/s]", "right[1].cube.x [m]"]
-    assert "left[2].contact.push [N]" in headings
-    assert AVERAGE_RUN["left[2].device.x"][0] == -0.03
-    with pytest.raises(KeyError):
-        AVERAGE_RUN["left[3].device.x"]
-
-
 @pytest.mark.parametrize("delay", ["0 ms", "0.5 ms", "3 ms"])
 def test_a_force_that_acts_later_has_a_column_of_when_it_acts(delay: str) -> None:
     text = AVERAGE.replace("delay: 1 ms", f"delay: {delay}")
@@ -139,7 +130,9 @@ def test_pandas_and_xarray_hold_the_same_numbers() -> None:
 def test_signals_are_chosen_by_pattern_and_are_those_of_a_whole_run(
     patterns: list[str], names: list[str]
 ) -> None:
-    system = grouped(paper(), ("left", 2, {"cube.x": 0.01}), ("right", 1, {}))
+    system = compiled(
+        replaced(AVERAGE, ("user: {count: 3}", "left: {count: 2, set: {cube.x: 1 cm}}\n  right: {count: 1}"))
+    )
     found, whole = (
         simulate(system, duration=Fraction(1, 20), signals=asked, jit=False) for asked in (patterns, [])
     )
@@ -239,7 +232,7 @@ def test_what_cant_be_simulated_is_refused_by_name(monkeypatch: pytest.MonkeyPat
         simulate(compiled(replaced(AVERAGE, ("count: 3", "count: 1000000000"))), duration=Fraction(1))
     monkeypatch.setattr("apc.memory.free_memory", lambda: 8e9)
     with pytest.raises(ApcError, match="E874 10,000 peers"):
-        prepare(edged(paper(peers=10_000)), Settings(Fraction(1)))
+        prepare(edged("sum", [0.0] * 10_000), Settings(Fraction(1)))
 
 
 def test_a_verdict_on_no_position_or_on_some_says_so() -> None:
