@@ -16,6 +16,7 @@ rounding, a panel is halved.
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -266,6 +267,10 @@ def impulses(site: SiteForcing, starts: Floats, which: Integers) -> Floats:
 def _impulses_of_length(site: SiteForcing, kernel: Kernel, starts: Floats) -> Floats:
     total, off, size = _integrated(site, whole(kernel), starts)
     rows, at = _switched(site, kernel, starts)
+    if not kernel.smooth:
+        layers = _layers(kernel)
+        rows = np.append(rows, np.repeat(np.arange(len(starts)), len(layers)))
+        at = np.append(at, np.tile(layers, len(starts)))
     off[rows] = True
     if not off.any():
         return total
@@ -290,6 +295,16 @@ def _impulses_of_length(site: SiteForcing, kernel: Kernel, starts: Floats) -> Fl
             halves = np.tile(rows, 2), np.append(low, middle), np.append(middle, high)
             work.append((*halves, halvings + 1))
     return total
+
+
+def _layers(kernel: Kernel) -> Floats:
+    """Return times of an interval ever nearer to its end, down to where what decays fastest is seen.
+
+    Of a motion that forgets within a small part of the interval only the end counts: both rules miss it.
+    """
+    rate = float(np.abs(kernel.a).sum(axis=1).max(initial=0)) * float(kernel.duration)
+    steps = min(math.ceil(math.log(rate, 4)), MOST_HALVINGS) if rate > 1 else 0
+    return float(kernel.duration) * (1 - 4.0 ** -np.arange(1, steps + 1))
 
 
 def _too_fast(starts: Floats, kernel: Kernel) -> ApcError:
