@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import RefusedError, read_file, unlink_link, unwritable, write_bytes
+from apc.compiler.files import RefusedError, is_special, read_file, unlink_link, unwritable, write_bytes
 from apc.compiler.seal import seal
 from apc.npz import read_arrays
 from apc.sweeps.quantities import Cells
@@ -52,6 +52,8 @@ class Parts:
         try:
             self.folder.mkdir(exist_ok=True)
             unlink_link(self._path(part))
+            if is_special(self._path(part)):  # a pipe, say, which nobody reads
+                self._path(part).unlink()
             write_bytes(self._path(part), content)
         except OSError as error:
             raise unwritable(self.folder, error) from error
