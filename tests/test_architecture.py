@@ -133,7 +133,7 @@ def test_nothing_is_evaluated_or_unpickled() -> None:
 
 def test_what_casadi_reads_is_read_in_one_place_at_most() -> None:
     """Reading its form may run commands that a text names: a file's is read under this user's seal alone."""
-    for what, places in (("deserialize", {"store"}), ("decoded", {"store", "processes"})):
+    for what, places in (("deserialize", {"store"}), ("decoded", {"processes"})):
         reading = {name.rpartition(".")[2] for name, one in modules().items() if what in one.calls}
         assert reading == places, what
     with pytest.raises(AssertionError):
