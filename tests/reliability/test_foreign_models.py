@@ -84,10 +84,9 @@ def serialized(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 @pytest.mark.whole
 def test_forged_files_of_every_sort_do_nothing_else_and_end() -> None:
     """Each is opened and asked in a process that notes commands, libraries, sockets and files written."""
-    options = "--inputs 0 --models 40 --recordings 40 --parts 40 --seed 7 --out"
-    command = f"{sys.executable} -m tests.fuzz {options} {Path.cwd()}/failures"
-    ran = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stdout + ran.stderr
+    options = "--inputs 0 --models 40 --recordings 40 --parts 40 --seed 7"
+    command = f"cd {ROOT}; {sys.executable} -m tests.fuzz {options} --out {Path.cwd()}/failures"
+    assert os.system(command) == 0
 
 
 # ---- what stands for a topology ----
@@ -111,21 +110,22 @@ def test_lines_of_somebody_else_run_nothing_and_stand_for_no_topology(
 ) -> None:
     """Theirs say another topology, or hold a function that calls a command; they are sealed or not."""
     apc.save(compiled(OTHER), MODEL)
-    head, _, origin, _ = lines_of(MODEL.read_bytes())
+    other = lines_of(MODEL.read_bytes())
     write("scene.yaml", AVERAGE)
     assert (unchanged(capsys), unchanged(capsys)) == (False, True)
     mine = MODEL.read_bytes()
     honest = apc.load(MODEL).kinds[0].derivative.serialize().encode()
     assert honest in mine
-    other = (head, mark, origin, lines_of(mine)[3].replace(honest, serialized))
-    lines = [other[k] if str(k) in theirs else line for k, line in enumerate(lines_of(mine))]
-    MODEL.write_bytes(b"\n".join(lines))
-    stale = told(apc.load, MODEL)
-    assert ("scene.yaml has changed" in stale[0]) if "2" in theirs else not stale
+    lines = lines_of(mine)
+    other[1:] = mark, other[2], lines[3].replace(honest, serialized)
+    MODEL.write_bytes(b"\n".join(other[k] if str(k) in theirs else lines[k] for k in range(4)))
     assert apc.simulate("scene.yaml", duration="20 ms", jit=False)
     right = apc.analyze(compiled(AVERAGE)).spectral_radius
-    for file in ("scene.yaml", MODEL)[: 1 if stale else 2]:
-        assert apc.analyze(file).spectral_radius == right, "the texts decide"
+    assert apc.analyze("scene.yaml").spectral_radius == right, "the texts decide"
+    if "2" in theirs:
+        assert "scene.yaml has changed" in told(apc.load, MODEL)[0]
+    else:
+        assert apc.analyze(MODEL).spectral_radius == right
     assert not list(Path().rglob(f"{PWNED}*"))
     assert not unchanged(capsys)
     assert MODEL.read_bytes() == mine
@@ -151,9 +151,8 @@ def test_what_was_compiled_serves_this_user_alone(
     seal._secret.cache_clear()
     assert (unchanged(capsys), unchanged(capsys)) == (False, again)
     assert apc.load(MODEL).peers == 3
-    if again:
-        modes = [(folder / "cache" / name).stat().st_mode & 0o777 for name in ("", "secret")]
-        assert modes == [0o700, 0o600]
+    for path in (folder / "cache", folder / "cache" / "secret") if again else ():
+        assert path.stat().st_mode & 0o077 == 0
 
 
 # ---- a model by itself ----
@@ -282,32 +281,31 @@ def test_what_is_no_model_is_refused_and_beside_its_topology_passed_over(content
     assert apc.analyze("scene.yaml").topology == "three-users-average"
 
 
-@pytest.mark.parametrize("place", range(0, 1000, 97))
 def test_a_byte_changed_or_an_end_cut_off_is_refused_or_compiled_again(
-    place: int, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     apc.save(compiled(AVERAGE), MODEL)
-    monkeypatch.setattr(store, "decoded", lambda model: pytest.fail("it is read"))
-    data = bytearray(MODEL.read_bytes())
-    data[place * len(data) // 1000] ^= 1
-    for end in (None, -place - 1):
-        MODEL.write_bytes(data[:end])
-        assert told(apc.load, MODEL) or apc.load(MODEL).peers == 3
+    become_another(monkeypatch)
+    data = MODEL.read_bytes()
+    for end in range(0, len(data), 1_999):
+        for rest in (b"", b"x" + data[end + 1 :]):
+            MODEL.write_bytes(data[:end] + rest)
+            assert told(apc.load, MODEL) or apc.load(MODEL).peers == 3
 
 
-def test_a_file_that_is_too_large_is_refused_before_it_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    MODEL.touch()
-    os.truncate(MODEL, 2**40)
-    assert "E602 is larger than " in told(apc.load, MODEL)[0]
+def test_what_is_not_there_or_a_folder_or_too_large_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("folder.apc").mkdir()
+    Path("large.apc").touch()
+    os.truncate("large.apc", 2**40)
     apc.save(compiled(AVERAGE), MODEL)
     monkeypatch.setattr(cache, "LARGEST_ORIGIN", 100)
-    assert re.match(DAMAGED, told(apc.load, MODEL)[0])
-
-
-def test_what_is_not_there_or_a_folder_is_told() -> None:
-    Path("folder.apc").mkdir()
-    assert told(apc.load, "gone.apc") == ["gone.apc: E602 does not exist. Write: apc compile"]
-    assert told(apc.load, "folder.apc") == ["folder.apc: E602 is a folder, not a compiled model."]
+    for name, words in (
+        ("gone.apc", "E602 does not exist. Write: apc compile"),
+        ("folder.apc", "E602 is a folder, not a compiled model."),
+        ("large.apc", "E602 is larger than "),
+        ("scene.apc", "E604 is damaged: "),
+    ):
+        assert f"{name}: {words}" in told(apc.load, name)[0]
     for name in ("no/scene.apc", "folder.apc"):
         assert "E601 can't be written: " in told(apc.save, compiled(AVERAGE), name)[0]
-    assert [path.name for path in Path().iterdir()] == ["folder.apc"]
+    assert sorted(map(str, Path().iterdir())) == ["folder.apc", "large.apc", "scene.apc"]
