@@ -117,7 +117,7 @@ def read_archive(path: Path) -> Archive:
         numbers = (one for change in made_from.changes for one in change if one[0] != HANDS_CHANGE)
         if not all(_RATIONAL.fullmatch(value) for _, value in numbers):
             raise ValueError
-    except ValueError:
+    except (ValueError, RecursionError):  # what is nested too deeply
         raise ApcError(Mistake("E604", Place(str(path)), FOREIGN, hint=hint)) from None
     whole = b"\n".join((head, origin, model))
     return Archive(made_from, model, is_sealed(whole, mark.decode("latin-1")), form[2] == b"compiled")

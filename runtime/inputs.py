@@ -88,8 +88,8 @@ def load_fresh(path: Path) -> CompiledSystem:
     """Read a compiled model. Raises ApcError if it is damaged, or if what it was made from has changed."""
     archive = read_archive(path)
     topology = path.with_name(archive.origin.topology)
-    there = os.path.isfile(topology)  # noqa: PTH113 -- of a name too long pathlib raises
-    now = changed(archive, path.parent) if there else ""
+    # `Path.is_file` raises for a name that is too long, which no file has.
+    now = changed(archive, path.parent) if os.path.isfile(topology) else ""  # noqa: PTH113 -- see above
     if now:
         what = f"is stale: {now} has changed since it was compiled"
         raise ApcError(Mistake("E605", Place(str(path)), what, hint=f"apc compile {topology}"))

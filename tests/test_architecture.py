@@ -16,6 +16,8 @@ from pathlib import Path
 
 import pytest
 
+from apc.compiler import store
+from apc.compiler.cache import Archive, Origin
 from tests.topologies import AVERAGE, ROOT
 
 STAGES = ("source", "language", "components", "scene", "equations", "functions", "view")  # of the compiler
@@ -121,10 +123,12 @@ def test_nothing_is_evaluated_or_unpickled() -> None:
 
 
 def test_what_casadi_reads_is_read_in_one_place_at_most() -> None:
-    """Reading its own form may run commands that the text names; who reads it asks for this user's seal."""
-    reading = [module for module in modules().values() if "deserialize" in module.calls]
-    assert len(reading) <= 1
-    assert all(any("seal" in one for one in module.imports) for module in reading)
+    """Reading its form may run commands that a text names: a file's is read under this user's seal alone."""
+    for what, places in (("deserialize", {"store"}), ("decoded", {"processes"})):
+        reading = {name.rpartition(".")[2] for name, one in modules().items() if what in one.calls}
+        assert reading == places, what
+    with pytest.raises(AssertionError):
+        store.opened(Archive(Origin("scene.yaml"), b"", sealed=False, compiled=True))
 
 
 def test_what_holds_arrays_is_not_compared_by_them() -> None:

@@ -8,10 +8,9 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import apc
-from apc.compiler.view.listing import show_page
+from apc.compiler.view.listing import diagram_of
 from apc.present.graph import graph_picture
 from tests.commands import Cli, Ran, folder, write
 from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, replaced, told
@@ -68,35 +67,37 @@ def words_of(svg: str) -> list[str]:
 @pytest.mark.parametrize("name", TEXTS)
 def test_no_text_of_a_picture_stands_over_another_or_leaves_the_page(name: str, tmp_path: Path) -> None:
     words = words_of(shown(TEXTS[name], "svg", tmp_path))
-    figure = graph_picture(show_page(tmp_path / "scene.yaml"))
-    drawn = figure.axes[0].texts
-    assert {one.get_text() for one in drawn} == set(words)
-    renderer = FigureCanvasAgg(figure).get_renderer()  # one for all: each is as large as the picture
-    boxes = {one: one.get_window_extent(renderer) for one in drawn}
+    figure = graph_picture(diagram_of(tmp_path / "scene.yaml"))
+    figure.draw_without_rendering()
+    labels = [label for ax in figure.axes[1:] if ax.axison for label in ax.get_yticklabels()]
+    drawn = [*(text for ax in figure.axes for text in (*ax.texts, ax.title)), *labels]
+    boxes = {one: one.get_window_extent() for one in drawn if one.get_text()}
+    assert {line for one in boxes for line in one.get_text().splitlines()} <= set(words)
     for box in boxes.values():
         assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y0 >= 0 and box.y1 <= figure.bbox.height
-    for one, two in itertools.combinations(drawn, 2):
+    for one, two in itertools.combinations(boxes, 2):
         assert not boxes[one].overlaps(boxes[two]), (one.get_text(), two.get_text())
 
 
 def test_the_picture_names_every_part_with_its_type_and_numbers() -> None:
     words = words_of(apc.show(FILE, format="svg"))
     for word in (
-        *("three-users-average", "one of 3 peers", "device", "mass 0.1 kg", "cube", "shared: 0.2 kg a copy"),
+        *("three-users-average, one of 3 peers", "device", "mass 0.1 kg", "cube", "shared: 0.2 kg a copy"),
         *("contact", "SampledSpringDamper", "stiffness 1000 N/m", "delay 1 ms", "coordination"),
-        *("AveragePosition", "lan", "available 8 ms later", "3 peers, complete graph"),
-        *("clock haptic: every 1 ms", "one frame, 8 ms"),
+        *("AveragePosition", "lan", "available 8 ms later", "lan: 3 peers, complete graph"),
+        *("haptic: every 1 ms", "ms of one frame, 8 ms"),
     ):
         assert word in words, word
 
 
-def test_text_of_a_scene_cannot_break_out_of_the_picture(tmp_path: Path) -> None:
+@pytest.mark.parametrize("form", ["svg", "mermaid"])
+def test_text_of_a_scene_cannot_break_out_of_the_picture(form: str, tmp_path: Path) -> None:
     mark = '"<script>alert(1)</script> & Three'
-    drawn = shown(
-        replaced(AVERAGE, ("about: Three", f"about: {mark}"), ("others.  ", 'others."  ')), "svg", tmp_path
-    )
+    about = ("about: Three", f"about: {mark}"), ("others.  ", 'others."  ')
+    drawn = shown(replaced(AVERAGE, *about), form, tmp_path)
     assert "<script>" not in drawn
-    ET.fromstring(drawn)
+    if form == "svg":
+        ET.fromstring(drawn)
 
 
 def test_parts_are_joined_as_the_topology_says(tmp_path: Path) -> None:
@@ -109,8 +110,11 @@ def test_parts_are_joined_as_the_topology_says(tmp_path: Path) -> None:
         assert frozenset(pair) in average
     assert frozenset(("device", "coordination")) not in average
     many = joints(MANY)
-    for pair in (("leash", "chain[3]"), ("long", "links"), ("end and cube", "end"), ("cube", "end and cube")):
-        assert frozenset(pair) in many or pair[0] == "leash", pair
+    for pair in (
+        *(("leash", "ground of leash"), ("long", "links"), ("end and cube", "end"), ("cube", "end and cube")),
+        ("far", "link wan"),
+    ):
+        assert frozenset(pair) in many, pair
     words = " ".join(words_of(shown(MANY, "svg", tmp_path)))
     assert "40 of them" in words and "only at left" in words
 
@@ -126,21 +130,21 @@ def test_peers_that_a_picture_leaves_out_are_counted(tmp_path: Path) -> None:
 def test_the_text_tells_graph_equations_and_schedule() -> None:
     lines = apc.show(FILE).splitlines()
     for line in (
-        "    device: mass 0.1 kg, damping 5 N·s/m",
-        "      joins device and cube",
-        "      hears the others over lan",
-        "  18 equations, 18 unknowns",
-        "    device.mass*der(device.v) = device.flange.f - device.damping*device.v",
-        "    der(device.v) := (device.flange.f - device.damping*device.v)/device.mass",
+        "  device: mass 0.1 kg, damping 5 N·s/m",
+        "    joined to device, cube",
+        "    joined to cube, lan",
+        "  kind user: 18 equations, 18 unknowns",
+        "    device.mass*der(device.v) = device.flange.f - device.damping*device.v #",
+        "      der(device.v) := (device.flange.f - device.damping*device.v)/device.mass",
         "  frame of 8 ms, after which every clock stands as before",
-        "  network ticks every 8 ms, once a frame: packets leave over lan",
-        "  contact.f acts from 1 ms after its tick, held for 1 ms until the next one acts",
+        "  clock network, period 8 ms, ticks 1, sends lan",
+        "  kind user, hold contact.f, clock haptic, delay 1 ms, held 1 ms",
     ):
         assert line in lines, line
     schedule = " ".join(" ".join(lines[lines.index("SCHEDULE") :]).split())
     assert (
-        "lan: a packet (coordination.x, coordination.v) every 8 ms, available 8 ms later; "
-        "1 packet of each sender on the way; the newest one heard is 8 ms to 16 ms old"
+        "link lan, sends coordination.x and coordination.v, period 8 ms, delay 8 ms, on the way 1, "
+        "age 8 ms to 16 ms"
     ) in schedule
 
 
@@ -168,7 +172,7 @@ def test_what_costs_a_pair_is_said(cli: Cli) -> None:
         "scene.yaml", replaced(text, ("type: AveragePosition", "type: Furthest"), ("1 ms, link", "0 s, link"))
     )
     write("furthest.yaml", FURTHEST)
-    assert "over lan; one evaluation a pair of peers" in " ".join(cli("show scene.yaml").out.split())
+    assert "link lan, pairwise" in " ".join(cli("show scene.yaml").out.split())
     ran = cli("compile scene.yaml")
     assert ran.code == 0, ran.err
     assert re.search(
@@ -178,10 +182,32 @@ def test_what_costs_a_pair_is_said(cli: Cli) -> None:
     )
 
 
+def test_graphviz_text_has_every_node_once_and_closes_every_quote() -> None:
+    text = apc.show(FILE, format="dot")
+    assert text.startswith('digraph "three-users-average" {\n') and text.endswith("\n}")
+    for name in ("device", "cube", "contact", "coordination"):
+        assert len(re.findall(rf'^ *"{name}" \[', text, re.MULTILINE)) == 1
+    assert '"cube" -> "contact"' in text and '"coordination" -> "link lan" [dir=both, style=dashed]' in text
+    assert all(len(re.findall(r'(?<!\\)"', line)) % 2 == 0 for line in text.splitlines())
+
+
+def test_mermaids_text_joins_what_is_joined() -> None:
+    lines = apc.show(FILE, format="mermaid").splitlines()
+    assert lines[:2] == ["flowchart LR", '  n0["device<br>mass 0.1 kg<br>damping 5 N·s/m"]']
+    assert "  n0 --- n2" in lines and "  n3 -.- n4" in lines
+
+
 @pytest.mark.parametrize(
     ("suffix", "start"),
     [
-        *(("svg", b"<"), ("SVG", b"<"), ("dot", b"digraph"), ("json", b"{"), ("txt", b"three")),
+        *(
+            ("svg", b"<"),
+            ("SVG", b"<"),
+            ("dot", b"digraph"),
+            ("mmd", b"flowchart"),
+            ("json", b"{"),
+            ("txt", b"three"),
+        ),
         *(("pdf", b"%PDF-"), ("png", b"\x89PNG")),
     ],
 )
@@ -190,7 +216,7 @@ def test_the_file_says_the_format(suffix: str, start: bytes, cli: Cli) -> None:
     assert Path(f"scene.{suffix}").read_bytes().startswith(start)
 
 
-KINDS = ".txt, .json, .dot, .gv, .svg, .png, .pdf"
+KINDS = ".txt, .json, .dot, .gv, .mmd, .svg, .png, .pdf"
 
 
 @pytest.mark.parametrize(
@@ -209,10 +235,10 @@ def test_no_file_is_written_as_what_its_name_does_not_say(
 
 
 def test_the_command_prints_what_the_function_returns(cli: Cli) -> None:
-    for form in ("text", "json", "dot", "svg"):
+    for form in ("text", "json", "dot", "mermaid", "svg"):
         printed = apc.show(FILE, format=form) + "\n"  # type: ignore[arg-type] # a word
         assert cli(f"show '{FILE}' --format {form}") == Ran(0, printed, "")
     assert told(apc.show, "scene.apc") == [
-        "scene.apc: E615 is a compiled model, which no longer has the equations as they were written. "
+        "scene.apc: E615 is a compiled model, and this reads the topology that it was made from. "
         "Write: apc show scene.yaml"
     ]
