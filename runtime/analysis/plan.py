@@ -110,7 +110,12 @@ def make_plan(
     if method in ("auto", "determinant") and not not_populations(system, jacobians):
         prompt = method == "determinant" and _prompt(schedules, numbers, exchange)
         if prompt or _many(system, jacobians, schedules, numbers, exchange):
-            return _plan_populations(schedules, exchange)
+            sparse = [way.link for way in used_ways(schedules) if not exchange.is_complete(way.link)]
+            if not sparse:
+                return _plan_populations(schedules, exchange)
+            if method == "determinant":
+                reason = f"the peers differ, and not all of them hear all others over {sparse[0]}"
+                raise cannot_serve(system, method, reason)
     groups = peer_groups(system, jacobians, schedules, numbers, exchange)
     if is_large_ring(groups, exchange):
         what = f"a ring of {exchange.peers:,} peers is as many systems, up to {LARGEST_RING:,} are solved"
@@ -206,9 +211,7 @@ def _many(
     numbers: Numbers,
     exchange: Exchange,
 ) -> bool:
-    """Say whether so many peers differ that all hear all others that they are not worth an object each."""
-    if not all(exchange.is_complete(way.link) for way in used_ways(schedules)):
-        return False
+    """Say whether so many peers differ that they are not worth an object each."""
     states = sum(
         len(rows) * len(system.kinds[group.kind].states)
         for rows, group in zip(numbers.parameters, system.groups, strict=True)
