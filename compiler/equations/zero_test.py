@@ -29,7 +29,8 @@ Residue: TypeAlias = int | NDArray[np.object_]
 PRIME = (1 << 61) - 1
 MOST = 200  # nodes beyond which no identity is looked for: simplifying takes its time
 POINTS, NEARLY = 4, 1e-20  # at which an identity must vanish, and how nearly, of 30 digits
-SMOOTH_FUNCTIONS = tuple(FUNCTIONS[name] for name in SMOOTH)
+# Functions of which SymPy knows identities.
+KNOWN_FUNCTIONS = (*(FUNCTIONS[name] for name in SMOOTH), sympy.Abs)
 
 
 class Divisors:
@@ -136,8 +137,9 @@ def _modular(value: Fraction | Term) -> int:
 
 def _is_identity(expression: Term) -> bool:
     """Say whether an expression is zero for all values of its symbols, by what functions have in common."""
+    expression = expression.replace(FUNCTIONS["abs"], sympy.Abs)
     functions = expression.atoms(sympy.Function)
-    if size(expression) > MOST or not all(isinstance(one, SMOOTH_FUNCTIONS) for one in functions):
+    if size(expression) > MOST or not all(isinstance(one, KNOWN_FUNCTIONS) for one in functions):
         return bool(expression == 0)
     chance = random.Random(0)
     for _ in range(POINTS):

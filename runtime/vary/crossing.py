@@ -17,6 +17,7 @@ tangents of the two ends miss each other by half-way stands for what the cubic d
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -430,5 +431,6 @@ def _held(stretch: Stretch, ends: tuple[float, float], sides: tuple[Verdict, Ver
             (middle, found, right, above) if found.stable == below.stable else (left, below, middle, found)
         )
     grows = above if below.stable else below
-    proof = grows.proof or "bounded in floats"
+    bits = re.search(r"\d+ bits", f"{below.proof} {above.proof}")
+    proof = f"proved with {bits[0]}" if bits else grows.proof or "bounded in floats"
     return Crossing((left + right) / 2, (right - left) / 2, side, grows.frequency_hz, "crossing", proof)

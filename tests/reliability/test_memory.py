@@ -26,10 +26,6 @@ SHORT = "simulate scene.yaml --duration 16ms"
         (AVERAGE, "analyze scene.yaml", "E804 2 systems of up to 8 states take about .* kB"),
         (
             AVERAGE,
-            "E804 1 different peers of up to 8 states take about .* kB",
-        ),
-        (
-            AVERAGE,
             "analyze scene.yaml --method determinant",
             "E804 2 determinants of 2 peers that differ take about .* kB",
         ),
