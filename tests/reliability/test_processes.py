@@ -116,6 +116,7 @@ def test_a_process_stopped_from_outside_is_told_and_finished_parts_are_kept(tmp_
     assert 1 <= len(parts(tmp_path / "r.csv")) < 16
 
 
+@pytest.mark.whole
 def test_an_interrupt_ends_the_processes_at_once_and_keeps_the_runs_that_are_done() -> None:
     before = set(workers_of_mine())
 
@@ -128,6 +129,7 @@ def test_an_interrupt_ends_the_processes_at_once_and_keeps_the_runs_that_are_don
     assert set(workers_of_mine()) <= before
 
 
+@pytest.mark.whole
 def test_a_number_of_peers_whose_process_is_lost_is_refused_and_the_others_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -49,6 +49,7 @@ def bundle(found: Any) -> dict[str, str]:
     return shown
 
 
+@pytest.mark.whole
 def test_a_result_is_its_text_and_its_picture_and_elsewhere_a_line() -> None:
     model = compiled(AVERAGE)
     results: tuple[Any, ...] = (

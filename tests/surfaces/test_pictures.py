@@ -143,6 +143,7 @@ def test_pictures_beside_answers_are_refused_before_anything_is_computed(words: 
     assert "a.svg is written" in cli(f"{words} --plot a.svg").out
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "settings",
     [

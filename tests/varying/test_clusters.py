@@ -39,6 +39,7 @@ def address() -> Iterator[str]:
         yield cluster.scheduler_address
 
 
+@pytest.mark.whole
 def test_what_was_begun_by_one_process_is_finished_on_a_cluster_to_the_last_bit(
     tmp_path: Path, address: str
 ) -> None:

@@ -106,7 +106,9 @@ def test_what_grows_by_itself_is_held_between_two_values(ticks: int) -> None:
     assert found.crossings[0].value == pytest.approx(growth, rel=1e-9)
 
 
-@pytest.mark.parametrize("packets", [2, 12, 40, 300, pytest.param(1000, marks=pytest.mark.whole)])
+@pytest.mark.parametrize(
+    "packets", [2, 12, 40, *(pytest.param(many, marks=pytest.mark.whole) for many in (300, 1000))]
+)
 def test_where_all_eigenvalues_cross_at_once_the_value_is_that(packets: int) -> None:
     found = apc.critical(followers(packets), "it.pull", upper="3000 Hz")
     (one,) = found.crossings
@@ -202,7 +204,7 @@ def test_the_error_holds_against_the_full_map_in_50_digits() -> None:
         assert sizes[0] < 1 < sizes[1]
 
 
-@pytest.mark.parametrize("frames", [13, pytest.param(40, marks=pytest.mark.whole), 100])
+@pytest.mark.parametrize("frames", [13, *(pytest.param(many, marks=pytest.mark.whole) for many in (40, 100))])
 def test_a_long_delay_has_the_crossing_of_all_peers_by_hand(frames: int) -> None:
     """The spectral radius of the full map, a packet a state, is 1 between the ends of the error."""
     delay = Fraction(8 * frames, 1000)

@@ -105,6 +105,7 @@ def test_a_scene_that_is_not_stable_has_no_margins_and_says_so() -> None:
     assert found.rows == () and "not stable" in str(found)
 
 
+@pytest.mark.whole
 def test_a_delay_is_scanned_far_enough_or_said_not_to_be() -> None:
     text = replaced(AVERAGE, (SAMPLED, SAMPLED.replace("1 ms", "0.13 ms")))
     for one in rows_of(compiled(text)).values():
@@ -137,6 +138,7 @@ def test_in_passing_what_takes_long_is_named_with_the_option_that_asks_for_it(
     assert max(map(len, text.splitlines())) <= 80
 
 
+@pytest.mark.whole
 def test_margins_are_those_of_the_function_and_left_out_where_they_are_not_wanted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -46,6 +46,7 @@ def answers(place: int) -> str:
     return "\n".join(listed)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "place",
     [pytest.param(k, marks=[] if k in FIRST else [pytest.mark.whole]) for k in range(len(SCENES))],

@@ -94,6 +94,7 @@ def test_a_walls_verdict_turns_at_its_known_limit_and_a_search_may_be_swept() ->
     assert list(found.column("verdict")) == ["stable below the value"] * 2
 
 
+@pytest.mark.whole
 def test_the_rows_do_not_depend_on_who_computes_them_or_in_which_order(tmp_path: Path, whole: bytes) -> None:
     small(out=tmp_path / "2.csv", jobs=2)
     assert (tmp_path / "2.csv").read_bytes() == whole
@@ -397,6 +398,7 @@ def test_an_interrupt_ends_with_what_is_done_and_says_how_to_go_on(folder: Path)
     assert not target.exists() and len(parts(target)) == 2
 
 
+@pytest.mark.whole
 def test_a_terminal_sees_progress_and_a_file_does_not(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
