@@ -61,8 +61,8 @@ def wire(system: ClosedSystem) -> Wiring:
     rigid = rigid_modes_here(system)
     wiring = _without(system, feedback, rigid)
     if rigid.names:
-        values = np.linalg.eigvals(reduced(wiring, system.matrix[None], 1)[0])
-        if np.any(np.abs(values - 1) < NEAR_ONE):
+        within = reduced(wiring, system.matrix[None], 1)[0]
+        if np.isfinite(within).all() and np.any(np.abs(np.linalg.eigvals(within) - 1) < NEAR_ONE):
             wiring = _without(system, feedback, find_rigid_modes(system))
     return wiring
 

@@ -190,8 +190,13 @@ def _forge_model(seed: str) -> Input:
 
 
 def _whole_models() -> list[Input]:
-    """Return models that nobody sealed and nobody changed."""
-    return [Input("", ((FILE, unsealed(msgspec.json.encode(origin), model)),)) for origin, model in bases()]
+    """Return models that nobody sealed and nobody changed, each asked everything once: that loads all."""
+    files = [unsealed(msgspec.json.encode(origin), model) for origin, model in bases()]
+    with tempfile.TemporaryDirectory() as name:
+        for content in files:
+            (Path(name) / FILE).write_bytes(content)
+            assert ask(Path(name) / FILE, everything=True) == "answered"
+    return [Input("", ((FILE, content),)) for content in files]
 
 
 def ask(path: Path, *, everything: bool = False) -> str:
