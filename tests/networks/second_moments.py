@@ -118,7 +118,7 @@ class Lossy:
     def driven(self) -> Floats:
         """Return the second moments that pushes of variance 1, drawn anew at each tick, make in a frame."""
         chain = self.shares @ np.eye(len(self.shares))[self.before]
-        stays = scipy.linalg.null_space(chain - np.eye(len(chain)))[:, 0]
+        stays = np.linalg.svd(chain - np.eye(len(chain)))[2][-1]
         after = self.pushed @ self.pushed.transpose(0, 2, 1)
         weighted = self.shares * (stays / stays.sum())[self.before]
         return np.asarray(np.tensordot(weighted, after, 1))

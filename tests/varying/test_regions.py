@@ -365,7 +365,6 @@ KEEPS = "E905 in part of the rectangle some motion neither grows nor dies out"
     [
         (FREE, "tie.stiffness=1 N/m:100 N/m", "wall.stiffness=1 N/m:100 N/m", KEEPS),
         (AVERAGE, TINY, "coordination.stiffness=0 N/m:1500 N/m", "E905"),
-        pytest.param(AVERAGE, TINY, "lan.delay=0 ms:4 ms", "E905", marks=pytest.mark.whole),
         (
             AVERAGE,
             X,
