@@ -304,7 +304,7 @@ def _layers(kernel: Kernel) -> Floats:
     """
     rate = float(np.abs(kernel.a).sum(axis=1).max(initial=0)) * float(kernel.duration)
     steps = min(math.ceil(math.log(rate, 4)), MOST_HALVINGS) if rate > 1 else 0
-    return float(kernel.duration) * (1 - 4.0 ** -np.arange(1, steps + 1))
+    return np.asarray(float(kernel.duration) * (1 - 4.0 ** -np.arange(1, steps + 1)), dtype=np.float64)
 
 
 def _too_fast(starts: Floats, kernel: Kernel) -> ApcError:
