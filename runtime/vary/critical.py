@@ -245,18 +245,19 @@ def _line(system: CompiledSystem, free: Free, limits: Sequence[Fraction | None],
     parameter = parameter_of(system, free)
     low, high = (None if one is None else float(one) for one in limits)
     low = parameter.minimum if low is None else low
+    most = math.inf if parameter.maximum is None else parameter.maximum
     try:
         family = evaluator_of_many(system, [free], _PLACE, prepared=prepared)
     except ApcError:
         if not many_packets(system, prepared):
             raise
         scale = abs(parameter.value) or 1.0
-        top = min(high or SPAN * scale, math.inf if parameter.maximum is None else parameter.maximum)
+        top = min(SPAN * scale if high is None else high, most)
         return AnalysedLine(system, free, prepared, low or 0.0, top, scale)
     line = MatrixLine(family, np.array([parameter.value]), 0, low, high)
-    if parameter.maximum is None:
-        return line
-    return replace(line, top=min(high or SPAN * line.scale, parameter.maximum))
+    if high is None and math.isfinite(most):
+        return replace(line, top=min(SPAN * line.scale, most))
+    return line
 
 
 def _at_start(system: CompiledSystem, prepared: Prepared) -> Prepared:
