@@ -412,7 +412,7 @@ def _often(step: Matrix, count: int, after: Callable[[Matrix, Matrix], Matrix]) 
 
 
 def _each_time(step: Matrix, y: Matrix, received: Matrix, count: int, numbers: Arithmetic) -> Matrix:
-    """Return what each of so many times needs, and all that is heard (count, n + n_r, columns).
+    """Return what each of `count` times needs, and all that is heard (count, n + n_r, columns).
 
     Parameters
     ----------
@@ -422,6 +422,10 @@ def _each_time(step: Matrix, y: Matrix, received: Matrix, count: int, numbers: A
         What the first needs (n, columns).
     received
         All that is heard (n_r, columns).
+    count
+        How many times there are.
+    numbers
+        The arithmetic: floats, exact rationals or balls.
 
     Notes
     -----
