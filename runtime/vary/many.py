@@ -8,7 +8,7 @@ Does not: give all modes, or share out work among processes (see `sweeps`).
 
 Points whose times and numbers of peers are the same have the same schedules, and one `BatchEvaluator`; the
 matrices come with their bounds (`BatchEvaluator.bounded`), the largest eigenvalue with its own
-(`eigen.dominant`), and the turns of its mode are counted along its own motion (`frame.course`).
+(`eigen.enclosure`), and the turns of its mode are counted along its own motion (`frame.course`).
 """
 
 from __future__ import annotations
