@@ -57,14 +57,14 @@ def test_not_a_bit_of_its_forces_is_different(name: str, tmp_path: Path) -> None
     assert worst(differences(compiled(EXACT[name]), tmp_path, duration="0.2 s")) == 0.0
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ROUNDED)
 def test_its_forces_are_those_of_simulate_to_the_last_bits(name: str, tmp_path: Path) -> None:
     """A rounding of a sum over the others is all that differs, and what loops make of it in 0.4 s."""
     assert worst(differences(compiled(ROUNDED[name]), tmp_path, duration="0.2 s")) < 2e-13
 
 
-@pytest.mark.few(1)
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "scene",
     ["planar-users", "two-users-waves", "two-users-passivity", "client-server"],

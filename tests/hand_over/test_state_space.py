@@ -171,6 +171,7 @@ def opened(path: Path) -> dict[str, Any]:
         return dict(archive)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("suffix", [".py", ".mat", ".npz"])
 def test_every_file_holds_the_same(
     suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -253,7 +254,7 @@ FREE = {
 }
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("cut", ["", "link", "coupler"])
 @pytest.mark.parametrize("name", FREE)
 def test_with_a_number_free_it_is_at_each_value_what_it_is_with_that_set(name: str, cut: str) -> None:

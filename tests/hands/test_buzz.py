@@ -82,6 +82,7 @@ hands: {hand: {type: ConstantForce, flange: device, force: 3 N}}
 """
 
 
+@pytest.mark.whole
 def test_a_wall_buzzes_under_the_hand_that_presses_it_and_a_hand_that_pulls_lets_go() -> None:
     found = apc.buzz(compiled(WALL))
     assert found.predicted is not None and found.predicted.attracts

@@ -249,6 +249,7 @@ def test_in_a_plane_a_hand_feels_along_each_axis_what_it_feels_on_a_line() -> No
             np.testing.assert_allclose(getattr(found, name), getattr(line, name), rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.whole
 def test_the_command_line_says_what_python_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

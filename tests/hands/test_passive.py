@@ -134,6 +134,7 @@ def tuned(found: PassiveHands) -> np.ndarray:
     return np.array([(mass, 0.0, mass * (2 * np.pi * part * at) ** 2) for mass, part, at in each])
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(("seed", "scenes"), [(0, 5), pytest.param(1, 300, marks=pytest.mark.whole)])
 def test_no_passive_hand_shakes_what_is_called_passive_and_a_tuned_one_what_is_not(
     seed: int, scenes: int
@@ -199,7 +200,7 @@ def by_region(system: CompiledSystem, limit: float) -> None:
     assert "stable with every passive hand" in str(found)
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "way",
     [by_critical, by_certificate, by_sweep, by_box, pytest.param(by_region, marks=pytest.mark.whole)],

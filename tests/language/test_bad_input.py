@@ -333,6 +333,7 @@ def test_any_bytes_are_read_or_refused_and_nothing_else(data: bytes) -> None:
         apc.compile(FILE)
 
 
+@pytest.mark.whole
 @settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.one_of(

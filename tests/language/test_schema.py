@@ -95,6 +95,7 @@ def test_it_is_a_schema_of_draft_2020_12_with_every_section_and_component() -> N
     assert {"AveragePosition", "Link", "Falcon"} < set(schema["$defs"])
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_scene_fits_and_names_it_in_its_first_line(path: Path) -> None:
     text = path.read_text(encoding="utf-8")

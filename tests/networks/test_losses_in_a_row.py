@@ -65,7 +65,7 @@ def test_who_shakes_or_drifts_anyhow_is_told_so() -> None:
     assert found.note.startswith("the scene is not proved to settle with no packet lost; no pattern tried")
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("peers", "stiffness", "damping", "coupler", "operator", "known"),
     [

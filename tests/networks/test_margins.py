@@ -20,6 +20,7 @@ def grown(system: CompiledSystem) -> Margins:
     return network_margins(system, prepare(system), Margins((), ""))
 
 
+@pytest.mark.whole
 def test_over_another_network_a_margin_is_another() -> None:
     """Of three users, brute force over all patterns: 1384 N/m at a loss of 40 %, to 0.5 N/m."""
     system = system_of(scene(3, 500.0, loss="40 %"))

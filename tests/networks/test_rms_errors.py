@@ -47,7 +47,7 @@ def test_with_next_to_no_loss_the_error_is_that_of_an_ideal_network(
 PATH = dict.fromkeys([(0, 1), (1, 0), (1, 2), (2, 1)], 1.0)
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("text", "more", "law"),
     [

@@ -396,6 +396,7 @@ def inputs(scene: Cli) -> Cli:
     return scene
 
 
+@pytest.mark.few(10)
 @pytest.mark.parametrize("command", WRITING)
 def test_a_link_to_what_a_command_reads_is_refused_and_a_file_that_is_read_only_stays(
     inputs: Cli, command: tuple[str, str]

@@ -145,6 +145,7 @@ def test_help_fits_a_terminal_and_every_command_is_one_of_ours(cli: Cli) -> None
     assert cli("--version") == Ran(0, f"apc {apc.__version__}\n", "")
 
 
+@pytest.mark.few(1)
 @pytest.mark.skipif(sys.platform == "win32", reason="a shell of another kind")
 @pytest.mark.parametrize(
     ("line", "code", "told"),
@@ -167,7 +168,7 @@ def _finite(word: str) -> float:
     pytest.fail(f"{word} is no JSON")
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     "command",
     [
@@ -209,6 +210,7 @@ def test_what_is_not_printed_is_written_out_as_json_has_it() -> None:
     assert text.count(r"\u001b") == 3
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("words", ["check", "compile", "analyze", "analyze --json", "show"])
 def test_a_name_in_a_file_does_not_act_on_the_terminal(cli: Cli, words: str) -> None:
     write("scene.yaml", replaced(AVERAGE, ("topology: three-users-average", r'topology: "a\e[31mb"')))

@@ -405,6 +405,7 @@ run(server, link, browser=True)
 """
 
 
+@pytest.mark.whole
 def test_the_browser_opens_a_file_of_ours_and_ctrl_c_closes_the_tabs_that_are_open() -> None:
     """What a browser is started with, all users see: the link's token is not in it."""
     ended = subprocess.run([sys.executable, "-c", SERVED], capture_output=True, text=True, check=False)
@@ -437,6 +438,7 @@ run(server, link, browser=False)
 """
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "left", [40, pytest.param(MOST + 20, marks=pytest.mark.whole)], ids=["few", "enough"]
 )
@@ -513,6 +515,7 @@ def tapped(page: Page, x: Any, y: Any) -> None:
     page.document.apply_json_patch({"events": [told]})
 
 
+@pytest.mark.whole
 def test_what_the_browser_can_t_say_changes_nothing(page: Page) -> None:
     models = [*page.handles, *page.selects, page.begins, page.meant, page.at]
     before = [one.value for one in models]
@@ -569,6 +572,7 @@ UPGRADE = {
 }
 
 
+@pytest.mark.whole
 def test_only_this_machine_with_the_token_and_no_other_origin_gets_in(link: str) -> None:
     bare, query = link.partition("?")[0], urlsplit(link).query
     assert link.startswith("http://127.0.0.1:")

@@ -197,7 +197,7 @@ def test_each_pair_is_what_looking_at_every_packet_gives(
     check(system, by_hand(force, GRAPHS[graph], punctual(late)))
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", FORCES)
 @pytest.mark.parametrize(
     ("more", "graph"),

@@ -108,6 +108,7 @@ def test_a_force_that_acts_later_has_a_column_of_when_it_acts(delay: str) -> Non
     assert [one.role for one in found.signals] == roles
 
 
+@pytest.mark.whole
 def test_pandas_and_xarray_hold_the_same_numbers() -> None:
     pytest.importorskip("pandas")
     pytest.importorskip("xarray")

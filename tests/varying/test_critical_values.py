@@ -259,7 +259,7 @@ ALONG = {
 }
 
 
-@pytest.mark.few(10)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", ALONG)
 def test_the_verdict_along_a_scan_is_what_analyses_say(name: str) -> None:
     text, parameter, asked, values, count = ALONG[name]

@@ -66,6 +66,7 @@ def test_every_stiffness_damping_and_delay_of_a_coupler_has_a_row() -> None:
     )
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("scene", "names"),
     [
@@ -125,6 +126,7 @@ def test_of_very_large_systems_delays_are_said_not_to_be_looked_for() -> None:
     }
 
 
+@pytest.mark.whole
 def test_in_passing_what_takes_long_is_named_with_the_option_that_asks_for_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

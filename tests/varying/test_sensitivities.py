@@ -62,6 +62,7 @@ def rates(found: Sensitivities) -> dict[str, float | None]:
     return {row.parameter: row.derivative for row in found.rows}
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("name", SCENE)
 def test_every_derivative_is_that_of_the_scene_in_320_bits(name: str) -> None:
     found = apc.sensitivities(compiled(SCENE[name]))
@@ -105,7 +106,7 @@ def changed(system: CompiledSystem, every: int) -> str:
     return ""
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("every", [3, 1])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_row_says_what_setting_its_name_does(name: str, every: int) -> None:
