@@ -90,11 +90,13 @@ TIED = replaced(
 )  # fmt: skip
 
 
+@pytest.mark.whole
 def test_what_is_not_linear_moves_by_the_same_steps(tmp_path: Path) -> None:
     off = differences(compiled(BENT), tmp_path, duration="0.1 s", method="rk4:0.25ms", device="device")
     assert worst(off) < 2e-13
 
 
+@pytest.mark.whole
 def test_nothing_in_it_changes_but_what_is_given(tmp_path: Path) -> None:
     """No data of its own that could be written, and nothing called but what computes."""
     plan = plan_of(compiled(PAPER), DEFAULT)

@@ -176,6 +176,7 @@ def test_peers_joined_by_a_network_of_ones_own_are_the_scene(
     assert off < 1e-9
 
 
+@pytest.mark.whole
 def test_a_step_may_be_of_any_length_and_a_state_can_be_had_back(fmpy: Any, tmp_path: Path) -> None:
     path, _ = written(PAPER, tmp_path)
     course = apc.simulate(compiled(PAPER), duration="0.2 s", jit=False)
@@ -232,6 +233,7 @@ def test_its_sources_compile_strictly(tmp_path: Path) -> None:
     subprocess.run(command, cwd=tmp_path, check=True)
 
 
+@pytest.mark.whole
 def test_another_program_is_not_given_another_scene(fmpy: Any, tmp_path: Path) -> None:
     """A library whose description was exchanged refuses to begin."""
     path, _ = written(PAPER, tmp_path)

@@ -163,9 +163,9 @@ def test_a_network_feels_viscous_by_as_much_as_dampers_lack(text: str, heard: in
     assert network == pytest.approx(formula, rel=0.02)
 
 
+@pytest.mark.whole
 # Of hands and of sensors, at the first of either group: error and velocity, by an independent program, which
 # adds up the answers to each tick's noise.
-@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("at", "known"),
     [

@@ -280,7 +280,7 @@ def test_no_damping_helps_where_peers_feel_each_other_otherwise_than_springs_do(
 UNEVEN = "a: {count: 1, set: {coordination.stiffness: 50 N/m}}\n  b: {count: 3}"
 
 
-@pytest.mark.few(1)
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "change", [("delay: 8 ms}", "delay: 8 ms, graph: star}"), ("user: {count: 4}", UNEVEN)]
 )

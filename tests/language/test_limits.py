@@ -108,6 +108,7 @@ def test_peers_on_a_complete_graph_have_no_limit() -> None:
     assert apc.analyze(compiled(replaced(AVERAGE, MANY))).stable
 
 
+@pytest.mark.whole
 def test_delays_are_searched_and_varied_only_so_far() -> None:
     assert told(lambda: apc.critical(compiled(AVERAGE), "lan.delay", upper="1e6 s")) == [
         "critical value: E846 from 0 to 1e+06 (SI) events coincide at more than 10,000 values of lan.delay, "

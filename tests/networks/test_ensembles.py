@@ -84,6 +84,7 @@ def moved(stiffness: float) -> str:
     return replaced(apart(AVERAGE, "loss: 20 %"), ("stiffness: 500 N/m", f"stiffness: {stiffness} N/m"))
 
 
+@pytest.mark.whole
 def test_runs_agree_with_the_judgedin_mean_square_and_take_the_time_of_its_growth() -> None:
     stable, unstable = runs(moved(1000)), runs(moved(1300))
     for found, verdict in ((stable, "stable in mean square"), (unstable, "unstable in mean square")):

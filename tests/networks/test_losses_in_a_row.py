@@ -140,7 +140,7 @@ def test_what_is_not_served_is_left_open_and_named(text: str, why: str) -> None:
     assert found.note.startswith("losses in a row are left open: ") and why in found.note
 
 
-@pytest.mark.few(1)
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("delay", "clock"),
     [("8 ms", "8 ms"), ("6.5 ms", "8 ms"), ("27.3 ms", "8 ms"), ("8 ms", "{period: 8 ms, phase: 2.5 ms}")],

@@ -249,6 +249,7 @@ TEXTS = ('"scene.yaml"', '["scene.yaml", 3]', '["scene.yaml", "*"]')
 NEWER = f"scene.apc: E603 has format version 99, this program reads version {cache.FORMAT}"
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize(
     ("content", "words"),
     [

@@ -115,6 +115,7 @@ def played(
     return loop
 
 
+@pytest.mark.few(1)
 @SECRETS
 def test_of_what_was_heard_in_one_session_nothing_is_taken_in_another(
     secret: bytes, monkeypatch: pytest.MonkeyPatch

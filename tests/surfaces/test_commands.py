@@ -84,6 +84,7 @@ def test_json_is_one_document_and_nothing_else(scene: Cli) -> None:
     assert (unstable.code, json.loads(unstable.out)["stable"]) == (0, False), "which is an answer"
 
 
+@pytest.mark.whole
 def test_a_model_works_without_its_topology_and_a_stale_one_is_refused(scene: Cli) -> None:
     scene("compile")
     again = "scene.apc: E614 is compiled already. Write: apc analyze scene.apc\n"
@@ -168,7 +169,7 @@ def _finite(word: str) -> float:
     pytest.fail(f"{word} is no JSON")
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "command",
     [

@@ -68,6 +68,7 @@ def named(sliders: tuple[Slider, ...], label: str) -> Slider:
 # The sliders.
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "name", ["three-users-average", "experiment-average", "mixed-clocks", "lossy-average"]
 )
@@ -122,6 +123,7 @@ def test_what_follows_from_others_has_no_slider(tmp_path: Path) -> None:
 # What is computed.
 
 
+@pytest.mark.whole
 def test_sections_tell_what_the_api_tells(tmp_path: Path) -> None:
     system = compiled(AVERAGE, tmp_path)
     sliders, model = sliders_of(system), model_bytes(system)
@@ -218,6 +220,7 @@ def test_an_old_answer_never_takes_the_place_of_a_newer_one() -> None:
 # The topology with other values.
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("label", "value", "line"),
     [

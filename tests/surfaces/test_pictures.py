@@ -137,7 +137,7 @@ def test_without_ffmpeg_it_says_what_to_do(cli: Cli, monkeypatch: pytest.MonkeyP
     assert folder() == []
 
 
-@pytest.mark.few(1)
+@pytest.mark.whole
 @pytest.mark.parametrize("words", [f"analyze '{SCENE}'", f"critical coordination.stiffness '{SCENE}'"])
 def test_pictures_beside_answers_are_refused_before_anything_is_computed(words: str, cli: Cli) -> None:
     assert "E878 the suffix of --plot" in cli(f"{words} --plot a.txt").err

@@ -139,6 +139,7 @@ def test_from_python_a_report_is_a_result_and_a_page(cli: Cli) -> None:
         apc.report("scene.yaml", "scene.yaml")
 
 
+@pytest.mark.whole
 def test_a_report_is_computed_anew_from_itself_alone(cli: Cli) -> None:
     write("scene.yaml", replaced(LONE, ("{count: 1}", "{table: users.csv}")))
     write("users.csv", "device.mass [kg]\n0.1\n0.12\n")

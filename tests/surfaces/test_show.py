@@ -64,7 +64,7 @@ def words_of(svg: str) -> list[str]:
     return ["".join(one.itertext()) for one in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")]
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", TEXTS)
 def test_no_text_of_a_picture_stands_over_another_or_leaves_the_page(name: str, tmp_path: Path) -> None:
     words = words_of(shown(TEXTS[name], "svg", tmp_path))
@@ -91,6 +91,7 @@ def test_the_picture_names_every_part_with_its_type_and_numbers() -> None:
         assert word in words, word
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("form", ["svg", "mermaid"])
 def test_text_of_a_scene_cannot_break_out_of_the_picture(form: str, tmp_path: Path) -> None:
     mark = '"<script>alert(1)</script> & Three'
@@ -151,7 +152,7 @@ def test_the_text_tells_graph_equations_and_schedule() -> None:
     ) in schedule
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_scene_can_be_shown_in_80_columns(path: Path) -> None:
     assert max(map(len, apc.show(path).splitlines())) <= 80
@@ -239,6 +240,7 @@ def test_no_file_is_written_as_what_its_name_does_not_say(
     assert folder() == []
 
 
+@pytest.mark.whole
 def test_the_command_prints_what_the_function_returns(cli: Cli) -> None:
     for form in ("text", "json", "dot", "mermaid", "svg"):
         printed = apc.show(FILE, format=form) + "\n"  # type: ignore[arg-type] # a word

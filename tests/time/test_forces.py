@@ -165,7 +165,7 @@ LATE = [(f"type: StepForce, force: 2 N, start: {at!r} s", lambda t, at=at: 2 * (
         for at in (1e-9, 3.99999e-3)]  # fmt: skip
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("mass", [1e-3, 1e-6])
 @pytest.mark.parametrize(("words", "force", "edges"), [*LATE, PUSHES["a sine"]])
 def test_a_device_that_forgets_at_once_is_pushed_as_its_integral_says(

@@ -179,7 +179,7 @@ GRAPHS: dict[str, Ways] = {
 OWN = "8 ms, delays: {near: {far: 19 ms}, far: {near: 2 ms}}"
 
 
-@pytest.mark.few(9)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", FORCES)
 @pytest.mark.parametrize("graph", GRAPHS)
 @pytest.mark.parametrize("delay", ["0 ms", "3 ms", "8 ms", "21 ms", OWN])
@@ -197,7 +197,7 @@ def test_each_pair_is_what_looking_at_every_packet_gives(
     check(system, by_hand(force, GRAPHS[graph], punctual(late)))
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", FORCES)
 @pytest.mark.parametrize(
     ("more", "graph"),

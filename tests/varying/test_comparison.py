@@ -83,6 +83,7 @@ def test_the_verdict_is_of_the_network_nominal_or_with_passive_hands_as_asked() 
     assert found.stiffness == apc.critical(system, "coordination.stiffness", criterion="passive")
 
 
+@pytest.mark.whole
 def test_a_scheme_that_is_not_linear_is_judged_in_time_beside_its_linearization() -> None:
     """A wall is in no linearization about a start before it; in time 1 N rests 2 mm in 500 N/m."""
     system = compiled(f"{BOUNCING}experiment: {{duration: 3 s}}\n")
@@ -102,6 +103,7 @@ def test_a_scheme_that_is_not_linear_is_judged_in_time_beside_its_linearization(
     assert column[0] == "settles" and column.isna()[1]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("experiment", "message"),
     [
@@ -205,6 +207,7 @@ def test_two_numbers_a_packet_go_to_everybody_who_hears_them(
 # ---- which stiffness, delay and loss ----
 
 
+@pytest.mark.whole
 def test_the_stiffness_is_of_the_coupler_that_hears_others_or_of_what_it_follows_from() -> None:
     for text, names in (
         (LOSSLESS, ["coordination.stiffness", "lan.delay", "lan.loss"]),
@@ -289,6 +292,7 @@ def scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ["average.yaml", "mesh.yaml"]
 
 
+@pytest.mark.whole
 def test_a_table_has_a_row_a_scheme(scenes: list[str]) -> None:
     assert run(["compare", *scenes, "--out", "out.csv"]) == 0
     with Path("out.csv").open(encoding="utf-8") as file:

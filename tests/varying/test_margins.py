@@ -93,6 +93,7 @@ def test_a_margin_lies_between_two_analyses(scene: str, names: Sequence[str]) ->
         holds(system, rows[name])
 
 
+@pytest.mark.whole
 def test_a_delay_without_a_margin_is_stable_as_far_as_it_was_scanned() -> None:
     system = compiled(DEAD_RECKONING)
     row = rows_of(system)["coordination.delay"]

@@ -441,6 +441,7 @@ def test_text_fits_a_terminal_and_json_is_the_contract(said: Callable[..., str])
     assert 10 < curve["frequency_hz"][0] < curve["frequency_hz"][1] < 30 and curve["error"] <= TOLERANCE
 
 
+@pytest.mark.whole
 def test_several_scenes_and_settings_are_panels(said: Callable[..., str]) -> None:
     words = ("--x", X, "--y", Y, "--compare", "others/mesh.yaml")
     document = json.loads(said(*words, "--vary", "lan.delay=0,8 ms", "--json"))

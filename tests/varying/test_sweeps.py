@@ -254,7 +254,7 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
 }
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_part_that_is_not_as_it_was_written_is_computed_again(
     damage: str, tmp_path: Path, whole: bytes
@@ -282,6 +282,7 @@ def test_what_another_user_computed_is_computed_again(
     assert not any("already" in note for note in found.notes) and target.read_bytes() == whole
 
 
+@pytest.mark.whole
 def test_without_a_place_for_a_secret_a_process_takes_up_what_it_wrote_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -291,6 +292,7 @@ def test_without_a_place_for_a_secret_a_process_takes_up_what_it_wrote_itself(
     assert small(out=tmp_path / "r.csv", jobs=1).notes == ("128 points were there already",)
 
 
+@pytest.mark.whole
 def test_sweeps_of_one_target_and_what_others_put_beside_leave_each_other_alone(tmp_path: Path) -> None:
     target = tmp_path / "r.csv"
     kept = interrupted(target)
