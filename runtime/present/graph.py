@@ -113,8 +113,8 @@ def _places(boxes: Sequence[Box], edges: Sequence[Edge]) -> _Places:
 def _width(text: str, size: float) -> float:
     """Return how wide a line in bold letters is, in points."""
     bold = need("matplotlib.font_manager", "plot").FontProperties(weight="bold", size=size)
-    lengths = need("matplotlib.textpath", "plot").text_to_path.get_text_width_height_descent(text, bold, False)
-    return float(lengths[0])
+    letters = need("matplotlib.textpath", "plot").text_to_path
+    return float(letters.get_text_width_height_descent(text, bold, False)[0])
 
 
 def _height(box: Box) -> float:
