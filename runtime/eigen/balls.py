@@ -36,9 +36,6 @@ from apc.frame.site import LinearSite, entrywise
 
 Balls = NDArray[Any]  # of flint.arb, and the integers 0 and 1 where these are exact
 
-# Products of matrices that take fewer of numbers are not worth matrices of python-flint.
-FEW_PRODUCTS = 4096
-
 # [F G] by duration in quanta, for one site.
 Steps = Mapping[int, Balls]
 
@@ -216,46 +213,17 @@ def _surd_ball(surd: Surd) -> Any:
 
 
 def _multiply(matrix: Balls, rows: Balls) -> Balls:
-    """Return the product with a matrix that is mostly zeros, as rows may be; an exact zero is the integer.
-
-    Enough balls are multiplied by python-flint at once; numbers with slopes, and few, one by one.
-    """
+    """Return the product with a matrix that is mostly zeros, as rows may be; an exact zero is the integer."""
     product = np.zeros((len(matrix), rows.shape[1]), dtype=object)
-    if matrix.size * rows.shape[1] > FEW_PRODUCTS and _all_balls(matrix, rows):
-        left, right = _maybe(matrix), _maybe(rows)
-        between = np.flatnonzero(left.any(axis=0) & right.any(axis=1))
-        lines = np.flatnonzero(left[:, between].any(axis=1))
-        columns = np.flatnonzero(right[between].any(axis=0))
-        whole = _flint(matrix[np.ix_(lines, between)]) * _flint(rows[np.ix_(between, columns)])
-        entries = np.empty(len(lines) * len(columns), dtype=object)
-        entries[:] = whole.entries()
-        found = entries.reshape(len(lines), len(columns))
-        found[~(left[np.ix_(lines, between)] @ right[np.ix_(between, columns)])] = 0
-        product[np.ix_(lines, columns)] = found
-        return product
-    columns = rows.T.tolist()
+    columns = [
+        [(row, other) for row, other in enumerate(column) if not isinstance(other, int) or other]
+        for column in rows.T.tolist()
+    ]
     for line, entries in zip(product, matrix.tolist(), strict=True):
-        used = [(row, entry) for row, entry in enumerate(entries) if not isinstance(entry, int) or entry]
+        used = {row: entry for row, entry in enumerate(entries) if not isinstance(entry, int) or entry}
         for place, column in enumerate(columns):
-            total = 0
-            for row, entry in used:
-                other = column[row]
-                if not isinstance(other, int) or other:
-                    total = other * entry + total
-            line[place] = total
+            line[place] = sum((other * used[row] for row, other in column if row in used), 0)
     return product
-
-
-def _maybe(numbers: Balls) -> NDArray[np.bool_]:
-    """Say which of an array of numbers may be other than zero: all but exact zeros."""
-    known = [isinstance(one, int) and not one for one in numbers.ravel().tolist()]
-    return ~np.array(known, dtype=np.bool_).reshape(numbers.shape)
-
-
-def _all_balls(*blocks: Balls) -> bool:
-    """Say whether all numbers are balls or integers, and some are balls."""
-    kinds = {kind for block in blocks for kind in map(type, block.ravel())}
-    return flint.arb in kinds and kinds <= {flint.arb, int}
 
 
 def _flint(block: Balls) -> Any:
