@@ -144,7 +144,8 @@ def _root_discs(polynomial: Any) -> tuple[Complexes, Floats]:
     ]
     least = min(int(exponent) for mantissa, exponent in middle if mantissa)
     whole = flint.fmpz_poly([int(m) << int(e) - least if m else 0 for m, e in middle])
-    points = [root.mid() for root, times in whole.complex_roots() for _ in range(times)]
+    found: Any = whole.complex_roots()  # with multiplicities; python-flint's types say otherwise
+    points = [root.mid() for root, times in found for _ in range(times)]
     reduced = flint.acb_poly(coefficients[zeros:])
     radii = np.zeros(n)
     for i, point in enumerate(points):

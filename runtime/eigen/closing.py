@@ -312,12 +312,12 @@ def close(
         r = numbers.add(numbers.multiply(heard.now, sent), heard.before) if at_once else heard.before
         received.append(r)
         _put(matrix[..., place, :], place, one.p, one.q, r, numbers)
-    one = numbers.exact(np.array(1))
-    for packet, place in layout.places.items():  # each grows older by a frame
+    unit = numbers.exact(np.array(1))
+    for packet, at in layout.places.items():  # each grows older by a frame
         if packet.lag == 1:
-            matrix[..., place, :] = sent[..., starts[packet.site] + packet.row, :]
+            matrix[..., at, :] = sent[..., starts[packet.site] + packet.row, :]
         else:
-            matrix[..., place, layout.places[Packet(packet.site, packet.row, packet.lag - 1)]] = one
+            matrix[..., at, layout.places[Packet(packet.site, packet.row, packet.lag - 1)]] = unit
     return Closed(matrix, tuple(received), sent)
 
 

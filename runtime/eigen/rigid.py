@@ -141,23 +141,36 @@ def what_stands(system: ClosedSystem | Loop, *, with_drifts: bool = True) -> Sta
     vectors = [state for _, state in _standing_solutions(system)]
     turning = _places(system.sites, ANGLES)
     moving = [*turning, *_places(system.sites, (LENGTH,))]  # what turns anything is a rotation
-    basis: dict[int, list[Fraction]] = {}
-    unfelt = [left for vector in vectors if (left := _beyond(basis, vector, moving)) is not None]
-    rates: dict[int, list[Fraction]] = {}
+    ramps = []
     for weights, state in _drifts(system, vectors) if with_drifts else []:
         rate = [sum(map(mul, weights, column), Fraction(0)) for column in zip(*vectors, strict=True)]
-        # Behind the rate, as one vector, what drifts at it: to be told apart by the rate alone.
-        left = _beyond(rates, [*rate, *state], moving)
-        if left is not None and (rest := _beyond(basis, left[len(rate) :], moving)) is not None:
-            unfelt.append(rest)
-    angles = sum(place in turning for place in basis)
+        ramps.append([*rate, *state])  # what drifts at a rate behind that, to be told by the rate alone
+    drifting = _echelon(ramps, moving)
+    drifts = sum(pivot in moving for pivot, _ in drifting)
+    standing = [*vectors, *(row[len(row) // 2 :] for _, row in drifting[drifts:])]
+    found = _echelon(standing, moving)
+    pivots = [pivot for pivot, _ in found if pivot in moving]
+    unfelt = [row for _, row in found[len(pivots) :]]
     return Standing(
-        translations=len(basis) - angles,
-        rotations=angles,
-        drifts=len(rates),
+        translations=sum(pivot not in turning for pivot in pivots),
+        rotations=sum(pivot in turning for pivot in pivots),
+        drifts=drifts,
         unfelt=len(unfelt),
         names=tuple(dict.fromkeys(_shifted(system.names, vector) for vector in unfelt)),
     )
+
+
+def _echelon(rows: Sequence[Sequence[Fraction]], first: Sequence[int]) -> list[tuple[int, list[Fraction]]]:
+    """Return a reduced basis of the space that rows span, each with its pivot, some places first."""
+    if not rows:
+        return []
+    order = [*first, *sorted(set(range(len(rows[0]))) - set(first))]
+    across = null_space(np.array(rows, dtype=object)[:, order])
+    # What is at right angles to all that is at right angles to them.
+    spanned = null_space(np.array(across, dtype=object).reshape(len(across), len(order)))
+    back = np.argsort(order).tolist()
+    pivots = [order[next(column for column, entry in enumerate(row) if entry)] for row in spanned]
+    return [(pivot, [row[place] for place in back]) for pivot, row in zip(pivots, spanned, strict=True)]
 
 
 def _shifted(names: Sequence[str], vector: Sequence[Fraction]) -> str:
@@ -180,22 +193,6 @@ def _places(sites: Sequence[PeerGroup], units: Sequence[str]) -> list[int]:
         found += [start + place for place, state in enumerate(states) if state.unit in units]
         start += size
     return found
-
-
-def _beyond(
-    basis: dict[int, list[Fraction]], vector: Sequence[Fraction], moving: Sequence[int]
-) -> list[Fraction] | None:
-    """Add what of a vector moves beyond a basis to it; return the vector less that where nothing does."""
-    left = list(vector)
-    for pivot, other in basis.items():
-        if left[pivot]:
-            times = left[pivot]
-            left = [entry - times * more for entry, more in zip(left, other, strict=True)]
-    place = next((place for place in moving if left[place]), None)
-    if place is None:
-        return left
-    basis[place] = [entry / left[place] for entry in left]
-    return None
 
 
 def stays_rigid(
@@ -256,7 +253,9 @@ def _standing(system: ClosedSystem | Loop, sites: Sequence[LinearSite]) -> tuple
 
     Both are matrices over the unknowns: every site's states, then the outputs of its clocks.
     """
-    starts, outputs, size = [], [], 0
+    starts: list[int] = []
+    outputs: list[list[list[int]]] = []
+    size = 0
     for site in sites:
         starts.append(size)
         size += len(site.kind.states)
