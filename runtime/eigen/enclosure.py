@@ -101,6 +101,8 @@ def descending(values: Complexes) -> NDArray[np.intp]:
 
 def enclose_stack(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]:
     """Do the same for a stack of matrices (k, n, n), each taken as a whole, with bounds on each."""
+    # In one order in memory, no bit of an answer hangs on what is solved beside it.
+    matrix, error = np.ascontiguousarray(matrix), np.ascontiguousarray(error)
     k, n = matrix.shape[:2]
     if n == 1:
         values, ones = matrix[:, 0].astype(np.complex128), np.ones((k, 1, 1), dtype=np.complex128)
