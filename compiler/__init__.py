@@ -13,7 +13,7 @@ language                    expression, parsing, grammar: text to trees; evaluat
 components                  component, parts, declarations, component_check, definitions, library
 scene                       named_numbers, timebase, instances, sections, channels, graphs, links, groups,
                             studies: a section each; oddities: warnings; scene: all of them
-equations                   connections: where connectors meet; flatten: equations, and what crosses between them
+equations                   connections: where connectors meet; flatten: equations and crossings
                             clocks: what ticks together; terms, zero_test: SymPy
                             reductions: what is heard of the others; derivatives, solution: data types
                             matching, elimination, blocks: solving; aliases, index: derivatives and states

@@ -108,19 +108,18 @@ def report_singular(
     holders = [[i for i, held in enumerate(incidence) if j in held] for j in range(len(unknowns))]
     unmatched = [i for i in range(len(residuals)) if i not in columns]
     over, over_columns = alternating(unmatched, incidence, match)
-    open_ = [j for j in range(len(unknowns)) if j not in match]
-    under_columns, under = alternating(open_, holders, columns)
+    free = [j for j in range(len(unknowns)) if j not in match]
+    under_columns, under = alternating(free, holders, columns)
     parts = []
     if over:
         names = [unknowns[j] for j in over_columns]
         only = f"only {counted(len(names), 'unknown')} ({listed(names)})" if names else "no unknown"
-        shown = listed([residuals[i] for i in over])
-        parts.append(f"{counted(len(over), 'equation')} hold {only}: {shown}")
+        parts.append(f"{counted(len(over), 'equation')} hold {only}: {listed([residuals[i] for i in over])}")
     if under_columns:
-        names, texts = [unknowns[j] for j in under_columns], [residuals[i] for i in under]
-        by = f"only {counted(len(texts), 'equation')}, {listed(texts)}" if texts else "no equation"
-        has = "has" if len(names) == 1 else "have"
-        parts.append(f"{counted(len(names), 'unknown')} ({listed(names)}) {has} {by}")
+        names = [unknowns[j] for j in under_columns]
+        by = f"only {counted(len(under), 'equation')}, {listed([residuals[i] for i in under])}"
+        has = f"{'has' if len(names) == 1 else 'have'} {by if under else 'no equation'}"
+        parts.append(f"{counted(len(names), 'unknown')} ({listed(names)}) {has}")
     first = [residuals[i] for i in unmatched] or residuals
     problem.report("E502", first, f"{problem.where} can't be solved: {'; and '.join(parts)}")
 

@@ -97,27 +97,22 @@ def check_alone(component: Component, place: Place, mistakes: Mistakes) -> None:
 
 def _partitioned(kind: FlatKind, mistakes: Mistakes) -> ClockedKind:
     clocks = _Clocks(kind, mistakes)
-    samples: list[SampleCrossing] = []
-    holds: list[HoldCrossing] = []
-    previous: list[PreviousCrossing] = []
-    receives: list[ReceiveCrossing] = []
-    for one in kind.crossings:
-        match one:
-            case SampleCrossing():
-                samples.append(one)
-            case ReceiveCrossing():
-                receives.append(replace(one, clock=clocks.of(one.symbol)))
-            case HoldCrossing():
-                holds.append(replace(one, clock=clocks.of(one.variable)))
-                if holds[-1].clock == CONTINUOUS:
-                    call = format_expression(Call("hold", (Name((one.shown,)), one.delay)))
-                    what = f"{call} holds {one.shown}, which is continuous already"
-                    mistakes.add("E505", one.place, what, hint=one.shown)
-            case PreviousCrossing():
-                previous.append(replace(one, clock=clocks.of(one.variable)))
-                if previous[-1].clock == CONTINUOUS:
-                    expected = "a variable that belongs to a clock"
-                    mistakes.add("E505", one.place, one.symbol, expected=expected)
+    crossings = [
+        one
+        if isinstance(one, SampleCrossing)
+        else replace(one, clock=clocks.of(one.symbol if isinstance(one, ReceiveCrossing) else one.variable))
+        for one in kind.crossings
+    ]
+    samples = tuple(one for one in crossings if isinstance(one, SampleCrossing))
+    holds = tuple(one for one in crossings if isinstance(one, HoldCrossing))
+    previous = tuple(one for one in crossings if isinstance(one, PreviousCrossing))
+    receives = tuple(one for one in crossings if isinstance(one, ReceiveCrossing))
+    for hold in (hold for hold in holds if hold.clock == CONTINUOUS):
+        call = format_expression(Call("hold", (Name((hold.shown,)), hold.delay)))
+        what = f"{call} holds {hold.shown}, which is continuous already"
+        mistakes.add("E505", hold.place, what, hint=hold.shown)
+    for one in (one for one in previous if one.clock == CONTINUOUS):
+        mistakes.add("E505", one.place, one.symbol, expected="a variable that belongs to a clock")
     for send in kind.sends:
         for variable in (".".join(name.parts) for name in names(send.expression)):
             clocks.check_start(variable, send.place)
@@ -130,11 +125,9 @@ def _partitioned(kind: FlatKind, mistakes: Mistakes) -> ClockedKind:
         members.setdefault(clocks.of(f"equation {index}"), ([], []))[1].append(equation)
     for variable in clocks.variables:
         members.setdefault(clocks.of(variable), ([], []))[0].append(variable)
-    return ClockedKind(
-        kind,
-        tuple(Partition(clock, tuple(its), tuple(listed)) for clock, (its, listed) in members.items()),
-        *(tuple(samples), tuple(holds), tuple(previous), tuple(receives)),
-    )
+    listed = ((clock, tuple(its), tuple(of)) for clock, (its, of) in members.items())
+    partitions = tuple(Partition(*one) for one in listed)
+    return ClockedKind(kind, partitions, samples, holds, previous, receives)
 
 
 class _Clocks:

@@ -46,7 +46,9 @@ class Elimination:
         self.pivots: list[tuple[Symbol, dict[Term, Term]]] = []
         self.rows: dict[int, dict[Term, Term]] = {}
         for i, row in enumerate(rows):
-            self._subtract(self.rows.setdefault(i, {}), row, -ONE)
+            self.rows[i] = {}
+            for column, value in row.items():
+                self._put(self.rows[i], column, value)
 
     def next_pivot(self, *, stays: bool) -> tuple[int, Symbol] | None:
         """Return the shortest row that may be divided by a coefficient, and of these the one in fewest rows.
@@ -68,10 +70,10 @@ class Elimination:
         """Take an unknown out of every other open row, by row i."""
         pivot = self.rows.pop(i)
         self.pivots.append((unknown, pivot))
-        others = {column: value for column, value in pivot.items() if column is not unknown}
-        for row in self.rows.values():
-            if unknown in row:
-                self._subtract(row, others, self._short(row.pop(unknown) / pivot[unknown]))
+        for row in (row for row in self.rows.values() if unknown in row):
+            factor = self._short(row.pop(unknown) / pivot[unknown])
+            for column in (column for column in pivot if column is not unknown):
+                self._put(row, column, row.pop(column, ZERO) - factor * pivot[column])
 
     def by_cramer(self) -> list[Assignment]:
         """Solve the open rows by their determinant; nothing where that is zero."""
@@ -96,11 +98,10 @@ class Elimination:
             for unknown, row in reversed(self.pivots)
         ]
 
-    def _subtract(self, row: dict[Term, Term], other: Mapping[Term, Term], factor: Term) -> None:
-        for column, value in other.items():
-            entry = self._short(row.pop(column, ZERO) - factor * value)
-            if not self.divisors.is_zero(entry):
-                row[column] = entry
+    def _put(self, row: dict[Term, Term], column: Term, value: Term) -> None:
+        value = self._short(value)
+        if not self.divisors.is_zero(value):
+            row[column] = value
 
     def _short(self, entry: Term) -> Term:
         """Return an entry, or the name it gets when it is long."""

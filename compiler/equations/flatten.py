@@ -169,27 +169,44 @@ class FlatSystem:
 def flatten(scene: Scene) -> FlatSystem:
     """Write out the equations of every kind. Raises ApcError with every mistake found on the way."""
     mistakes = Mistakes(scene.names)
-    delays = _delay_names(scene)
     structures: dict[object, list[SceneGroup]] = {}
     for group in scene.groups:
-        for name in delays.intersection(name for name, _ in group.columns):
-            what = f"{name} can't differ from peer to peer within a group"
-            mistakes.add("E211", group.place, what, hint="a group of its own for each delay")
         present = tuple(part.name for part in scene.parts if group.name in part.groups)
-        # The schedule is a kind's: a group that sets a delay can have it changed without the others'.
-        alone = None if delays.isdisjoint(name for name, _ in group.values) else group.name
-        structures.setdefault((present, tuple(sorted(group.words)), alone), []).append(group)
+        structures.setdefault((present, tuple(sorted(group.words))), []).append(group)
     kinds = []
-    for first, *others in structures.values():
+    for groups in structures.values():
+        first = groups[0]
         parts = [_with_words(part, first.words) for part in scene.parts if first.name in part.groups]
-        groups = (first.name, *(group.name for group in others))
-        kind = _flat_kind(" and ".join(groups), parts, mistakes)
+        kind = _flat_kind("", parts, mistakes)
         joints = connection_equations(parts, mistakes)
         equations = (FlatEquation(left, right, CONNECTION, None, place) for left, right, place in joints)
-        set_ = tuple((name, value) for name, value in first.values if name in delays)
-        kinds.append(replace(kind, groups=groups, delays=set_, equations=(*kind.equations, *equations)))
+        kind = replace(kind, equations=(*kind.equations, *equations))
+        delays = _delay_names(kind)
+        sharing: dict[str, list[SceneGroup]] = {}
+        for group in groups:
+            for name in delays.intersection(name for name, _ in group.columns):
+                what = f"{name} can't differ from peer to peer within a group"
+                mistakes.add("E211", group.place, what, hint="a group of its own for each delay")
+            # The schedule is a kind's: a group that sets a delay can have it changed without the others'.
+            alone = any(name in delays for name, _ in group.values)
+            sharing.setdefault(group.name if alone else "", []).append(group)
+        for alike in sharing.values():
+            names_ = tuple(group.name for group in alike)
+            set_ = tuple((name, value) for name, value in alike[0].values if name in delays)
+            kinds.append(replace(kind, name=" and ".join(names_), groups=names_, delays=set_))
     mistakes.raise_if_any()
     return FlatSystem(scene, tuple(kinds))
+
+
+def _delay_names(kind: FlatKind) -> set[str]:
+    """Return the numbers of parts that a hold's delay is or depends on: of the schedule, not of equations."""
+    delays = [one.delay for one in kind.crossings if isinstance(one, HoldCrossing)]
+    found = {".".join(name.parts) for delay in delays for name in names(delay)}
+    for part in reversed(kind.parts):  # what an inner part's number depends on is a number of an outer part
+        for name, value in part.values:
+            if f"{part.name}.{name}" in found and value.expression is not None:
+                found |= {".".join(node.parts) for node in names(value.expression)}
+    return found
 
 
 def flatten_alone(component: Component, place: Place, mistakes: Mistakes) -> FlatKind:
@@ -203,32 +220,12 @@ def flatten_alone(component: Component, place: Place, mistakes: Mistakes) -> Fla
     return _flat_kind(component.name, [part], mistakes)
 
 
-def _delay_names(scene: Scene) -> set[str]:
-    """Return the numbers of parts that a hold's delay is or depends on: of the schedule, not of equations."""
-    found: set[str] = set()
-    for part in scene.parts:
-        component = part.component
-        sides = [side for equation in component.equations for side in (equation.left, equation.right)]
-        for node in (
-            node for one in (*sides, *(s.expression for s in component.sends)) for node in walk(one)
-        ):
-            if isinstance(node, Call) and node.function == "hold":
-                found |= {f"{part.name}.{name.parts[0]}" for one in node.arguments[1:] for name in names(one)}
-    for part in reversed(scene.parts):  # what an inner part's number depends on is a number of an outer part
-        for name, value in part.values:
-            if f"{part.name}.{name}" in found and value.expression is not None:
-                found |= {".".join(node.parts) for node in names(value.expression)}
-    return found
-
-
 def _with_words(part: Part, words: Sequence[tuple[str, str]]) -> Part:
     """Return a part with the options, clocks and links that a group of peers sets for itself."""
-    prefix = f"{part.name}."
-    own = {name.removeprefix(prefix): word for name, word in words if name.rpartition(".")[0] == part.name}
-    options = {p.name for p in part.component.parameters if isinstance(p, Option)}
-    chosen = dict(part.options) | {name: word for name, word in own.items() if name in options}
-    named = dict(part.references) | {name: word for name, word in own.items() if name not in options}
-    return replace(part, options=tuple(chosen.items()), references=tuple(named.items()))
+    split = ((name.rpartition("."), word) for name, word in words)
+    own = {name: word for (owner, _, name), word in split if owner == part.name}
+    options, references = dict(part.options) | own, dict(part.references) | own
+    return replace(part, options=tuple(options.items()), references=tuple(references.items()))
 
 
 def _flat_kind(name: str, parts: Sequence[Part], mistakes: Mistakes) -> FlatKind:

@@ -72,13 +72,13 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
         for kind in system.kinds
     ]
     reached = reached_together(system.kinds, limited)
-    rows = _shared_rows(reached)
-    kinds = [_kind(one, rows, timings, own) for one, own in zip(reached, limited, strict=True)]
+    heard = dict.fromkeys(name for kind in reached for one in kind.receives for name in sends_of(one))
+    kinds = [_kind(one, heard, timings, own) for one, own in zip(reached, limited, strict=True)]
     dropped = []
     for one in reached:
         unread = (hold for hold in one.kind.clocked.holds if hold not in one.holds)
         dropped += [(hold.variable, "nobody reads this held value") for hold in unread]
-        dropped += [(send.name, "nobody hears it") for send in one.kind.sends if send.name not in rows]
+        dropped += [(send.name, "nobody hears it") for send in one.kind.sends if send.name not in heard]
     check_channels(scene, kinds)
     numbers = {group: i for i, kind in enumerate(system.kinds) for group in kind.clocked.flat.groups}
     check_heard(scene, {group: kinds[place] for group, place in numbers.items()})
@@ -104,32 +104,15 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     )
 
 
-def _shared_rows(kinds: Sequence[Reached]) -> dict[str, str]:
-    """Return, for each send that some kind hears, the send whose row it travels in.
-
-    Two sends over one link share a row when every kind sends the same under both names.
-    """
-    sent: dict[str, list[object]] = {}
-    for place, one in enumerate(kinds):
-        for send in one.kind.sends:
-            sent.setdefault(send.name, []).append((place, send.link, send.expression))
-    rows: dict[str, str] = {}
-    for name in (name for kind in kinds for heard in kind.receives for name in sends_of(heard)):
-        if name not in rows:
-            rows[name] = next((row for row in rows.values() if sent[row] == sent[name]), name)
-    return rows
-
-
-def _kind(reached: Reached, rows: Mapping[str, str], timings: Timings, limited: Limited) -> Kind:
-    """Write a kind's functions; `rows` says in which row each send that is heard travels."""
+def _kind(reached: Reached, heard: Iterable[str], timings: Timings, limited: Limited) -> Kind:
+    """Write a kind's functions; `heard` are the names of the sends that any kind hears."""
     kind, flat, holds = reached.kind, reached.kind.clocked.flat, reached.holds
     sends = {send.name: send for send in kind.sends}
     tables = {f"{part.name}.{table.name}": table for part in flat.parts for table in part.tables}
     units = {one.name: format_dimension(one.dimension) for one in flat.variables}
-    channels: dict[str, list[str]] = {}  # over each link, the sends whose rows travel
-    for name, row in rows.items():
-        if name in sends and row not in (listed := channels.setdefault(sends[name].link, [])):
-            listed.append(row)
+    channels: dict[str, list[str]] = {}  # over each link, what is heard of this kind
+    for name in (name for name in heard if name in sends):
+        channels.setdefault(sends[name].link, []).append(name)
     outputs: dict[str, dict[str, None]] = {part.clock: {} for part in kind.partitions[1:]}
     switched: list[HoldCrossing | PreviousCrossing] = [*holds, *reached.previous]
     for one in switched:
@@ -157,27 +140,26 @@ def _kind(reached: Reached, rows: Mapping[str, str], timings: Timings, limited: 
     def function(name: str, output: str, value: Any, between: Mapping[str, Any], by: Writer = writer) -> Any:
         return by.function(name, {**around[0], **between, **around[1]}, output, value)
 
-    def edge(heard: Heard, m: Any, r: Any) -> Any | None:
+    def edge(one: Heard, m: Any, r: Any) -> Any | None:
         """Write what a reduction runs over, for one peer that hears and one that is heard, if anything."""
-        if heard.edge is None:
+        if one.edge is None:
             return None
-        listed = channels[heard.link]
-        sent = casadi.SX.sym("s", len(listed) + (heard.age == "edge"))
-        theirs = {name: sent[listed.index(row)] for name, row in rows.items() if row in listed}
-        others = {symbol(f"{OTHERS}.{name}"): value for name, value in theirs.items()}
-        pair = writer.extended({**others, symbol(HEARD_AGE): sent[sent.numel() - 1]})
-        value = pair.write(heard.edge)
+        theirs = [symbol(f"{OTHERS}.{name}") for name in channels[one.link]]
+        theirs += [symbol(HEARD_AGE)] if one.age == "edge" else []
+        sent = casadi.SX.sym("s", len(theirs))
+        pair = writer.extended(dict(zip(theirs, casadi.vertsplit(sent), strict=True)))
+        value = pair.write(one.edge)
         if casadi.depends_on(value, r):
-            what = f"{heard.symbol} asks of each other peer what depends on all that are heard"
+            what = f"{one.symbol} asks of each other peer what depends on all that are heard"
             expected = "a mean or sum that is linear in what the others send"
-            raise ApcError(Mistake("E506", heard.place, what, expected))
+            raise ApcError(Mistake("E506", one.place, what, expected))
         return function("edge", "value", value, {"m": m, "s": sent}, pair)
 
     def clock(name: str, computed: Sequence[str]) -> ClockPartition:
         """Write what one clock's tick computes, from what is remembered and heard as well."""
-        heard = [one for one in reached.receives if one.clock == name]
+        received = [one for one in reached.receives if one.clock == name]
         remembered = [one for one in reached.previous if one.clock == name]
-        m, r = column(remembered), column(heard)
+        m, r = column(remembered), column(received)
         values = writer.column(writer.write(symbol(output)) for output in computed)
         return ClockPartition(
             name,
@@ -187,10 +169,10 @@ def _kind(reached: Reached, rows: Mapping[str, str], timings: Timings, limited: 
             tuple(previous.variable for previous in remembered),
             tuple(
                 Receive(
-                    *(one.symbol, one.operator, one.link, channels[one.link].index(rows[one.send])),
+                    *(one.symbol, one.operator, one.link, channels[one.link].index(one.send)),
                     *(edge(one, m, r), one.age, one.before),
                 )
-                for one in heard
+                for one in received
             ),
             function(f"tick_{name}", "y", values, {"m": m, "r": r}),
         )
