@@ -15,7 +15,15 @@ from functools import partial
 from itertools import count, islice
 
 from apc.compiler.compiled import count_of
-from apc.compiler.components.component import OTHERS, Component, Option, Reference, Send, option_test
+from apc.compiler.components.component import (
+    OTHERS,
+    Component,
+    Option,
+    Reference,
+    Send,
+    Variable,
+    option_test,
+)
 from apc.compiler.components.component_check import ComponentNames
 from apc.compiler.equations.connections import ZERO, connection_equations
 from apc.compiler.errors import Mistakes, Place, place_in
@@ -50,11 +58,21 @@ REDUCTIONS = ("mean", "sum", "max", "min", "count")
 
 @dataclass(frozen=True, slots=True)
 class FlatVariable:
-    """A scalar unknown of one site; `start` says whether it has a start value, a parameter of its name."""
+    """A scalar unknown of one site; `declared` is a component's declaration of it, if there is one."""
 
     name: str
     dimension: Dimension
-    start: bool
+    declared: Variable | None = None
+
+    @property
+    def start(self) -> bool:
+        """Whether it has a start value, a parameter of its name."""
+        return self.declared is not None and self.declared.start is not None
+
+    @property
+    def limit(self) -> str:
+        """The parameter of its part that its size should stay within, empty if there is none."""
+        return "" if self.declared is None else self.declared.limit
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,12 +256,11 @@ def _flat_kind(name: str, parts: Sequence[Part], mistakes: Mistakes) -> FlatKind
         writer = _PartWriter(part, crossings, mistakes)
         component, clock = part.component, part.reference("clock")
         variables += [
-            FlatVariable(f"{part.name}.{one.name}", one.unit.dimension, one.start is not None)
-            for one in component.variables
+            FlatVariable(f"{part.name}.{one.name}", one.unit.dimension, one) for one in component.variables
         ]
-        variables += [FlatVariable(f"{part.name}.{local}", its, False) for local, its in component.locals]
+        variables += [FlatVariable(f"{part.name}.{local}", its) for local, its in component.locals]
         variables += [
-            FlatVariable(f"{part.name}.{connector}.{one.name}", one.unit.dimension, False)
+            FlatVariable(f"{part.name}.{connector}.{one.name}", one.unit.dimension)
             for connector, type_ in component.connectors
             if connector not in writer.passed  # else it is the inner part's
             for one in (*type_.potentials, *type_.flows)
@@ -411,7 +428,7 @@ class _PartWriter:
             free = (f"held{n}" for n in count(1) if f"held{n}" not in taken)
             name = next(islice(free, len(self.held_variables), None))
             variable = Name((*self.part.name.split("."), name))
-            self.held_variables.append(FlatVariable(format_expression(variable), dimension, False))
+            self.held_variables.append(FlatVariable(format_expression(variable), dimension))
             self.held_equations.append(FlatEquation(variable, shown, self.part.name, clock, where.place))
         for moving in (name for one in delay for name in names(one)):
             if moving.parts in self.names.variables or moving.parts[0] in ("time", OTHERS):

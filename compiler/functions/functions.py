@@ -26,9 +26,9 @@ from apc.compiler.compiled import (
     SendPartition,
     State,
 )
-from apc.compiler.components.component import OTHERS, Variable
+from apc.compiler.components.component import OTHERS
 from apc.compiler.components.parts import GROUND
-from apc.compiler.equations.flatten import HEARD_AGE, HoldCrossing, PreviousCrossing
+from apc.compiler.equations.flatten import HEARD_AGE, FlatVariable, HoldCrossing, PreviousCrossing
 from apc.compiler.equations.reductions import Heard
 from apc.compiler.equations.solution import ImplicitBlock
 from apc.compiler.equations.structure import SortedSystem
@@ -55,25 +55,15 @@ from apc.compiler.scene.instances import Part
 from apc.compiler.scene.oddities import warning_texts
 
 WORK = Dimension((("kg", 1), ("m", 2), ("s", -2)))  # the joule
-Limited = Mapping[str, tuple[Part, Variable]]  # the variables of a kind that have a limit
 
 
 def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     """Write every kind as CasADi functions, and what lies between the sites beside them."""
     scene = system.scene
     timings = Timings(scene)
-    limited: list[Limited] = [
-        {
-            f"{part.name}.{variable.name}": (part, variable)
-            for part in kind.clocked.flat.parts
-            for variable in part.component.variables
-            if variable.limit
-        }
-        for kind in system.kinds
-    ]
-    reached = reached_together(system.kinds, limited)
+    reached = reached_together(system.kinds)
     heard = dict.fromkeys(name for kind in reached for one in kind.receives for name in sends_of(one))
-    kinds = [_kind(one, heard, timings, own) for one, own in zip(reached, limited, strict=True)]
+    kinds = [_kind(one, heard, timings) for one in reached]
     dropped = []
     for one in reached:
         unread = (hold for hold in one.kind.clocked.holds if hold not in one.holds)
@@ -104,7 +94,7 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     )
 
 
-def _kind(reached: Reached, heard: Iterable[str], timings: Timings, limited: Limited) -> Kind:
+def _kind(reached: Reached, heard: Iterable[str], timings: Timings) -> Kind:
     """Write a kind's functions; `heard` are the names of the sends that any kind hears."""
     kind, flat, holds = reached.kind, reached.kind.clocked.flat, reached.holds
     sends = {send.name: send for send in kind.sends}
@@ -182,17 +172,19 @@ def _kind(reached: Reached, heard: Iterable[str], timings: Timings, limited: Lim
         written = function(f"send_{link}", "s", values, {})
         return SendPartition(link, tuple(names), tuple(sends[name].unit for name in names), written)
 
-    def limit(name: str, part: Part, variable: Variable) -> Limit:
+    def limit(variable: FlatVariable) -> Limit:
         """Write a variable that has a limit, unless it is a state."""
+        name, (part, _, own) = variable.name, variable.name.rpartition(".")
         if any(name in clocked.variables for clocked in kind.clocked.partitions[1:]):
+            assert variable.declared is not None
             what = f"{name} has a limit and is computed at ticks; a limit is of what holds at every moment"
-            hint = f"acting = hold({whole_and_index(variable.name)[0]}), with the limit of acting"
-            raise ApcError(Mistake("E513", variable.place, what, hint=hint))
+            hint = f"acting = hold({whole_and_index(own)[0]}), with the limit of acting"
+            raise ApcError(Mistake("E513", variable.declared.place, what, hint=hint))
         state = name in kind.states
         value = (
             None if state else function("limited", "value", writer.column([writer.write(symbol(name))]), {})
         )
-        return Limit(name, units[name], f"{part.name}.{variable.limit}", value)
+        return Limit(name, units[name], f"{part}.{variable.limit}", value)
 
     held = [hold.variable for hold in holds]
     hands = [part for part in flat.parts if part.section == "hands"]
@@ -218,7 +210,7 @@ def _kind(reached: Reached, heard: Iterable[str], timings: Timings, limited: Lim
         tuple(send(link, listed) for link, listed in channels.items()),
         Ports(tuple(part for part, *_ in ports), port) if ports else None,
         hands=tuple(part.name for part in hands if "." not in part.name and _answers(part)),
-        limits=tuple(limit(name, *one) for name, one in limited.items()),
+        limits=tuple(limit(one) for one in flat.variables if one.limit),
         held=tuple(
             dict.fromkeys(other for part in hands for _, other, _ in part.connections if other != GROUND)
         ),

@@ -8,7 +8,7 @@ Does not: write functions (see `functions`).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from apc.compiler.components.component import OTHERS
@@ -36,8 +36,8 @@ class Reached:
     parameters: tuple[str, ...]
 
 
-def reached_together(kinds: Sequence[SortedKind], watched: Sequence[Collection[str]]) -> list[Reached]:
-    """Return what is read of each kind, its `watched` too, where each sends what any of them hears."""
+def reached_together(kinds: Sequence[SortedKind]) -> list[Reached]:
+    """Return what is read of each kind, which sends what any hears; what has a limit is read as well."""
     definitions: list[dict[Symbol, Definition]] = []
     reads: dict[tuple[int, Symbol], list[tuple[int, Symbol]]] = {}
     work: list[tuple[int, Symbol]] = []
@@ -61,7 +61,7 @@ def reached_together(kinds: Sequence[SortedKind], watched: Sequence[Collection[s
                 ),
             ]
         work += ((place, derivative(name)) for name in kind.states)
-        work += ((place, symbol(name)) for name in watched[place])
+        work += ((place, symbol(one.name)) for one in kind.clocked.flat.variables if one.limit)
     read: set[tuple[int, Symbol]] = set()
     while work:
         one = work.pop()
