@@ -208,10 +208,10 @@ def flatten(scene: Scene) -> FlatSystem:
             # The schedule is a kind's: a group that sets a delay can have it changed without the others'.
             alone = any(name in delays for name, _ in group.values)
             sharing.setdefault(group.name if alone else "", []).append(group)
-        for alike in sharing.values():
-            names_ = tuple(group.name for group in alike)
-            set_ = tuple((name, value) for name, value in alike[0].values if name in delays)
-            kinds.append(replace(kind, name=" and ".join(names_), groups=names_, delays=set_))
+        for sharers in sharing.values():
+            members = tuple(group.name for group in sharers)
+            settings = tuple((name, value) for name, value in sharers[0].values if name in delays)
+            kinds.append(replace(kind, name=" and ".join(members), groups=members, delays=settings))
     mistakes.raise_if_any()
     return FlatSystem(scene, tuple(kinds))
 

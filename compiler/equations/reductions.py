@@ -11,7 +11,7 @@ that is linear in these is that of each by itself, so that N peers cost N, not N
 from __future__ import annotations
 
 from collections.abc import Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import sympy
 
@@ -55,7 +55,7 @@ def taken_apart(crossing: ReceiveCrossing, mistakes: Mistakes) -> tuple[Term, li
     mistakes
         Takes E506 what is asked of each peer by itself and is known of all together only.
     """
-    operator, link, clock = crossing.operator, crossing.link, crossing.clock
+    operator, link = crossing.operator, crossing.link
     count = symbol(count_of(link))
     values: dict[Symbol, tuple[str, bool]] = {}  # what others send: its name, and whether of the tick before
     ages: dict[Symbol, str] = {}
@@ -69,19 +69,18 @@ def taken_apart(crossing: ReceiveCrossing, mistakes: Mistakes) -> tuple[Term, li
                 values[symbol(name)] = send, call == "previous"
     term = to_term(crossing.argument).xreplace(dict.fromkeys(ages, AGE))
     first = next(iter((*ages.values(), *(send for send, _ in values.values()))), "")
+    whole = Heard(crossing.symbol, operator, first, link, crossing.clock, crossing.place)
     parts = _linear_parts(term, values.keys()) if operator in ("mean", "sum") else None
     if parts is None or any(aged and value in values and values[value][1] for value, aged in parts):
-        for earlier in (send for send, is_before in values.values() if is_before):
+        for earlier in (send for send, before in values.values() if before):
             previous = f"previous(others.{earlier.rpartition('.')[2]})"
             hint, expected = f"mean({previous}), or sum", "a mean or sum that is linear in it"
             mistakes.add("E506", crossing.place, previous, expected=expected, hint=hint)
-        name, age = crossing.symbol, "edge" if AGE in term.free_symbols else ""
-        counted = operator == "sum" and age != "" and values.keys().isdisjoint(term.free_symbols)
-        if counted:
-            name, operator = f"mean{name.removeprefix(operator)}", "mean"
-        edge = None if term in values else term
-        whole = Heard(name, operator, first, link, clock, crossing.place, age, edge=edge)
-        return symbol(name) * (count if counted else 1), [whole]
+        if term not in values:
+            whole = replace(whole, edge=term, age="edge" if AGE in term.free_symbols else "")
+        if operator == "sum" and whole.age and values.keys().isdisjoint(term.free_symbols):
+            whole = replace(whole, symbol=f"mean{whole.symbol.removeprefix(operator)}", operator="mean")
+        return symbol(whole.symbol) * (1 if whole.operator == operator else count), [whole]
     total, heard = ZERO, list[Heard]()
     for (value, aged), coefficient in parts.items():
         send, before = values.get(value, (first, False))
@@ -92,7 +91,7 @@ def taken_apart(crossing: ReceiveCrossing, mistakes: Mistakes) -> tuple[Term, li
         age = "" if not aged else "alone" if value is None else "factor"
         kind = operator if many == 1 else "mean"  # a sum of ages is their mean as often as any are heard
         name = f"{kind}({f'previous(others.{send})' if before else TEXTS[age].format(send)})"
-        heard.append(Heard(name, kind, send, link, clock, crossing.place, age, before))
+        heard.append(replace(whole, symbol=name, operator=kind, send=send, age=age, before=before))
         total += many * coefficient * symbol(name)
     return total, heard
 

@@ -113,14 +113,15 @@ def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[Symbol, Given]]:
     """Return the numbers of each group of a kind, those that differ from peer to peer as they do."""
     common = {f"{part.name}.{name}": value for part in scene.parts for name, value in part.values}
     found = []
-    for group in scene.groups:
+    for group in (group for group in scene.groups if group.name in kind.flat.groups):
         columns: dict[str, Given] = dict(group.columns)
         numbers: dict[str, Given] = {"peers": Fraction(scene.peers)}
-        for name, value in (common | dict(group.values)).items() if group.name in kind.flat.groups else ():
+        for name, value in (common | dict(group.values)).items():
             numbers[name] = value.number
             # Inside a part, what depends on a number that differs from peer to peer does so too.
-            used = names(value.expression) if value.expression is not None and name not in columns else ()
-            if value.expression is not None and any(".".join(node.parts) in columns for node in used):
+            used = () if value.expression is None or name in columns else names(value.expression)
+            if any(".".join(node.parts) in columns for node in used):
+                assert value.expression is not None
                 columns[name] = to_term(value.expression)
         found.append({symbol(name): number for name, number in (numbers | columns).items()})
     return found
