@@ -177,6 +177,12 @@ class Component:
         return (parameter for parameter in self.parameters if isinstance(parameter, Number))
 
     @property
+    def flows(self) -> Iterator[tuple[str, Variable]]:
+        """The flows of its own connectors, those of inner parts left out, each with its connector."""
+        passed = {connector for connector, _, _ in self.passed}
+        return ((name, flow) for name, kind in self.connectors if name not in passed for flow in kind.flows)
+
+    @property
     def depth(self) -> int:
         """How deep parts stand inside parts: 1 for a component without any."""
         return 1 + max((inner.component.depth for inner in self.inner), default=0)

@@ -36,8 +36,9 @@ from apc.compiler.language.expression import (
 )
 from apc.compiler.language.values import Value
 from apc.compiler.language.vectors import whole_and_index
+from apc.compiler.scene.groups import SceneGroup
 from apc.compiler.scene.instances import Part
-from apc.compiler.scene.scene import Scene, SceneGroup
+from apc.compiler.scene.scene import Scene
 
 PEERS = Name(("peers",))
 

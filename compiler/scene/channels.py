@@ -13,24 +13,26 @@ one turns bad with the probability p, a bad one good with r. Its defaults are ne
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.components.component import Number as Parameter
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.errors import Place
 from apc.compiler.language.dimensions import DIMENSIONLESS
 from apc.compiler.language.expression import Binary, Name, Number
 from apc.compiler.language.recordings import read_trace
 from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.units import Unit
 from apc.compiler.language.values import Value
+from apc.compiler.scene.named_numbers import NamedNumbers
 from apc.compiler.source.nodes import Mapping as MappingNode
 from apc.compiler.source.nodes import Node, Scalar
-from apc.compiler.source.reading import brief, check_keys, read_text
+from apc.compiler.source.reading import Body, brief, fault, text_of
 
 PROBABILITIES = ("p", "r", "1-h", "1-k")  # netem's names, in netem's order
 LOSS_EXAMPLE = "loss: {p: 1 %, r: 25 %}"
@@ -49,7 +51,8 @@ PROBABILITY = Parameter(
     place=Place("probability"),
 )
 
-# What each word is about: it says nothing on a link that has none of them.
+# What each word is where a link does not say it, and what it is about: on a link without, it says nothing.
+_DEFAULTS = {"distribution": "uniform", "reorder": "newest", "on_loss": "hold"}
 _ABOUT = {"distribution": ("jitter",), "reorder": ("jitter", "trace"), "on_loss": ("loss", "trace")}
 
 
@@ -86,108 +89,87 @@ class SceneChannel:
 
 def read_channel(
     link: str,
-    body: MappingNode,
-    nodes: Mapping[str, Node | None],
-    jitter: Value | None,
+    nodes: Mapping[str, Node],
+    values: Mapping[str, Value],
     words: Mapping[str, str],
-    read_number: Callable[[Node, str], Value | None],
+    numbers: NamedNumbers,
     files: NamedFiles,
 ) -> SceneChannel | None:
     """Read what makes a link unreliable; None when its entry says nothing of the kind.
 
     Parameters
     ----------
-    link, body
-        The link's name and entry.
+    link
+        The link's name.
     nodes
-        Its nodes of the roles loss, trace and delays, and of its jitter, where they are given.
-    jitter
-        The value of its jitter, given or by default.
-    words
-        Its words: distribution, reorder, on_loss.
-    read_number
-        Reads a number without a unit, or an expression for one.
+        What its entry gives, by key, but its loss, trace and delays by their roles.
+    values, words
+        The link's numbers and words, given or by default.
+    numbers
+        Reads probabilities.
     files
-        Reads a trace, and takes what is at fault.
+        Reads a trace.
     """
-    mistakes = files.mistakes
-    given = {key for key in ("loss", "jitter", "trace") if nodes.get(key) is not None}
-    _check_words(link, body, given, mistakes)
+    mistakes = numbers.mistakes
+    given = {key for key in _EXAMPLES if key in nodes}
+    for word, about in _ABOUT.items():
+        if word in nodes and not given.intersection(about):
+            what = f"{link} says {word} but has no {' or '.join(about)} that this would be about"
+            mistakes.add("E262", nodes[word].place, what, hint=_EXAMPLES[about[0]])
     if not given:
         return None
-    trace = nodes.get("trace")
-    for key in ("loss", "jitter", "delays") if trace is not None else ():
-        if (other := nodes.get(key)) is not None:
-            what = f"{link} has a trace, which says when every packet arrives: it can't have {key} as well"
-            mistakes.add("E262", other.place, what)
-    return SceneChannel(
-        _loss(link, nodes.get("loss"), read_number, mistakes),
-        jitter if "jitter" in given else None,
-        words.get("distribution", "uniform"),
-        words.get("reorder", "newest"),
-        words.get("on_loss", "hold"),
-        None if trace is None else _trace(trace, files),
-    )
+    loss: dict[str, Value] = {}
+    trace = None
+    if "loss" in nodes:
+        with mistakes:
+            loss = _loss(link, nodes["loss"], numbers)
+    if "trace" in nodes:
+        place = nodes["trace"].place
+        for key in ("loss", "jitter", "delays"):
+            if key in nodes:
+                told = (
+                    f"{link} has a trace, which says when every packet arrives: it can't have {key} as well"
+                )
+                mistakes.add("E262", nodes[key].place, told)
+        with mistakes:
+            text = text_of(nodes["trace"], "trace", _EXAMPLES["trace"])
+            trace = files.read(text, lambda path: read_trace(path, place))
+    jitter = values.get("jitter") if "jitter" in given else None
+    distribution, reorder, on_loss = (words.get(key, default) for key, default in _DEFAULTS.items())
+    delays = None if trace is None else trace.delays
+    return SceneChannel(tuple(loss.items()), jitter, distribution, reorder, on_loss, delays)
 
 
-def _check_words(link: str, body: MappingNode, given: set[str], mistakes: Mistakes) -> None:
-    """Record a word about something that the link hasn't got."""
-    for word, about in _ABOUT.items():
-        node = body.get(word)
-        if node is not None and not given.intersection(about):
-            what = f"{link} says {word} but has no {' or '.join(about)} that this would be about"
-            mistakes.add("E262", node.place, what, hint=_EXAMPLES[about[0]])
-
-
-def _loss(
-    link: str, node: Node | None, read_number: Callable[[Node, str], Value | None], mistakes: Mistakes
-) -> tuple[tuple[str, Value], ...]:
-    """Read a probability, or a mapping of netem's four."""
-    if node is None:
-        return ()
+def _loss(link: str, node: Node, numbers: NamedNumbers) -> dict[str, Value]:
+    """Read a probability, or a mapping of netem's four; those not given are as netem has them."""
     name = f"{link}.loss"
     if not isinstance(node, MappingNode):
-        p = _probability(node, "loss", read_number, mistakes)
-        return () if p is None else _completed(name, name, {"p": p})
-    node = check_keys(node, PROBABILITIES, f"the loss of {link}", mistakes)
-    if node.get("p") is None:
-        mistakes.add("E201", node.place, f"the loss of {link} has no p", hint=LOSS_EXAMPLE)
-    found = {}
-    for key in PROBABILITIES:
-        value = node.get(key)
-        number = None if value is None else _probability(value, key, read_number, mistakes)
-        if number is not None:
-            found[key] = number
-    return _completed(name, f"{name}.p", found) if "p" in found else ()
+        return _completed(name, name, {"p": _probability(node, "loss", numbers)})
+    body = Body(node, PROBABILITIES, f"the loss of {link}", numbers.mistakes)
+    read = {key: body.read(key, partial(_probability, numbers=numbers), None) for key in PROBABILITIES}
+    if "p" not in body.nodes:
+        raise fault("E201", node.place, f"the loss of {link} has no p", hint=LOSS_EXAMPLE)
+    known = {key: value for key, value in read.items() if value is not None}
+    return _completed(name, f"{name}.p", known) if "p" in known else {}
 
 
-def _completed(name: str, name_p: str, given: Mapping[str, Value]) -> tuple[tuple[str, Value], ...]:
-    """Return all four probabilities with their names, those not given as netem has them."""
+def _completed(name: str, name_p: str, given: Mapping[str, Value]) -> dict[str, Value]:
+    """Return all four probabilities by their whole names."""
     p = given["p"]
     rest = Binary("-", Number(Fraction(1)), Name(tuple(name_p.split("."))))
-    defaults = {
+    known = {
         "r": Value(1 - p.number, DIMENSIONLESS, rest, p.place),
         "1-h": Value(Fraction(1), DIMENSIONLESS, None, p.place),
         "1-k": Value(Fraction(0), DIMENSIONLESS, None, p.place),
-    }
-    others = ((f"{name}.{key}", given.get(key, default)) for key, default in defaults.items())
-    return ((name_p, p), *others)
+    } | dict(given)
+    return {name_p: p} | {f"{name}.{key}": known[key] for key in PROBABILITIES[1:]}
 
 
-def _probability(
-    node: Node, what: str, read_number: Callable[[Node, str], Value | None], mistakes: Mistakes
-) -> Value | None:
-    value = read_number(node, what)
-    if value is None or 0 <= value.number <= 1:
+def _probability(node: Node, what: str, numbers: NamedNumbers) -> Value:
+    value = numbers.read(node, what, DIMENSIONLESS, "%")
+    if 0 <= value.number <= 1:
         return value
-    got = brief(node.text) if isinstance(node, Scalar) else str(value)
+    got = brief(node.text) if isinstance(node, Scalar) else ""
     bare = isinstance(node, Scalar) and isinstance(node.value, int | float) and 1 < value.number <= 100
     hint = f"{what}: {got} %" if bare else ""
-    mistakes.add("E261", value.place, what, expected="a probability, 0 % to 100 %", got=got, hint=hint)
-    return None
-
-
-def _trace(node: Node, files: NamedFiles) -> NDArray[np.float64] | None:
-    text = read_text(node, "trace", files.mistakes, hint=_EXAMPLES["trace"])
-    trace = None if text is None else files.read(text, lambda path: read_trace(path, node.place))
-    return None if trace is None else trace.delays
+    raise fault("E261", value.place, what, "a probability, 0 % to 100 %", got, hint)

@@ -9,32 +9,27 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping as MappingType
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 
 from apc.compiler.compiled import MOST_PLACED, Graph
-from apc.compiler.errors import Mistakes
+from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.tables import NamedFiles, Table, read_table
-from apc.compiler.language.values import Value
+from apc.compiler.language.values import AlreadyReportedError, Value
+from apc.compiler.scene.named_numbers import NamedNumbers
 from apc.compiler.source.nodes import Node, Scalar, Sequence
-from apc.compiler.source.reading import (
-    add_unknown,
-    brief,
-    check_keys,
-    entries,
-    form,
-    read_mapping,
-    read_text,
-    whole_number,
-)
+from apc.compiler.source.reading import Body, brief, fault, form, mapping_of, text_of, unknown, whole_number
 
 SHAPES = ("complete", "ring", "star")
+PAIRS = ("edges", "arcs")
 _PEER = re.compile(r"(?P<group>[A-Za-z]\w*)\[(?P<number>\d{1,10})\]\Z", re.ASCII)
 
-
 COMPLETE = Graph("complete", np.zeros((0, 2), np.int64), np.zeros(0))
+
+Arc = tuple[int, int, float]  # sending and hearing peer, from 0, and a weight
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,196 +41,155 @@ class SceneDelay:
     delay: Value
 
 
-def read_graph(node: Node | None, counts: MappingType[str, int], files: NamedFiles) -> Graph:
+def read_graph(node: Node, counts: Mapping[str, int], files: NamedFiles) -> Graph:
     """Read `complete`, `ring`, `star`, `{edges: …}` or `{arcs: …}`.
 
     Parameters
     ----------
     node
-        The node; None means complete.
+        The node.
     counts
         The number of peers by group, in order.
     files
-        Reads tables of arcs, and takes what is at fault.
+        Reads tables of arcs, and takes what is at fault in them.
+
+    Raises
+    ------
+    ApcError
+        What is at fault.
     """
-    mistakes = files.mistakes
-    if node is None:
-        return COMPLETE
-    peers = sum(counts.values())
-    if peers > MOST_PLACED and not (isinstance(node, Scalar) and node.text == COMPLETE.shape):
+    peers, word = sum(counts.values()), node.text if isinstance(node, Scalar) else None
+    if peers > MOST_PLACED and word != COMPLETE.shape:
         expected = f"at most {MOST_PLACED:,} peers where it isn't complete"
-        mistakes.add(
-            "E208", node.place, "a graph", expected=expected, got=f"{peers:,}", hint="graph: complete"
+        raise fault("E208", node.place, "a graph", expected, f"{peers:,}", "graph: complete")
+    if word in SHAPES:
+        return replace(COMPLETE, shape=str(word))
+    if word is not None:
+        what = f"there is no graph {brief(word)}"
+        raise unknown("E206", node.place, what, word, (*SHAPES, *PAIRS))
+    hint = "edges: [[1, 2], [2, 3]]"
+    body = Body(mapping_of(node, "graph", f"graph: {{{hint}}}"), PAIRS, "graph", files.mistakes)
+    given = [key for key in PAIRS if key in body.nodes]
+    if len(given) != 1 or len(body.nodes) != 1:
+        raise fault("E203", node.place, "graph", "either edges or arcs", hint=hint)
+    pairs, what = body.nodes[given[0]], given[0]
+    if isinstance(pairs, Scalar) and pairs.text.endswith(".csv"):
+        table = files.read(pairs.text, lambda path: read_table(path, pairs.place))
+        arcs = [] if table is None else _arcs_of(table, what, peers)
+    else:
+        arcs = _listed(pairs, what, counts, files)
+    if what == "edges":
+        arcs += [(receiver, sender, weight) for sender, receiver, weight in arcs]
+    ends = np.array([arc[:2] for arc in arcs], np.int64).reshape(-1, 2)
+    return Graph("arcs", ends, np.array([arc[2] for arc in arcs]))
+
+
+def _listed(node: Node, what: str, counts: Mapping[str, int], files: NamedFiles) -> list[Arc]:
+    """Read `[[1, 2], [left[1], 3, 0.5]]`."""
+    if not isinstance(node, Sequence):
+        expected = "a list of pairs or a .csv file"
+        raise fault("E203", node.place, what, expected, form(node), f"{what}: [[1, 2], [2, 3]]")
+    found: dict[tuple[int, int], Arc] = {}
+    for item in node.items:
+        with files.mistakes:
+            if not isinstance(item, Sequence) or len(item.items) not in (2, 3):
+                expected = "two peers, and a weight if it isn't 1"
+                raise fault("E203", item.place, what, expected, form(item), "[1, 2]")
+            ends: list[int] = []
+            for end in item.items[:2]:
+                with files.mistakes:
+                    ends.append(_peer(end, counts))
+            weight = _weight(item.items[2]) if len(item.items) == 3 else 1.0
+            if len(ends) < 2:
+                raise AlreadyReportedError
+            sender, receiver = ends
+            if sender == receiver:
+                raise fault("E213", item.place, f"peer {sender + 1} can't be joined to itself")
+            if (sender, receiver) in found or (what == "edges" and (receiver, sender) in found):
+                twice = f"the pair {sender + 1}, {receiver + 1} is given twice"
+                raise fault("E213", item.place, twice)
+            found[sender, receiver] = sender, receiver, weight
+    return [*found.values()]
+
+
+def _weight(node: Node) -> float:
+    number = node.value if isinstance(node, Scalar) else None
+    usable = isinstance(number, int | float) and not isinstance(number, bool)
+    if usable and number and math.isfinite(float(number)):
+        return float(number)
+    raise fault("E203", node.place, "a weight", "a number other than 0", form(node), "0.5")
+
+
+def _peer(node: Node, counts: Mapping[str, int]) -> int:
+    """Return a peer's number, from 0: written 1 to N, or as left[2]."""
+    peers = sum(counts.values())
+    number, named = whole_number(node), _PEER.match(node.text) if isinstance(node, Scalar) else None
+    if named and 1 <= int(named["number"]) <= counts.get(named["group"], 0):
+        starts = dict(zip(counts, accumulate(counts.values(), initial=0), strict=False))
+        number = starts[named["group"]] + int(named["number"])
+    if number is not None and 1 <= number <= peers:
+        return number - 1
+    expected = f'a number from 1 to {peers}, or a name in quotes such as "{next(iter(counts), "user")}[1]"'
+    raise fault("E213", node.place, "a peer", expected, form(node))
+
+
+def _arcs_of(table: Table, what: str, peers: int) -> list[Arc]:
+    """Read pairs from a table with the columns from, to and weight or none."""
+    names, place = [column.name for column in table.columns], table.columns[0].place
+    if names not in (["from", "to"], ["from", "to", "weight"]):
+        expected = "the headings from, to and weight or none"
+        raise fault("E702", place, "a table of pairs", expected, brief(", ".join(names)))
+    sender, receiver, *rest = (column.numbers for column in table.columns)
+    weights = rest[0] if rest else np.ones(table.rows)
+    ends = np.stack([sender, receiver])
+    bad = (ends != np.round(ends)) | (ends < 1) | (ends > peers) | (sender == receiver) | (weights == 0)
+    if bad.any():
+        line = table.lines[int(np.flatnonzero(bad.any(axis=0))[0])]
+        expected = f"two different peers from 1 to {peers}, and a weight that isn't 0"
+        raise fault(
+            "E213", replace(place, line=line, column=1, source_line=""), f"a pair of {what}", expected
         )
-        return COMPLETE
-    if isinstance(node, Scalar):
-        if node.text in SHAPES:
-            return Graph(node.text, COMPLETE.arcs, COMPLETE.weights)
-        what = f"there is no graph {brief(node.text)}"
-        add_unknown("E206", node.place, what, node.text, (*SHAPES, "edges", "arcs"), mistakes)
-        return COMPLETE
-    body = read_mapping(node, "graph", mistakes, hint="graph: {edges: [[1, 2], [2, 3]]}")
-    if body is None:
-        return COMPLETE
-    body = check_keys(body, ("edges", "arcs"), "graph", mistakes)
-    if len(body.entries) != 1:
-        mistakes.add(
-            "E203", body.place, "graph", expected="either edges or arcs", hint="edges: [[1, 2], [2, 3]]"
-        )
-        return COMPLETE
-    key, value = body.entries[0]
-    reader = _ArcReader(counts, files)
-    pairs = reader.read(value, key.text)
-    if key.text == "edges":
-        pairs += [(receiver, sender, weight) for sender, receiver, weight in pairs]
-    arcs = np.array([pair[:2] for pair in pairs], np.int64).reshape(-1, 2)
-    return Graph("arcs", arcs, np.array([pair[2] for pair in pairs]))
+    keys = np.sort(ends, axis=0) if what == "edges" else ends
+    if len(np.unique(keys, axis=1).T) < table.rows:
+        raise fault("E213", place, f"a pair of {what} is given twice")
+    return [(int(a) - 1, int(b) - 1, float(w)) for a, b, w in zip(sender, receiver, weights, strict=True)]
 
 
-class _ArcReader:
-    def __init__(self, counts: MappingType[str, int], files: NamedFiles) -> None:
-        self.counts = counts
-        self.files = files
-        self.mistakes = files.mistakes
-        self.peers = sum(counts.values())
-        self.starts: dict[str, int] = {}
-        total = 0
-        for group, count in counts.items():
-            self.starts[group] = total
-            total += count
-
-    def read(self, node: Node, what: str) -> list[tuple[int, int, float]]:
-        if isinstance(node, Scalar) and node.text.endswith(".csv"):
-            return self._from_file(node, what)
-        if not isinstance(node, Sequence):
-            hint = f"{what}: [[1, 2], [2, 3]]"
-            self.mistakes.add(
-                "E203", node.place, what, expected="a list of pairs or a .csv file", got=form(node), hint=hint
-            )
-            return []
-        found: dict[tuple[int, int], float] = {}
-        for item in node.items:
-            pair = self._pair(item, what)
-            if pair is not None and self._is_new(pair, found, item, what):
-                found[pair[:2]] = pair[2]
-        return [(a, b, weight) for (a, b), weight in found.items()]
-
-    def _is_new(
-        self, pair: tuple[int, int, float], found: dict[tuple[int, int], float], item: Node, what: str
-    ) -> bool:
-        twice = pair[:2] in found or (what == "edges" and (pair[1], pair[0]) in found)
-        if twice:
-            self.mistakes.add("E213", item.place, f"the pair {pair[0] + 1}, {pair[1] + 1} is given twice")
-        return not twice
-
-    def _pair(self, item: Node, what: str) -> tuple[int, int, float] | None:
-        if not isinstance(item, Sequence) or len(item.items) not in (2, 3):
-            expected = "two peers, and a weight if it isn't 1"
-            self.mistakes.add("E203", item.place, what, expected=expected, got=form(item), hint="[1, 2]")
-            return None
-        one, two = (self._peer(node) for node in item.items[:2])
-        weight = 1.0
-        if len(item.items) == 3:
-            node = item.items[2]
-            number = node.value if isinstance(node, Scalar) else None
-            usable = isinstance(number, int | float) and not isinstance(number, bool)
-            if not usable or not math.isfinite(float(number or 0)) or float(number or 0) == 0:
-                self.mistakes.add(
-                    "E203",
-                    node.place,
-                    "a weight",
-                    expected="a number other than 0",
-                    got=form(node),
-                    hint="0.5",
-                )
-                return None
-            weight = float(number or 0)
-        if one is None or two is None:
-            return None
-        if one == two:
-            self.mistakes.add("E213", item.place, f"peer {one + 1} can't be joined to itself")
-            return None
-        return one, two, weight
-
-    def _peer(self, node: Node) -> int | None:
-        """Return a peer's number, from 0: written 1 to N, or as left[2]."""
-        if isinstance(node, Scalar):
-            number = whole_number(node)
-            if number is not None and 1 <= number <= self.peers:
-                return number - 1
-            found = _PEER.match(node.text)
-            if (
-                found
-                and found["group"] in self.counts
-                and 1 <= int(found["number"]) <= self.counts[found["group"]]
-            ):
-                return self.starts[found["group"]] + int(found["number"]) - 1
-        first = next(iter(self.counts), "user")
-        expected = f'a number from 1 to {self.peers}, or a name in quotes such as "{first}[1]"'
-        self.mistakes.add("E213", node.place, "a peer", expected=expected, got=form(node))
-        return None
-
-    def _from_file(self, node: Scalar, what: str) -> list[tuple[int, int, float]]:
-        table = self.files.read(node.text, lambda path: read_table(path, node.place))
-        if table is None:
-            return []
-        names = [column.name for column in table.columns]
-        if names not in (["from", "to"], ["from", "to", "weight"]):
-            got = brief(", ".join(names))
-            self.mistakes.add(
-                "E702",
-                table.columns[0].place,
-                "a table of pairs",
-                expected="the headings from, to and weight or none",
-                got=got,
-            )
-            return []
-        return self._pairs_of(table, what)
-
-    def _pairs_of(self, table: Table, what: str) -> list[tuple[int, int, float]]:
-        ends = np.stack([table.columns[0].numbers, table.columns[1].numbers])
-        weights = table.columns[2].numbers if len(table.columns) == 3 else np.ones(table.rows)
-        bad = (ends != np.round(ends)) | (ends < 1) | (ends > self.peers)
-        wrong = bad.any(axis=0) | (ends[0] == ends[1]) | (weights == 0)
-        if wrong.any():
-            row = int(np.flatnonzero(wrong)[0])
-            place = table.columns[0].place
-            where = type(place)(place.file, table.lines[row], 1)
-            expected = f"two different peers from 1 to {self.peers}, and a weight that isn't 0"
-            self.mistakes.add("E213", where, f"a pair of {what}", expected=expected)
-            return []
-        keys = np.sort(ends, axis=0) if what == "edges" else ends
-        if len(np.unique(keys, axis=1).T) < table.rows:
-            self.mistakes.add("E213", table.columns[0].place, f"a pair of {what} is given twice")
-            return []
-        return [(int(a) - 1, int(b) - 1, float(w)) for a, b, w in zip(ends[0], ends[1], weights, strict=True)]
-
-
-def read_pairs(
-    node: Node | None, groups: MappingType[str, int], mistakes: Mistakes
-) -> list[tuple[str, str, Node]]:
-    """Read `{SENDER: {RECEIVER: value}}` between groups, the values unread.
+def read_delays(node: Node, counts: Mapping[str, int], numbers: NamedNumbers) -> tuple[SceneDelay, ...]:
+    """Read `{SENDER: {RECEIVER: 12 ms}}`: the delays of pairs of groups that differ from the link's.
 
     Parameters
     ----------
     node
-        The mapping; None gives no pairs.
-    groups
+        The mapping.
+    counts
         How many peers each group has.
-    mistakes
-        Takes E203 and E206.
+    numbers
+        Reads a delay.
+
+    Raises
+    ------
+    ApcError
+        E203 it is no mapping; other mistakes are recorded.
     """
     found = []
     hint = "delays: {left: {right: 12 ms}}"
-    for sender, body in entries(read_mapping(node, "delays", mistakes, hint=hint)):
-        if sender.text not in groups:
-            what = f"delays names {brief(sender.text)}, which is no group of peers"
-            add_unknown("E206", sender.place, what, sender.text, list(groups), mistakes)
-            continue
-        for receiver, value in entries(read_mapping(body, sender.text, mistakes, hint=hint)):
-            if receiver.text not in groups:
-                what = f"delays names {brief(receiver.text)}, which is no group of peers"
-                add_unknown("E206", receiver.place, what, receiver.text, list(groups), mistakes)
-            elif read_text(value, receiver.text, mistakes, hint=hint) is not None:
-                found.append((sender.text, receiver.text, value))
-    return found
+
+    def group(key: Scalar) -> str:
+        if key.text in counts:
+            return key.text
+        what = f"delays names {brief(key.text)}, which is no group of peers"
+        raise unknown("E206", key.place, what, key.text, counts)
+
+    for key, body in mapping_of(node, "delays", hint).entries:
+        with numbers.mistakes:
+            sender = group(key)
+            for inner, value in mapping_of(body, sender, hint).entries:
+                with numbers.mistakes:
+                    receiver = group(inner)
+                    text_of(value, receiver, hint)
+                    delay = numbers.read(value, f"the delay from {sender} to {receiver}", SECOND, "ms")
+                    if delay.number < 0:
+                        raise fault("E207", delay.place, "a delay", "0 s or more", str(delay))
+                    found.append(SceneDelay(sender, receiver, delay))
+    return tuple(found)

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
-from apc.compiler.components.parts import GROUND
+from apc.compiler.components.parts import GROUND, PartEntry
 from apc.compiler.errors import Mistake, Place
-from apc.compiler.scene.instances import Part, PartEntry
+from apc.compiler.scene.instances import Part
 
 # Of each part, those it is joined to, by any number of others too, and itself.
 Joined = Mapping[str, frozenset[str]]

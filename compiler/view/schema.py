@@ -16,7 +16,7 @@ from typing import Any
 from apc.compiler.compiled import LARGEST_COUNT
 from apc.compiler.components.component import Component, Number, Option, Parameter, Reference
 from apc.compiler.components.library import Library
-from apc.compiler.components.parts import LARGEST_ARRAY
+from apc.compiler.components.parts import DEFAULT_TYPES, LARGEST_ARRAY, PART_KEYS
 from apc.compiler.errors import Place
 from apc.compiler.functions.exchange import LOSS_ABOUT
 from apc.compiler.language.dimensions import Dimension
@@ -24,28 +24,12 @@ from apc.compiler.language.units import Unit, parse_unit
 from apc.compiler.language.vectors import whole_and_index
 from apc.compiler.scene.channels import PROBABILITIES
 from apc.compiler.scene.graphs import SHAPES
-from apc.compiler.scene.instances import PART_KEYS
-from apc.compiler.scene.sections import DEFAULT_TYPES, SECTIONS
+from apc.compiler.scene.scene import REQUIRED, SECTIONS, TOPOLOGY
 from apc.compiler.source.reading import IDENTIFIER
 
 Schema = dict[str, Any]
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-ABOUT = {
-    "topology": "the scene's name",
-    "about": "one sentence",
-    "library": "folders of components of one's own, from this file's folder",
-    "clocks": "what ticks, and how often",
-    "parameters": "named quantities, for use in expressions",
-    "peers": "who is there: groups of peers",
-    "masses": "what each peer has",
-    "couplers": "what pulls at masses",
-    "links": "what carries samples to the other peers",
-    "hands": "what moves a device",
-    "experiment": "what a simulation runs for",
-    "studies": "which parameters a study varies",
-}
-REQUIRED = ("topology", "peers", "masses")
 # Any unit may be written; of these an editor can say at once that one does not fit, or propose one that does.
 EVERYDAY_UNITS = (
     *("kg", "g", "mg", "m", "mm", "cm", "um", "s", "ms", "us", "min", "h", "Hz", "kHz"),
@@ -116,7 +100,7 @@ def topology_schema(library: Library) -> Schema:
         "$schema": DIALECT,
         "title": "A topology of apc",
         "type": "object",
-        "properties": {key: {"description": ABOUT[key], **schema} for key, schema in properties.items()},
+        "properties": {key: {"description": TOPOLOGY[key], **schema} for key, schema in properties.items()},
         "required": list(REQUIRED),
         "additionalProperties": False,
         # Components of one's own are known to the compiler alone.
