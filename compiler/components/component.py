@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import TypeVar
 
 from apc.compiler.errors import Place
 from apc.compiler.language.dimensions import Dimension
@@ -17,6 +18,10 @@ from apc.compiler.language.expression import FUNCTIONS, KEYWORDS, Compare, Equat
 from apc.compiler.language.units import Unit
 from apc.compiler.language.values import Binding, Bounds
 from apc.compiler.source.nodes import Node
+
+T = TypeVar("T")
+Named = tuple[tuple[str, T], ...]  # values by name, in order
+Joined = tuple[tuple[str, str, str], ...]  # connectors, each with a part and a connector of it
 
 OTHERS = "others"
 # Words of the language, which nothing may have as its name.
@@ -66,7 +71,7 @@ class Number:
     open_minimum: bool
     maximum: Fraction | None
     divided: bool
-    words: tuple[tuple[str, Fraction], ...]
+    words: Named[Fraction]
     about: str
     place: Place
 
@@ -120,12 +125,12 @@ class Entry:
     connector to (part, connector); the part "ground" is fixed, an empty part is the component around.
     """
 
-    values: tuple[tuple[str, Binding], ...]
-    options: tuple[tuple[str, str], ...]
-    references: tuple[tuple[str, str], ...]
-    described: tuple[tuple[str, Node], ...]
-    starts: tuple[tuple[str, Binding], ...]
-    connections: tuple[tuple[str, str, str], ...]
+    values: Named[Binding]
+    options: Named[str]
+    references: Named[str]
+    described: Named[Node]
+    starts: Named[Binding]
+    connections: Joined
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,14 +156,14 @@ class Component:
     name: str
     about: str
     source: str
-    connectors: tuple[tuple[str, Connector], ...]
+    connectors: Named[Connector]
     parameters: tuple[Parameter, ...]
     variables: tuple[Variable, ...]
-    locals: tuple[tuple[str, Dimension], ...]
+    locals: Named[Dimension]
     sends: tuple[Send, ...]
     equations: tuple[Equation, ...]
     inner: tuple[Inner, ...]
-    passed: tuple[tuple[str, str, str], ...]
+    passed: Joined
     place: Place
     grips: tuple[str, ...] = ()
     peers: int = 0

@@ -12,19 +12,13 @@ scene give the rest.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from fractions import Fraction
 from itertools import count
+from typing import TypeVar
 
-from apc.compiler.components.component import (
-    OTHERS,
-    Component,
-    Option,
-    Reference,
-    Send,
-    option_test,
-)
+from apc.compiler.components.component import OTHERS, Component, Named, Option, Reference, Send, option_test
 from apc.compiler.components.declarations import Sends
 from apc.compiler.errors import ApcError, Mistakes, Place, place_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
@@ -57,6 +51,8 @@ from apc.compiler.words import counted
 _TRUE = Compare("==", Literal(Fraction(1)), Literal(Fraction(1)))
 
 Path = tuple[str, ...]  # a name in an equation, between its dots
+Written = tuple[Expr, str, Place]  # an expression, its text, and where it starts
+T = TypeVar("T")
 
 
 class ComponentNames:
@@ -105,13 +101,13 @@ class ComponentNames:
                 found.append(Send(name, expression, text, place, dimension))
         return tuple(found)
 
-    def infer_locals(self, sends: Sends) -> tuple[tuple[str, Dimension], ...]:
+    def infer_locals(self, sends: Sends) -> Named[Dimension]:
         """Return the undeclared names that stand alone on the left of an equation.
 
         What one is may hang on another, on itself, or on what is sent: each round settles some. An unknown
         name on the right is reported once, by `check`.
         """
-        undeclared: dict[Path, tuple[Expr, str, Place]] = {
+        undeclared: dict[Path, Written] = {
             equation.left.parts: (equation.right, equation.text, equation.place)
             for equation in reversed(self.component.equations)
             if isinstance(equation.left, Name)
@@ -119,27 +115,20 @@ class ComponentNames:
             and not equation.left.parts[0].endswith("]")
             and equation.left.parts not in self.dimensions
         }
-        open_: dict[Path, tuple[Expr, str, Place]] = {
-            (OTHERS, name): (expression, text, place) for name, expression, text, place in sends
-        }
-        open_ |= undeclared
+        open_: dict[Path, Written] = {
+            (OTHERS, name): (tree, *place) for name, tree, *place in sends
+        } | undeclared
         self.dimensions |= dict.fromkeys(open_)
         self.sizes |= dict.fromkeys(open_)
-        for _ in range(len(open_) + 1):  # a size that contradicts itself never settles
-            settled = {name: self._size(*written) for name, written in open_.items()}
-            if all(self.sizes[name] == size for name, size in settled.items()):
-                break
-            self.sizes |= settled
-        waiting = [*open_]
-        while True:
-            found = {name: self._inferred(*open_[name]) for name in waiting}
-            for name, dimension in found.items():
-                if dimension is not None:
-                    self._add(name, self.sizes[name] or 0, dimension)
-            if None not in found.values() or waiting == (waiting := [n for n in waiting if found[n] is None]):
-                break
-        for name in waiting:
-            self._add(name, self.sizes[name] or 0, self.dimensions[name])
+        _settle(open_, self._size, self.sizes.__setitem__)
+        # A size that contradicts itself is none.
+        self.sizes |= {name: self._size(*written) for name, written in open_.items()}
+
+        def add(name: Path, dimension: Dimension | None) -> None:
+            self._add(name, self.sizes[name] or 0, dimension)
+
+        for name in _settle(open_, self._inferred, add):
+            add(name, None)
         return tuple((name[0], _known(self.dimensions[name])) for name in reversed(undeclared))
 
     def _size(self, expression: Expr, text: str, place: Place) -> int | None:
@@ -282,6 +271,23 @@ class ComponentNames:
             )
         known = sorted(".".join(one) for one in self.dimensions if not whole_and_index(one[-1])[1])
         return unknown("E303", place, f"{self.component.name} has no {brief(shown)}", shown, known)
+
+
+def _settle(
+    waiting: Mapping[Path, Written],
+    infer: Callable[[Expr, str, Place], T | None],
+    keep: Callable[[Path, T], None],
+) -> Collection[Path]:
+    """Infer something of each name, which may hang on others': each round settles some. Return the rest."""
+    while waiting:
+        found = {name: infer(*written) for name, written in waiting.items()}
+        for name, value in found.items():
+            if value is not None:
+                keep(name, value)
+        before, waiting = waiting, {name: one for name, one in waiting.items() if found[name] is None}
+        if len(before) == len(waiting):
+            break
+    return waiting
 
 
 def _visible_names(component: Component) -> Iterator[tuple[tuple[str, ...], Dimension]]:

@@ -18,7 +18,7 @@ from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.language.expression import Equation, Expr
 from apc.compiler.language.grammar import parse_equation, parse_expression
 from apc.compiler.language.units import Unit, parse_quantity, parse_unit, quantity
-from apc.compiler.language.values import AlreadyReportedError, Value, text_place
+from apc.compiler.language.values import AlreadyReportedError, Bounds, Value, text_place
 from apc.compiler.language.vectors import SIZES
 from apc.compiler.language.vectors import entries as names_of
 from apc.compiler.source.nodes import Node, Scalar, Sequence
@@ -96,8 +96,8 @@ def read_variables(root: Body, section: str = "variables") -> tuple[Variable, ..
             body = Body(node, VARIABLE, f"variable {name}", root.mistakes)
             about, limit = body.text("about"), body.text("limit", "limit: force_limit")
             unit, size = _unit_and_size(body, name)
-            starts = body.read("start", partial(_numbers_of, name=name, unit=unit, size=size), None)
-            for one, start in zip(names_of(name, size), starts or [None] * max(size, 1), strict=True):
+            starts = _entries_of(body, "start", name, unit, size)
+            for one, start in zip(names_of(name, size), starts, strict=True):
                 found.append(Variable(one, unit, start, about, key.place, limit))
     return tuple(found)
 
@@ -150,52 +150,48 @@ def _option(name: str, options: Sequence, body: Body) -> Option:
 
 def _numbers(name: str, body: Body) -> list[Number]:
     """Read a number's declaration, or a vector's, of which each entry is a number."""
-    about, shared = body.text("about"), body.text("shared")
+    about, shared, nodes = body.text("about"), body.text("shared"), body.nodes
     if shared not in ("", "divided", "whole"):
-        raise fault("E203", body.nodes["shared"].place, "shared", "divided or whole", brief(shared))
+        wrong = fault("E203", nodes["shared"].place, "shared", "divided or whole", brief(shared))
+        body.mistakes.take(wrong)
     unit, size = _unit_and_size(body, name)
-    number = partial(_number, unit=unit)
-    least, above, most = (
-        body.read(key, lambda node, _: number(node, name), None) for key in ("min", "above", "max")
-    )
-    options = body.nodes.get("options")
+
+    def number(node: Node, _: str) -> Fraction:
+        return _number(node, name, unit)
+
+    minimum, above, most = (body.read(key, number, None) for key in ("min", "above", "max"))
+    options, default = nodes.get("options"), nodes.get("default")
     if size and options is not None:
         raise fault("E203", options.place, name, "a number, to have names for its values", "a vector")
-    named: dict[str, tuple[Fraction, Node]] = {}
+    if minimum is not None and above is not None:
+        body.mistakes.add("E203", nodes["above"].place, name, expected="either min or above", got="both")
+    first = names_of(name, size)[0]
+    least = minimum if above is None else above
+    bounds = Bounds(unit.text, unit.scale, least, above is not None, most)
+
+    def within(value: Fraction, node: Node, what: str) -> Fraction:
+        """Return a number of the declaration itself, which has to lie within its bounds."""
+        bounds.check(Value(value, unit.dimension, None, node.place), what, body.mistakes)
+        return value
+
+    if most is not None:
+        within(most, nodes["max"], f"the max of {first}")
+    words: dict[str, Fraction] = {}
     for key, node in () if options is None else mapping_of(options, "options").entries:
         with body.mistakes:
-            named[key.text] = number(node, key.text), node
-    default = body.nodes.get("default")
-    defaults: list[Fraction | None] | None
-    if isinstance(default, Scalar) and default.text in named:
-        defaults = [named[default.text][0]]
+            value = _number(node, key.text, unit)
+            words[key.text] = within(value, node, f"{key.text} of {first}")
+    if isinstance(default, Scalar) and default.text in words:
+        defaults = [words[default.text]]
     else:
-        defaults = body.read("default", partial(_numbers_of, name=name, unit=unit, size=size), None)
-    if least is not None and above is not None:
-        body.mistakes.add("E203", body.nodes["above"].place, name, expected="either min or above", got="both")
-    words = tuple((word, value) for word, (value, _) in named.items())
-    found = [
-        Number(
-            one,
-            unit,
-            start,
-            least if above is None else above,
-            above is not None,
-            most,
-            shared == "divided",
-            words,
-            about,
-            body.place,
-        )
-        for one, start in zip(names_of(name, size), defaults or [None] * max(size, 1), strict=True)
-    ]
-    given: list[tuple[str, Fraction | None, Node | None]]
-    given = [(f"{word} of {found[0].name}", value, at) for word, (value, at) in named.items()]
-    given.append((f"the max of {found[0].name}", most, body.nodes.get("max")))
-    for what, value, at in (*given, *((f"the default of {one.name}", one.default, default) for one in found)):
-        if value is not None and at is not None:
-            within = Value(value, unit.dimension, None, at.place)
-            found[0].bounds.check(within, what, body.mistakes)
+        defaults = _entries_of(body, "default", name, unit, size)
+    found = []
+    for one, start in zip(names_of(name, size), defaults, strict=True):
+        if start is not None and default is not None:
+            within(start, default, f"the default of {one}")
+        divided, named = shared == "divided", tuple(words.items())
+        limits = least, above is not None, most
+        found.append(Number(one, unit, start, *limits, divided, named, about, body.place))
     return found
 
 
@@ -223,10 +219,14 @@ def _size(node: Node, what: str, name: str) -> int:
     raise fault("E203", node.place, f"the {what} of {name}", "2 or 3", form(node), hint)
 
 
-def _numbers_of(node: Node, key: str, name: str, unit: Unit, size: int) -> list[Fraction | None]:
-    """Read the default or start of a number, or the list of a vector's."""
-    nodes = list_of(node, key, size, "0") if size else (node,)
-    return [_number(one, name, unit) for one in nodes]
+def _entries_of(body: Body, key: str, name: str, unit: Unit, size: int) -> list[Fraction | None]:
+    """Read the default or start of a number, or the list of a vector's; None of one that isn't given."""
+
+    def read(node: Node, _: str) -> list[Fraction | None]:
+        nodes = list_of(node, key, size, "0") if size else (node,)
+        return [_number(one, name, unit) for one in nodes]
+
+    return body.read(key, read, [None] * max(size, 1))
 
 
 def _number(node: Node, what: str, unit: Unit) -> Fraction:

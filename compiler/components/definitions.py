@@ -18,6 +18,8 @@ from apc.compiler.components.component import (
     Component,
     Connector,
     Inner,
+    Joined,
+    Named,
     Parameter,
     Reference,
     Variable,
@@ -57,8 +59,6 @@ COMPONENT = (
     *("parts", "connect", "sends", "equations"),
 )
 DEEPEST = 10  # levels of parts inside parts
-
-Passed = tuple[tuple[str, str, str], ...]
 
 
 def read_connector(source: Source) -> Connector:
@@ -176,7 +176,7 @@ def _overridden(
 
 def _read_inner(
     root: Body, outer: Component, library: Definitions, mistakes: Mistakes
-) -> tuple[tuple[Inner, ...], Passed]:
+) -> tuple[tuple[Inner, ...], Joined]:
     """Read the parts inside a component and the connectors it passes on to them."""
     parts = Parts(library, mistakes)
     parts.read("parts", root)
@@ -210,7 +210,7 @@ def _read_inner(
     return inner, (*passed, *_read_connect(root, outer, inner, parts.faulty))
 
 
-def _read_connect(root: Body, outer: Component, inner: Collection[Inner], faulty: Collection[str]) -> Passed:
+def _read_connect(root: Body, outer: Component, inner: Collection[Inner], faulty: Collection[str]) -> Joined:
     """Read `connect: {flange: tip.flange}`: connectors of the component that are those of an inner part."""
     found = []
     own = dict(outer.connectors)
@@ -249,7 +249,7 @@ def _check_distinct(
 
 def _connectors(
     root: Body, library: Definitions, mistakes: Mistakes
-) -> tuple[tuple[tuple[str, Connector], ...], tuple[str, ...]]:
+) -> tuple[Named[Connector], tuple[str, ...]]:
     """Read `connectors: {flange: Flange, grip: {type: Flange, for: hands}}`, and which are for hands."""
     found, grips = [], []
     for key, value in root.section("connectors", "{flange: Flange}"):

@@ -40,9 +40,8 @@ from apc.compiler.language.evaluation import evaluate, formula_of
 from apc.compiler.language.expression import Expr, Name, Number, transform
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import Value, renamed
-from apc.compiler.scene.channels import SceneChannel
 from apc.compiler.scene.groups import SceneGroup
-from apc.compiler.scene.links import SceneLink
+from apc.compiler.scene.links import SceneChannel, SceneLink
 from apc.compiler.scene.scene import Scene
 from apc.compiler.words import enumerated
 

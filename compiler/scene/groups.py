@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import LARGEST_COUNT, MOST_GROUPS
-from apc.compiler.components.component import Number, Option, Reference, Settable, Variable
+from apc.compiler.components.component import Named, Number, Option, Reference, Settable, Variable
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.language.evaluation import evaluate
 from apc.compiler.language.expression import names
@@ -79,8 +79,8 @@ class SceneGroup:
 
     name: str
     count: int
-    values: tuple[tuple[str, Value], ...]
-    words: tuple[tuple[str, str], ...]
+    values: Named[Value]
+    words: Named[str]
     columns: Columns
     place: Place
     counted: Value | None = None
@@ -256,12 +256,14 @@ class GroupReader:
         self, values: dict[str, Value], words: dict[str, str], columns: Collection[str], place: Place
     ) -> None:
         """Add what follows from a group's settings, inside the parts that they set."""
-        known: dict[str, Value] = {}
-        for part in self.parts:
-            known |= {f"{part.name}.{name}": value for name, value in (*part.values, *part.starts)}
+        known = {
+            f"{part.name}.{name}": value
+            for part in self.parts
+            for name, value in (*part.values, *part.starts)
+        }
 
         def number(parts: tuple[str, ...]) -> Fraction:
-            value = values.get(name := ".".join(parts)) or known.get(name)
+            value = values.get(name := ".".join(parts), known.get(name))
             return self.numbers.number(parts) if value is None else value.number
 
         for part in self.parts:
@@ -269,17 +271,17 @@ class GroupReader:
                 for own, outer in inner.entry.references:
                     if (word := words.get(f"{part.name}.{outer}")) is not None:
                         words.setdefault(f"{part.name}.{inner.name}.{own}", word)
-            for name, value in (*part.values, *part.starts):
-                whole, tree = f"{part.name}.{name}", value.expression
-                if tree is None or whole in values or whole in columns:
-                    continue
-                if not any(".".join(node.parts) in values for node in names(tree)):
-                    continue
+        for whole, value in known.items():  # of an outer part before those inside it
+            tree = value.expression
+            if tree is None or whole in values or whole in columns:
+                continue
+            if any(".".join(node.parts) in values for node in names(tree)):
                 with self.mistakes:
                     follows = Fraction(evaluate(tree, number, place))
                     values[whole] = replace(value, number=follows, place=place)
-                    if isinstance(declared := part.component.parameter(name), Number):
-                        declared.bounds.check(values[whole], whole, self.mistakes)
+                    item = next((item for _, item in self.settable.get(whole, ())), None)
+                    if isinstance(item, Number):
+                        item.bounds.check(values[whole], whole, self.mistakes)
 
 
 def _check_column(

@@ -15,7 +15,7 @@ from fractions import Fraction
 from functools import partial
 from itertools import product
 
-from apc.compiler.components.component import Component, Inner, Reference, Settable
+from apc.compiler.components.component import Component, Inner, Joined, Named, Reference, Settable
 from apc.compiler.components.parts import GROUND, MOST_PARTS, PartEntry, Scope, read_entry
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.language.expression import Name, names
@@ -45,12 +45,12 @@ class Part:
     name: str
     section: str
     component: Component
-    values: tuple[tuple[str, Value], ...]
-    options: tuple[tuple[str, str], ...]
-    references: tuple[tuple[str, str], ...]
+    values: Named[Value]
+    options: Named[str]
+    references: Named[str]
     tables: tuple[TimeTable, ...]
-    starts: tuple[tuple[str, Value], ...]
-    connections: tuple[tuple[str, str, str], ...]
+    starts: Named[Value]
+    connections: Joined
     shared: bool
     groups: tuple[str, ...]
     place: Place
@@ -206,9 +206,7 @@ def _inside(part: Part, inner: Inner, peers: int) -> Part:
     )
 
 
-def _settled_inside(
-    part: Part, bindings: Collection[tuple[str, Binding]], peers: int
-) -> tuple[tuple[str, Value], ...]:
+def _settled_inside(part: Part, bindings: Collection[tuple[str, Binding]], peers: int) -> Named[Value]:
     """Return what numbers in terms of an outer part come to, their expressions in whole names."""
     values: dict[tuple[str, ...], Fraction] = {PEERS: Fraction(peers)}
     values |= {(name,): value.number for name, value in part.values}

@@ -14,7 +14,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 
-from apc.compiler.components.component import RESERVED, Component, Number, Settable, Variable
+from apc.compiler.components.component import RESERVED, Component, Named, Number, Settable, Variable
 from apc.compiler.errors import Mistakes
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import names
@@ -174,9 +174,7 @@ class NamedNumbers:
             item.bounds.check(value, what, self.mistakes)
         return value
 
-    def settled(
-        self, bindings: Collection[tuple[str, Binding]], component: Component
-    ) -> tuple[tuple[str, Value], ...]:
+    def settled(self, bindings: Collection[tuple[str, Binding]], component: Component) -> Named[Value]:
         """Return what named bindings come to, within the bounds of a component's parameters."""
         found = []
         for name, binding in bindings:

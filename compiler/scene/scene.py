@@ -17,17 +17,16 @@ from pathlib import Path
 
 from apc.compiler.cache import SUFFIX
 from apc.compiler.compiled import Axis, Experiment
-from apc.compiler.components.component import Settable
+from apc.compiler.components.component import Named, Settable
 from apc.compiler.components.library import Library, definition_of
 from apc.compiler.components.parts import Parts, Scope
 from apc.compiler.errors import Mistake, Mistakes, Place, visible
 from apc.compiler.files import RefusedError, files_below
 from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.values import AlreadyReportedError, Value
-from apc.compiler.scene.channels import PROBABILITY
 from apc.compiler.scene.groups import GroupReader, SceneGroup, read_counts
 from apc.compiler.scene.instances import Part, PartReader, settable_names
-from apc.compiler.scene.links import SceneLink, read_link
+from apc.compiler.scene.links import PROBABILITY, SceneLink, read_link
 from apc.compiler.scene.named_numbers import read_named_numbers
 from apc.compiler.scene.oddities import oddities
 from apc.compiler.scene.studies import read_experiment, read_region
@@ -67,13 +66,13 @@ class Scene:
     name: str
     about: str
     clocks: tuple[SceneClock, ...]
-    parameters: tuple[tuple[str, Value], ...]
+    parameters: Named[Value]
     groups: tuple[SceneGroup, ...]
     parts: tuple[Part, ...]
     links: tuple[SceneLink, ...]
     experiment: Experiment
     region: tuple[Axis, ...]
-    texts: tuple[tuple[str, str], ...]
+    texts: Named[str]
     place: Place
     warnings: tuple[Mistake, ...] = ()
 

@@ -22,8 +22,8 @@ from apc.compiler.functions.exchange import LOSS_ABOUT
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.units import Unit, parse_unit
 from apc.compiler.language.vectors import whole_and_index
-from apc.compiler.scene.channels import PROBABILITIES
 from apc.compiler.scene.graphs import SHAPES
+from apc.compiler.scene.links import PROBABILITIES
 from apc.compiler.scene.scene import REQUIRED, SECTIONS, TOPOLOGY
 from apc.compiler.source.reading import IDENTIFIER
 
