@@ -41,6 +41,7 @@ from apc.compiler.language.vectors import whole_and_index
 from apc.compiler.source.nodes import Mapping, Node, Scalar
 from apc.compiler.source.reading import (
     Body,
+    among,
     brief,
     fault,
     form,
@@ -221,13 +222,10 @@ def _read_connect(root: Body, outer: Component, inner: Collection[Inner], faulty
             part, _, connector = text.partition(".")
             if part.partition("[")[0] in faulty:
                 continue
-            if key.text not in own:
-                what = f"connect names {brief(key.text)}, which is no connector of this component"
-                raise unknown("E206", key.place, what, key.text, own)
-            if text not in known:
-                what = f"connect names {brief(text)}, which is no connector of an inner part"
-                raise unknown("E206", value.place, what, text, known)
-            found.append((key.text, part, connector))
+            what = "connect names {}, which is no connector of"
+            name = among(key.text, own, key.place, f"{what} this component")
+            among(text, known, value.place, f"{what} an inner part")
+            found.append((name, part, connector))
     return tuple(found)
 
 

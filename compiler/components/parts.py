@@ -27,6 +27,7 @@ from apc.compiler.source.nodes import Mapping as MappingNode
 from apc.compiler.source.nodes import Node, Scalar
 from apc.compiler.source.reading import (
     Body,
+    among,
     brief,
     fault,
     form,
@@ -43,7 +44,12 @@ GROUND = "ground"
 LARGEST_ARRAY = 500
 # Of one peer, those inside parts included: half a minute and 1 GB of compiling.
 MOST_PARTS = 1000
-PART_KEYS = ("at", "shared", "count")  # those of every part of a topology, beside its type
+# The keys of every part of a topology beside its type.
+PART_KEYS = {
+    "at": "only at these groups",
+    "shared": "a copy at each peer of one object",
+    "count": "an array",
+}
 # By section, an entry without its name; and a type to show for an entry that has none.
 EXAMPLES = {
     "masses": ("device", "{mass: 0.1 kg}", "Mass"),
@@ -216,7 +222,7 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
     units = {p.name: p.unit for p in component.numbers}
     units |= {v.name: v.unit for v in component.variables if v.start is not None}
     named = (whole_and_index(name)[0] for name in (*(p.name for p in component.parameters), *units))
-    common = PART_KEYS if outer is None else ("count",)
+    common = [*PART_KEYS] if outer is None else ["count"]
     keys = dict.fromkeys(("type", *common, *dict(component.connectors), *named))
     body = Body(entry.body, keys, f"{entry.name} ({component.name})", mistakes)
     reader = _EntryReader(entry, body.nodes, scope, mistakes, index, units)
@@ -350,11 +356,8 @@ class _EntryReader:
                 raise fault("E204", node.place, parameter.name, parameter.unit.text, outer.unit.text)
             return word
         known = self.scope.references(role, word)
-        if word in known:
-            return word
         missing = f"isn't in {role}s" if within is None else f"is no {role} of {within.name}"
-        what = f"{self.entry.name} names {role} {brief(word)}, which {missing}"
-        raise unknown("E206", node.place, what, word, known)
+        return among(word, known, node.place, f"{self.entry.name} names {role} {{}}, which {missing}")
 
     def _connection(self, connector: str, kind: str) -> tuple[str, str] | None:
         """Return the part and the connector of it that a connector is joined to."""
@@ -416,11 +419,8 @@ class _EntryReader:
         shown, hand = f"{part.name} ({part.component.name})", self.entry.section == "hands"
         fitting = [name for name, its in _kinds(part.component).items() if its == kind]
         meant = [name for name in fitting if (name in part.component.grips) == hand] or fitting
-        if named in fitting:
-            return str(named)
         if named is not None:
-            what = f"{shown} has no {kind} called {brief(named)}"
-            raise unknown("E206", node.place, what, named, fitting)
+            return among(named, fitting, node.place, f"{shown} has no {kind} called {{}}")
         if len(meant) == 1:
             return meant[0]
         if fitting:

@@ -41,18 +41,12 @@ from apc.compiler.language.expression import Expr, Name, Number, transform
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import Value, renamed
 from apc.compiler.scene.groups import SceneGroup
-from apc.compiler.scene.links import SceneChannel, SceneLink
+from apc.compiler.scene.links import PROBABILITIES, SceneChannel, SceneLink
 from apc.compiler.scene.scene import Scene
 from apc.compiler.words import enumerated
 
 NO_DELAY = "no delay"
 MOST_DEAF = 3  # names of peers that hear nobody in one message
-LOSS_ABOUT = (
-    "probability that a good link turns bad after a packet",
-    "probability that a bad link turns good after a packet",
-    "probability that a bad link loses a packet",
-    "probability that a good link loses a packet",
-)
 
 
 def period_of(clock: str) -> str:
@@ -422,7 +416,7 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
                     about=about,
                     exact=value.number,
                 )
-                for (name, value), about in zip(link.channel.loss, LOSS_ABOUT, strict=False)
+                for (name, value), about in zip(link.channel.loss, PROBABILITIES.values(), strict=False)
             }
     for clock in scene.clocks:
         if (name := period_of(clock.name)) in needed:  # by `interval`: the same number as the timing

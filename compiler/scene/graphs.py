@@ -21,7 +21,7 @@ from apc.compiler.language.tables import NamedFiles, Table, read_table
 from apc.compiler.language.values import AlreadyReportedError, Value
 from apc.compiler.scene.named_numbers import NamedNumbers
 from apc.compiler.source.nodes import Node, Scalar, Sequence
-from apc.compiler.source.reading import Body, brief, fault, form, mapping_of, text_of, unknown
+from apc.compiler.source.reading import Body, among, brief, fault, form, mapping_of, text_of, unknown
 
 SHAPES = ("complete", "ring", "star")
 PAIRS = ("edges", "arcs")
@@ -156,21 +156,15 @@ def read_delays(node: Node, counts: Mapping[str, int], numbers: NamedNumbers) ->
     ApcError
         E203 it is no mapping; other mistakes are recorded.
     """
-    found = []
+    found, what = [], "delays names {}, which is no group of peers"
     hint = "delays: {left: {right: 12 ms}}"
-
-    def group(key: Scalar) -> str:
-        if key.text in counts:
-            return key.text
-        what = f"delays names {brief(key.text)}, which is no group of peers"
-        raise unknown("E206", key.place, what, key.text, counts)
 
     for key, body in mapping_of(node, "delays", hint).entries:
         with numbers.mistakes:
-            sender = group(key)
+            sender = among(key.text, counts, key.place, what)
             for inner, value in mapping_of(body, sender, hint).entries:
                 with numbers.mistakes:
-                    receiver = group(inner)
+                    receiver = among(inner.text, counts, inner.place, what)
                     text_of(value, receiver, hint)
                     delay = numbers.read(value, f"the delay from {sender} to {receiver}", SECOND, "ms")
                     if delay.number < 0:

@@ -35,6 +35,7 @@ from apc.compiler.source.nodes import Mapping as MappingNode
 from apc.compiler.source.nodes import Node, Scalar, Sequence
 from apc.compiler.source.reading import (
     Body,
+    among,
     brief,
     fault,
     form,
@@ -47,7 +48,11 @@ from apc.compiler.source.reading import (
 )
 
 MOST_FAULTS = 5  # of a column, that are told
-GROUP = ("count", "set", "table")
+GROUP = {
+    "count": "how many",
+    "set": "this group's own settings; a list has a value a peer",
+    "table": "a CSV file with a row a peer",
+}
 # How a count begins that is no number, word of YAML or quantity: with a name, or a parenthesis before one.
 _IN_NAMES = re.compile(
     r"\(*\s*(?!(true|false|null)\Z)[A-Za-z]\w*|[0-9]+\s*[-+*/]\s*\(*\s*[A-Za-z]\w*", re.ASCII
@@ -240,10 +245,8 @@ class GroupReader:
         """Read an option, or the name of a clock."""
         known = item.words if isinstance(item, Option) else self.clocks
         word = text_of(node, what, f"{what}: {next(iter(known), 'name')}")
-        if word in known:
-            return word
         role = "option" if isinstance(item, Option) else "clock"
-        raise unknown("E206", node.place, f"{what} has no {role} {brief(word)}", word, known)
+        return among(word, known, node.place, f"{what} has no {role} {{}}")
 
     def _listed(self, node: Sequence, what: str, item: Settable, count: int) -> NDArray[np.float64]:
         """Read a list with a number a peer."""

@@ -25,7 +25,7 @@ from apc.compiler.language.values import PEERS, Binding, Value, renamed, settle
 from apc.compiler.language.vectors import entries, whole_and_index
 from apc.compiler.scene.named_numbers import NamedNumbers
 from apc.compiler.source.nodes import Node, Scalar, Sequence
-from apc.compiler.source.reading import brief, fault, form, text_of, unknown
+from apc.compiler.source.reading import among, fault, form, text_of
 
 LINK_ROLES = ("graph", "delays", "loss", "trace")
 
@@ -176,10 +176,8 @@ class PartReader:
         for item in items:
             with self.numbers.mistakes:
                 group = text_of(item, "a group")
-                if group not in self.counts:
-                    what = f"{name} is at {brief(group)}, which is no group of peers"
-                    raise unknown("E206", item.place, what, group, self.counts)
-                found.append(group)
+                what = f"{name} is at {{}}, which is no group of peers"
+                found.append(among(group, self.counts, item.place, what))
         return tuple(found)
 
 

@@ -41,7 +41,13 @@ from apc.compiler.source.nodes import Node, Scalar
 from apc.compiler.source.reading import Body, brief, fault, text_of
 
 OBEYED = ("delay", "jitter", "distribution", "reorder", "on_loss")  # a link's numbers and words
-PROBABILITIES = ("p", "r", "1-h", "1-k")  # netem's names, in netem's order
+# Those of netem, in its order.
+PROBABILITIES = {
+    "p": "probability that a good link turns bad after a packet",
+    "r": "probability that a bad link turns good after a packet",
+    "1-h": "probability that a bad link loses a packet",
+    "1-k": "probability that a good link loses a packet",
+}
 LOSS_EXAMPLE = "loss: {p: 1 %, r: 25 %}"
 _EXAMPLES = {"loss": "loss: 2 %", "jitter": "jitter: 2 ms", "trace": "trace: delays.csv"}
 # What a number of a link's losses is, where one is read.
@@ -234,8 +240,8 @@ def _completed(name: str, name_p: str, given: Mapping[str, Value]) -> dict[str, 
         "r": Value(1 - p.number, DIMENSIONLESS, rest, p.place),
         "1-h": Value(Fraction(1), DIMENSIONLESS, None, p.place),
         "1-k": Value(Fraction(0), DIMENSIONLESS, None, p.place),
-    } | dict(given)
-    return {name_p: p} | {f"{name}.{key}": known[key] for key in PROBABILITIES[1:]}
+    }
+    return {name_p: p} | {f"{name}.{key}": given.get(key, value) for key, value in known.items()}
 
 
 def _probability(node: Node, what: str, numbers: NamedNumbers) -> Value:

@@ -181,6 +181,26 @@ def unknown(code: str, place: Place, what: str, name: str, known: Collection[str
     return fault(code, place, f"{what}; there are: {listed}" if listed else f"{what}; there is none")
 
 
+def among(name: str, known: Collection[str], place: Place, what: str, code: str = "E206") -> str:
+    """Return a name that is known.
+
+    Parameters
+    ----------
+    name, known
+        The name as written, and the names there are.
+    place, what, code
+        Where it stands, what is wrong with another, whose name takes the place of `{}`, and the code of that.
+
+    Raises
+    ------
+    ApcError
+        The name is not known.
+    """
+    if name in known:
+        return name
+    raise unknown(code, place, what.replace("{}", brief(name)), name, known)
+
+
 def read_text(node: Node | None, what: str, mistakes: Mistakes, *, hint: str = "") -> str | None:
     """Return the text of a scalar as `text_of`; None without one, whose fault is recorded."""
     with mistakes:
