@@ -19,7 +19,7 @@ from itertools import count
 from typing import TypeVar
 
 from apc.compiler.components.component import OTHERS, Component, Named, Option, Reference, Send, option_test
-from apc.compiler.components.declarations import Sends
+from apc.compiler.components.declarations import Written
 from apc.compiler.errors import ApcError, Mistakes, Place, place_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import (
@@ -51,7 +51,6 @@ from apc.compiler.words import counted
 _TRUE = Compare("==", Literal(Fraction(1)), Literal(Fraction(1)))
 
 Path = tuple[str, ...]  # a name in an equation, between its dots
-Written = tuple[Expr, str, Place]  # an expression, its text, and where it starts
 T = TypeVar("T")
 
 
@@ -91,21 +90,23 @@ class ComponentNames:
         """Return the size of a name: 0 for a number, None for what is to be inferred."""
         return self.sizes.get(parts, 0)
 
-    def infer_sends(self, sends: Sends, mistakes: Mistakes) -> tuple[Send, ...]:
-        """Return the sends with the dimension of what they send."""
-        found = []
-        for name, expression, text, place in sends:
+    def completed(self, sends: Mapping[str, Written], mistakes: Mistakes) -> Component:
+        """Return the component with its locals and what it sends, checked, its vectors entry by entry."""
+        locals_, found = self._infer_locals(sends), []
+        for name, (expression, text, place) in sends.items():
             with mistakes:
                 written_out(expression, self.size_of, text, place)  # or its sizes do not fit
                 dimension = _known(self._dimension(expression, text, place))
                 found.append(Send(name, expression, text, place, dimension))
-        return tuple(found)
+        own = self.component
+        component = replace(own, locals=(*own.locals, *locals_), sends=(*own.sends, *found))
+        return component if mistakes else self._checked(component, mistakes)
 
-    def infer_locals(self, sends: Sends) -> Named[Dimension]:
+    def _infer_locals(self, sends: Mapping[str, Written]) -> Named[Dimension]:
         """Return the undeclared names that stand alone on the left of an equation.
 
         What one is may hang on another, on itself, or on what is sent: each round settles some. An unknown
-        name on the right is reported once, by `check`.
+        name on the right is reported once, by `_checked`.
         """
         undeclared: dict[Path, Written] = {
             equation.left.parts: (equation.right, equation.text, equation.place)
@@ -115,9 +116,8 @@ class ComponentNames:
             and not equation.left.parts[0].endswith("]")
             and equation.left.parts not in self.dimensions
         }
-        open_: dict[Path, Written] = {
-            (OTHERS, name): (tree, *place) for name, tree, *place in sends
-        } | undeclared
+        open_: dict[Path, Written] = {(OTHERS, name): written for name, written in sends.items()}
+        open_ |= undeclared
         self.dimensions |= dict.fromkeys(open_)
         self.sizes |= dict.fromkeys(open_)
         _settle(open_, self._size, self.sizes.__setitem__)
@@ -132,7 +132,7 @@ class ComponentNames:
         return tuple((name[0], _known(self.dimensions[name])) for name in reversed(undeclared))
 
     def _size(self, expression: Expr, text: str, place: Place) -> int | None:
-        """Return the size of an expression; 0 of one at fault, which `check` reports."""
+        """Return the size of an expression; 0 of one at fault, which `_checked` reports."""
         with Mistakes():
             found = written_out(expression, self.size_of, text, place)
             return len(found) if isinstance(found, tuple) else None if found is None else 0
@@ -143,7 +143,7 @@ class ComponentNames:
             return self._dimension(expression, text, place)
         return None
 
-    def check(self, component: Component, mistakes: Mistakes) -> Component:
+    def _checked(self, component: Component, mistakes: Mistakes) -> Component:
         """Check names, then units and sizes, of every equation, and that what is sent is no reduction.
 
         Return the component without vectors, everything in terms of their entries.

@@ -35,7 +35,7 @@ from apc.compiler.source.reading import (
     whole_number,
 )
 
-Sends = tuple[tuple[str, Expr, str, Place], ...]
+Written = tuple[Expr, str, Place]  # an expression, its text, and where it starts
 VARIABLE = ("unit", "size", "start", "limit", "about")
 NUMBER = ("unit", "size", "min", "above", "max", "default", "about", "shared", "options")
 OPTION = ("options", "default", "about")
@@ -73,16 +73,16 @@ def read_equations(root: Body, mistakes: Mistakes) -> tuple[tuple[Equation, ...]
     return tuple(found), undefined
 
 
-def read_sends(root: Body, mistakes: Mistakes) -> Sends:
-    """Read `sends: {x: sample(object.x)}` as (name, expression, its text, its place)."""
-    found = []
+def read_sends(root: Body, mistakes: Mistakes) -> dict[str, Written]:
+    """Read `sends: {x: sample(object.x)}`."""
+    found = {}
     for key, value in root.section("sends", "{x: sample(object.x)}"):
         with mistakes:
             name = name_of(key, "what is sent")
             text = text_of(value, name, f"{name}: sample(object.x)")
             place = text_place(value)
-            found.append((name, parse_expression(text, place), text, place))
-    return tuple(found)
+            found[name] = parse_expression(text, place), text, place
+    return found
 
 
 def read_variables(root: Body, section: str = "variables") -> tuple[Variable, ...]:
@@ -182,7 +182,7 @@ def _numbers(name: str, body: Body) -> list[Number]:
             value = _number(node, key.text, unit)
             words[key.text] = within(value, node, f"{key.text} of {first}")
     if isinstance(default, Scalar) and default.text in words:
-        defaults = [words[default.text]]
+        defaults: list[Fraction | None] = [words[default.text]]
     else:
         defaults = _entries_of(body, "default", name, unit, size)
     found = []

@@ -88,11 +88,7 @@ def read_component(source: Source, library: Definitions) -> Component:
     if mistakes:
         unread.pass_on(mistakes)
     mistakes.raise_if_any()
-    names = ComponentNames(draft, undefined)
-    locals_, found = names.infer_locals(sends), names.infer_sends(sends, mistakes)
-    component = replace(draft, locals=(*draft.locals, *locals_), sends=(*draft.sends, *found))
-    if not mistakes:
-        component = names.check(component, mistakes)
+    component = ComponentNames(draft, undefined).completed(sends, mistakes)
     unread.pass_on(mistakes)
     mistakes.raise_if_any()
     check_balance(component)

@@ -8,12 +8,14 @@ Does not: read what is in a definition (see `definitions`).
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 from apc.compiler.cache import SUFFIX, builtin_files
 from apc.compiler.components.component import Component, Connector
 from apc.compiler.components.definitions import read_component, read_connector
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.files import RefusedError, files_below, read_file, same_file
 from apc.compiler.source.nodes import MAX_BYTES, Mapping, Scalar
 from apc.compiler.source.reading import brief, fault
@@ -110,19 +112,14 @@ def _read(path: Path) -> Source:
     try:
         return read_source(path)
     except ApcError as error:
-        if any(word in _text(path) for word in (b"component", b"connector")):
+        text = b"component"  # why a file is refused tells nothing of what is in it
+        with suppress(RefusedError):
+            text = read_file(path, MAX_BYTES)
+        if b"component" in text or b"connector" in text:
             raise
-        what = "a file of a library"
-        expected = "YAML that defines a component or connector"
-        places = [Place(one.place.file, one.place.line, one.place.column) for one in error.mistakes]
+        what, expected = "a file of a library", "YAML that defines a component or connector"
+        places = [replace(one.place, source_line="") for one in error.mistakes]
         raise ApcError(Mistake("E219", place, what, expected) for place in places) from None
-
-
-def _text(path: Path) -> bytes:
-    try:
-        return read_file(path, MAX_BYTES)
-    except RefusedError:
-        return b"component"  # why it is not read tells nothing of what is in it
 
 
 def definition_of(source: Source) -> tuple[str, str]:
