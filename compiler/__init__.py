@@ -11,7 +11,7 @@ language                    expression, parsing, grammar: text to trees; evaluat
                             vectors; values, tables, recordings: numbers of a scene, and in CSV files
                             probes: of what ping and irtt wrote
 components                  component, parts, declarations, component_check, definitions, library
-scene                       named_numbers, timebase, instances, sections, channels, graphs, links, groups,
+scene                       named_numbers, timebase, instances, graphs, links, groups,
                             studies: a section each; oddities: warnings; scene: all of them
 equations                   connections: where connectors meet; flatten: equations and crossings
                             clocks: what ticks together; terms, zero_test: SymPy

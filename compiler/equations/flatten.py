@@ -45,8 +45,9 @@ from apc.compiler.language.expression import (
 )
 from apc.compiler.language.values import Value
 from apc.compiler.language.vectors import whole_and_index
+from apc.compiler.scene.groups import SceneGroup
 from apc.compiler.scene.instances import Part
-from apc.compiler.scene.scene import Scene, SceneGroup
+from apc.compiler.scene.scene import Scene
 
 HEARD_AGE = f"{OTHERS}.age"  # in what a reduction runs over; no send has this name, as a part's stands before
 CONNECTION = "connection"  # where an equation comes from that is no part's

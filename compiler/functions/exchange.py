@@ -40,17 +40,13 @@ from apc.compiler.language.evaluation import evaluate, formula_of
 from apc.compiler.language.expression import Expr, Name, Number, transform
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import Value, renamed
-from apc.compiler.scene.scene import Scene, SceneGroup
+from apc.compiler.scene.groups import SceneGroup
+from apc.compiler.scene.links import PROBABILITIES
+from apc.compiler.scene.scene import Scene
 from apc.compiler.words import enumerated
 
 NO_DELAY = "no delay"
 Left = list[tuple[str, str]]  # what the scene names and nothing needs, with the reason
-LOSS_ABOUT = (
-    "probability that a good link turns bad after a packet",
-    "probability that a bad link turns good after a packet",
-    "probability that a bad link loses a packet",
-    "probability that a good link loses a packet",
-)
 
 
 def period_of(clock: str) -> str:
@@ -346,7 +342,7 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
         if count_of(link.name) in needed:  # every group has its own value
             found.append(Parameter(count_of(link.name), "1", float(scene.peers - 1), about=COUNT_ABOUT))
         if link.channel is not None and link.name in used:
-            for (name, value), about in zip(link.channel.loss, LOSS_ABOUT, strict=False):
+            for (name, value), about in zip(link.channel.loss, PROBABILITIES.values(), strict=False):
                 found.append(replace(_named(name, value, about), minimum=0.0, maximum=1.0))
     for clock in scene.clocks:
         if (name := period_of(clock.name)) in needed:  # by `interval`: the same number as the timing

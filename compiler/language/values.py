@@ -65,8 +65,12 @@ class Value:
         return format_si(float(self.number), self.dimension)
 
 
-class AlreadyReportedError(Exception):
+class AlreadyReportedError(ApcError):
     """Raised by a look-up for a name whose own fault was reported: what depends on it needs no message."""
+
+    def __init__(self) -> None:
+        """Hold no mistake."""
+        self.mistakes = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,8 +166,6 @@ def read_binding(
         )
     except ApcError as error:
         mistakes.take(error)
-        return None
-    except AlreadyReportedError:
         return None
 
 

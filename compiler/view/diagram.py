@@ -14,7 +14,7 @@ from fractions import Fraction
 from html import escape
 
 from apc.compiler.components.component import Number, Reference
-from apc.compiler.components.parts import GROUND
+from apc.compiler.components.parts import DEFAULT_TYPES, GROUND
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.unit_text import format_si
@@ -23,7 +23,6 @@ from apc.compiler.language.vectors import whole_and_index
 from apc.compiler.scene.instances import Part
 from apc.compiler.scene.links import SceneLink
 from apc.compiler.scene.scene import Scene
-from apc.compiler.scene.sections import DEFAULT_TYPES
 from apc.compiler.words import counted
 
 ROLES = {"masses": "mass", "couplers": "coupler", "hands": "hand"}

@@ -14,38 +14,22 @@ from collections.abc import Iterable
 from typing import Any
 
 from apc.compiler.compiled import LARGEST_COUNT
-from apc.compiler.components.component import Component, Number, Option, Parameter, Reference
+from apc.compiler.components.component import ROLES, Component, Number, Option, Parameter, Reference
 from apc.compiler.components.library import Library
-from apc.compiler.components.parts import LARGEST_ARRAY
+from apc.compiler.components.parts import DEFAULT_TYPES, LARGEST_ARRAY, PART_KEYS
 from apc.compiler.errors import Place
-from apc.compiler.functions.exchange import LOSS_ABOUT
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.units import Unit, parse_unit
 from apc.compiler.language.vectors import whole_and_index
-from apc.compiler.scene.channels import PROBABILITIES
 from apc.compiler.scene.graphs import SHAPES
-from apc.compiler.scene.instances import PART_KEYS
-from apc.compiler.scene.sections import DEFAULT_TYPES, SECTIONS
+from apc.compiler.scene.groups import GROUP
+from apc.compiler.scene.links import PROBABILITIES
+from apc.compiler.scene.scene import REQUIRED, SECTIONS, TOPOLOGY
 from apc.compiler.source.reading import IDENTIFIER
 
 Schema = dict[str, Any]
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-ABOUT = {
-    "topology": "the scene's name",
-    "about": "one sentence",
-    "library": "folders of components of one's own, from this file's folder",
-    "clocks": "what ticks, and how often",
-    "parameters": "named quantities, for use in expressions",
-    "peers": "who is there: groups of peers",
-    "masses": "what each peer has",
-    "couplers": "what pulls at masses",
-    "links": "what carries samples to the other peers",
-    "hands": "what moves a device",
-    "experiment": "what a simulation runs for",
-    "studies": "which parameters a study varies",
-}
-REQUIRED = ("topology", "peers", "masses")
 # Any unit may be written; of these an editor can say at once that one does not fit, or propose one that does.
 EVERYDAY_UNITS = (
     *("kg", "g", "mg", "m", "mm", "cm", "um", "s", "ms", "us", "min", "h", "Hz", "kHz"),
@@ -81,9 +65,14 @@ def topology_schema(library: Library) -> Schema:
     definitions = {
         "name": {"type": "string", "pattern": _pattern(IDENTIFIER)},
         "joined": {"type": "string", "pattern": _TARGET, "examples": ["ground"]},
-        "at": {"type": "array", "items": {"$ref": "#/$defs/name"}, "description": "only at these groups"},
-        "count": {"type": "integer", "minimum": 1, "maximum": LARGEST_ARRAY, "description": "an array"},
-        "shared": {"type": "boolean", "description": "a copy at each peer of one object"},
+        "at": {"type": "array", "items": {"$ref": "#/$defs/name"}, "description": PART_KEYS["at"]},
+        "count": {
+            "type": "integer",
+            "minimum": 1,
+            "maximum": LARGEST_ARRAY,
+            "description": PART_KEYS["count"],
+        },
+        "shared": {"type": "boolean", "description": PART_KEYS["shared"]},
         "clock": {"anyOf": [clock, _object({"period": clock, "phase": clock}, required=("period",))]},
         "group": _group(),
         "part": _by_type({name: {"$ref": f"#/$defs/{name}"} for name in parts}),
@@ -116,7 +105,7 @@ def topology_schema(library: Library) -> Schema:
         "$schema": DIALECT,
         "title": "A topology of apc",
         "type": "object",
-        "properties": {key: {"description": ABOUT[key], **schema} for key, schema in properties.items()},
+        "properties": {key: {"description": TOPOLOGY[key], **schema} for key, schema in properties.items()},
         "required": list(REQUIRED),
         "additionalProperties": False,
         # Components of one's own are known to the compiler alone.
@@ -221,16 +210,10 @@ def _parameter(parameter: Parameter, quantities: _Quantities) -> Schema:
         default = {} if parameter.default is None else {"default": parameter.default}
         return {"enum": list(parameter.words), **default, **about}
     if isinstance(parameter, Reference):
-        by_role = {
-            "clock": {"$ref": "#/$defs/name", "description": "a clock"},
-            "link": {"$ref": "#/$defs/name", "description": "a link"},
-            "graph": {"$ref": "#/$defs/graph", "description": "who hears whom"},
-            "delays": {"$ref": "#/$defs/delays", "description": "other delays: sending group, hearing group"},
-            "loss": {"$ref": "#/$defs/loss", "description": "how packets get lost"},
-            "trace": {**_string(), "description": "a CSV file of recorded delays, one a packet"},
-            "table": {**_string(), "description": "a CSV file of numbers over time"},
-        }
-        return {**by_role[parameter.role], **about}
+        role = parameter.role
+        named = "name" if role in ("clock", "link") else role
+        schema = _string() if role in ("trace", "table") else {"$ref": f"#/$defs/{named}"}
+        return {**schema, "description": ROLES[role], **about}
     schema = quantities.of(parameter.unit)
     if parameter.words:
         schema = {"anyOf": [{"enum": [word for word, _ in parameter.words]}, schema]}
@@ -303,15 +286,15 @@ def _group() -> Schema:
                     "type": "integer",
                     "minimum": 1,
                     "maximum": LARGEST_COUNT,
-                    "description": "how many",
+                    "description": GROUP["count"],
                 },
                 "set": {
                     "type": "object",
-                    "description": "this group's own settings; a list has a value a peer",
+                    "description": GROUP["set"],
                     "propertyNames": {"pattern": _SETTING},
                     "additionalProperties": {"anyOf": [value, values, {"type": "array", "items": values}]},
                 },
-                "table": {**_string(), "description": "a CSV file with a row a peer"},
+                "table": {**_string(), "description": GROUP["table"]},
             }
         ),
     }
@@ -326,8 +309,9 @@ def _graph() -> Schema:
 
 
 def _loss() -> Schema:
-    told = dict(zip(PROBABILITIES, LOSS_ABOUT, strict=True))
-    each = {name: {"$ref": "#/$defs/probability", "description": about} for name, about in told.items()}
+    each = {
+        name: {"$ref": "#/$defs/probability", "description": about} for name, about in PROBABILITIES.items()
+    }
     return {"anyOf": [{"$ref": "#/$defs/probability"}, _object(each, required=["p"])]}
 
 
