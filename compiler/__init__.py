@@ -21,7 +21,7 @@ equations                   connections: where connectors meet; flatten
                             and states; structure
 functions                   casadi_writer, reached: what is written; exchange: what lies beside;
                             functions
-compiled, plain, formula    the compiled model; operations of its functions; numbers that follow from others
+compiled, plain             the compiled model; operations of its functions
 interpolation               tables over time in these functions
 crowd                       how many peers there are, and how many each hears
 store                       the compiled model on disk

@@ -36,7 +36,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, files_below, read_file
 from apc.compiler.seal import is_sealed, seal
 
-FORMAT = 13  # of NAME.apc
+FORMAT = 14  # of NAME.apc
 LARGEST = 256 * 2**20  # bytes of the file
 LARGEST_ORIGIN = 64 * 2**20  # bytes of its third line, each of which takes up to ten of memory
 SUFFIX = ".yaml"  # of the files in a folder of components
