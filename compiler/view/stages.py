@@ -21,10 +21,10 @@ from apc.compiler.equations.structure import SortedSystem
 from apc.compiler.equations.terms import text_of
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.unit_text import format_dimension
-from apc.compiler.language.values import Value
 from apc.compiler.scene.scene import Scene
 from apc.compiler.source.nodes import Mapping, Node, Scalar
 from apc.compiler.source.source import Source
+from apc.compiler.view.diagram import build_diagram
 
 
 def step_lines(step: Assignment | ImplicitBlock) -> Iterator[str]:
@@ -66,35 +66,15 @@ def _nodes(node: Node, indent: str) -> Iterator[str]:
 @describe.register
 def _(scene: Scene) -> str:
     lines = [f"topology {scene.name}: {scene.about}"]
-    lines += [
-        f"clock {c.name}: every {_quantity(c.period)}, first at {_quantity(c.phase)}" for c in scene.clocks
-    ]
-    lines += [f"parameter {name} = {_quantity(value)}" for name, value in scene.parameters]
-    for group in scene.groups:
-        lines.append(f"group {group.name}: {group.count} peers")
-        lines += [f"  {name} = {_quantity(value)}" for name, value in group.values]
-        lines += [f"  {name} = {word}" for name, word in group.words]
-        lines += [f"  {name}: a value a peer" for name, _ in group.columns]
-    for part in scene.parts:
-        shared = ", shared" if part.shared else ""
-        lines.append(
-            f"{part.section} {part.name}: {part.component.name}{shared}, at {', '.join(part.groups)}"
-        )
-        lines += [f"  {name} = {_quantity(value)}" for name, value in (*part.values, *part.starts)]
-        lines += [f"  {name} = {word}" for name, word in (*part.options, *part.references)]
-        lines += [
-            f"  {own} joins {f'{other}.{its}' if its else other}" for own, other, its in part.connections
-        ]
-    for link in scene.links:
-        lines.append(f"link {link.name}: {link.graph.shape}, on {link.clock}, delay {_quantity(link.delay)}")
-        lines += [f"  from {d.sender} to {d.receiver}: {_quantity(d.delay)}" for d in link.delays]
-        if link.channel is not None:
-            lines += [f"  {told}" for told in link.channel.told]
+    lines += [f"clock {c.name}: every {c.period}, first at {c.phase}" for c in scene.clocks]
+    for name, value in scene.parameters:
+        expression = f"{format_expression(value.expression)} = " if value.expression else ""
+        lines.append(f"parameter {name} = {expression}{value}")
+    diagram = build_diagram(scene)
+    for box in diagram.boxes:
+        lines += [f"{box.role} {box.lines[0]}", *(f"  {line}" for line in box.lines[1:])]
+    lines += [f"{edge.one} joins {edge.two}" for edge in diagram.edges if not edge.sent]
     return "\n".join(lines)
-
-
-def _quantity(value: Value) -> str:
-    return f"{format_expression(value.expression)} = {value}" if value.expression else str(value)
 
 
 @describe.register
