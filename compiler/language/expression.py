@@ -244,38 +244,27 @@ def _format_number(value: Fraction) -> tuple[str, int]:
     return f"{sign}{number:f}", level
 
 
+_PARTS: dict[type[Spanned], tuple[str, ...]] = {
+    Negate: ("operand",),
+    Not: ("operand",),
+    **dict.fromkeys((Binary, Compare, Logic), ("left", "right")),
+    Call: ("arguments",),
+    Conditional: ("condition", "then", "otherwise"),
+    Vector: ("entries",),
+}
+
+
 def children(expr: Expr) -> tuple[Expr, ...]:
     """Return the sub-expressions of a node, left to right."""
-    match expr:
-        case Number() | Name():
-            return ()
-        case Negate() | Not():
-            return (expr.operand,)
-        case Binary() | Compare() | Logic():
-            return (expr.left, expr.right)
-        case Call():
-            return expr.arguments
-        case Conditional():
-            return (expr.condition, expr.then, expr.otherwise)
-        case Vector():
-            return expr.entries
+    parts = [getattr(expr, name) for name in _PARTS.get(type(expr), ())]
+    several: tuple[Expr, ...] = parts[0] if isinstance(expr, Call | Vector) else tuple(parts)
+    return several
 
 
 def rebuild(expr: Expr, parts: tuple[Expr, ...]) -> Expr:
     """Return the node with other sub-expressions, in the order of `children`."""
-    match expr:
-        case Number() | Name():
-            return expr
-        case Negate() | Not():
-            return replace(expr, operand=parts[0])
-        case Binary() | Compare() | Logic():
-            return replace(expr, left=parts[0], right=parts[1])
-        case Call():
-            return replace(expr, arguments=parts)
-        case Conditional():
-            return replace(expr, condition=parts[0], then=parts[1], otherwise=parts[2])
-        case Vector():
-            return replace(expr, entries=parts)
+    values = (parts,) if isinstance(expr, Call | Vector) else parts
+    return replace(expr, **dict(zip(_PARTS.get(type(expr), ()), values, strict=True)))
 
 
 def interval_of(clock: str) -> str:

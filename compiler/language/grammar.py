@@ -200,28 +200,19 @@ def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
     raise FaultError("E322", token, what)
 
 
-def _check(expr: Expr, text: str) -> None:
+def _check(expr: Expr, text: str, depth: int = 1, *, conditional: bool = False) -> None:
     """Raise E328 if a tree is too deep, E327 for a condition where a number is due or the reverse."""
-    fault: FaultError | None = None
-    waiting: list[tuple[Expr, int, bool]] = [(expr, 0, False)]
-    while waiting:
-        node, depth, conditional = waiting.pop()
-        if depth >= MAX_DEPTH:
-            raise FaultError("E328", node.start, TOO_DEEP)
-        condition = isinstance(node, Compare | Logic | Not)
-        # A name may stand for a condition; what it is, only its declaration can tell.
-        if condition != conditional and not isinstance(node, Name):
-            kinds = "a condition, and a number" if condition else "a number, and a condition"
-            what = f"{cut(text[node.start : node.end])} is {kinds} is due here"
-            fault = fault or FaultError("E327", node.start, what)
-        first, others = isinstance(node, Logic | Not | Conditional), isinstance(node, Logic)
-        # A first operand that is a leaf is read at the level of its operator.
-        parts = children(node)
-        levels = [depth + 1 - (part is parts[0] is not parts[-1] and not children(part)) for part in parts]
-        due = [first, *(others for _ in parts[1:])]
-        waiting += reversed([*zip(parts, levels, due, strict=False)])
-    if fault is not None:
-        raise fault
+    if depth > MAX_DEPTH:
+        raise FaultError("E328", expr.start, TOO_DEEP)
+    condition = isinstance(expr, Compare | Logic | Not)
+    # A name may stand for a condition; what it is, only its declaration can tell.
+    if condition != conditional and not isinstance(expr, Name):
+        kinds = "a condition, and a number" if condition else "a number, and a condition"
+        what = f"{cut(text[expr.start : expr.end])} is {kinds} is due here"
+        raise FaultError("E327", expr.start, what)
+    for place, part in enumerate(children(expr)):
+        due = isinstance(expr, Logic) or (place == 0 and isinstance(expr, Not | Conditional))
+        _check(part, text, depth + 1, conditional=due)
 
 
 def _check_name(token: Token) -> None:

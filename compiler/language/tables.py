@@ -16,7 +16,7 @@ import io
 import re
 import zlib
 from array import array
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -113,18 +113,14 @@ def read_table(path: Path, named_at: Place) -> Table:
         E701 it can't be read, E702 a heading, E703 a row or cell is at fault.
     """
     with open_table(path, named_at) as opened:
-        mistakes = Mistakes()
         headings = opened.headings
-        cells, lines = _rows(opened, mistakes)
-        mistakes.raise_if_any()
-        if not lines:
-            raise ApcError(Mistake("E703", Place(opened.file, 2, 1), "the table has headings but no rows"))
-    numbers = np.frombuffer(cells, dtype=np.float64).reshape(len(lines), len(headings))
+        cells, lines = opened.numbers(range(len(headings)), plain_float, "a cell", "a finite number")
+    numbers = cells.reshape(len(lines), len(headings))
     columns = tuple(
         Column(name, unit, numbers[:, i] * float(unit.scale), place)
         for i, (name, unit, place) in enumerate(headings)
     )
-    return Table(opened.file, columns, tuple(lines), opened.digest)
+    return Table(opened.file, columns, lines, opened.digest)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,19 +132,64 @@ class Opened:
     headings: Headings
     rows: Any  # a reader of the module csv, whose type has no public name
 
-    def numbered(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield each row with the line it begins in: a cell in quotes may go over several."""
+    def numbers(
+        self,
+        columns: Sequence[int],
+        number: Callable[[str], float],
+        what: str,
+        expected: str,
+        *,
+        empty_too: bool = False,
+    ) -> tuple[NDArray[np.float64], tuple[int, ...]]:
+        """Return the numbers of some columns, row after row, and the line that each row begins in.
+
+        Parameters
+        ----------
+        columns
+            Which columns, counted from 0.
+        number
+            Gives the number of a cell, or raises ValueError.
+        what, expected
+            What a cell is and has to be, for messages.
+        empty_too
+            Read rows whose cells are all empty, too; a line without a character is no row.
+
+        Raises
+        ------
+        ApcError
+            E703 a row or cell is at fault, or there is none.
+        """
+        mistakes, numbers, lines, faults = Mistakes(), array("d"), array("q"), 0
         begin = self.rows.line_num + 1
         for cells in self.rows:
-            yield begin, cells
-            begin = self.rows.line_num + 1
-
-    def is_whole(self, cells: list[str], line: int, mistakes: Mistakes) -> bool:
-        """Say whether a row has as many cells as there are headings, and record it if not."""
-        if len(cells) != len(self.headings):
-            what = f"the row has {len(cells)} cells and there are {len(self.headings)} headings"
-            mistakes.add("E703", Place(self.file, line, 1), what)
-        return len(cells) == len(self.headings)
+            # A cell in quotes may go over several lines.
+            place, begin = Place(self.file, begin, 1), self.rows.line_num + 1
+            filled = len(cells) > 1 or (cells and not cells[0].isspace())
+            if not (filled if empty_too else any(map(str.strip, cells))):
+                continue
+            lines.append(place.line)
+            try:
+                if len(cells) != len(self.headings):
+                    reason = f"the row has {len(cells)} cells and there are {len(self.headings)} headings"
+                    mistakes.add("E703", place, reason)
+                    faults += 1
+                else:
+                    numbers.extend([number(cells[column]) for column in columns])
+            except ValueError:
+                for column in columns:
+                    try:
+                        number(cells[column])
+                    except ValueError:
+                        at = place.shifted(sum(len(cell) + 1 for cell in cells[:column]))
+                        got = brief(cells[column]) or "nothing"
+                        mistakes.add("E703", at, what, expected=expected, got=got)
+                faults += 1
+            if faults >= MOST_MISTAKES:
+                break
+        mistakes.raise_if_any()
+        if not lines:
+            raise ApcError(Mistake("E703", Place(self.file, 2, 1), "the table has headings but no rows"))
+        return np.frombuffer(numbers, dtype=np.float64), tuple(lines)
 
 
 @contextmanager
@@ -262,33 +303,3 @@ def _heading(text: str, place: Place, mistakes: Mistakes) -> tuple[str, Unit]:
     except ApcError as error:
         mistakes.take(error)
         return name, NO_UNIT
-
-
-def _rows(opened: Opened, mistakes: Mistakes) -> tuple[array[float], array[int]]:
-    """Return all numbers, row after row, and the line of each row."""
-    numbers, lines = array("d"), array("q")
-    faults = 0
-    for line, cells in opened.numbered():
-        if not any(cell.strip() for cell in cells):
-            continue
-        try:
-            whole = opened.is_whole(cells, line, mistakes)
-            numbers.extend([plain_float(cell) for cell in cells] if whole else [])
-            lines.append(line)
-        except ValueError:
-            _add_bad_cells(cells, opened.file, line, mistakes)
-            whole = False
-        faults += not whole
-        if faults >= MOST_MISTAKES:
-            break
-    return numbers, lines
-
-
-def _add_bad_cells(cells: list[str], file: str, line: int, mistakes: Mistakes) -> None:
-    place = Place(file, line, 1)
-    for cell in cells:
-        try:
-            plain_float(cell)
-        except ValueError:
-            mistakes.add("E703", place, "a cell", expected="a finite number", got=brief(cell) or "nothing")
-        place = place.shifted(len(cell) + 1)
