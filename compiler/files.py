@@ -196,29 +196,26 @@ def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
 
 
 def _walked(folder: Path, suffix: str) -> tuple[Path, ...]:
-    kernels = _kernels_devices()
     found: list[Path] = []
-    seen = 0
-    waiting = [(folder, 1)]
-    while waiting:
-        here, depth = waiting.pop()
-        if depth > MOST_DEPTH:
-            raise RefusedError("large", f"is more than {MOST_DEPTH} folders deep")
-        try:
-            if os.stat(here).st_dev in kernels:  # noqa: PTH116 -- as in os.scandir
+    kernels, entries = _kernels_devices(), 0
+    try:
+        for name, folders, files in os.walk(folder, onerror=_raise):
+            path = Path(name)
+            if len(path.relative_to(folder).parts) >= MOST_DEPTH:
+                raise RefusedError("large", f"is more than {MOST_DEPTH} folders deep")
+            if path.stat().st_dev in kernels:
                 raise RefusedError("special", KERNELS_OWN)
-            with os.scandir(here) as entries:
-                for entry in entries:
-                    seen += 1
-                    if seen > MOST_ENTRIES:
-                        raise RefusedError("large", f"holds more than {MOST_ENTRIES} files and folders")
-                    if entry.is_dir(follow_symlinks=False):
-                        waiting.append((Path(entry.path), depth + 1))
-                    elif entry.name.endswith(suffix):
-                        found.append(Path(entry.path))
-        except (OSError, ValueError) as error:
-            raise _refusal(error) from None
+            entries += len(folders) + len(files)
+            if entries > MOST_ENTRIES:
+                raise RefusedError("large", f"holds more than {MOST_ENTRIES} files and folders")
+            found += [path / file for file in files if file.endswith(suffix)]
+    except (OSError, ValueError) as error:
+        raise _refusal(error) from None
     return tuple(sorted(found))
+
+
+def _raise(error: OSError) -> None:
+    raise error
 
 
 def same_file(one: Path, other: Path) -> bool:

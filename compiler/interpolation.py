@@ -36,13 +36,6 @@ class Interpolation:
         """The slopes of its lines, 0 before the first row and after the last (n + 1,)."""
         return np.pad(np.diff(self.numbers) / np.diff(self.times), 1)
 
-    @property
-    def is_consistent(self) -> bool:
-        """Whether its rows are finite numbers at rising times."""
-        rows = np.concatenate([self.times, self.numbers])
-        rising = len(self.times) > 1 and bool((np.diff(self.times) > 0).all())
-        return rising and len(self.times) == len(self.numbers) and bool(np.isfinite(rows).all())
-
     def value(self, at: Any, number: Callable[[float], Any]) -> Any:
         """Return what the table says at a number of some kind, which a float is turned into by `number`."""
         place = self._place(at)

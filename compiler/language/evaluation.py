@@ -20,7 +20,6 @@ from apc.compiler.compiled import Formula
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.language.expression import (
     SMOOTH,
-    Binary,
     Call,
     Compare,
     Conditional,
@@ -31,6 +30,7 @@ from apc.compiler.language.expression import (
     children,
     format_expression,
     names,
+    operation,
     walk,
 )
 from apc.compiler.language.grammar import parse_expression
@@ -224,16 +224,7 @@ def _operation(expr: Expr, operands: list[Any], rule: Rule) -> Any:
             operands = operands[::-1]
         case Call("max" | "min"):
             return reduce(rule(_OPERATIONS[expr.function]), operands)
-    return rule(_OPERATIONS[_key(expr)])(*operands)
-
-
-def _key(expr: Expr) -> str:
-    match expr:
-        case Binary() | Compare() | Logic():
-            return expr.operator
-        case Call():
-            return expr.function
-    return type(expr).__name__
+    return rule(_OPERATIONS[operation(expr)])(*operands)
 
 
 def _check_functions(expr: Expr, place: Place) -> None:

@@ -1,8 +1,8 @@
 """The nodes of an expression's tree, walking and changing them, and their text.
 
 Takes: `Expr` trees.
-Gives: the node types, `Equation`, `format_expression`, `interval_of`, `children`, `rebuild`, `walk`, `names`,
-`transform`, `fold`.
+Gives: the node types, `Equation`, `format_expression`, `interval_of`, `operation`, `children`, `rebuild`,
+`walk`, `names`, `transform`, `fold`.
 Guarantees: plain frozen data; the text has no more parentheses than the tree needs.
 Does not: read text (see `grammar`), or know what a name means, or its unit.
 """
@@ -252,6 +252,16 @@ _PARTS: dict[type[Spanned], tuple[str, ...]] = {
     Conditional: ("condition", "then", "otherwise"),
     Vector: ("entries",),
 }
+
+
+def operation(expr: Expr) -> str:
+    """Return what a node does: its operator, its function, or else the name of its type."""
+    match expr:
+        case Binary() | Compare() | Logic():
+            return expr.operator
+        case Call():
+            return expr.function
+    return type(expr).__name__
 
 
 def children(expr: Expr) -> tuple[Expr, ...]:

@@ -14,7 +14,7 @@ or `cross`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial, reduce
@@ -23,19 +23,17 @@ from typing import NoReturn
 
 from apc.compiler.errors import ApcError, Mistake, Place, place_in
 from apc.compiler.language.expression import (
+    COMPARISONS,
     Binary,
     Call,
-    Compare,
-    Conditional,
     Equation,
     Expr,
-    Logic,
     Name,
-    Not,
     Number,
     Vector,
     children,
     format_expression,
+    operation,
     rebuild,
     walk,
 )
@@ -44,6 +42,14 @@ from apc.compiler.language.grammar import MAX_LENGTH
 SIZES = (2, 3)
 VECTOR_WORDS = ("{", "dot", "norm", "cross")  # what makes or takes vectors is written with one of these
 LONGEST_REPEATED = 20  # characters of a number that a message writes once for each entry
+
+# Which parts of an operation are numbers, never vectors, and which are left as they are.
+NUMBERS: dict[str, tuple[int, ...]] = {
+    **dict.fromkeys((*COMPARISONS, "and", "or", "Not"), (0, 1)),
+    **dict.fromkeys(("/", "hold", "interpolate"), (1,)),
+    "Conditional": (0,),
+}
+AS_THEY_ARE: dict[str, tuple[int, ...]] = {"sample": (1,), "interpolate": (0,)}
 
 # An expression written out: a number, a vector's entries, or None where a name's size isn't known yet.
 Written = Expr | tuple[Expr, ...] | None
@@ -140,64 +146,43 @@ class _Writer:
 
     def written(self, expr: Expr) -> Written:
         match expr:
-            case Number():
+            case Number() | Call("count"):  # peers are counted, whatever they send
                 return expr
             case Name(path):
                 size = self.size_of(path)
                 if size is None:
                     return None
-                whole = (replace(expr, parts=(*path[:-1], one)) for one in entries(path[-1], size))
-                return tuple(whole) if size else expr
+                names = (replace(expr, parts=(*path[:-1], name)) for name in entries(path[-1], size))
+                return tuple(names) if size else expr
             case Vector():
                 if len(expr.entries) not in SIZES:
                     got = f"{len(expr.entries)}"
                     self.fail("E406", expr, self.said(expr), f"{_or(SIZES)} entries", got)
-                return tuple(self.number(one) for one in expr.entries)
-            case Binary("*"):
-                parts = [self.written(expr.left), self.written(expr.right)]
-                if all(isinstance(part, tuple) for part in parts):
-                    hint = f"dot({format_expression(expr.left)}, {format_expression(expr.right)})"
-                    self.fail("E407", expr, self.said(expr), "one vector at most in a product", "two", hint)
-                return self.each(expr, parts)
+                return tuple(map(self.number, expr.entries))
+            case Call("dot" | "cross" | "norm"):
+                return self.product(expr)
             case Binary("^"):
                 inner, power = format_expression(expr.left), format_expression(expr.right)
                 hint = f"dot({inner}, {inner})" if power == "2" else f"norm({inner})^{power}"
                 return self.each(expr, [self.number(expr.left, hint), expr.right])
-            case Compare() | Logic() | Not():
-                return self.of_parts(expr, numbers=range(2))
-            case Conditional():
-                return self.of_parts(expr, numbers=(0,))
-            case Call():
-                return self.call(expr)
-            case _:
-                divided = isinstance(expr, Binary) and expr.operator == "/"
-                return self.of_parts(expr, numbers=(1,) if divided else ())
-
-    def of_parts(self, expr: Expr, *, numbers: Container[int]) -> Written:
-        """Write a node out whose parts have to be numbers at some places, and of one size at the others."""
-        parts = children(expr)
-        found = [self.number(p) if k in numbers else self.written(p) for k, p in enumerate(parts)]
-        alike = [k for k in range(len(parts)) if k not in numbers]
-        if isinstance(expr, Call):  # which takes numbers beside vectors
-            alike = [k for k in alike if isinstance(found[k], tuple)]
-        self.agree([parts[k] for k in alike], [found[k] for k in alike])
-        return self.each(expr, found)
-
-    def call(self, expr: Call) -> Written:
-        first, *others = expr.arguments
-        match expr.function:
-            case "dot" | "cross" | "norm":
-                return self.product(expr)
-            case "count":
-                return expr  # of peers, whatever they send
-            case "age":  # of a vector, which travels in one packet
-                found = self.written(first)
-                return replace(expr, arguments=found[:1]) if isinstance(found, tuple) else expr
-            case "sample":
-                return self.each(expr, [self.written(first), *others])  # the second is a clock
-            case "interpolate":
-                return self.each(expr, [first, *map(self.number, others)])
-        return self.of_parts(expr, numbers=(1,) if expr.function == "hold" else ())
+        parts, word = children(expr), operation(expr)
+        numbers, skipped = NUMBERS.get(word, ()), AS_THEY_ARE.get(word, ())
+        written = [
+            part if k in skipped else self.number(part) if k in numbers else self.written(part)
+            for k, part in enumerate(parts)
+        ]
+        is_vector = [isinstance(part, tuple) for part in written]
+        if word == "age":  # of a vector, which travels in one packet
+            return replace(expr, arguments=written[0][:1]) if isinstance(written[0], tuple) else expr
+        if word == "*" and all(is_vector):
+            hint = f"dot({', '.join(map(format_expression, parts))})"
+            self.fail("E407", expr, self.said(expr), "one vector at most in a product", "two", hint)
+        if word != "*":
+            # A function takes numbers beside vectors.
+            equal = [k for k in range(len(parts)) if k not in (*numbers, *skipped)]
+            equal = [k for k in equal if is_vector[k] or not isinstance(expr, Call)]
+            self.agree([parts[k] for k in equal], [written[k] for k in equal])
+        return self.each(expr, written)
 
     def product(self, expr: Call) -> Written:
         """Write out `dot`, `cross` and `norm`, each piece of which stands where the whole does."""

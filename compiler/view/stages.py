@@ -1,4 +1,4 @@
-"""The value of any stage as text for a person to read: what `apc compile --until` prints.
+"""The value of any stage before the last as text for a person to read: what `apc compile --until` prints.
 
 Takes: the value of a stage. Gives: `describe`; `step_lines`, of what is computed.
 Guarantees: the same topology gives the same bytes.
@@ -7,13 +7,9 @@ Does not: compute anything new.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from functools import singledispatch
-from typing import Any
 
-import casadi
-
-from apc.compiler.compiled import CompiledSystem
 from apc.compiler.equations.clocks import ClockedSystem, ReceiveCrossing
 from apc.compiler.equations.flatten import FlatKind, FlatSystem
 from apc.compiler.equations.solution import Assignment, ImplicitBlock
@@ -124,27 +120,3 @@ def _(system: SortedSystem) -> str:
         lines += [f"  {name} := {text_of(expression)}" for name, _, expression in kind.samples]
         lines += [f"  send over {s.link}: {s.name} := {text_of(s.expression)}" for s in kind.sends]
     return "\n".join(lines)
-
-
-@describe.register
-def _(system: CompiledSystem) -> str:
-    lines = [f"{system.name}: {system.about}"]
-    lines += [f"timing {t.name} = {t.value} s" for t in system.timings]
-    lines += [f"parameter {p.name} = {p.value:.12g} {p.unit}" for p in system.parameters]
-    for kind in system.kinds:
-        lines.append(f"kind {kind.name}")
-        lines += _function_lines(kind.derivative, [f"der({state.name})" for state in kind.states])
-        for clock in kind.clocks:
-            lines += _function_lines(clock.tick, clock.outputs)
-        for send in kind.sends:
-            lines += _function_lines(send.send, send.channels)
-    lines += [f"dropped {name}: {reason}" for name, reason in system.dropped]
-    return "\n".join(lines)
-
-
-def _function_lines(function: Any, names: Iterable[str]) -> Iterator[str]:
-    yield f"  {function}"
-    if not function.is_a("SXFunction"):
-        return  # it solves a loop: a graph of matrices, whose entries have no text of their own
-    values = function(*function.sx_in())
-    yield from (f"    {name} = {casadi.SX(values[row])}" for row, name in enumerate(names))
