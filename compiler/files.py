@@ -14,11 +14,13 @@ Does not: know a format, or say at which line a file was named.
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import stat
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Literal
@@ -32,10 +34,7 @@ STDOUT = 1  # the descriptor of standard output
 KERNELS = ("/proc", "/sys")  # file systems whose files are answers of the kernel
 KERNELS_OWN = "is an answer of the system's kernel"
 
-MOST_WRITERS = 1000  # of one file at once
 UNFINISHED = ".unfinished"  # how the name of a temporary file ends that goes with the next writer
-
-_locks: dict[Path, int] = {}  # what keeps the temporary files of this process from being taken for left ones
 
 Why = Literal["missing", "folder", "special", "large", "forbidden", "unreadable"]
 
@@ -307,7 +306,8 @@ def unwritable(path: Path, error: OSError | ValueError) -> ApcError:
 def begin_file(path: Path) -> Path:
     """Make the empty temporary file of a path: beside what it leads to, so that a rename puts it there.
 
-    What writers of the same path left that were killed is removed.
+    What writers of the same path left that were killed on this machine is removed, unless another process has
+    got the number of the one that wrote it.
 
     Raises
     ------
@@ -320,83 +320,33 @@ def begin_file(path: Path) -> Path:
     target = _target(path)
     if target.is_dir():
         raise IsADirectoryError(None, "it is a folder")
-    if is_special(path) or sys.platform == "win32":
-        import tempfile  # where nothing is written it is not needed
-
-        folder = None if is_special(path) else target.parent
-        handle, name = tempfile.mkstemp(prefix=f".{target.name[:48]}.", dir=folder)
+    if is_special(path):
+        handle, name = tempfile.mkstemp(prefix=f".{target.name[:24]}.")
         os.close(handle)
         return Path(name)
     if target.exists() and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)):
         raise PermissionError(None, "it is read-only")
     # The name of the target need not fit: a temporary's is longer.
-    names = (target.with_name(f".{target.name[:48]}.{place}{UNFINISHED}") for place in range(MOST_WRITERS))
-    made = next((temporary for temporary in names if _is_begun(temporary)), None)
-    if made is None:
-        raise FileExistsError(None, "too many are writing it")
-    while (left := next(names, None)) is not None and os.path.lexists(left):
-        _remove_left(left)
-    return made
+    prefix = f".{target.name[:24]}.{platform.node()}."
+    handle, name = tempfile.mkstemp(UNFINISHED, f"{prefix}{os.getpid()}.", target.parent)
+    os.close(handle)
+    with suppress(OSError):  # a folder may be written to and not be read
+        for left in target.parent.iterdir():
+            if left.name.startswith(prefix) and left.name.endswith(UNFINISHED):
+                _remove_left(left, left.name.removeprefix(prefix).partition(".")[0])
+    return Path(name)
 
 
-def _is_begun(temporary: Path) -> bool:
-    """Make a temporary file and lock it, unless there is one that another writer has locked.
-
-    The lock ends with the process, however that ends.
-    """
-    while True:
-        try:
-            handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-        except FileExistsError:
-            if not _remove_left(temporary):
-                return False
-            continue
-        if _is_locked(handle) is not True and _leads_to(temporary, handle):
-            _locks[temporary] = handle
-            return True
-        os.close(handle)  # it was taken for one that was left, in the instant before it was locked
-
-
-def _remove_left(temporary: Path) -> bool:
-    """Remove a temporary file of this user's whose writer is no more, and say whether it is gone."""
+def _remove_left(temporary: Path, process: str) -> None:
+    """Remove a temporary file of this user's whose writer, a process of this machine, is no more."""
     try:
-        handle = os.open(temporary, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    except FileNotFoundError:
-        return True
-    except OSError:
-        return False
-    try:
-        found = os.fstat(handle)
-        if not stat.S_ISREG(found.st_mode) or found.st_uid != os.geteuid() or _is_locked(handle) is not False:
-            return False
-        if _leads_to(temporary, handle):
-            temporary.unlink()
-    except OSError:
-        return False
-    finally:
-        os.close(handle)
-    return True
-
-
-def _is_locked(handle: int) -> bool | None:
-    """Lock an open file, unless another writer has; say whether one has, None where there are no locks."""
-    import fcntl
-
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return None
-    return False
-
-
-def _leads_to(path: Path, handle: int) -> bool:
-    """Return whether a path still is that of an open file."""
-    try:
-        return os.path.samestat(path.lstat(), os.fstat(handle))
-    except FileNotFoundError:
-        return False
+        found = temporary.lstat()
+        if stat.S_ISREG(found.st_mode) and found.st_uid == os.geteuid() and process.isdecimal():
+            os.kill(int(process), 0)  # sends nothing
+    except ProcessLookupError:
+        temporary.unlink(missing_ok=True)
+    except (OSError, OverflowError, AttributeError):  # not on Windows, where to kill is to end
+        return
 
 
 def finish_file(temporary: Path, path: Path) -> None:
@@ -426,15 +376,7 @@ def finish_file(temporary: Path, path: Path) -> None:
         if (made.st_uid, made.st_gid) != (before.st_uid, before.st_gid):
             _give(temporary, before)
         temporary.chmod(stat.S_IMODE(before.st_mode))
-    handle = _locks.pop(temporary, None)
-    try:
-        temporary.replace(target)
-    except OSError:
-        if handle is not None:
-            _locks[temporary] = handle
-        raise
-    if handle is not None:
-        os.close(handle)
+    temporary.replace(target)
 
 
 def partial_name(path: Path) -> Path:
@@ -458,10 +400,7 @@ def unlink_link(path: Path) -> None:
 
 def drop_file(temporary: Path) -> None:
     """Remove a temporary file that was not put where it belongs."""
-    handle = _locks.pop(temporary, None)
     temporary.unlink(missing_ok=True)
-    if handle is not None:
-        os.close(handle)
 
 
 def _target(path: Path) -> Path:

@@ -32,15 +32,11 @@ LOST = "lost"  # a packet that never arrived, in a trace; so is a cell with noth
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeTable:
-    """A quantity over time: `times` (n,) in seconds, rising; `numbers` (n,) in SI.
-
-    `digest` is the SHA-256 of the file's bytes.
-    """
+    """A quantity over time: `times` (n,) in seconds, rising; `numbers` (n,) in SI."""
 
     name: str
     times: NDArray[np.float64]
     numbers: NDArray[np.float64]
-    digest: str
 
 
 def read_time_table(path: Path, name: str, unit: Unit, named_at: Place) -> TimeTable:
@@ -71,19 +67,18 @@ def read_time_table(path: Path, name: str, unit: Unit, named_at: Place) -> TimeT
     if table.rows < 2 or not (np.diff(times.numbers) > 0).all():
         expected = "two or more rows of rising time"
         raise ApcError(Mistake("E703", times.place, "a table over time", expected))
-    return TimeTable(name, times.numbers, numbers.numbers, table.digest)
+    return TimeTable(name, times.numbers, numbers.numbers)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trace:
     """Recorded one-way delays: `delays` (n,) in seconds, one a packet, infinite for one that was lost.
 
-    `digest` is the SHA-256 of the file's bytes; `program` wrote it, "" for a table; `interval` lies between
-    two packets, in seconds, not a number where the file doesn't say.
+    `program` wrote the file, "" for a table; `interval` lies between two packets, in seconds, not a number
+    where the file doesn't say.
     """
 
     delays: NDArray[np.float64]
-    digest: str
     program: str = ""
     interval: float = math.nan
 
@@ -108,10 +103,9 @@ def read_trace(path: Path, named_at: Place) -> Trace:
         fault, or there is none.
     """
     if path.suffix.lower() != TABLE_SUFFIX:
-        data, digest = read_bytes(path, named_at)
-        text = data.decode("utf-8-sig")
+        text = read_bytes(path, named_at).decode("utf-8-sig")
         if (probe := read_probe(text)) is not None:
-            return Trace(probe.delays, digest, probe.program, probe.interval)
+            return Trace(probe.delays, probe.program, probe.interval)
         if DELAY not in text.partition("\n")[0]:
             raise ApcError(Mistake("E702", Place(str(path), 1, 1), "a recording", RECORDINGS))
     with open_table(path, named_at, known=(DELAY,)) as opened:
@@ -128,7 +122,7 @@ def read_trace(path: Path, named_at: Place) -> Trace:
 
         expected = f"a time from 0 to {LATEST_DELAY:.0e} s, or {LOST}"
         delays, _ = opened.numbers([column], delay, "a delay", expected, empty_too=True)
-    return Trace(delays, opened.digest)
+    return Trace(delays)
 
 
 def _delay_column(names: Headings) -> int:

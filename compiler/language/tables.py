@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import csv
 import gzip
-import hashlib
 import io
 import re
 import zlib
@@ -20,7 +19,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,24 +41,16 @@ _HEADING = re.compile(r"(?P<name>[^\[\]]*(\[[0-9]+\][^\[\]]*)*?)(\[(?P<unit>[^\[
 Headings = tuple[tuple[str, Unit, Place], ...]  # name, unit and where it stands
 
 
-class Digested(Protocol):
-    """What was read of a file; `digest` is the SHA-256 of its bytes."""
-
-    @property
-    def digest(self) -> str:
-        """The digest."""
-
-
-F = TypeVar("F", bound=Digested)
+F = TypeVar("F")
 
 
 @dataclass(frozen=True, slots=True)
 class NamedFiles:
-    """The files a topology names, of a `folder`: the digests of those read, by name, and all `mistakes`."""
+    """The files a topology names, of a `folder`: the `names` of those read, and all `mistakes`."""
 
     folder: Path
     mistakes: Mistakes
-    digests: dict[str, str] = field(default_factory=dict)
+    names: set[str] = field(default_factory=set)
 
     def read(self, name: str, reader: Callable[[Path], F]) -> F | None:
         """Return what a reader finds in a file; None, and its mistakes are taken, if that is at fault."""
@@ -68,7 +59,7 @@ class NamedFiles:
         except ApcError as error:
             self.mistakes.take(error)
             return None
-        self.digests[name] = found.digest
+        self.names.add(name)
         return found
 
 
@@ -84,12 +75,11 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A CSV file, whole. `lines` are the lines its rows stand in, `digest` the SHA-256 of its bytes."""
+    """A CSV file, whole. `lines` are the lines its rows stand in."""
 
     file: str
     columns: tuple[Column, ...]
     lines: tuple[int, ...]
-    digest: str
 
     @property
     def rows(self) -> int:
@@ -120,7 +110,7 @@ def read_table(path: Path, named_at: Place) -> Table:
         Column(name, unit, numbers[:, i] * float(unit.scale), place)
         for i, (name, unit, place) in enumerate(headings)
     )
-    return Table(opened.file, columns, lines, opened.digest)
+    return Table(opened.file, columns, lines)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +118,6 @@ class Opened:
     """A CSV file whose headings are read, each a name, a unit and a place; `rows` are the rest."""
 
     file: str
-    digest: str
     headings: Headings
     rows: Any  # a reader of the module csv, whose type has no public name
 
@@ -209,13 +198,13 @@ def open_table(path: Path, named_at: Place, known: Collection[str] = ()) -> Iter
         E701 it can't be read, E702 its headings; E703 its rows are no CSV. What the body raises passes, but
         of a file that does not begin as a table does only that is told: its text may be somebody's.
     """
-    data, digest = read_bytes(path, named_at)
+    data = read_bytes(path, named_at)
     file = str(path)
     rows = csv.reader(io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig"))
     first: list[str] = []
     try:
         first = next(rows, [])
-        yield Opened(file, digest, _headings(first, file), rows)
+        yield Opened(file, _headings(first, file), rows)
     except csv.Error as error:
         raise ApcError(Mistake("E703", Place(file, rows.line_num or 1, 1), f"is no CSV: {error}")) from None
     except ApcError:
@@ -235,8 +224,8 @@ def _is_table(headings: list[str], known: Collection[str]) -> bool:
     )
 
 
-def read_bytes(path: Path, named_at: Place) -> tuple[bytes, str]:
-    """Return a file's bytes, unpacked if it is called .gz, and the SHA-256 of those on disk.
+def read_bytes(path: Path, named_at: Place) -> bytes:
+    """Return a file's bytes, unpacked if it is called .gz.
 
     Raises
     ------
@@ -245,7 +234,6 @@ def read_bytes(path: Path, named_at: Place) -> tuple[bytes, str]:
     """
     try:
         data = read_file(path, MAX_BYTES)
-        digest = hashlib.sha256(data).hexdigest()
         if path.suffix.lower() == PACKED:
             with gzip.open(io.BytesIO(data)) as packed:
                 data = packed.read(MAX_BYTES + 1)
@@ -262,7 +250,7 @@ def read_bytes(path: Path, named_at: Place) -> tuple[bytes, str]:
         ) from None
     except (OSError, EOFError, zlib.error):
         raise ApcError(Mistake("E701", named_at, f"{path.name} is no whole gzip file")) from None
-    return data, digest
+    return data
 
 
 def _headings(texts: list[str], file: str) -> Headings:

@@ -74,7 +74,7 @@ class SceneGroup:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A topology, whole. `texts` are the digests of the files it names; `warnings` are no mistakes."""
+    """A topology, whole. `texts` are the files it names; `warnings` are no mistakes."""
 
     name: str
     about: str
@@ -85,7 +85,7 @@ class Scene:
     links: tuple[SceneLink, ...]
     experiment: Experiment
     region: tuple[Axis, ...]
-    texts: tuple[tuple[str, str], ...]
+    texts: tuple[str, ...]
     place: Place
     warnings: tuple[Mistake, ...] = ()
 
@@ -191,7 +191,7 @@ def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene |
         read_links,
         read_experiment(root.get("experiment"), numbers.read_time, mistakes),
         read_region(root.get("studies"), varied, sections.is_reported, numbers.read_for, mistakes),
-        tuple(sorted(files.digests.items())),
+        tuple(sorted(files.names)),
         root.place,
         warnings,
     )

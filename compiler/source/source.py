@@ -1,13 +1,12 @@
 """A file, or its bytes, to the YAML nodes in it.
 
-Takes: a path, or bytes. Gives: `Source`: the text, its digest and its tree of nodes (see `nodes`).
+Takes: a path, or bytes. Gives: `Source`: the text and its tree of nodes (see `nodes`).
 Guarantees: a regular file of bounded size (see `files`), UTF-8 without control characters, one YAML document.
 Does not: know what a topology is, or what any key means.
 """
 
 from __future__ import annotations
 
-import hashlib
 import re
 import unicodedata
 from dataclasses import dataclass
@@ -21,12 +20,11 @@ from apc.compiler.source.nodes import MAX_BYTES, Lines, Node
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A text that was read: `file` is its name in messages, `digest` the SHA-256 of its bytes (hex)."""
+    """A text that was read: `file` is its name in messages."""
 
     file: str
     path: Path | None
     text: str
-    digest: str
     root: Node
 
 
@@ -99,7 +97,7 @@ def parse_source(data: bytes, *, file: str, path: Path | None = None) -> Source:
     lines = Lines(file, text)
     _refuse_control_characters(text, lines)
     root = compose(text, lines)
-    return Source(file, path, text, hashlib.sha256(data).hexdigest(), root)
+    return Source(file, path, text, root)
 
 
 def _missing(path: Path) -> str:

@@ -186,4 +186,4 @@ def tables_of(scene: Path) -> tuple[Path, ...]:
     """Return the files that a topology names from its folder."""
     built = run_stages(scene, until="scene")
     assert isinstance(built, Scene)
-    return tuple(scene.parent / name for name, _ in built.texts)
+    return tuple(scene.parent / name for name in built.texts)
