@@ -112,34 +112,33 @@ def read_file(path: Path, most: int) -> bytes:
 
 
 def _read(path: Path, most: int) -> bytes:
-    try:
-        check_file(path, most)  # first, as opening a device can already do something
-        with open(path, "rb", opener=_without_waiting) as stream:
-            found = os.fstat(stream.fileno())
-            _check(found, most)  # of what was opened
-            data = stream.read(found.st_size + 1)  # as many bytes are set aside
-            if len(data) > found.st_size:
-                data += stream.read(most + 1 - len(data))
-    except (OSError, ValueError) as error:
-        raise _refusal(error) from None
+    check_file(path, most)  # first, as opening a device can already do something
+    with _refusing(), open(path, "rb", opener=_without_waiting) as stream:
+        found = os.fstat(stream.fileno())
+        _check(found, most)  # of what was opened
+        data = stream.read(found.st_size + 1)  # as many bytes are set aside
+        if len(data) > found.st_size:
+            data += stream.read(most + 1 - len(data))
     return data
 
 
 def check_file(path: Path, most: int) -> None:
     """Refuse what `read_file` would refuse by what it is, without opening it. Raises RefusedError."""
-    try:
+    with _refusing():
         _check(path.stat(), most)
-    except (OSError, ValueError) as error:
-        raise _refusal(error) from None
 
 
-def _refusal(error: OSError | ValueError) -> RefusedError:
-    if isinstance(error, FileNotFoundError | NotADirectoryError):
-        return RefusedError("missing", "does not exist")
-    if isinstance(error, PermissionError):
-        return RefusedError("forbidden", "may not be read (no permission)")
-    # a name too long, a loop of links, a NUL in the name
-    return RefusedError("unreadable", f"can't be read: {_reason(error)}")
+@contextmanager
+def _refusing() -> Iterator[None]:
+    """Turn what the system says into RefusedError."""
+    try:
+        yield
+    except (FileNotFoundError, NotADirectoryError):
+        raise RefusedError("missing", "does not exist") from None
+    except PermissionError:
+        raise RefusedError("forbidden", "may not be read (no permission)") from None
+    except (OSError, ValueError) as error:  # a name too long, a loop of links, a NUL in the name
+        raise RefusedError("unreadable", f"can't be read: {_reason(error)}") from None
 
 
 def _check(found: os.stat_result, most: int) -> None:
@@ -154,11 +153,8 @@ def _check(found: os.stat_result, most: int) -> None:
 
 
 def _too_large(most: int) -> RefusedError:
-    return RefusedError("large", f"is larger than {_size(most)}, the most it may have")
-
-
-def _size(size: int) -> str:
-    return f"{size >> 20} MiB" if size % (1 << 20) == 0 else f"{size:,} bytes"
+    size = f"{most >> 20} MiB" if most % (1 << 20) == 0 else f"{most:,} bytes"
+    return RefusedError("large", f"is larger than {size}, the most it may have")
 
 
 def _kernels_devices() -> set[int]:
@@ -197,7 +193,7 @@ def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
 def _walked(folder: Path, suffix: str) -> tuple[Path, ...]:
     found: list[Path] = []
     kernels, entries = _kernels_devices(), 0
-    try:
+    with _refusing():
         for name, folders, files in os.walk(folder, onerror=_raise):
             path = Path(name)
             if len(path.relative_to(folder).parts) >= MOST_DEPTH:
@@ -208,8 +204,6 @@ def _walked(folder: Path, suffix: str) -> tuple[Path, ...]:
             if entries > MOST_ENTRIES:
                 raise RefusedError("large", f"holds more than {MOST_ENTRIES} files and folders")
             found += [path / file for file in files if file.endswith(suffix)]
-    except (OSError, ValueError) as error:
-        raise _refusal(error) from None
     return tuple(sorted(found))
 
 
@@ -225,7 +219,7 @@ def same_file(one: Path, other: Path) -> bool:
         return False
 
 
-def write_file(path: Path, write: Callable[[Path], None]) -> None:
+def write_file(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file, then put it where it belongs.
 
     Parameters
@@ -240,28 +234,30 @@ def write_file(path: Path, write: Callable[[Path], None]) -> None:
     ApcError
         E601 it can't be written; then what was there before is as it was.
     """
-    try:
+    with _writing(path):
         temporary = begin_file(path)
-    except (OSError, ValueError) as error:
-        raise unwritable(path, error) from error
     try:
         write(temporary)
         finish_file(temporary, path)
-    except OSError as error:
+    except BaseException as error:
         drop_file(temporary)
-        raise unwritable(path, error) from error
-    except BaseException:
-        drop_file(temporary)
+        if isinstance(error, OSError):
+            raise unwritable(path, error) from error
         raise
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Turn what the system says of a file that is to be written into ApcError (E601)."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        raise unwritable(path, error) from error
 
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file, whole or not at all. Raises ApcError (E601) if it can't be written."""
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(content)
-
-    write_file(path, write)
+    write_file(path, lambda temporary: temporary.write_bytes(content))
 
 
 def write_text(path: Path, text: str) -> None:
@@ -274,17 +270,13 @@ def write_texts(texts: Mapping[Path, str]) -> None:
     ready: dict[Path, Path] = {}
     try:
         for path, text in texts.items():
-            try:
+            with _writing(path):
                 ready[path] = begin_file(path)
                 ready[path].write_bytes(text.encode())
-            except (OSError, ValueError) as error:
-                raise unwritable(path, error) from error
         for path in texts:
-            try:
+            with _writing(path):
                 finish_file(ready[path], path)
                 del ready[path]
-            except (OSError, ValueError) as error:
-                raise unwritable(path, error) from error
     finally:
         for temporary in ready.values():
             drop_file(temporary)
@@ -292,10 +284,8 @@ def write_texts(texts: Mapping[Path, str]) -> None:
 
 def check_target(path: Path) -> None:
     """Refuse a place where nothing can be written, before anything is computed: ApcError E601."""
-    try:
+    with _writing(path):
         drop_file(begin_file(path))
-    except (OSError, ValueError) as error:
-        raise unwritable(path, error) from error
 
 
 def unwritable(path: Path, error: OSError | ValueError) -> ApcError:
@@ -391,11 +381,9 @@ def unlink_link(path: Path) -> None:
 
     Raises ApcError (E601) if it can't be removed.
     """
-    try:
+    with _writing(path):
         if path.is_symlink():
             path.unlink()
-    except OSError as error:
-        raise unwritable(path, error) from error
 
 
 def drop_file(temporary: Path) -> None:

@@ -288,6 +288,5 @@ def _kept_finite(rule: Callable[..., Any]) -> Callable[..., Any]:
 
 
 # Exact where an operation is rational, and finite.
-EXACT: dict[str, Callable[..., Any]] = {
-    word: _kept_finite(rule) for word, rule in {**RULES, **ROUNDED, "sqrt": _root, "pow": _power}.items()
-}
+_EXACT: dict[str, Callable[..., Any]] = {**RULES, **ROUNDED, "sqrt": _root, "pow": _power}
+EXACT = {word: _kept_finite(rule) for word, rule in _EXACT.items()}

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from decimal import Context, Decimal, Inexact
 from enum import IntEnum
 from fractions import Fraction
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from apc.compiler.errors import Place
 
@@ -130,28 +130,15 @@ SMOOTH = ("exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "co
 
 # function -> (fewest arguments, most arguments)
 FUNCTIONS: dict[str, tuple[int, int]] = {
-    "der": (1, 1),
+    **dict.fromkeys(
+        ("der", "previous", "initial", "age", "mean", "sum", "count", "interval", "norm"), (1, 1)
+    ),
+    **dict.fromkeys(("abs", "sign", "sqrt", "floor", *SMOOTH), (1, 1)),
+    **dict.fromkeys(("atan2", "interpolate", "dot", "cross"), (2, 2)),
     "sample": (1, 2),
     "hold": (1, 2),
-    "previous": (1, 1),
-    "initial": (1, 1),
-    "age": (1, 1),
     "max": (1, 16),
     "min": (1, 16),
-    "abs": (1, 1),
-    "sign": (1, 1),
-    "sqrt": (1, 1),
-    **dict.fromkeys(SMOOTH, (1, 1)),
-    "atan2": (2, 2),
-    "floor": (1, 1),
-    "interpolate": (2, 2),
-    "mean": (1, 1),
-    "sum": (1, 1),
-    "count": (1, 1),
-    "interval": (1, 1),
-    "dot": (2, 2),
-    "norm": (1, 1),
-    "cross": (2, 2),
 }
 
 KEYWORDS = frozenset(("if", "then", "elseif", "else", "and", "or", "not"))
@@ -273,8 +260,9 @@ def children(expr: Expr) -> tuple[Expr, ...]:
 
 def rebuild(expr: Expr, parts: tuple[Expr, ...]) -> Expr:
     """Return the node with other sub-expressions, in the order of `children`."""
-    values = (parts,) if isinstance(expr, Call | Vector) else parts
-    return replace(expr, **dict(zip(_PARTS.get(type(expr), ()), values, strict=True)))
+    values: tuple[Any, ...] = (parts,) if isinstance(expr, Call | Vector) else parts
+    changed: dict[str, Any] = dict(zip(_PARTS.get(type(expr), ()), values, strict=True))
+    return replace(expr, **changed)
 
 
 def interval_of(clock: str) -> str:

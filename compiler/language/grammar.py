@@ -210,9 +210,12 @@ def _check(expr: Expr, text: str, depth: int = 1, *, conditional: bool = False) 
         kinds = "a condition, and a number" if condition else "a number, and a condition"
         what = f"{cut(text[expr.start : expr.end])} is {kinds} is due here"
         raise FaultError("E327", expr.start, what)
-    for place, part in enumerate(children(expr)):
+    parts = children(expr)
+    for place, part in enumerate(parts):
         due = isinstance(expr, Logic) or (place == 0 and isinstance(expr, Not | Conditional))
-        _check(part, text, depth + 1, conditional=due)
+        # A first operand that is a leaf is read at the level of its operator.
+        deeper = bool(place or len(parts) == 1 or children(part))
+        _check(part, text, depth + deeper, conditional=due)
 
 
 def _check_name(token: Token) -> None:

@@ -291,11 +291,9 @@ def _unit(text: str) -> Unit:
     if any(abs(power) > MAX_EXPONENT for power in (*powers.values(), *dimensions.values())):
         what = f"{cut(text.strip())} is no unit of this world: an exponent or its scale is too large"
         raise FaultError("E225", 0, what)
-    square: Fraction | float = Fraction(1)  # of the scale, so that the root of a square is exact
-    for name, power in powers.items():
-        grams = Fraction(1000) ** int(registry().get_dimensionality(name)["[mass]"])  # Pint's unit of mass
-        its = Fraction(registry().get_root_units(name)[0]) / grams
-        square *= 1 if its == 1 else its ** (2 * power)
+    # The square of the scale, so that the root of a square is exact; Pint's unit of mass is the gram.
+    square, _ = registry().get_root_units(powers**2)
+    square = square / Fraction(1000) ** (2 * dimensions["[mass]"])
     rational = Fraction(square)
     scale = Fraction(math.isqrt(rational.numerator), math.isqrt(rational.denominator))
     if isinstance(square, float) or scale**2 != square:

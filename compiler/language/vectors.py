@@ -173,7 +173,7 @@ class _Writer:
         ]
         is_vector = [isinstance(part, tuple) for part in written]
         if word == "age":  # of a vector, which travels in one packet
-            return replace(expr, arguments=written[0][:1]) if isinstance(written[0], tuple) else expr
+            return rebuild(expr, written[0][:1]) if isinstance(written[0], tuple) else expr
         if word == "*" and all(is_vector):
             hint = f"dot({', '.join(map(format_expression, parts))})"
             self.fail("E407", expr, self.said(expr), "one vector at most in a product", "two", hint)

@@ -102,7 +102,7 @@ class _Composer:
         """Return the tree that starts with an event, at a depth counted from 1."""
         place = self.lines.of(event.start_mark)
         if isinstance(event, yaml.AliasEvent):
-            tree = self.alias(event.anchor, place, depth)
+            tree = self.alias(event.anchor or "", place, depth)
             self.count(tree.size, place)
             return tree
         if isinstance(event, yaml.ScalarEvent):

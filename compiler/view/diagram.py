@@ -82,8 +82,8 @@ def build_diagram(scene: Scene) -> Diagram:
             clock = next((word for role, word in words if role == "clock"), "")
             lines = tuple(_part_lines(scene, part, sizes[name] if name != part.name else 1))
             boxes[name] = Box(name, ROLES[part.section], (name, *lines), clock)
-            links = dict.fromkeys(word for role, word in words if role == "link")
-            sent += [Edge(name, f"link {link}", sent=True) for link in links]
+            heard = dict.fromkeys(word for role, word in words if role == "link")
+            sent += [Edge(name, f"link {link}", sent=True) for link in heard]
     for part in parts:
         for _, other, _ in part.connections:
             one, two = shown(part.name), shown(other.partition(".")[0])

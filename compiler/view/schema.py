@@ -111,11 +111,12 @@ def _part(component: Component, quantities: dict[str, Schema]) -> Schema:
     for variable in component.variables:
         if variable.start is not None:
             name, _ = whole_and_index(variable.name)
-            about = {"description": f"start value of the {variable.about or name}"}
-            entries.setdefault(name, []).append(_quantity(variable.unit, quantities) | about)
+            start = {"description": f"start value of the {variable.about or name}"}
+            entries.setdefault(name, []).append(_quantity(variable.unit, quantities) | start)
     for name, schemas in entries.items():
-        size, about = len(schemas), {"description": schemas[0].get("description", "")}
-        vector = {"type": "array", **about, "prefixItems": schemas, "minItems": size, "maxItems": size}
+        size, about = len(schemas), schemas[0].get("description", "")
+        vector: Schema = {"type": "array", "description": about, "prefixItems": schemas}
+        vector |= {"minItems": size, "maxItems": size}
         properties[name] = schemas[0] if size == 1 else vector
     required = dict.fromkeys(whole_and_index(p.name)[0] for p in component.parameters if is_required(p))
     return {
