@@ -107,14 +107,8 @@ def off_boundary(functions: list[str], points: Floats) -> Floats:
     return np.abs(np.max(away, axis=0))
 
 
-PAST = pytest.mark.xfail(strict=True, reason="the first curve passes its corner and comes back to it")
-
-
 @pytest.mark.few(5)
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[PAST] if name == "another mode takes over" else []) for name in FIELDS],
-)
+@pytest.mark.parametrize("name", FIELDS)
 def test_a_region_made_by_construction_has_its_curves_and_its_area(name: str) -> None:
     functions, area, closed, open_ended = FIELDS[name]
     found = apc.region(fields(*functions), x="u=0:1", y="v=0:1")
