@@ -28,6 +28,7 @@ from apc.compiler.language.expression import (
     Name,
     Number,
     children,
+    fold,
     format_expression,
     names,
     operation,
@@ -180,19 +181,17 @@ def computed(formula: Formula, values: Sequence[Any], rule: Rule) -> Any:
     """
     by_name = dict(zip(formula.names, values, strict=True))
 
-    def value(expr: Expr) -> Any:
-        match expr:
-            case Number():
-                return float(expr.value)
-            case Name():
-                return by_name[".".join(expr.parts)]
-            case Conditional():
-                holds, then, otherwise = map(value, children(expr))
-                branches = (holds, then), (rule("not")(holds), otherwise)
-                return rule("add")(*(rule("if_else_zero")(*branch) for branch in branches))
-        return _operation(expr, [value(part) for part in children(expr)], rule)
+    def leaf(expr: Name | Number) -> Any:
+        return float(expr.value) if isinstance(expr, Number) else by_name[".".join(expr.parts)]
 
-    return value(_tree(formula.text))
+    def node(expr: Expr, *operands: Any) -> Any:
+        if not isinstance(expr, Conditional):
+            return _operation(expr, operands, rule)
+        holds, then, otherwise = operands
+        branches = (holds, then), (rule("not")(holds), otherwise)
+        return rule("add")(*(rule("if_else_zero")(*branch) for branch in branches))
+
+    return fold(_tree(formula.text), leaf, node)
 
 
 def _exactly(expr: Expr, values: dict[str, Any], rule: Rule) -> Any:
@@ -217,7 +216,7 @@ def _exactly(expr: Expr, values: dict[str, Any], rule: Rule) -> Any:
     return value(expr)
 
 
-def _operation(expr: Expr, operands: list[Any], rule: Rule) -> Any:
+def _operation(expr: Expr, operands: Sequence[Any], rule: Rule) -> Any:
     """Return what a node comes to, from what its sub-expressions come to."""
     match expr:
         case Compare(">" | ">="):

@@ -42,7 +42,7 @@ from apc.compiler.language.expression import (
     format_expression,
     interval_of,
 )
-from apc.compiler.language.parsing import TREE, FaultError, exponent_of, kind_of, parser, unclosed
+from apc.compiler.language.parsing import TREE, FaultError, exponent_of, kind_of, parser, placing, unclosed
 from apc.compiler.words import cut
 
 ALIKE = 0.8  # of the letters of a function's name, for another to be the one that was meant
@@ -94,17 +94,15 @@ def parse_expression(text: str, place: Place) -> Expr:
         E321 a character, E322 a wrong or missing token, E323 a number, E324 a name, E325 a function,
         E326 an exponent, E327 a condition where a number is due or the reverse, E328 too long or too deep.
     """
-    try:
+    with placing(text, place):
         expr: Expr = _parsed(text, "expression")[0]
         _check(expr, text)
         return expr
-    except FaultError as fault:
-        raise fault.placed(text, place) from None
 
 
 def parse_equation(text: str, place: Place) -> Equation:
     """Return both sides of `left = right`: as `parse_expression`, and E329 unless there is just one `=`."""
-    try:
+    with placing(text, place):
         left, *others = _parsed(text, "equation")
         if isinstance(left, Compare) and left.operator == "==" and not others:
             # The usual slip: `a == b` for `a = b`.
@@ -117,8 +115,6 @@ def parse_equation(text: str, place: Place) -> Equation:
         _check(left, text)
         _check(others[1], text)
         return Equation(left, others[1], text, place)
-    except FaultError as fault:
-        raise fault.placed(text, place) from None
 
 
 @lru_cache(maxsize=1024)

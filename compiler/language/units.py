@@ -27,7 +27,7 @@ from lark.exceptions import UnexpectedCharacters, UnexpectedToken
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension, product
 from apc.compiler.language.expression import PI
-from apc.compiler.language.parsing import TREE, FaultError, exponent_of, kind_of, parser, unclosed
+from apc.compiler.language.parsing import TREE, FaultError, exponent_of, kind_of, parser, placing, unclosed
 from apc.compiler.words import cut
 
 TURN = 2 * PI  # a cycle in radians
@@ -136,10 +136,8 @@ def parse_unit(text: str, place: Place) -> Unit:
         E222 not the text of a unit, E223 no such unit, E224 a unit with an offset or a logarithm,
         E225 an exponent or scale that is too large.
     """
-    try:
+    with placing(text, place):
         return _unit(text)
-    except FaultError as fault:
-        raise fault.placed(text, place) from None
 
 
 def parse_quantity(text: str, place: Place) -> Quantity:
@@ -150,10 +148,8 @@ def parse_quantity(text: str, place: Place) -> Quantity:
     ApcError
         E221 not the text of a quantity, E226 a number that is too large; and those of `parse_unit`.
     """
-    try:
+    with placing(text, place):
         return _quantity(text)
-    except FaultError as fault:
-        raise fault.placed(text, place) from None
 
 
 def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
@@ -178,12 +174,13 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
     wanted = parse_unit(unit, place)
     named = "a plain number" if unit == "1" else unit
     try:
-        found = _quantity(text)
-    except FaultError as fault:
-        if fault.mistake.code == "E221" and not fault.mistake.hint:
-            example = f"{what}: 1" if unit == "1" else f"{what}: 1 {unit}"
-            raise ApcError(Mistake("E221", place, what, named, cut(text) or "nothing", example)) from None
-        raise fault.placed(text, place) from None
+        found = parse_quantity(text, place)
+    except ApcError as error:
+        [mistake] = error.mistakes
+        if mistake.code != "E221" or mistake.hint:
+            raise
+        example = f"{what}: 1" if unit == "1" else f"{what}: 1 {unit}"
+        raise ApcError(Mistake("E221", place, what, named, cut(text) or "nothing", example)) from None
     its, due = found.unit.dimension, wanted.dimension
     got, right = cut(text.strip()), unit
     if its == due and (found.unit != NO_UNIT or due == DIMENSIONLESS):
