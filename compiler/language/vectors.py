@@ -74,12 +74,12 @@ def whole_and_index(name: str) -> tuple[str, int]:
 
 def sizes_of(names: Iterable[tuple[str, ...]]) -> dict[tuple[str, ...], int]:
     """Return the vectors whose entries are among names, and the size of each."""
-    found: dict[tuple[str, ...], int] = {}
+    sizes: dict[tuple[str, ...], int] = {}
     for parts in names:
         if parts[-1].endswith("]"):
             whole, index = whole_and_index(parts[-1])
-            found[*parts[:-1], whole] = max(index, found.get((*parts[:-1], whole), 0))
-    return found
+            sizes[*parts[:-1], whole] = max(index, sizes.get((*parts[:-1], whole), 0))
+    return sizes
 
 
 def written_out(expr: Expr, size_of: SizeOf, text: str, place: Place) -> Written:
@@ -104,12 +104,12 @@ def written_out(expr: Expr, size_of: SizeOf, text: str, place: Place) -> Written
         E328 it gets too long, E406 sizes that differ, E407 a vector where a number is due or the reverse.
     """
     writer = _Writer(size_of, text, place)
-    found = writer.written(expr)
-    for one in found if isinstance(found, tuple) else (found or expr,):
-        if len(list(islice(walk(one), MAX_LENGTH + 1))) > MAX_LENGTH:
+    written = writer.written(expr)
+    for tree in written if isinstance(written, tuple) else (written or expr,):
+        if len(list(islice(walk(tree), MAX_LENGTH + 1))) > MAX_LENGTH:
             what = f"entry by entry this has more than {MAX_LENGTH} terms: give a part of it a name"
             writer.fail("E328", expr, what)
-    return found
+    return written
 
 
 def written_equation(equation: Equation, size_of: SizeOf) -> tuple[Equation, ...]:
@@ -121,7 +121,7 @@ def written_equation(equation: Equation, size_of: SizeOf) -> tuple[Equation, ...
     if not isinstance(left, tuple) or not isinstance(right, tuple):
         assert isinstance(left, Expr) and isinstance(right, Expr)
         return (replace(equation, left=left, right=right),)
-    return tuple(replace(equation, left=one, right=two) for one, two in zip(left, right, strict=True))
+    return tuple(replace(equation, left=lhs, right=rhs) for lhs, rhs in zip(left, right, strict=True))
 
 
 def number_of(expr: Expr, text: str, place: Place) -> Expr:
@@ -135,7 +135,7 @@ class _Writer:
     def __init__(self, size_of: SizeOf, text: str, place: Place) -> None:
         self.size_of, self.text, self.place = size_of, text, place
 
-    def said(self, expr: Expr) -> str:
+    def source(self, expr: Expr) -> str:
         """Return a part as it is written, or as it would be when it comes from somewhere else."""
         return self.text[expr.start : expr.end] or format_expression(expr)
 
@@ -157,7 +157,7 @@ class _Writer:
             case Vector():
                 if len(expr.entries) not in SIZES:
                     got = f"{len(expr.entries)}"
-                    self.fail("E406", expr, self.said(expr), f"{_or(SIZES)} entries", got)
+                    self.fail("E406", expr, self.source(expr), f"{_or(SIZES)} entries", got)
                 return tuple(map(self.number, expr.entries))
             case Call("dot" | "cross" | "norm"):
                 return self.product(expr)
@@ -176,7 +176,7 @@ class _Writer:
             return rebuild(expr, written[0][:1]) if isinstance(written[0], tuple) else expr
         if word == "*" and all(is_vector):
             hint = f"dot({', '.join(map(format_expression, parts))})"
-            self.fail("E407", expr, self.said(expr), "one vector at most in a product", "two", hint)
+            self.fail("E407", expr, self.source(expr), "one vector at most in a product", "two", hint)
         if word != "*":
             # A function takes numbers beside vectors.
             equal = [k for k in range(len(parts)) if k not in (*numbers, *skipped)]
@@ -187,19 +187,26 @@ class _Writer:
     def product(self, expr: Call) -> Written:
         """Write out `dot`, `cross` and `norm`, each piece of which stands where the whole does."""
         vectors: list[tuple[Expr, ...]] = []
-        for one in expr.arguments:
-            found = self.written(one)
-            if found is None:
+        for argument in expr.arguments:
+            written = self.written(argument)
+            if written is None:
                 return None if expr.function == "cross" else Number(Fraction(0))
-            if not isinstance(found, tuple):
+            if not isinstance(written, tuple):
                 shown = [format_expression(part) for part in expr.arguments]
                 hint = {"norm": f"abs({shown[0]})", "dot": "*".join(shown)}.get(expr.function, "")
-                self.fail("E407", one, f"{self.said(one)} in {expr.function}", "a vector", "a number", hint)
-            vectors.append(found)
+                self.fail(
+                    "E407",
+                    argument,
+                    f"{self.source(argument)} in {expr.function}",
+                    "a vector",
+                    "a number",
+                    hint,
+                )
+            vectors.append(written)
         self.agree(expr.arguments, vectors)
 
-        def binary(operator: str, one: Expr, two: Expr) -> Expr:
-            return Binary(operator, one, two, start=expr.start, end=expr.end)
+        def binary(operator: str, left: Expr, right: Expr) -> Expr:
+            return Binary(operator, left, right, start=expr.start, end=expr.end)
 
         a, b = vectors[0], vectors[-1]
         if expr.function == "cross":
@@ -213,24 +220,26 @@ class _Writer:
 
     def number(self, expr: Expr, hint: str = "") -> Expr:
         """Return an expression that has to be a number."""
-        found = self.written(expr)
-        if isinstance(found, tuple):
-            self.fail("E407", expr, self.said(expr), "a number", _size(found), hint or self.of_vector(expr))
-        return expr if found is None else found
+        written = self.written(expr)
+        if isinstance(written, tuple):
+            self.fail(
+                "E407", expr, self.source(expr), "a number", _size(written), hint or self.of_vector(expr)
+            )
+        return expr if written is None else written
 
-    def agree(self, parts: Sequence[Expr], found: Sequence[Written]) -> None:
+    def agree(self, parts: Sequence[Expr], written: Sequence[Written]) -> None:
         """Refuse parts that are not of one size."""
-        known = [(part, one) for part, one in zip(parts, found, strict=True) if one is not None]
-        for part, one in known[1:]:
-            like, first = known[0]
-            size, its = _length(first), _length(one)
-            if its == size:
+        known = [(part, other) for part, other in zip(parts, written, strict=True) if other is not None]
+        for part, other in known[1:]:
+            model, first = known[0]
+            size, length = _length(first), _length(other)
+            if length == size:
                 continue
             text, hint = format_expression(part), "" if size else self.of_vector(part)
-            if not its and len(text) <= LONGEST_REPEATED:
+            if not length and len(text) <= LONGEST_REPEATED:
                 hint = "{" + ", ".join([text] * size) + "}"
-            expected = f"{_size(first)} like {self.said(like)}"
-            self.fail("E406", part, self.said(part), expected, _size(one), hint)
+            expected = f"{_size(first)} like {self.source(model)}"
+            self.fail("E406", part, self.source(part), expected, _size(other), hint)
 
     def each(self, node: Expr, parts: Sequence[Written]) -> Written:
         """Return a node of other parts: one for each entry, where one of them is a vector."""
@@ -241,8 +250,8 @@ class _Writer:
         rows = zip(
             *(part if isinstance(part, tuple) else (part,) * (size or 1) for part in known), strict=True
         )
-        found = tuple(rebuild(node, row) for row in rows)
-        return found if size else found[0]
+        nodes = tuple(rebuild(node, row) for row in rows)
+        return nodes if size else nodes[0]
 
     def of_vector(self, expr: Expr) -> str:
         """Return numbers that somebody may have meant who wrote a vector."""
@@ -250,12 +259,12 @@ class _Writer:
         return f"{entry(of, 1)}, or norm({of})" if isinstance(expr, Name) else f"norm({of})"
 
 
-def _length(found: Written) -> int:
-    return len(found) if isinstance(found, tuple) else 0
+def _length(written: Written) -> int:
+    return len(written) if isinstance(written, tuple) else 0
 
 
-def _size(found: Written) -> str:
-    return f"a vector of {len(found)}" if isinstance(found, tuple) else "a number"
+def _size(written: Written) -> str:
+    return f"a vector of {len(written)}" if isinstance(written, tuple) else "a number"
 
 
 def _or(numbers: Iterable[int]) -> str:
