@@ -56,14 +56,12 @@ def _not_read(path: Path, place: Place, refused: RefusedError) -> Mistake:
     match refused.why:
         case "missing":
             return Mistake("E101", place, _missing(path))
-        case "folder":
-            return Mistake("E102", place, "this", "a YAML file", "a folder")
-        case "special":
-            return Mistake("E104", place, "this", "a YAML file", refused.words.removeprefix("is "))
+        case "folder" | "special":
+            code = "E102" if refused.why == "folder" else "E104"
+            return Mistake(code, place, "this", "a YAML file", refused.words.removeprefix("is "))
         case "large":
             return _too_large(place)
-        case _:
-            return Mistake("E103", place, f"this file {refused.words}")
+    return Mistake("E103", place, f"this file {refused.words}")
 
 
 def _too_large(place: Place) -> Mistake:
