@@ -263,7 +263,15 @@ def _headings(texts: list[str], file: str) -> Headings:
     mistakes = Mistakes()
     found: dict[str, tuple[str, Unit, Place]] = {}
     for text in texts:
-        name, unit = _heading(text, place, mistakes)
+        name, written = _parts(text)
+        unit = NO_UNIT
+        if not name:
+            expected, got = "a name and its unit", brief(text) or "nothing"
+            mistakes.add("E702", place, "a heading", expected=expected, got=got, hint="device.mass [kg]")
+        try:
+            unit = parse_unit(written, place) if written else NO_UNIT
+        except ApcError as error:
+            mistakes.take(error)
         if name in found:
             mistakes.add("E702", place, f"the heading {brief(name)} is used twice")
         found[name] = (name, unit, place)
@@ -279,15 +287,3 @@ def _parts(heading: str) -> tuple[str, str | None]:
         return "", None
     unit = found["unit"]
     return found["name"].strip(), None if unit is None else unit.strip()
-
-
-def _heading(text: str, place: Place, mistakes: Mistakes) -> tuple[str, Unit]:
-    name, written = _parts(text)
-    if not name:
-        expected, got = "a name and its unit", brief(text) or "nothing"
-        mistakes.add("E702", place, "a heading", expected=expected, got=got, hint="device.mass [kg]")
-    try:
-        return name, parse_unit(written, place) if written else NO_UNIT
-    except ApcError as error:
-        mistakes.take(error)
-        return name, NO_UNIT
