@@ -1,7 +1,8 @@
 """Vectors written out: an expression of vectors to one for each entry.
 
 Takes: `Expr` and `Equation`, and the size of every name: 0 for a number.
-Gives: `written_out`, `written_equation`, `number_of`; `entry`, `entries`, `whole_and_index`, `sizes_of`.
+Gives: `written_out`, `written_equation`, `number_of`; `entry`, `entries`, `whole_and_index`, `by_vector`,
+`sizes_of`.
 Guarantees: what is written out holds no vector; each piece keeps the place it has in the text; sizes that do
 not fit are refused with what to write.
 Does not: check units, or know what a name is of.
@@ -19,7 +20,7 @@ from dataclasses import replace
 from fractions import Fraction
 from functools import partial, reduce
 from itertools import islice
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
 from apc.compiler.errors import ApcError, Mistake, Place, place_in
 from apc.compiler.language.expression import (
@@ -39,6 +40,7 @@ from apc.compiler.language.expression import (
 )
 from apc.compiler.language.grammar import MAX_LENGTH
 
+T = TypeVar("T")
 SIZES = (2, 3)
 VECTOR_WORDS = ("{", "dot", "norm", "cross")  # what makes or takes vectors is written with one of these
 LONGEST_REPEATED = 20  # characters of a number that a message writes once for each entry
@@ -70,6 +72,14 @@ def whole_and_index(name: str) -> tuple[str, int]:
     """Return the vector that an entry is of, and which it is; of a number its name and 0."""
     whole, bracket, index = name.rstrip("]").rpartition("[")
     return (whole, int(index)) if bracket and name.endswith("]") else (name, 0)
+
+
+def by_vector(items: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
+    """Return named items by the vectors whose entries they are of; what is of a number stands alone."""
+    vectors: dict[str, list[T]] = {}
+    for item in items:
+        vectors.setdefault(whole_and_index(name(item))[0], []).append(item)
+    return vectors
 
 
 def sizes_of(names: Iterable[tuple[str, ...]]) -> dict[tuple[str, ...], int]:

@@ -9,7 +9,7 @@ Does not: place anything on a page: `present.graph` does, or Graphviz, or Mermai
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from html import escape
@@ -20,7 +20,7 @@ from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.unit_text import format_si
 from apc.compiler.language.values import Value
-from apc.compiler.language.vectors import whole_and_index
+from apc.compiler.language.vectors import by_vector, whole_and_index
 from apc.compiler.scene.instances import Part
 from apc.compiler.scene.links import SceneLink
 from apc.compiler.scene.scene import Scene
@@ -134,7 +134,7 @@ def _part_lines(scene: Scene, part: Part, count: int) -> Iterator[str]:
 
 def _numbers(scene: Scene, part: Part) -> Iterator[str]:
     """Yield a part's numbers, those that are zero left out, and its words that are no default."""
-    for name, entries in _by_vector(part.values):
+    for name, entries in by_vector(part.values, lambda named: named[0]).items():
         if any(value.number for _, value in entries):
             yield f"{name} {_quantities(part, entries)}"
         for own, value in entries:
@@ -142,21 +142,13 @@ def _numbers(scene: Scene, part: Part) -> Iterator[str]:
             if part.shared and isinstance(parameter, Number) and parameter.divided:
                 each = Value(value.number / scene.peers, value.dimension, None, value.place)
                 yield f"shared: {_quantity(part, own, each)} a copy"
-    for name, entries in _by_vector(part.starts):
+    for name, entries in by_vector(part.starts, lambda named: named[0]).items():
         yield f"{name} starts at {_quantities(part, entries)}"
     for own, word in part.options:
         if word != getattr(part.component.parameter(own), "default", None):
             yield f"{own} {word}"
     for table in part.tables:
         yield f"{table.name}: a table of {len(table.times)} rows"
-
-
-def _by_vector(values: Iterable[tuple[str, Value]]) -> Iterator[tuple[str, list[tuple[str, Value]]]]:
-    """Yield numbers by name, the entries of a vector together."""
-    vectors: dict[str, list[tuple[str, Value]]] = {}
-    for name, value in values:
-        vectors.setdefault(whole_and_index(name)[0], []).append((name, value))
-    yield from vectors.items()
 
 
 def _quantities(part: Part, entries: list[tuple[str, Value]]) -> str:
