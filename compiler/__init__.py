@@ -13,12 +13,11 @@ language                    expression, parsing, grammar: text to trees; evaluat
 components                  component, parts, declarations, component_check, definitions, library
 scene                       named_numbers, timebase, instances, sections, channels, graphs, links, groups,
                             studies: a section each; oddities: warnings; scene: all of them
-equations                   connections: where connectors meet; flatten
-                            reductions: what is heard of the others; clock_inference: what ticks together;
-                            clocks
-                            terms, symbolic, zero_test: SymPy; solution, matching, residuals,
-                            elimination, tearing, blocks: solving; derivatives, aliases, index: derivatives
-                            and states; structure
+equations                   connections: where connectors meet; flatten: equations and crossings
+                            clocks: what ticks together; terms, zero_test: SymPy
+                            reductions: what is heard of the others; derivatives, solution: data types
+                            matching, elimination, blocks: solving; aliases, index: derivatives and states
+                            structure
 functions                   casadi_writer, reached: what is written; exchange: what lies beside;
                             functions
 compiled, plain             the compiled model; operations of its functions

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import singledispatch
 
-from apc.compiler.equations.clocks import ClockedSystem, ReceiveCrossing
+from apc.compiler.equations.clocks import ClockedSystem
 from apc.compiler.equations.flatten import FlatKind, FlatSystem
 from apc.compiler.equations.solution import Assignment, ImplicitBlock
 from apc.compiler.equations.structure import SortedSystem
@@ -98,14 +98,14 @@ def _(clocked: ClockedSystem) -> str:
             f"  hold of {h.clock}: {h.variable}, after {format_expression(h.delay)} s" for h in kind.holds
         ]
         lines += [f"  previous on {p.clock}: {p.variable}" for p in kind.previous]
-        lines += [f"  receive on {r.clock} over {r.link}: {_heard(r)}" for r in kind.receives]
-        lines += [f"  send over {s.link}: {s.name} = {format_expression(s.expression)}" for s in kind.sends]
+        lines += [
+            f"  receive on {r.clock} over {r.link}: {r.operator} of {format_expression(r.argument)}"
+            for r in kind.receives
+        ]
+        lines += [
+            f"  send over {s.link}: {s.name} = {format_expression(s.expression)}" for s in kind.flat.sends
+        ]
     return "\n".join(lines)
-
-
-def _heard(receive: ReceiveCrossing) -> str:
-    what = format_expression(receive.of.expression if receive.edge is None else receive.edge)
-    return f"{receive.operator} of {what}"
 
 
 @describe.register
@@ -117,6 +117,6 @@ def _(system: SortedSystem) -> str:
         for partition in kind.partitions:
             lines.append(f"  {partition.clock}:")
             lines += [line for step in partition.assignments for line in step_lines(step)]
-        lines += [f"  {name} := {text_of(expression)}" for name, _, expression in kind.samples]
+        lines += [f"  {name} := {text_of(expression)}" for name, expression in kind.samples]
         lines += [f"  send over {s.link}: {s.name} := {text_of(s.expression)}" for s in kind.sends]
     return "\n".join(lines)
