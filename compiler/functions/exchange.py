@@ -285,12 +285,11 @@ def with_rounded(scene: Scene, kind: Kind, links: Sequence[Link]) -> Kind:
     rounded = []
     for link in links:
         if count_of(link.name) in kind.parameters and link.graph.shape == "arcs":
-            sums = heard_sums(link, scene.peers)
-            values = {sums.of(peer) for peer in range(scene.peers)} if sums.rounded else set()
+            values = heard_sums(link, scene.peers).values
             if len(set(map(float, values))) < len(values):
                 what = f"what two peers hear over {link.name} adds up to sums that doubles can't tell apart"
                 raise ApcError(Mistake("E217", places[link.name], what, hint="weights of at most 15 digits"))
-            if values:
+            if any(Fraction(float(value)) != value for value in values):
                 rounded.append((kind.parameters.index(count_of(link.name)), tuple(sorted(values))))
     return replace(kind, rounded=tuple(rounded))
 

@@ -61,7 +61,7 @@ REQUIRED = {
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A topology, whole. `texts` are the digests of the files it names; `warnings` are no mistakes."""
+    """A topology, whole. `texts` are the files it names; `warnings` are no mistakes."""
 
     name: str
     about: str
@@ -72,7 +72,7 @@ class Scene:
     links: tuple[SceneLink, ...]
     experiment: Experiment
     region: tuple[Axis, ...]
-    texts: Named[str]
+    texts: tuple[str, ...]
     place: Place
     warnings: tuple[Mistake, ...] = ()
 
@@ -170,7 +170,7 @@ def build_scene(source: Source, library: Library) -> Scene:
         read_links,
         read_experiment(root, numbers),
         read_region(root, settable | losses, numbers, names.is_reported),
-        tuple(sorted(files.digests.items())),
+        tuple(sorted(files.names)),
         root.place,
     )
     mistakes.raise_if_any()  # before warnings, which would tell a second time what is missing for a mistake
