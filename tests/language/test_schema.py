@@ -14,11 +14,9 @@ import yaml
 import apc
 from apc.__main__ import run
 from apc.compiler.compiled import LARGEST_COUNT
-from apc.compiler.components.parts import LARGEST_ARRAY
-from apc.compiler.functions.exchange import LOSS_ABOUT
-from apc.compiler.scene.channels import PROBABILITIES
+from apc.compiler.components.parts import DEFAULT_TYPES, LARGEST_ARRAY
 from apc.compiler.scene.graphs import SHAPES
-from apc.compiler.scene.sections import DEFAULT_TYPES
+from apc.compiler.scene.links import PROBABILITIES
 from apc.compiler.source.reading import IDENTIFIER
 from tests.topologies import AVERAGE, ROOT, SCENES, replaced
 
@@ -194,8 +192,6 @@ def test_what_is_written_by_hand_agrees_with_the_compiler() -> None:
     assert definitions["name"]["pattern"] == "^" + IDENTIFIER.pattern.replace(r"\Z", "$")
     assert definitions["graph"]["anyOf"][0]["enum"] == list(SHAPES)
     channels = definitions["loss"]["anyOf"][1]["properties"]
-    assert {name: one["description"] for name, one in channels.items()} == dict(
-        zip(PROBABILITIES, LOSS_ABOUT, strict=True)
-    )
+    assert {name: one["description"] for name, one in channels.items()} == PROBABILITIES
     for section, default in DEFAULT_TYPES.items():
         assert sections[section]["additionalProperties"]["properties"]["type"]["default"] == default
