@@ -170,9 +170,9 @@ class ManyAnalyses:
 
     def _family(self, timing: tuple[int, ...], count: int) -> _Family | None:
         """Return what points of these times share, None where each of them has an analysis of its own."""
+        if count < FEWEST:  # whatever was asked before: the same points have the same bits each time
+            return None
         if timing not in self.families:
-            if count < FEWEST:
-                return None
             while len(self.families) >= KEPT:
                 self.families.pop(next(iter(self.families)))
             given = tuple(
