@@ -1,355 +1,414 @@
-"""What a peer computes, in plain C99.
+"""A peer in plain C99: its header, what it computes, and a program that runs it.
 
-Takes: a `CPeer`. Gives: `source`.
+Takes: a `Peer`. Gives: `header`, `source`, `driver`; `memory`, `number`, `filled`.
 Guarantees: no allocation, no global that changes, nothing included but math.h; what happens at an instant is
-computed by the functions that `simulate` evaluates, in their order and with their roundings.
+computed by the functions that `simulate` evaluates, in their order and with their roundings; a number is read
+as the very same double; nothing in a comment ends it.
 Does not: compile or write files (see `code`), or join peers (see `scene_text`).
 
 A peer goes from instant to instant: `send` says what goes out as an instant begins, `force` computes what is
 due at it, `move` takes what the computer moves to the next; `tick` is all three. Between `send` and `force` a
-packet that needs no time can still be heard.
+packet that needs no time can still be heard. What stands in every text is in `peer.h`, `peer.c` and
+`peer_test.c` beside this module, with $names for what differs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
+from itertools import accumulate
+from pathlib import Path
+from string import Template
 
 import numpy as np
 
 from apc.compiler.plain import straight
 from apc.compiler.weights import sum_weights
-from apc.exports.c_names import CLOSE, OPEN, CPeer, block, comment, number, seconds, title
-from apc.exports.peer import Instant, Line, Move, Peer, has_edge
+from apc.distribution import program_version
+from apc.exports.peer import Line, Move, Peer, has_edge
+from apc.exports.words import identifier, unique
 from apc.simulation.machine import straight_lines
 from apc.simulation.pairs import pair_function
+from apc.simulation.signals import LocalSignal, ticking_partitions
 
 
-def source(c: CPeer, include: str) -> str:
-    """Return the code; `include` is the name of the header."""
-    peer = c.peer
-    kinds = tuple(dict.fromkeys(peer.instants))
-    parts = [
-        title(peer),
-        f'#include "{include}"\n#include <math.h>\n',
-        "/* Products and sums round one by one, as they are written. */",
-        "#if defined(__clang__)\n#pragma STDC FP_CONTRACT OFF\n#endif\n",
-        _parameters(c),
-        _instants(c, kinds),
-        *(_own(c, line) for line in peer.lines if line.sending >= 0),
-        *(_tick(c, p) for p in sorted({p for one in kinds for p in one.ticks})),
-        *(_move(c, place, one) for place, one in enumerate(peer.moves)),
-        _begin(c),
-        _times(c, kinds),
-        _send(c, kinds),
-        _force(c, kinds),
-        _whole(c, kinds),
+def filled(file: str, /, **values: object) -> str:
+    """Return the text of a file beside this module with values in the place of its $names."""
+    text = Path(__file__).with_name(file).read_text(encoding="utf-8")
+    return Template(text).substitute(values)
+
+
+def number(value: float) -> str:
+    """Return a number such that a compiler reads the very same double."""
+    text = "INFINITY" if math.isinf(value) else repr(float(value))
+    return f"({text})" if text.startswith("-") else text
+
+
+def row(values: Iterable[object]) -> str:
+    """Return what stands between the braces of an array, which has at least one entry."""
+    return ", ".join(map(str, values)) or "0"
+
+
+def block(lines: Iterable[str], indent: int = 2) -> str:
+    """Return lines with their ends, indented."""
+    return "".join(f"{' ' * indent}{line}\n" for line in lines)
+
+
+def comment(text: str) -> str:
+    """Return a text that can stand in a comment of C."""
+    shown = "".join(c if c.isascii() and c.isprintable() else "?" for c in text)
+    return shown.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?")
+
+
+def memory(peer: Peer, signal: LocalSignal) -> str:
+    """Return the member of a peer's memory that holds a signal."""
+    if signal.role == "output":
+        return _output(peer, *signal.place)
+    return f"{'x' if signal.role == 'state' else 'u'}[{signal.place[0]}]"
+
+
+def _output(peer: Peer, partition: int, output: int) -> str:
+    first = [*accumulate((len(one.outputs) for one in peer.kind.clocks), initial=0)]
+    return f"y[{first[partition] + output}]"
+
+
+def _title(peer: Peer) -> str:
+    """Return the comment that a text begins with."""
+    system, clocks = peer.system, {partition.clock for partition in peer.kind.clocks}
+    texts = [f"     {comment(digest)}  {comment(path)}" for path, digest in system.origin.digests]
+    timings = {one.name: float(one.value) for one in system.timings}
+    periods = [
+        f"{comment(one.name)} every {timings[one.period]!r} s" for one in system.clocks if one.name in clocks
     ]
-    return "\n".join(parts)
+    made = f"{comment(peer.name)} of {comment(system.name)}, written by apc {program_version()}"
+    return "\n".join([f"/* {made}. {', '.join(periods)}.", "   Made from (SHA-256):", *texts]) + " */"
 
 
-def _now(peer: Peer) -> str:
-    """Return the time of an instant in seconds, rounded as `simulate` rounds it."""
-    quantum = peer.schedule.quantum
-    return f"(double)peer->quanta * {float(quantum.numerator)!r} / {float(quantum.denominator)!r}"
+# ---- the header
+
+_Member = tuple[str, str]  # its declaration, and what it is
 
 
-def _parameters(c: CPeer) -> str:
-    units = {one.name: one.unit for one in c.peer.system.parameters}
-    named = zip(c.peer.kind.parameters, c.parameters, c.peer.parameters.tolist(), strict=True)
-    return "".join(
-        f"#define P_{own} {number(value)} /* {comment(name)} [{comment(units.get(name, '1'))}] */\n"
-        for name, own, value in named
+def _members(listed: Sequence[_Member]) -> str:
+    rows = listed or [("char none", "nothing")]
+    width = max(len(declared) for declared, _ in rows) + 1
+    return "\n".join(f"  {declared + ';':<{width}} /* {comment(what)} */" for declared, what in rows)
+
+
+def header(peer: Peer) -> str:
+    """Return the header: what goes in and out of a peer, its memory, and what it does."""
+    kind, name, states = peer.kind, peer.identifier, peer.kind.states
+    heard = [(f"double {own}", f"{states[i].name} [{states[i].unit}]") for i, own in peer.measured.items()]
+    sent = [
+        (f"double {own}", f"the force on {force.name.rpartition('.')[0]} [N]")
+        for own, force in peer.forces.items()
+    ]
+    packets = ""
+    for line in peer.lines:
+        rows = [
+            (f"double {own}", f"{channel} [{unit}]")
+            for own, channel, unit in zip(line.members, line.channels, line.units, strict=True)
+        ]
+        if line.missing:
+            rows.append(("int missing", "1: it is late, and what this peer would send stands in for it"))
+        type_ = f"{name}_{line.name}"
+        packets += f"/* A packet of {comment(line.link)}. */\n"
+        packets += f"typedef struct {{\n{_members(rows)}\n}} {type_};\n\n"
+        if line.senders:
+            names = ", ".join(one.name for one in line.senders[:8])
+            more = ", ..." if len(line.senders) > 8 else ""
+            heard.append(
+                (f"{type_} {line.name}[{len(line.senders)}]", f"the newest packets of {names}{more}")
+            )
+        if line.sending >= 0:
+            sent.append((f"{type_} {line.name}", "what it sends"))
+            sent.append((f"int {line.name}_sent", "whether it does now"))
+    holds = [hold.name for hold in kind.holds]
+    computed = [
+        one for partition in kind.clocks for one in zip(partition.outputs, partition.units, strict=True)
+    ]
+    inside = [(one.name, one.unit) if i not in peer.outside else ("", "") for i, one in enumerate(states)]
+    listed = [
+        (
+            f"double x[{len(inside) or 1}]",
+            ", ".join(f"{own} [{unit}]" if own else "-" for own, unit in inside),
+        ),
+        (f"double y[{len(computed) or 1}]", ", ".join(f"{own} [{unit}]" for own, unit in computed)),
+        (f"double u[{len(holds) or 1}]", f"what acts of {', '.join(holds)}"),
+        (f"double late[{len(holds) or 1}][{_kept(peer)}]", "what was computed of these, the newest first"),
+    ]
+    return filled(
+        "peer.h",
+        title=_title(peer),
+        guard=f"{name.upper()}_H",
+        name=name,
+        packets=packets.rstrip("\n") + "\n",
+        heard=_members(heard),
+        sent=_members(sent),
+        quantum=repr(float(peer.schedule.quantum)),
+        instants=len(peer.instants),
+        memory=_members(listed),
     )
 
 
-def _instants(c: CPeer, kinds: Sequence[Instant]) -> str:
-    listed = ", ".join(str(kinds.index(one)) for one in c.peer.instants)
-    what = f"static int {c.name}_kind(const {c.name} *peer)"
-    if len(kinds) == 1:
-        return f"{what} {OPEN}\n  (void)peer;\n  return 0;\n{CLOSE}\n"
-    return f"""\
-/* Which kind of instant the next one is. */
-{what} {OPEN}
-  static const short kinds[{len(c.peer.instants)}] = {OPEN}{listed}{CLOSE};
-  return kinds[peer->instant];
-{CLOSE}
-"""
+def _kept(peer: Peer) -> int:
+    """Return how many computed values of each hold are remembered."""
+    return 1 + max((act.lag for one in peer.instants for act in one.acts), default=0)
 
 
-def _inputs(c: CPeer) -> dict[str, list[str]]:
-    """Return what the arguments x, u and p of a function are called."""
-    return {
-        "x": [
-            f"peer->{own}" if own else f"in->{c.measured[i]}" if i in c.measured else "NAN"
-            for i, own in enumerate(c.states)
-        ],
-        "u": [f"peer->{own}" if own else "0.0" for own in c.acting],
-        "p": [f"P_{own}" for own in c.parameters],
-    }
+# ---- what it computes
 
 
-def _own(c: CPeer, line: Line) -> str:
+def source(peer: Peer, include: str) -> str:
+    """Return the code; `include` is the name of the header."""
+    kind, name = peer.kind, peer.identifier
+    kinds = tuple(dict.fromkeys(peer.instants))
+    units = {one.name: one.unit for one in peer.system.parameters}
+    named = zip(_parameters(peer), kind.parameters, peer.parameters.tolist(), strict=True)
+    over = {line.sending: line.name for line in peer.sending}
+    begin = [
+        dict(zip(partition.memories, values, strict=True)).get(o, 0.0)
+        for partition, values in zip(kind.clocks, peer.memories, strict=True)
+        for o in range(len(partition.outputs))
+    ]
+    unheard = [
+        f"in->{line.name}[{k}].{own} = {number(value)};"
+        for line in peer.lines
+        for k, sender in enumerate(line.senders)
+        for own, value in zip(line.members, sender.start, strict=True)
+    ]
+    unheard += [
+        f"for (int k = 0; k < {len(line.senders)}; k++) in->{line.name}[k].missing = 0;"
+        for line in peer.lines
+        if line.missing
+    ]
+    sends = [
+        [
+            text
+            for own in (over[partition] for partition in one.sends)
+            for text in (f"{name}_{own}_own(peer, in, &out->{own});", f"out->{own}_sent = 1;")
+        ]
+        for one in kinds
+    ]
+    ticks = [
+        [
+            *(f"{name}_tick_{p}(peer, in, t);" for p in one.ticks),
+            *(f"peer->u[{act.hold}] = peer->late[{act.hold}][{act.lag}];" for act in one.acts),
+        ]
+        for one in kinds
+    ]
+    forces = []
+    for own, force in peer.forces.items():
+        terms = [f"{number(factor)} * peer->u[{h}]" for h, factor in force.terms]
+        forces.append(f"out->{own} = {' + '.join(terms) or '0.0'};")
+    functions = [_own(peer, line) for line in peer.sending]
+    functions += [_tick(peer, p) for p in ticking_partitions(peer.schedule)]
+    functions += [_move(peer, place, move) for place, move in enumerate(peer.moves)]
+    return filled(
+        "peer.c",
+        title=_title(peer),
+        include=include,
+        name=name,
+        parameters="".join(
+            f"#define {own} {number(value)} /* {comment(label)} [{comment(units.get(label, '1'))}] */\n"
+            for own, label, value in named
+        ),
+        instants=len(peer.instants),
+        kinds=row(map(kinds.index, peer.instants)),
+        numerator=repr(float(peer.schedule.quantum.numerator)),
+        denominator=repr(float(peer.schedule.quantum.denominator)),
+        functions="\n".join(functions),
+        states=row(number(0.0 if i in peer.outside else value) for i, value in enumerate(peer.start)),
+        outputs=row(map(number, begin)),
+        holds=row("0" for _ in kind.holds),
+        late=row("{0}" for _ in kind.holds or "0"),
+        unheard=block(unheard),
+        lengths=row(peer.moves[one.move].quanta for one in kinds),
+        unsent=block(f"out->{own}_sent = 0;" for own in over.values()),
+        sends=_cases(sends),
+        ticks=_cases(ticks),
+        forces=block(forces),
+        moves=_cases([f"{name}_move_{one.move}(peer);"] for one in kinds),
+    )
+
+
+def _cases(bodies: Iterable[Sequence[str]]) -> str:
+    """Return what is done at each kind of instant."""
+    return "".join(f"  case {k}:\n{block([*body, 'break;'], 4)}" for k, body in enumerate(bodies))
+
+
+def _parameters(peer: Peer) -> list[str]:
+    return [f"P_{own}" for own in unique(map(identifier, peer.kind.parameters))]
+
+
+def _moving(peer: Peer) -> list[str]:
+    """Return what the arguments x and u of a function are called."""
+    x = [f"peer->x[{i}]" for i in range(len(peer.kind.states))]
+    for i in peer.outside:
+        x[i] = f"in->{peer.measured[i]}" if i in peer.measured else "NAN"
+    return [*x, *(f"peer->u[{h}]" for h in range(len(peer.kind.holds)))]
+
+
+def _memories(peer: Peer, p: int) -> list[str]:
+    return [f"peer->{_output(peer, p, o)}" for o in peer.kind.clocks[p].memories]
+
+
+def _own(peer: Peer, line: Line) -> str:
     """Return what the peer would send over a line now."""
-    sending = c.peer.kind.sends[line.sending]
-    function, inputs = straight(sending.send), _inputs(c)
-    names, lines = straight_lines(function, [*inputs["x"], *inputs["u"], *inputs["p"], "t"])
+    sending, name = peer.kind.sends[line.sending], f"{peer.identifier}_{line.name}"
+    function = straight(sending.send)
+    names, lines = straight_lines(function, [*_moving(peer), *_parameters(peer), "t"])
     stores = [
         f"packet->{own} = {names[function.results[0][sending.channels.index(channel)]]};"
-        for own, channel in zip(c.channels[line.link], line.channels, strict=True)
+        for own, channel in zip(line.members, line.channels, strict=True)
         if channel in sending.channels
     ]
-    if line.missing:
-        stores.append("packet->missing = 0;")
-    packet = f"{c.name}_{c.lines[line.link]}"
+    stores += ["packet->missing = 0;"] if line.missing else []
     return f"""\
-static void {packet}_own(const {c.name} *peer, const {c.name}_in *in, {packet} *packet) {OPEN}
-  const double t = {_now(c.peer)};
+static void {name}_own(const {peer.identifier} *peer, const {peer.identifier}_in *in, {name} *packet) {{
+  const double t = {peer.identifier}_now(peer);
   (void)in;
   (void)t;
-{block([*lines, *stores])}{CLOSE}
+{block([*lines, *stores])}}}
 """
 
 
-def _tick(c: CPeer, p: int) -> str:
+def _tick(peer: Peer, p: int) -> str:
     """Return what a clock partition computes at a tick."""
-    peer, partition = c.peer, c.peer.kind.clocks[p]
-    function, inputs = straight(partition.tick), _inputs(c)
+    partition, name, function = peer.kind.clocks[p], peer.identifier, straight(peer.kind.clocks[p].tick)
     body: list[str] = []
-    gaps = {
-        partition.receives[place].link
-        for place, channels in enumerate(peer.channels[p])
-        if channels and peer.line(partition.receives[place].link).missing
-    }
-    for link in sorted(gaps):
-        packet = f"{c.name}_{c.lines[link]}"
-        body += [f"{packet} own_{c.lines[link]};", f"{packet}_own(peer, in, &own_{c.lines[link]});"]
-    for place, channels in enumerate(peer.channels[p]):
-        body += _receive(c, p, place, channels)
-    arguments = [
-        *inputs["x"],
-        *inputs["u"],
-        *(f"peer->{c.outputs[p][o]}" for o in partition.memories),
-        *(f"r{place}" for place in range(len(partition.receives))),
-        *inputs["p"],
-        "t",
-    ]
-    names, lines = straight_lines(function, arguments)
-    stores = []
-    for o, value in enumerate(function.results[0]):
-        if (p, o) in c.late:
-            own, kept = c.late[p, o]
-            if kept > 1:
-                stores.append(f"for (int k = {kept - 1}; k > 0; k--) peer->{own}[k] = peer->{own}[k - 1];")
-            stores.append(f"peer->{own}[0] = {names[value]};")
-        stores.append(f"peer->{c.outputs[p][o]} = {names[value]};")
+    read = [place for place in range(len(partition.receives)) if (p, place) in peer.channels]
+    lines = {link: peer.line(link) for link in sorted({partition.receives[place].link for place in read})}
+    for line in lines.values():
+        if line.missing:
+            own = f"own_{line.name}"
+            body += [f"{name}_{line.name} {own};", f"{name}_{line.name}_own(peer, in, &{own});"]
+    for place in range(len(partition.receives)):
+        body += _receive(peer, p, place)
+    receives = [f"r{place}" for place in range(len(partition.receives))]
+    arguments = [*_moving(peer), *_memories(peer, p), *receives, *_parameters(peer), "t"]
+    names, computed = straight_lines(function, arguments)
+    stores = [f"peer->{_output(peer, p, o)} = {names[one]};" for o, one in enumerate(function.results[0])]
+    for h, hold in enumerate(peer.kind.holds):
+        if hold.clock == partition.clock:
+            late = f"peer->late[{h}]"
+            stores.append(f"for (int k = {_kept(peer) - 1}; k > 0; k--) {late}[k] = {late}[k - 1];")
+            stores.append(f"{late}[0] = peer->{_output(peer, p, hold.output)};")
     return f"""\
 /* A tick of {comment(partition.clock)}. */
-static void {c.name}_tick_{p}({c.name} *peer, const {c.name}_in *in, double t) {OPEN}
+static void {name}_tick_{p}({name} *peer, const {name}_in *in, double t) {{
   (void)in;
   (void)t;
-{block([*body, *lines, *stores])}{CLOSE}
+{block([*body, *computed, *stores])}}}
 """
 
 
-def _receive(c: CPeer, p: int, place: int, channels: Sequence[int]) -> list[str]:
+def _receive(peer: Peer, p: int, place: int) -> list[str]:
     """Return the lines that make up what a receive hears."""
-    peer, receive = c.peer, c.peer.kind.clocks[p].receives[place]
-    if not channels or not peer.line(receive.link).senders:
-        return [f"const double r{place} = 0.0;", f"(void)r{place};"]
-    line, total = peer.line(receive.link), f"r{place}"
-    own, count = c.lines[line.link], len(line.senders)
-    joined, mean = receive.operator in ("max", "min"), receive.operator == "mean"
-    edge = has_edge(peer.kind, p, place)
+    receive, total = peer.kind.clocks[p].receives[place], f"r{place}"
+    line = peer.line(receive.link) if (p, place) in peer.channels else None
+    if line is None or not line.senders:
+        return [f"const double {total} = 0.0;", f"(void){total};"]
+    names = [line.members[channel] for channel in peer.channels[p, place]]
+    count, packet = len(line.senders), f"in->{line.name}[k]"
+    mean, edge = receive.operator == "mean", has_edge(peer.kind, p, place)
+    looked, value = [], f"{packet}.{names[0]}"
+    if edge:
+        looked, value = _look(peer, p, place, line, names)
+    elif line.missing:
+        value = f"({packet}.missing ? own_{line.name}.{names[0]} : {value})"
+    loop = f"for (int k = 0; k < {count}; k++) {{"
+    if receive.operator in ("max", "min"):
+        larger = f"  {total} = f{receive.operator}({total}, {value});"
+        return [f"double {total} = NAN;", loop, *looked, larger, "}"]
     weights = np.array([one.weight for one in line.senders])
     divided = mean and line.complete and not edge
     if mean and not divided:
         weights = weights / sum_weights(np.zeros(count, np.int64), weights, 1).floats[0]
-    lines, weight = [f"double {total} = {'NAN' if joined else '0.0'};"], ""
-    if not joined and (weights != 1).any():
-        listed = ", ".join(map(number, weights.tolist()))
-        lines = [f"static const double weights_{place}[{count}] = {OPEN}{listed}{CLOSE};", *lines]
-        weight = f"weights_{place}[k] * "
-    packet = f"in->{own}[k]"
-    names = [c.channels[line.link][channel] for channel in channels]
-    lines.append(f"for (int k = 0; k < {count}; k++) {OPEN}")
-    value = f"{packet}.{names[0]}"
-    if edge:
-        lines += [f"  {one}" for one in _look(c, p, place, packet, names, line)]
-        value = "value"
-    elif line.missing:
-        value = f"({packet}.missing ? own_{own}.{names[0]} : {value})"
-    if joined:
-        lines.append(f"  {total} = f{receive.operator}({total}, {value});")
-    else:
-        lines.append(f"  {total} += {weight}{value};")
-    lines.append(CLOSE)
-    if divided:
-        lines.append(f"{total} /= {float(count)!r};")
-    return lines
+    return [
+        f"static const double weights_{place}[{count}] = {{{row(map(number, weights.tolist()))}}};",
+        f"double {total} = 0.0;",
+        *(loop, *looked, f"  {total} += weights_{place}[k] * {value};", "}"),
+        *([f"{total} /= {float(count)!r};"] if divided else []),
+    ]
 
 
-def _look(c: CPeer, p: int, place: int, packet: str, names: Sequence[str], line: Line) -> list[str]:
-    """Return the lines that make `value` of one sender's packet."""
-    pair, own = pair_function(c.peer.kind, p, place)
-    function, inputs = straight(pair), _inputs(c)
-    memories = [f"peer->{c.outputs[p][o]}" for o in c.peer.kind.clocks[p].memories]
-    every = [*inputs["x"], *inputs["u"], *memories, *inputs["p"]]
-    missing = f"{packet}.missing"
+def _look(peer: Peer, p: int, place: int, line: Line, names: Sequence[str]) -> tuple[list[str], str]:
+    """Return the lines that look at one sender's packet, and what they make of it."""
+    pair, own = pair_function(peer.kind, p, place)
+    function, packet = straight(pair), f"in->{line.name}[k]"
+    every = [*_moving(peer), *_memories(peer, p), *_parameters(peer)]
+    missing = f"{packet}.missing" if line.missing else "0.0"
     heard = [f"({missing} ? 0.0 : {packet}.{name})" if line.missing else f"{packet}.{name}" for name in names]
-    arguments = [*(every[row] for row in own), *heard, missing if line.missing else "0.0", "t"]
-    found, lines = straight_lines(function, arguments)
-    return [*lines, f"const double value = {found[function.results[0][0]]};"]
+    values, lines = straight_lines(function, [*(every[i] for i in own), *heard, missing, "t"])
+    return [f"  {one}" for one in lines], values[function.results[0][0]]
 
 
-def _move(c: CPeer, place: int, move: Move) -> str:
+def _move(peer: Peer, place: int, move: Move) -> str:
     """Return what moves the computer's states over a length of time."""
-    peer = c.peer
-    own = [i for i, name in enumerate(c.states) if name]
-    columns = [*(f"peer->{name}" if name else "" for name in (*c.states, *c.acting)), "1"]
-    lines: list[str] = []
-    stores: list[str] = []
-    for row in own:
-        if row in move.flowing:
-            continue
+    moving, name = _moving(peer), peer.identifier
+    exact = [i for i in range(len(peer.start)) if i not in peer.outside and i not in move.flowing]
+    lines, stores = [], {}
+    for i in exact:
         terms = [
-            f"{number(value)} * {column}" if column != "1" else number(value)
-            for value, column in zip(move.matrix[row].tolist(), columns, strict=True)
-            if value and column
+            f"{number(value)} * {factor}"
+            for j, (value, factor) in enumerate(zip(move.matrix[i].tolist(), [*moving, "1.0"], strict=True))
+            if value and j not in peer.outside
         ]
-        lines.append(f"const double x{row} = {' + '.join(terms) or '0.0'};")
-        stores.append(f"peer->{c.states[row]} = x{row};")
+        lines.append(f"const double x{i} = {' + '.join(terms) or '0.0'};")
+        stores[i] = f"x{i}"
     if move.flow is not None:
-        function, inputs = straight(move.flow), _inputs(c)
-        arguments = [*(inputs["x"][row] for row in move.flowing), *inputs["u"], *inputs["p"], "t"]
+        function = straight(move.flow)
+        flowing = [moving[i] for i in move.flowing]
+        arguments = [*flowing, *moving[len(peer.start) :], *_parameters(peer), "t"]
         names, more = straight_lines(function, arguments)
         lines += more
-        stores += [
-            f"peer->{c.states[row]} = {names[value]};"
-            for row, value in zip(move.flowing, function.results[0], strict=True)
-        ]
+        stores |= {i: names[one] for i, one in zip(move.flowing, function.results[0], strict=True)}
     return f"""\
-/* What this computer moves, over {seconds(peer, move.quanta)} s. */
-static void {c.name}_move_{place}({c.name} *peer) {OPEN}
-  const double t = {_now(peer)};
+/* What this computer moves, over {float(move.quanta * peer.schedule.quantum)!r} s. */
+static void {name}_move_{place}({name} *peer) {{
+  const double t = {name}_now(peer);
   (void)t;
-{block([*lines, *stores])}{CLOSE}
+{block([*lines, *(f"peer->x[{i}] = {value};" for i, value in stores.items())])}}}
 """
 
 
-def _begin(c: CPeer) -> str:
-    """Return what sets everything to where it starts."""
-    peer = c.peer
-    values: dict[str, float] = {own: peer.start[i] for i, own in enumerate(c.states) if own}
-    for p, partition in enumerate(peer.kind.clocks):
-        started = dict(zip(partition.memories, peer.memories[p], strict=True))
-        values |= {own: started.get(o, 0.0) for o, own in enumerate(c.outputs[p]) if own}
-    values |= dict.fromkeys((own for own in c.acting if own), 0.0)
-    lines = ["peer->quanta = 0;", "peer->instant = 0;"]
-    lines += [f"peer->{own} = {number(value)};" for own, value in values.items()]
-    lines += [f"for (int k = 0; k < {kept}; k++) peer->{own}[k] = 0.0;" for own, kept in c.late.values()]
-    silent = ["(void)in;"]
+# ---- a program
+
+
+def driver(peer: Peer, include: str) -> str:
+    """Return a program that reads what a peer measures and hears, a row an instant, and prints what it does.
+
+    With a number N it does N instants of what is heard at the start, and prints the time of one. It prints in
+    digits that say the very same doubles.
+    """
+    read = [("%lf", own, peer.kind.states[i].name) for i, own in peer.measured.items()]
     for line in peer.lines:
         for k, sender in enumerate(line.senders):
-            silent += [
-                f"in->{c.lines[line.link]}[{k}].{own} = {number(value)};"
-                for own, value in zip(c.channels[line.link], sender.start, strict=True)
+            begin, label = f"{line.name}[{k}]", f"{line.link} {sender.name}"
+            read += [
+                ("%lf", f"{begin}.{own}", f"{label} {channel}")
+                for own, channel in zip(line.members, line.channels, strict=True)
             ]
-            silent += [f"in->{c.lines[line.link]}[{k}].missing = 0;"] if line.missing else []
-    return f"""\
-void {c.name}_start({c.name} *peer) {OPEN}
-{block(lines)}{CLOSE}
-
-void {c.name}_unheard({c.name}_in *in) {OPEN}
-{block(silent)}{CLOSE}
-"""
-
-
-def _times(c: CPeer, kinds: Sequence[Instant]) -> str:
-    lengths = [c.peer.moves[one.move].quanta for one in kinds]
-    listed = ", ".join(map(str, lengths))
-    return f"""\
-double {c.name}_time(const {c.name} *peer) {OPEN} return {_now(c.peer)}; {CLOSE}
-
-long long {c.name}_next(const {c.name} *peer) {OPEN}
-  static const long long lengths[{len(kinds)}] = {OPEN}{listed}{CLOSE};
-  return peer->quanta + lengths[{c.name}_kind(peer)];
-{CLOSE}
-"""
-
-
-def _switch(c: CPeer, cases: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines that do what each kind of instant asks for."""
-    alike: dict[tuple[str, ...], list[int]] = {}
-    for place, case in enumerate(cases):
-        alike.setdefault(tuple(case), []).append(place)
-    if len(alike) == 1:
-        return [*cases[0]]
-    lines = [f"switch ({c.name}_kind(peer)) {OPEN}"]
-    for body, places in alike.items():
-        if body:
-            lines += [
-                *(f"  case {place}:" for place in places),
-                *(f"    {one}" for one in body),
-                "    break;",
-            ]
-    return [*lines, "  default:", "    break;", CLOSE]
-
-
-def _send(c: CPeer, kinds: Sequence[Instant]) -> str:
-    lines = ["(void)peer;", "(void)in;", "(void)out;"]
-    sent = {line.sending: line for line in c.peer.lines if line.sending >= 0}
-    lines += [f"out->{c.lines[line.link]}_sent = 0;" for line in sent.values()]
-    cases = [
-        [
-            text
-            for partition in one.sends
-            for own in (c.lines[sent[partition].link],)
-            for text in (f"{c.name}_{own}_own(peer, in, &out->{own});", f"out->{own}_sent = 1;")
+            read += [("%d", f"{begin}.missing", f"{label} missing")] if line.missing else []
+    shown = [("%.17g", f"out.{own}", force.name) for own, force in peer.forces.items()]
+    for line in peer.sending:
+        shown.append(("%d", f"out.{line.name}_sent", f"{line.link} sent"))
+        shown += [
+            ("%.17g", f"out.{line.name}.{own}", f"{line.link} {channel}")
+            for own, channel in zip(line.members, line.channels, strict=True)
         ]
-        for one in kinds
+    shown += [
+        ("%.17g", f"peer.{memory(peer, one)}", one.name) for one in peer.signals if one.role == "output"
     ]
-    return f"""\
-void {c.name}_send(const {c.name} *peer, const {c.name}_in *in, {c.name}_out *out) {OPEN}
-{block([*lines, *_switch(c, cases)])}{CLOSE}
-"""
-
-
-def _force(c: CPeer, kinds: Sequence[Instant]) -> str:
-    cases = []
-    for one in kinds:
-        case = [f"{c.name}_tick_{p}(peer, in, t);" for p in one.ticks]
-        for act in one.acts:
-            key = act.partition, act.output
-            value = f"{c.late[key][0]}[{act.lag}]" if key in c.late else c.outputs[act.partition][act.output]
-            case.append(f"peer->{c.acting[act.hold]} = peer->{value};")
-        cases.append(case)
-    forces = []
-    for own, force in zip(c.forces, c.peer.forces, strict=True):
-        terms = [
-            ("" if factor == 1 else "-" if factor == -1 else f"{number(factor)} * ") + f"peer->{c.acting[h]}"
-            for h, factor in force.terms
-            if c.acting[h]
-        ]
-        forces.append(f"out->{own} = {' + '.join(terms) or '0.0'};")
-    return f"""\
-void {c.name}_force({c.name} *peer, const {c.name}_in *in, {c.name}_out *out) {OPEN}
-  const double t = {_now(c.peer)};
-{block(["(void)in;", "(void)out;", "(void)t;", *_switch(c, cases), *forces])}{CLOSE}
-"""
-
-
-def _whole(c: CPeer, kinds: Sequence[Instant]) -> str:
-    moves = [[f"{c.name}_move_{one.move}(peer);"] for one in kinds]
-    return f"""\
-void {c.name}_move({c.name} *peer) {OPEN}
-  const long long next = {c.name}_next(peer);
-{block(_switch(c, moves))}  peer->quanta = next;
-  peer->instant = (peer->instant + 1) % {len(c.peer.instants)};
-{CLOSE}
-
-void {c.name}_tick({c.name} *peer, const {c.name}_in *in, {c.name}_out *out) {OPEN}
-  {c.name}_send(peer, in, out);
-  {c.name}_force(peer, in, out);
-  {c.name}_move(peer);
-{CLOSE}
-"""
+    tests = [f'scanf("{form}", &in.{own}) == 1' for form, own, _ in read]
+    return filled(
+        "peer_test.c",
+        title=_title(peer),
+        include=include,
+        name=peer.identifier,
+        reads=comment(", ".join(label for *_, label in read)) or "a line of any text",
+        prints=comment(", ".join(label for *_, label in shown)),
+        condition=" &&\n      ".join(tests) or '!feof(stdin) && scanf("%*[^\\n]") != EOF && getchar() != EOF',
+        shown=block((f'printf(" {form}", {value});' for form, value, _ in shown), 4),
+    )

@@ -16,12 +16,9 @@ from typing import ClassVar
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.files import write_texts
-from apc.exports.c_driver import driver
-from apc.exports.c_header import header
-from apc.exports.c_names import CPeer, c_peer
-from apc.exports.c_text import source
+from apc.exports.c_text import driver, header, source
 from apc.exports.fmu import Unit, unit_of
-from apc.exports.peer import peer_of, refused, sites_of
+from apc.exports.peer import Peer, peer_of, refused, sites_of
 from apc.exports.scene_text import c_scene, one_peer
 from apc.finite_equations import finite_equations
 from apc.result import Result
@@ -33,10 +30,10 @@ _NAME = re.compile(r"(?P<group>.+)\[(?P<number>[1-9][0-9]{0,8})\]\Z")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Code(Result):
-    """One peer of a scene in C: its names there, and the method of what moves in it."""
+    """One peer of a scene in C, and the method of what moves in it."""
 
     topology: str
-    code: CPeer
+    code: Peer
     method: str
     shown_by: ClassVar[str] = "code:code"
 
@@ -67,7 +64,7 @@ def peer_code(system: CompiledSystem, *, peer: str = "", device: str = "", metho
         hint = f'--peer "{plan.exchange.peer_name(0)}"'
         raise ApcError(Mistake("E963", Place(system.origin.topology), what, hint=hint))
     found = peer_of(plan, peer_named(plan, peer) if peer else 0, how, device=device or None)
-    return Code(system.name, c_peer(found), str(how))
+    return Code(system.name, found, str(how))
 
 
 def scene_unit(system: CompiledSystem, *, peer: str = "", method: str = "") -> Unit:

@@ -24,8 +24,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import write_file
 from apc.distribution import program_version
-from apc.exports.c_header import header
-from apc.exports.c_text import source
+from apc.exports.c_text import header, source
 from apc.exports.scene_text import CScene, scene_source
 from apc.result import Result
 from apc.simulation.native import compiler
@@ -65,8 +64,8 @@ def unit_of(system: CompiledSystem, scene: CScene, *, peer: str = "") -> Unit:
     duration = system.experiment.duration
     texts: dict[str, str] = {}
     for code in scene.codes:
-        texts[f"{code.name}.h"] = header(code)
-        texts[f"{code.name}.c"] = source(code, f"{code.name}.h")
+        texts[f"{code.identifier}.h"] = header(code)
+        texts[f"{code.identifier}.c"] = source(code, f"{code.identifier}.h")
     main = _main(scene)
     guid = hashlib.sha256("\0".join((*texts.values(), main)).encode()).hexdigest()
     texts[f"{_identifier(scene)}.c"] = main.replace("GUID_OF_TEXTS", guid)

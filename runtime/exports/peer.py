@@ -16,7 +16,7 @@ computer. A device that is tied to a copy by more than forces computed at ticks 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -27,11 +27,11 @@ from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.interpolation import jacobian
 from apc.compiler.language.vectors import whole_and_index
+from apc.exports.words import identifier, unique
 from apc.frame import schedule as frames
 from apc.frame.devices import Device, find_device
 from apc.frame.discretize import moved_together
 from apc.frame.exact import evaluate_exact
-from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians, edge_name, structural_pattern
 from apc.frame.parameters import exact_numbers
 from apc.frame.schedule import Schedule
@@ -49,11 +49,9 @@ STEPS = "--method rk4:0.1ms"  # a method that is arithmetic, whatever moves
 
 @dataclass(frozen=True, slots=True)
 class Act:
-    """Hold `hold` puts out output `output` of clock partition `partition`, computed `lag` ticks ago."""
+    """Hold `hold` puts out what was computed for it `lag` ticks ago."""
 
     hold: int
-    partition: int
-    output: int
     lag: int
 
 
@@ -85,15 +83,17 @@ class Sender:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A link as one peer has it: what is told over it, who is heard, whether it can miss a packet.
+    """A link as one peer has it: what is sent over it, who is heard, whether it can miss a packet.
 
     `sending` is the peer's own send partition, −1 if it sends nothing there; `complete` says that everybody
-    hears everybody.
+    hears everybody. In C the line is called `name`, and the channels of a packet `members`.
     """
 
     link: str
+    name: str
     channels: tuple[str, ...]
     units: tuple[str, ...]
+    members: tuple[str, ...]
     sending: int
     senders: tuple[Sender, ...]
     missing: bool
@@ -126,23 +126,24 @@ class Move:
 class Peer:
     """A peer. `number` counts from 0 over all groups; `parameters` (n_p,) are its kind's.
 
-    `outside` are the states that its computer does not move, `measured` those of them that it looks at.
-    `channels` are, for each receive of each clock partition, the places of what it hears among those of its
-    line; no place for a receive that nothing reads. `start` are the states', `memories` those of each clock
-    partition's remembered outputs.
+    In C it is called `identifier`. `outside` are the states that its computer does not move, `measured` those
+    of them that it looks at, by what they are called in C, and `forces` likewise. `channels` are, by clock
+    partition and receive, the places of what is heard among those of its line; a receive that nothing reads
+    has none. `start` are the states', `memories` those of each clock partition's remembered outputs.
     """
 
     system: CompiledSystem
     name: str
+    identifier: str
     number: int
     kind: Kind
     schedule: Schedule
     parameters: Any
     outside: frozenset[int]
-    measured: tuple[int, ...]
-    forces: tuple[Force, ...]
+    measured: dict[int, str]
+    forces: dict[str, Force]
     lines: tuple[Line, ...]
-    channels: tuple[tuple[tuple[int, ...], ...], ...]
+    channels: dict[tuple[int, int], tuple[int, ...]]
     instants: tuple[Instant, ...]
     moves: tuple[Move, ...]
     start: tuple[float, ...]
@@ -154,13 +155,20 @@ class Peer:
         every = local_signals(self.kind, self.schedule)
         return tuple(one for one in every if one.role != "state" or one.place[0] not in self.outside)
 
+    @property
+    def sending(self) -> tuple[Line, ...]:
+        """The lines over which it sends."""
+        return tuple(line for line in self.lines if line.sending >= 0)
+
     def line(self, link: str) -> Line:
         """Return what it has of a link."""
         return next(one for one in self.lines if one.link == link)
 
 
-def peer_of(plan: Plan, number: int, method: Method, *, device: str | None = NO_DEVICE) -> Peer:
-    """Take a peer apart from the others.
+def peer_of(
+    plan: Plan, number: int, method: Method, *, device: str | None = NO_DEVICE, name: str = ""
+) -> Peer:
+    """Take a peer out of its scene.
 
     Parameters
     ----------
@@ -172,46 +180,45 @@ def peer_of(plan: Plan, number: int, method: Method, *, device: str | None = NO_
         How the states move that no exact transition moves.
     device
         The part that moves outside the computer, `NO_DEVICE` if none does; None: what others are not told of.
+    name
+        What it is called in C; follows from its name in the scene if not given.
 
     Raises
     ------
     ApcError
         E960 it does what is not arithmetic, or has no ticks; E961 no device, or one that can't be told apart.
     """
-    system, exchange = plan.system, plan.exchange
-    group = group_of(plan, number)
+    system, group = plan.system, group_of(plan, number)
     place = system.groups[group].kind
     kind, site, schedule = system.kinds[place], plan.sites[place], plan.schedules[group]
-    row = int(plan.numbers.rows[group][number - int(exchange.starts[group])])
-    vector = plan.numbers.parameters[group][row]
-    name = exchange.peer_name(number)
-    _refuse_what_iterates(system, name, kind)
-    outside = _outside(system, name, site, device)
-    numbers = [
-        own
-        for one, listed in zip(system.groups, plan.numbers.parameters, strict=True)
-        if one.kind == place
-        for own in listed
-    ]
+    vector, label = _parameters(plan, number), plan.exchange.peer_name(number)
+    _refuse_what_iterates(system, label, kind)
+    outside = _outside(system, label, site, device)
     instants, lengths = _instants(schedule)
     lines, channels = lines_of(plan, number)
+    names = [line.name for line in lines]
+    looked_at = sorted(outside & _read(kind))
+    measured = unique((identifier(kind.states[row].name) for row in looked_at), names)
+    forces = _forces(system, label, site, vector, outside)
+    pushed = unique((identifier(one.name) for one in forces), [*names, *(f"{line}_sent" for line in names)])
     x, _, memories = start_values(site, [float(one) for one in vector])
     return Peer(
         system=system,
-        name=name,
+        name=label,
+        identifier=name or identifier(label),
         number=number,
         kind=kind,
         schedule=schedule,
         parameters=vector,
         outside=outside,
-        measured=tuple(sorted(outside & _read(kind))),
-        forces=_forces(system, name, site, vector, outside),
+        measured=dict(zip(looked_at, measured, strict=True)),
+        forces=dict(zip(pushed, forces, strict=True)),
         lines=lines,
         channels=channels,
         instants=instants,
-        moves=_moves(system, name, site, schedule, outside, lengths, method, vector, numbers),
-        start=tuple(float(one) for one in x),
-        memories=tuple(tuple(float(one) for one in own) for own in memories),
+        moves=_moves(plan, label, group, outside, lengths, method, vector),
+        start=tuple(x),
+        memories=tuple(map(tuple, memories)),
     )
 
 
@@ -220,20 +227,22 @@ def group_of(plan: Plan, number: int) -> int:
     return int(np.searchsorted(plan.exchange.starts, number, side="right")) - 1
 
 
+def _parameters(plan: Plan, number: int) -> Any:
+    """Return a peer's vector (n_p,) of parameters."""
+    group = group_of(plan, number)
+    row = plan.numbers.rows[group][number - int(plan.exchange.starts[group])]
+    return plan.numbers.parameters[group][int(row)]
+
+
 def sites_of(plan: Plan) -> tuple[int, ...]:
-    """Return of every peer the first one that is like it: of its group and numbers, and hears as many."""
+    """Return of every peer the first one of its group and numbers that hears others by the same weights."""
     first: dict[Any, int] = {}
     found = []
-    for group, rows in enumerate(plan.numbers.rows):
-        begin = int(plan.exchange.starts[group])
-        for place, row in enumerate(rows.tolist()):
-            number = begin + place
-            heard = tuple(
-                (link, tuple(weight for _, weight in _heard(plan.system, plan.exchange, link, number)))
-                for link in plan.exchange.links
-                if not plan.exchange.is_complete(link)
-            )
-            found.append(first.setdefault((group, row, heard), number))
+    graphs = [link for link in plan.exchange.links if not plan.exchange.is_complete(link)]
+    for number in range(plan.exchange.peers):
+        heard = tuple(tuple(weight for _, weight in _heard(plan, link, number)) for link in graphs)
+        key = group_of(plan, number), _parameters(plan, number).tobytes(), heard
+        found.append(first.setdefault(key, number))
     return tuple(found)
 
 
@@ -244,23 +253,15 @@ def refused(system: CompiledSystem, what: str, hint: str = "") -> ApcError:
 
 def _refuse_what_iterates(system: CompiledSystem, name: str, kind: Kind) -> None:
     """Refuse a peer of which something is solved by Newton's method."""
-    for partition in kind.clocks:
-        if not partition.tick.is_a("SXFunction"):
-            outputs = ", ".join(partition.outputs)
-            what = (
-                f"{name}: at a tick of {partition.clock} {outputs} are solved for by iteration, which is not"
-            )
-            raise refused(system, f"{what} written as C", "equations that can be solved for these")
-    for one in kind.sends:
-        if not one.send.is_a("SXFunction"):
-            what = (
-                f"{name}: {', '.join(one.channels)} of {one.link} are solved for by iteration, which is not"
-            )
-            raise refused(system, f"{what} written as C", "equations that can be solved for these")
+    computed = [(one.tick, f"at a tick of {one.clock} {', '.join(one.outputs)}") for one in kind.clocks]
+    computed += [(one.send, f"{', '.join(one.channels)} of {one.link}") for one in kind.sends]
+    for function, what in computed:
+        if not function.is_a("SXFunction"):
+            what = f"{name}: {what} are solved for by iteration, which is not written as C"
+            raise refused(system, what, "equations that can be solved for these")
     if not kind.clocks:
-        raise refused(
-            system, f"{name} computes nothing at any tick of a clock: there is nothing to write as C"
-        )
+        what = f"{name} computes nothing at any tick of a clock: there is nothing to write as C"
+        raise refused(system, what)
 
 
 # ---- what moves outside
@@ -268,62 +269,56 @@ def _refuse_what_iterates(system: CompiledSystem, name: str, kind: Kind) -> None
 
 def _outside(system: CompiledSystem, name: str, site: SiteJacobians, device: str | None) -> frozenset[int]:
     """Return the states that the peer's computer does not move."""
-    kind, place = site.kind, Place(system.origin.topology)
+    kind = site.kind
     if device == NO_DEVICE:
         return frozenset()
     parts = [whole_and_index(one.name)[0].rpartition(".")[0] for one in kind.states]
     masses = {part for row, part in enumerate(parts) if _is_position(kind, site, row)}
-    told = {parts[int(row)] for send in site.pattern.sends for row in np.flatnonzero(send.x.any(axis=0))}
-    tied = [
-        set(one.tolist())
-        for one in moved_together(structural_pattern(kind.derivative.jac_sparsity(0, 0)).astype(float))
-    ]
+    sent = {parts[int(row)] for send in site.pattern.sends for row in np.flatnonzero(send.x.any(axis=0))}
+    pattern = structural_pattern(kind.derivative.jac_sparsity(0, 0)).astype(float)
+    tied = [set(rows.tolist()) for rows in moved_together(pattern)]
     held = _held(kind)
     if device is not None:
         chosen = {one.strip() for one in device.split(",")}
         for one in sorted(chosen - masses):
+            near = nearest(one, masses) or min(masses, default=NO_DEVICE)
             what = f"--device: no mass of {name} is called {one[:40] or 'so'}"
-            raise ApcError(
-                Mistake(
-                    "E961",
-                    place,
-                    what,
-                    hint=f"--device {nearest(one, masses) or min(masses, default=NO_DEVICE)}",
-                )
-            )
+            raise _undecided(system, what, f"--device {near}")
     elif held:
         hands = tuple(f"{hand}." for hand in kind.hands)
-        chosen = {parts[row] for own in tied if own & held for row in own} & masses
+        chosen = {parts[row] for rows in tied if rows & held for row in rows} & masses
         chosen -= {part for part in masses if f"{part}.".startswith(hands)}
-        chosen -= told if chosen - told else set()
+        chosen -= sent if chosen - sent else set()
     else:
-        chosen = masses - told
+        chosen = masses - sent
     if not chosen:
+        hint = f"--device {NO_DEVICE} if its computer moves them all, or --device "
         what = f"{name} has no device: others are told of every mass of it"
-        mass = min(masses, default=NO_DEVICE)
-        hint = f"--device {NO_DEVICE} if its computer moves them all, or --device {mass}"
-        raise ApcError(Mistake("E961", place, what, hint=hint))
-    if device is None and not held and len(chosen) > 1:
-        listed = sorted(chosen)
+        raise _undecided(system, what, hint + min(masses, default=NO_DEVICE))
+    listed = sorted(chosen)
+    if device is None and not held and len(listed) > 1:
         what = f"{name}: {' and '.join(listed)} may be devices, or copies that its computer moves"
-        raise ApcError(
-            Mistake("E961", place, what, hint=f"--device {','.join(listed)} or --device {listed[0]}")
-        )
-    found: set[int] = set()
-    for own in tied:
-        inside = {parts[row] for row in own}
+        raise _undecided(system, what, f"--device {','.join(listed)} or --device {listed[0]}")
+    outside: set[int] = set()
+    for rows in tied:
+        inside = {parts[row] for row in rows}
         if not inside & chosen:
             continue
-        if copies := sorted((inside & told) - chosen):
+        if copies := sorted((inside & sent) - chosen):
             moving, copied = " and ".join(sorted(inside & chosen)), " and ".join(copies)
             what = (
                 f"{name}: {moving} and {copied} are tied to each other between ticks: no computer can move "
                 f"{copied} where {moving} moves by itself"
             )
             hint = f"a part with a clock between them, as SampledSpringDamper, or --device {NO_DEVICE}"
-            raise ApcError(Mistake("E961", place, what, hint=hint))
-        found |= own
-    return frozenset(found)
+            raise _undecided(system, what, hint)
+        outside |= rows
+    return frozenset(outside)
+
+
+def _undecided(system: CompiledSystem, what: str, hint: str = "") -> ApcError:
+    """Return the message (E961) of a device that can't be told apart."""
+    return ApcError(Mistake("E961", Place(system.origin.topology), what, hint=hint))
 
 
 def _held(kind: Kind) -> frozenset[int]:
@@ -380,11 +375,10 @@ def _forces(
         if casadi.depends_on(axis, varying):
             what = f"{name}: what pushes {state} is no sum of what ticks compute: it bends with the motion"
             hint = "a motor without a limit, which the real one has"
-            raise ApcError(Mistake("E961", Place(system.origin.topology), what, hint=hint))
+            raise _undecided(system, what, hint)
         device = find_device(site, vector, unit_of, part=state)
         if not isinstance(device, Device):
-            why = device or f"{state} is no mass"
-            raise ApcError(Mistake("E961", Place(system.origin.topology), f"{name}: {why}"))
+            raise _undecided(system, f"{name}: {device or f'{state} is no mass'}")
         function = casadi.Function("slopes", [x, u, p, t], [casadi.densify(axis)])
         values = evaluate_exact(function, [numbers[0], numbers[1], numbers[4], numbers[5]])[0]
         terms = tuple((h, float(one / device.inverse)) for h, one in enumerate(values) if one)
@@ -397,18 +391,17 @@ def _forces(
 
 
 def _moves(
-    system: CompiledSystem,
+    plan: Plan,
     name: str,
-    site: SiteJacobians,
-    schedule: Schedule,
+    group: int,
     outside: frozenset[int],
     lengths: Sequence[int],
     method: Method,
     vector: Any,
-    numbers: Sequence[Any],
 ) -> tuple[Move, ...]:
-    """Return what the computer's states do in every length of time."""
-    kind = site.kind
+    """Return what the computer's states do in every length of time, in quanta."""
+    system, place = plan.system, plan.system.groups[group].kind
+    kind, site, quantum = system.kinds[place], plan.sites[place], plan.schedules[group].quantum
     flowing = [row for row in rows_to_move(kind, method) if row not in outside]
     names = ", ".join(kind.states[row].name for row in flowing)
     if flowing and method.step is None:
@@ -417,27 +410,25 @@ def _moves(
     if flowing and not kind.derivative.is_a("SXFunction"):
         what = f"{name}: the rates of {names} are solved for by iteration, which is not written as C"
         raise refused(system, what, "equations that can be solved for these")
+    every = zip(system.groups, plan.numbers.parameters, strict=True)
+    numbers = [row for one, rows in every if one.kind == place for row in rows]
     flow = flow_of(kind, method, flowing, state_scales(system, kind, site, numbers))
     linear = rates(kind, [*sorted(outside), *flowing])
     if linear.timed:
-        g = linear.rate(*linear.rate.sx_in())
-        pushed = ", ".join(
-            kind.states[row].name
-            for row in range(g.numel())
-            if casadi.depends_on(g[row], linear.rate.sx_in()[1])
-        )
+        inputs = linear.rate.sx_in()
+        g = linear.rate(*inputs)
+        rows = [row for row in range(g.numel()) if casadi.depends_on(g[row], inputs[1])]
+        pushed = ", ".join(kind.states[row].name for row in rows)
         what = f"{name}: {pushed} is pushed by a force that changes with time between ticks"
         raise refused(system, f"{what}; its exact integral is not written as C", STEPS)
-    seconds = [length * schedule.quantum for length in lengths]
-    found = transition_rows(linear, vector[None], seconds)
+    seconds = [length * quantum for length in lengths]
+    matrices = transition_rows(linear, vector[None], seconds).matrices
     moves = []
-    for length, duration, matrix in zip(lengths, seconds, found.matrices, strict=True):
+    for length, duration, matrix in zip(lengths, seconds, matrices, strict=True):
         function = flow.over(duration) if flow is not None else None
         if function is not None and not function.is_a("SXFunction"):
-            what = (
-                f"{name}: {names} take too many steps of {method} from one instant to the next to be written"
-            )
-            raise refused(system, what, STEPS)
+            what = f"{name}: {names} take too many steps of {method} from one instant to the next"
+            raise refused(system, f"{what} to be written", STEPS)
         moves.append(Move(length, matrix[0], tuple(flowing), function))
     return tuple(moves)
 
@@ -447,70 +438,70 @@ def _instants(schedule: Schedule) -> tuple[tuple[Instant, ...], tuple[int, ...]]
     lengths = sorted({one.duration for one in schedule.events if isinstance(one, frames.Propagate)})
     ticked = dict.fromkeys(range(len(schedule.ticks)), 0)
     found: list[Instant] = []
-    sends: list[int] = []
-    ticks: list[int] = []
-    acts: list[Act] = []
-    for event in schedule.events:
+    now = Instant((), (), (), 0)
+    for event in schedule.events:  # a frame ends with a length of time
         match event:
             case frames.Send(partition):
-                sends.append(partition)
+                now = replace(now, sends=(*now.sends, partition))
             case frames.Tick(partition):
-                ticks.append(partition)
+                now = replace(now, ticks=(*now.ticks, partition))
                 ticked[partition] += 1
             case frames.Act(hold, value):
                 lag = ticked[value.partition] - 1 - value.index
-                acts.append(Act(hold, value.partition, value.output, lag))
+                now = replace(now, acts=(*now.acts, Act(hold, lag)))
             case frames.Propagate(duration):
-                found.append(Instant(tuple(sends), tuple(ticks), tuple(acts), lengths.index(duration)))
-                sends, ticks, acts = [], [], []
-    assert not (sends or ticks or acts), "a frame ends with a length of time"
+                found.append(replace(now, move=lengths.index(duration)))
+                now = Instant((), (), (), 0)
     return tuple(found), tuple(lengths)
 
 
 # ---- what is heard
 
 
-def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], tuple[tuple[tuple[int, ...], ...], ...]]:
+def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int, int], tuple[int, ...]]]:
     """Return the links of a peer, and for every receive the places of its channels on its line."""
     system, exchange, group = plan.system, plan.exchange, group_of(plan, number)
     site, schedule = plan.sites[system.groups[group].kind], plan.schedules[group]
     kind = site.kind
-    live = {
-        (event.partition, place)
+    read = {
+        (event.partition, place): kind.clocks[event.partition].receives[place].link
         for event in schedule.events
         if isinstance(event, frames.Tick)
         for place, rows in enumerate(event.heard)
         if rows
     }
-    own = {one.link: place for place, one in enumerate(kind.sends)}
-    sent = {link: {one.channel for one in schedule.sent if one.link == link} for link in exchange.links}
-    found = []
-    for link in exchange.links:
-        hears = {
-            channel
-            for p, place in live
-            if kind.clocks[p].receives[place].link == link
-            for channel in site.pattern.ticks[p].channels[place]
-        }
-        sending = [one for one in (kind, *system.kinds) if any(s.link == link for s in one.sends)]
-        if not hears and not sent[link]:
+    lines, places = [], {}
+    for name, (link, declared) in zip(
+        unique(map(identifier, exchange.links)), exchange.links.items(), strict=True
+    ):
+        sent = {one.channel for one in schedule.sent if one.link == link}
+        of = {key: site.pattern.ticks[key[0]].channels[key[1]] for key, one in read.items() if one == link}
+        hears = {channel for channels in of.values() for channel in channels}
+        if not hears and not sent:
             continue
-        known = next(one for one in sending[0].sends if one.link == link)
-        used = [i for i, name in enumerate(known.channels) if i in hears or name in sent[link]]
+        place, known = next(
+            (place, one)
+            for each in (kind, *system.kinds)
+            for place, one in enumerate(each.sends)
+            if one.link == link
+        )
+        used = [i for i, one in enumerate(known.channels) if i in hears or one in sent]
+        places |= {key: tuple(map(used.index, channels)) for key, channels in of.items()}
         channels = tuple(known.channels[i] for i in used)
-        senders = [*_heard(system, exchange, link, number)] if hears else []
+        senders = [*_heard(plan, link, number)] if hears else []
         if len(senders) > MOST_HEARD:
-            what = (
-                f"{exchange.peer_name(number)} hears {len(senders):,} peers over {link}; {MOST_HEARD:,} fit"
-            )
-            raise refused(system, f"{what} a text of C", "fewer peers, or a graph that is not complete")
-        law = exchange.links[link].channel
-        found.append(
+            what = f"{exchange.peer_name(number)} hears {len(senders):,} peers over {link}"
+            what = f"{what}; {MOST_HEARD:,} fit a text of C"
+            raise refused(system, what, "fewer peers, or a graph that is not complete")
+        law = declared.channel
+        lines.append(
             Line(
                 link=link,
+                name=name,
                 channels=channels,
                 units=tuple(known.units[i] for i in used),
-                sending=own[link] if sent[link] else -1,
+                members=unique(map(identifier, channels)),
+                sending=place if sent else -1,
                 senders=tuple(
                     Sender(one, exchange.peer_name(one), weight, first_packet(plan, link, one, channels))
                     for one, weight in senders
@@ -519,44 +510,25 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], tuple[tuple[tup
                 complete=exchange.is_complete(link),
             )
         )
-    line_of = {one.link: one for one in found}
-    places = tuple(
-        tuple(
-            tuple(_places(system, kind, receive.link, line_of[receive.link], tick.channels[place]))
-            if (p, place) in live
-            else ()
-            for place, receive in enumerate(partition.receives)
-        )
-        for p, (partition, tick) in enumerate(zip(kind.clocks, site.pattern.ticks, strict=True))
-    )
-    return tuple(found), places
-
-
-def _places(
-    system: CompiledSystem, kind: Kind, link: str, line: Line, channels: Sequence[int]
-) -> Iterator[int]:
-    """Yield where channels of a link stand on a line."""
-    known = next(s for one in (kind, *system.kinds) for s in one.sends if s.link == link)
-    for channel in channels:
-        yield line.channels.index(known.channels[channel])
+    return tuple(lines), places
 
 
 def first_packet(plan: Plan, link: str, number: int, channels: Sequence[str]) -> tuple[float, ...]:
     """Return what is heard of a peer over a link before any packet of it arrives, channel by channel."""
-    group = group_of(plan, number)
-    row = int(plan.numbers.rows[group][number - int(plan.exchange.starts[group])])
-    site = plan.sites[plan.system.groups[group].kind]
-    known = next((one for one in site.kind.sends if one.link == link), None)
-    if known is None:
-        return (0.0,) * len(channels)
-    vector = [float(one) for one in plan.numbers.parameters[group][row]]
-    x, u, _ = start_values(site, vector)
-    sent = np.asarray(known.send(x, u, vector, 0.0), np.float64).ravel()
-    return tuple(float(sent[known.channels.index(one)]) if one in known.channels else 0.0 for one in channels)
+    site = plan.sites[plan.system.groups[group_of(plan, number)].kind]
+    sent: dict[str, float] = {}
+    for sending in site.kind.sends:
+        if sending.link == link:
+            vector = [float(one) for one in _parameters(plan, number)]
+            x, u, _ = start_values(site, vector)
+            values = np.asarray(sending.send(x, u, vector, 0.0), np.float64).ravel().tolist()
+            sent = dict(zip(sending.channels, values, strict=True))
+    return tuple(sent.get(one, 0.0) for one in channels)
 
 
-def _heard(system: CompiledSystem, exchange: Exchange, link: str, number: int) -> Iterator[tuple[int, float]]:
+def _heard(plan: Plan, link: str, number: int) -> Iterator[tuple[int, float]]:
     """Yield the peers that one hears over a link, with their weights, in the scene's order."""
+    system, exchange = plan.system, plan.exchange
     sends = [any(one.link == link for one in system.kinds[group.kind].sends) for group in system.groups]
     if exchange.is_complete(link):
         listed = [(one, 1.0) for one in range(exchange.peers) if one != number]
@@ -564,9 +536,7 @@ def _heard(system: CompiledSystem, exchange: Exchange, link: str, number: int) -
         pairs, weights = exchange.arcs(link)
         mine = np.flatnonzero(pairs[:, 1] == number)
         listed = sorted(zip(pairs[mine, 0].tolist(), weights[mine].tolist(), strict=True))
-    for one, weight in listed:
-        if sends[int(np.searchsorted(exchange.starts, one, side="right")) - 1]:
-            yield one, weight
+    return ((one, weight) for one, weight in listed if sends[group_of(plan, one)])
 
 
 def has_edge(kind: Kind, partition: int, receive: int) -> bool:

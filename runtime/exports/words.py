@@ -1,15 +1,24 @@
 """Names out of a scene as other tools want them.
 
-Takes: names such as `left[2].cube.x`. Gives: `Port`, `word`, `words`.
-Guarantees: a word is made of letters, digits and `_`, and begins with a letter; of several no two are alike.
+Takes: names such as `left[2].cube.x`. Gives: `Port`, `word`, `words`; `identifier`; `unique`.
+Guarantees: a word is made of letters, digits and `_`, and begins with a letter; an identifier is none of C's
+words; of several no two are equal.
 Does not: say which tool wants that.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+
+# Words of C, and names of its library and of the texts, that nothing else may be called.
+_TEXT = """
+auto break case char const continue default do double else enum extern float for goto if inline int long
+register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while
+main quanta instant missing y0 y1 yn j0 j1 jn gamma
+"""
+RESERVED = frozenset(_TEXT.split())
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,20 +31,29 @@ class Port:
 
 def words(ports: Sequence[Port]) -> list[str]:
     """Return a word for each of some names."""
-    found: list[str] = []
-    taken: set[str] = set()
-    for port in ports:
-        one = own = word(port.name)
-        number = 1
-        while one in taken:
-            number += 1
-            one = f"{own}_{number}"
-        taken.add(one)
-        found.append(one)
-    return found
+    return [*unique(word(port.name) for port in ports)]
 
 
 def word(name: str) -> str:
     """Return a name as a word."""
     found = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
     return found if found[:1].isalpha() else f"x_{found}".rstrip("_")
+
+
+def identifier(name: str) -> str:
+    """Return a name as C has it: letters, digits and _, no word of the language."""
+    found = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or "n"
+    return f"n{found}" if found[0].isdigit() else f"{found}_" if found in RESERVED else found
+
+
+def unique(names: Iterable[str], taken: Iterable[str] = ()) -> tuple[str, ...]:
+    """Return names of which none is equal to another or taken: a repeated one gets a number behind."""
+    used, found = set(taken), []
+    for base in names:
+        name, count = base, 1
+        while name in used:
+            count += 1
+            name = f"{base}_{count}"
+        used.add(name)
+        found.append(name)
+    return tuple(found)

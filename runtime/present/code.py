@@ -14,7 +14,7 @@ from apc.compiler.words import counted, wrapped
 from apc.exports.c_text import source
 from apc.exports.code import Code
 from apc.exports.fmu import Unit
-from apc.exports.peer import Line, Peer
+from apc.exports.peer import Peer
 from apc.present.forms import document, note
 
 MOST_NAMED = 6
@@ -22,7 +22,7 @@ MOST_NAMED = 6
 
 def code_text(found: Code) -> str:
     """Return what a peer's code takes and gives."""
-    peer, name = found.code.peer, found.code.name
+    peer, name = found.code, found.code.identifier
     period = float(peer.schedule.frame_s) / len(peer.instants) * 1e3
     every = f"every {period:.6g} ms" if len({one.move for one in peer.instants}) == 1 else "at its instants"
     measured = [f"{peer.kind.states[i].name} [{peer.kind.states[i].unit}]" for i in peer.measured]
@@ -30,8 +30,8 @@ def code_text(found: Code) -> str:
     rows = [
         ("measures", measured),
         ("hears", [f"{sender.name} over {line.link}" for line in peer.lines for sender in line.senders]),
-        ("puts out", [f"{one.name} [N]" for one in peer.forces]),
-        ("sends", [f"{name} over {line.link}" for line in _sending(peer) for name in line.channels]),
+        ("puts out", [f"{one.name} [N]" for one in peer.forces.values()]),
+        ("sends", [f"{name} over {line.link}" for line in peer.sending for name in line.channels]),
         ("moves itself", inside),
     ]
     lines = [f"{found.topology}: {peer.name} in C99, {name}_tick {every}", ""]
@@ -42,11 +42,11 @@ def code_text(found: Code) -> str:
 
 def code_document(found: Code) -> dict[str, Any]:
     """Return a peer's code as plain data."""
-    peer = found.code.peer
+    peer = found.code
     return {
         "topology": found.topology,
         "peer": peer.name,
-        "name": found.code.name,
+        "name": found.code.identifier,
         "method": found.method,
         "measured": [peer.kind.states[place].name for place in peer.measured],
         "heard": [
@@ -54,12 +54,12 @@ def code_document(found: Code) -> dict[str, Any]:
             for line in peer.lines
             if line.senders
         ],
-        "forces": [one.name for one in peer.forces],
-        "sent": [{"link": line.link, "channels": list(line.channels)} for line in _sending(peer)],
+        "forces": [one.name for one in peer.forces.values()],
+        "sent": [{"link": line.link, "channels": list(line.channels)} for line in peer.sending],
         "instants_s": [
             float(sum(_lengths(peer)[:k]) * peer.schedule.quantum) for k in range(len(peer.instants))
         ],
-        "source": source(found.code, f"{found.code.name}.h"),
+        "source": source(found.code, f"{found.code.identifier}.h"),
     }
 
 
@@ -89,10 +89,6 @@ def unit_document(found: Unit) -> dict[str, Any]:
             for one in found.scene.variables
         ],
     }
-
-
-def _sending(peer: Peer) -> list[Line]:
-    return [line for line in peer.lines if line.sending >= 0]
 
 
 def _lengths(peer: Peer) -> list[int]:

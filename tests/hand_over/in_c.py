@@ -14,10 +14,7 @@ import numpy as np
 import pytest
 
 import apc
-from apc.exports.c_driver import driver
-from apc.exports.c_header import header
-from apc.exports.c_names import CPeer, c_peer
-from apc.exports.c_text import source
+from apc.exports.c_text import driver, header, source
 from apc.exports.peer import Peer, peer_of
 from apc.network.channel import PacketSource, channel_law
 from apc.simulation.settings import DEFAULT, parse_method
@@ -36,20 +33,20 @@ def compiler() -> str:
     return found or pytest.skip("there is no C compiler")
 
 
-def build(code: CPeer, folder: Path, options: Sequence[str] = SANITIZED) -> Path:
+def build(peer: Peer, folder: Path, options: Sequence[str] = SANITIZED) -> Path:
     """Return the driver of a peer, compiled."""
     texts = {
-        f"{code.name}.h": header(code),
-        f"{code.name}.c": source(code, f"{code.name}.h"),
-        f"{code.name}_test.c": driver(code, f"{code.name}.h"),
+        f"{peer.identifier}.h": header(peer),
+        f"{peer.identifier}.c": source(peer, f"{peer.identifier}.h"),
+        f"{peer.identifier}_test.c": driver(peer, f"{peer.identifier}.h"),
     }
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="ascii")
     listed = [name for name in texts if name.endswith(".c")]
-    command = [compiler(), *STRICT, *options, *listed, "-o", code.name, "-lm"]
+    command = [compiler(), *STRICT, *options, *listed, "-o", peer.identifier, "-lm"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    return folder / code.name
+    return folder / peer.identifier
 
 
 @dataclass
@@ -63,16 +60,15 @@ class Running:
     turns: itertools.cycle[int] | None = None
 
     @classmethod
-    def started(cls, code: CPeer, folder: Path) -> Running:
-        peer = code.peer
-        names = ["time", *(one.name for one in peer.forces)]
+    def started(cls, peer: Peer, folder: Path) -> Running:
+        names = ["time", *(one.name for one in peer.forces.values())]
         for line in peer.lines:
             if line.sending >= 0:
                 names += [f"{line.link} sent", *(f"{line.link} {one}" for one in line.channels)]
         ticking = {p for one in peer.instants for p in one.ticks}
         names += [name for p in sorted(ticking) for name in peer.kind.clocks[p].outputs]
         process = subprocess.Popen(
-            [build(code, folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [build(peer, folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
         turns = itertools.cycle(peer.moves[one.move].quanta for one in peer.instants)
         return cls(peer, process, tuple(names), 0, turns)
@@ -110,8 +106,7 @@ def differences(
     quantum = plan.schedules[0].quantum
     marks = [round(float(Fraction(float(t)) / quantum)) for t in course.time]
     running = [
-        Running.started(c_peer(peer_of(plan, k, how, device=device)), folder)
-        for k in range(plan.exchange.peers)
+        Running.started(peer_of(plan, k, how, device=device), folder) for k in range(plan.exchange.peers)
     ]
     network = _Network(plan)
     off: dict[str, tuple[float, float]] = {}

@@ -10,7 +10,6 @@ import pytest
 
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.exports.c_names import c_peer
 from apc.exports.peer import peer_of
 from apc.simulation.settings import DEFAULT, parse_method
 from apc.simulation.simulation import plan_of
@@ -100,17 +99,19 @@ def test_what_is_not_linear_moves_by_the_same_steps(tmp_path: Path) -> None:
 def test_nothing_in_it_changes_but_what_is_given(tmp_path: Path) -> None:
     """No data of its own that could be written, and nothing called but what computes."""
     plan = plan_of(compiled(PAPER), DEFAULT)
-    code = c_peer(peer_of(plan, 1, DEFAULT, device=None))
+    code = peer_of(plan, 1, DEFAULT, device=None)
     build(code, tmp_path, ("-O2",))
-    subprocess.run([compiler(), "-std=c99", "-c", f"{code.name}.c"], cwd=tmp_path, check=True)
-    told = subprocess.run(["nm", f"{code.name}.o"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    subprocess.run([compiler(), "-std=c99", "-c", f"{code.identifier}.c"], cwd=tmp_path, check=True)
+    told = subprocess.run(
+        ["nm", f"{code.identifier}.o"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
     kinds = {line.split()[-2]: line.split()[-1] for line in told.stdout.splitlines()}
     assert not set(kinds) & set("dDbBCgGsS"), told.stdout
     called = {line.split()[-1] for line in told.stdout.splitlines() if line.split()[-2] == "U"}
     assert called <= {"_GLOBAL_OFFSET_TABLE_", "__stack_chk_fail"}
-    text = (tmp_path / f"{code.name}.c").read_text(encoding="ascii")
+    text = (tmp_path / f"{code.identifier}.c").read_text(encoding="ascii")
     included = {line for line in text.splitlines() if line.startswith("#include")}
-    assert included == {f'#include "{code.name}.h"', "#include <math.h>"}
+    assert included == {f'#include "{code.identifier}.h"', "#include <math.h>"}
 
 
 def test_the_loop_of_the_readme_compiles(tmp_path: Path) -> None:
@@ -127,7 +128,7 @@ def test_the_loop_of_the_readme_compiles(tmp_path: Path) -> None:
 def test_numbers_of_any_size_and_none_do_no_harm(tmp_path: Path) -> None:
     """Under the sanitizers, what is measured and heard infinite, no number, tiny or huge."""
     plan = plan_of(compiled(LOSSY), DEFAULT)
-    code = c_peer(peer_of(plan, 0, DEFAULT, device=None))
+    code = peer_of(plan, 0, DEFAULT, device=None)
     program = build(code, tmp_path, SANITIZED)
     some = np.random.default_rng(1).choice(
         [0.0, -0.0, 1e308, -1e308, 5e-324, float("inf"), float("-inf"), float("nan"), 1.0], (500, 6)
