@@ -1,7 +1,7 @@
 """A kind's functions as expressions of Modelica.
 
 Takes: a `casadi.Function` of scalar operations, and what its inputs are called.
-Gives: `Text`, `number`, `identifier`, `unit_of_modelica`; `written`, `used_inputs`.
+Gives: `Text`, `number`, `identifier`, `unit_of_modelica`; `written`.
 Guarantees: parentheses where Modelica's precedence asks for them and nowhere else; a condition is a Boolean,
 never a number; a long part that is used again gets a name of its own.
 Does not: know what a variable means.
@@ -39,14 +39,6 @@ _KEYWORDS = frozenset(
     )
 )
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
-_CALLED = {
-    **{name: name for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan")},
-    **{name: name for name in ("sinh", "cosh", "tanh", "floor", "ceil", "sign")},
-    "fabs": "abs",
-    "fmin": "min",
-    "fmax": "max",
-}
-_RELATIONS = {"lt": "<", "le": "<="}
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +75,11 @@ def unit_of_modelica(unit: str) -> str:
     return re.sub(r"\^(-?[0-9]+)", r"\1", unit).replace("*", ".")
 
 
-def written(function: Any, names: Sequence[Sequence[Text]], keep: Callable[[Text], Text]) -> list[Text]:
+def written(
+    function: Any,
+    names: Sequence[Sequence[Text | Callable[[], Text]]],
+    keep: Callable[[Text], Text],
+) -> list[Text]:
     """Return what a function gives, entry by entry, in the names of what it takes.
 
     Parameters
@@ -91,19 +87,23 @@ def written(function: Any, names: Sequence[Sequence[Text]], keep: Callable[[Text
     function
         A `casadi.Function` of scalar operations with one output.
     names
-        Of each input, those of its entries.
+        Of each input, those of its entries, or what gives the name of one that the function depends on.
     keep
         Gives a name to an expression that is long.
     """
     plain = straight(function)
-    values = [one for listed in names for one in listed] + [number(value) for value in plain.constants]
-
     taken = Counter(place for _, *places in plain.operations for place in places)
-    again = iter([taken[len(values) + k] > 1 for k in range(len(plain.operations))])
+    used = taken.keys() | set(plain.results[0])
+    values = [
+        name if isinstance(name, Text) else name() if place in used else Text("0")
+        for place, name in enumerate(name for listed in names for name in listed)
+    ]
+    values += [number(value) for value in plain.constants]
+    again = iter([taken[len(values) + len(plain.tables) + k] > 1 for k in range(len(plain.operations))])
 
     def rule(word: str) -> Callable[..., Text]:
-        def operation(*operands: Text) -> Text:
-            found = _RULES[word](*operands)
+        def operation(*operands: Any) -> Text:
+            found = _SPECIAL[word](*operands) if word in _SPECIAL else _formed(word, *operands)
             return keep(found) if next(again) and len(found.text) > LONGEST else found
 
         return operation
@@ -112,30 +112,21 @@ def written(function: Any, names: Sequence[Sequence[Text]], keep: Callable[[Text
     return [found[place] for place in plain.results[0]]
 
 
-def used_inputs(function: Any) -> list[list[bool]]:
-    """Return of each input which entries a function depends on."""
-    plain = straight(function)
-    taken = {place for _, *places in plain.operations for place in places} | set(plain.results[0])
-    marks, first = [], 0
-    for _, rows in plain.inputs:
-        marks.append([first + row in taken for row in range(rows)])
-        first += rows
-    return marks
+def _real(operand: Text) -> Text:
+    return Text(f"if {operand.text} then 1 else 0", IF) if operand.truth else operand
 
 
-def _real(one: Text) -> Text:
-    return Text(f"if {one.text} then 1 else 0", IF) if one.truth else one
+def _truth(operand: Text) -> Text:
+    value = operand.within(SUM)
+    return operand if operand.truth else Text(f"{value} < 0 or {value} > 0", OR, truth=True)
 
 
-def _truth(one: Text) -> Text:
-    return one if one.truth else Text(f"{one.within(SUM)} < 0 or {one.within(SUM)} > 0", OR, truth=True)
-
-
-def _infix(sign: str, binds: int, right: int) -> Callable[[Text, Text], Text]:
-    def rule(a: Text, b: Text) -> Text:
-        return Text(f"{_real(a).within(binds)}{sign}{_real(b).within(right)}", binds)
-
-    return rule
+def _formed(word: str, *operands: Text) -> Text:
+    """Return an operation that is one form, in which each operand binds at least so tightly."""
+    form, binds, *least = _FORMS.get(word) or (f"{_CALLED.get(word, word)}({{}})", ATOM, IF)
+    convert = _truth if word in ("and", "or", "not") else _real
+    texts = [convert(operand).within(bound) for operand, bound in zip(operands, least, strict=True)]
+    return Text(form.format(*texts), binds, truth=binds in (OR, AND, NOT, RELATION))
 
 
 def _add(a: Text, b: Text) -> Text:
@@ -144,7 +135,7 @@ def _add(a: Text, b: Text) -> Text:
         return Text(f"if {a.branch[0].text} then {a.branch[1].text} else {b.branch[1].text}", IF)
     if b.text.startswith("-") and b.binds == SUM:
         return Text(f"{_real(a).within(SUM)} - {b.text[1:]}", SUM)
-    return _infix(" + ", SUM, SUM)(a, b)
+    return _formed("plus", a, b)
 
 
 def _branch(condition: Text, value: Text) -> Text:
@@ -152,69 +143,50 @@ def _branch(condition: Text, value: Text) -> Text:
     return Text(f"if {condition.text} then {value.text} else 0", IF, branch=(condition, value))
 
 
-def _power(a: Text, b: Text) -> Text:
-    return Text(f"{_real(a).within(ATOM)}^{_real(b).within(ATOM)}", POWER)
-
-
-def _call(name: str) -> Callable[..., Text]:
-    return lambda *operands: Text(f"{name}({', '.join(_real(one).text for one in operands)})")
-
-
-def _relation(sign: str) -> Callable[[Text, Text], Text]:
-    return lambda a, b: Text(f"{_real(a).within(SUM)} {sign} {_real(b).within(SUM)}", RELATION, truth=True)
-
-
-def _equal(a: Text, b: Text) -> Text:
-    """Return that two numbers are equal, which Modelica asks of no two Reals."""
-    a, b = _real(a), _real(b)
-    low, high = f"{a.within(SUM)} <= {b.within(SUM)}", f"{a.within(SUM)} >= {b.within(SUM)}"
-    return Text(f"{low} and {high}", AND, truth=True)
-
-
-def _not(a: Text) -> Text:
-    return Text(f"not {_truth(a).within(NOT + 1)}", NOT, truth=True)
-
-
 def _interpolated(table: Interpolation, at: Text) -> Text:
     """Return a table's value as branches, each chosen by so many conditions as halve the rows to one.
 
     A simulator stops at conditions on time, and so at each row that it reaches.
     """
-    at, rows = _real(at), (table.times.tolist(), table.numbers.tolist(), table.rates.tolist())
-    starts, lows, rates = rows[0][:1] + rows[0], rows[1][:1] + rows[1], rows[2]
-    since = [_RULES["sub"](at, number(start)) for start in starts]
-    pieces = [
-        _RULES["add"](number(low), _RULES["mul"](number(rate), one)) if rate else number(low)
-        for low, rate, one in zip(lows, rates, since, strict=True)
-    ]
-    ends = rows[0]
+    ends, numbers, rates = table.times.tolist(), table.numbers.tolist(), table.rates.tolist()
+    pieces = []
+    for start, low, rate in zip(ends[:1] + ends, numbers[:1] + numbers, rates, strict=True):
+        risen = _formed("mul", number(rate), _formed("sub", at, number(start)))
+        pieces.append(_add(number(low), risen) if rate else number(low))
     while len(pieces) > 1:
         joined = [
-            Text(f"if {at.within(SUM)} < {number(end).within(SUM)} then {one.text} else {other.text}", IF)
-            for one, other, end in zip(pieces[::2], pieces[1::2], ends[::2], strict=False)
+            Text(f"if {_formed('lt', at, number(end)).text} then {low.text} else {high.text}", IF)
+            for low, high, end in zip(pieces[::2], pieces[1::2], ends[::2], strict=False)
         ]
         pieces, ends = [*joined, *pieces[len(pieces) & ~1 :]], ends[1::2]
     return pieces[0]
 
 
-_RULES: dict[str, Callable[..., Text]] = {
-    **{word: _call(name) for word, name in _CALLED.items()},
-    **{word: _relation(sign) for word, sign in _RELATIONS.items()},
-    "neg": lambda a: Text(f"-{_real(a).within(PRODUCT)}", SUM),
-    "sq": lambda a: _power(a, number(2)),
-    "twice": lambda a: _infix("*", PRODUCT, PRODUCT)(number(2), a),
-    "inv": lambda a: _infix("/", PRODUCT, POWER)(number(1), a),
+_CALLED = {"fabs": "abs"}
+# Of an operation its form, how tightly that binds, and its operands at least; any other is a function's call.
+_FORMS: dict[str, tuple[Any, ...]] = {
+    "plus": ("{} + {}", SUM, SUM, SUM),
+    "neg": ("-{}", SUM, PRODUCT),
+    "sq": ("{}^2", POWER, ATOM),
+    "twice": ("2*{}", PRODUCT, PRODUCT),
+    "inv": ("1/{}", PRODUCT, POWER),
+    "sub": ("{} - {}", SUM, SUM, PRODUCT),
+    "mul": ("{}*{}", PRODUCT, PRODUCT, PRODUCT),
+    "div": ("{}/{}", PRODUCT, PRODUCT, POWER),
+    "pow": ("{}^{}", POWER, ATOM, ATOM),
+    "constpow": ("{}^{}", POWER, ATOM, ATOM),
+    "fmin": ("min({}, {})", ATOM, IF, IF),
+    "fmax": ("max({}, {})", ATOM, IF, IF),
+    "lt": ("{} < {}", RELATION, SUM, SUM),
+    "le": ("{} <= {}", RELATION, SUM, SUM),
+    "eq": ("{0} <= {1} and {0} >= {1}", AND, SUM, SUM),  # Modelica asks no two Reals whether they are equal
+    "and": ("{} and {}", AND, AND, AND),
+    "or": ("{} or {}", OR, OR, OR),
+    "not": ("not {}", NOT, NOT + 1),
+}
+_SPECIAL: dict[str, Callable[..., Text]] = {
     "add": _add,
-    "sub": _infix(" - ", SUM, PRODUCT),
-    "mul": _infix("*", PRODUCT, PRODUCT),
-    "div": _infix("/", PRODUCT, POWER),
-    "pow": _power,
-    "constpow": _power,
-    "eq": _equal,
-    "ne": lambda a, b: _not(_equal(a, b)),
-    "and": lambda a, b: Text(f"{_truth(a).within(AND)} and {_truth(b).within(AND)}", AND, truth=True),
-    "or": lambda a, b: Text(f"{_truth(a).within(OR)} or {_truth(b).within(OR)}", OR, truth=True),
-    "not": _not,
+    "ne": lambda a, b: _formed("not", _formed("eq", a, b)),
     "if_else_zero": _branch,
     "interpolate": _interpolated,
 }

@@ -151,9 +151,10 @@ class Peer:
 
     @property
     def signals(self) -> tuple[LocalSignal, ...]:
-        """What there is to look at: of the states those that its computer moves."""
+        """What there is to look at: states that its computer moves, what is computed, what acts later."""
+        outside = {("state", (row,)) for row in self.outside}
         every = local_signals(self.kind, self.schedule)
-        return tuple(one for one in every if one.role != "state" or one.place[0] not in self.outside)
+        return tuple(one for one in every if one.role != "limited" and (one.role, one.place) not in outside)
 
     @property
     def sending(self) -> tuple[Line, ...]:

@@ -53,9 +53,9 @@ class Link:
     """A link in a scene, called `name` in C: its period, phase and the channels of its packets.
 
     `ring` packets of each peer are kept; `start` (peers, channels) is what is heard before the first arrives.
-    `ways` are (sender, receiver), those of a receiver in the order in which it hears them; `delays` are theirs
-    in s. `luck` is None where every packet takes its delay; otherwise `key` is that of its numbers, and up to
-    `kept` packets of each way are.
+    `ways` are (sender, receiver), those of a receiver in the order in which it hears them; `delays` are
+    theirs, in s. `luck` is None where every packet takes its delay; otherwise `key` is that of its numbers,
+    and up to `kept` packets of each way are.
     """
 
     link: str
