@@ -312,7 +312,8 @@ def _receive(peer: Peer, p: int, place: int) -> list[str]:
     names = [line.members[channel] for channel in peer.channels[p, place]]
     count, packet = len(line.senders), f"in->{line.name}[k]"
     mean, edge = receive.operator == "mean", has_edge(peer.kind, p, place)
-    looked, value = [], f"{packet}.{names[0]}"
+    looked: list[str] = []
+    value = f"{packet}.{names[0]}"
     if edge:
         looked, value = _look(peer, p, place, line, names)
     elif line.missing:

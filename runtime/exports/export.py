@@ -6,8 +6,8 @@ Guarantees: a format is chosen by its name or by the suffix, which agree; an opt
 format is refused; a maker is imported when it is asked for.
 Does not: make anything itself.
 
-A new format is a line of the table: its name, its suffix, what it is, the options it takes, and a function
-that makes a result of a compiled scene and what is asked, and one that writes it.
+A new format is a line of the table, its name, its suffix, what it is, the options it takes, and a case of
+`_makers`: a function that makes a result of a compiled scene and what is asked, and one that writes it.
 """
 
 from __future__ import annotations
@@ -45,89 +45,38 @@ class Format:
     suffix: str
     about: str
     takes: tuple[str, ...]
-    make: Callable[[CompiledSystem, Asked], Result]
-    write: Callable[[Path, Any], None]
-
-
-def _state_space(system: CompiledSystem, asked: Asked) -> Result:
-    if asked.free:
-        from apc.exports.free import with_free
-
-        return with_free(system, asked.free, cut=asked.cut)
-    from apc.exports.lifted import state_space
-
-    return state_space(system, cut=asked.cut)
-
-
-def _script(path: Path, found: Any) -> None:
-    from apc.exports.files import write_script
-
-    write_script(path, found)
-
-
-def _mat(path: Path, found: Any) -> None:
-    from apc.exports.files import write_mat
-
-    write_mat(path, found)
-
-
-def _npz(path: Path, found: Any) -> None:
-    from apc.exports.files import write_npz
-
-    write_npz(path, found)
-
-
-def _modelica(system: CompiledSystem, asked: Asked) -> Result:
-    from apc.exports.modelica import modelica
-
-    return modelica(system)
-
-
-def _mo(path: Path, found: Any) -> None:
-    from apc.exports.modelica import write_modelica
-
-    write_modelica(path, found)
-
-
-def _code(system: CompiledSystem, asked: Asked) -> Result:
-    from apc.exports.code import peer_code
-
-    return peer_code(system, peer=asked.peer, device=asked.device, method=asked.method)
-
-
-def _unit(system: CompiledSystem, asked: Asked) -> Result:
-    from apc.exports.code import scene_unit
-
-    return scene_unit(system, peer=asked.peer, method=asked.method)
-
-
-def _texts(path: Path, found: Any) -> None:
-    from apc.exports.code import write_code
-
-    write_code(path, found)
-
-
-def _fmu(path: Path, found: Any) -> None:
-    from apc.exports.fmu import write_fmu
-
-    write_fmu(path, found)
 
 
 FORMATS = (
-    Format("control", ".py", "a script that makes a control.StateSpace", ("cut",), _state_space, _script),
-    Format("mat", ".mat", "a state space for MATLAB and SciPy", ("cut", "free"), _state_space, _mat),
-    Format("npz", ".npz", "a state space for NumPy", ("cut", "free"), _state_space, _npz),
-    Format("modelica", ".mo", "a flat model of Modelica 3.3 with clocks", (), _modelica, _mo),
-    Format(
-        "c",
-        ".c",
-        "one tick of a peer in C99, a header and a driver",
-        ("peer", "device", "method"),
-        _code,
-        _texts,
-    ),
-    Format("fmu", ".fmu", "a scene or a peer for co-simulation", ("peer", "method"), _unit, _fmu),
+    Format("control", ".py", "a script that makes a control.StateSpace", ("cut",)),
+    Format("mat", ".mat", "a state space for MATLAB and SciPy", ("cut", "free")),
+    Format("npz", ".npz", "a state space for NumPy", ("cut", "free")),
+    Format("modelica", ".mo", "a flat model of Modelica 3.3 with clocks", ()),
+    Format("c", ".c", "one tick of a peer in C99, a header and a driver", ("peer", "device", "method")),
+    Format("fmu", ".fmu", "a scene or a peer for co-simulation", ("peer", "method")),
 )
+
+
+def _makers(name: str) -> tuple[Callable[..., Result], Callable[[Path, Any], None]]:
+    """Return what makes a format of a compiled scene and what is asked of it, and what writes it."""
+    match name:
+        case "modelica":
+            from apc.exports.modelica import modelica, write_modelica
+
+            return modelica, write_modelica
+        case "c":
+            from apc.exports.code import peer_code, write_code
+
+            return peer_code, write_code
+        case "fmu":
+            from apc.exports.code import scene_unit
+            from apc.exports.fmu import write_fmu
+
+            return scene_unit, write_fmu
+    from apc.exports.files import write_mat, write_npz, write_script
+    from apc.exports.free import state_space_of
+
+    return state_space_of, {"control": write_script, "mat": write_mat, "npz": write_npz}[name]
 
 
 def format_of(to: str | None, out: Path | None, *, option: str = "--") -> Format:
@@ -190,7 +139,8 @@ def export(system: CompiledSystem, chosen: Format, asked: Asked, out: Path | Non
             able = ", ".join(one.name for one in FORMATS if name in one.takes)
             what = f"--{name} means nothing to the format {chosen.name}"
             raise ApcError(Mistake("E953", Place(f"--{name}"), what, hint=f"--to {able}" if able else ""))
-    found = chosen.make(system, asked)
+    make, write = _makers(chosen.name)
+    found = make(system, **{name: getattr(asked, name) for name in chosen.takes})
     if out is not None:
-        chosen.write(out, found)
+        write(out, found)
     return found

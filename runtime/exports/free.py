@@ -1,6 +1,6 @@
 """A state space as a function of some of the scene's numbers.
 
-Takes: a `CompiledSystem`, names of its parameters. Gives: `with_free`.
+Takes: a `CompiledSystem`, names of its parameters. Gives: `state_space_of`.
 Guarantees: what follows from a free number by a formula follows from it here too; at the scene's own numbers
 the matrices are those of `lifted.state_space`, but for rounding.
 Does not: free a time: another delay is another order of events, another number of states.
@@ -45,15 +45,15 @@ OPTION = "--free"
 SPAN, TERMS = 64, 16
 
 
-def with_free(system: CompiledSystem, names: Sequence[str], *, cut: str = "") -> StateSpace:
+def state_space_of(system: CompiledSystem, *, cut: str = "", free: Sequence[str] = ()) -> StateSpace:
     """Lift a scene, with its matrices as a function of some numbers.
 
     Parameters
     ----------
     system, cut
         As for `lifted.state_space`.
-    names
-        Parameters of the scene or of a group.
+    free
+        Parameters of the scene or of a group; none gives the matrices alone.
 
     Raises
     ------
@@ -62,25 +62,28 @@ def with_free(system: CompiledSystem, names: Sequence[str], *, cut: str = "") ->
         `lifted.state_space`.
     """
     found = state_space(system, cut=cut)
-    frees = _frees(system, names)
-    ports = tuple(Port(free.label, unit_of(system, free.name)) for free in frees)
+    if not free:
+        return found
+    frees = _frees(system, free)
+    ports = tuple(Port(one.label, unit_of(system, one.name)) for one in frees)
     symbols = [casadi.SX.sym(word) for word in words(ports)]
     prepared = prepare_at_start(system, prepare(system))
     if prepared is None:
         what = "where the scene is linearized does not follow from its numbers alone"
         raise ApcError(Mistake("E954", Place(OPTION), what, hint=f"no {OPTION}"))
     groups, exchange = peers_of(system, prepared=prepared)
-    apart = [part for group in groups for part in _by_groups(group, exchange.starts)]
+    groups = tuple(part for group in groups for part in _by_groups(group, exchange.starts))
     values = dict(zip(frees, symbols, strict=True))
 
-    def numbers_of(group: PeerGroup) -> list[Any]:
+    def vector(group: PeerGroup) -> Any:
         place = int(np.searchsorted(exchange.starts, group.peers[0], side="right")) - 1
         peer = int(group.peers[0] - exchange.starts[place])
-        return free_values(system, system.groups[place], peer, values, symbolic)
+        listed = free_values(system, system.groups[place], peer, values, symbolic)
+        return casadi.vertcat(*map(casadi.SX, listed))
 
-    blocks, _, _ = lifted(system, apart, exchange, cut, _numbers(numbers_of))
+    blocks, _, _ = lifted(system, groups, exchange, cut, _numbers(vector))
     function = casadi.Function(
-        "state_space", symbols, [_matrix(block) for block in blocks], words(ports), ["A", "B", "C", "D"]
+        "state_space", symbols, [*map(_matrix, blocks)], words(ports), ["A", "B", "C", "D"]
     )
     return replace(found, free=ports, function=function)
 
@@ -109,31 +112,26 @@ def _by_groups(group: PeerGroup, starts: Any) -> list[PeerGroup]:
     return [replace(group, peers=own, count=len(own)) for one in np.unique(of) for own in [peers[of == one]]]
 
 
-def _numbers(numbers_of: Callable[[PeerGroup], list[Any]]) -> Numbers:
-    """Return what a frame is made of in CasADi's expressions."""
+def _numbers(vector: Callable[[PeerGroup], Any]) -> Numbers:
+    """Return what a frame is made of in CasADi's expressions of each group's vector (n_p,) of parameters."""
 
-    def vector(group: PeerGroup) -> Any:
-        return casadi.vertcat(*(casadi.SX(value) for value in numbers_of(group)))
+    def values(function: Any, group: PeerGroup) -> list[Any]:
+        rest = [casadi.DM.zeros(*function.size_in(place)) for place in range(function.n_in() - 2)]
+        return [_plain(one) for one in function(*rest, vector(group), 0).nonzeros()]
 
     def site(group: PeerGroup) -> LinearSite:
-        function = group.jacobians.function
-        rest = [casadi.DM.zeros(*function.size_in(place)) for place in range(4)]
-        found = function(*rest, vector(group), 0)
-        return site_of_entries(group.jacobians, [_plain(one) for one in found.nonzeros()], 0)
+        return site_of_entries(group.jacobians, values(group.jacobians.function, group), 0)
 
     def inverses(group: PeerGroup, push: Push) -> list[Any]:
-        rest = [casadi.DM.zeros(*push.symbolic.size_in(place)) for place in range(2)]
-        return [_plain(one) for one in casadi.vertsplit(push.symbolic(*rest, vector(group), 0))]
+        return values(push.symbolic, group)
 
     def steps(
         group: PeerGroup, forces: Sequence[Push], count: int, durations: Sequence[Fraction]
     ) -> list[Matrix]:
-        own = site(group)
-        columns = np.zeros((len(own.a), count), dtype=object)
-        for place, push in enumerate(forces):
-            for velocity, inverse in zip(push.velocities, inverses(group, push), strict=True):
-                columns[velocity, place] = inverse
-        moving = np.concatenate([own.a, own.b, columns], axis=1)
+        plain = site(group)
+        moving = np.concatenate([plain.a, plain.b, np.zeros((len(plain.a), count))], axis=1).astype(object)
+        for place, push in enumerate(forces, moving.shape[1] - count):
+            moving[list(push.velocities), place] = inverses(group, push)
         if not any(isinstance(one, casadi.SX) for one in moving.flat):
             return [one.astype(object) for one in steps_in_floats(group, forces, count, durations)]
         return [_step(moving, group.site.a, float(duration)) for duration in durations]
@@ -154,11 +152,7 @@ def _step(moving: Matrix, now: Matrix, seconds: float) -> Matrix:
         found = casadi.SX.eye(width) + casadi.mtimes(small, found) / term
     for _ in range(halvings):
         found = casadi.mtimes(found, found)
-    step = np.zeros((n, width), dtype=object)
-    for row, column in zip(*found.sparsity().get_triplet(), strict=True):
-        if row < n:
-            step[row, column] = _plain(found[row, column])
-    return step
+    return _array(found[:n, :])
 
 
 def _plain(one: Any) -> Any:
@@ -167,16 +161,12 @@ def _plain(one: Any) -> Any:
     return float(value) if value.is_constant() else value
 
 
-def _tidy(matrix: Matrix) -> Matrix:
-    """Return a matrix whose constants are floats."""
-    for place in np.ndindex(matrix.shape):
-        if isinstance(matrix[place], casadi.SX):
-            matrix[place] = _plain(matrix[place])
-    return matrix
-
-
-def _vanishes(matrix: Matrix) -> bool:
-    return not any(isinstance(one, casadi.SX) or one for one in matrix.flat)
+def _array(matrix: Any) -> Matrix:
+    """Return CasADi's matrix as an array whose constants are floats."""
+    found = np.zeros(matrix.shape, dtype=object)
+    for row, column in zip(*matrix.sparsity().get_triplet(), strict=True):
+        found[row, column] = _plain(matrix[row, column])
+    return found
 
 
 def _matrix(block: Matrix) -> Any:
@@ -189,9 +179,9 @@ def _matrix(block: Matrix) -> Any:
 
 
 SYMBOLS = Arithmetic(
-    multiply=lambda left, right: _tidy(np.matmul(left.astype(object), right.astype(object))),
-    add=lambda one, other: _tidy(np.add(one.astype(object), other)),
-    subtract=lambda one, other: _tidy(np.subtract(one.astype(object), other)),
+    multiply=lambda left, right: _array(casadi.mtimes(_matrix(left), _matrix(right))),
+    add=lambda one, other: _array(_matrix(one) + _matrix(other)),
+    subtract=lambda one, other: _array(_matrix(one) - _matrix(other)),
     exact=lambda matrix: matrix.astype(object),
-    vanishes=_vanishes,
+    vanishes=lambda matrix: not _matrix(matrix).nnz(),
 )

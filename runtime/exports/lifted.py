@@ -23,7 +23,7 @@ upon it within the frame.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
@@ -46,7 +46,7 @@ from apc.frame.exchange import Exchange
 from apc.frame.lift import MOST_PACKETS, FrameMap, check_packets, compose, named, step_durations
 from apc.frame.ports import OUTSIDE, with_cuts, with_holds, with_ports
 from apc.frame.radius import FLOATS, Arithmetic
-from apc.frame.schedule import Propagate, Schedule, Tick, Value
+from apc.frame.schedule import Heard, Propagate, Schedule, Tick, Value
 from apc.frame.site import LinearSite
 from apc.memory import refuse_beyond
 from apc.network.nominal import left_out
@@ -68,6 +68,7 @@ ENTRY = 40
 
 
 Labels = tuple[Port, ...]
+Placed = list[tuple[Port, int]]  # and where each is in z
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,67 +236,59 @@ def lifted(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Opened:
-    """Peers that are moved from outside: `group` has the ways in, of which `inputs` says what they are.
+    """Peers that are moved from outside: `group` has the ways in, `map` is their frame.
 
-    `states` and `signals` name entries of z and what is simulated, which are those at `places`; `drawn` are
-    the entries of z that come in. `cuts` are the forces cut open, `computed` the entries of z that hold what
-    the ticks made of them, and the last of what is heard stands in their place. `unpushed` says what no force
-    comes in at, and why.
+    `units` are those of the entries of z. `signals` and where each is in z are what is simulated, `inputs`
+    and the entries of z that they come in at what moves them. `cuts` are the forces cut open and the entries
+    of z that hold what the ticks made of them; the last of what is heard stands in their place. `unpushed`
+    says what no force comes in at, and why.
     """
 
     group: PeerGroup
     map: FrameMap
-    states: tuple[Port, ...]
-    signals: tuple[Port, ...]
-    places: tuple[int, ...]
-    inputs: tuple[Port, ...]
-    drawn: Places
-    cuts: tuple[Port, ...]
-    computed: tuple[int, ...]
+    units: tuple[str, ...]
+    signals: Placed
+    inputs: Placed
+    cuts: Placed
     unpushed: tuple[str, ...]
 
 
 def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) -> _Opened:
     """Let forces and noise into some peers, and cut the forces of a coupler open."""
-    schedule = _remembering(group)
+    schedule, kind = _remembering(group), group.jacobians.kind
     (forces, unpushed), noises = _masses(system, group), _measured(group.site)
-    plain = numbers.site(group)
-    wide = with_inputs(plain, forces, [numbers.inverses(group, one) for one in forces], noises)
+    inverses = [numbers.inverses(group, one) for one in forces]
+    wide = with_inputs(numbers.site(group), forces, inverses, noises)
     count = len(forces) + len(noises)
     nothing = np.zeros((0, sum(wide.b.shape)), dtype=wide.b.dtype)
     (site,), full, ports = with_ports([wide], schedule, count, [0], [nothing], [])
-    kind = group.jacobians.kind
-    unit_of = [*(state.unit for state in kind.states)]
-    unit_of += [kind.clocks[one.partition].units[one.output] for one in schedule.carried]
-    listed = _cut_forces(group, cut) if cut else []
-    site, full, cuts, computed = _cut_open(site, full, listed)
+    units = [*(state.unit for state in kind.states)]
+    units += [kind.clocks[one.partition].units[one.output] for one in schedule.carried]
+    site, full, cuts = _cut_open(site, full, _cut_forces(group, cut) if cut else [])
+    units += ["1"] * (len(kind.states) + len(full.carried) - len(units))
     check_packets(full)
     durations = step_durations(full)
     steps = numbers.steps(group, forces, count, [one * full.quantum for one in durations])
     frame = compose(site, full, dict(zip(durations, steps, strict=True)), numbers=numbers.arithmetic)
-    own = named(site.kind, full, frame, frame.mapped(np.zeros_like))
-    names = [*(state.name for state in kind.states), *schedule.value_names]
-    place_of = {one: len(kind.states) + k for k, one in enumerate(schedule.carried)}
+    first = {one: len(kind.states) + k for k, one in enumerate(schedule.carried)}
     signals = [
         (
             Port(one.name, one.unit),
-            one.place[0] if one.role == "state" else place_of[Value(one.place[0], one.place[1], -1)],
+            one.place[0] if one.role == "state" else first[Value(one.place[0], one.place[1], -1)],
         )
         for one in local_signals(kind, group.schedule)
         if one.role in ("state", "output")
     ]
     inputs = [Port(f"force on {push.part}", "N") for push in forces]
     inputs += [Port(f"noise on {kind.states[place].name}", kind.states[place].unit) for place in noises]
+    lifted_site = named(site.kind, full, frame, frame.mapped(np.zeros_like))
     return _Opened(
-        group=group.with_site(site, group.exact, full, own),
+        group=group.with_site(site, group.exact, full, lifted_site),
         map=frame,
-        states=tuple(map(Port, names, unit_of)),
-        signals=tuple(port for port, _ in signals),
-        places=tuple(place for _, place in signals),
-        inputs=tuple(inputs),
-        drawn=ports.drawn.ravel(),
+        units=tuple(units),
+        signals=signals,
+        inputs=list(zip(inputs, ports.drawn.ravel().tolist(), strict=True)),
         cuts=cuts,
-        computed=computed,
         unpushed=tuple(unpushed),
     )
 
@@ -406,25 +399,22 @@ def _cut_forces(group: PeerGroup, cut: str) -> list[tuple[int, int]]:
 
 def _cut_open(
     site: LinearSite, schedule: Schedule, listed: Sequence[tuple[int, int]]
-) -> tuple[LinearSite, Schedule, tuple[Port, ...], tuple[int, ...]]:
-    """Let forces come from outside at each tick, what the tick computes of them being remembered beside."""
+) -> tuple[LinearSite, Schedule, Placed]:
+    """Let forces come from outside at each tick; what the tick computes of them is remembered in z."""
     cuts = [(partition, output) for partition, output in listed if schedule.ticks[partition]]
-    count = sum(schedule.ticks[partition] for partition, _ in cuts)
-    if len(schedule.heard) + count > MOST_PACKETS:
-        what = f"{count:,} ticks a frame, each an input where it is cut, and {MOST_PACKETS} are the most"
-        raise ApcError(Mistake("E951", Place("--cut"), what, hint="--cut LINK"))
-    ports: list[Port] = []
-    at = _instants(schedule)
+    at, ports = _instants(schedule), []
     for partition, output in cuts:
         clock = site.kind.clocks[partition]
-        for index in range(schedule.ticks[partition]):
-            when = float(at[partition][index] * schedule.quantum * 1000)
-            ports.append(Port(f"{clock.outputs[output]} at {when:.6g} ms", clock.units[output]))
+        times = [float(one * schedule.quantum * 1000) for one in at[partition]]
+        ports += [Port(f"{clock.outputs[output]} at {when:.6g} ms", clock.units[output]) for when in times]
+    if len(schedule.heard) + len(ports) > MOST_PACKETS:
+        what = f"{len(ports):,} ticks a frame, each an input where it is cut, and {MOST_PACKETS} are the most"
+        raise ApcError(Mistake("E951", Place("--cut"), what, hint="--cut LINK"))
     wide, whole = with_cuts(site, schedule, cuts)
     names = (*schedule.value_names, *(f"{port.name} computed" for port in ports))
     first = len(site.kind.states) + len(schedule.carried)
-    computed = tuple(range(first, first + count))
-    return wide, replace(whole, value_names=names), tuple(ports), computed
+    computed = [(port, first + place) for place, port in enumerate(ports)]
+    return wide, replace(whole, value_names=names), computed
 
 
 def _check_size(system: CompiledSystem, opened: Sequence[_Opened]) -> None:
@@ -449,89 +439,70 @@ def _closed(
     """Close a loop, but where it is cut; return A, B, C and D, and the names of states, inputs, outputs."""
     layout = lay_out_loop(loop)
     n, peers = len(layout.names), [site.name for site in loop.sites]
-    plain = [one.plain for one in feedback_of(loop, layout)]
-    open_rows = [_open_rows(one, link) for one in sites]
-    outside = sum(map(len, open_rows))
-    taken, feedback = 0, []
-    for wires, rows in zip(plain, open_rows, strict=True):
+    heard = [one.group.schedule.heard for one in sites]
+    opened = [
+        [row for row, what in enumerate(rows) if what is OUTSIDE or (link and what.way.link == link)]
+        for rows in heard
+    ]
+    outside, given = sum(map(len, opened)), n
+    feedback, answer = [], []
+    for wires, rows in zip((one.plain for one in feedback_of(loop, layout)), opened, strict=True):
         now, before = wires.now.copy(), np.pad(wires.before, ((0, 0), (0, outside)))
+        answer.append((now[rows], before[rows]))
         now[rows], before[rows] = 0.0, 0.0
-        before[rows, n + taken + np.arange(len(rows))] = 1.0
+        before[rows, given + np.arange(len(rows))] = 1.0
         feedback.append(Feedback(now, before))
-        taken += len(rows)
+        given += len(rows)
     whole = close([one.map for one in sites], feedback, layout, numbers=arithmetic)
-    drawn = _places(one.drawn + offset for one, offset in zip(sites, layout.offsets, strict=True))
-    computed = _places(
-        np.array(one.computed, np.intp) + offset for one, offset in zip(sites, layout.offsets, strict=True)
-    )
-    own = np.delete(np.arange(n), np.concatenate([drawn, computed]))
+
+    def spread(listed: Sequence[Placed]) -> tuple[Labels, Places]:
+        """Return what each site has, by its peer's name, and where in the state."""
+        every = [
+            (_named(port, peer), place + offset)
+            for ports, peer, offset in zip(listed, peers, layout.offsets, strict=True)
+            for port, place in ports
+        ]
+        return tuple(port for port, _ in every), np.array([place for _, place in every], np.intp)
+
+    inputs, drawn = spread([one.inputs for one in sites])
+    forces, computed = spread([one.cuts for one in sites])
+    kept = np.delete(np.arange(n), np.concatenate([drawn, computed]))
     names = layout.names if len(sites) > 1 else tuple(f"{peers[0]}.{name}" for name in layout.names)
     of_states = [unit for one in sites for unit in _units(one, units)]
-    states = tuple(Port(names[place], of_states[place]) for place in own)
-    matrix = whole.matrix
+    states = tuple(Port(names[place], of_states[place]) for place in kept)
+    matrix, outer = whole.matrix, n + np.arange(outside)
     if not cut:
-        seen = _places(
-            np.array(one.places, np.intp) + offset for one, offset in zip(sites, layout.offsets, strict=True)
-        )
-        c = (own[None, :] == seen[:, None]).astype(np.float64)
-        inputs = tuple(
-            _named(port, peer) for one, peer in zip(sites, peers, strict=True) for port in one.inputs
-        )
-        outputs = tuple(
-            _named(port, peer) for one, peer in zip(sites, peers, strict=True) for port in one.signals
-        )
-        blocks = matrix[np.ix_(own, own)], matrix[np.ix_(own, drawn)], c, np.zeros((len(c), len(drawn)))
+        outputs, seen = spread([one.signals for one in sites])
+        c = (kept[None, :] == seen[:, None]).astype(np.float64)
+        blocks = matrix[np.ix_(kept, kept)], matrix[np.ix_(kept, drawn)], c, np.zeros((len(c), len(drawn)))
         return blocks, (states, inputs, outputs)
-    given = n + np.arange(outside)
     if link:
-        back = [
-            arithmetic.add(
-                arithmetic.multiply(wires.now[rows], whole.sent),
-                np.pad(wires.before[rows], ((0, 0), (0, outside))),
-            )
-            for wires, rows in zip(plain, open_rows, strict=True)
-        ]
-        answer = -np.concatenate(back)
+        forces, _ = spread([_heard_ports(rows, link, units) for rows in heard])
+        parts = [arithmetic.add(arithmetic.multiply(now, whole.sent), before) for now, before in answer]
+        back = -np.concatenate(parts)
     else:
-        answer = -matrix[computed]
-    ways = [
-        (port, peer)
-        for one, peer in zip(sites, peers, strict=True)
-        for port in (_heard_ports(one, link, units) if link else one.cuts)
-    ]
-    inputs = tuple(_named(port, peer) for port, peer in ways)
-    outputs = tuple(_named(replace(port, name=f"{port.name} back"), peer) for port, peer in ways)
-    blocks = matrix[np.ix_(own, own)], matrix[np.ix_(own, given)], answer[:, own], answer[:, given]
-    return blocks, (states, inputs, outputs)
-
-
-def _places(listed: Iterable[Places]) -> Places:
-    """Return places one after the other."""
-    return np.concatenate([np.zeros(0, np.intp), *listed])
+        back = -matrix[computed]
+    outputs = tuple(replace(port, name=f"{port.name} back") for port in forces)
+    blocks = matrix[np.ix_(kept, kept)], matrix[np.ix_(kept, outer)], back[:, kept], back[:, outer]
+    return blocks, (states, forces, outputs)
 
 
 def _named(port: Port, peer: str) -> Port:
     """Return a peer's port, its name with the peer's: `force on left[2].cube`."""
-    word, _, rest = port.name.rpartition(" on ")
-    return replace(port, name=f"{word} on {peer}.{rest}" if word else f"{peer}.{rest}")
+    word, on, rest = port.name.rpartition(" on ")
+    return replace(port, name=f"{word}{on}{peer}.{rest}")
 
 
-def _open_rows(one: _Opened, link: str) -> list[int]:
-    """Return which rows of what a peer hears come from outside."""
-    heard = one.group.schedule.heard
-    return [row for row, what in enumerate(heard) if what is OUTSIDE or (link and what.way.link == link)]
-
-
-def _heard_ports(one: _Opened, link: str, units: Mapping[tuple[str, str], str]) -> list[Port]:
+def _heard_ports(heard: Sequence[Heard], link: str, units: Mapping[tuple[str, str], str]) -> Placed:
     """Return what a peer hears over a link: of which packet of a frame, and how many frames ago."""
-    heard = [what for what in one.group.schedule.heard if what.way.link == link]
+    heard = [what for what in heard if what.way.link == link]
     several = any(what.sent.slot for what in heard)
-    found = []
-    for what in heard:
-        which = f" #{what.sent.slot + 1}" if several else ""
-        name = f"{what.way.operator} {what.sent.channel}{which}({-what.lag})"
-        found.append(Port(name, units[what.sent.link, what.sent.channel]))
-    return found
+    named = [
+        f"{what.way.operator} {what.sent.channel}{f' #{what.sent.slot + 1}' * several}({-what.lag})"
+        for what in heard
+    ]
+    listed = zip(named, heard, strict=True)
+    return [(Port(name, units[what.sent.link, what.sent.channel]), 0) for name, what in listed]
 
 
 def _sent_units(system: CompiledSystem) -> dict[tuple[str, str], str]:
@@ -546,12 +517,7 @@ def _sent_units(system: CompiledSystem) -> dict[tuple[str, str], str]:
 
 def _units(one: _Opened, units: Mapping[tuple[str, str], str]) -> list[str]:
     """Return the units of a peer's part of the state: of z, then of the packets on their way."""
-    group = one.group
-    own = [port.unit for port in one.states]
-    added = ["1"] * (len(group.lifted.z_names) - len(own))
-    packets = [
-        units[sent.link, sent.channel]
-        for sent, depth in zip(group.schedule.sent, group.schedule.depths, strict=True)
-        for _ in range(depth)
-    ]
-    return [*own, *added, *packets]
+    found, schedule = [*one.units], one.group.schedule
+    for sent, depth in zip(schedule.sent, schedule.depths, strict=True):
+        found += [units[sent.link, sent.channel]] * depth
+    return found

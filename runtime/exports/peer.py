@@ -471,7 +471,8 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int,
         for place, rows in enumerate(event.heard)
         if rows
     }
-    lines, places = [], {}
+    lines: list[Line] = []
+    places: dict[tuple[int, int], tuple[int, ...]] = {}
     for name, (link, declared) in zip(
         unique(map(identifier, exchange.links)), exchange.links.items(), strict=True
     ):
