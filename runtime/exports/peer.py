@@ -29,7 +29,7 @@ from apc.compiler.interpolation import jacobian
 from apc.compiler.language.vectors import whole_and_index
 from apc.exports.words import identifier, unique
 from apc.frame import schedule as frames
-from apc.frame.devices import Device, find_device
+from apc.frame.devices import Device, find_device, find_devices
 from apc.frame.discretize import moved_together
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, edge_name, structural_pattern
@@ -194,7 +194,7 @@ def peer_of(
     kind, site, schedule = system.kinds[place], plan.sites[place], plan.schedules[group]
     vector, label = _parameters(plan, number), plan.exchange.peer_name(number)
     _refuse_what_iterates(system, label, kind)
-    outside = _outside(system, label, site, device)
+    outside = _outside(system, label, site, vector, device)
     instants, lengths = _instants(schedule)
     lines, channels = lines_of(plan, number)
     names = [line.name for line in lines]
@@ -268,7 +268,9 @@ def _refuse_what_iterates(system: CompiledSystem, name: str, kind: Kind) -> None
 # ---- what moves outside
 
 
-def _outside(system: CompiledSystem, name: str, site: SiteJacobians, device: str | None) -> frozenset[int]:
+def _outside(
+    system: CompiledSystem, name: str, site: SiteJacobians, vector: Any, device: str | None
+) -> frozenset[int]:
     """Return the states that the peer's computer does not move."""
     kind = site.kind
     if device == NO_DEVICE:
@@ -278,26 +280,21 @@ def _outside(system: CompiledSystem, name: str, site: SiteJacobians, device: str
     sent = {parts[int(row)] for send in site.pattern.sends for row in np.flatnonzero(send.x.any(axis=0))}
     pattern = structural_pattern(kind.derivative.jac_sparsity(0, 0)).astype(float)
     tied = [set(rows.tolist()) for rows in moved_together(pattern)]
-    held = _held(kind)
     if device is not None:
         chosen = {one.strip() for one in device.split(",")}
         for one in sorted(chosen - masses):
             near = nearest(one, masses) or min(masses, default=NO_DEVICE)
             what = f"--device: no mass of {name} is called {one[:40] or 'so'}"
             raise _undecided(system, what, f"--device {near}")
-    elif held:
-        hands = tuple(f"{hand}." for hand in kind.hands)
-        chosen = {parts[row] for rows in tied if rows & held for row in rows} & masses
-        chosen -= {part for part in masses if f"{part}.".startswith(hands)}
-        chosen -= sent if chosen - sent else set()
     else:
-        chosen = masses - sent
+        devices = find_devices(site, vector, {one.name: one.unit for one in system.parameters})
+        chosen = {one.rpartition(".")[0] if one.endswith("]") else one for one in devices}
     if not chosen:
         hint = f"--device {NO_DEVICE} if its computer moves them all, or --device "
         what = f"{name} has no device: others are told of every mass of it"
         raise _undecided(system, what, hint + min(masses, default=NO_DEVICE))
     listed = sorted(chosen)
-    if device is None and not held and len(listed) > 1:
+    if device is None and not kind.held and len(listed) > 1:
         what = f"{name}: {' and '.join(listed)} may be devices, or copies that its computer moves"
         raise _undecided(system, what, f"--device {','.join(listed)} or --device {listed[0]}")
     outside: set[int] = set()
@@ -322,18 +319,6 @@ def _undecided(system: CompiledSystem, what: str, hint: str = "") -> ApcError:
     return ApcError(Mistake("E961", Place(system.origin.topology), what, hint=hint))
 
 
-def _held(kind: Kind) -> frozenset[int]:
-    """Return the states whose rates depend on a number of what the scene calls a hand."""
-    inputs: Any = kind.derivative.sx_in() if kind.derivative.is_a("SXFunction") else kind.derivative.mx_in()
-    rates_of, p = kind.derivative(*inputs), inputs[2]
-    hands = tuple(f"{hand}." for hand in kind.hands)
-    own = [p[place] for place, one in enumerate(kind.parameters) if hands and one.startswith(hands)]
-    if not own or not rates_of.numel():
-        return frozenset()
-    slopes = casadi.jacobian(rates_of, casadi.vertcat(*own)) if rates_of.is_column() else rates_of
-    return frozenset(slopes.sparsity().get_triplet()[0])
-
-
 def _is_position(kind: Kind, site: SiteJacobians, row: int) -> bool:
     """Say whether a state is a place whose rate is another state, as of a mass."""
     return kind.states[row].unit == "m" and site.pattern.a[row].sum() == 1 and not site.pattern.b[row].any()
@@ -343,13 +328,8 @@ def _read(kind: Kind) -> frozenset[int]:
     """Return the states that anything computed at an instant looks at."""
     functions = [one.tick for one in kind.clocks] + [one.send for one in kind.sends]
     functions += [receive.edge for one in kind.clocks for receive in one.receives if receive.edge is not None]
-    found: set[int] = set()
-    for function in functions:
-        x = function.sx_in()[0]
-        if x.numel():
-            everything = casadi.vertcat(*map(casadi.vec, function.call(function.sx_in())))
-            found |= set(np.flatnonzero(casadi.which_depends(everything, x, 1, False)).tolist())
-    return frozenset(found)
+    reads = [structural_pattern(function.jac_sparsity(0, 0)).any(axis=0) for function in functions]
+    return frozenset(np.flatnonzero(np.any(reads, axis=0)).tolist())
 
 
 def _forces(

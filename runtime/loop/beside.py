@@ -8,6 +8,7 @@ Does not: write (see `run`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, analyze
-from apc.compiler.compiled import Channel, CompiledSystem
+from apc.compiler.compiled import Channel, CompiledSystem, Link
 from apc.loop.peer import live_scene
 from apc.loop.run import PeerRun, Run, delays_of, trace_name
 from apc.moments.network import NetworkVerdict, judge_network
@@ -125,17 +126,22 @@ def compare_run(run: Run) -> RunComparison:
     system, peers = run.system, run.peers
     simulation = prepare(live_scene(system), Settings(_duration(peers), jit=False))
     frame = float(simulation.frame * simulation.quantum)
-    why_not = _incomplete(system, peers)
+    why_not, ways = _incomplete(system, peers), _ways(run)
+    heard = [[one for one in ways if one.link == link.name and one.came.law] for link in system.links]
     return RunComparison(
         topology=system.name,
         folder=run.folder,
         seconds=max((float(one.time[-1]) for one in peers if len(one.time)), default=0.0),
         emulated=any(one.emulated for one in peers),
         ticks=tuple(ticks_of(one, frame) for one in peers),
-        ways=(ways := _ways(run)),
+        ways=ways,
         apart={} if why_not else _apart(run),
         why_not=why_not,
-        measured=tuple(_measured(run, link.name, ways) for link in system.links if _heard(ways, link.name)),
+        measured=tuple(
+            _measured(system, link, listed)
+            for link, listed in zip(system.links, heard, strict=True)
+            if listed
+        ),
     )
 
 
@@ -191,74 +197,54 @@ def _apart(run: Run) -> dict[str, tuple[float, float]]:
     simulation = prepare(live_scene(run.system), Settings(_duration(run.peers), jit=False))
     player = Stepwise(simulation.population, lambda _: _AsSeen(run, simulation))
     whole = np.concatenate([block.values for block in blocks(simulation, player=player)])
-    units = {one.name: one.unit for one in simulation.signals}
-    columns = {one.name: column for column, one in enumerate(simulation.signals)}
+    simulated = {one.name: (one.unit, whole[:, column]) for column, one in enumerate(simulation.signals)}
     found: dict[str, tuple[float, float]] = {}
     for peer in run.peers:
-        rows = min(len(peer.values), len(whole))
-        for column, name in enumerate(peer.signals):
-            played = peer.values[:rows, column]
-            far = float(np.abs(played - whole[:rows, columns[name]]).max(initial=0.0))
-            most, large = found.get(units[name], (0.0, 0.0))
-            found[units[name]] = max(most, far), max(large, float(np.abs(played).max(initial=0.0)))
+        for name, played in zip(peer.signals, peer.values[: len(whole)].T, strict=True):
+            unit, values = simulated[name]
+            far = float(np.abs(played - values[: len(played)]).max(initial=0.0))
+            most, large = found.get(unit, (0.0, 0.0))
+            found[unit] = max(most, far), max(large, float(np.abs(played).max(initial=0.0)))
     return found
 
 
 def _ways(run: Run) -> tuple[WayRun, ...]:
-    system, names = run.system, {one.number: one for one in run.peers}
-    clocks = {one.name: one for one in system.clocks}
+    system, peers = run.system, {one.number: one for one in run.peers}
     timings = {one.name: float(one.value) for one in system.timings}
+    periods = {one.name: timings[one.period] for one in system.clocks}
     found = []
     for peer in run.peers:
-        for link, sender in sorted({(int(link), int(sender)) for link, sender in peer.arrivals[:, :2]}):
-            trace = trace_name(system, link, sender, peer.number)
-            other = names.get(sender)
-            period = timings[clocks[system.links[link].clock].period]
+        for number, sender in peer.ways:
+            link, trace = system.links[number], trace_name(system, number, sender, peer.number)
+            other = peers.get(sender)
+            came = describe_delays(delays_of(peer, number, sender), trace, interval=periods[link.clock])
             found.append(
                 WayRun(
-                    link=system.links[link].name,
+                    link=link.name,
                     sender=other.name if other else trace.split("-to-")[0],
                     receiver=peer.name,
-                    sent=None if other is None else other.sent.get((link, peer.number), 0),
-                    came=describe_delays(delays_of(peer, link, sender), trace, interval=period),
+                    sent=other.sent.get(number, {}).get(peer.number, 0) if other else None,
+                    came=came,
                     trace=str(Path(run.folder) / trace),
                 )
             )
     return tuple(found)
 
 
-def _heard(ways: tuple[WayRun, ...], link: str) -> bool:
-    return any(one.link == link and one.came.law is not None for one in ways)
-
-
-def _measured(run: Run, link: str, ways: tuple[WayRun, ...]) -> Measured:
-    """Return what is said of the scene with a link as its worst way was: most lost, then latest."""
-    heard = [one for one in ways if one.link == link and one.came.law is not None]
-    worst = max(heard, key=lambda one: (one.came.lost.value, one.came.mean))
-    system = run.system
-    own = next(one for one in system.links if one.name == link)
-    median = dict(worst.came.quantiles).get(0.5, worst.came.mean)
-    tick = min(float(one.value) for one in system.timings if one.name in {c.period for c in system.clocks})
+def _measured(system: CompiledSystem, link: Link, ways: Sequence[WayRun]) -> Measured:
+    """Return what is said of the scene with a link as the worst of its ways was: most lost, then latest."""
+    worst = max(ways, key=lambda one: (one.came.lost.value, one.came.mean))
+    came, clocks = worst.came, {one.name: one.period for one in system.clocks}
+    tick = min(float(one.value) for one in system.timings if one.name in clocks.values())
+    median = dict(came.quantiles).get(0.5, came.mean)
     delay = Fraction(int(np.ceil(median / tick - 1e-9))) * Fraction(tick).limit_denominator(10**9)
-    channel = Channel(
-        None,
-        None,
-        "uniform",
-        own.channel.reorder if own.channel else "newest",
-        own.channel.on_loss if own.channel else "hold",
-        worst.came.delays,
-    )
-    timings = tuple(replace(one, value=delay) if one.name == own.delay else one for one in system.timings)
-    period = next(
-        one.value
-        for one in timings
-        if one.name == next(c.period for c in system.clocks if c.name == own.clock)
-    )
-    links = tuple(
-        replace(one, channel=channel, delays=()) if one.name == link else one for one in system.links
-    )
+    usual = link.channel or Channel(None, None, "uniform", "newest", "hold", None)
+    channel = Channel(None, None, "uniform", usual.reorder, usual.on_loss, came.delays)
+    timings = tuple(replace(one, value=delay) if one.name == link.delay else one for one in system.timings)
+    period = next(float(one.value) for one in timings if one.name == clocks[link.clock])
+    links = tuple(replace(one, channel=channel, delays=()) if one is link else one for one in system.links)
     measured = replace(system, timings=timings, links=links)
+    late = came.longest > LATEST * period or came.packets > LONGEST
+    network = None if late else judge_network(measured)
     way = f"{worst.sender} to {worst.receiver}"
-    late = worst.came.longest > LATEST * float(period)
-    network = None if late or worst.came.packets > LONGEST else judge_network(measured)
-    return Measured(link, way, float(delay), analyze(measured), network)
+    return Measured(link.name, way, float(delay), analyze(measured), network)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from apc.compiler.files import RefusedError, read_file
 from apc.compiler.words import counted
 from apc.loop.packets import DROPPED
 from apc.loop.peer import live_scene
-from apc.loop.run import ARRAYS, PLAIN, SCENE, PeerRun, Run
+from apc.loop.run import ARRAYS, SCENE, PeerRun, Run, Words
 from apc.network.timetable import START, Route
 from apc.npz import DamageError, read_arrays
 from apc.opening import opened
@@ -47,27 +47,6 @@ KINDS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class _Told:
-    """What a peer's file says in words and single numbers; see `PeerRun`."""
-
-    name: str
-    number: int
-    digest: str
-    session: int
-    first: int
-    frames: int
-    stopped: bool
-    emulated: bool
-    outside: bool
-    signals: tuple[str, ...]
-    dropped: dict[str, int]
-    not_given: tuple[str, ...]
-    sent: tuple[tuple[int, int, int], ...]
-    offsets: tuple[tuple[int, float, float], ...]
-    routes: int
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scene:
     """What a peer's file is held against: the scene's `names` of peers, and what simulates it."""
@@ -84,38 +63,35 @@ class _Scene:
 
 def read_run(folder: Path) -> Run:
     """Read a run. Raises ApcError E973 if a folder is none, damaged, or of several scenes."""
+
+    def refuse(wrong: bool, what: str, hint: str = "apc play FILE --out ANOTHER") -> None:
+        if wrong:
+            raise ApcError(Mistake("E973", Place(str(folder)), what, hint=hint))
+
     files = sorted(folder.glob("*.npz"))
-    if not (folder / SCENE).is_file() or not files:
-        what = f"holds no run: {SCENE} and a file a peer, as apc play writes them"
-        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out RUN"))
+    none = f"holds no run: {SCENE} and a file a peer, as apc play writes them"
+    refuse(not (folder / SCENE).is_file() or not files, none, "apc play FILE --out RUN")
     archive = read_archive(folder / SCENE)
     system = opened(archive, folder)
-    if len(files) > system.peers:
-        what = f"holds {counted(len(files), 'peer', ',')} of a scene with {system.peers:,}"
-        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
+    many = f"holds {counted(len(files), 'peer', ',')} of a scene with {system.peers:,}"
+    refuse(len(files) > system.peers, many)
     names = tuple(f"{group.name}[{place + 1}]" for group in system.groups for place in range(group.count))
     simulation = prepare(live_scene(system), Settings(Fraction(1, 1000), jit=False))
     scene = _Scene(names, tuple(link.name for link in system.links), simulation)
     peers = tuple(sorted((_read_peer(path, scene) for path in files), key=lambda one: one.number))
-    if len({(one.digest, one.session) for one in peers}) > 1:
-        what = "holds peers that did not play together: of other runs, of other scenes, or with another --set"
-        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
-    if peers[0].digest != hashlib.sha256(archive.model).hexdigest():
-        what = f"its {SCENE} is not the scene that was played"
-        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
-    if len({one.number for one in peers}) < len(peers):
-        what = "holds a peer twice"
-        raise ApcError(Mistake("E973", Place(str(folder)), what, hint="apc play FILE --out ANOTHER"))
+    apart = "holds peers that did not play together: of other runs, of other scenes, or with another --set"
+    refuse(len({(one.digest, one.session) for one in peers}) > 1, apart)
+    played = hashlib.sha256(archive.model).hexdigest()
+    refuse(peers[0].digest != played, f"its {SCENE} is not the scene that was played")
+    refuse(len({one.number for one in peers}) < len(peers), "holds a peer twice")
     return Run(str(folder), system, peers)
 
 
 def _read_peer(path: Path, scene: _Scene) -> PeerRun:
     try:
-        found = read_arrays(read_file(path, LARGEST), KINDS, LARGEST)
-        peer = _peer(found)
-        _check_told(peer, scene)
-        _check_signals(peer, scene)
-        _check_packets(peer, scene)
+        peer = _peer(read_arrays(read_file(path, LARGEST), KINDS, LARGEST))
+        for check in (_check_words, _check_signals, _check_packets):
+            check(peer, scene)
     except (RefusedError, DamageError) as error:
         raise ApcError(Mistake("E973", Place(str(path)), f"is no peer of this run: {error}")) from None
     return peer
@@ -132,38 +108,35 @@ def _peer(found: dict[str, NDArray[Any]]) -> PeerRun:
     _want({"told", *ARRAYS} <= found.keys(), f"it lacks one of {', '.join(('told', *ARRAYS))}")
     _want(found["told"].size <= LONGEST, "it tells too much")
     try:
-        told = msgspec.json.decode(found["told"].tobytes(), type=_Told)
-        _want(all(map(str.isprintable, told.not_given)), "")  # it is shown in a terminal
+        words = msgspec.json.decode(found["told"].tobytes(), type=Words)
+        _want(all(map(str.isprintable, words.not_given)), "")  # it is shown in a terminal
     except ValueError:
         raise DamageError("what it tells is not what apc play writes") from None
-    routed = {f"{name}{at}" for name in ("packets", "missing") for at in range(min(told.routes, len(found)))}
-    _want(found.keys() == {"told", *ARRAYS, *routed}, "its links are not those it tells of")
-    plain: dict[str, Any] = {name: getattr(told, name) for name in PLAIN}
-    plain["sent"] = {(link, other): count for link, other, count in told.sent}
-    plain["offsets"] = {other: (trip, ahead) for other, trip, ahead in told.offsets}
-    arrays: dict[str, Any] = {name: found[name] for name in ARRAYS}
+    routes = range((len(found) - len(ARRAYS) - 1) // 2)
+    packets, missing = ([f"{name}{at}" for at in routes] for name in ("packets", "missing"))
+    _want(found.keys() == {"told", *ARRAYS, *packets, *missing}, "it hears no route, or one by half")
     return PeerRun(
-        **plain,
-        **arrays,
-        packets=tuple(found[f"packets{at}"] for at in range(told.routes)),
-        missing=tuple(found[f"missing{at}"] for at in range(told.routes)),
+        **{one.name: getattr(words, one.name) for one in fields(Words)},
+        **{name: found[name] for name in ARRAYS},
+        packets=tuple(found[name] for name in packets),
+        missing=tuple(found[name] for name in missing),
     )
 
 
-def _check_told(peer: PeerRun, scene: _Scene) -> None:
-    """Check what is told against the scene."""
+def _check_words(peer: PeerRun, scene: _Scene) -> None:
+    """Check what is said in words against the scene."""
     peers, links = range(len(scene.names)), range(len(scene.links))
     _want(peer.number in peers and peer.name == scene.names[peer.number], "the scene has no such peer")
     _want(re.fullmatch("[0-9a-f]{64}", peer.digest) is not None, "it doesn't say of which scene it is")
     _want(0 <= peer.session < 1 << 64, "its session is no number of 64 bits")
     _want(0 <= peer.first < peer.frames <= LATEST, "it joins after the end")
     _want(peer.dropped.keys() <= DROPPED.keys(), "datagrams are dropped for no known reason")
-    counts = [*peer.dropped.values(), *peer.sent.values()]
+    sent = [(link, *one) for link, by_peer in peer.sent.items() for one in by_peer.items()]
+    counts = [*peer.dropped.values(), *(count for *_, count in sent)]
     _want(all(0 <= count <= LATEST for count in counts), "a count is negative, or beyond all time")
-    sent = all(link in links and other in peers for link, other in peer.sent)
-    _want(
-        sent and all(other in peers for other in peer.offsets), "it tells of a peer or link that isn't there"
-    )
+    others = {*peer.offsets, *(other for _, other, _ in sent)}
+    known = peer.sent.keys() <= {*links} and others <= {*peers}
+    _want(known, "it tells of a peer or link that isn't there")
 
 
 def _check_signals(peer: PeerRun, scene: _Scene) -> None:

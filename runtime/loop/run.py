@@ -1,19 +1,20 @@
 """What a peer of a run did and heard, on disk: one file a peer, a trace a way, and the scene they played.
 
-Takes: a `Loop` that has ended. Gives: `PeerRun`, `Run`, `run_of`, `check_folder`, `write_run`.
+Takes: a `Loop` that has ended. Gives: `Words`, `PeerRun`, `Run`, `run_of`, `check_folder`, `write_run`.
 Guarantees: a run is put where it belongs when all of it is written, until then what is there stays.
 Does not: read it again (see `reading`), or judge it (see `beside`).
 """
 
 from __future__ import annotations
 
-import json
 import math
 import tempfile
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,17 +33,13 @@ ARRAYS = ("time", "values", "late", "took", "arrivals")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PeerRun:
-    """What one peer did.
+class Words:
+    """What one peer did, as far as it is said in words and single numbers.
 
     `session` is one number of all that played together; `first` is the frame it joined with, of `frames`;
-    `outside` says that it had a device outside. `values` (rows, signals) are its `signals` at `time`
-    (rows,) in seconds, as `simulate` gives them. `late` and `took` (n,) are how long after its due each
-    instant began and how long it was worked on, in seconds. `arrivals` (n, 5) are link, sender, count of a
-    packet, the instant of its sample and that of its coming, in nanoseconds of the scene; `sent` counts
-    packets by (link, receiver). `packets` and `missing` are, a route of the scene each, what its ticks saw
-    on its own ways (ticks, ways). `dropped` counts datagrams by why; `not_given` is what the system did not
-    give; `offsets` are, of each other, the shortest round trip and how far its clock was ahead, in seconds.
+    `outside` says that it had a device outside. `signals` are what was recorded. `dropped` counts datagrams
+    by why; `not_given` is what the system did not give; `sent` counts packets by link and receiver; `offsets`
+    are, of each other, the shortest round trip and how far its clock was ahead, in seconds.
     """
 
     name: str
@@ -55,17 +52,35 @@ class PeerRun:
     emulated: bool
     outside: bool
     signals: tuple[str, ...]
+    dropped: dict[str, int]
+    not_given: tuple[str, ...]
+    sent: dict[int, dict[int, int]]
+    offsets: dict[int, tuple[float, float]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PeerRun(Words):
+    """What one peer did.
+
+    `values` (rows, signals) are its signals at `time` (rows,) in seconds, as `simulate` gives them. `late`
+    and `took` (n,) are how long after its due each instant began and how long it was worked on, in seconds.
+    `arrivals` (n, 5) are link, sender, count of a packet, the instant of its sample and that of its coming,
+    in nanoseconds of the scene. `packets` and `missing` are, a route of the scene each, what its ticks saw on
+    its own ways (ticks, ways).
+    """
+
     time: Floats
     values: Floats
     late: Floats
     took: Floats
     arrivals: Integers
-    sent: Mapping[tuple[int, int], int]
     packets: tuple[Integers, ...]
     missing: tuple[NDArray[np.bool_], ...]
-    dropped: Mapping[str, int]
-    not_given: tuple[str, ...]
-    offsets: Mapping[int, tuple[float, float]]
+
+    @property
+    def ways(self) -> list[tuple[int, int]]:
+        """The link and the sender of each way that something came on."""
+        return sorted({(link, sender) for link, sender in self.arrivals[:, :2].tolist()})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,20 +95,27 @@ class Run:
 def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
     """Return what a loop that has ended did."""
     simulation, player = loop.simulation, loop.player
-    rows = np.concatenate(loop.rows) if loop.rows else np.zeros((0, simulation.population.width))
+    rows = np.concatenate([np.zeros((0, simulation.population.width)), *loop.rows])
     last = int(simulation.settings.duration / simulation.quantum)
-    marks, played = len(simulation.marks), len(rows) // len(simulation.marks)
-    whole = [
-        instants_of(simulation, at, last) for at in range(loop.first, loop.first + played, simulation.length)
-    ]
-    instants, kept = (
-        np.concatenate([one[i] for one in whole])[: played * marks] if whole else np.zeros(0, np.int64)
-        for i in range(2)
-    )
-    kept = kept.astype(bool) & np.isfinite(rows).all(axis=1)
-    log = np.maximum(
-        np.array(player.log, np.int64).reshape(-1, 3), 0
-    )  # told to end, it did not wait for the last instant
+    played = len(rows) // len(simulation.marks)
+    starts = range(loop.first, loop.first + played, simulation.length)
+    whole = [instants_of(simulation, at, last) for at in starts]
+    instants = np.concatenate([np.zeros(0, np.int64), *(one for one, _ in whole)])[: len(rows)]
+    recorded = np.concatenate([np.zeros(0, np.bool_), *(one for _, one in whole)])[: len(rows)]
+    recorded = recorded.astype(bool) & np.isfinite(rows).all(axis=1)
+    # Told to end, it did not wait for the last instant.
+    log = np.maximum(np.array(player.log, np.int64).reshape(-1, 3), 0)
+    sent: dict[int, dict[int, int]] = {}
+    for (link, receiver), count in player.sent.items():
+        sent.setdefault(link, {})[receiver] = count
+
+    def seen(place: int, kind: type) -> tuple[NDArray[Any], ...]:
+        ways = zip(player.seen, player.mine, strict=True)
+        return tuple(
+            np.array([one[place] for one in ticks], kind).reshape(len(ticks), len(mine))
+            for ticks, mine in ways
+        )
+
     return PeerRun(
         name=loop.name,
         number=loop.own,
@@ -105,23 +127,17 @@ def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
         emulated=loop.player.network is not None,
         outside=loop.player.outside is not None,
         signals=tuple(one.name for one in simulation.signals),
-        time=np.asarray(instants[kept] * float(simulation.quantum), np.float64),
-        values=rows[kept][:, simulation.order],
+        dropped=dict(loop.post.dropped),
+        not_given=not_given,
+        sent=sent,
+        offsets={one: (trip / NANO, ahead / NANO) for one, (trip, ahead) in loop.offsets.items()},
+        time=np.asarray(instants[recorded] * float(simulation.quantum), np.float64),
+        values=rows[recorded][:, simulation.order],
         late=log[:, 1] / NANO,
         took=log[:, 2] / NANO,
         arrivals=np.array(player.arrivals, np.int64).reshape(-1, 5),
-        sent=dict(player.sent),
-        packets=tuple(
-            np.array([one for one, _ in seen], np.int64).reshape(len(seen), len(mine))
-            for seen, mine in zip(player.seen, player.mine, strict=True)
-        ),
-        missing=tuple(
-            np.array([one for _, one in seen], np.bool_).reshape(len(seen), len(mine))
-            for seen, mine in zip(player.seen, player.mine, strict=True)
-        ),
-        dropped=dict(loop.post.dropped),
-        not_given=not_given,
-        offsets={one: (trip / NANO, ahead / NANO) for one, (trip, ahead) in loop.offsets.items()},
+        packets=seen(0, np.int64),
+        missing=seen(1, np.bool_),
     )
 
 
@@ -184,37 +200,16 @@ def write_run(folder: Path, system: CompiledSystem, peers: Sequence[PeerRun], *,
 
 def _write_peer(folder: Path, peer: PeerRun, system: CompiledSystem) -> None:
     """Write what a peer did, and a trace of every way that it heard. Raises OSError if it can't."""
-    told = {
-        **{name: getattr(peer, name) for name in PLAIN},
-        "sent": [[*key, count] for key, count in peer.sent.items()],
-        "offsets": [[one, *both] for one, both in peer.offsets.items()],
-        "routes": len(peer.packets),
-    }
+    words = msgspec.json.encode({one.name: getattr(peer, one.name) for one in fields(Words)})
     arrays = {name: getattr(peer, name) for name in ARRAYS}
     arrays |= {f"packets{at}": one for at, one in enumerate(peer.packets)}
     arrays |= {f"missing{at}": one for at, one in enumerate(peer.missing)}
-    arrays["told"] = np.frombuffer(json.dumps(told).encode(), np.uint8)
+    arrays["told"] = np.frombuffer(words, np.uint8)
     np.savez_compressed(folder / f"{file_name(peer.name)}.npz", **arrays)
-    for link, sender in sorted({(int(link), int(sender)) for link, sender in peer.arrivals[:, :2]}):
+    for link, sender in peer.ways:
         rows = ("lost" if math.isinf(one) else f"{one * 1e3:.6f}" for one in delays_of(peer, link, sender))
         text = "\n".join(["delay [ms]", *rows, ""])
         (folder / trace_name(system, link, sender, peer.number)).write_text(text, encoding="utf-8")
-
-
-PLAIN = (
-    "name",
-    "number",
-    "digest",
-    "session",
-    "first",
-    "frames",
-    "stopped",
-    "emulated",
-    "outside",
-    "signals",
-    "dropped",
-    "not_given",
-)
 
 
 def delays_of(peer: PeerRun, link: int, sender: int) -> Floats:
