@@ -346,8 +346,6 @@ class _OnePeer(Stepwise):
         seen: tuple[Seen, ...],
         rows: Floats,
         pushes: Sequence[Floats | None],
-        marks: list[int],
-        pushed: list[int],
     ) -> None:
         """Wait for a segment's instant, play it, and hand over what it sends at its end."""
         instant = number * self.loop.frame_ns + self.begin_at[index]
@@ -356,7 +354,7 @@ class _OnePeer(Stepwise):
         outside = self.outside if self.loop.begins else None
         if outside and (index == 0 or self.begin_at[index] > self.begin_at[index - 1]):
             self._of_device(outside.measure, instant / NANO, self.carries[self.member])
-        super()._segment(number, index, seen, rows, pushes, marks, pushed)
+        super()._segment(number, index, seen, rows, pushes)
         if outside and index:  # before it nothing ticks: a frame begins with what is sent then
             self._push(outside, index)
         self._hand_over(number, index)

@@ -116,7 +116,7 @@ class _Runner:
         if stop < len(rows):
             name = simulation.signals[int(np.argmin(finite[stop]))].name
             return Block(time[:stop], values[:stop], self.done, name, float(time[stop]))
-        if self.failed is None and instants[-1] <= last and not self.player.in_range().all():
+        if self.failed is None and instants[-1] <= last and not self.player.in_range():
             return Block(time, values, self.done, "what is not recorded", float(time[-1]))
         return Block(time, values, self.done)
 
@@ -134,7 +134,9 @@ def pushes(simulation: Simulation, first: int) -> list[Floats | None]:
         which = np.tile(np.array([place for _, place in program.intervals], dtype=np.int64), len(numbers))
         quanta = (numbers[:, None] * simulation.frame + begin).reshape(-1)
         starts = quanta * simulation.quantum.numerator / simulation.quantum.denominator
-        own = [impulses(one, starts, which)[:, program.rates.g].reshape(len(numbers), -1) for one in forces]
+        own = [
+            impulses(one, starts, which)[:, program.rates.pushed].reshape(len(numbers), -1) for one in forces
+        ]
         found.append(np.ascontiguousarray(np.stack(own, axis=-1)))
     return found
 

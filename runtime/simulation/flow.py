@@ -36,7 +36,7 @@ from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.interpolation import jacobian
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.start import start_values
-from apc.simulation.integrate import integrated
+from apc.simulation.integrate import Integrated
 from apc.simulation.propagate import nonlinear_rows
 from apc.simulation.settings import EXACT, RK4, WHERE_NEEDED, Method
 
@@ -77,7 +77,7 @@ class Flow:
             short = self.rate.is_a("SXFunction") and duration <= MOST_UNROLLED * self.method.step
             return move.expand() if short else move
         assert self.method.tolerance is not None
-        return integrated(self.rate, self.scale, self.method.tolerance, duration)
+        return Integrated(self.rate, self.scale, self.method.tolerance, duration)
 
     def tolerances(self, kind: Kind) -> tuple[Tolerance, ...]:
         """Return the tolerances of its states, none if the step is fixed."""

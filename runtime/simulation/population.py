@@ -28,7 +28,6 @@ from apc.simulation.hearing import Hearing, hearing_of
 from apc.simulation.program import Member
 
 Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,10 +50,9 @@ class Population:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Played:
-    """Some frames: `rows` (frames · marks, width · runs), `work` (frames, parts) in J until each begins.
+    """Some frames: `rows` (frames · marks, width), `work` (frames, parts) in J until each begins.
 
-    Each number of a row stands there once a run, side by side; the work is that of all runs. Only the first
-    `frames` could be played.
+    Only the first `frames` could be played.
     """
 
     rows: Floats
@@ -63,12 +61,10 @@ class Played:
 
 
 class Player(Protocol):
-    """Plays a population, frame after frame: `runs` runs of one seed, which differ in their packets."""
-
-    runs: int
+    """Plays a population, frame after frame; the runs of one seed differ in their packets."""
 
     def begin(self, run: int) -> None:
-        """Go back to time 0; `run` is the number of the first run, the others follow it."""
+        """Go back to time 0 of the run of a number."""
 
     def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> Played:
         """Play the frames from number `first` on; of the members with impulses `pushes` are these.
@@ -76,8 +72,8 @@ class Player(Protocol):
         They are (frames, rows, sites). What is returned may be written over by the next call.
         """
 
-    def in_range(self) -> Flags:
-        """Say of each run whether all that moves, recorded or not, is still a number; its work may not be."""
+    def in_range(self) -> bool:
+        """Say whether all that moves, recorded or not, is still a number; its work may not be."""
 
 
 def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:

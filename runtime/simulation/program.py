@@ -1,6 +1,6 @@
 """One frame of one site as compiled steps, and the peers that take them.
 
-Takes: sites' parameters, what each interval does to them (`Transitions`), their start values; which of a
+Takes: sites' parameters, what each interval does to them, their start values; which of a
 group's different sites each peer is.
 Gives: `Program`, `Segment`, `Layout`; `Member`, `build_member`; `seconds_at`.
 Guarantees: the carry at time 0 is what was never computed, as zero, and the states where they start; what
@@ -27,7 +27,7 @@ from apc.frame.jacobians import SiteJacobians
 from apc.frame.schedule import Schedule, Value
 from apc.frame.start import start_values
 from apc.simulation.pairs import Pairwise
-from apc.simulation.propagate import Rates, Transitions
+from apc.simulation.propagate import Rates
 from apc.simulation.signals import LocalSignal
 
 Floats = NDArray[np.float64]
@@ -62,7 +62,8 @@ class Segment:
     """A stretch of the frame: `kernel` is the function above; `heard`, `sent` are rows of the schedule.
 
     After those rows the kernel hears what comes of each of `pairs`. `held` are the rows of the carry after it
-    with what each hold puts out then, −1 for what was never computed.
+    with what each hold puts out then, −1 for what was never computed. Of a frame's rows and impulses its
+    first are `first_mark` and `first_impulse`.
     """
 
     kernel: Any  # casadi.Function
@@ -70,6 +71,8 @@ class Segment:
     pairs: tuple[Pairwise, ...]
     sent: tuple[int, ...]
     held: tuple[int, ...]
+    first_mark: int
+    first_impulse: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +80,8 @@ class Program:
     """A site's frame. `recorded` are the signals of each row; `timed` says that the frame's number matters.
 
     `durations` are the intervals' lengths in quanta, in the order of a site's constants; `intervals` are
-    (start, place in `durations`) of each interval, for the impulses of forces that change with time.
+    (start, place in `durations`) of each interval, for the impulses of forces that change with time; `moves`
+    are what segments integrate by, which has to outlive them.
     """
 
     kind: Kind
@@ -88,20 +92,17 @@ class Program:
     recorded: tuple[LocalSignal, ...]
     durations: tuple[int, ...]
     intervals: tuple[tuple[int, int], ...]
+    moves: tuple[Any, ...]
 
     @property
     def impulse_rows(self) -> int:
         """How many numbers the impulses of one frame are."""
-        return int(self.rates.g.sum()) * len(self.intervals) if self.rates.timed else 0
+        return len(self.rates.pushed) * len(self.intervals) if self.rates.timed else 0
 
-    def constants(self, parameters: Floats, transitions: Transitions) -> Floats:
-        """Return a site's constants, of many (sites, rows): parameters, then E, F and c of each duration."""
-        rates, n_x = self.rates, self.layout.states
-        parts = [parameters]
-        for matrix in transitions.matrices:
-            e, f, c = np.split(matrix, [n_x, matrix.shape[-1] - 1], axis=-1)
-            parts += [e[..., rates.e], f[..., rates.f], c[..., rates.g, 0]]
-        return np.concatenate(parts, axis=-1)
+    def constants(self, parameters: Floats, transitions: Sequence[Floats]) -> Floats:
+        """Return sites' constants (sites, rows): parameters, then each duration's [E F c], columns first."""
+        columns = self.rates.pattern.T
+        return np.concatenate([parameters, *(one.swapaxes(1, 2)[:, columns] for one in transitions)], axis=1)
 
     def start(
         self, x: Sequence[Floats | float], remembered: Sequence[Sequence[Floats | float]], *, sites: int = 1
@@ -167,7 +168,7 @@ def build_member(
     rows: NDArray[np.int64],
     vectors: Floats,
     program: Program,
-    transitions: Transitions,
+    transitions: Sequence[Floats],
 ) -> Member:
     """Collect what some peers of a group bring to a population.
 
@@ -196,7 +197,7 @@ def build_member(
         program=program,
         rows=own,
         parameters=some,
-        constants=program.constants(some, transitions.chosen(used)),
+        constants=program.constants(some, [one[used] for one in transitions]),
         sends={
             one.link: np.asarray(one.send.map(len(some))(states, still, some.T, 0.0), np.float64).T
             for one in kind.sends

@@ -29,7 +29,7 @@ from apc.frame.scheduling import build_schedules
 from apc.memory import refuse_beyond
 from apc.network.timetable import Luck, Route, Timetable, luck_of, routes_of
 from apc.simulation.flow import Flow, Tolerance, flow_of, rows_to_move, state_scales
-from apc.simulation.forcing import SiteForcing, forcing_of
+from apc.simulation.forcing import Kernel, SiteForcing, forcing_of, kernel_of, site_forcing
 from apc.simulation.machine import Library, Machine, library_of
 from apc.simulation.pairs import count_pairs
 from apc.simulation.population import (
@@ -41,8 +41,7 @@ from apc.simulation.population import (
     refuse_unheard_of,
 )
 from apc.simulation.program import Member, Program, build_member
-from apc.simulation.propagate import Transitions, exact_rates, perturbed, rates, transition_rows
-from apc.simulation.quadrature import Kernel, kernel_of
+from apc.simulation.propagate import exact_rates, perturbed, rates, transition_rows
 from apc.simulation.settings import CVODES, EXACT, WHERE_NEEDED, Method, Settings, check_step
 from apc.simulation.signals import (
     Choice,
@@ -131,10 +130,10 @@ class Simulation:
         """The parts whose work is added up."""
         return self.population.parts
 
-    def player(self, runs: int = 1) -> Player:
-        """Return what plays it, with memory of its own, in machine code as many runs side by side."""
+    def player(self) -> Player:
+        """Return what plays it, with memory of its own."""
         if self.library is not None:
-            return Machine(self.library, self.population, self.lucks, self.seed, runs)
+            return Machine(self.library, self.population, self.lucks, self.seed)
         return Stepwise(self.population, self._timetable if self.lucks else None)
 
     def _timetable(self, run: int) -> Timetable:
@@ -147,7 +146,6 @@ def prepare(
     settings: Settings,
     *,
     signals: Sequence[str] = (),
-    runs: int = 1,
     live: bool = False,
 ) -> Simulation:
     """Do what comes before the first instant.
@@ -160,8 +158,6 @@ def prepare(
         How it is played.
     signals
         Patterns of the signals to record, all if there is none; see `signals.choose`.
-    runs
-        How many runs will stand side by side; it decides how machine code is made, not what comes out.
     live
         Whether it will be played instant by instant, as what is heard at one is known no sooner.
 
@@ -198,7 +194,7 @@ def prepare(
         frame=schedule.frame,
         marks=marks,
         ticks=frozenset(marks if _ticks_at_zero(system, plan.numbers) else marks[1:]),
-        library=library_of(population, runs) if settings.jit else None,
+        library=library_of(population) if settings.jit else None,
         length=_chunk_length(population, settings.duration),
     )
 
@@ -310,7 +306,7 @@ def _members(plan: Plan, choices: Sequence[Choice], method: Method, *, live: boo
     groups = zip(system.groups, plan.schedules, choices, strict=True)
     for group, (one, schedule, choice) in enumerate(groups):
         rows, vectors = numbers.rows[group], numbers.parameters[group]
-        moves: Transitions | None = None
+        moves: Sequence[Floats] | None = None
         for peers, recorded in _recorded_and_not(choice):
             key = (one.kind, id(schedule), recorded)
             if key not in programs:
@@ -421,7 +417,7 @@ def _check_step(
     check_step(system, method, fastest, max(lengths, default=fastest))
 
 
-def _transitions(program: Program, vectors: Floats, method: Method) -> Transitions:
+def _transitions(program: Program, vectors: Floats, method: Method) -> tuple[Floats, ...]:
     """Return what the different sites of a group do over every interval."""
     seconds = [length * program.schedule.quantum for length in program.durations]
     found = transition_rows(program.rates, vectors, seconds)
@@ -443,5 +439,5 @@ def _forces(member: Member) -> tuple[SiteForcing, ...]:
         if key not in kernels:
             a = exact_rates(program.rates, vector)[:, :n_x]
             kernels[key] = tuple(kernel_of(a, forcing.pushed, length) for length in seconds)
-        found.append(SiteForcing(forcing, vector, kernels[key]))
+        found.append(site_forcing(forcing, vector, kernels[key]))
     return tuple(found)

@@ -69,6 +69,7 @@ def build_program(
         recorded=tuple(recorded),
         durations=writer.durations,
         intervals=tuple(writer.intervals),
+        moves=tuple(writer.moves),
     )
 
 
@@ -132,6 +133,7 @@ class _Writer:
         self.pair_functions: dict[tuple[int, int], tuple[Any, tuple[int, ...]]] = {}
         self.rest: list[Event] = list(schedule.events)
         self.begun = -1  # the instant of the event before
+        self.marks = self.impulses = 0  # written so far
 
     def segment(self, events: Sequence[tuple[int, Event]], last: bool) -> Segment:
         """Write the events of one segment."""
@@ -146,8 +148,7 @@ class _Writer:
         heard_rows = sorted({row for _, tick in ticks for rows in tick.heard for row in rows} - apart)
         heard = type_.sym("heard", len(heard_rows) + len(pairs))
         lengths = sum(isinstance(event, Propagate) for _, event in events)
-        rows_of_g = int(self.rates.g.sum()) if self.rates.timed else 0
-        impulses = type_.sym("impulses", rows_of_g * lengths)
+        impulses = type_.sym("impulses", len(self.rates.pushed) * lengths if self.rates.timed else 0)
         self.known: dict[Any, Any] = {key: carry[i] for i, key in enumerate(self.keys)}
         if ("u", 0) not in self.known:  # the first segment
             for h, value in enumerate(self.schedule.acting):
@@ -183,7 +184,12 @@ class _Writer:
         assert not last or len(self.keys) == layout.size
         puts_out = [self.schedule.acting[h] if last else ("u", h) for h in range(len(self.kind.holds))]
         held = tuple(-1 if one is None else self.keys.index(one) for one in puts_out)
-        return Segment(kernel, tuple(heard_rows), tuple(pairs.values()), tuple(sorted(self.sent)), held)
+        first = self.marks, self.impulses
+        self.marks += len(self.rows) // max(len(self.recorded), 1)
+        self.impulses += impulses.numel()
+        return Segment(
+            kernel, tuple(heard_rows), tuple(pairs.values()), tuple(sorted(self.sent)), held, *first
+        )
 
     def _pairs(self, now: int, tick: Tick) -> dict[Any, Pairwise]:
         """Return what a tick hears pair by pair, by (tick, receive): what matters of x, u, m and p."""
@@ -215,9 +221,7 @@ class _Writer:
         return first
 
     def _constant_rows(self) -> int:
-        rates = self.rates
-        of_step = int(rates.e.sum() + rates.f.sum() + rates.g.sum())
-        return len(self.kind.parameters) + of_step * len(self.durations)
+        return len(self.kind.parameters) + int(self.rates.pattern.sum()) * len(self.durations)
 
     def _x(self) -> Any:
         return _column(self.type_, [self.known["x", i] for i in range(self.layout.states)])
@@ -286,32 +290,26 @@ class _Writer:
 
     def _propagate(self, now: int, place: int) -> None:
         """Move x over one interval, and add up the work that held values do meanwhile."""
-        rates, type_ = self.rates, self.type_
-        e_size, f_size, g_size = int(rates.e.sum()), int(rates.f.sum()), int(rates.g.sum())
-        at = len(self.kind.parameters) + place * (e_size + f_size + g_size)
+        pattern, type_ = self.rates.pattern, self.type_
         constants, _, _, impulses = self.inputs
-        factors = iter(range(at, at + e_size + f_size + g_size))
-        before, u = [self.known["x", i] for i in range(self.layout.states)], self._u()
-        after = [type_(0)] * self.layout.states
-        for pattern, values in ((rates.e, before), (rates.f, [u[h] for h in range(len(self.kind.holds))])):
-            for row, column in zip(*np.nonzero(pattern), strict=True):
-                after[row] = after[row] + constants[next(factors)] * values[column]
-        for row in np.flatnonzero(rates.g):
-            after[row] = after[row] + constants[next(factors)]
-        if rates.timed:
-            for row in np.flatnonzero(rates.g):
-                after[row] = after[row] + impulses[self.taken]
-                self.taken += 1
+        before, u, size = self._x(), self._u(), int(pattern.sum())
+        begin = len(self.kind.parameters) + place * size
+        rows, columns = np.nonzero(pattern.T)[::-1]
+        sparsity = casadi.Sparsity.triplet(*pattern.shape, rows.tolist(), columns.tolist())
+        step = type_(sparsity, constants[begin : begin + size])
+        after = casadi.vertsplit(casadi.densify(step @ casadi.vertcat(before, u, 1)))
+        for row in self.rates.pushed if self.rates.timed else ():
+            after[row] = after[row] + impulses[self.taken]
+            self.taken += 1
         if self.flow is not None:
-            moved = [before[row] for row in self.flow.rows]
-            moved = self.moves[place](_column(type_, moved), u, self._p(), self._time(now))
+            moved = self.moves[place](before[list(self.flow.rows)], u, self._p(), self._time(now))
             for i, row in enumerate(self.flow.rows):
                 after[row] = moved[i]
         self.intervals.append((now, place))
         ports = self.kind.ports
         if ports:
             n = len(ports.parts)
-            old = ports.port(_column(type_, before), u, self._p(), self._time(now))
+            old = ports.port(before, u, self._p(), self._time(now))
             new = ports.port(_column(type_, after), u, self._p(), self._time(now))
             for i, part in enumerate(ports.parts):
                 self.known["work", part] = self.known["work", part] - old[n + i] * (new[i] - old[i])
