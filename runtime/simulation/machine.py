@@ -29,7 +29,6 @@ from apc.network.timetable import START, Luck
 from apc.simulation.hearing import Arrived, Complete, Deliver, Look, Operation, Source, Weighed
 from apc.simulation.native import native
 from apc.simulation.population import Played, Population
-from apc.simulation.program import Member
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -192,7 +191,7 @@ def _kernel(place: int, kernel: Kernel) -> str:
     ]
     after, sent, rows = function.results
     values, lines = straight_lines(function, inputs)
-    stores = [f"carry[{k} * n + i] = {values[one]};" for k, one in enumerate(after)]
+    stores = [f"carry[{k} * n + i] = {values[one]};" for k, one in enumerate(after) if one != k]
     stores += [f"sent[keys[{k}] * peers + i] = {values[one]};" for k, one in enumerate(sent)]
     stores += [
         f"rows[{k // recorded} * width + {k % recorded} * n + i] = {values[one]};"
@@ -335,7 +334,7 @@ class Machine:
         hearing, members = population.hearing, population.members
         self.packets = self._changing(np.repeat(hearing.start[None], hearing.ring, axis=0))
         self.held = [self._changing(one) for one in hearing.held]
-        self.carries = [self._changing(_carry(member)) for member in members]
+        self.carries = [self._changing(member.each(member.carry).T) for member in members]
         self.heard = [
             self._own(np.zeros((max(s.kernel.numel_in("heard") for s in one.program.segments), one.count)))
             for one in members
@@ -544,16 +543,6 @@ class Machine:
             r=self._read(one.missing)[2] if one.missing else 0,
             v=self.heard[one.member][one.row],
         )
-
-
-def _carry(member: Member) -> Floats:
-    """Return the carry of a member's peers at time 0, in room for that of every segment (rows, peers)."""
-    sizes = [
-        (one.kernel.numel_in("carry"), one.kernel.numel_out("carry_after")) for one in member.program.segments
-    ]
-    start = np.zeros((max(map(max, sizes)), member.count))
-    start[: member.carry.shape[1]] = member.each(member.carry).T
-    return start
 
 
 def _set(record: Any, **fields: Any) -> Any:

@@ -2,7 +2,7 @@
 
 Takes: sites' parameters, what each interval does to them, their start values; which of a
 group's different sites each peer is.
-Gives: `Program`, `Segment`, `Layout`; `Member`, `build_member`; `seconds_at`.
+Gives: `Program`, `Segment`, `Layout`; `Member`, `build_member`; `timed_events`, `seconds_at`.
 Guarantees: the carry at time 0 is what was never computed, as zero, and the states where they start; what
 many peers have in common is kept once.
 Does not: write the steps (see `writing`), or know the other members (see `frame_packets`, `population`).
@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.schedule import Schedule, Value
+from apc.frame.schedule import Event, Propagate, Schedule, Value
 from apc.frame.start import start_values
 from apc.simulation.pairs import Pairwise
 from apc.simulation.propagate import Rates
@@ -35,42 +36,47 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The rows of the carry at the start of a frame: x, newest outputs, values to act later, work.
+    """The rows of the carry: x, newest outputs, what holds put out, values to act later, work.
 
-    `outputs` are the (clock partition, output) pairs that are computed; `later` are values of earlier frames
-    that a hold puts out in this one or after; `parts` are those whose work is added up.
+    `outputs` are the (clock partition, output) pairs that are computed; `later` are values of earlier frames,
+    or of earlier segments, that a hold puts out after; `parts` are those whose work is added up.
     """
 
     states: int
     outputs: tuple[tuple[int, int], ...]
+    holds: int
     later: tuple[Value, ...]
     parts: tuple[str, ...]
 
     @property
-    def size(self) -> int:
-        """The number of rows."""
-        return self.states + len(self.outputs) + len(self.later) + len(self.parts)
+    def ends(self) -> tuple[int, ...]:
+        """Where each of these begins, and the last ends."""
+        sizes = (self.states, len(self.outputs), self.holds, len(self.later), len(self.parts))
+        return tuple(accumulate(sizes, initial=0))
+
+    @property
+    def held(self) -> slice:
+        """The rows that hold what holds put out."""
+        return slice(*self.ends[2:4])
 
     @property
     def work(self) -> slice:
         """The rows that hold the work done so far, in J."""
-        return slice(self.size - len(self.parts), self.size)
+        return slice(*self.ends[4:])
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
     """A stretch of the frame: `kernel` is the function above; `heard`, `sent` are rows of the schedule.
 
-    After those rows the kernel hears what comes of each of `pairs`. `held` are the rows of the carry after it
-    with what each hold puts out then, −1 for what was never computed. Of a frame's rows and impulses its
-    first are `first_mark` and `first_impulse`.
+    After those rows the kernel hears what comes of each of `pairs`. Of a frame's rows and impulses its first
+    are `first_mark` and `first_impulse`.
     """
 
     kernel: Any  # casadi.Function
     heard: tuple[int, ...]
     pairs: tuple[Pairwise, ...]
     sent: tuple[int, ...]
-    held: tuple[int, ...]
     first_mark: int
     first_impulse: int
 
@@ -121,10 +127,16 @@ class Program:
         newest: dict[tuple[int, int], Floats | float] = dict.fromkeys(self.layout.outputs, 0.0)
         for p, (partition, values) in enumerate(zip(self.kind.clocks, remembered, strict=True)):
             newest |= {(p, o): one for o, one in zip(partition.memories, values, strict=True)}
-        carry = np.zeros((sites, self.layout.size))
+        carry = np.zeros((sites, self.layout.ends[-1]))
         for row, one in enumerate([*x, *(newest[one] for one in self.layout.outputs)]):
             carry[:, row] = one
         return carry
+
+
+def timed_events(schedule: Schedule) -> list[tuple[int, Event]]:
+    """Return what happens in a frame, each with its instant in quanta."""
+    lengths = [event.duration if isinstance(event, Propagate) else 0 for event in schedule.events]
+    return list(zip(accumulate(lengths, initial=0), schedule.events, strict=False))
 
 
 def seconds_at(schedule: Schedule, frame: Any, now: int) -> Any:
