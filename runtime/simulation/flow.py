@@ -191,11 +191,14 @@ def integrals(rate: Any) -> tuple[tuple[int, int], ...]:
     type_: Any = casadi.SX if rate.is_a("SXFunction") else casadi.MX
     arguments = [type_.sym(f"a{i}", rate.numel_in(i)) for i in range(4)]
     speed = rate(*arguments)
-    blocks = [jacobian(speed, one) for one in arguments]
-    rows, columns = blocks[0].sparsity().get_triplet()
-    others = {row for block in blocks[1:] for row in block.sparsity().get_triplet()[0]}
-    found = {i: j for i, j in zip(rows, columns, strict=True) if rows.count(i) == 1 and i not in others}
-    found = {i: j for i, j in found.items() if blocks[0][i, j].is_constant() and float(blocks[0][i, j]) == 1}
+    slopes = casadi.horzcat(*(jacobian(speed, one) for one in arguments))
+    found: dict[int, int] = {}
+    for i in range(speed.numel()):
+        columns = slopes[i, :].sparsity().get_triplet()[1]
+        if len(columns) == 1 and columns[0] < speed.numel():
+            slope = slopes[i, columns[0]]
+            if slope.is_constant() and float(slope) == 1:
+                found[i] = columns[0]
     ordered: list[tuple[int, int]] = []
     while found:
         ready = [i for i, j in found.items() if j not in found]

@@ -31,7 +31,7 @@ MOST_CROSSINGS = 4  # between two events that are located; those after are left 
 MOST_STEPS = 20_000  # of CVODES from look to look: what takes more jumps to and fro without end
 
 
-class Integrated(casadi.Callback):  # type: ignore[misc] # CasADi has no types
+class Integrated(casadi.Callback):
     """The function (x, u, p, t) -> x after some time, by CVODES.
 
     CasADi calls it by its address: whoever uses a function made of it keeps it, too.
@@ -71,7 +71,8 @@ class Integrated(casadi.Callback):  # type: ignore[misc] # CasADi has no types
         looks = [k / LOOKS for k in range(1, LOOKS + 1)]
         self.once = casadi.integrator("once", "cvodes", problem, 0.0, [1.0], options)
         guards = guards_of(rate, casadi.vertcat(y, begin, t, s)) if type_ is casadi.SX else []
-        self.looks, self.signs = None, None
+        self.looks: Any = None
+        self.signs: Any = None
         if guards:
             decides = casadi.substitute(casadi.vertcat(*guards), s, 0) >= 0
             self.signs = casadi.Function("signs", [y, fixed], [casadi.densify(decides)])
@@ -122,7 +123,6 @@ class Integrated(casadi.Callback):  # type: ignore[misc] # CasADi has no types
         return np.asarray(self.once(x0=y, p=fixed)["xf"])
 
     def _signs(self, y: Floats, held: Floats, at: float) -> Floats:
-        assert self.signs is not None
         return np.asarray(self.signs(y, np.vstack([held, [[at], [0.0]]])))
 
     def _located(

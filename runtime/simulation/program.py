@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from itertools import accumulate
 from typing import Any
 
@@ -99,6 +100,11 @@ class Program:
     durations: tuple[int, ...]
     intervals: tuple[tuple[int, int], ...]
     moves: tuple[Any, ...]
+
+    @property
+    def seconds(self) -> tuple[Fraction, ...]:
+        """The intervals' lengths in seconds."""
+        return tuple(length * self.schedule.quantum for length in self.durations)
 
     @property
     def impulse_rows(self) -> int:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,6 @@ from apc.simulation.propagate import exact_rates, perturbed, rates, transition_r
 from apc.simulation.settings import CVODES, EXACT, WHERE_NEEDED, Method, Settings, check_step
 from apc.simulation.signals import (
     Choice,
-    LocalSignal,
     Signal,
     choose,
     local_signals,
@@ -92,7 +92,6 @@ class Simulation:
     system: CompiledSystem
     settings: Settings
     population: Population
-    choices: tuple[Choice, ...]
     signals: tuple[Signal, ...]
     order: Integers
     forces: tuple[tuple[SiteForcing, ...], ...]
@@ -108,11 +107,6 @@ class Simulation:
     length: int
 
     @property
-    def compiled(self) -> bool:
-        """Whether it runs in machine code."""
-        return self.library is not None
-
-    @property
     def how(self) -> str:
         """The method in words of a command line; what is exact throughout is called so."""
         method = self.settings.method
@@ -125,19 +119,13 @@ class Simulation:
         """How many rows there are at most: those of whole frames."""
         return (int(self.settings.duration / self.quantum) // self.frame + 1) * len(self.marks)
 
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """The parts whose work is added up."""
-        return self.population.parts
-
     def player(self) -> Player:
         """Return what plays it, with memory of its own."""
         if self.library is not None:
             return Machine(self.library, self.population, self.lucks, self.seed)
-        return Stepwise(self.population, self._timetable if self.lucks else None)
-
-    def _timetable(self, run: int) -> Timetable:
-        return Timetable(self.population.hearing.routes, self.lucks, seed=self.seed, run=run)
+        routes = self.population.hearing.routes
+        timetable = partial(Timetable, routes, self.lucks, seed=self.seed)
+        return Stepwise(self.population, (lambda run: timetable(run=run)) if routes else None)
 
 
 @part("prepare")
@@ -175,16 +163,15 @@ def prepare(
         choices = _choices(plan, signals)
         members = _members(plan, choices, settings.method, live=live)
         population = build_population(plan.exchange, members, plan.routes)
-    schedule = plan.schedules[0]
+    schedule, listed = plan.schedules[0], signals_of(system, choices)
     marks = schedule.marks[:-1]
     timings, quantum = plan.numbers.timings, schedule.quantum
     return Simulation(
         system=system,
         settings=settings,
         population=population,
-        choices=choices,
-        signals=signals_of(system, choices),
-        order=_order(system, population, choices),
+        signals=listed,
+        order=_order(system, population, listed),
         forces=tuple(_forces(member) for member in members),
         lucks=tuple(luck_of(system, timings, plan.exchange, route, quantum) for route in plan.routes),
         seed=system.experiment.seed if settings.seed is None else settings.seed,
@@ -307,12 +294,17 @@ def _members(plan: Plan, choices: Sequence[Choice], method: Method, *, live: boo
     for group, (one, schedule, choice) in enumerate(groups):
         rows, vectors = numbers.rows[group], numbers.parameters[group]
         moves: Sequence[Floats] | None = None
-        for peers, recorded in _recorded_and_not(choice):
+        is_recorded = choice.wanted.any(axis=1)
+        for which, recorded in ((is_recorded, choice.locals), (~is_recorded, ())):
+            peers = np.flatnonzero(which)
+            if not len(peers):
+                continue
             key = (one.kind, id(schedule), recorded)
             if key not in programs:
                 programs[key] = build_program(linear[one.kind], schedule, recorded, cuts, flows[one.kind])
-            if moves is None:
-                moves = _transitions(programs[key], vectors, method)
+            if moves is None:  # what the different sites of a group do over every interval
+                moves = transition_rows(linear[one.kind], vectors, programs[key].seconds)
+                moves = perturbed(moves, 0) if method.perturbed else moves
             numbered, site = plan.exchange.starts[group] + peers, plan.sites[one.kind]
             members.append(build_member(group, numbered, site, rows[peers], vectors, programs[key], moves))
     return members
@@ -327,19 +319,16 @@ def _chunk_length(population: Population, duration: Fraction) -> int:
     return -(-frames // -(-frames // most))
 
 
-def _order(system: CompiledSystem, population: Population, choices: Sequence[Choice]) -> Integers:
+def _order(system: CompiledSystem, population: Population, signals: Sequence[Signal]) -> Integers:
     """Return where each signal stands in a row of a population."""
-    first = np.cumsum([0] + [int(choice.wanted.sum()) for choice in choices])
     starts = np.cumsum([0] + [group.count for group in system.groups])
-    order = np.empty(int(first[-1]), np.int64)
-    for member, column in zip(population.members, population.columns, strict=True):
-        if member.program.recorded:
-            wanted = choices[member.group].wanted
-            own = member.peers - starts[member.group]
-            place = first[member.group] + np.cumsum(wanted).reshape(wanted.shape) - 1
-            here = column + np.arange(member.count * wanted.shape[1]).reshape(-1, member.count).T
-            order[place[own][wanted[own]]] = here[wanted[own]]
-    return order
+    column_of = {
+        (system.groups[member.group].name, peer, local.name): column + place * member.count + i
+        for member, column in zip(population.members, population.columns, strict=True)
+        for place, local in enumerate(member.program.recorded)
+        for i, peer in enumerate((member.peers - starts[member.group] + 1).tolist())
+    }
+    return np.array([column_of[one.group, one.peer, one.local] for one in signals], np.int64)
 
 
 def _ticks_at_zero(system: CompiledSystem, numbers: Numbers) -> bool:
@@ -368,13 +357,6 @@ def _check_size(
     refuse_beyond(
         NUMBER * total, "E874", Place(system.origin.topology), what, "fewer peers, or fewer --signals"
     )
-
-
-def _recorded_and_not(choice: Choice) -> list[tuple[Integers, tuple[LocalSignal, ...]]]:
-    """Split a group into the peers that are recorded and the others, neither empty."""
-    recorded = choice.wanted.any(axis=1)
-    split = [(np.flatnonzero(recorded), choice.locals), (np.flatnonzero(~recorded), ())]
-    return [(peers, signals) for peers, signals in split if len(peers)]
 
 
 def _flow(
@@ -417,19 +399,11 @@ def _check_step(
     check_step(system, method, fastest, max(lengths, default=fastest))
 
 
-def _transitions(program: Program, vectors: Floats, method: Method) -> tuple[Floats, ...]:
-    """Return what the different sites of a group do over every interval."""
-    seconds = [length * program.schedule.quantum for length in program.durations]
-    found = transition_rows(program.rates, vectors, seconds)
-    return perturbed(found, 0) if method.perturbed else found
-
-
 def _forces(member: Member) -> tuple[SiteForcing, ...]:
     """Return the forces that change with time on each different site of a group; none if none does."""
     program = member.program
     if not program.impulse_rows:
         return ()
-    seconds = [length * program.schedule.quantum for length in program.durations]
     forcing, n_x = forcing_of(program.rates), program.layout.states
     kernels: dict[bytes, tuple[Kernel, ...]] = {}
     found = []
@@ -438,6 +412,6 @@ def _forces(member: Member) -> tuple[SiteForcing, ...]:
         key = np.asarray(program.rates.matrices(vector)).tobytes()
         if key not in kernels:
             a = exact_rates(program.rates, vector)[:, :n_x]
-            kernels[key] = tuple(kernel_of(a, forcing.pushed, length) for length in seconds)
+            kernels[key] = tuple(kernel_of(a, forcing.pushed, length) for length in program.seconds)
         found.append(site_forcing(forcing, vector, kernels[key]))
     return tuple(found)

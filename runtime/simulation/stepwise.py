@@ -88,8 +88,10 @@ class Stepwise:
                 for carry, (done, places) in zip(self.carries, self.work, strict=True):
                     np.add.at(work[n], places, np.add.reduce(carry[done], axis=1))
                 now = [None if one is None else one[n] for one in pushes]
+                of_frame, heard = rows[n * marks : (n + 1) * marks], next(seen, ())
                 try:
-                    self._frame(first + n, rows[n * marks : (n + 1) * marks], next(seen, ()), now)
+                    for index in range(len(population.hearing.segments)):
+                        self._segment(first + n, index, heard, of_frame, now)
                 except RuntimeError:
                     return Played(rows, work, n)
         return Played(rows, work, count)
@@ -109,14 +111,10 @@ class Stepwise:
             end = min(begin + each, first + count)
             whole = self.table.take(end * self.population.frame)
             for n in range(end - begin):
-                yield tuple(_of_frame(one, n, route.ticks) for one, route in zip(whole, routes, strict=True))
-
-    def _frame(
-        self, number: int, rows: Floats, seen: tuple[Seen, ...], pushes: Sequence[Floats | None]
-    ) -> None:
-        """Play one frame; `rows` (marks, width) are filled in."""
-        for index in range(len(self.population.hearing.segments)):
-            self._segment(number, index, seen, rows, pushes)
+                ticks = [slice(n * one.ticks, (n + 1) * one.ticks) for one in routes]
+                yield tuple(
+                    Seen(one.packets[now], one.missing[now]) for one, now in zip(whole, ticks, strict=True)
+                )
 
     def _segment(
         self,
@@ -214,12 +212,6 @@ class Stepwise:
             joined.at(result, one.receivers, values)
 
 
-def _of_frame(seen: Seen, number: int, ticks: int) -> Seen:
-    """Return what the ticks of one of several frames see."""
-    own = slice(number * ticks, (number + 1) * ticks)
-    return Seen(seen.packets[own], seen.missing[own])
-
-
 class _Moving:
     """A segment of a member's program, mapped over its peers, with the memory that CasADi works in."""
 
@@ -229,14 +221,11 @@ class _Moving:
         self.heard = len(segment.heard) + len(segment.pairs)
         self._function = kernel.map(count)  # the buffer looks at it
         self._buffer, self._call = self._function.buffer()
-        shapes = [(self._function.size1_in(i), self._function.size2_in(i)) for i in range(5)]
-        self._in = [np.zeros(shape, order="F") for shape in shapes]
-        shapes = [(self._function.size1_out(i), self._function.size2_out(i)) for i in range(3)]
-        self._out = [np.zeros(shape, order="F") for shape in shapes]
-        for i, one in enumerate(self._in):
-            self._buffer.set_arg(i, memoryview(one.reshape(-1, order="F").data))
-        for i, one in enumerate(self._out):
-            self._buffer.set_res(i, memoryview(one.reshape(-1, order="F").data))
+        self._in = [np.zeros(self._function.size_in(i), order="F") for i in range(5)]
+        self._out = [np.zeros(self._function.size_out(i), order="F") for i in range(3)]
+        for give, arrays in ((self._buffer.set_arg, self._in), (self._buffer.set_res, self._out)):
+            for i, one in enumerate(arrays):
+                give(i, memoryview(one.reshape(-1, order="F").data))
         self._in[2][:] = member.each(member.constants).T
 
     def move(

@@ -179,6 +179,7 @@ class Watch:
             verdict = "moves on" if swing is None else "dies away" if swing[3] else "shakes"
         settles = verdict == "settles"
         largest = max(self.forces, key=lambda i: float(self.peak[i]), default=-1)
+        work = tuple(zip(self.simulation.population.parts, block.work.tolist(), strict=True))
         force = (signals[largest].name, float(self.peak[largest]), float(self.peak_at[largest]))
         return Summary(
             verdict=verdict,
@@ -190,7 +191,7 @@ class Watch:
             largest_force=None if largest < 0 else force,
             copies=self._copies(),
             # Of a motion without bound the work is as meaningless as it is large.
-            work=() if block.stopped else tuple(zip(self.simulation.parts, block.work.tolist(), strict=True)),
+            work=() if block.stopped else work,
             rows=self.rows,
             signals=len(signals),
             end=float(ends[-1]),
