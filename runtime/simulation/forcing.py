@@ -1,7 +1,7 @@
 """What forces that change with time alone add to a site's motion, exact to rounding.
 
 Takes: the `Rates` of a kind, parameter vectors, when the intervals begin and how long they last.
-Gives: `Forcing`, `forcing_of`, `SiteForcing`, `site_forcing`, `Kernel`, `kernel_of`, `impulses`.
+Gives: `SiteForcing`, `site_forcing`, `Kernel`, `impulses`.
 Guarantees: an interval is split where a comparison of `time` switches (a step, a corner of a ramp, a row of
 a table), so that what is integrated is smooth; an impulse is right to a few roundings of its terms and of
 the instants.
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.discretize import UNIT, discretize
 from apc.frame.jacobians import guards_of, lookups_of
-from apc.simulation.propagate import Rates
+from apc.simulation.propagate import Rates, exact_rates
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -50,19 +50,6 @@ BISECTIONS = 60  # of the time between two looks, after which the switch is plac
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Forcing:
-    """A kind's g(t): `force(p, t)` are the rows of the states `pushed`, and where it is not smooth.
-
-    It is not at the instants `breaks(p)`, nor where one of `switches(p, t)` changes sign.
-    """
-
-    pushed: tuple[int, ...]
-    force: Any  # casadi.Function
-    breaks: Any  # casadi.Function
-    switches: Any  # casadi.Function
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Kernel:
     """e^{A u} up to `duration` seconds, in Legendre coefficients, panel by panel.
 
@@ -77,7 +64,11 @@ class Kernel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteForcing:
-    """The forces on one site, functions of time; its `breaks` in order, a kernel for each interval length."""
+    """The forces on one site: `force` of time, and where it is not smooth.
+
+    It is not at the instants `breaks`, in order, nor where one of `switches` changes sign. `kernels` has one
+    of each length of interval.
+    """
 
     force: Any  # casadi.Function
     switches: Any  # casadi.Function
@@ -85,11 +76,25 @@ class SiteForcing:
     kernels: tuple[Kernel, ...]
 
 
-def forcing_of(rates: Rates) -> Forcing:
-    """Find what a kind's forces push, and where they switch with time."""
+def site_forcing(
+    rates: Rates, parameters: Floats, durations: Sequence[Fraction], kernels: dict[Any, tuple[Kernel, ...]]
+) -> SiteForcing:
+    """Return the forces on a site.
+
+    Parameters
+    ----------
+    rates
+        The equations of its kind.
+    parameters
+        The site's (n_p,).
+    durations
+        The lengths of intervals, in seconds.
+    kernels
+        What sites have in common that differ in nothing the continuous equations read.
+    """
     type_: Any = casadi.SX if rates.rate.is_a("SXFunction") else casadi.MX
-    p, t = type_.sym("p", rates.rate.numel_in(0)), type_.sym("t")
-    g = rates.rate(p, t)
+    t = type_.sym("t")
+    g = rates.rate(parameters, t)
     pushed, breaks, switches = tuple(range(g.numel())), [], []
     if type_ is casadi.SX:  # a loop solved by iteration has no switches but those that halving finds
         pushed = tuple(row for row in pushed if not g[row].is_zero())
@@ -105,51 +110,21 @@ def forcing_of(rates: Rates) -> Forcing:
                 switches.append(guard)
             else:
                 breaks.append(-casadi.substitute(guard, t, 0) / slope)
-    return Forcing(
-        pushed=pushed,
-        force=casadi.Function("force", [p, t], [casadi.densify(g[list(pushed)])]),
-        breaks=casadi.Function("breaks", [p], [casadi.densify(casadi.vertcat(type_(0, 1), *breaks))]),
-        switches=casadi.Function(
-            "switches", [p, t], [casadi.densify(casadi.vertcat(type_(0, 1), *switches))]
-        ),
-    )
-
-
-def site_forcing(forcing: Forcing, parameters: Floats, kernels: Sequence[Kernel]) -> SiteForcing:
-    """Return the forces on a site.
-
-    Parameters
-    ----------
-    forcing
-        Those of its kind.
-    parameters
-        The site's (n_p,).
-    kernels
-        The kernel of each length of intervals.
-    """
-    type_: Any = casadi.SX if forcing.force.is_a("SXFunction") else casadi.MX
-    t = type_.sym("t")
-    breaks = np.asarray(forcing.breaks(parameters), np.float64).reshape(-1)
+    known = np.asarray(casadi.evalf(casadi.vertcat(type_(0, 1), *breaks)), np.float64).reshape(-1)
+    key = (pushed, np.asarray(rates.matrices(parameters)).tobytes())
+    if key not in kernels:
+        a = exact_rates(rates, parameters)[:, : len(rates.pattern)]
+        kernels[key] = tuple(_kernel_of(a, pushed, length) for length in durations)
     return SiteForcing(
-        force=casadi.Function("force", [t], [casadi.densify(forcing.force(parameters, t))]),
-        switches=casadi.Function("switches", [t], [casadi.densify(forcing.switches(parameters, t))]),
-        breaks=np.unique(breaks[np.isfinite(breaks)]),
-        kernels=tuple(kernels),
+        force=casadi.Function("force", [t], [casadi.densify(g[list(pushed)])]),
+        switches=casadi.Function("switches", [t], [casadi.densify(casadi.vertcat(type_(0, 1), *switches))]),
+        breaks=np.unique(known[np.isfinite(known)]),
+        kernels=kernels[key],
     )
 
 
-def kernel_of(a: NDArray[Any], pushed: Sequence[int], duration: Fraction) -> Kernel:
-    """Compute the exponential over an interval.
-
-    Parameters
-    ----------
-    a
-        A (n_x, n_x), exact.
-    pushed
-        The states that a force pushes.
-    duration
-        The interval's length in seconds.
-    """
+def _kernel_of(a: NDArray[Any], pushed: Sequence[int], duration: Fraction) -> Kernel:
+    """Compute the exponential of A (n_x, n_x), exact, where a force pushes, over an interval."""
     length, least = float(duration), 2.0**-MOST_HALVINGS * float(duration)
     start = np.eye(len(a))[:, list(pushed)]  # the exponential where nothing is left
     largest = start

@@ -116,28 +116,6 @@ class Program:
         columns = self.rates.pattern.T
         return np.concatenate([parameters, *(one.swapaxes(1, 2)[:, columns] for one in transitions)], axis=1)
 
-    def start(
-        self, x: Sequence[Floats | float], remembered: Sequence[Sequence[Floats | float]], *, sites: int = 1
-    ) -> Floats:
-        """Return the carry at time 0 (sites, rows), when nothing is computed yet.
-
-        Parameters
-        ----------
-        x
-            The states' start values, each a number or (sites,).
-        remembered
-            Those of the remembered outputs of every clock partition.
-        sites
-            How many.
-        """
-        newest: dict[tuple[int, int], Floats | float] = dict.fromkeys(self.layout.outputs, 0.0)
-        for p, (partition, values) in enumerate(zip(self.kind.clocks, remembered, strict=True)):
-            newest |= {(p, o): one for o, one in zip(partition.memories, values, strict=True)}
-        carry = np.zeros((sites, self.layout.ends[-1]))
-        for row, one in enumerate([*x, *(newest[one] for one in self.layout.outputs)]):
-            carry[:, row] = one
-        return carry
-
 
 def timed_events(schedule: Schedule) -> list[tuple[int, Event]]:
     """Return what happens in a frame, each with its instant in quanta."""
@@ -205,10 +183,16 @@ def build_member(
         What each peer does in a frame.
     """
     used, own = np.unique(rows, return_inverse=True)
-    some = vectors[used]
+    some, kind, layout = vectors[used], site.kind, program.layout
     x, _, remembered = start_values(site, list(some.T))
-    kind, states = site.kind, np.array(x).reshape(len(x), len(some))
-    still = np.zeros((len(kind.holds), len(some)))
+    carry = np.zeros((len(some), layout.ends[-1]))
+    for row, value in enumerate(x):
+        carry[:, row] = value
+    for p, (partition, values) in enumerate(zip(kind.clocks, remembered, strict=True)):
+        for output, value in zip(partition.memories, values, strict=True):
+            if (p, output) in layout.outputs:  # else its clock never ticks
+                carry[:, layout.states + layout.outputs.index((p, output))] = value
+    states, still = carry[:, : layout.states].T, np.zeros((layout.holds, len(some)))
     return Member(
         group=group,
         peers=peers,
@@ -220,5 +204,5 @@ def build_member(
             one.link: np.asarray(one.send.map(len(some))(states, still, some.T, 0.0), np.float64).T
             for one in kind.sends
         },
-        carry=program.start(x, remembered, sites=len(some)),
+        carry=carry,
     )

@@ -30,7 +30,7 @@ from apc.frame.scheduling import build_schedules
 from apc.memory import refuse_beyond
 from apc.network.timetable import Luck, Route, Timetable, luck_of, routes_of
 from apc.simulation.flow import Flow, Tolerance, flow_of, rows_to_move, state_scales
-from apc.simulation.forcing import Kernel, SiteForcing, forcing_of, kernel_of, site_forcing
+from apc.simulation.forcing import Kernel, SiteForcing, site_forcing
 from apc.simulation.machine import Library, Machine, library_of
 from apc.simulation.pairs import count_pairs
 from apc.simulation.population import (
@@ -42,7 +42,7 @@ from apc.simulation.population import (
     refuse_unheard_of,
 )
 from apc.simulation.program import Member, Program, build_member
-from apc.simulation.propagate import exact_rates, perturbed, rates, transition_rows
+from apc.simulation.propagate import perturbed, rates, transition_rows
 from apc.simulation.settings import CVODES, EXACT, WHERE_NEEDED, Method, Settings, check_step
 from apc.simulation.signals import (
     Choice,
@@ -401,17 +401,7 @@ def _check_step(
 
 def _forces(member: Member) -> tuple[SiteForcing, ...]:
     """Return the forces that change with time on each different site of a group; none if none does."""
-    program = member.program
+    program, kernels = member.program, dict[Any, tuple[Kernel, ...]]()
     if not program.impulse_rows:
         return ()
-    forcing, n_x = forcing_of(program.rates), program.layout.states
-    kernels: dict[bytes, tuple[Kernel, ...]] = {}
-    found = []
-    for vector in member.parameters:
-        # Sites that differ in nothing the continuous equations read share a kernel.
-        key = np.asarray(program.rates.matrices(vector)).tobytes()
-        if key not in kernels:
-            a = exact_rates(program.rates, vector)[:, :n_x]
-            kernels[key] = tuple(kernel_of(a, forcing.pushed, length) for length in program.seconds)
-        found.append(site_forcing(forcing, vector, kernels[key]))
-    return tuple(found)
+    return tuple(site_forcing(program.rates, one, program.seconds, kernels) for one in member.parameters)

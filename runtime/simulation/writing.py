@@ -264,7 +264,8 @@ class _Writer:
         size, before = int(pattern.sum()), self.x
         begin = len(self.kind.parameters) + place * size
         columns, rows = np.nonzero(pattern.T)
-        sparsity = casadi.Sparsity.triplet(*pattern.shape, rows.tolist(), columns.tolist())
+        shape = pattern.shape[0], pattern.shape[1]
+        sparsity = casadi.Sparsity.triplet(*shape, rows.tolist(), columns.tolist())
         step = self.type_(sparsity, self.constants[begin : begin + size])
         after = casadi.vertsplit(casadi.densify(step @ casadi.vertcat(before, self.u, 1)))
         for row in self.rates.pushed if self.rates.timed else ():
@@ -275,7 +276,7 @@ class _Writer:
             for i, row in enumerate(self.flow.rows):
                 after[row] = moved[i]
         self.intervals.append((now, place))
-        old = self._of_site(ports.port, now) if ports else None
+        old: Any = self._of_site(ports.port, now) if ports else None
         self.x = _column(self.type_, after)
         if ports:
             n, new = len(ports.parts), self._of_site(ports.port, now)
