@@ -127,7 +127,6 @@ def pushes(simulation: Simulation, first: int) -> list[Floats | None]:
 def instants_of(simulation: Simulation, first: int, last: int) -> tuple[Integers, NDArray[np.bool_]]:
     """Return every row's instant in quanta, and which rows are kept: those until the quantum `last`."""
     marks = np.array(simulation.marks, dtype=np.int64)
-    is_tick = np.array([mark in simulation.ticks for mark in simulation.marks])
     instants = (first + np.arange(simulation.length))[:, None] * simulation.frame + marks
-    kept = (is_tick | (instants == 0)) & (instants <= last)
+    kept = ((marks > marks[0]) | simulation.ticks_at_zero | (instants == 0)) & (instants <= last)
     return instants.reshape(-1), kept.reshape(-1)

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.discretize import UNIT, discretize
+from apc.frame.exact import ROWS, evaluate_exact
 from apc.frame.jacobians import guards_of, lookups_of
 from apc.simulation.propagate import Rates, exact_rates
 
@@ -131,7 +132,7 @@ def _kernel_of(a: NDArray[Any], pushed: Sequence[int], duration: Fraction) -> Ke
     edges, terms, work = [0.0], [], [(0.0, length)]
     while work:
         low, high = work.pop()
-        left = [Fraction(float(one)) for one in _nodes(low, high)]
+        left = [Fraction(float(node)) for node in _nodes(low, high)]
         steps = discretize(a, np.zeros((len(a), 0), dtype=object), left)
         values = np.array([step.matrix[:, list(pushed)] for step in steps])
         largest = np.maximum(largest, np.abs(values).max(axis=0))
@@ -203,7 +204,7 @@ def _impulses_of_length(site: SiteForcing, kernel: Kernel, starts: Floats) -> Fl
                     raise _too_fast(starts, kernel)
                 rows, low, high = rows[off], low[off], high[off]
                 middle = (low + high) / 2
-                work.append((np.tile(rows, 2), np.append(low, middle), np.append(middle, high), halvings + 1))
+                work += [(rows, low, middle, halvings + 1), (rows, middle, high, halvings + 1)]
     return total
 
 
@@ -231,18 +232,18 @@ def _integrated(
     instants = starts[:, None] + (kernel.duration - _nodes(low, high))
     g = np.moveaxis(_at(site.force, instants), 0, -1)  # (k, nodes, pushed)
     half = (high - low)[:, None] / 2
-    terms = steps * (g * WEIGHTS[:, None])[:, :, None, :] * half[:, :, None, None]
-    np.maximum.at(size, rows, np.abs(terms).sum(axis=(1, 3)))
+    weighted = (g * WEIGHTS[:, None] * half[:, :, None]).reshape(len(rows), 1, -1)
+    flat = steps.swapaxes(2, 3).reshape(len(steps), weighted.shape[2], steps.shape[2])
+    np.maximum.at(size, rows, (np.abs(weighted) @ np.abs(flat))[:, 0])
     coefficients = np.abs(np.einsum("ci,kiq->kcq", TRANSFORM, g))
     # A rounding of the instants moves the force by its slope, which no halving mends.
     slope = np.einsum("c,kcq->kq", np.arange(TERMS) ** 2.0, coefficients) / half
-    rounding = UNIT * np.abs(instants[:, :1]) * slope
+    rounding = TERMS * UNIT * np.abs(instants[:, :1]) * slope
     missed = np.maximum(
         coefficients[:, -2:].sum(axis=1) - np.where(np.isfinite(rounding), rounding, 0.0), 0.0
     )
-    error = 2 * half * np.einsum("knq,kq->kn", np.broadcast_to(
-        np.abs(steps).max(axis=1), (len(rows), *steps.shape[2:])), missed)  # fmt: skip
-    return terms.sum(axis=(1, 3)), error
+    error = 2 * half * (np.abs(steps).max(axis=1) @ missed[:, :, None])[:, :, 0]
+    return (weighted @ flat)[:, 0], error
 
 
 def _nodes(low: Any, high: Any) -> Floats:
@@ -252,12 +253,18 @@ def _nodes(low: Any, high: Any) -> Floats:
 
 
 def _at(function: Any, instants: Floats) -> Floats:
-    """Return a function's column at instants of any shape, in seconds (rows, *shape)."""
-    shape = (function.numel_out(0), *instants.shape)
+    """Return a function's column at instants of any shape, in seconds (rows, *shape).
+
+    Each operation of an expression is NumPy's over all instants: CasADi's own map takes longer to build.
+    """
+    shape, flat = (function.numel_out(0), *instants.shape), instants.reshape(-1)
     if not np.prod(shape):
         return np.empty(shape)
-    values = np.asarray(function.map(instants.size)(instants.reshape(1, -1)), np.float64)
-    return values.reshape(shape)
+    if not function.is_a("SXFunction"):  # the solution of a loop, which only CasADi knows
+        return np.asarray(function.map(flat.size)(flat.reshape(1, -1)), np.float64).reshape(shape)
+    with np.errstate(all="ignore"):
+        [rows] = evaluate_exact(function, [[flat]], number=np.float64, rules=ROWS)
+    return np.stack([np.broadcast_to(row, flat.shape) for row in rows]).reshape(shape)
 
 
 def _too_fast(starts: Floats, kernel: Kernel) -> ApcError:

@@ -172,21 +172,21 @@ class _Listing:
 
     def __init__(self, exchange: Exchange, members: Sequence[Member], routes: Sequence[Route]) -> None:
         self.exchange, self.members, self.routes = exchange, members, tuple(routes)
-        self.route_of = {(one.link, one.clock): place for place, one in enumerate(routes)}
-        self.first = np.cumsum([0, *(one.count for one in members)])
+        self.route_of = {(route.link, route.clock): place for place, route in enumerate(routes)}
+        self.first = np.cumsum([0, *(member.count for member in members)])
         self.member_of = np.empty(exchange.peers, np.int64)  # of each peer of the scene
         self.place_in = np.empty(exchange.peers, np.int64)  # among that member's peers
         for number, member in enumerate(members):
             self.member_of[member.peers] = number
             self.place_in[member.peers] = np.arange(member.count)
         self.column_of = self.first[self.member_of] + self.place_in
-        self.keys = tuple(sorted({one for member in members for one in member.program.schedule.sent}))
-        self.key_of = {one: place for place, one in enumerate(self.keys)}
+        self.keys = tuple(sorted({sent for member in members for sent in member.program.schedule.sent}))
+        self.key_of = {sent: place for place, sent in enumerate(self.keys)}
         self.channels = [
-            sorted({one.channel for one in self.keys if one.link == route.link}) for route in routes
+            sorted({sent.channel for sent in self.keys if sent.link == route.link}) for route in routes
         ]
         self.sending = {
-            link: np.array([any(one.link == link for one in m.program.kind.sends) for m in members])
+            link: np.array([any(send.link == link for send in m.program.kind.sends) for m in members])
             for link in exchange.links
         }
         self.functions: dict[int, tuple[int, object]] = {}
@@ -195,8 +195,8 @@ class _Listing:
     def hearing(self) -> Hearing:
         start = np.zeros((len(self.keys), self.exchange.peers))
         for g, member in enumerate(self.members):
-            for key, one in enumerate(self.keys):
-                start[key, self.first[g] : self.first[g + 1]] = _first_packet(member, one.link, one.channel)
+            for key, sent in enumerate(self.keys):
+                start[key, self.first[g] : self.first[g + 1]] = _first_packet(member, sent.link, sent.channel)
         channels = tuple(
             np.array([
                 [self.key_of[Sent(route.link, c, slot)] for slot in range(route.slots)] for c in listed
@@ -210,9 +210,9 @@ class _Listing:
             column_of=self.column_of,
             keys=self.keys,
             sent=tuple(
-                tuple(self.key_of[one] for one in member.program.schedule.sent) for member in self.members
+                tuple(self.key_of[sent] for sent in member.program.schedule.sent) for member in self.members
             ),
-            ring=1 + max([*depths, *(one.frames for one in self.routes)], default=0),
+            ring=1 + max([*depths, *(route.frames for route in self.routes)], default=0),
             start=start,
             routes=self.routes,
             channels=channels,
@@ -228,7 +228,7 @@ class _Listing:
 
     def _segment(self, index: int) -> tuple[Operation, ...]:
         """Return what is done before a segment: all that is heard in it was sent before it began."""
-        found: list[Operation] = []
+        operations: list[Operation] = []
         late: dict[tuple[int, int], list[Operation]] = {}  # by the tick of a route that it hears
         before: dict[tuple[int, int], list[Operation]] = {}  # what the tick before heard is still there
         for g, member in enumerate(self.members):
@@ -239,7 +239,7 @@ class _Listing:
             ]
             for place, pairwise in enumerate(segment.pairs, len(segment.heard)):
                 rows = [received[row] for row in pairwise.heard]
-                listed += [(rows[0], one) for one in self._looks(g, place, pairwise, rows)]
+                listed += [(rows[0], look) for look in self._looks(g, place, pairwise, rows)]
             for heard, operation in listed:
                 if isinstance(heard, Selected):
                     group = before if heard.way.before else late
@@ -247,10 +247,10 @@ class _Listing:
                         operation
                     )
                 else:
-                    found.append(operation)
+                    operations.append(operation)
         for route, tick in sorted({*late, *before}):
-            found += [*before.get((route, tick), ()), Deliver(route, tick), *late.get((route, tick), ())]
-        return tuple(found)
+            operations += [*before.get((route, tick), ()), Deliver(route, tick), *late.get((route, tick), ())]
+        return tuple(operations)
 
     def _source(self, row: Heard | Selected) -> Source:
         """Return what a row of the schedule reads."""
@@ -290,29 +290,29 @@ class _Listing:
         function, _ = self.functions.setdefault(
             id(pairwise.function), (len(self.functions), pairwise.function)
         )
-        found: list[Operation] = []
-        for delay in dict.fromkeys(one.way.delay for one in rows):
-            listed = [one for one in rows if one.way.delay == delay]
+        looks: list[Operation] = []
+        for delay in dict.fromkeys(row.way.delay for row in rows):
+            listed = [row for row in rows if row.way.delay == delay]
             arcs = self._arcs(listener, listed[0])
-            gaps = [self._source(one) for one in listed if isinstance(one, Selected) and one.gap]
-            found.append(
+            gaps = [self._source(row) for row in listed if isinstance(row, Selected) and row.gap]
+            looks.append(
                 Look(
                     member=listener,
                     row=place,
                     function=function,
                     pairwise=pairwise,
                     operator=listed[0].way.operator,
-                    first=not found,
+                    first=not looks,
                     sources=tuple(
-                        self._source(one) for one in listed if isinstance(one, Heard) or not one.gap
+                        self._source(row) for row in listed if isinstance(row, Heard) or not row.gap
                     ),
-                    missing=next((one for one in gaps if isinstance(one, Arrived)), None),
+                    missing=next((source for source in gaps if isinstance(source, Arrived)), None),
                     senders=arcs.senders,
                     receivers=arcs.receivers,
                     weights=arcs.weights,
                 )
             )
-        return found
+        return looks
 
     # ---- who hears whom
 
@@ -326,8 +326,8 @@ class _Listing:
                 totals = self._checked(listener, way, receivers, weights)
                 weights = weights / totals[receivers] if way.operator == "mean" else weights
             group = self.members[listener].group
-            delays = [self.exchange.delay(way.link, one.group, group) for one in self.members]
-            late = np.array([one == way.delay for one in delays])[members]
+            delays = [self.exchange.delay(way.link, member.group, group) for member in self.members]
+            late = np.array([delay == way.delay for delay in delays])[members]
             self.arcs[key] = _Arcs(senders[late], receivers[late], weights[late])
         return self.arcs[key]
 
@@ -376,7 +376,7 @@ class _Listing:
 
 def _first_packet(member: Member, link: str, channel: str) -> Floats:
     """Return what each peer of a member sends at the start (count,), 0 where it sends nothing."""
-    sent = next((one.channels for one in member.program.kind.sends if one.link == link), ())
+    sent = next((send.channels for send in member.program.kind.sends if send.link == link), ())
     if channel not in sent:
         return np.zeros(member.count)
     return member.each(member.sends[link][:, sent.index(channel)])

@@ -1,8 +1,8 @@
 """All peers' frames in machine code: the kernels as loops over peers, and the engine that plays them.
 
 Takes: a `Population`, the laws of its unreliable links.
-Gives: `library_of`, `Library`, `Machine`; `program_text`, the C text; `Kernel`; `straight_lines`,
-`luck_text`, `DISTRIBUTIONS`.
+Gives: `library_of`, `Library`, `Machine`; `program_text`, the C text; `straight_lines`, `luck_text`,
+`DISTRIBUTIONS`.
 Guarantees: the numbers of `stepwise` to a few roundings of the sums, and the same packets; the text depends
 on what a peer does in a frame, not on how many peers there are or on their numbers.
 Does not: compile (see `native`), or play kernels that are not straight code, such as solvers.
@@ -141,27 +141,19 @@ PLAN = _fields(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Kernel:
-    """A segment's function (see `program`) as plain data, and how many signals it records at a mark."""
-
-    function: PlainFunction
-    recorded: int
-
-
-def program_text(kernels: Sequence[Kernel], looks: Sequence[PlainFunction]) -> str:
+def program_text(kernels: Sequence[tuple[PlainFunction, int]], looks: Sequence[PlainFunction]) -> str:
     """Return the C text that plays members whose segments are these kernels, and looks at pairs so.
 
     Parameters
     ----------
     kernels
-        The segments' kernels.
+        The segments' kernels, each with how many signals it records at a mark.
     looks
         The functions of pairs (see `pairs`).
     """
     parts = [HEAD]
-    parts += [_kernel(place, one) for place, one in enumerate(kernels)]
-    parts += [_look(place, one) for place, one in enumerate(looks)]
+    parts += [_kernel(place, *kernel) for place, kernel in enumerate(kernels)]
+    parts += [_look(place, look) for place, look in enumerate(looks)]
     parts.append(_table("kernels", "kernel", PARAMETERS.format(own="int own, "), len(kernels)))
     parts.append(_table("looks", "look", LOOKED, len(looks)))
     parts += [luck_text(), Path(__file__).with_name("engine.c").read_text(encoding="utf-8")]
@@ -178,9 +170,8 @@ def _table(name: str, each: str, parameters: str, count: int) -> str:
     return f"static void (*const {name}[])({parameters}) = {{{listed}}};\n"
 
 
-def _kernel(place: int, kernel: Kernel) -> str:
+def _kernel(place: int, function: PlainFunction, recorded: int) -> str:
     """Return a segment's kernel as a loop over peers."""
-    function, recorded = kernel.function, kernel.recorded
     carry, heard, constants, impulses, _ = (rows for _, rows in function.inputs)
     inputs = [
         *(f"carry[{k} * n + i]" for k in range(carry)),
@@ -191,11 +182,11 @@ def _kernel(place: int, kernel: Kernel) -> str:
     ]
     after, sent, rows = function.results
     values, lines = straight_lines(function, inputs)
-    stores = [f"carry[{k} * n + i] = {values[one]};" for k, one in enumerate(after) if one != k]
-    stores += [f"sent[keys[{k}] * peers + i] = {values[one]};" for k, one in enumerate(sent)]
+    stores = [f"carry[{k} * n + i] = {values[value]};" for k, value in enumerate(after) if value != k]
+    stores += [f"sent[keys[{k}] * peers + i] = {values[value]};" for k, value in enumerate(sent)]
     stores += [
-        f"rows[{k // recorded} * width + {k % recorded} * n + i] = {values[one]};"
-        for k, one in enumerate(rows)
+        f"rows[{k // recorded} * width + {k % recorded} * n + i] = {values[value]};"
+        for k, value in enumerate(rows)
     ]
     body = "\n    ".join([*lines, *stores])
     given = "n, carry, heard, constants, {}impulses, sites, site, frame, sent, keys, peers, rows, width"
@@ -250,7 +241,7 @@ def straight_lines(function: PlainFunction, inputs: Sequence[str]) -> tuple[list
         names.append(f"v{place}")
         if place in used:
             lines.append(f"const double v{place} = {text};")
-    names += [_number(one) for one in function.constants]
+    names += [_number(constant) for constant in function.constants]
     for table in function.tables:
         names.append(f"{len(names)}")
         for what, column in (("times", table.times), ("numbers", table.numbers)):
@@ -289,14 +280,18 @@ class Library:
 
 def library_of(population: Population) -> Library | None:
     """Return what plays a population in machine code, None where that can't be had."""
-    segments = {id(one): (one, m.program) for m in population.members for one in m.program.segments}
-    functions = [one.kernel for one, _ in segments.values()]
+    segments = {
+        id(segment): (segment, m.program) for m in population.members for segment in m.program.segments
+    }
+    functions = [segment.kernel for segment, _ in segments.values()]
     looks = list(population.hearing.functions)
-    if ctypes.sizeof(ctypes.c_void_p) != 8 or not all(_is_worth_it(one) for one in (*functions, *looks)):
+    if ctypes.sizeof(ctypes.c_void_p) != 8 or not all(
+        _is_worth_it(function) for function in (*functions, *looks)
+    ):
         return None
-    kernels = [Kernel(straight(one.kernel), len(own.recorded)) for one, own in segments.values()]
+    kernels = [(straight(segment.kernel), len(program.recorded)) for segment, program in segments.values()]
     many = max(member.count for member in population.members) >= MANY
-    loaded = native(program_text(kernels, [straight(one) for one in looks]), many=many)
+    loaded = native(program_text(kernels, [straight(look) for look in looks]), many=many)
     if loaded is None:
         return None
     return Library(loaded, {key: place for place, key in enumerate(segments)})
@@ -305,7 +300,7 @@ def library_of(population: Population) -> Library | None:
 def _is_worth_it(function: Any) -> bool:
     if not function.is_a("SXFunction"):
         return False
-    rows = sum(len(table_of(one).times) for one in function.find_functions(0))
+    rows = sum(len(table_of(table).times) for table in function.find_functions(0))
     return bool(function.n_instructions() + rows <= MOST_OPERATIONS)
 
 
@@ -333,21 +328,22 @@ class Machine:
         self._start: list[tuple[NDArray[Any], NDArray[Any]]] = []  # what changes, and its beginning
         hearing, members = population.hearing, population.members
         self.packets = self._changing(np.repeat(hearing.start[None], hearing.ring, axis=0))
-        self.held = [self._changing(one) for one in hearing.held]
+        self.held = [self._changing(start) for start in hearing.held]
         self.carries = [self._changing(member.each(member.carry).T) for member in members]
+        heights = [max(segment.kernel.numel_in("heard") for segment in m.program.segments) for m in members]
         self.heard = [
-            self._own(np.zeros((max(s.kernel.numel_in("heard") for s in one.program.segments), one.count)))
-            for one in members
+            self._own(np.zeros((height, member.count)))
+            for height, member in zip(heights, members, strict=True)
         ]
         self.members = self._own(np.array([self._member(g) for g in range(len(members))], MEMBER))
-        self.routes = self._own(np.array([self._route(i, one) for i, one in enumerate(lucks)], ROUTE))
+        self.routes = self._own(np.array([self._route(i, luck) for i, luck in enumerate(lucks)], ROUTE))
         operations = [
             self._operation("work", g, population.parts.index(part), member.program.layout.work.start + row)
             for g, member in enumerate(members)
             for row, part in enumerate(member.program.layout.parts)
         ]
         for index, listed in enumerate(hearing.segments):
-            operations += [self._heard(one) for one in listed]
+            operations += [self._heard(operation) for operation in listed]
             operations += [self._moved(g, index, library) for g in range(len(members))]
         self.plan = self._own(np.zeros(1, PLAN))
         _set(
@@ -380,9 +376,9 @@ class Machine:
     def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> Played:
         """Play the frames from number `first` on (see `Player`)."""
         population = self.population
-        for g, one in enumerate(pushes):
-            if one is not None:
-                self.members["impulses"][g] = one.ctypes.data
+        for g, impulses in enumerate(pushes):
+            if impulses is not None:
+                self.members["impulses"][g] = impulses.ctypes.data
         if len(self.work) != count:
             self.rows = np.empty((count * population.marks, population.width))
             self.work = np.empty((count, len(population.parts)))
@@ -396,7 +392,7 @@ class Machine:
         """Say whether all that moves is still a number (see `Player`)."""
         members = zip(self.carries, self.population.members, strict=True)
         moving = (carry[: member.program.layout.work.start] for carry, member in members)
-        return all(bool(np.isfinite(one).all()) for one in (self.packets, *moving))
+        return all(bool(np.isfinite(array).all()) for array in (self.packets, *moving))
 
     # ---- the layout
 
@@ -499,8 +495,8 @@ class Machine:
             return -1, 0, self.held[source.route][source.row].ctypes.data
         return source.key, source.lag, 0
 
-    def _heard(self, one: Operation) -> Any:
-        match one:
+    def _heard(self, operation: Operation) -> Any:
+        match operation:
             case Complete(g, row, packet, ranges, own, divisor):
                 where = (g, packet.key, packet.lag, len(ranges), int(own))
                 to = self.heard[g][row]
@@ -515,33 +511,33 @@ class Machine:
                 return self._operation("weighed", g, key, lag, r=address, v=self.heard[g][row], **fields)
             case Deliver(route, tick):
                 return self._operation("deliver", route, tick)
-        return self._look(one)
+        return self._look(operation)
 
-    def _look(self, one: Look) -> Any:
+    def _look(self, look: Look) -> Any:
         """Return what looks at each pair."""
-        member = self.population.members[one.member]
-        carry, constants = self.carries[one.member], int(self.members["constants"][one.member])
+        member = self.population.members[look.member]
+        carry, constants = self.carries[look.member], int(self.members["constants"][look.member])
         own = len(member.parameters) > 1
-        rows = [(carry[row].ctypes.data, 1) for row in one.pairwise.carry]
+        rows = [(carry[row].ctypes.data, 1) for row in look.pairwise.carry]
         stride = 8 * (member.count if own else 1)
-        rows += [(constants + stride * row, int(own)) for row in one.pairwise.constants]
-        sources = [self._read(source) for source in one.sources]
-        listed = [one.receivers, np.array(rows, np.int64).ravel(), np.array(sources, np.int64).ravel()]
+        rows += [(constants + stride * row, int(own)) for row in look.pairwise.constants]
+        sources = [self._read(source) for source in look.sources]
+        listed = [look.receivers, np.array(rows, np.int64).ravel(), np.array(sources, np.int64).ravel()]
         quantum = member.program.schedule.quantum
-        where = (one.function, len(one.senders), OPERATORS[one.operator], int(one.first), len(sources))
+        where = (look.function, len(look.senders), OPERATORS[look.operator], int(look.first), len(sources))
         return self._operation(
             "look",
-            one.member,
+            look.member,
             *where,
-            one.pairwise.now,
+            look.pairwise.now,
             x=float(len(rows)),
             y=float(quantum.numerator),
             z=float(quantum.denominator),
-            p=self._own(one.senders),
+            p=self._own(look.senders),
             q=self._own(np.concatenate(listed)),
-            u=self._own(one.weights),
-            r=self._read(one.missing)[2] if one.missing else 0,
-            v=self.heard[one.member][one.row],
+            u=self._own(look.weights),
+            r=self._read(look.missing)[2] if look.missing else 0,
+            v=self.heard[look.member][look.row],
         )
 
 

@@ -194,15 +194,10 @@ def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fracti
 def _symbols(kind: Kind) -> tuple[Any, Any, Any, Any]:
     """Return (x, u), p and t as symbols, and the rates of change."""
     type_: Any = casadi.SX if kind.derivative.is_a("SXFunction") else casadi.MX
-    x, u = type_.sym("x", len(kind.states)), type_.sym("u", len(kind.holds))
-    p, t = type_.sym("p", len(kind.parameters)), type_.sym("t")
-    speed = kind.derivative(x, u, p, t)
-    if type_ is casadi.SX:
-        return casadi.vertcat(x, u), p, t, speed
-    # A derivative is taken with respect to a symbol, which a column of two is not.
-    both = type_.sym("moving", x.numel() + u.numel())
-    speed = kind.derivative(both[: x.numel()], both[x.numel() :], p, t)
-    return both, p, t, speed
+    n_x, n_u = len(kind.states), len(kind.holds)
+    moving, p, t = type_.sym("moving", n_x + n_u), type_.sym("p", len(kind.parameters)), type_.sym("t")
+    x, u = casadi.vertsplit(moving, [0, n_x, n_x + n_u])
+    return moving, p, t, kind.derivative(x, u, p, t)
 
 
 def _curved(speed: Any, moving: Any, t: Any) -> list[int]:

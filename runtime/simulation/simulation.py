@@ -58,8 +58,8 @@ from apc.simulation.writing import build_program
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Numbers that one call of a player gives out, at most, if a frame gives fewer: 4 MiB stay in the machine's
-# caches.
+# Numbers that one call of a player takes and gives out, at most, if a frame has fewer: 4 MiB stay in the
+# machine's caches.
 CHUNK = 2**19
 ROW = Fraction(1, 1000)  # seconds from row to row of a scene in which nothing ticks
 MOST_FRAMES = 2000  # of one chunk: what has left the range of floats is noticed at its end
@@ -82,10 +82,11 @@ class Simulation:
     """A scene ready to be played.
 
     `signals` are the columns of what comes out, the `order` (signals,) of which in a row of the population is
-    another; `marks` the instants of a frame's rows, in quanta, of which those not in `ticks` make a row at
-    time 0 only; `forces` are those that change with time, of each member's different sites. `lucks` are what
-    chance does on the unreliable links, `seed` is what it begins from: that of the settings, or of the
-    experiment. `library` is the machine code, None if there is none. `length` frames are played at a time.
+    another; `marks` the instants of a frame's rows, in quanta, the first of which makes a row at time 0 only
+    unless `ticks_at_zero`; `forces` are those that change with time, of each member's different sites.
+    `lucks` are what chance does on the unreliable links, `seed` is what it begins from: that of the settings,
+    or of the experiment. `library` is the machine code, None if there is none. `length` frames are played at
+    a time.
     `tolerances` are of the states that CVODES moves, `sent` the names of those that peers send as they are.
     """
 
@@ -102,7 +103,7 @@ class Simulation:
     quantum: Fraction
     frame: int
     marks: tuple[int, ...]
-    ticks: frozenset[int]
+    ticks_at_zero: bool
     library: Library | None
     length: int
 
@@ -180,7 +181,7 @@ def prepare(
         quantum=quantum,
         frame=schedule.frame,
         marks=marks,
-        ticks=frozenset(marks if _ticks_at_zero(system, plan.numbers) else marks[1:]),
+        ticks_at_zero=_ticks_at_zero(system, plan.numbers),
         library=library_of(population) if settings.jit else None,
         length=_chunk_length(population, settings.duration),
     )
@@ -314,7 +315,8 @@ def _chunk_length(population: Population, duration: Fraction) -> int:
     """Return how many frames to play at once: equal chunks, none larger than need be."""
     frames = int(duration / (population.frame * population.quantum)) + 1
     pushed = sum(one.program.impulse_rows * len(one.parameters) for one in population.members)
-    numbers = population.marks * population.width + pushed
+    seen = sum(one.ticks * len(one.pairs) for one in population.hearing.routes)
+    numbers = population.marks * population.width + pushed + seen
     most = max(1, min(MOST_FRAMES, CHUNK // max(1, numbers), frames))
     return -(-frames // -(-frames // most))
 

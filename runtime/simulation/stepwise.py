@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -25,7 +25,6 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-MOST_SEEN = 2**20  # packets that ticks see, drawn at once
 JOINS = {"max": np.fmax, "min": np.fmin}
 
 
@@ -58,12 +57,12 @@ class Stepwise:
         """
         self.population, self.timetable = population, timetable
         self.moving = tuple(range(len(population.members)) if moving is None else moving)
-        self.segments = [[_Moving(m, one) for one in m.program.segments] for m in population.members]
+        self.segments = [[_Moving(m, segment) for segment in m.program.segments] for m in population.members]
         # Of each member the rows of its carry that are the work done, and which parts these are.
         layouts = [m.program.layout for m in population.members]
         self.work = [
-            (one.work, np.array([population.parts.index(part) for part in one.parts], np.int64))
-            for one in layouts
+            (layout.work, np.array([population.parts.index(part) for part in layout.parts], np.int64))
+            for layout in layouts
         ]
         self.begin(0)
 
@@ -73,25 +72,31 @@ class Stepwise:
         self.table = None if self.timetable is None else self.timetable(run)
         self.packets = np.repeat(hearing.start[None], hearing.ring, axis=0)
         self.carries = [member.each(member.carry).T for member in self.population.members]
-        self.held = [one.copy() for one in hearing.held]
-        self.effective = [np.full(len(one.pairs), START, np.int64) for one in hearing.routes]
+        self.held = [start.copy() for start in hearing.held]
+        self.effective = [np.full(len(route.pairs), START, np.int64) for route in hearing.routes]
 
     def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> Played:
         """Play the frames from number `first` on (see `Player`)."""
         population, marks = self.population, self.population.marks
         rows = np.full((count * marks, population.width), np.nan)
         work = np.zeros((count, len(population.parts)))
-        seen = self._seen(first, count)
+        routes = population.hearing.routes
+        taken = self.table.take((first + count) * population.frame) if self.table else ()
         # Where a solver gives up CasADi prints its arguments, and then the ones that it was called from.
         with contextlib.redirect_stderr(io.StringIO()), np.errstate(all="ignore"):
             for n in range(count):
                 for carry, (done, places) in zip(self.carries, self.work, strict=True):
                     np.add.at(work[n], places, np.add.reduce(carry[done], axis=1))
-                now = [None if one is None else one[n] for one in pushes]
-                of_frame, heard = rows[n * marks : (n + 1) * marks], next(seen, ())
+                now = [None if push is None else push[n] for push in pushes]
+                of_frame = rows[n * marks : (n + 1) * marks]
+                ticks = [slice(n * route.ticks, (n + 1) * route.ticks) for route in routes if taken]
+                seen = tuple(
+                    Seen(packets.packets[at], packets.missing[at])
+                    for packets, at in zip(taken, ticks, strict=True)
+                )
                 try:
                     for index in range(len(population.hearing.segments)):
-                        self._segment(first + n, index, heard, of_frame, now)
+                        self._segment(first + n, index, seen, of_frame, now)
                 except RuntimeError:
                     return Played(rows, work, n)
         return Played(rows, work, count)
@@ -99,22 +104,7 @@ class Stepwise:
     def in_range(self) -> bool:
         """Say whether all that moves is still a number (see `Player`)."""
         moving = (carry[: done.start] for carry, (done, _) in zip(self.carries, self.work, strict=True))
-        return all(bool(np.isfinite(one).all()) for one in (self.packets, *moving))
-
-    def _seen(self, first: int, count: int) -> Iterator[tuple[Seen, ...]]:
-        """Yield what the ticks of each frame see on every route."""
-        if self.table is None:
-            return
-        routes = self.population.hearing.routes
-        each = max(1, MOST_SEEN // max(1, sum(one.ticks * len(one.pairs) for one in routes)))
-        for begin in range(first, first + count, each):
-            end = min(begin + each, first + count)
-            whole = self.table.take(end * self.population.frame)
-            for n in range(end - begin):
-                ticks = [slice(n * one.ticks, (n + 1) * one.ticks) for one in routes]
-                yield tuple(
-                    Seen(one.packets[now], one.missing[now]) for one, now in zip(whole, ticks, strict=True)
-                )
+        return all(bool(np.isfinite(array).all()) for array in (self.packets, *moving))
 
     def _segment(
         self,
@@ -155,8 +145,10 @@ class Stepwise:
             return np.asarray(self.held[source.route][source.row])
         return np.asarray(self.packets[(number - source.lag) % self.population.hearing.ring, source.key])
 
-    def _hear(self, one: Operation, number: int, heard: Sequence[Floats], seen: tuple[Seen, ...]) -> None:
-        match one:
+    def _hear(
+        self, operation: Operation, number: int, heard: Sequence[Floats], seen: tuple[Seen, ...]
+    ) -> None:
+        match operation:
             case Complete(g, place, packet, ranges, own, divisor):
                 row, first = self._row(packet, number), self.population.hearing.first
                 total = sum(np.add.reduce(row[begin:end]) for begin, end in ranges)
@@ -166,7 +158,7 @@ class Stepwise:
             case Deliver(route, tick):
                 self._deliver(route, *self._sees(route, tick, seen))
             case Look():
-                self._look(one, number, heard[one.member][one.row])
+                self._look(operation, number, heard[operation.member][operation.row])
 
     def _sees(self, place: int, tick: int, seen: tuple[Seen, ...]) -> tuple[Integers, Flags]:
         """Return the packets that a tick sees on a route, and which are missing."""
@@ -188,28 +180,28 @@ class Stepwise:
         if route.zero:
             held[:-1, missing], held[-1] = 0.0, missing
 
-    def _look(self, one: Look, number: int, result: Floats) -> None:
+    def _look(self, look: Look, number: int, result: Floats) -> None:
         """Join what a member makes of each pair to `result` (peers,)."""
-        member, count = self.population.members[one.member], len(one.senders)
-        joined = JOINS.get(one.operator)
-        if one.first:
+        member, count = self.population.members[look.member], len(look.senders)
+        joined = JOINS.get(look.operator)
+        if look.first:
             result[:] = 0.0 if joined is None else np.nan
         if not count:
             return
-        sent = np.array([self._row(source, number)[one.senders] for source in one.sources])
-        missing = self._row(one.missing, number)[one.senders] if one.missing else np.zeros(count)
+        sent = np.array([self._row(source, number)[look.senders] for source in look.sources])
+        missing = self._row(look.missing, number)[look.senders] if look.missing else np.zeros(count)
         own = np.concatenate([
-            self.carries[one.member][list(one.pairwise.carry)],
-            member.each(member.constants[:, list(one.pairwise.constants)]).T,
+            self.carries[look.member][list(look.pairwise.carry)],
+            member.each(member.constants[:, list(look.pairwise.constants)]).T,
         ])  # fmt: skip
-        function: Any = self.population.hearing.functions[one.function]
-        t = seconds_at(member.program.schedule, float(number), one.pairwise.now)
-        pairs = function.map(count)(own[:, one.receivers], sent.reshape(-1, count), missing[None], t)
+        function: Any = self.population.hearing.functions[look.function]
+        t = seconds_at(member.program.schedule, float(number), look.pairwise.now)
+        pairs = function.map(count)(own[:, look.receivers], sent.reshape(-1, count), missing[None], t)
         values = np.asarray(pairs)[0]
         if joined is None:
-            np.add.at(result, one.receivers, one.weights * values)
+            np.add.at(result, look.receivers, look.weights * values)
         else:
-            joined.at(result, one.receivers, values)
+            joined.at(result, look.receivers, values)
 
 
 class _Moving:
@@ -224,8 +216,8 @@ class _Moving:
         self._in = [np.zeros(self._function.size_in(i), order="F") for i in range(5)]
         self._out = [np.zeros(self._function.size_out(i), order="F") for i in range(3)]
         for give, arrays in ((self._buffer.set_arg, self._in), (self._buffer.set_res, self._out)):
-            for i, one in enumerate(arrays):
-                give(i, memoryview(one.reshape(-1, order="F").data))
+            for i, array in enumerate(arrays):
+                give(i, memoryview(array.reshape(-1, order="F").data))
         self._in[2][:] = member.each(member.constants).T
 
     def move(

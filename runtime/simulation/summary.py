@@ -108,8 +108,10 @@ class Watch:
         """Begin before the first row of what is played."""
         self.simulation, self.signals = simulation, simulation.signals
         n = len(self.signals)
-        self.positions = [i for i, one in enumerate(self.signals) if is_position(one)]
-        self.forces = [i for i, one in enumerate(self.signals) if one.unit == "N" and one.role != "limited"]
+        self.positions = [i for i, signal in enumerate(self.signals) if is_position(signal)]
+        self.forces = [
+            i for i, signal in enumerate(self.signals) if signal.unit == "N" and signal.role != "limited"
+        ]
         self.limits = _limits(simulation.system, self.signals)
         self.width = -(-simulation.rows // max(16, min(BUCKETS, MOST_EXTREMES // max(n, 1))))
         buckets = -(-simulation.rows // self.width)
@@ -131,15 +133,15 @@ class Watch:
         self.last = values[-1].copy()
         bucket = (self.rows + np.arange(len(time))) // self.width
         self.rows += len(time)
-        some, starts = np.unique(bucket, return_index=True)
-        self.low[some] = np.minimum(self.low[some], np.minimum.reduceat(values, starts))
-        self.high[some] = np.maximum(self.high[some], np.maximum.reduceat(values, starts))
+        touched, starts = np.unique(bucket, return_index=True)
+        self.low[touched] = np.minimum(self.low[touched], np.minimum.reduceat(values, starts))
+        self.high[touched] = np.maximum(self.high[touched], np.maximum.reduceat(values, starts))
         self.ends[bucket] = time
         moving = np.concatenate([self.before, values[:, self.positions]])
         way = np.sign(np.diff(moving, axis=0))
         turned = np.zeros((len(time), len(self.positions)), np.int64)
         turned[len(time) - max(len(way) - 1, 0) :] = way[1:] * way[:-1] < 0
-        self.turns[some] += np.add.reduceat(turned, starts)
+        self.turns[touched] += np.add.reduceat(turned, starts)
         self.before = moving[-2:]
         watched = np.array([*self.forces, *(column for column, _, _ in self.limits)], np.int64)
         size = np.abs(values[:, watched])
@@ -160,10 +162,11 @@ class Watch:
             settled = self._settled(low, high, ends)
             swing = self._swing(low, high, ends, settled)
         signals, unsettled = self.signals, np.isnan(settled)
+        numbers = np.stack([self.first, self.last, low.min(axis=0), high.max(axis=0)], axis=1).tolist()
         extents = tuple(
-            Extent(one.name, one.unit, *map(float, numbers), None if np.isnan(since) else float(since))
-            for one, since, *numbers in zip(
-                signals, settled, self.first, self.last, low.min(axis=0), high.max(axis=0), strict=True
+            Extent(signal.name, signal.unit, first, last, least, most, None if np.isnan(since) else since)
+            for signal, since, (first, last, least, most) in zip(
+                signals, settled.tolist(), numbers, strict=True
             )
         )
         moved = [extents[i] for i in self.positions]
@@ -171,7 +174,7 @@ class Watch:
             verdict, swing = "diverges", None
         elif not self.positions:
             verdict = NOT_JUDGED
-        elif all(one.low == one.high for one in moved):
+        elif all(extent.low == extent.high for extent in moved):
             verdict = "rests"
         elif not unsettled[self.positions].any():
             verdict = "settles"
@@ -203,7 +206,7 @@ class Watch:
     def _settled(self, low: Floats, high: Floats, ends: Floats) -> Floats:
         """Return when each signal is within its band for good; NaN if that is not well before the end."""
         span = high.max(axis=0) - low.min(axis=0)
-        names = np.array([one.local for one in self.signals])
+        names = np.array([signal.local for signal in self.signals])
         for name in dict.fromkeys(names.tolist()):  # the largest range among the peers
             span[names == name] = span[names == name].max()
         outside = (high - self.last > BAND * span) | (self.last - low > BAND * span)
@@ -232,10 +235,12 @@ class Watch:
         if not places:
             return None
         swing = high[now].max(axis=0) - low[now].min(axis=0)
-        own = np.maximum(high.max(axis=0) - low.min(axis=0), np.finfo(float).tiny)
-        units = [one.unit for one in self.signals]  # a length and an angle are each compared with their like
+        ranges = np.maximum(high.max(axis=0) - low.min(axis=0), np.finfo(float).tiny)
+        units = [
+            signal.unit for signal in self.signals
+        ]  # a length and an angle are each compared with their like
         span = {
-            unit: max(own[i] for i in self.positions if units[i] == unit)
+            unit: max(ranges[i] for i in self.positions if units[i] == unit)
             for unit in {*map(units.__getitem__, places)}
         }
         place = max(places, key=lambda i: float(swing[i] / span[units[i]]))
@@ -246,16 +251,20 @@ class Watch:
 
     def _copies(self) -> tuple[tuple[str, float], ...]:
         """Return how far apart the peers' copies of each state that is sent as it is are at the end."""
-        found = []
+        copies = []
         for name in self.simulation.sent:
-            places = [i for i, one in enumerate(self.signals) if one.local == name and one.unit in POSITIONS]
+            places = [
+                i
+                for i, signal in enumerate(self.signals)
+                if signal.local == name and signal.unit in POSITIONS
+            ]
             if len(places) > 1:
-                found.append((name, float(np.ptp(self.last[places]))))
-        return tuple(found)
+                copies.append((name, float(np.ptp(self.last[places]))))
+        return tuple(copies)
 
     def _broken(self) -> tuple[Broken, ...]:
         """Return the limits that were broken, the first of them first."""
-        found = [
+        broken = [
             Broken(
                 self.signals[column].name,
                 name,
@@ -268,22 +277,22 @@ class Watch:
             for (column, name, bound), first in zip(self.limits, self.beyond, strict=True)
             if not np.isnan(first)
         ]
-        return tuple(sorted(found, key=lambda one: one.first_s))
+        return tuple(sorted(broken, key=lambda limit: limit.first_s))
 
 
 def _limits(system: CompiledSystem, signals: Sequence[Signal]) -> list[tuple[int, str, float]]:
     """Return the columns of signals that have a limit, its name and its value, those of each peer its own."""
     groups = {group.name: group for group in system.groups}
-    common = {one.name: one.value for one in system.parameters}
+    common = {parameter.name: parameter.value for parameter in system.parameters}
     limits = {
-        (group.name, one.name): one.limit
+        (group.name, limit.name): limit.limit
         for group in system.groups
-        for one in system.kinds[group.kind].limits
+        for limit in system.kinds[group.kind].limits
     }
     return [
-        (column, name, _number(groups[one.group], one.peer, name, common))
-        for column, one in enumerate(signals)
-        if (name := limits.get((one.group, one.local))) is not None
+        (column, name, _number(groups[signal.group], signal.peer, name, common))
+        for column, signal in enumerate(signals)
+        if (name := limits.get((signal.group, signal.local))) is not None
     ]
 
 
@@ -292,7 +301,7 @@ def _number(group: Group, peer: int, name: str, common: dict[str, float]) -> flo
     for column in group.columns:
         if column.name == name:
             return float(column.values[peer - 1])
-    return next((one.value for one in group.values if one.name == name), common[name])
+    return next((value.value for value in group.values if value.name == name), common[name])
 
 
 def is_position(signal: Signal) -> bool:
@@ -308,10 +317,10 @@ def _positions(system: CompiledSystem) -> int:
 
 def _overshoot(extents: Sequence[Extent]) -> tuple[str, float] | None:
     """Return the largest way beyond the last value, as a part of the way from the first."""
-    found = []
-    for one in extents:
-        way = one.last - one.first
-        if abs(way) > LEAST_WAY * (one.high - one.low):
-            beyond = one.high - one.last if way > 0 else one.last - one.low
-            found.append((one.name, beyond / abs(way)))
-    return max(found, key=lambda pair: pair[1], default=None)
+    beyonds = []
+    for extent in extents:
+        way = extent.last - extent.first
+        if abs(way) > LEAST_WAY * (extent.high - extent.low):
+            beyond = extent.high - extent.last if way > 0 else extent.last - extent.low
+            beyonds.append((extent.name, beyond / abs(way)))
+    return max(beyonds, key=lambda pair: pair[1], default=None)

@@ -93,9 +93,11 @@ def _layout(rates: Rates, schedule: Schedule, segments: Sequence[Timed]) -> Layo
     for events in segments:
         needed = {event.value for _, event in events if isinstance(event, Act)}
         if events is segments[-1]:
-            needed |= {shifted(one, schedule.ticks) for one in before}
+            needed |= {shifted(value, schedule.ticks) for value in before}
         computed = {(event.partition, event.index) for _, event in events if isinstance(event, Tick)}
-        passed |= {one for one in needed if one.index >= 0 and (one.partition, one.index) not in computed}
+        passed |= {
+            value for value in needed if value.index >= 0 and (value.partition, value.index) not in computed
+        }
     return Layout(
         states=len(kind.states),
         outputs=tuple((p, o) for p in outputs for o in range(len(kind.clocks[p].outputs))),
@@ -139,11 +141,11 @@ class _Writer:
             if isinstance(event, Tick)
             for key, pair in self._pairs(now, event).items()
         }
-        assert all(one.now == events[0][0] for one in pairs.values()), "peers look before anything happens"
+        assert all(pair.now == events[0][0] for pair in pairs.values()), "peers look before anything happens"
         heard = {
             row for _, event in events if isinstance(event, Tick) for rows in event.heard for row in rows
         }
-        heard_rows = sorted(heard - {row for one in pairs.values() for row in one.heard})
+        heard_rows = sorted(heard - {row for pair in pairs.values() for row in pair.heard})
         moved = sum(isinstance(event, Propagate) for _, event in events)
         sizes = {
             "carry": layout.ends[-1],
@@ -164,11 +166,11 @@ class _Writer:
         for now, event in events:
             first, self.begun = now > self.begun, now
             if first and now in self.schedule.marks:  # the first event at an instant, which is then over
-                rows += [self._signal(one, now) for one in self.recorded]
+                rows += [self._signal(signal, now) for signal in self.recorded]
             self._step(now, event)
         passed = [
-            self.values[shifted(one, self.schedule.ticks) if last and one.index < 0 else one]
-            for one in layout.later
+            self.values[shifted(value, self.schedule.ticks) if last and value.index < 0 else value]
+            for value in layout.later
         ]
         after = (self.x, *self.newest.values(), self.u, *passed, self.work)
         kernel = casadi.Function(
@@ -189,17 +191,17 @@ class _Writer:
 
     def _pairs(self, now: int, tick: Tick) -> dict[Any, Pairwise]:
         """Return what a tick hears pair by pair, by (tick, receive): what matters of x, u, m and p."""
-        computing, found, layout = self.kind.clocks[tick.partition], {}, self.layout
+        computing, pairs, layout = self.kind.clocks[tick.partition], {}, self.layout
         x, outputs, u, *_ = (range(*ends) for ends in zip(layout.ends, layout.ends[1:], strict=False))
         memories = [outputs[layout.outputs.index((tick.partition, o))] for o in computing.memories]
         inside = [*x, *u, *memories]
         for place, (receive, rows) in enumerate(zip(computing.receives, tick.heard, strict=True)):
             if rows and edge_name(computing, receive):
-                function, own = pair_function(self.kind, tick.partition, place)
-                carry = tuple(inside[row] for row in own if row < len(inside))
-                constants = tuple(row - len(inside) for row in own if row >= len(inside))
-                found[tick, place] = Pairwise(function, carry, constants, rows, now)
-        return found
+                function, matter = pair_function(self.kind, tick.partition, place)
+                carry = tuple(inside[row] for row in matter if row < len(inside))
+                constants = tuple(row - len(inside) for row in matter if row >= len(inside))
+                pairs[tick, place] = Pairwise(function, carry, constants, rows, now)
+        return pairs
 
     def _p(self) -> Any:
         return self.constants[: len(self.kind.parameters)]
@@ -253,7 +255,7 @@ class _Writer:
             weight: Any = 1
             if isinstance(heard, Selected) and heard.gap:
                 # What a site would itself send at this moment stands in for what it misses.
-                sending = next(one for one in self.kind.sends if one.link == heard.way.link)
+                sending = next(send for send in self.kind.sends if send.link == heard.way.link)
                 weight = self._of_site(sending.send, now)[sending.channels.index(heard.channel)]
             total = total + weight * self.heard[row]
         return total
