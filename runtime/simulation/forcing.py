@@ -138,8 +138,10 @@ def _kernel_of(a: NDArray[Any], pushed: Sequence[int], duration: Fraction) -> Ke
         largest = np.maximum(largest, np.abs(values).max(axis=0))
         coefficients = np.tensordot(TRANSFORM, values, 1)
         missed = np.abs(coefficients[-2:]).max(axis=0)
-        if low == 0:  # what dies out at once may be over at the first node
-            missed = np.maximum(missed, np.abs(legendre.legval(-1, coefficients) - start))
+        if (
+            low == 0
+        ):  # what dies out at once may be over at the first node; here roundings of all terms add up
+            missed = np.maximum(missed, np.abs(legendre.legval(-1, coefficients) - start) / TERMS)
         if (missed <= AGREE * largest).all() or high - low <= least:
             edges.append(high)
             terms.append(coefficients)
