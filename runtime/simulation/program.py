@@ -39,8 +39,9 @@ Floats = NDArray[np.float64]
 class Layout:
     """The rows of the carry: x, newest outputs, what holds put out, values to act later, work.
 
-    `outputs` are the (clock partition, output) pairs that are computed; `later` are values of earlier frames,
-    or of earlier segments, that a hold puts out after; `parts` are those whose work is added up.
+    `outputs` are the (clock partition, output) pairs that are remembered or recorded; `later` are values of
+    earlier frames, or of earlier segments, that a hold puts out after; `parts` are those whose work is added
+    up.
     """
 
     states: int

@@ -183,7 +183,9 @@ class Watch:
         settles = verdict == "settles"
         largest = max(self.forces, key=lambda i: float(self.peak[i]), default=-1)
         work = tuple(zip(self.simulation.population.parts, block.work.tolist(), strict=True))
-        force = (signals[largest].name, float(self.peak[largest]), float(self.peak_at[largest]))
+        force = None
+        if largest >= 0:
+            force = signals[largest].name, float(self.peak[largest]), float(self.peak_at[largest])
         return Summary(
             verdict=verdict,
             settled=float(settled[self.positions].max()) if settles else None,
@@ -191,7 +193,7 @@ class Watch:
             stopped_at=block.stopped_at if block.stopped else None,
             swing=swing[:3] if swing else None,
             overshoot=_overshoot(moved) if settles else None,
-            largest_force=None if largest < 0 else force,
+            largest_force=force,
             copies=self._copies(),
             # Of a motion without bound the work is as meaningless as it is large.
             work=() if block.stopped else work,

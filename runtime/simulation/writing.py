@@ -15,6 +15,7 @@ from typing import Any
 import casadi
 import numpy as np
 
+from apc.compiler.compiled import Kind
 from apc.frame.jacobians import edge_name
 from apc.frame.schedule import (
     Act,
@@ -85,9 +86,11 @@ def _cut(events: Timed, cuts: Sequence[int]) -> list[Timed]:
     return [events[begin:end] for begin, end in zip([0, *ends], [*ends, len(events)], strict=True)]
 
 
-def _layout(rates: Rates, schedule: Schedule, segments: Sequence[Timed]) -> Layout:
+def _layout(
+    kind: Kind, schedule: Schedule, segments: Sequence[Timed], recorded: Sequence[LocalSignal]
+) -> Layout:
     """Return the rows of the carry; it is the same between any two segments."""
-    kind, outputs = rates.kind, ticking_partitions(schedule)
+    seen = {signal.place for signal in recorded if signal.role == "output"}
     before = remembered([event.value for event in schedule.events if isinstance(event, Act)], schedule.ticks)
     passed = set(before)  # and what is computed in another segment than it is needed in
     for events in segments:
@@ -100,7 +103,12 @@ def _layout(rates: Rates, schedule: Schedule, segments: Sequence[Timed]) -> Layo
         }
     return Layout(
         states=len(kind.states),
-        outputs=tuple((p, o) for p in outputs for o in range(len(kind.clocks[p].outputs))),
+        outputs=tuple(
+            (p, o)
+            for p in ticking_partitions(schedule)
+            for o in range(len(kind.clocks[p].outputs))
+            if o in kind.clocks[p].memories or (p, o) in seen
+        ),
         holds=len(kind.holds),
         later=tuple(sorted(passed)),
         parts=tuple(dict.fromkeys(kind.ports.parts)) if kind.ports else (),
@@ -128,7 +136,7 @@ class _Writer:
         plain = all(function.is_a("SXFunction") for function in functions)
         self.type_: Any = casadi.SX if plain else casadi.MX
         self.intervals: list[tuple[int, int]] = []
-        self.layout = _layout(rates, schedule, segments)
+        self.layout = _layout(kind, schedule, segments, recorded)
         self.begun = -1  # the instant of the event before
         self.marks = self.impulses = 0  # written so far
 
@@ -172,7 +180,8 @@ class _Writer:
             self.values[shifted(value, self.schedule.ticks) if last and value.index < 0 else value]
             for value in layout.later
         ]
-        after = (self.x, *self.newest.values(), self.u, *passed, self.work)
+        newest = [self.newest[key] for key in layout.outputs]
+        after = (self.x, *newest, self.u, *passed, self.work)
         kernel = casadi.Function(
             "segment",
             list(arguments.values()),
