@@ -84,7 +84,9 @@ class Integrated(casadi.Callback):
             at = first + (last - first) * casadi.DM([0.0, *looks]).T
             places = casadi.vertcat(casadi.repmat(held, 1, LOOKS + 1), at, casadi.MX.zeros(1, LOOKS + 1))
             signs = self.signs.map(LOOKS + 1)(every, places)
-            self.looks = casadi.Function("looks", [start, held, first, last], [every, at, signs])
+            crossed = casadi.norm_inf(casadi.vec(signs[:, 1:] - signs[:, :-1]))
+            found = [every[:, -1] * scale, crossed, every, at, signs]
+            self.looks = casadi.Function("looks", [start, held, first, last], found)
         self.construct("move", {})
 
     def get_n_in(self) -> int:
@@ -105,25 +107,24 @@ class Integrated(casadi.Callback):
 
     def eval(self, arguments: Sequence[Any]) -> list[Any]:
         """Return x at the end, locating what decides on the way, for CasADi."""
-        y = np.asarray(arguments[0]) / self.scale[:, None]
-        held = np.concatenate([np.asarray(one) for one in arguments[1:]])
-        begin = 0.0
+        y, held, begin = arguments[0] / casadi.DM(self.scale), casadi.vertcat(*arguments[1:]), 0.0
         for _ in range(MOST_CROSSINGS if self.looks is not None else 0):
-            every, at, signs = map(np.asarray, self.looks(y, held, begin, self.duration))
+            end, crossed, *looked = self.looks(y, held, begin, self.duration)
+            if not float(crossed):
+                return [end]
+            every, at, signs = map(np.asarray, looked)
             changed = (signs[:, 1:] != signs[:, :-1]).any(axis=0)
-            if not changed.any():
-                return [every[:, -1] * self.scale]
             first = int(changed.argmax())
             ends = every[:, [first]], every[:, [first + 1]]
             y, begin = self._located(*ends, held, at[0, first], at[0, first + 1])
         return [self._moved(y, held, begin, self.duration)[:, 0] * self.scale]
 
     def _moved(self, y: Floats, held: Floats, begin: float, end: float) -> Floats:
-        fixed = np.vstack([held, [[begin], [end - begin]]])
+        fixed = np.vstack([np.asarray(held), [[begin], [end - begin]]])
         return np.asarray(self.once(x0=y, p=fixed)["xf"])
 
     def _signs(self, y: Floats, held: Floats, at: float) -> Floats:
-        return np.asarray(self.signs(y, np.vstack([held, [[at], [0.0]]])))
+        return np.asarray(self.signs(y, np.vstack([np.asarray(held), [[at], [0.0]]])))
 
     def _located(
         self, low: Floats, high: Floats, held: Floats, begin: float, end: float
