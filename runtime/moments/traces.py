@@ -33,6 +33,7 @@ from apc.eigen.rigid import find_rigid_modes
 from apc.frame.radius import RADII, radius_of, value_of, with_radius
 from apc.frame.schedule import Heard, Schedule, Selected, Sent
 from apc.moments.crowd import Hearing, hearing, instants
+from apc.moments.unserved import UnservedError
 from apc.network.timetable import instant_of
 
 Floats = NDArray[np.float64]
@@ -53,8 +54,8 @@ class Found:
     frames: int
 
 
-def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found | str:
-    """Return what motions grow by in a frame, on the mean over a period; or why that is not told.
+def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
+    """Return what motions grow by in a frame, on the mean over a period.
 
     Parameters
     ----------
@@ -69,7 +70,8 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found | str:
     slots = {name: len(instants(told, clocks[link.clock])) for name, link in links.items()}
     frames = math.lcm(*(_period_of(links[row.way.link], slots[row.way.link]) for row in rows))
     if frames > MOST_FRAMES:
-        return f"the recorded delays come again after {frames:,} frames, and {MOST_FRAMES:,} are the most"
+        what = f"the recorded delays come again after {frames:,} frames"
+        raise UnservedError(f"{what}, and {MOST_FRAMES:,} are the most")
     heard: dict[Selected, list[int]] = {}
     for row in rows:
         link = links[row.way.link]
@@ -92,7 +94,7 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found | str:
             )
             > MOST_STATES
         ):
-            return "the recorded delays are longer than can be followed"
+            raise UnservedError("the recorded delays are longer than can be followed")
         found.append(_period(loop, told, heard, depth, slots, frames))
     low, high = max(one.low for one in found), max(one.high for one in found)
     return Found(low, high, max(one.radius for one in found), max(one.doubt for one in found), frames)

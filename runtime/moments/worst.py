@@ -42,6 +42,7 @@ from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, value_of
 from apc.frame.schedule import Way
 from apc.moments.held import Ear, HeldLoop, held_loop, held_scene, lossy_rows
+from apc.moments.unserved import UnservedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -126,9 +127,10 @@ def worst_case(system: CompiledSystem, prepared: Prepared) -> LossesInARow:
     prepared
         From `analysis.prepare`, of this system with any numbers.
     """
-    found = held_parts(system, prepared)
-    if isinstance(found, str):
-        return LossesInARow(None, None, None, f"losses in a row are left open: {found}")
+    try:
+        found = held_parts(system, prepared)
+    except UnservedError as why:
+        return LossesInARow(None, None, None, f"losses in a row are left open: {why}")
     certified = harmless(found)
     if certified == MANY:
         return LossesInARow(MANY, None, None, f"{MANY:,} losses in a row are harmless, where counting ends")
@@ -172,8 +174,8 @@ def trace_of_worst(system: CompiledSystem) -> CompiledSystem:
     return replace(system, links=tuple(map(played, system.links)))
 
 
-def held_parts(system: CompiledSystem, prepared: Prepared) -> HeldParts | str:
-    """Make the modes of a scene whose receivers hold what they heard last, or say why not.
+def held_parts(system: CompiledSystem, prepared: Prepared) -> HeldParts:
+    """Make the modes of a scene whose receivers hold what they heard last.
 
     Parameters
     ----------
@@ -181,26 +183,22 @@ def held_parts(system: CompiledSystem, prepared: Prepared) -> HeldParts | str:
         As for `worst_case`.
     """
     scene = held_scene(system, prepared)
-    loops = (
-        scene if isinstance(scene, str) else loops_at_right_angles(scene.groups, scene.exchange, MOST_STATES)
-    )
-    if isinstance(scene, str) or isinstance(loops, str):
-        return str(loops)
+    loops = loops_at_right_angles(scene.told.groups, scene.told.exchange, MOST_STATES)
+    if isinstance(loops, str):
+        raise UnservedError(loops)
     lossy = scene.lossy
     parts, ratios = [], _ratios(loops[0].sites, lossy)
     weight, sizes = _weight(loops, lossy)
     for loop in loops:
         if loop.states > MOST_STATES:
-            return f"peers make one system of {loop.states:,} states, and {MOST_STATES} are the most"
-        part = _part(loop, lossy, ratios, sizes)
-        if part is None:
-            return "a packet follows from another one of its frame"
-        parts.append(part)
+            what = f"peers make one system of {loop.states:,} states"
+            raise UnservedError(f"{what}, and {MOST_STATES} are the most")
+        parts.append(_part(loop, lossy, ratios, sizes))
     return HeldParts(tuple(parts), weight)
 
 
-def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios, sizes: Sizes) -> HeldPart | None:
-    """Make a mode of a scene, None where packets depend on one another within a frame."""
+def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios, sizes: Sizes) -> HeldPart:
+    """Make a mode of a scene."""
 
     def size(site: int, link: str) -> float:
         """Return how far n peers of a site that move alike by 1 move together: √n, or as they are weighed."""
@@ -227,9 +225,7 @@ def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios, sizes: Sizes) -> He
                 places = [line for line, one in rows if (one.way, one.sent) == (way, sent)]
                 outside.append(Ear(dict.fromkeys(((g, line) for line in places), ONE)))
                 shares.append(1 / size(g, sent.link))
-    heard, whole = held_loop(loop, ears, lossy), held_loop(loop, [*ears, *outside], lossy)
-    if heard is None or whole is None:
-        return None
+    heard, whole = (held_loop(loop, some, lossy).relative() for some in (ears, [*ears, *outside]))
     roundings = [8 * UNIT * share if share != 1 else 0.0 for share in shares]
     sums: dict[tuple[int, str, str], Floats] = {}
     for place, ear in enumerate(ears):
