@@ -213,15 +213,10 @@ def moments_of(
             # One channel drives the mean of all receivers by 1/n, and their differences by 1 − 1/n or −1/n.
             by = 1 / receivers
             share = heard * (by if only is None else 1 - by)
-            units = np.zeros((len(one.units), *channel.matrix.shape[-2:]))
-            k = one.units.shape[-1]
-            units[:, -k:, -k:] = one.units
-            answers = _answers(
-                channel.misses, luck, classes, share, one, channel.own, by if only is None else -by
-            )
-            driven = arithmetic_of(channel.matrix).exact(units)
+            own = one, channel.own, by if only is None else -by
+            answers = tuple(_answers(channel.misses, luck, classes, share, *own))
             place = slice(one.places[0].start, one.places[-1].stop)
-            drives.append(Drive(channel.matrix, driven, place, 0, tuple(answers), number, share))
+            drives.append(Drive(channel.matrix, channel.into, one.units, place, answers, number, share))
     return Moments(tuple(parts), tuple(drives), luck[-1].places[-1].stop if luck else 0)
 
 

@@ -205,13 +205,14 @@ def moments_error(of: Moments, classes: Sequence[tuple[int, Peer]]) -> float:
             added.append(Answer(place, form, np.array([drive.share]), entry))
         return replace(drive, answers=(*drive.answers, *added))
 
-    column = slice(count, count + 1)
-    pushes = [
-        Drive(part.matrix, _pushes(part, classes)[None], column, 0, part.answers, number, 1.0)
-        for number, part in enumerate(of.parts)
-    ]
-    drives = [read(drive) for drive in (*of.drives, *pushes)]
-    matrix = gain(drives, (count + len(forms), count + 1), 1.0, FLOATS)
+    drives = list(of.drives)
+    for number, part in enumerate(of.parts):
+        drawn, n = _pushes(part, classes), len(part.at.rest)
+        into = RADII.exact(np.eye(n))
+        drives.append(
+            Drive(part.matrix, into, drawn[None], slice(count, count + 1), part.answers, number, 1.0)
+        )
+    matrix = gain([read(drive) for drive in drives], (count + len(forms), count + 1), 1.0, FLOATS)
     assert matrix is not None, "means grow, and second moments were to die out"
     luck = np.linalg.solve(np.eye(count) - matrix[:count, :count], matrix[:count, count])
     return _largest(matrix[count:, :count] @ luck + matrix[count:, count])
@@ -243,15 +244,15 @@ def _largest(variances: Floats) -> float:
     return math.sqrt(largest)
 
 
-def _pushes(part: Part, classes: Sequence[tuple[int, Peer]]) -> Matrix:
-    """Return the moments (2, n, n) that pushes add to a loop of means as a frame begins."""
+def _pushes(part: Part, classes: Sequence[tuple[int, Peer]]) -> Floats:
+    """Return the moments (n, n) that pushes add to a loop of means as a frame begins."""
     variance = np.zeros(len(part.at.held) + len(part.at.rest))
     for g, (count, peer) in enumerate(classes):
         if part.only in (None, g):
             start = part.offsets[g] if part.only is None else 0
             share = 1 / count if part.only is None else 1 - 1 / count
             variance[start + np.array(peer.drawn, np.intp)] = share
-    return RADII.exact(np.diag(variance[part.at.rest]))
+    return np.diag(variance[part.at.rest])
 
 
 def _errors(classes: Sequence[tuple[int, Peer]]) -> list[_Error]:

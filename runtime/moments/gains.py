@@ -98,15 +98,15 @@ class Drive:
     Attributes
     ----------
     matrix
-        The loop (2, n, n) with its radius or over a cell, the luck's own states included.
-    driven
-        The moments (b, 2, n, n) that each unit of luck adds.
+        The loop (2, n, n) with its radius or over a cell.
+    into
+        How luck, which is drawn as a frame begins, enters its states (2, n, k).
+    units
+        The covariances (b, k, k) of luck that G has a column for each.
     place
-        The columns of G that these units stand in.
-    delay
-        How many frames pass until luck is in the state.
+        Which columns these are.
     answers
-        The covariances that follow.
+        The covariances that follow; their forms are over states (n,), or over these and luck (n + k,).
     part
         Which loop of means this is, its own states first.
     share
@@ -114,9 +114,9 @@ class Drive:
     """
 
     matrix: Matrix
-    driven: Matrix
+    into: Matrix
+    units: Floats
     place: slice
-    delay: int
     answers: tuple[Answer, ...]
     part: int
     share: float
@@ -319,14 +319,17 @@ def gain(
     result = numbers.exact(np.zeros(shape))
     shrink, root = number_of(1 / growth, numbers), number_of(growth**-0.5, numbers)
     for drive in drives:
-        driven = of_kind(drive.driven, numbers)
-        if drive.delay:
-            driven = scaled(driven, shrink, numbers)
+        units = numbers.exact(drive.units)
+        driven = scaled(around(of_kind(drive.into, numbers), units, numbers), shrink, numbers)
         moments = stein(scaled(of_kind(drive.matrix, numbers), root, numbers), driven, numbers)
         if moments is None:
             return None
+        n = moments.shape[-1]
+        both = np.zeros((*moments.shape[:-2], *(n + units.shape[-1],) * 2))
+        both[..., :n, :n], both[..., n:, n:] = moments, units
         for answer in drive.answers:
-            squares = around(of_kind(answer.forms, numbers), moments[:, None], numbers)
+            over = both if answer.forms.shape[-1] > n else moments
+            squares = around(of_kind(answer.forms, numbers), over[:, None], numbers)
             total = _weighted(squares, answer.weights, numbers)
             if answer.spread is not None:
                 total = scaled(total, of_kind(answer.spread, numbers), numbers)

@@ -89,13 +89,14 @@ class Listened:
 class Channel:
     """What the luck of a channel does to a loop.
 
-    `matrix` (2, n + m + k, n + m + k) moves the loop's n states, the channel's own m and its luck ξ, which is
-    drawn as a frame begins. `misses` says how far what is uncertain of each site's packets, by site, route
-    and slot, is from what is sent, over these states; `own`, of each slot, what the channel itself adds to
-    that.
+    `matrix` (2, n + m, n + m) moves the loop's n states and the channel's own m, and `into` (2, n + m, k) its
+    luck ξ, which is drawn as a frame begins. `misses` says how far what is uncertain of each site's packets,
+    by site, route and slot, is from what is sent, over these states and ξ; `own`, of each slot, what the
+    channel itself adds to that.
     """
 
     matrix: Matrix
+    into: Matrix
     misses: Mapping[tuple[int, Route, int], Matrix]
     own: tuple[Matrix, ...]
 
@@ -310,15 +311,16 @@ def mean_loop(
             number * len(one.memory.old) + e for number in range(len(one.channels)) for e in one.memory.kept
         ]
         columns = np.concatenate([rest, np.arange(first, last)])
-        matrix = np.zeros((len(like), len(columns), len(columns)))
+        states = n + len(kept)
+        matrix = np.zeros((len(like), states, len(columns)))
         matrix[:, :n] = moved[..., columns]
-        matrix[:, n : n + len(kept), n:] = over_as_many(own[:, kept], like)
+        matrix[:, n:, n:] = over_as_many(own[:, kept], like)
         within = []
         for rows in one.before:
             memorized = over_as_many(one.memorized(rows), like)
             radius_of(memorized)[...] *= -1
             within.append(np.concatenate([np.zeros((*memorized.shape[:-1], n)), -memorized], axis=-1))
-        channels.append(Channel(matrix, missed(columns), tuple(within)))
+        channels.append(Channel(matrix[..., :states], matrix[..., states:], missed(columns), tuple(within)))
     return MeanLoop(moved[..., rest], at, tuple(offsets), missed(rest)), channels
 
 

@@ -34,7 +34,7 @@ from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, with_radius
 from apc.frame.schedule import Selected, Way
 from apc.moments.crowd import Hearing, own_value, peer_classes, remembered_of, standing_motions
-from apc.moments.gains import Answer, Drive, Moments, Part, around, number_of
+from apc.moments.gains import Answer, Drive, Moments, Part, number_of
 from apc.moments.mean_loops import Remembered, Site, scaled, standing_state, with_memory
 from apc.moments.unserved import UnservedError
 from apc.network.channel import ChannelLaw, channel_law
@@ -285,12 +285,13 @@ def _closed(
         for d in range(len(counts)) if only is None else [only]:
             # Of a peer in n, the mean of all takes 1/n, and what it differs by from that the rest.
             share = 1 / counts[d] if only is None else 1 - 1 / counts[d]
-            units = np.zeros((listed[d].shape[1], *matrix.shape[1:]))
-            a, b = listed[d] + (offsets[d] if only is None else 0)
+            units = np.zeros((listed[d].shape[1], *[states[d].stop - states[d].start] * 2))
+            a, b = listed[d]
             units[np.arange(len(a)), a, b] = units[np.arange(len(a)), b, a] = 1.0
-            into = relative_rows(RADII.exact(np.eye(units.shape[-1])), bounded, RADII)
-            driven = scaled(around(into, RADII.exact(units), RADII), number_of(share, RADII), RADII)
-            drives.append(Drive(part.matrix, driven, places[d], 1, answers, number, 1.0))
+            columns = states[d] if only is None else slice(None)
+            into = relative_rows(RADII.exact(np.eye(matrix.shape[-1])[:, columns]), bounded, RADII)
+            into = scaled(into, number_of(share**0.5, RADII), RADII)
+            drives.append(Drive(part.matrix, into, units, places[d], answers, number, 1.0))
     return Moments(tuple(parts), tuple(drives), ends[-1])
 
 
