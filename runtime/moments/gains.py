@@ -325,10 +325,12 @@ def gain(
         if moments is None:
             return None
         n = moments.shape[-1]
-        both = np.zeros((*moments.shape[:-2], *(n + units.shape[-1],) * 2))
-        both[..., :n, :n], both[..., n:, n:] = moments, units
         for answer in drive.answers:
-            over = both if answer.forms.shape[-1] > n else moments
+            size = answer.forms.shape[-1]
+            over = np.zeros((*moments.shape[:-2], size, size))
+            over[..., :n, :n] = moments
+            if size > n:
+                over[..., n:, n:] = units
             squares = around(of_kind(answer.forms, numbers), over[:, None], numbers)
             total = _weighted(squares, answer.weights, numbers)
             if answer.spread is not None:
@@ -485,5 +487,4 @@ def _radius(of: Moments, least: float) -> tuple[float | None, float]:
     while over(high := least + gap) < 0:
         low, gap = high, WIDER * gap
     root = float(brentq(over, low, high, xtol=1e-300, rtol=4 * np.finfo(np.float64).eps))
-    slope = (over(root * (1 + STEP)) - over(root * (1 - STEP))) / (2 * STEP)
-    return root, max(1.0, slope)
+    return root, max(1.0, over(root * (1 + STEP)) / STEP)
