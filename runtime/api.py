@@ -66,11 +66,11 @@ def compile(path: str | Path) -> CompiledSystem:
     ApcError
         The file is at fault; holds every mistake found.
     """
-    from apc.analysis.selfcheck import check_frame
     from apc.compiler.pipeline import compile_topology
+    from apc.frame.values import check_values
 
     system = compile_topology(Path(path))
-    check_frame(system)
+    check_values(system)
     return system
 
 

@@ -111,11 +111,11 @@ def load_or_compile(path: Path) -> CompiledSystem:
         return load_fresh(path)
     if (archive := compiled_already(path)) is not None:
         return opened(archive, path.parent)
-    from apc.analysis.selfcheck import check_frame
     from apc.compiler.pipeline import compile_topology
+    from apc.frame.values import check_values
 
     system = compile_topology(path)
-    check_frame(system)
+    check_values(system)
     return system
 
 

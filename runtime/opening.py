@@ -38,11 +38,11 @@ def opened(archive: Archive, folder: Path) -> CompiledSystem:
         from apc.compiler import store
 
         return store.opened(archive)
-    from apc.analysis.selfcheck import check_frame
     from apc.compiler.pipeline import compile_again
+    from apc.frame.values import check_values
 
     system = compile_again(archive.origin, folder)
-    check_frame(system)
+    check_values(system)
     for change in archive.origin.changes:
         system = _changed_again(system, change)
     return system

@@ -158,6 +158,7 @@ HEAVY = {"numpy", "casadi", "scipy", "sympy", "pint", "yaml", "rich", "flint"}
 OPTIONAL = {"matplotlib", "bokeh", "pandas", "pyarrow", "IPython", "control", "distributed", "xarray"}
 
 
+@pytest.mark.whole
 def test_a_command_loads_what_it_runs(tmp_path: Path) -> None:
     """Nothing to tell what there is or that nothing has changed; nothing optional to compute."""
     (tmp_path / "scene.yaml").write_text(AVERAGE, encoding="utf-8")

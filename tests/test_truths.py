@@ -171,6 +171,7 @@ def _pairs() -> list[object]:
     return found
 
 
+@pytest.mark.few(70)
 @pytest.mark.parametrize(("name", "way"), _pairs())
 def test_every_way_is_true_within_its_bound_or_refuses_in_words(name: str, way: str) -> None:
     case, told = CASES[name], truth(name)

@@ -27,8 +27,8 @@ def check_command(file: str | None) -> None:
 
     Exit code 0 if there is none, 1 otherwise.
     """
-    from apc.analysis.selfcheck import check_frame
     from apc.compiler.pipeline import check_definition, compile_topology
+    from apc.frame.values import check_values
     from apc.inputs import find_input
     from apc.present.analysis import warning_lines
 
@@ -37,7 +37,7 @@ def check_command(file: str | None) -> None:
         tell(f"{path}: no mistakes. {found}.")
         return
     system = compile_topology(path)
-    check_frame(system)
+    check_values(system)
     tell(f"{path}: no mistakes. {system.name}, {counted(system.peers, 'peer')}.")
     for line in warning_lines(system.warnings):
         tell(line)
@@ -83,12 +83,12 @@ def compile_command(file: str | None, until: str, force: bool) -> None:
 def _compile(path: Path) -> None:
     """Compile, check, save and report."""
     from apc.analysis.needs import needs
-    from apc.analysis.selfcheck import check_frame
     from apc.compiler.pipeline import compile_topology
     from apc.compiler.store import save
+    from apc.frame.values import check_values
     from apc.present.analysis import compile_text
 
     system = compile_topology(path)
-    difference = check_frame(system)
+    check_values(system)
     save(system, target := path.with_suffix(".apc"), compiled=True)
-    tell(compile_text(system, needs(system), target, difference))
+    tell(compile_text(system, needs(system), target))

@@ -111,21 +111,42 @@ def _finite_slopes(
         one = linearize_rows(site, np.asarray(parameters, dtype=np.float64)[None])
         _refuse_infinite(site, one[0])
         return one.ravel()
-    x, u, m, r, p, t = start_arguments(site, [float(value) for value in parameters], float, listening)
-    kind = site.kind
     if not site.affine:  # else the start is anywhere
-        values = [("der({})", [state.name for state in kind.states], kind.derivative(x, u, p, t))]
-        memories, heard = iter(m), iter(r)
-        for clock in kind.clocks:
-            own = [next(memories) for _ in clock.memories], [next(heard) for _ in clock.receives]
-            column = clock.tick(x, u, *own, p, t)
-            values.append(("{}", list(clock.outputs) * (column.numel() // len(clock.outputs)), column))
-        values += [("{}", list(send.channels), send.send(x, u, p, t)) for send in kind.sends]
-        for form, rows, column in values:
-            _check_finite([form.format(row) for row in rows], np.asarray(column).ravel(), "", kind.name)
-    flat = np.asarray(site.function(x, u, m, r, p, t), dtype=np.float64).ravel()
+        check_start(site, parameters, listening)
+    arguments = start_arguments(site, [float(value) for value in parameters], float, listening)
+    flat = np.asarray(site.function(*arguments), dtype=np.float64).ravel()
     _refuse_infinite(site, flat)
     return flat
+
+
+def check_start(
+    site: SiteJacobians, parameters: NDArray[np.float64], listening: Listening | None = None
+) -> None:
+    """Evaluate the site's equations at the start values.
+
+    Parameters
+    ----------
+    site, parameters
+        The site and its numbers (n_p,).
+    listening
+        What it hears where that matters.
+
+    Raises
+    ------
+    ApcError
+        E808 a value that is not finite, by name.
+    """
+    x, u, m, r, p, t = start_arguments(site, [float(value) for value in parameters], float, listening)
+    kind = site.kind
+    values = [("der({})", [state.name for state in kind.states], kind.derivative(x, u, p, t))]
+    memories, heard = iter(m), iter(r)
+    for clock in kind.clocks:
+        own = [next(memories) for _ in clock.memories], [next(heard) for _ in clock.receives]
+        column = clock.tick(x, u, *own, p, t)
+        values.append(("{}", list(clock.outputs) * (column.numel() // len(clock.outputs)), column))
+    values += [("{}", list(send.channels), send.send(x, u, p, t)) for send in kind.sends]
+    for form, rows, column in values:
+        _check_finite([form.format(row) for row in rows], np.asarray(column).ravel(), "", kind.name)
 
 
 def _refuse_infinite(site: SiteJacobians, flat: NDArray[np.float64]) -> None:

@@ -66,7 +66,7 @@ _WORDS = {
 }
 
 
-def compile_text(system: CompiledSystem, needs: Needs, target: Path, difference: float) -> str:
+def compile_text(system: CompiledSystem, needs: Needs, target: Path) -> str:
     """Return what `apc compile` prints.
 
     Parameters
@@ -75,8 +75,6 @@ def compile_text(system: CompiledSystem, needs: Needs, target: Path, difference:
         The compiled scene and what it keeps.
     target
         The file written.
-    difference
-        The largest relative difference the self-check found.
     """
     ticks = ", ".join(
         f"{name} ticks {count} times" if count != 1 else f"{name} once" for name, count in needs.ticks
@@ -85,24 +83,11 @@ def compile_text(system: CompiledSystem, needs: Needs, target: Path, difference:
         f"{system.name} → {target}",
         *note(str(replace(needs, pairs=()))),  # they follow, with their reason
         f"  frame {_time(float(needs.frame))}: {ticks or 'no clock is used, any frame will do'}",
-        *note(f"self-check: {_self_check(system, difference)}"),
     ]
     lines += warning_lines(system.warnings)
     for text in (*_pairwise(system), *(f"left out: {name}, as {reason}" for name, reason in system.dropped)):
         lines += note(text)
     return "\n".join(lines)
-
-
-def _self_check(system: CompiledSystem, difference: float) -> str:
-    from apc.analysis.selfcheck import skipped  # an analysis checks nothing
-
-    left_out = skipped(system)
-    compared = f"one frame event by event and lifted differ by {difference:.0e}"
-    if not left_out:
-        return compared
-    if len(left_out) == len(system.kinds):
-        return "no frame is compared, as no peer here is linear"
-    return f"{compared} (not {' and '.join(left_out)}, which is not linear)"
 
 
 def _pairwise(system: CompiledSystem) -> Iterator[str]:

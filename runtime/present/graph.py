@@ -111,10 +111,10 @@ def _places(boxes: Sequence[Box], edges: Sequence[Edge]) -> _Places:
 
 
 def _width(text: str, size: float) -> float:
-    """Return how wide a line in bold letters is."""
-    bold = need("matplotlib.font_manager", "plot").FontProperties(weight="bold")
-    path = need("matplotlib.textpath", "plot").TextPath((0, 0), text.replace("$", "s"), size, prop=bold)
-    return float(path.get_extents().width) if text.strip() else 0.0
+    """Return how wide a line in bold letters is, in points."""
+    bold = need("matplotlib.font_manager", "plot").FontProperties(weight="bold", size=size)
+    letters = need("matplotlib.textpath", "plot").text_to_path
+    return float(letters.get_text_width_height_descent(text, bold, False)[0])
 
 
 def _height(box: Box) -> float:

@@ -73,7 +73,7 @@ def region_text(found: Region) -> str:
     lines += ["", f"  Looked at in cells of {cell}, and finer where the"]
     lines.append("  eigenvalues hint at more; an island inside one cell could be missed.")
     if found.stepped and found.criterion == "passive":
-        lines.append("  Between the edges of cells it is drawn straight: there it is right to a cell.")
+        lines.append("  Its points are on the boundary; between them it is drawn straight.")
     elif found.stepped:
         lines.append("  Along these times the boundary has steps: it is right to a cell only.")
     return "\n".join(lines)
@@ -125,7 +125,7 @@ def region_document(found: Region) -> dict[str, Any]:
 def _curve_document(curve: Curve) -> dict[str, Any]:
     return {
         "points": curve.points.tolist(),
-        "tangents": curve.tangents.tolist(),
+        "handles": curve.handles.tolist(),
         "error": curve.error,
         "mode": curve.mode,
         "frequency_hz": document(curve.frequency_hz),
@@ -209,12 +209,12 @@ def _columns(found: Region) -> list[Column]:
     x, y = (Column(one.free.label, "" if one.unit == "1" else one.unit) for one in (found.x, found.y))
     words = (Column("panel", kind="text"), Column("topology", kind="text"))
     curve = (Column("curve", kind="count"), Column("mode", kind="text"))
-    return [*words, *curve, x, y, Column("tangent x"), Column("tangent y"), Column("error")]
+    return [*words, *curve, x, y, Column("error")]
 
 
 def _rows(found: Region, panel: str = "") -> Iterator[Row]:
     """Yield a row a point of every curve, in the order of `_columns`."""
     for number, curve in enumerate(found.curves):
         mode = curve.mode
-        for point, tangent in zip(curve.points.tolist(), curve.tangents.tolist(), strict=True):
-            yield (panel, found.topology, number, mode, *point, *tangent, curve.error)
+        for point in curve.points.tolist():
+            yield (panel, found.topology, number, mode, *point, curve.error)

@@ -239,13 +239,9 @@ def drawn_points(found: Region, number: int) -> Floats:
     curve = found.curves[number]
     if not curve.smooth:
         return curve.points
-    rectangle = found.rectangle
-    knots = rectangle.points(curve.points)
-    ends = (knots[:-1], knots[1:], curve.tangents[:-1], curve.tangents[1:])
-    pieces = -(-DRAWN // (len(knots) - 1))
-    parts = [between(*ends, share / pieces) for share in range(pieces)]
-    points = np.stack(parts, axis=1).reshape(-1, 2)
-    return rectangle.values(np.concatenate([points, knots[-1:]]))
+    pieces = -(-DRAWN // (len(curve.points) - 1))
+    parts = [between(curve.points, curve.handles, share / pieces) for share in range(pieces)]
+    return np.concatenate([np.stack(parts, axis=1).reshape(-1, 2), curve.points[-1:]])
 
 
 def stable_outlines(found: Region) -> list[Floats]:

@@ -1,6 +1,6 @@
 """Boundary curves of a stable region in the unit square, to a stated accuracy.
 
-Takes: a `Deciding` and the `Survey` of its cells.
+Takes: a `Eigenvalues` and the `Survey` of its cells.
 Gives: `Arc`, `trace`; `trace_steps` for a boundary that has steps; `stable_area`, `relative_to`.
 Guarantees: every point lies on the boundary to rounding; between its points a curve is the cubic Hermite
 interpolant through points and tangents, and that has been measured against the true boundary in the middle
@@ -38,8 +38,8 @@ from apc.regions.boundary_points import (
     polish,
 )
 from apc.regions.cells import Survey
-from apc.regions.curves import area_beside, between, fill, off_an_arc, stencils, through_four
-from apc.regions.eigenpairs import Deciding, Pairs, join
+from apc.regions.curves import area_beside, handles_of, off_an_arc, straight_handles, tangents
+from apc.regions.eigenpairs import Eigenvalues, Pairs, join
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -48,10 +48,9 @@ Integers = NDArray[np.int64]
 # Halvings of the intervals between the first points of a curve. Each makes the interpolant 16 times better.
 MOST_HALVINGS = 12
 
-# The middle of an interval, put in, makes the cubic through two points 16 times better than it was measured
-# there, the polynomial through four some hundred times once it converges; little of that is counted on.
-GAIN_TWO = 8.0
-GAIN_FOUR = 10.0
+# The middle of an interval, put in, makes the cubic 16 times better than it was measured there; half of that
+# is counted on.
+GAIN = 8.0
 
 # A knot whose log|λ| is farther from 0 is at a jump: where other motions are free on either side.
 JUMP = 1e-6
@@ -65,11 +64,15 @@ ASTRAY = 0.25
 # Two ends of an interval are on one branch if the eigenvalue's slopes explain its difference to this share.
 EXPLAINED = 0.25
 
-# The share of the tolerance that interpolation may take.
-FILLED = 0.75
+# The share of the tolerance that the middle of an interval may be off: elsewhere in it the miss is up to
+# twice that, and rounding takes a share.
+FILLED = 0.375
 
 # Where on a cell's edge a step of the boundary is, in shares of the range: finer than any picture shows.
 RESOLUTION = 2.0**-24
+
+# A straight line that is off by less, in shares of the range, is not halved.
+STRAIGHT = 2.5e-4
 
 # Errors are relative to a coordinate, or to this share of its range where the coordinate is smaller.
 LEAST_COORDINATE = 1e-3
@@ -79,7 +82,7 @@ LEAST_COORDINATE = 1e-3
 class Arc:
     """A piece of the boundary along which one mode decides, stable side on the left.
 
-    `points` and unit `tangents` (k, 2) are of the unit square; `curves.between` goes from each to the next.
+    `points` (k, 2) and `handles` (k − 1, 2, 2), see `curves`, are of the unit square.
     `errors` (k − 1,) are its distances from the boundary. `knots` (m, 2) are the points that were solved for,
     `values` (m,) the eigenvalues there, `system` is the closed system they belong to, and `rounding` bounds
     how far rounding moves them. `chain` says which chain of the survey the arc is on. An arc that is not
@@ -87,7 +90,7 @@ class Arc:
     """
 
     points: Floats
-    tangents: Floats
+    handles: Floats
     errors: Floats
     knots: Floats
     values: Complexes
@@ -95,6 +98,11 @@ class Arc:
     rounding: float
     chain: int
     smooth: bool = True
+
+    @property
+    def normals(self) -> Floats:
+        """Unit normals (k, 2) at its points, towards the unstable side."""
+        return tangents(self.points, self.handles)[:, ::-1] * np.array([1.0, -1.0])
 
     @property
     def closed(self) -> bool:
@@ -134,7 +142,7 @@ class _Knots:
         return _tangents(self.pairs.gradient[knots])
 
 
-def trace(deciding: Deciding, found: Survey, *, tolerance: float, offset: Floats) -> tuple[Arc, ...]:
+def trace(deciding: Eigenvalues, found: Survey, *, tolerance: float, offset: Floats) -> tuple[Arc, ...]:
     """Follow the boundary through all crossings of a survey.
 
     Parameters
@@ -173,12 +181,10 @@ def trace(deciding: Deciding, found: Survey, *, tolerance: float, offset: Floats
         intervals = _apart(knots, intervals)
         if not len(intervals):
             break
-        intervals = _halve(
-            deciding, knots, intervals, tolerance, offset, guarded=not halving or deciding.strays
-        )
+        intervals = _halve(deciding, knots, intervals, tolerance, offset, guarded=not halving)
     for a, b in intervals.tolist():  # given up: the chord is all that is known
         knots.error[a] = max(knots.error[a], float(np.linalg.norm(knots.points[b] - knots.points[a])))
-    return _arcs(deciding, knots, found.closed, tolerance, offset)
+    return _arcs(deciding, knots, found.closed)
 
 
 def _apart(knots: _Knots, intervals: Integers) -> Integers:
@@ -200,7 +206,13 @@ def _tangents(gradient: Floats) -> Floats:
 
 
 def _halve(
-    deciding: Deciding, knots: _Knots, intervals: Integers, tolerance: float, offset: Floats, *, guarded: bool
+    deciding: Eigenvalues,
+    knots: _Knots,
+    intervals: Integers,
+    tolerance: float,
+    offset: Floats,
+    *,
+    guarded: bool,
 ) -> Integers:
     """Put a knot into every interval, or a corner; return the intervals that are not good enough yet.
 
@@ -216,7 +228,11 @@ def _halve(
     if len(a):
         chord = knots.points[b] - knots.points[a]
         length = _norm(chord)
-        expected, unseen, gain = _expected(knots, a, b)
+        tangent_a, tangent_b = knots.tangents(a), knots.tangents(b)
+        # The cubic with these tangents goes through here in its middle.
+        handles = handles_of(knots.points[a], knots.points[b], tangent_a, tangent_b)
+        expected = (knots.points[a] + knots.points[b] + 3 * handles.sum(axis=1)) / 8
+        unseen = off_an_arc(tangent_a, tangent_b, length)
         place, pairs = polish(deciding, expected, _halfway(knots, a, b, chord))
         off = _norm(place - expected)
         good = off <= ASTRAY * length
@@ -224,42 +240,14 @@ def _halve(
             good &= clear(deciding, place, pairs)
         lost = np.concatenate([lost, np.stack([a[~good], b[~good]], axis=1)])
         a, b, place, pairs = a[good], b[good], place[good], pairs.at(good)
-        off = off[good] / gain[good] + unseen[good]
+        off = (off[good] + unseen[good]) / GAIN
         middle = knots.add(place, pairs, a, (knots.key[a] + knots.key[b]) / 2)
         knots.error[a] = knots.error[middle] = off
-        fine = off <= FILLED / 2 * tolerance * relative_to(place, pairs.gradient, offset)
+        fine = off <= FILLED * tolerance * relative_to(place, pairs.gradient, offset)
         left += [np.stack([a, middle], axis=1)[~fine], np.stack([middle, b], axis=1)[~fine]]
     if len(lost):
         left.append(_search(deciding, knots, lost, tolerance, offset))
     return np.concatenate(left) if left else intervals[:0]
-
-
-def _expected(knots: _Knots, a: Integers, b: Integers) -> tuple[Floats, Floats, Floats]:
-    """Return where the middles of intervals are expected (k, 2), what their misses do not show (k,), and how
-    much better the middle makes the interpolant (k,).
-
-    By four knots of the same arc where there are as many, else by two.
-    """
-    points, tangents = knots.points, knots.tangents(np.arange(len(knots.key)))
-    plain = between(points[a], points[b], tangents[a], tangents[b], 0.5)
-    unseen = off_an_arc(tangents[a], tangents[b], _norm(points[b] - points[a]))
-    order = np.lexsort((knots.key, knots.chain))
-    pairs = np.stack([order[:-1], order[1:]], axis=1)
-    ends = knots.last[order[:-1]] | (knots.chain[order[:-1]] != knots.chain[order[1:]])
-    ends |= _norm(points[order[1:]] - points[order[:-1]]) <= COINCIDENT
-    ends |= ~_on_one_branch(knots, pairs)
-    first = stencils(np.concatenate([[0], np.cumsum(ends)]))
-    place = np.empty(len(order), dtype=np.int64)
-    place[order] = np.arange(len(order))
-    first = first[place[a]]
-    four = order[np.minimum(np.maximum(first, 0)[:, None] + np.arange(4), len(order) - 1)]
-    better, _ = through_four(points[four], tangents[four], points[a], points[b], np.array([0.5]))
-    use = (first >= 0) & np.isfinite(better[:, 0]).all(axis=1)
-    return (
-        np.where(use[:, None], better[:, 0], plain),
-        np.where(use, 0.0, unseen / GAIN_TWO),
-        np.where(use, GAIN_FOUR, GAIN_TWO),
-    )
 
 
 def _norm(vectors: Floats) -> Floats:
@@ -299,7 +287,7 @@ def _halfway(knots: _Knots, a: Integers, b: Integers, chord: Floats) -> Pairs:
     return replace(start, value=(start.value + end.value) / 2 + slopes / 8)
 
 
-def _corners(deciding: Deciding, knots: _Knots, intervals: Integers) -> tuple[Integers, Integers]:
+def _corners(deciding: Eigenvalues, knots: _Knots, intervals: Integers) -> tuple[Integers, Integers]:
     """Solve for the corner in each interval; return the intervals beside corners, and those without one."""
     a, b = intervals.T
     count = len(a)
@@ -337,7 +325,7 @@ def _corners(deciding: Deciding, knots: _Knots, intervals: Integers) -> tuple[In
 
 
 def _search(
-    deciding: Deciding, knots: _Knots, intervals: Integers, tolerance: float, offset: Floats
+    deciding: Eigenvalues, knots: _Knots, intervals: Integers, tolerance: float, offset: Floats
 ) -> Integers:
     """Put a knot into intervals nothing is known about, where a line across their middle meets the boundary.
 
@@ -364,15 +352,13 @@ def _search(
     new = knots.add(place, pairs, a, (knots.key[a] + knots.key[b]) / 2)
     straight = knots.jumps[np.stack([a, new, b])].all(axis=0)
     off = _norm(place - middle[found])
-    straight &= off <= FILLED / 2 * tolerance * relative_to(place, across[found], offset)
+    straight &= off <= FILLED * tolerance * relative_to(place, across[found], offset)
     knots.error[a[straight]] = knots.error[new[straight]] = off[straight]
     a, b, new = a[~straight], b[~straight], new[~straight]
     return np.concatenate([np.stack([a, new], axis=1), np.stack([new, b], axis=1)])
 
 
-def _arcs(
-    deciding: Deciding, knots: _Knots, closed: tuple[bool, ...], tolerance: float, offset: Floats
-) -> tuple[Arc, ...]:
+def _arcs(deciding: Eigenvalues, knots: _Knots, closed: tuple[bool, ...]) -> tuple[Arc, ...]:
     """Return each chain's knots in order, cut at its corners."""
     arcs = []
     for chain, comes_back in enumerate(closed):
@@ -384,7 +370,7 @@ def _arcs(
         for piece in itertools.chain.from_iterable(_between_jumps(knots, one) for one in pieces):
             kept = _without_copies(knots.points[piece])
             if len(kept) > 1:
-                arcs.append(_arc(deciding, knots, piece[kept], chain, tolerance, offset))
+                arcs.append(_arc(deciding, knots, piece[kept], chain))
     return tuple(arcs)
 
 
@@ -404,9 +390,7 @@ def _without_copies(points: Floats) -> Integers:
     return kept
 
 
-def _arc(
-    deciding: Deciding, knots: _Knots, piece: Integers, chain: int, tolerance: float, offset: Floats
-) -> Arc:
+def _arc(deciding: Eigenvalues, knots: _Knots, piece: Integers, chain: int) -> Arc:
     """Return some knots as an arc."""
     jumps = knots.jumps[piece]
     if jumps.any():
@@ -416,20 +400,13 @@ def _arc(
     pairs = knots.pairs.at(piece)
     system = int(pairs.system[0])
     steepness = np.linalg.norm(pairs.gradient, axis=1)
-    # Some of what is allowed is left for rounding, and for the interval's other points.
-    allowed = FILLED * tolerance * relative_to(knots.points[piece], pairs.gradient, offset)
-    points, tangents, errors = fill(
-        knots.points[piece],
-        _tangents(pairs.gradient),
-        knots.error[piece[:-1]],
-        np.minimum(allowed[:-1], allowed[1:]),
-    )
+    points, along = knots.points[piece], knots.tangents(piece)
     rounding = deciding.value_errors(pairs) / np.maximum(steepness, np.finfo(np.float64).tiny)
     return Arc(
         points=points,
-        tangents=tangents,
-        errors=errors,
-        knots=knots.points[piece],
+        handles=handles_of(points[:-1], points[1:], along[:-1], along[1:]),
+        errors=knots.error[piece[:-1]],
+        knots=points,
         values=pairs.value,
         system=system,
         rounding=float(rounding.max()),
@@ -438,50 +415,81 @@ def _arc(
 
 
 def trace_steps(
-    growth: Callable[[Floats], Floats], leading: Callable[[Floats], complex], found: Survey
+    growth: Callable[[Floats], Floats],
+    leading: Callable[[Floats], complex],
+    found: Survey,
+    *,
+    halvings: int = 0,
 ) -> tuple[Arc, ...]:
-    """Follow a boundary that has steps and no tangents: from cell edge to cell edge by straight lines.
+    """Follow a boundary that is known by verdicts alone, by straight lines.
 
     Over a link a packet is read at ticks only: the radius is a step function of the delay, and the boundary a
     staircase, which goes straight up wherever a packet comes a tick later. How it runs inside a cell is not
-    said: its error there is the size of the cell.
+    said: its error there is the length of the line.
 
     Parameters
     ----------
     growth
-        The log of the spectral radius (k,) at points (k, 2).
+        Gives the logarithm of the spectral radius (k,), or what stands for it, at points (k, 2).
     leading
-        The eigenvalue that decides at a point (2,).
+        Gives the eigenvalue that decides at a point (2,).
     found
         Where the boundary crosses the cells' edges, and in what order.
+    halvings
+        How often the middle of a line is put onto the boundary, where that has no steps; the error is then by
+        how far it was off.
     """
     if not found.crossings:
         return ()
     stable = np.array([one.stable for one in found.crossings])
     unstable = np.array([one.unstable for one in found.crossings])
-    while float(np.abs(unstable - stable).max()) > RESOLUTION:
-        middle = (stable + unstable) / 2
-        out = growth(middle) >= 0
-        unstable, stable = np.where(out[:, None], middle, unstable), np.where(out[:, None], stable, middle)
-    points = (stable + unstable) / 2
+    stable, unstable = _closed_in(growth, stable, unstable)
     arcs = []
     for number, (chain, closed) in enumerate(zip(found.chains, found.closed, strict=True)):
         members = [*chain, chain[0]] if closed else list(chain)
-        own = points[members]
+        points = (stable[members] + unstable[members]) / 2
+        errors = np.maximum(_norm(np.diff(points, axis=0)), RESOLUTION)
+        for _ in range(halvings):
+            points, errors = _halved(growth, points, errors)
         middle = members[len(members) // 2]  # its unstable side has the motion that grows
-        value = leading(unstable[middle])
-        errors = np.maximum(_norm(np.diff(own, axis=0)), RESOLUTION)
-        arcs.append(_straight(own, errors, unstable[middle], value, number))
+        arcs.append(_straight(points, errors, unstable[middle], leading(unstable[middle]), number))
     return tuple(arcs)
+
+
+def _closed_in(growth: Callable[[Floats], Floats], stable: Floats, unstable: Floats) -> tuple[Floats, Floats]:
+    """Bisect stretches from stable to unstable points (k, 2) until they are as short as `RESOLUTION`."""
+    while len(stable) and float(np.abs(unstable - stable).max()) > RESOLUTION:
+        middle = (stable + unstable) / 2
+        out = growth(middle) >= 0
+        unstable, stable = np.where(out[:, None], middle, unstable), np.where(out[:, None], stable, middle)
+    return stable, unstable
+
+
+def _halved(growth: Callable[[Floats], Floats], points: Floats, errors: Floats) -> tuple[Floats, Floats]:
+    """Put a point of the boundary beside the middle of each line that is off by more than `STRAIGHT`.
+
+    An arc of a circle is off its chord by four times what it is off two chords; half of that is counted on.
+    """
+    lines = np.flatnonzero(errors > STRAIGHT)
+    chord = np.diff(points, axis=0)[lines]
+    middle = (points[lines] + points[lines + 1]) / 2
+    across = np.stack([chord[:, 1], -chord[:, 0]], axis=1) / 2  # to the right, where it is unstable
+    stable, unstable = just_inside(middle - across), just_inside(middle + across)
+    if not len(lines):
+        return points, errors
+    crossed = (growth(stable) < 0) & (growth(unstable) >= 0)
+    ends = _closed_in(growth, stable[crossed], unstable[crossed])
+    lines, added = lines[crossed], (ends[0] + ends[1]) / 2
+    errors = errors.copy()
+    errors[lines] = np.maximum(_norm(added - middle[crossed]) / 2, RESOLUTION)
+    return np.insert(points, lines + 1, added, axis=0), np.insert(errors, lines, errors[lines])
 
 
 def _straight(points: Floats, errors: Floats, knot: Floats, value: complex, chain: int) -> Arc:
     """Return an arc of straight lines through points (k, 2), with the eigenvalue beyond one of them."""
-    chord = np.diff(points, axis=0)
-    direction = chord / np.maximum(_norm(chord), RESOLUTION)[:, None]
     return Arc(
         points=points,
-        tangents=np.concatenate([direction, direction[-1:]]),
+        handles=straight_handles(points),
         errors=errors,
         knots=knot[None],
         values=np.array([value], np.complex128),
@@ -500,7 +508,7 @@ def stable_area(arcs: Sequence[Arc], found: Survey) -> tuple[float, float]:
     area, off = 0.0, 0.0
     ends: dict[int, list[Floats]] = {}
     for arc in arcs:
-        area += area_beside(arc.points, arc.tangents) if arc.smooth else _polygon(arc.points)
+        area += area_beside(arc.points, arc.handles)
         length = np.linalg.norm(np.diff(arc.points, axis=0), axis=1)
         off += float(length @ arc.errors) + float(length.sum()) * arc.rounding
         ends.setdefault(arc.chain, []).append(arc.points)
@@ -513,8 +521,3 @@ def stable_area(arcs: Sequence[Arc], found: Survey) -> tuple[float, float]:
         area += (turn - below) if stable else 0.0
         stable, below = not stable, turn
     return min(max(area, 0.0), 1.0), off
-
-
-def _polygon(points: Floats) -> float:
-    """Return ∫ x dy along straight lines."""
-    return float(((points[:-1, 0] + points[1:, 0]) / 2) @ np.diff(points[:, 1]))

@@ -1,6 +1,6 @@
 """Newton's method onto the boundary, for many points at once.
 
-Takes: a `Deciding`, and guesses of points and eigenvalues.
+Takes: a `Eigenvalues`, and guesses of points and eigenvalues.
 Gives: `cross`, `polish`, `moved`, `clear`, `just_inside`; `SHORT`.
 Guarantees: a point is on the curve log|λ| = 0 of its eigenvalue to rounding, or NaN; one of `cross` is where
 the spectral radius is 1.
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.regions.cells import INSIDE_RIM
-from apc.regions.eigenpairs import Deciding, Pairs
+from apc.regions.eigenpairs import Eigenvalues, Pairs
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -38,7 +38,7 @@ OUTSIDE = 1e-9
 
 
 def cross(
-    deciding: Deciding, stable: Floats, unstable: Floats, growth: Floats, *, tries: int = MOST_TRIES
+    deciding: Eigenvalues, stable: Floats, unstable: Floats, growth: Floats, *, tries: int = MOST_TRIES
 ) -> tuple[Floats, Pairs]:
     """Return where the boundary lies on stretches from stable to unstable points, and who decides there.
 
@@ -135,7 +135,7 @@ def rounded_growth(points: Floats, gradient: Floats) -> Floats:
     return limit
 
 
-def clear(deciding: Deciding, points: Floats, pairs: Pairs) -> NDArray[np.bool_]:
+def clear(deciding: Eigenvalues, points: Floats, pairs: Pairs) -> NDArray[np.bool_]:
     """Say of each point of the boundary whether no other eigenvalue has left the unit circle there."""
     alone: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
     if alone.any():
@@ -150,7 +150,7 @@ def moved(pairs: Pairs, by: Floats) -> Pairs:
 
 
 def polish(
-    deciding: Deciding, points: Floats, guess: Pairs, along: Floats | None = None
+    deciding: Eigenvalues, points: Floats, guess: Pairs, along: Floats | None = None
 ) -> tuple[Floats, Pairs]:
     """Move points onto the curve log|λ| = 0 of the eigenvalues guessed; NaN where that leads nowhere.
 

@@ -1,7 +1,7 @@
 """The eigenvalues that decide, of families of matrices over a plane, with their slopes.
 
 Takes: a `Family`: the closed systems of a scene as matrices over the unit square, with their derivatives.
-Gives: `Family`, `Deciding`, `Pairs`, `join`; `Eigenvalues`; `log_magnitudes`, `largest`, `by_system`.
+Gives: `Family`, `Pairs`, `join`; `Eigenvalues`; `log_magnitudes`, `largest`, `by_system`.
 Guarantees: all points at once; what is small is computed in few calls. A complex pair is stood for by its
 eigenvalue of positive imaginary part.
 Does not: know what the two coordinates are.
@@ -47,33 +47,6 @@ class Family(Protocol):
 
     def slopes(self, system: int, points: Floats) -> tuple[Floats, Floats]:
         """Return one system's matrices (k, n, n) and their derivatives (2, k, n, n) over x and y."""
-
-
-class Deciding(Protocol):
-    """What decides at points of the unit square: complex numbers, stable inside the circle.
-
-    Of several that decide in parts of the square, each is followed as if it were alone.
-    """
-
-    @property
-    def family(self) -> Family:
-        """The matrices that it follows from."""
-
-    @property
-    def strays(self) -> bool:
-        """Whether a good guess may lead to another than it meant."""
-
-    def log_magnitudes(self, matrices: Sequence[Floats], count: int) -> Floats:
-        """Return the logarithms of the `count` largest magnitudes (k, count) of such matrices, descending."""
-
-    def leading(self, points: Floats) -> Pairs:
-        """Return the one of largest magnitude at each point (k, 2)."""
-
-    def follow(self, points: Floats, guess: Pairs) -> Pairs:
-        """Return at each point the one that a guess leads to."""
-
-    def value_errors(self, pairs: Pairs) -> Floats:
-        """Return by how much the numbers (k,) may be off."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,10 +101,9 @@ def by_system(system: Integers) -> list[tuple[int, Integers | slice]]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eigenvalues:
-    """A `Deciding` of closed systems: their eigenvalues."""
+    """The eigenvalues of closed systems over the unit square."""
 
     family: Family
-    strays: bool = False
 
     def log_magnitudes(self, matrices: Sequence[Floats], count: int) -> Floats:
         """Return the logarithms of the `count` largest magnitudes of all systems (k, count), descending."""

@@ -31,8 +31,7 @@ from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, relative_to, stable_area, trace, trace_steps
 from apc.regions.cells import survey
 from apc.regions.curves import between
-from apc.regions.eigenpairs import Deciding, Eigenvalues, Family, largest
-from apc.regions.peaks import Peaks
+from apc.regions.eigenpairs import Eigenvalues, Family, largest
 from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
 from apc.regions.strips import BRANCHES, Striped, trace_strips
 from apc.result import Look, Result
@@ -56,7 +55,6 @@ from apc.vary.growth import (
     growth_at,
     refuse_time,
 )
-from apc.vary.ports import PortEvaluator, port_evaluator
 
 if TYPE_CHECKING:
     import pandas
@@ -70,6 +68,9 @@ CELLS = 12
 # could not be followed so closely it is said, see `Region.coarse`.
 TOLERANCE = 1e-9
 
+# How often the straight lines of a boundary known by verdicts alone are halved, where it has no steps.
+HALVINGS = 3
+
 # How near to 0 or π, in radians, an eigenvalue's angle may come before its turns are counted again.
 FOLD = 0.1
 
@@ -77,22 +78,23 @@ FOLD = 0.1
 CHUNK = 1024
 
 
-Source = BatchEvaluator | PointEvaluator | GrowthEvaluator | PortEvaluator
+Source = BatchEvaluator | PointEvaluator | GrowthEvaluator
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
     """A piece of the boundary made by one mode; the stable side is on the left of the points' order.
 
-    `points` (k, 2) are in SI; `tangents` (k, 2) are directions in units of the ranges. From point to point
-    goes the cubic of `curves.between`, or a straight line if not `smooth` (where events coincide, and in the
-    steps over two times). `error` bounds the curve's distance from the true boundary, relative to the
-    coordinate in which it makes the smaller difference, `distance` the same in units of the ranges. `knots`
-    (m, 2) are the points solved for, in SI, and `eigenvalues` (m,) those that decide there.
+    `points` (k, 2) are in SI, as are `handles` (k − 1, 2, 2): from each point to the next goes the cubic
+    Bézier curve with these two control points between, a straight line if not `smooth` (where events
+    coincide, in the steps over two times, and with passive hands). `error` bounds the curve's distance from
+    the true boundary, relative to the coordinate in which it makes the smaller difference, `distance` the
+    same in units of the ranges. `knots` (m, 2) are the points solved for, in SI, and `eigenvalues` (m,) those
+    that decide there.
     """
 
     points: Floats
-    tangents: Floats
+    handles: Floats
     error: float
     distance: float
     closed: bool
@@ -259,7 +261,8 @@ def region(
     -----
     Where one axis is a delay, the rectangle is cut where events coincide (see `strips`). Where both axes are
     times, or the scene is linearized at its start, each point is analysed by itself, and the boundary is a
-    line from cell edge to cell edge, its error the size of a cell.
+    line from cell edge to cell edge, its error the size of a cell. With passive hands there are no steps: its
+    points are on the boundary, and it goes straight between.
     """
     free = tuple(axis.free for axis in axes)
     meant = criterion_of(system, criterion, PLACE, free)
@@ -296,9 +299,8 @@ def region(
                 source = replace(plain, start=start)
         elif start is not None:
             found = trace_strips(system, axes, times[0], start, cells=cells, tolerance=tolerance, told=told)
-        # Of one point at a time what hands can draw is known as the damping needed, which jumps.
-        by_point = meant == PASSIVE and isinstance(source, GrowthEvaluator)
-        stepped = (bool(times) or by_point) and found is None
+        # What hands can draw is known as the damping needed, which jumps.
+        stepped = (bool(times) or meant == PASSIVE) and found is None
         if found is None:
             found = _surveyed(source, rectangle, stepped, cells, tolerance, told)
         curves = tuple(_curve(source, rectangle, arc) for arc in found.arcs)
@@ -344,9 +346,6 @@ def _source(
     system: CompiledSystem, free: Sequence[Free], prepared: Prepared, meant: str, *, timed: bool
 ) -> Source:
     """Return what gives the matrices of a criterion; `timed`: a time or a number of peers varies."""
-    ports = port_evaluator(system, free, prepared) if meant == PASSIVE else None
-    if ports is not None:
-        return ports
     if meant in BY_GROWTH:
         return GrowthEvaluator(system, tuple(free), prepared, PLACE, meant)
     if timed:
@@ -364,9 +363,7 @@ def _surveyed(
 ) -> Striped:
     """Survey the whole rectangle and follow the boundary through it, or go by steps from cell to cell."""
     family = _family(source, rectangle, timed=stepped)
-    deciding: Deciding = Eigenvalues(family)
-    if isinstance(source, PortEvaluator):
-        deciding = Peaks(family, source.ports, source.damping)
+    deciding = Eigenvalues(family)
     looked = 0
 
     def samples(points: Floats) -> Floats:
@@ -382,6 +379,7 @@ def _surveyed(
             lambda points: samples(points)[:, 0],
             lambda point: largest(family.matrices(point[None])),
             found,
+            halvings=HALVINGS if isinstance(source, GrowthEvaluator) else 0,
         )
     else:
         arcs = trace(deciding, found, tolerance=tolerance, offset=rectangle.offset)
@@ -391,7 +389,7 @@ def _surveyed(
 
 def _family(source: Source, rectangle: Rectangle, *, timed: bool) -> Family:
     """Return the closed systems over the unit square."""
-    if isinstance(source, GrowthEvaluator | PortEvaluator):  # one point's bounds are enough, and dear
+    if isinstance(source, GrowthEvaluator):  # one point's bounds are enough, and dear
         errors = tuple(one[0] for one in source.errors(rectangle.values(np.array([[0.5, 0.5]]))))
         return DirectFamily(source, rectangle, tuple(len(one) for one in errors), errors)
     if timed:  # each point has a schedule of its own: there are no slopes, and no one size
@@ -399,7 +397,7 @@ def _family(source: Source, rectangle: Rectangle, *, timed: bool) -> Family:
     return family_over(source, rectangle, source.errors)
 
 
-def _samples(deciding: Deciding, source: Source, rectangle: Rectangle, points: Floats) -> Floats:
+def _samples(deciding: Eigenvalues, source: Source, rectangle: Rectangle, points: Floats) -> Floats:
     """Return the logarithms of the largest magnitudes, or raise what is wrong with a point."""
     matrices = deciding.family.matrices(points)
     for one in matrices:
@@ -419,7 +417,7 @@ def _curve(source: Source, rectangle: Rectangle, arc: Arc) -> Curve:
     """Return an arc in SI."""
     return Curve(
         points=rectangle.values(arc.points),
-        tangents=arc.tangents,
+        handles=rectangle.values(arc.handles),
         error=_relative_error(arc, rectangle.offset),
         distance=float(arc.errors.max(initial=0.0)) + arc.rounding,
         closed=arc.closed,
@@ -432,8 +430,7 @@ def _curve(source: Source, rectangle: Rectangle, arc: Arc) -> Curve:
 
 def _relative_error(arc: Arc, offset: Floats) -> float:
     """Return the largest distance from the boundary, relative to the coordinate it changes less."""
-    normal = np.stack([arc.tangents[:, 1], -arc.tangents[:, 0]], axis=1)
-    size = relative_to(arc.points, normal, offset)
+    size = relative_to(arc.points, arc.normals, offset)
     errors = np.maximum(np.append(arc.errors, 0.0), np.insert(arc.errors, 0, 0.0)) + arc.rounding
     return float((errors / size).max())
 
@@ -441,9 +438,6 @@ def _relative_error(arc: Arc, offset: Floats) -> float:
 def _identify(source: Source, value: Floats, eigenvalue: complex) -> tuple[str, float, float]:
     """Return the name of an eigenvalue's closed system, its turn in a frame, and the frame in s."""
     assert not isinstance(source, GrowthEvaluator), "one number has no mode"
-    if isinstance(source, PortEvaluator):
-        name, hertz, frame_s = source.motion_at(value, abs(float(np.angle(eigenvalue))))
-        return name, 2 * np.pi * hertz * frame_s, frame_s
     closed = source.closed_at(value.tolist())
     found, frame_s = mode_near(closed, eigenvalue), closed[0].frame_s
     return found.shape, 2 * np.pi * found.frequency_hz * frame_s, frame_s
@@ -461,10 +455,8 @@ def side_of_curves(found: Region, points: Floats) -> tuple[NDArray[np.bool_], ND
     for curve in found.curves:
         knots = rectangle.points(curve.points)
         a, b = knots[:-1], knots[1:]
-        sagitta = np.zeros(len(a))
-        if curve.smooth:
-            middle = between(a, b, curve.tangents[:-1], curve.tangents[1:], 0.5)
-            sagitta = 1.5 * np.linalg.norm(middle - (a + b) / 2, axis=1)
+        middle = between(knots, rectangle.points(curve.handles), 0.5)
+        sagitta = 1.5 * np.linalg.norm(middle - (a + b) / 2, axis=1)
         reach = sagitta + curve.distance
         ends = [knots[0], knots[-1]] if not curve.closed else []
         for start in range(0, len(points), CHUNK):

@@ -25,9 +25,9 @@ from apc.eigen.relative import relative_bounded
 from apc.eigen.spectrum import mode_near
 from apc.frame.names import Range, parameter_of
 from apc.regions.axes import PLACE
-from apc.regions.boundary import Arc, relative_to, stable_area, trace
+from apc.regions.boundary import Arc, stable_area, trace
 from apc.regions.cells import HALVINGS, survey
-from apc.regions.curves import between, refined
+from apc.regions.curves import straight_handles, tangents
 from apc.regions.eigenpairs import Eigenvalues, largest, log_magnitudes
 from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
 from apc.vary.batch import batch_evaluator
@@ -45,15 +45,6 @@ BRANCHES = 6
 # Ends of curves on either side of a strip's edge that are nearer than this many tolerances are one point:
 # each is off by a tolerance at most, and the coordinate it is relative to differs by little.
 SAME = 8.0
-
-# The share of the tolerance that drawing a strip's curves in units of the whole range may take.
-RESTATED = 0.25
-
-# The share that a strip's own curves may take: distances count for more where they are relative to the whole.
-WITHIN = 0.4
-
-# Pieces an interval is cut into for it at most; each doubling makes it 16 times better.
-MOST_PIECES = 64
 
 # How far inside a strip, relative to its width, a point is looked at that stands for its edge.
 INSIDE = 1e-6
@@ -213,11 +204,9 @@ def _standing(piece: Piece, other: Range, ends: Sequence[float], prepared: Prepa
 
 def _straight(points: Floats, knot: Floats, value: complex, error: float) -> Arc:
     """Return a straight piece of the boundary (2, 2); at its knot (1, 2) `value` is the eigenvalue."""
-    chord = points[1] - points[0]
-    tangent = chord / np.linalg.norm(chord)
     return Arc(
         points=points,
-        tangents=np.array([tangent, tangent]),
+        handles=straight_handles(points),
         errors=np.array([error]),
         knots=knot,
         values=np.array([value], np.complex128),
@@ -245,14 +234,10 @@ def _moving(
     if family is None:
         return None
     found = survey(lambda points: log_magnitudes(family.matrices(points), BRANCHES), cells=cells)
-    arcs = trace(Eigenvalues(family), found, tolerance=tolerance * WITHIN, offset=rectangle.offset)
+    arcs = trace(Eigenvalues(family), found, tolerance=tolerance, offset=rectangle.offset)
     area, off = stable_area(arcs, found)
-    offset = rectangle_of(delay, other).offset
-    restated = [_restated(arc, ends, tolerance, offset) for arc in arcs]
-    if any(arc is None for arc in restated):
-        return None
-    kept = tuple(arc for arc in restated if arc is not None)
-    return _Strip(ends[0], ends[1], kept, (found.corners[0], found.corners[1]), area, off)
+    placed = tuple(_placed(arc, ends) for arc in arcs)
+    return _Strip(ends[0], ends[1], placed, (found.corners[0], found.corners[1]), area, off)
 
 
 def _within(source: PointEvaluator, piece: Piece, rectangle: Rectangle) -> DirectFamily | None:
@@ -274,36 +259,26 @@ def _within(source: PointEvaluator, piece: Piece, rectangle: Rectangle) -> Direc
     return family_over(family, rectangle, errors)
 
 
-def _restated(arc: Arc, ends: Sequence[float], tolerance: float, offset: Floats) -> Arc | None:
-    """Return an arc of a strip's unit square as one of the whole's, whose cubics go another way between."""
+def _placed(arc: Arc, ends: Sequence[float]) -> Arc:
+    """Return an arc of a strip's unit square in that of the whole."""
     scale = np.array([ends[1] - ends[0], 1.0])
 
     def moved(points: Floats) -> Floats:
-        found: Floats = points * scale + np.array([ends[0], 0.0])
-        found[points[:, 0] == 0.0, 0], found[points[:, 0] == 1.0, 0] = ends[0], ends[1]
-        return found
+        """Return points of the strip's square; its edges become exactly the strip's ends."""
+        placed: Floats = points * scale + np.array([ends[0], 0.0])
+        placed[points[..., 0] == 0.0, 0], placed[points[..., 0] == 1.0, 0] = ends[0], ends[1]
+        return placed
 
-    pieces = 1
-    while pieces <= MOST_PIECES:
-        points, tangents = refined(arc.points, arc.tangents, pieces)
-        own = moved(points)
-        turned = tangents * scale
-        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-        apart = np.zeros(len(own) - 1)
-        for share in (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875):
-            here = between(own[:-1], own[1:], turned[:-1], turned[1:], share)
-            # Refined once more, the strip's own curve has its points there.
-            along, way = refined(arc.points, arc.tangents, 8 * pieces)
-            there = moved(along)[round(8 * share) :: 8][: len(apart)]
-            normal = (way * scale)[round(8 * share) :: 8][: len(apart), ::-1] * [-1.0, 1.0]
-            normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-            apart = np.maximum(apart, np.abs(((here - there) * normal).sum(axis=1)))
-        normals = np.stack([turned[:-1, 1], -turned[:-1, 0]], axis=1)
-        if (apart <= RESTATED * tolerance * relative_to(own[:-1], normals, offset)).all():
-            errors = np.repeat(arc.errors, pieces) + apart
-            return replace(arc, points=own, tangents=turned, errors=errors, knots=moved(arc.knots))
-        pieces *= 2
-    return None
+    # A line e apart from another with the direction t is e det S/|S t| apart from it in the scaled square.
+    shrunk = scale[0] / np.linalg.norm(tangents(arc.points, arc.handles) * scale, axis=1)
+    return replace(
+        arc,
+        points=moved(arc.points),
+        handles=moved(arc.handles),
+        errors=arc.errors * np.maximum(shrunk[:-1], shrunk[1:]),
+        knots=moved(arc.knots),
+        rounding=arc.rounding * float(shrunk.max()),
+    )
 
 
 def _join(
@@ -408,7 +383,7 @@ def _after(one: Arc, other: Arc) -> Arc:
     return replace(
         one,
         points=np.concatenate([one.points, other.points[1:]]),
-        tangents=np.concatenate([one.tangents[:-1], other.tangents]),
+        handles=np.concatenate([one.handles, other.handles]),
         errors=np.concatenate([one.errors, other.errors]),
         knots=np.concatenate([one.knots, other.knots]),
         values=np.concatenate([one.values, other.values]),
@@ -420,7 +395,7 @@ def _swapped(arc: Arc) -> Arc:
     return replace(
         arc,
         points=arc.points[::-1, ::-1].copy(),
-        tangents=-arc.tangents[::-1, ::-1],
+        handles=arc.handles[::-1, ::-1, ::-1].copy(),
         errors=arc.errors[::-1].copy(),
         knots=arc.knots[::-1, ::-1].copy(),
         values=arc.values[::-1].copy(),

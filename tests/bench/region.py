@@ -15,7 +15,7 @@ import numpy as np
 from apc.benchmark.timing import take_turns, timed
 from apc.regions.axes import parse_axes
 from apc.regions.boundary import relative_to
-from apc.regions.curves import between
+from apc.regions.curves import between, tangents
 from apc.regions.region import Region, region
 from tests.bench.by_hand import modal_radii, stable_grid
 from tests.bench.judge import Judge, Timed, judged, parser_of
@@ -33,9 +33,10 @@ def true_error(found: Region, every: int) -> float:
     low, width = found.rectangle.low, found.rectangle.width
     for curve in found.curves:
         knots = (curve.points - low) / width
-        normal = np.stack([curve.tangents[:-1, 1], -curve.tangents[:-1, 0]], axis=1)
+        handles = (curve.handles - low) / width
+        normal = tangents(knots, handles)[:-1, ::-1] * [1, -1]
         for share in (0.0, 0.25, 0.5, 0.75):
-            places = between(knots[:-1], knots[1:], curve.tangents[:-1], curve.tangents[1:], share)[1::every]
+            places = between(knots, handles, share)[1::every]
             values = found.rectangle.values(places)
             away = values[:, 1] - [limit(float(x), float(y)) for x, y in values]
             away = np.abs(away) / width[1] * np.abs(normal[1::every, 1])

@@ -57,14 +57,14 @@ def test_not_a_bit_of_its_forces_is_different(name: str, tmp_path: Path) -> None
     assert worst(differences(compiled(EXACT[name]), tmp_path, duration="0.2 s")) == 0.0
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ROUNDED)
 def test_its_forces_are_those_of_simulate_to_the_last_bits(name: str, tmp_path: Path) -> None:
     """A rounding of a sum over the others is all that differs, and what loops make of it in 0.4 s."""
     assert worst(differences(compiled(ROUNDED[name]), tmp_path, duration="0.2 s")) < 2e-13
 
 
-@pytest.mark.few(1)
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "scene",
     ["planar-users", "two-users-waves", "two-users-passivity", "client-server"],
@@ -90,11 +90,13 @@ TIED = replaced(
 )  # fmt: skip
 
 
+@pytest.mark.whole
 def test_what_is_not_linear_moves_by_the_same_steps(tmp_path: Path) -> None:
     off = differences(compiled(BENT), tmp_path, duration="0.1 s", method="rk4:0.25ms", device="device")
     assert worst(off) < 2e-13
 
 
+@pytest.mark.whole
 def test_nothing_in_it_changes_but_what_is_given(tmp_path: Path) -> None:
     """No data of its own that could be written, and nothing called but what computes."""
     plan = plan_of(compiled(PAPER), DEFAULT)

@@ -72,7 +72,7 @@ def gap(system: apc.CompiledSystem, path: Path, unit: Unit, method: str = "", se
     return float(np.abs(rows - course.values).max() / max(1.0, np.abs(course.values).max()))
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_is_played_as_simulate_plays_it(name: str, fmpy: Any, tmp_path: Path) -> None:
     path, unit = written(SCENES[name], tmp_path)
@@ -80,6 +80,7 @@ def test_a_scene_is_played_as_simulate_plays_it(name: str, fmpy: Any, tmp_path: 
     assert gap(compiled(SCENES[name]), path, unit) < 1e-9
 
 
+@pytest.mark.whole
 def test_recorded_delays_are_played_one_after_another(fmpy: Any, tmp_path: Path) -> None:
     (tmp_path / "delays.csv").write_text("delay [ms]\n8\n9.5\n\n21\n7\n8\n30\n", encoding="utf-8")
     text = replaced(MOVED, ("delay: 8 ms}", "trace: delays.csv}"))
@@ -89,6 +90,7 @@ def test_recorded_delays_are_played_one_after_another(fmpy: Any, tmp_path: Path)
     assert gap(system, path, unit) < 1e-9
 
 
+@pytest.mark.whole
 def test_what_is_not_linear_is_played_by_the_steps_asked_for(fmpy: Any, tmp_path: Path) -> None:
     path, unit = written(BENT, tmp_path, method="rk4:0.5ms")
     assert not fmpy.validate_fmu(path)
@@ -136,7 +138,7 @@ class Instance:
         self.unit.freeInstance()
 
 
-@pytest.mark.few(1)
+@pytest.mark.whole
 @pytest.mark.parametrize(("text", "late"), [(PAPER, 8), (AT_ONCE, 0), (MOVED, 8)])
 def test_peers_joined_by_a_network_of_ones_own_are_the_scene(
     text: str, late: int, fmpy: Any, tmp_path: Path
@@ -174,6 +176,7 @@ def test_peers_joined_by_a_network_of_ones_own_are_the_scene(
     assert off < 1e-9
 
 
+@pytest.mark.whole
 def test_a_step_may_be_of_any_length_and_a_state_can_be_had_back(fmpy: Any, tmp_path: Path) -> None:
     path, _ = written(PAPER, tmp_path)
     course = apc.simulate(compiled(PAPER), duration="0.2 s", jit=False)
@@ -230,6 +233,7 @@ def test_its_sources_compile_strictly(tmp_path: Path) -> None:
     subprocess.run(command, cwd=tmp_path, check=True)
 
 
+@pytest.mark.whole
 def test_another_program_is_not_given_another_scene(fmpy: Any, tmp_path: Path) -> None:
     """A library whose description was exchanged refuses to begin."""
     path, _ = written(PAPER, tmp_path)

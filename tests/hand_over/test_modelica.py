@@ -80,15 +80,15 @@ def worst(system: apc.CompiledSystem, seconds: float, method: str | None = None)
     return max(apart)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @needs_rumoca
 @pytest.mark.parametrize("times", TIMES)
 def test_rumoca_plays_the_papers_scene_at_any_times_as_simulate_does(times: str) -> None:
     assert worst(compiled(replaced(APART, *TIMES[times])), 0.06) < 1e-9
 
 
+@pytest.mark.few(1)
 # Other groups, couplers that remember, a server, a graph, a plane, forces that change with time.
-@pytest.mark.few(3)
 @needs_rumoca
 @pytest.mark.parametrize(
     ("name", "settings"),

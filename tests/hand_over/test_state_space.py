@@ -87,6 +87,7 @@ def grows(found: StateSpace, gain: float) -> bool:
     return bool(magnitudes(closed)[1] > 1)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("cut", ["contact", "coordination"])
 def test_the_gain_margin_of_a_coupler_cut_open_is_that_of_its_stiffness(cut: str) -> None:
     """Its force is its stiffness times a length: all else is as it was."""
@@ -171,6 +172,7 @@ def opened(path: Path) -> dict[str, Any]:
         return dict(archive)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("suffix", [".py", ".mat", ".npz"])
 def test_every_file_holds_the_same(
     suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -253,7 +255,7 @@ FREE = {
 }
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("cut", ["", "link", "coupler"])
 @pytest.mark.parametrize("name", FREE)
 def test_with_a_number_free_it_is_at_each_value_what_it_is_with_that_set(name: str, cut: str) -> None:

@@ -21,6 +21,7 @@ def experiment(name: str, *pairs: tuple[str, str]) -> CompiledSystem:
     return compiled(replaced(TEXT[name], *pairs))
 
 
+@pytest.mark.whole
 def test_the_buzz_of_the_experiment_is_predicted_and_played() -> None:
     """An independent program: predicted 47.10 Hz, 2.437 mm, 80.5 %; played 46.95 Hz, 2.545 mm, 79.3 %."""
     found = apc.buzz(experiment("average", AT_ONCE))
@@ -82,6 +83,7 @@ hands: {hand: {type: ConstantForce, flange: device, force: 3 N}}
 """
 
 
+@pytest.mark.whole
 def test_a_wall_buzzes_under_the_hand_that_presses_it_and_a_hand_that_pulls_lets_go() -> None:
     found = apc.buzz(compiled(WALL))
     assert found.predicted is not None and found.predicted.attracts

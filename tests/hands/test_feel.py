@@ -163,9 +163,9 @@ def test_a_network_feels_viscous_by_as_much_as_dampers_lack(text: str, heard: in
     assert network == pytest.approx(formula, rel=0.02)
 
 
+@pytest.mark.whole
 # Of hands and of sensors, at the first of either group: error and velocity, by an independent program, which
 # adds up the answers to each tick's noise.
-@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("at", "known"),
     [
@@ -249,6 +249,7 @@ def test_in_a_plane_a_hand_feels_along_each_axis_what_it_feels_on_a_line() -> No
             np.testing.assert_allclose(getattr(found, name), getattr(line, name), rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.whole
 def test_the_command_line_says_what_python_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

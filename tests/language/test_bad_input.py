@@ -292,6 +292,7 @@ def test_a_setting_that_cannot_be_is_one_message(setting: str, expected: str, me
 NOTHING = "Write: apc new  (it writes a topology.yaml to start from)"
 
 
+@pytest.mark.whole
 def test_the_only_scene_of_a_folder_is_the_one_that_is_meant(
     message: Say, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -323,6 +324,7 @@ def test_no_traceback_reaches_a_terminal() -> None:
     assert [path.name for path in Path().iterdir()] == ["scene.yaml"]
 
 
+@pytest.mark.whole
 @settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.one_of(st.binary(max_size=60), st.text("ab:-[]{}#&*!|>'\"%@`,? \n\t<1", max_size=40).map(str.encode))
@@ -333,6 +335,7 @@ def test_any_bytes_are_read_or_refused_and_nothing_else(data: bytes) -> None:
         apc.compile(FILE)
 
 
+@pytest.mark.whole
 @settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.one_of(

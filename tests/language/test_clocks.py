@@ -176,7 +176,7 @@ def same(folder: Path, place: str, expression: str, name: str, **variables: str)
     return found[0] == pytest.approx(found[1], rel=1e-9)
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("number", "place"), list(enumerate(CLOCKED_PLACES)))
 def test_an_expression_of_a_clock_means_what_a_variable_means(
     number: int, place: str, tmp_path: Path
@@ -186,7 +186,7 @@ def test_an_expression_of_a_clock_means_what_a_variable_means(
         assert same(tmp_path, place, expression, "before", clocked=expression, start=start), expression
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("place", MOVING_PLACES)
 def test_a_continuous_expression_means_what_a_variable_means(place: str, tmp_path: Path) -> None:
     for expression in MOVING if place != "K*(@)" else MOVING[3:4]:

@@ -6,6 +6,8 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
+
 from tests.topologies import ROOT
 
 CATALOGUE = Path(__file__).with_name("codes.txt").read_text(encoding="utf-8")
@@ -18,6 +20,7 @@ def test_a_code_has_one_meaning_and_a_meaning_one_code() -> None:
     assert len(set(codes)) == len(set(meanings)) == len(codes)
 
 
+@pytest.mark.whole
 def test_codes_that_are_told_are_those_of_the_catalogue_and_docstrings_name_no_others() -> None:
     pages = [path.read_text(encoding="utf-8") for path in FILES]
     nodes = [node for page in pages for node in ast.walk(ast.parse(page)) if isinstance(node, ast.Constant)]

@@ -64,7 +64,7 @@ def test_a_heading_without_end_is_told_in_a_few_words(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.few(1)
+@pytest.mark.whole
 @pytest.mark.parametrize("asked", ["10 s", "1285.71 ms", "1001 ms"])
 def test_the_delay_that_is_proposed_for_a_force_is_taken(asked: str, tmp_path: Path) -> None:
     def late(delay: str) -> list[str]:
@@ -98,6 +98,7 @@ MUCH: list[tuple[tuple[tuple[str, str], ...], str]] = [
 ]  # fmt: skip
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("pairs", "expected"), MUCH, ids=[expected for _, expected in MUCH])
 def test_what_is_too_much_is_told_at_once(pairs: tuple[tuple[str, str], ...], expected: str) -> None:
     assert expected in wrong(*pairs)
@@ -107,6 +108,7 @@ def test_peers_on_a_complete_graph_have_no_limit() -> None:
     assert apc.analyze(compiled(replaced(AVERAGE, MANY))).stable
 
 
+@pytest.mark.whole
 def test_delays_are_searched_and_varied_only_so_far() -> None:
     assert told(lambda: apc.critical(compiled(AVERAGE), "lan.delay", upper="1e6 s")) == [
         "critical value: E846 from 0 to 1e+06 (SI) events coincide at more than 10,000 values of lan.delay, "
@@ -118,6 +120,7 @@ def test_delays_are_searched_and_varied_only_so_far() -> None:
         assert "hundreds of matrices, here of 506 states; 300 are the most" in message
 
 
+@pytest.mark.whole
 def test_what_takes_too_long_is_judged_and_not_varied(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -169,6 +172,7 @@ def test_an_array_of_composites_or_inside_one_has_a_limit(tmp_path: Path) -> Non
     assert "E208 the count of a wants a whole number from 1 to 500, got 501." in lines[0]
 
 
+@pytest.mark.whole
 def test_a_chain_of_masses_is_sorted_in_seconds_and_a_rigid_one_is_one_mass() -> None:
     """Springs between 160 masses; 60 masses joined rigidly by gears, which move as one."""
 

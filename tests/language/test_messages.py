@@ -105,7 +105,7 @@ def test_a_mistake_is_told_once_at_its_place(section: str, row: str, check: Any)
     assert told == _told(row)
 
 
-@pytest.mark.few(60)
+@pytest.mark.few(30)
 @_named([(section, row) for section, row in ROWS if "Write: " in row])
 def test_what_a_message_says_to_write_is_accepted(section: str, row: str, check: Any) -> None:
     text = next(iter(MODELS[section].values()))

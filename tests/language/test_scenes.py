@@ -290,6 +290,7 @@ def test_what_is_seldom_meant_is_told_at_its_place(pairs: Any, expected: list[st
     assert changed(*pairs).warnings == tuple(f"scene.yaml:{one}" for one in expected)
 
 
+@pytest.mark.whole
 def test_every_command_that_judges_says_a_warning_and_a_model_keeps_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

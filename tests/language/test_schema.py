@@ -95,6 +95,7 @@ def test_it_is_a_schema_of_draft_2020_12_with_every_section_and_component() -> N
     assert {"AveragePosition", "Link", "Falcon"} < set(schema["$defs"])
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_scene_fits_and_names_it_in_its_first_line(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
@@ -149,6 +150,7 @@ def test_any_unit_of_the_right_kind_may_be_written() -> None:
         assert faults(replaced(AVERAGE, ("500 N/m,", f"{stiffness},"))) == [], stiffness
 
 
+@pytest.mark.whole
 def test_the_command_prints_it_and_writes_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["schema"]) == 0
     assert json.loads(capsys.readouterr().out) == apc.schema()

@@ -39,6 +39,7 @@ def test_every_component_has_one_line(call: Call) -> None:
     assert sorted(one["name"] for room in rooms.values() for one in room) == NAMES
 
 
+@pytest.mark.few(20)
 @pytest.mark.parametrize("path", LIBRARY, ids=lambda path: path.stem)
 def test_every_component_is_shown_with_its_parameters_and_equations(path: Path, call: Call) -> None:
     name = "".join(word.capitalize() for word in path.stem.split("-"))
@@ -75,6 +76,7 @@ def test_a_misspelt_component_or_scene_is_told_with_the_nearest(call: Call) -> N
     )
 
 
+@pytest.mark.whole
 def test_every_scene_of_the_library_is_listed_and_copied_so_that_it_is_sound(call: Call) -> None:
     listed = [line.split()[0] for line in call("new", "--list")[1].splitlines() if line.startswith("  ")]
     assert listed == sorted(path.stem for path in SCENES.glob("*.yaml"))

@@ -50,7 +50,7 @@ def _motion(system: apc.CompiledSystem) -> tuple[float, list[list[float]]]:
     return apc.analyze(system).spectral_radius, run.values.tolist()
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", PERIODS)
 def test_a_period_that_is_set_reaches_what_computes_with_it(name: str) -> None:
     """Set without compiling again it is as written in the file: motion and spectral radius."""

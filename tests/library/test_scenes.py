@@ -36,6 +36,7 @@ def path_of(name: str) -> Path:
     return SCENES / f"{name}.yaml"
 
 
+@pytest.mark.few(15)
 @pytest.mark.parametrize("name", NAMES)
 def test_every_scene_compiles_needs_all_it_names_and_has_its_verdict(name: str) -> None:
     system = apc.compile(path_of(name))

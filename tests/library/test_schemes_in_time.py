@@ -100,6 +100,7 @@ def contact(x: Sequence[tuple[Any, Any]]) -> Any:
     return 1000 * (x[0][0] - x[1][0])
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("delay", "largest"), [(0, 30.0), (50, 30.0), (50, 3.0), (200, 30.0)])
 def test_passivity_controlled_average_is_its_law(delay: int, largest: float) -> None:
     def law(_: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
@@ -131,7 +132,7 @@ def test_passivity_controlled_average_is_its_law(delay: int, largest: float) -> 
 # ---- set positions ----
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("delay", [0, 50, 200])
 @pytest.mark.parametrize("energy", [1e-5, 10.0])
 def test_set_position_modulation_gives_no_energy(delay: int, energy: float) -> None:
@@ -243,6 +244,7 @@ def test_a_god_object_sticks_within_its_cone_and_slides_beyond(sideways: float) 
 LIMITED = replaced(scene("limited-motor"), ("type: RampForce", "type: ConstantForce"), (", rise: 1 s", ""))
 
 
+@pytest.mark.whole
 def test_limited_motor_holds_up_to_its_limit_and_gives_way_beyond() -> None:
     """3 N rest 3/500 m deep; of 5 N the motor takes 3.3 N, and the damper the rest: (5 − 3.3)/b."""
     held = run_of(replaced(LIMITED, ("force: 5 N", "force: 3 N")), "2 s")

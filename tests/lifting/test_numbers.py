@@ -157,6 +157,7 @@ def test_what_depends_on_a_column_is_worked_out_peer_by_peer(tmp_path: Path) -> 
     assert _column(less, "o.inner.stiffness") == pytest.approx([3.0, 9.0, 3.5], rel=1e-15)
 
 
+@pytest.mark.whole
 def test_what_is_set_for_all_groups_says_what_each_of_them_has(capsys: pytest.CaptureFixture[str]) -> None:
     """The star's teacher holds on with 400 N/m of its own, its students with the part's 100 N/m."""
     told = (
@@ -168,6 +169,7 @@ def test_what_is_set_for_all_groups_says_what_each_of_them_has(capsys: pytest.Ca
     assert capsys.readouterr().err == f"note: {told}\n"
 
 
+@pytest.mark.whole
 def test_what_the_compiler_counts_or_adds_is_nobody_s_to_set() -> None:
     """A hold without delay, one by an expression, and how many are heard have names that mean nothing."""
     own = compiled(replaced(AVERAGE, ("link: lan}", "link: lan, delays: own}")))

@@ -75,6 +75,7 @@ def check(values: dict[str, Any]) -> Analysis:
 QUEUE = {"operator": "mean", "kt": 0.05, "kc": 1.0, "bc": 2.0, "network": MS, "comp": Fraction(0)}
 
 
+@pytest.mark.whole
 @settings(max_examples=4, derandomize=True)
 @given(scenes())
 @example({**QUEUE, "comm": 11 * MS})

@@ -101,6 +101,7 @@ SCENES: dict[str, tuple[Scene, str, float]] = {
 }
 
 
+@pytest.mark.few(10)
 @pytest.mark.parametrize("name", SCENES)
 def test_the_modes_are_the_whole_spectrum_of_all_peers(name: str) -> None:
     scene, method, off = SCENES[name]
@@ -152,6 +153,7 @@ RINGS: list[dict[str, Any]] = [
 ]
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("values", RINGS, ids=str)
 @pytest.mark.parametrize(("peers", "graph"), [(301, "ring"), (1_000_000, "complete")])
 def test_very_many_alike_have_the_radius_of_all_their_modes(

@@ -41,6 +41,7 @@ ALL = apart(
 )
 
 
+@pytest.mark.whole
 # Machine code plays 13 side by side: more than are added up at once, and no multiple of it.
 @pytest.mark.parametrize(
     ("text", "part", "jit"),
@@ -83,6 +84,7 @@ def moved(stiffness: float) -> str:
     return replaced(apart(AVERAGE, "loss: 20 %"), ("stiffness: 500 N/m", f"stiffness: {stiffness} N/m"))
 
 
+@pytest.mark.whole
 def test_runs_agree_with_the_judgedin_mean_square_and_take_the_time_of_its_growth() -> None:
     stable, unstable = runs(moved(1000)), runs(moved(1300))
     for found, verdict in ((stable, "stable in mean square"), (unstable, "unstable in mean square")):
@@ -98,6 +100,7 @@ def test_runs_agree_with_the_judgedin_mean_square_and_take_the_time_of_its_growt
     assert judged.mean_square_radius ** (told.settles_in / 0.008 / 2) == pytest.approx(0.05, rel=1e-9)
 
 
+@pytest.mark.whole
 def test_runs_that_are_about_something_else_than_a_verdict_say_so() -> None:
     short = runs(moved(1200), 2, "0.3")
     assert short.agrees is False and "and the runs show how it begins" in said(short)

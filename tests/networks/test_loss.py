@@ -180,7 +180,7 @@ def test_loss_is_a_parameter_like_others() -> None:
     np.testing.assert_allclose(swept.column("mean_square_radius"), expected, rtol=1e-9)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("peers", "nominal"), [(2, 0.9028182673009955), (3, 0.9161770691168368), (5, 0.9198995414489803)]
 )
@@ -190,7 +190,7 @@ def test_next_to_no_loss_gives_the_square_of_the_nominal_radius(peers: int, nomi
     assert apc.judge_network(system_of(scene(peers, 500.0, loss="0 %"))) is None
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("loss", "stiffness", "proved"),
     [

@@ -65,7 +65,7 @@ def test_who_shakes_or_drifts_anyhow_is_told_so() -> None:
     assert found.note.startswith("the scene is not proved to settle with no packet lost; no pattern tried")
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("peers", "stiffness", "damping", "coupler", "operator", "known"),
     [
@@ -140,7 +140,7 @@ def test_what_is_not_served_is_left_open_and_named(text: str, why: str) -> None:
     assert found.note.startswith("losses in a row are left open: ") and why in found.note
 
 
-@pytest.mark.few(1)
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("delay", "clock"),
     [("8 ms", "8 ms"), ("6.5 ms", "8 ms"), ("27.3 ms", "8 ms"), ("8 ms", "{period: 8 ms, phase: 2.5 ms}")],

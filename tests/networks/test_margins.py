@@ -20,6 +20,7 @@ def grown(system: CompiledSystem) -> Margins:
     return network_margins(system, prepare(system), Margins((), ""))
 
 
+@pytest.mark.whole
 def test_over_another_network_a_margin_is_another() -> None:
     """Of three users, brute force over all patterns: 1384 N/m at a loss of 40 %, to 0.5 N/m."""
     system = system_of(scene(3, 500.0, loss="40 %"))
@@ -47,6 +48,7 @@ def test_derivatives_are_those_of_moments_followed_event_by_event() -> None:
         assert row.error < 1e-3 * abs(row.derivative)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("loss", ["{p: 1.1 %, r: 10 %}", "100 %"])
 def test_where_one_value_takes_long_or_is_not_judged_margins_say_so(loss: str) -> None:
     system = system_of(scene(3, 500.0, loss=loss))
@@ -56,9 +58,9 @@ def test_where_one_value_takes_long_or_is_not_judged_margins_say_so(loss: str) -
     assert why.startswith("what moves it most: not looked for")
 
 
+@pytest.mark.few(1)
 # Largest stiffness of three users by the share lost (brute force over all patterns, to 0.5 N/m): none
 # 1096.4, 5 % 1118, 10 % 1143.2, 40 % 1384.
-@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("stiffness", "more", "box", "stable"),
     [

@@ -140,7 +140,7 @@ def listener(
     return Listener(source, newest=newest, phase=0, period=8, delay=8, quantum=quantum)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("newest", [True, False])
 @pytest.mark.parametrize(
     "law",
@@ -172,6 +172,7 @@ def test_ticks_see_what_looking_at_every_packet_finds_however_time_is_cut(
 # ---- who hears whom ----
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("changes", "why"),
     [

@@ -50,7 +50,7 @@ GROUPS = replaced(
 )
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("more", ["loss: 0 %", "jitter: 0 ms, reorder: all", "loss: 0 %, on_loss: zero"])
 @pytest.mark.parametrize(
     "name",
@@ -104,6 +104,7 @@ def test_a_link_that_loses_everything_leaves_every_copy_where_it_is_or_holds_the
     np.testing.assert_allclose(rows_of(hold)[-1, columns], means, atol=1e-6)
 
 
+@pytest.mark.whole
 def test_the_same_seed_gives_the_same_rows_however_long_the_chunks_are() -> None:
     system = compiled(apart(AVERAGE, "loss: 20 %, jitter: 9 ms, distribution: pareto, reorder: all"))
     long, short = (prepare(system, Settings(Fraction(time), jit=False, seed=1)) for time in ("3", "1/10"))

@@ -70,6 +70,7 @@ def laws(draw: st.DrawFn) -> Law:
 QUIET = [*HealthCheck]
 
 
+@pytest.mark.whole
 @settings(max_examples=2, derandomize=True, suppress_health_check=QUIET)
 @given(scenes(), laws())
 @example(Scene(peers=2, kt=900.0, cube=0.3, comm=Fraction(12, 1000)), Law(0.03, 0.3, 0.9, 0.02, zero=True))

@@ -240,6 +240,7 @@ def test_the_command(
         assert "secret" not in told_wrong
 
 
+@pytest.mark.whole
 def test_a_packed_file_is_unpacked_within_bounds(tmp_path: Path) -> None:
     with gzip.open(tmp_path / "bomb.csv.gz", "wb") as packed:
         packed.write(b"delay [ms]\n" + b"8\n" * (1 << 25))

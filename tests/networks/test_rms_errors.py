@@ -47,7 +47,7 @@ def test_with_next_to_no_loss_the_error_is_that_of_an_ideal_network(
 PATH = dict.fromkeys([(0, 1), (1, 0), (1, 2), (2, 1)], 1.0)
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("text", "more", "law"),
     [
@@ -90,6 +90,7 @@ def test_of_many_users_bursts_tell_an_estimate_that_is_called_one() -> None:
     assert any("an estimate: moments of at most 3 channels' states together" in note for note in found.notes)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("more", ["", ", on_loss: zero"])
 def test_a_million_users_cost_what_three_do(more: str) -> None:
     """Each then follows a mean that the others hardly move: the error is that of a user held by a spring."""
@@ -101,6 +102,7 @@ def test_a_million_users_cost_what_three_do(more: str) -> None:
     assert near != far
 
 
+@pytest.mark.whole
 def test_a_force_moves_all_that_is_rigidly_connected_with_a_device() -> None:
     geared = replaced(
         scene(3, 500.0),

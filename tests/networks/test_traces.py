@@ -45,6 +45,7 @@ def test_recorded_losses_are_frames_multiplied_by_hand(tmp_path: Path, heard: tu
     assert abs(found.mean_square_radius - truth**2) <= 1e-9 + found.error
 
 
+@pytest.mark.whole
 def test_many_recorded_delays_are_told_with_how_they_were_found_and_too_many_are_not(tmp_path: Path) -> None:
     """Over 1000 frames bounds on roundings say nothing; one lost packet moves it by less than 0.1 %."""
     found = judged(tmp_path, "8\n" * 999 + "lost\n")

@@ -44,6 +44,7 @@ def refused(data: bytes, most: int = 1 << 20) -> str:
     return str(caught.value)
 
 
+@pytest.mark.whole
 @given(
     arrays.arrays(np.float64, st.tuples(st.integers(0, 40))),
     arrays.arrays(np.int64, st.tuples(st.integers(0, 9), st.integers(0, 9))),

@@ -99,6 +99,7 @@ def test_forged_files_of_every_sort_do_nothing_else_and_end() -> None:
 # ---- what stands for a topology ----
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("theirs", "mark"),
     [
@@ -208,6 +209,7 @@ NUMBERS = ("1e99999999", "1/0", "-1", "nan", "9" * 5000, "__import__('os')")
 CHANGES = (*(("lan.delay", number) for number in NUMBERS), ("no", "1"), ("peers", "3"), ("hands", "no"))
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize(
     ("text", "fields", "words"),
     [
@@ -247,6 +249,7 @@ TEXTS = ('"scene.yaml"', '["scene.yaml", 3]', '["scene.yaml", "*"]')
 NEWER = f"scene.apc: E603 has format version 99, this program reads version {cache.FORMAT}"
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -263,6 +266,7 @@ def test_what_is_no_model_is_refused_and_beside_its_topology_passed_over(content
     assert apc.analyze("scene.yaml").topology == "three-users-average"
 
 
+@pytest.mark.whole
 def test_a_byte_changed_or_an_end_cut_off_is_refused_or_compiled_again(
     other: Other,
 ) -> None:

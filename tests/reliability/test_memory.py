@@ -47,6 +47,7 @@ def test_what_would_not_fit_is_refused_with_what_it_needs_and_what_there_is(
     assert ran.code == 1 and re.search(rf"{needs} of memory, and 1 kB are free\. Write: ", ran.err), ran.err
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("suffix", ["csv", "npz", "mat", "parquet"])
 def test_a_file_that_would_not_fit_while_it_is_written_is_refused_and_not_begun(
     monkeypatch: pytest.MonkeyPatch, cli: Cli, suffix: str

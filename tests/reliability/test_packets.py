@@ -115,6 +115,7 @@ def played(
     return loop
 
 
+@pytest.mark.few(1)
 @SECRETS
 def test_of_what_was_heard_in_one_session_nothing_is_taken_in_another(
     secret: bytes, monkeypatch: pytest.MonkeyPatch
@@ -192,6 +193,7 @@ def test_peers_whose_clocks_were_started_at_different_times_begin_at_one_instant
         assert loop.first == (wire.time - loop.begins) // loop.frame_ns + 2
 
 
+@pytest.mark.whole
 def test_a_flood_is_read_after_a_tick_s_work(monkeypatch: pytest.MonkeyPatch) -> None:
     """Datagrams without end, of strangers and of a peer, at 10 µs each: of them a late tick reads so many."""
     for address in (("192.0.2.9", 9), ("127.0.0.1", 5001)):

@@ -85,6 +85,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("what", ["sweep", pytest.param("all", marks=pytest.mark.whole)])
 def test_no_process_that_is_started_runs_what_lies_beside_a_topology(what: str, tmp_path: Path) -> None:
     script, folder = tmp_path / "script.py", tmp_path / "folder"
@@ -101,6 +102,7 @@ def test_no_process_that_is_started_runs_what_lies_beside_a_topology(what: str, 
     assert ran.returncode == 0, ran.stderr
 
 
+@pytest.mark.whole
 def test_a_process_stopped_from_outside_is_told_and_finished_parts_are_kept(tmp_path: Path) -> None:
     if not Path("/proc/self/task").is_dir():
         pytest.skip("this system does not tell which processes one has started")

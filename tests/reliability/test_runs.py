@@ -59,6 +59,7 @@ def put(place: Any, number: float) -> Callable[[Any], Any]:
     return change
 
 
+@pytest.mark.few(12)
 @pytest.mark.parametrize(
     ("name", "change", "why"),
     [

@@ -158,6 +158,7 @@ def test_compiling_again_says_unchanged_and_force_compiles_to_the_same_bytes(
     assert MODEL.read_bytes() == before
 
 
+@pytest.mark.few(6)
 @pytest.mark.parametrize(
     "put",
     [

@@ -239,6 +239,7 @@ def test_what_is_no_file_of_ours_is_no_temporary() -> None:
     assert Path("mine.txt").read_text() == "mine"
 
 
+@pytest.mark.whole
 def test_of_many_writers_at_once_each_writes_it_whole() -> None:
     texts = {str(number) * 10_000 for number in range(8)}
 
@@ -318,6 +319,7 @@ def test_a_folder_without_end_is_no_library(
 SECRET = "root:$6$abc:19000:0:99999:7:::"
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     "text",
     [
@@ -396,6 +398,7 @@ def inputs(scene: Cli) -> Cli:
     return scene
 
 
+@pytest.mark.few(10)
 @pytest.mark.parametrize("command", WRITING)
 def test_a_link_to_what_a_command_reads_is_refused_and_a_file_that_is_read_only_stays(
     inputs: Cli, command: tuple[str, str]
@@ -461,6 +464,7 @@ def test_what_a_command_reads_it_never_replaces(inputs: Cli, line: str, message:
     ]
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("line", "start"),
     [

@@ -142,6 +142,7 @@ def test_more_peers_are_measured_each_in_a_process_of_its_own(cli: Cli) -> None:
     assert "peers of group many, beside 1 of other groups" in text and "3,000" in text
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("scene", "counts", "message"),
     [
@@ -216,6 +217,7 @@ def test_every_scene_has_its_truth_and_says_where_it_comes_from_and_what_is_hard
         assert "\n# From: " in text
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_hard_case_gets_the_right_verdict_and_a_bound_that_holds(name: str) -> None:
     system = apc.compile(HERE / f"{name}.yaml")
@@ -225,6 +227,7 @@ def test_a_hard_case_gets_the_right_verdict_and_a_bound_that_holds(name: str) ->
     assert math.isfinite(case.bound)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["coasting", "stiff-contact", "two-clusters", "million-peers"])
 def test_the_stored_truth_is_what_its_script_computes(name: str) -> None:
     assert truth_of(apc.compile(HERE / f"{name}.yaml")) == STORED[name]

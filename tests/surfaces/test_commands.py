@@ -84,6 +84,7 @@ def test_json_is_one_document_and_nothing_else(scene: Cli) -> None:
     assert (unstable.code, json.loads(unstable.out)["stable"]) == (0, False), "which is an answer"
 
 
+@pytest.mark.whole
 def test_a_model_works_without_its_topology_and_a_stale_one_is_refused(scene: Cli) -> None:
     scene("compile")
     again = "scene.apc: E614 is compiled already. Write: apc analyze scene.apc\n"
@@ -145,6 +146,7 @@ def test_help_fits_a_terminal_and_every_command_is_one_of_ours(cli: Cli) -> None
     assert cli("--version") == Ran(0, f"apc {apc.__version__}\n", "")
 
 
+@pytest.mark.few(1)
 @pytest.mark.skipif(sys.platform == "win32", reason="a shell of another kind")
 @pytest.mark.parametrize(
     ("line", "code", "told"),
@@ -167,7 +169,7 @@ def _finite(word: str) -> float:
     pytest.fail(f"{word} is no JSON")
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "command",
     [
@@ -209,6 +211,7 @@ def test_what_is_not_printed_is_written_out_as_json_has_it() -> None:
     assert text.count(r"\u001b") == 3
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("words", ["check", "compile", "analyze", "analyze --json", "show"])
 def test_a_name_in_a_file_does_not_act_on_the_terminal(cli: Cli, words: str) -> None:
     write("scene.yaml", replaced(AVERAGE, ("topology: three-users-average", r'topology: "a\e[31mb"')))

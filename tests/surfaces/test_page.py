@@ -68,6 +68,7 @@ def named(sliders: tuple[Slider, ...], label: str) -> Slider:
 # The sliders.
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "name", ["three-users-average", "experiment-average", "mixed-clocks", "lossy-average"]
 )
@@ -122,6 +123,7 @@ def test_what_follows_from_others_has_no_slider(tmp_path: Path) -> None:
 # What is computed.
 
 
+@pytest.mark.whole
 def test_sections_tell_what_the_api_tells(tmp_path: Path) -> None:
     system = compiled(AVERAGE, tmp_path)
     sliders, model = sliders_of(system), model_bytes(system)
@@ -218,6 +220,7 @@ def test_an_old_answer_never_takes_the_place_of_a_newer_one() -> None:
 # The topology with other values.
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("label", "value", "line"),
     [
@@ -405,6 +408,7 @@ run(server, link, browser=True)
 """
 
 
+@pytest.mark.whole
 def test_the_browser_opens_a_file_of_ours_and_ctrl_c_closes_the_tabs_that_are_open() -> None:
     """What a browser is started with, all users see: the link's token is not in it."""
     ended = subprocess.run([sys.executable, "-c", SERVED], capture_output=True, text=True, check=False)
@@ -437,6 +441,7 @@ run(server, link, browser=False)
 """
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "left", [40, pytest.param(MOST + 20, marks=pytest.mark.whole)], ids=["few", "enough"]
 )
@@ -513,6 +518,7 @@ def tapped(page: Page, x: Any, y: Any) -> None:
     page.document.apply_json_patch({"events": [told]})
 
 
+@pytest.mark.whole
 def test_what_the_browser_can_t_say_changes_nothing(page: Page) -> None:
     models = [*page.handles, *page.selects, page.begins, page.meant, page.at]
     before = [one.value for one in models]
@@ -569,6 +575,7 @@ UPGRADE = {
 }
 
 
+@pytest.mark.whole
 def test_only_this_machine_with_the_token_and_no_other_origin_gets_in(link: str) -> None:
     bare, query = link.partition("?")[0], urlsplit(link).query
     assert link.startswith("http://127.0.0.1:")

@@ -114,6 +114,7 @@ def test_what_settles_is_told_in_seconds() -> None:
     assert apc.analyze(compiled(AVERAGE), set={"coordination.stiffness": "5000 N/m"}).settling_s is None
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("suffix", "magic"), [("gif", b"GIF89a"), pytest.param("mp4", b"ftyp", marks=pytest.mark.whole)]
 )
@@ -136,6 +137,7 @@ def test_without_ffmpeg_it_says_what_to_do(cli: Cli, monkeypatch: pytest.MonkeyP
     assert folder() == []
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("words", [f"analyze '{SCENE}'", f"critical coordination.stiffness '{SCENE}'"])
 def test_pictures_beside_answers_are_refused_before_anything_is_computed(words: str, cli: Cli) -> None:
     assert "E878 the suffix of --plot" in cli(f"{words} --plot a.txt").err
@@ -169,6 +171,7 @@ def test_a_picture_is_drawn_without_the_settings_in_the_working_folder(
     assert (tmp_path / "scene.png").is_file()
 
 
+@pytest.mark.whole
 def test_settings_that_somebody_made_in_python_stay(cli: Cli) -> None:
     with matplotlib.rc_context({"animation.ffmpeg_path": "mine"}):
         assert cli(f"show '{SCENE}' --out a.png").code == 0

@@ -24,6 +24,7 @@ def block_after(mark: str) -> str:
     return found.group(1)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "words",
     [

@@ -141,6 +141,7 @@ def test_a_loop_that_is_told_to_end_ends_however_late_it_is(monkeypatch: pytest.
     assert loop.trouble is None
 
 
+@pytest.mark.whole
 def test_what_cant_be_played_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -64,6 +64,7 @@ class Reader(HTMLParser):
         assert self.open.pop() == tag
 
 
+@pytest.mark.whole
 def test_a_page_loads_nothing_runs_nothing_and_names_nothing_twice() -> None:
     reader = Reader(page())
     assert all(one.startswith(("#", "data:")) for one in reader.wanted)
@@ -103,6 +104,7 @@ def test_the_numbers_are_those_of_the_commands() -> None:
     assert area == pytest.approx(apc.region(model).stable_area / (5000 * 1500))
 
 
+@pytest.mark.whole
 def test_what_a_scene_says_is_text_and_no_markup(cli: Cli) -> None:
     evil = "</pre></script><script>alert(1)</script><img src=x>"
     write("scene.yaml", replaced(LONE, ("lone\n", f'lone\nabout: "{evil}"\n')))
@@ -114,6 +116,7 @@ def test_what_a_scene_says_is_text_and_no_markup(cli: Cli) -> None:
     assert kept_report(Path("r.html"))["scenes"][0]["about"] == evil
 
 
+@pytest.mark.whole
 def test_sections_that_a_scene_cannot_fill_say_why(cli: Cli) -> None:
     write("scene.yaml", LONE)
     report = apc.report("scene.yaml")
@@ -136,6 +139,7 @@ def test_from_python_a_report_is_a_result_and_a_page(cli: Cli) -> None:
         apc.report("scene.yaml", "scene.yaml")
 
 
+@pytest.mark.whole
 def test_a_report_is_computed_anew_from_itself_alone(cli: Cli) -> None:
     write("scene.yaml", replaced(LONE, ("{count: 1}", "{table: users.csv}")))
     write("users.csv", "device.mass [kg]\n0.1\n0.12\n")

@@ -64,6 +64,7 @@ def words_of(svg: str) -> list[str]:
     return ["".join(one.itertext()) for one in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")]
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", TEXTS)
 def test_no_text_of_a_picture_stands_over_another_or_leaves_the_page(name: str, tmp_path: Path) -> None:
     words = words_of(shown(TEXTS[name], "svg", tmp_path))
@@ -90,6 +91,7 @@ def test_the_picture_names_every_part_with_its_type_and_numbers() -> None:
         assert word in words, word
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("form", ["svg", "mermaid"])
 def test_text_of_a_scene_cannot_break_out_of_the_picture(form: str, tmp_path: Path) -> None:
     mark = '"<script>alert(1)</script> & Three'
@@ -100,6 +102,7 @@ def test_text_of_a_scene_cannot_break_out_of_the_picture(form: str, tmp_path: Pa
         ET.fromstring(drawn)
 
 
+@pytest.mark.whole
 def test_parts_are_joined_as_the_topology_says(tmp_path: Path) -> None:
     def joints(text: str) -> set[frozenset[str]]:
         dot = shown(text, "dot", tmp_path)
@@ -119,6 +122,7 @@ def test_parts_are_joined_as_the_topology_says(tmp_path: Path) -> None:
     assert "40 of them" in words and "only at left" in words
 
 
+@pytest.mark.whole
 def test_peers_that_a_picture_leaves_out_are_counted(tmp_path: Path) -> None:
     for count in (300, 1_000_000):
         drawn = shown(replaced(TEXTS["star"], ("count: 300", f"count: {count}")), "svg", tmp_path)
@@ -148,6 +152,7 @@ def test_the_text_tells_graph_equations_and_schedule() -> None:
     ) in schedule
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_scene_can_be_shown_in_80_columns(path: Path) -> None:
     assert max(map(len, apc.show(path).splitlines())) <= 80
@@ -197,6 +202,7 @@ def test_mermaids_text_joins_what_is_joined() -> None:
     assert "  n0 --- n2" in lines and "  n3 -.- n4" in lines
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("suffix", "start"),
     [
@@ -234,6 +240,7 @@ def test_no_file_is_written_as_what_its_name_does_not_say(
     assert folder() == []
 
 
+@pytest.mark.whole
 def test_the_command_prints_what_the_function_returns(cli: Cli) -> None:
     for form in ("text", "json", "dot", "mermaid", "svg"):
         printed = apc.show(FILE, format=form) + "\n"  # type: ignore[arg-type] # a word

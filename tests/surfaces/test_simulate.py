@@ -20,6 +20,7 @@ def moved(cli: Cli) -> Cli:
     return cli
 
 
+@pytest.mark.whole
 def test_the_only_scene_of_a_folder_is_played_for_as_long_as_it_says(cli: Cli) -> None:
     write("scene.yaml", (SCENES / "experiment-average.yaml").read_text(encoding="utf-8"))
     ran = cli("simulate")

@@ -39,6 +39,7 @@ def test_csv_keeps_every_digit_and_leaves_empty_cells_empty(tmp_path: Path) -> N
     assert "nan" not in path.read_text(encoding="utf-8")
 
 
+@pytest.mark.whole
 def test_parquet_keeps_types_and_what_made_it(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     path = tmp_path / "t.parquet"
@@ -49,6 +50,7 @@ def test_parquet_keeps_types_and_what_made_it(tmp_path: Path) -> None:
     assert json.loads(table.schema.metadata[b"apc"]) == {"model": "abc"}
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 @pytest.mark.parametrize("rows", [(), ROWS, ROWS * (BLOCK // 3)], ids=["none", "few", "many blocks"])
 def test_columns_come_back_as_they_were_written(

@@ -78,6 +78,7 @@ def dense_output(
     return np.array(rows)
 
 
+@pytest.mark.whole
 def test_hunt_and_crossleys_impact_is_that_of_an_independent_integration() -> None:
     def laws(inside: bool) -> object:
         def law(t: float, x: np.ndarray) -> list[float]:

@@ -87,7 +87,7 @@ def test_a_run_in_a_plane_is_drawn_as_paths_as_well(tmp_path: Path) -> None:
 RUN = apc.simulate(SCENES / "experiment-mesh.yaml", duration="0.5 s", jit=False)
 
 
-@pytest.mark.few(1)
+@pytest.mark.whole
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
 def test_a_picture_is_written_and_the_same_run_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     one, two = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"

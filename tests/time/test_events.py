@@ -100,7 +100,7 @@ MOVING = replaced(AVERAGE, ("{count: 3}", MOVED))
 LIMITED = replaced(MESH, ("{count: 3}", MOVED), ("type: FullMesh", "type: SaturatedMesh, limit: 1 N"))
 
 
-@pytest.mark.few(1)
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "text",
     [

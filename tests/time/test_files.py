@@ -70,6 +70,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, list[str], dict[str, Any]]
                 return npz["time"], npz["values"], npz["names"].tolist(), json.loads(str(npz["provenance"]))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_file_holds_every_digit_of_every_row(simulation: Simulation, tmp_path: Path, suffix: str) -> None:
     path = written(simulation, tmp_path / f"run{suffix}")
@@ -129,6 +130,7 @@ def check_kept(path: Path, message: str) -> int:
     return rows
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_wherever_the_disk_is_full_the_blocks_before_are_kept(
     simulation: Simulation, tmp_path: Path, suffix: str

@@ -137,6 +137,7 @@ def pushed(words: str, folder: Path, scene: str = SCENE) -> apc.CompiledSystem:
     return compile_topology(path)
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("what", PUSHES)
 def test_a_force_of_time_moves_a_mass_as_its_integral_says(what: str, tmp_path: Path) -> None:
     words, force, edges = PUSHES[what]
@@ -164,6 +165,7 @@ LATE = [(f"type: StepForce, force: 2 N, start: {at!r} s", lambda t, at=at: 2 * (
         for at in (1e-9, 3.99999e-3)]  # fmt: skip
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("mass", [1e-3, 1e-6])
 @pytest.mark.parametrize(("words", "force", "edges"), [*LATE, PUSHES["a sine"]])
 def test_a_device_that_forgets_at_once_is_pushed_as_its_integral_says(

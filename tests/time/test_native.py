@@ -55,8 +55,8 @@ def test_a_linker_opens_nothing_of_the_working_folder(
     assert half(native(TEXT)) == 1.5
 
 
+@pytest.mark.whole
 @needs_compiler
-@pytest.mark.few(1)
 @pytest.mark.parametrize("part", [7, 0, 13, 19])
 def test_a_library_with_a_bit_turned_is_compiled_again(cache: Path, part: int) -> None:
     native(TEXT)

@@ -108,6 +108,7 @@ def test_a_force_that_acts_later_has_a_column_of_when_it_acts(delay: str) -> Non
     assert [one.role for one in found.signals] == roles
 
 
+@pytest.mark.whole
 def test_pandas_and_xarray_hold_the_same_numbers() -> None:
     pytest.importorskip("pandas")
     pytest.importorskip("xarray")
@@ -235,6 +236,7 @@ def test_what_cant_be_simulated_is_refused_by_name(monkeypatch: pytest.MonkeyPat
         prepare(edged("sum", [0.0] * 10_000), Settings(Fraction(1)))
 
 
+@pytest.mark.whole
 def test_a_verdict_on_no_position_or_on_some_says_so() -> None:
     text = AVERAGE.replace("{count: 3}", "{count: 3, set: {device.x: [10 mm, 0 mm, -5 mm]}}")
     none = simulate(compiled(text), duration=Fraction(1), signals=["*.v"])
@@ -246,6 +248,7 @@ def test_a_verdict_on_no_position_or_on_some_says_so() -> None:
     assert "No recorded position moves." in str(still)
 
 
+@pytest.mark.whole
 def test_the_swing_that_is_told_is_the_largest_of_its_unit_not_the_first() -> None:
     """A light device beside a heavy cube swings most, whatever share of its own way each makes."""
     start = "{count: 3, set: {device.x: [10 mm, 0 mm, -5 mm]}}"

@@ -72,6 +72,7 @@ UNSTABLE = [
 ]
 
 
+@pytest.mark.few(6)
 @pytest.mark.parametrize("place", range(len(PROVED)))
 def test_a_box_is_proved_and_every_point_of_it_is_stable(place: int) -> None:
     text, box = PROVED[place]
@@ -124,6 +125,7 @@ def test_what_can_not_be_proved_is_left_open_and_says_where() -> None:
     assert apc.prove_box(compiled(loose), {"contact.stiffness": "±1%"}).stable is not True
 
 
+@pytest.mark.whole
 def test_a_box_stands_before_the_answer_and_says_that_more_cells_may_decide_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

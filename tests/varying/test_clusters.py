@@ -94,6 +94,7 @@ def test_an_address_at_which_no_scheduler_can_be_is_told(
     assert got.startswith(message)
 
 
+@pytest.mark.whole
 def test_a_cluster_that_is_not_there_is_told_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sweep_cluster, "PATIENCE_S", 0.5)
     with socket.socket() as taken:  # a port that nobody listens at

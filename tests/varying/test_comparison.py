@@ -83,6 +83,7 @@ def test_the_verdict_is_of_the_network_nominal_or_with_passive_hands_as_asked() 
     assert found.stiffness == apc.critical(system, "coordination.stiffness", criterion="passive")
 
 
+@pytest.mark.whole
 def test_a_scheme_that_is_not_linear_is_judged_in_time_beside_its_linearization() -> None:
     """A wall is in no linearization about a start before it; in time 1 N rests 2 mm in 500 N/m."""
     system = compiled(f"{BOUNCING}experiment: {{duration: 3 s}}\n")
@@ -102,6 +103,7 @@ def test_a_scheme_that_is_not_linear_is_judged_in_time_beside_its_linearization(
     assert column[0] == "settles" and column.isna()[1]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("experiment", "message"),
     [
@@ -115,6 +117,7 @@ def test_what_is_not_played_says_why(experiment: str, message: str) -> None:
     assert "in time" not in str(compared(AVERAGE, MESH))
 
 
+@pytest.mark.whole
 def test_a_scheme_that_refuses_has_its_place_and_says_why(tmp_path: Path) -> None:
     files = []
     for name, text in (("free", AVERAGE), ("held", replaced(AVERAGE, ("links:", ARM)))):
@@ -152,6 +155,7 @@ def operations(function: casadi.Function) -> int:
     return sum(function.instruction_id(k) not in idle for k in range(function.n_instructions()))
 
 
+@pytest.mark.whole
 def test_a_tick_takes_its_arithmetic_and_one_operation_for_each_number_heard() -> None:
     """Position and velocity of two others are four; what is evaluated pair by pair counts once a pair."""
     arcs = "delay: 8 ms, graph: {arcs: [[1, 2], [1, 3], [2, 1]]}}"  # two hear the first, nobody hears two
@@ -175,7 +179,7 @@ GUESTS = replaced(
 )
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("text", "graph", "busiest", "arcs"),
     [
@@ -203,6 +207,7 @@ def test_two_numbers_a_packet_go_to_everybody_who_hears_them(
 # ---- which stiffness, delay and loss ----
 
 
+@pytest.mark.whole
 def test_the_stiffness_is_of_the_coupler_that_hears_others_or_of_what_it_follows_from() -> None:
     for text, names in (
         (LOSSLESS, ["coordination.stiffness", "lan.delay", "lan.loss"]),
@@ -245,6 +250,7 @@ def test_a_name_that_is_missing_or_serves_no_scene_is_told(
 # ---- what is said ----
 
 
+@pytest.mark.whole
 def test_a_cell_that_cant_be_had_says_why_below_its_dash() -> None:
     found = compared(SHAKING, LOSSY, ONE_MASS)
     missing = [dict(one.missing) for one in found.schemes]
@@ -259,6 +265,7 @@ def test_a_cell_that_cant_be_had_says_why_below_its_dash() -> None:
     assert all(" ".join(why.split()) in text for one in missing for why in one.values())
 
 
+@pytest.mark.whole
 def test_schemes_that_differ_in_more_than_their_coupling_are_told_of_and_what_is_left_out_first() -> None:
     longer = replaced(AVERAGE, ("network: 8 ms", "network: 10 ms"), ("count: 3", "count: 4"))
     assert compared(AVERAGE, MESH).notes == ()
@@ -285,6 +292,7 @@ def scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ["average.yaml", "mesh.yaml"]
 
 
+@pytest.mark.whole
 def test_a_table_has_a_row_a_scheme(scenes: list[str]) -> None:
     assert run(["compare", *scenes, "--out", "out.csv"]) == 0
     with Path("out.csv").open(encoding="utf-8") as file:

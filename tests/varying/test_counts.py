@@ -25,6 +25,7 @@ def plain(system: CompiledSystem) -> tuple[object, ...]:
     return groups, apc.parameters(system).rows, found.peers, found.spectral_radius, modes
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("count", [2, 7, 40])
 @pytest.mark.parametrize("text", [AVERAGE, RING, STAR], ids=["average", "ring", "star"])
 def test_a_model_with_another_count_is_the_one_that_compiles(text: str, count: int) -> None:

@@ -142,6 +142,7 @@ def test_a_narrow_window_is_found_by_a_search_about_it(shape: str, middle: float
     ]
 
 
+@pytest.mark.whole
 def test_a_delay_that_stands_in_a_force_moves_the_force_as_well() -> None:
     system = sprung("Straight", "low: 100 N/m, high: 1 N/m, u: 0, rate: 1e6 N/m/s")
     found = apc.critical(system, "c.delay")
@@ -259,7 +260,7 @@ ALONG = {
 }
 
 
-@pytest.mark.few(10)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", ALONG)
 def test_the_verdict_along_a_scan_is_what_analyses_say(name: str) -> None:
     text, parameter, asked, values, count = ALONG[name]

@@ -64,7 +64,7 @@ EVERY_SCENE = sorted(
 )
 
 
-@pytest.mark.few(10)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("points", [2, 6])
 @pytest.mark.parametrize("path", EVERY_SCENE, ids=lambda path: path.stem)
 def test_every_point_is_as_an_analysis_of_its_own_says(path: Path, points: int) -> None:

@@ -66,6 +66,7 @@ def test_every_stiffness_damping_and_delay_of_a_coupler_has_a_row() -> None:
     )
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("scene", "names"),
     [
@@ -92,6 +93,7 @@ def test_a_margin_lies_between_two_analyses(scene: str, names: Sequence[str]) ->
         holds(system, rows[name])
 
 
+@pytest.mark.whole
 def test_a_delay_without_a_margin_is_stable_as_far_as_it_was_scanned() -> None:
     system = compiled(DEAD_RECKONING)
     row = rows_of(system)["coordination.delay"]
@@ -125,6 +127,7 @@ def test_of_very_large_systems_delays_are_said_not_to_be_looked_for() -> None:
     }
 
 
+@pytest.mark.whole
 def test_in_passing_what_takes_long_is_named_with_the_option_that_asks_for_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

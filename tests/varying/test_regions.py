@@ -107,13 +107,8 @@ def off_boundary(functions: list[str], points: Floats) -> Floats:
     return np.abs(np.max(away, axis=0))
 
 
-PAST = pytest.mark.xfail(strict=True, reason="the first curve passes its corner and comes back to it")
-
-
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[PAST] if name == "another mode takes over" else []) for name in FIELDS],
-)
+@pytest.mark.few(5)
+@pytest.mark.parametrize("name", FIELDS)
 def test_a_region_made_by_construction_has_its_curves_and_its_area(name: str) -> None:
     functions, area, closed, open_ended = FIELDS[name]
     found = apc.region(fields(*functions), x="u=0:1", y="v=0:1")
@@ -147,6 +142,7 @@ def test_ends_where_modes_meet_are_the_corner_and_a_cusp_is_followed_to_its_tang
 # ---- the paper's plane ----
 
 
+@pytest.mark.whole
 def test_the_papers_boundary_is_right_to_one_part_in_a_billion() -> None:
     """Against fifty digits at one place in seven."""
     [curve] = paper().curves
@@ -243,6 +239,7 @@ def plane(name: str) -> tuple[CompiledSystem, Region]:
     return system, apc.region(system, x=x, y=y)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     "name",
     [pytest.param(one, marks=[pytest.mark.whole] if one.startswith("begins") else []) for one in PLANES],
@@ -438,6 +435,7 @@ def test_text_fits_a_terminal_and_json_is_the_contract(said: Callable[..., str])
     assert 10 < curve["frequency_hz"][0] < curve["frequency_hz"][1] < 30 and curve["error"] <= TOLERANCE
 
 
+@pytest.mark.whole
 def test_several_scenes_and_settings_are_panels(said: Callable[..., str]) -> None:
     words = ("--x", X, "--y", Y, "--compare", "others/mesh.yaml")
     document = json.loads(said(*words, "--vary", "lan.delay=0,8 ms", "--json"))
@@ -460,6 +458,7 @@ def test_an_overlay_is_told_with_its_source_and_is_its_formula(said: Callable[..
     assert points[:, 1] == pytest.approx(points[:, 0] * 1e-3 / 2, rel=1e-9)
 
 
+@pytest.mark.whole
 def test_tables_and_pictures_are_written_by_their_suffix_and_the_same_each_time(
     said: Callable[..., str],
 ) -> None:

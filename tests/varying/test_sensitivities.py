@@ -62,6 +62,7 @@ def rates(found: Sensitivities) -> dict[str, float | None]:
     return {row.parameter: row.derivative for row in found.rows}
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("name", SCENE)
 def test_every_derivative_is_that_of_the_scene_in_320_bits(name: str) -> None:
     found = apc.sensitivities(compiled(SCENE[name]))
@@ -105,7 +106,7 @@ def changed(system: CompiledSystem, every: int) -> str:
     return ""
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("every", [3, 1])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_row_says_what_setting_its_name_does(name: str, every: int) -> None:
@@ -118,6 +119,7 @@ def test_where_the_radius_is_large_it_is_differentiated_all_the_same() -> None:
     assert apc.sensitivities(system).radius > 1e7 and changed(system, 2) == ""
 
 
+@pytest.mark.whole
 def test_a_scene_linearized_within_its_limits_is_the_linear_one() -> None:
     """Inside of its limits a saturated mesh is a mesh."""
     text = replaced(GROUPS, ("AveragePosition", "FullMesh"))

@@ -117,6 +117,7 @@ def test_a_point_at_fault_says_why_and_the_sweep_goes_on(tmp_path: Path) -> None
     assert f"at 1 of them: {message}" in str(found)
 
 
+@pytest.mark.whole
 def test_files_and_tables_hold_the_rows_that_are_held_without_them(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     held = small(jobs=1)
@@ -253,7 +254,7 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
 }
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_part_that_is_not_as_it_was_written_is_computed_again(
     damage: str, tmp_path: Path, whole: bytes
@@ -269,6 +270,7 @@ def test_a_part_that_is_not_as_it_was_written_is_computed_again(
     assert (tmp_path / "own").read_text(encoding="utf-8") == "mine"
 
 
+@pytest.mark.whole
 def test_what_another_user_computed_is_computed_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: bytes
 ) -> None:
@@ -280,6 +282,7 @@ def test_what_another_user_computed_is_computed_again(
     assert not any("already" in note for note in found.notes) and target.read_bytes() == whole
 
 
+@pytest.mark.whole
 def test_without_a_place_for_a_secret_a_process_takes_up_what_it_wrote_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -289,6 +292,7 @@ def test_without_a_place_for_a_secret_a_process_takes_up_what_it_wrote_itself(
     assert small(out=tmp_path / "r.csv", jobs=1).notes == ("128 points were there already",)
 
 
+@pytest.mark.whole
 def test_sweeps_of_one_target_and_what_others_put_beside_leave_each_other_alone(tmp_path: Path) -> None:
     target = tmp_path / "r.csv"
     kept = interrupted(target)
@@ -313,6 +317,7 @@ def test_what_is_no_folder_in_its_place_is_refused_and_stays(tmp_path: Path, kin
     assert list((tmp_path / "other").iterdir()) == []
 
 
+@pytest.mark.whole
 def test_two_processes_may_do_the_same_sweep(tmp_path: Path, whole: bytes) -> None:
     target = tmp_path / "r.csv"
 
@@ -385,6 +390,7 @@ def test_killed_three_times_it_gives_the_file_of_one_left_alone(folder: Path) ->
     assert not (folder / "r.csv.parts").exists()
 
 
+@pytest.mark.whole
 def test_an_interrupt_ends_with_what_is_done_and_says_how_to_go_on(folder: Path) -> None:
     target = folder / "r.csv"
     running = start_waiting(folder, 2, *LONG, "--out", "r.csv", "--jobs", "2")
