@@ -20,7 +20,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -176,24 +176,14 @@ class _Tagged:
         return np.asarray(found)
 
 
-class _Names:
-    """What stands for each set of tags, and the permutation that takes that one to it; remembered."""
-
-    def __init__(self, peers: int) -> None:
-        """Start with nothing remembered."""
-        self.peers = peers
-        self._known: dict[Tags, tuple[Tags, tuple[int, ...]]] = {}
-
-    def of(self, tags: Tags) -> tuple[Tags, tuple[int, ...]]:
-        """Return the set that stands for all like it, and which peers its peers 0, 1, … are here."""
-        if tags not in self._known:
-            touched, rest = _touched(tags, self.peers)
-            renamed = (
-                (_renamed(tags, {peer: place for place, peer in enumerate(chosen)}), (*chosen, *rest))
-                for chosen in itertools.permutations(touched)
-            )
-            self._known[tags] = min(renamed)
-        return self._known[tags]
+@cache
+def _named(tags: Tags, peers: int) -> tuple[Tags, tuple[int, ...]]:
+    """Return the set that stands for all like some tags, and which peers its peers 0, 1, … are in these."""
+    touched, rest = _touched(tags, peers)
+    return min(
+        (_renamed(tags, {peer: place for place, peer in enumerate(chosen)}), (*chosen, *rest))
+        for chosen in itertools.permutations(touched)
+    )
 
 
 def _touched(tags: Tags, peers: int) -> tuple[list[int], list[int]]:
@@ -208,11 +198,10 @@ def _renamed(tags: Tags, label: Mapping[int, int]) -> Tags:
 
 def _tagged(of: Affine, order: int) -> _Tagged:
     """Find the sets of so many tags at most, and what each one's moments follow from."""
-    names = _Names(of.peers)
     layers: list[dict[Tags, None]] = [{(): None}]
     for _ in range(order):  # each larger set is a smaller one with an arc more
         larger = ((*one, arc) for one in layers[-1] for arc in of.arcs if arc not in one)
-        layers.append(dict.fromkeys(names.of(tuple(sorted(tags)))[0] for tags in larger))
+        layers.append(dict.fromkeys(_named(tuple(sorted(tags)), of.peers)[0] for tags in larger))
     sets = tuple(one for layer in layers for one in layer)
     entries = _orbits(of, sets)
     kappa = (1 - 2 * of.chance) / np.sqrt(of.chance * (1 - of.chance))
@@ -239,7 +228,7 @@ def _tagged(of: Affine, order: int) -> _Tagged:
             once = times([(1.0, tags)], arc)
             for factor, one in once:
                 if len(one) <= order:
-                    stands, peers = names.of(one)
+                    stands, peers = _named(one, of.peers)
                     (own,) = _renamed((arc,), {peer: label for label, peer in enumerate(peers)})
                     first.append((factor, s * count + c, len(origin)))
                     origin.append(
@@ -248,7 +237,7 @@ def _tagged(of: Affine, order: int) -> _Tagged:
             for d, other in enumerate(of.arcs):
                 for factor, one in times(once, other):
                     if len(one) <= order:
-                        stands, peers = names.of(one)
+                        stands, peers = _named(one, of.peers)
                         label = {peer: name for name, peer in enumerate(peers)}
                         to = [number[label[g], label[h]] for g, h in (arc, other)]
                         source = (place[stands] * count + to[0]) * count + to[1]

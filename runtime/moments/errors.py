@@ -171,16 +171,6 @@ def _positions(site: LinearSite, kind: Kind) -> Matrix:
     return np.array(rows, dtype=site.b.dtype).reshape(len(rows), sum(site.b.shape))
 
 
-@dataclass(frozen=True, slots=True)
-class _Error:
-    """The error of a copy of a peer of class `of`: `own` times its position, `means` times those of all."""
-
-    of: int
-    copy: Copy
-    own: float
-    means: tuple[float, ...]
-
-
 def moments_error(of: Moments, classes: Sequence[tuple[int, Peer]]) -> float:
     """Return the largest error of copies in m.
 
@@ -191,14 +181,13 @@ def moments_error(of: Moments, classes: Sequence[tuple[int, Peer]]) -> float:
     classes
         How many peers each class has, and what they got.
     """
-    forms = _errors(classes)
-    rows = [[_row(part.only, part.at, part.offsets, form, classes) for form in forms] for part in of.parts]
+    rows = _error_rows([(part.only, part.at, part.offsets) for part in of.parts], classes)
     count = of.entries
     entry = np.zeros((2, 1), np.intp)
 
     def read(drive: Drive) -> Drive:
         added = []
-        for number, row in enumerate(rows[drive.part]):
+        for number, row in enumerate(listed[drive.part] for listed in rows):
             form = np.zeros((1, 2, 1, drive.matrix.shape[-1]))
             form[0, 0, 0, : len(row)] = row
             place = slice(count + number, count + number + 1)
@@ -212,7 +201,7 @@ def moments_error(of: Moments, classes: Sequence[tuple[int, Peer]]) -> float:
         drives.append(
             Drive(part.matrix, into, drawn[None], slice(count, count + 1), part.answers, number, 1.0)
         )
-    matrix = gain([read(drive) for drive in drives], (count + len(forms), count + 1), 1.0, FLOATS)
+    matrix = gain([read(drive) for drive in drives], (count + len(rows), count + 1), 1.0, FLOATS)
     assert matrix is not None, "means grow, and second moments were to die out"
     luck = np.linalg.solve(np.eye(count) - matrix[:count, :count], matrix[:count, count])
     return _largest(matrix[count:, :count] @ luck + matrix[count:, count])
@@ -232,8 +221,8 @@ def largest_error(
     classes
         What each peer got, as for `moments_error`.
     """
-    rows = [_row(None, at, offsets, form, classes) for form in _errors(classes)]
-    return _largest(np.array([row @ moments @ row for row in rows]))
+    rows = _error_rows([(None, at, offsets)], classes)
+    return _largest(np.array([row @ moments @ row for (row,) in rows]))
 
 
 def _largest(variances: Floats) -> float:
@@ -255,37 +244,42 @@ def _pushes(part: Part, classes: Sequence[tuple[int, Peer]]) -> Floats:
     return np.diag(variance[part.at.rest])
 
 
-def _errors(classes: Sequence[tuple[int, Peer]]) -> list[_Error]:
-    """Return the error of a copy of each class that has others: x_i − (Σ_j x_j − x_i)/(N − 1)."""
+def _error_rows(
+    loops: Sequence[tuple[int | None, Relative, Sequence[int]]], classes: Sequence[tuple[int, Peer]]
+) -> list[list[Floats]]:
+    """Return the error of a copy of each class that has others, over the coordinates (n,) of each loop.
+
+    It is x_i − (Σ_j x_j − x_i)/(N − 1).
+
+    Parameters
+    ----------
+    loops
+        Of each loop the class whose peers' differences it holds, None where it holds all classes; its
+        coordinates; and where each class's states begin.
+    classes
+        How many peers each class has, and what they got.
+    """
     errors = []
     for copy in dict.fromkeys(copy for _, peer in classes for copy in peer.copies):
-        counts = [count if copy in peer.copies else 0 for count, peer in classes]
-        others = sum(counts) - 1
-        if others:
-            means = tuple(-count / others for count in counts)
-            errors += [_Error(g, copy, 1 + 1 / others, means) for g, count in enumerate(counts) if count]
+        places = {g: peer.copies[copy] for g, (_, peer) in enumerate(classes) if copy in peer.copies}
+        others = sum(classes[g][0] for g in places) - 1
+        for g in places if others else ():
+            rows = []
+            for only, at, offsets in loops:
+                row = np.zeros(len(at.held) + len(at.rest))
+                if only is None:
+                    for k, place in places.items():
+                        row[offsets[k] + place] = -classes[k][0] / others
+                start = offsets[g] if only is None else 0
+                if only in (None, g):
+                    row[start + places[g]] += 1 + 1 / others
+                moved = row[at.held] + row[at.rest] @ at.weights
+                if np.abs(moved).max(initial=0.0) > STANDING * np.abs(row).max(initial=0.0):
+                    raise UnservedError(
+                        "nothing holds the copies together: what they differ by grows for ever"
+                    )
+                rows.append(row[at.rest])
+            errors.append(rows)
     if not errors:
         raise UnservedError("no position of a mass is told to others")
     return errors
-
-
-def _row(
-    only: int | None,
-    at: Relative,
-    offsets: Sequence[int],
-    form: _Error,
-    classes: Sequence[tuple[int, Peer]],
-) -> Floats:
-    """Return an error (n,) over the coordinates of a loop."""
-    whole = np.zeros(len(at.held) + len(at.rest))
-    if only is None:
-        for g, weight in enumerate(form.means):
-            if weight:
-                place = offsets[g] + classes[g][1].copies[form.copy]
-                whole[place] = weight + (form.own if g == form.of else 0.0)
-    elif only == form.of:
-        whole[classes[only][1].copies[form.copy]] = form.own
-    moved = whole[at.held] + whole[at.rest] @ at.weights
-    if np.abs(moved).max(initial=0.0) > STANDING * np.abs(whole).max(initial=0.0):
-        raise UnservedError("nothing holds the copies together: what they differ by grows for ever")
-    return np.asarray(whole[at.rest])

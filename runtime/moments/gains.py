@@ -2,7 +2,7 @@
 
 Takes: loops of means, and the covariances of luck that drive them.
 Gives: `Answer`, `Drive`, `Part`, `Moments`; `gain`, `mean_square_radius`, `Enclosed`, `below_1`; `stein`,
-`around`, `of_kind`, `number_of`.
+`around`, `weighted`, `number_of`.
 Guarantees: a radius between `low` and `high` for every loop within the radii of its matrices.
 Does not: know where the loops come from (see `crowd` and `stand_in`).
 
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,9 @@ TINY = float(np.finfo(np.float64).tiny)
 # G is looked at so near above the means' own growth, where it has its pole; and so many times farther from it
 # each time until its largest eigenvalue is below 1.
 NEAR, WIDER = 1e-9, 4.0
+
+# How near the radius is near enough, relatively.
+CLOSE = 1e-14
 
 # The step over which the slope of G at the radius is taken, relatively.
 STEP = 1e-6
@@ -332,7 +336,7 @@ def gain(
             if size > n:
                 over[..., n:, n:] = units
             squares = around(of_kind(answer.forms, numbers), over[:, None], numbers)
-            total = _weighted(squares, answer.weights, numbers)
+            total = weighted(squares, answer.weights, numbers)
             if answer.spread is not None:
                 total = scaled(total, of_kind(answer.spread, numbers), numbers)
             block = np.moveaxis(total[..., answer.entries[0], answer.entries[1]], 0, -1)
@@ -341,8 +345,16 @@ def gain(
     return result
 
 
-def _weighted(blocks: Matrix, weights: Floats, numbers: Arithmetic) -> Matrix:
-    """Return Σ_k w_k of matrices (b, k, …), the weights rounded."""
+def weighted(blocks: Matrix, weights: Floats, numbers: Arithmetic) -> Matrix:
+    """Return Σ_k w_k X_k of matrices X (b, k, …), the weights w (k,) rounded.
+
+    Parameters
+    ----------
+    blocks, weights
+        X and w.
+    numbers
+        What X are of.
+    """
     if numbers is FLOATS:
         return np.asarray(np.einsum("k,bkij->bij", weights, blocks))
     size = np.abs(weights)
@@ -478,6 +490,7 @@ def _radius(of: Moments, least: float) -> tuple[float | None, float]:
     nearly straight from −1 at the means' own growth, where G has its pole.
     """
 
+    @cache
     def over(growth: float) -> float:
         return 1 / max(_largest(of, growth), TINY) - 1
 
@@ -486,5 +499,5 @@ def _radius(of: Moments, least: float) -> tuple[float | None, float]:
         return None, 1.0
     while over(high := least + gap) < 0:
         low, gap = high, WIDER * gap
-    root = float(brentq(over, low, high, xtol=1e-300, rtol=4 * np.finfo(np.float64).eps))
+    root = float(brentq(over, low, high, xtol=1e-300, rtol=CLOSE))
     return root, max(1.0, over(root * (1 + STEP)) / STEP)

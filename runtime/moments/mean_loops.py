@@ -50,15 +50,15 @@ FINEST = 10**6
 class Remembered:
     """What is remembered of a link's packets with one delay: of each of its `channels` the same.
 
-    `after` holds each value once all packets are sent, over [values kept, packets sent, luck]; `before`, for
-    each slot, its uncertain values before its packet.
+    `after` holds each value once all packets are sent, over [values kept, packets sent, luck]; `misses`, for
+    each slot, how far its uncertain values are before its packet from what that holds.
     """
 
     route: Route
     memory: Memory
     channels: tuple[str, ...]
     after: Matrix
-    before: tuple[Matrix, ...]
+    misses: tuple[Matrix, ...]
 
     @property
     def sizes(self) -> list[int]:
@@ -66,7 +66,7 @@ class Remembered:
         return [len(self.memory.uncertain(slot)) for slot in range(self.memory.slots)]
 
     def memorized(self, rows: Matrix) -> Matrix:
-        """Return rows of `after` or `before` over [values kept, luck], for each of the channels."""
+        """Return rows of `after` or `misses` over [values kept, luck], for each of the channels."""
         count, first = self.memory.count, self.memory.count + self.memory.slots
         columns = [*range(count), *range(first, first + sum(self.sizes))]
         inner = rows[..., columns]
@@ -133,11 +133,13 @@ def remember(route: Route, memory: Memory, channels: Sequence[str]) -> Remembere
     sizes = [len(memory.uncertain(slot)) for slot in range(slots)]
     after = np.zeros((2 + len(memory.moves), len(memory.old), count + slots + sum(sizes)))
     after[0, np.arange(len(memory.old)), memory.old] = 1.0
-    before = []
+    misses = []
     first = count + slots
     for slot, size in enumerate(sizes):
         uncertain, certain = memory.uncertain(slot), memory.chances[:, slot] == 1
-        before.append(after[:, uncertain])
+        misses.append(-after[:, uncertain])
+        misses[slot][0, :, count + slot] = 1.0
+        misses[slot][1] *= -1
         after[:, certain] = 0.0
         after[0, certain, count + slot] = 1.0
         chance = memory.chance(slot)
@@ -148,7 +150,7 @@ def remember(route: Route, memory: Memory, channels: Sequence[str]) -> Remembere
         after[:, uncertain, count + slot] = chance
         after[0, uncertain, first + np.arange(size)] = 1.0
         first += size
-    return Remembered(route, memory, tuple(channels), after, tuple(before))
+    return Remembered(route, memory, tuple(channels), after, tuple(misses))
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,10 +162,14 @@ class Site:
     """
 
     map: FrameMap
-    names: tuple[str, ...]
     values: Mapping[tuple[Route, str, int], int]
     misses: Mapping[tuple[Route, int], slice]
     sent: Mapping[Sent, int]
+
+    @property
+    def states(self) -> int:
+        """How many states it has."""
+        return int(self.map.p.shape[-1])
 
 
 def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: FrameMap | None = None) -> Site:
@@ -210,14 +216,11 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: Frame
     for one in dict.fromkeys(one for one, _ in numbers):
         for slot in range(one.memory.slots):
             start = count
-            for place, (other, channel) in enumerate(numbers):
+            for place, (other, _) in enumerate(numbers):
                 if other is not one:
                     continue
-                held = over_all(one.before[slot], place)
-                packet = np.zeros_like(held)
-                packet[0, :, n_m + row_of[Sent(one.route[0], channel, slot)]] = 1.0
-                rows.append(arithmetic_of(held).subtract(packet, held))
-                count += held.shape[-2]
+                rows.append(over_all(one.misses[slot], place))
+                count += rows[-1].shape[-2]
             misses[one.route, slot] = slice(start, count)
     plainly = np.zeros((2, n_s, n_m + n_s))
     plainly[0, :, n_m:] = np.eye(n_s)
@@ -233,11 +236,8 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: Frame
     q = np.concatenate([plain.q, multiply(keeping[..., n_m:], plain.d)], axis=-2)
     s = np.concatenate([multiply(listed[..., n_m:], plain.s), listed[..., :n_m]], axis=-1)
     d = multiply(listed[..., n_m:], plain.d)
-    names = [
-        f"{channel} heard" for (_, channel), many in zip(numbers, counts, strict=True) for _ in range(many)
-    ]
     sent: dict[Sent, int] = {one: count + row for one, row in row_of.items()}
-    return Site(FrameMap(p, q, s, d), (*group.lifted.z_names, *names), values, misses, sent)
+    return Site(FrameMap(p, q, s, d), values, misses, sent)
 
 
 def mean_loop(
@@ -268,9 +268,9 @@ def mean_loop(
     """
     of_route = {one.route: one for one in remembered}
     sites = [with_memory(group, remembered, frames[group.name] if frames else None) for group in loop.sites]
-    offsets = np.cumsum([0] + [len(one.names) for one in sites]).tolist()
+    offsets = np.cumsum([0] + [one.states for one in sites]).tolist()
     starts = np.cumsum([0] + [one.map.s.shape[-2] for one in sites]).tolist()
-    layout = StateLayout(tuple(offsets[:-1]), tuple(name for one in sites for name in one.names), {})
+    layout = StateLayout(tuple(offsets[:-1]), ("",) * offsets[-1], {})
     values = [of_route[one.route].memorized(of_route[one.route].after) for one in listened]
     firsts = np.cumsum([offsets[-1]] + [one.shape[-1] for one in values]).tolist()
     feedback, like, numbers = list[Feedback](), sites[0].map.p, arithmetic_of(sites[0].map.p)
@@ -315,11 +315,8 @@ def mean_loop(
         matrix = np.zeros((len(like), states, len(columns)))
         matrix[:, :n] = moved[..., columns]
         matrix[:, n:, n:] = over_as_many(own[:, kept], like)
-        within = []
-        for rows in one.before:
-            memorized = over_as_many(one.memorized(rows), like)
-            radius_of(memorized)[...] *= -1
-            within.append(np.concatenate([np.zeros((*memorized.shape[:-1], n)), -memorized], axis=-1))
+        memorized = [over_as_many(one.memorized(miss), like) for miss in one.misses]
+        within = [np.concatenate([np.zeros((*miss.shape[:-1], n)), miss], axis=-1) for miss in memorized]
         channels.append(Channel(matrix[..., :states], matrix[..., states:], missed(columns), tuple(within)))
     return MeanLoop(moved[..., rest], at, tuple(offsets), missed(rest)), channels
 

@@ -31,10 +31,10 @@ from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import Coupling, Loop
 from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.frame.discretize import UNIT
-from apc.frame.radius import RADII, with_radius
+from apc.frame.radius import RADII
 from apc.frame.schedule import Selected, Way
 from apc.moments.crowd import Hearing, own_value, peer_classes, remembered_of, standing_motions
-from apc.moments.gains import Answer, Drive, Moments, Part, number_of
+from apc.moments.gains import Answer, Drive, Moments, Part, number_of, weighted
 from apc.moments.mean_loops import Remembered, Site, scaled, standing_state, with_memory
 from apc.moments.unserved import UnservedError
 from apc.network.channel import ChannelLaw, channel_law
@@ -158,7 +158,7 @@ def receivers_of(
             [math.prod(listed) for listed in itertools.product(*(shares for _, shares in nodes))]
         )
         receivers.append(_receiver(sites[h], rows, one, values, own, others, heard, weight))
-    offsets = np.cumsum([0] + [len(site.names) for site in sites]).tolist()
+    offsets = np.cumsum([0] + [site.states for site in sites]).tolist()
     return receivers, offsets, law
 
 
@@ -230,24 +230,21 @@ def _receiver(
     alone = RADII.add(
         np.broadcast_to(plain.p, (m, *plain.p.shape)), RADII.multiply(RADII.multiply(reached, gap), own_rows)
     )
-    mean = _mean(weight, alone)
+
+    def averaged(blocks: Matrix) -> Matrix:
+        return np.asarray(weighted(blocks[None], weight, RADII)[0])
+
+    mean = averaged(alone)
     varies, shares, per_peer = [RADII.subtract(alone, mean)], [], []
     for g, (felt_of, rows_of) in enumerate(zip(from_class, values, strict=True)):
         block = RADII.multiply(RADII.multiply(reached, felt_of), rows_of)
-        alike = _each(block, heard[:, g])
-        shared = _mean(weight, alike)
+        counts = np.stack([heard[:, g], NODE_ROUNDINGS * UNIT * np.abs(heard[:, g])], axis=-1)
+        alike = scaled(block, counts[..., None, None], RADII)
+        shared = averaged(alike)
         shares.append(scaled(shared, number_of(1 / max(others[g], 1), RADII), RADII))
         varies.append(RADII.subtract(alike, shared))
         per_peer.append(RADII.subtract(block, shares[g]))
     return Receiver(heard, weight, mean, tuple(shares), np.concatenate(varies, axis=-1), tuple(per_peer))
-
-
-def _mean(weight: Floats, blocks: Matrix) -> Matrix:
-    """Return the mean (2, n, n) of matrices (m, 2, n, n), the weights rounded."""
-    value = np.tensordot(weight, blocks[:, 0], 1)
-    size = np.tensordot(np.abs(weight), np.abs(blocks[:, 0]), 1)
-    radius = np.tensordot(np.abs(weight), blocks[:, 1], 1) + NODE_ROUNDINGS * (len(weight) + 4) * UNIT * size
-    return with_radius(value, radius * (1 + 8 * UNIT))
 
 
 def _closed(
@@ -330,12 +327,3 @@ def _forms(
     listed.append((one.per_peer[only], one.weight * one.heard[:, only] * n / (n - 1)))
     listed.append((one.shares[only][None], np.array([missed * n / (n - 1)])))
     return np.concatenate([forms for forms, _ in listed]), np.concatenate([weights for _, weights in listed])
-
-
-def _each(blocks: Matrix, by: Floats) -> Matrix:
-    """Return matrices (m, 2, n, n), each times a number of its own (m,)."""
-    factor = by[:, None, None, None]
-    found = blocks * np.abs(factor)
-    found[:, 0] = blocks[:, 0] * by[:, None, None]
-    found[:, 1] += NODE_ROUNDINGS * UNIT * np.abs(found[:, 0])
-    return found
