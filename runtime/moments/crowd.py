@@ -30,8 +30,8 @@ from apc.frame.parameters import resolve
 from apc.frame.schedule import Event, Schedule, Selected, Send, Sent, Tick, Way, tick_by_tick
 from apc.frame.scheduling import build_schedules
 from apc.frame.taylor import arithmetic_of
-from apc.moments.gains import Answer, Drive, Moments, Part
-from apc.moments.mean_loops import Listened, Remembered, Route, mean_loop, remember
+from apc.moments.gains import Answer, Drive, Moments, Part, number_of
+from apc.moments.mean_loops import Listened, Remembered, Route, mean_loop, remember, scaled
 from apc.moments.memory import memory_of
 from apc.network.channel import ChannelLaw, channel_law
 
@@ -249,13 +249,15 @@ def _answers(
         for kind in luck:
             if (kind.listened.route, kind.sender) != (route, classes[site]):
                 continue
-            forms, weights = miss[None], np.array([share])
+            left, right, weights = miss[None], miss[None], np.array([share])
             if kind is driving:
-                # by (m oᵀ + o mᵀ) as a sum of squares; o oᵀ itself counts once, in the loop of all.
-                both = arithmetic_of(miss).add(miss, own[slot])
-                forms = np.stack([miss, own[slot], both])
-                weights = np.array([share - by, (1.0 if by > 0 else 0.0) - by, by])
-            yield Answer(kind.places[slot], forms, weights, kind.entries[slot], kind.spreads[slot])
+                # by (m oᵀ + o mᵀ), and o oᵀ itself once, in the loop of all.
+                numbers = arithmetic_of(miss)
+                more = scaled(miss, number_of(2 * by, numbers), numbers)
+                more = numbers.add(more, own[slot]) if by > 0 else more
+                left, right = np.stack([miss, more]), np.stack([miss, own[slot]])
+                weights = np.array([share, 1.0])
+            yield Answer(kind.places[slot], left, right, weights, kind.entries[slot], kind.spreads[slot])
 
 
 def _luck(common: Loop, weights: Coupling, memories: Sequence[Remembered]) -> list[_Luck]:

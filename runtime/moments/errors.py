@@ -191,7 +191,7 @@ def moments_error(of: Moments, classes: Sequence[tuple[int, Peer]]) -> float:
             form = np.zeros((1, 2, 1, drive.matrix.shape[-1]))
             form[0, 0, 0, : len(row)] = row
             place = slice(count + number, count + number + 1)
-            added.append(Answer(place, form, np.array([drive.share]), entry))
+            added.append(Answer(place, form, form, np.array([drive.share]), entry))
         return replace(drive, answers=(*drive.answers, *added))
 
     drives = list(of.drives)

@@ -66,20 +66,22 @@ FIRST_WIDTH, LAST_WIDTH = 1e-12, 1e-3
 # Covariances of luck times cubes of the means' states: as much takes some ten seconds.
 MOST_WORK = 20_000_000
 
-# Roundings of a weight and of a product with it.
+# Roundings of a weight, of a product with it and of a symmetric part.
 WEIGHT_ROUNDINGS = 18
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """Covariances that moments X of a loop make: `spread` ∘ Σ_k w_k L_k X L_kᵀ, of which some entries count.
+    """Covariances that moments X of a loop make: `spread` ∘ Σ_k w_k L_k X R_kᵀ, of which some entries count.
+
+    Of a product that is not symmetric its symmetric part is meant.
 
     Attributes
     ----------
     place
         The rows of G that they stand in.
-    forms
-        L (k, 2, p, n), each with its radius or over a cell.
+    left, right
+        L and R (k, 2, p, n), each with its radius or over a cell.
     weights
         w (k,).
     entries
@@ -89,7 +91,8 @@ class Answer:
     """
 
     place: slice
-    forms: Matrix
+    left: Matrix
+    right: Matrix
     weights: Floats
     entries: NDArray[np.intp]
     spread: Matrix | None = None
@@ -330,13 +333,14 @@ def gain(
             return None
         n = moments.shape[-1]
         for answer in drive.answers:
-            size = answer.forms.shape[-1]
+            size = answer.left.shape[-1]
             over = np.zeros((*moments.shape[:-2], size, size))
             over[..., :n, :n] = moments
             if size > n:
                 over[..., n:, n:] = units
-            squares = around(of_kind(answer.forms, numbers), over[:, None], numbers)
-            total = weighted(squares, answer.weights, numbers)
+            left, right = of_kind(answer.left, numbers), of_kind(answer.right, numbers)
+            total = weighted(around(left, over[:, None], numbers, right), answer.weights, numbers)
+            total = (total + np.swapaxes(total, -1, -2)) / 2
             if answer.spread is not None:
                 total = scaled(total, of_kind(answer.spread, numbers), numbers)
             block = np.moveaxis(total[..., answer.entries[0], answer.entries[1]], 0, -1)
