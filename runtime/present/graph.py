@@ -17,17 +17,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from apc.compiler.multiples import common_multiple
-from apc.compiler.view.diagram import (
-    Box,
-    Diagram,
-    Edge,
-    Net,
-    boxes_of,
-    edges_of,
-    one_of,
-    seconds,
-    shape_of,
-)
+from apc.compiler.scene.links import SceneLink
+from apc.compiler.scene.scene import Scene
+from apc.compiler.view.diagram import Box, Diagram, Edge, one_of, seconds, shape_of
 from apc.compiler.words import counted
 from apc.optional import need
 from apc.present.pictures import COLOURS
@@ -54,30 +46,30 @@ def graph_picture(diagram: Diagram) -> Any:
     ApcError
         E875 matplotlib or networkx is not installed.
     """
-    boxes, edges = boxes_of(diagram), edges_of(diagram)
+    scene, boxes, edges = diagram.scene, diagram.boxes, diagram.edges
     places = _places(boxes, edges)
-    title = f"{diagram.title}, {one_of(diagram)}"
-    below = BESIDE * (len(diagram.links) + 2 * bool(diagram.pulses))
+    title = f"{scene.name}, {one_of(scene)}"
+    below = BESIDE * (len(scene.links) + 2 * bool(scene.clocks))
     right = max(left + wide for left, _, wide, _ in places.values())
     width = max(below, max(right, _width(title, TITLE)) + 2 * MARGIN)
     graph = max(top + high for _, top, _, high in places.values()) + BETWEEN
-    small = BELOW if diagram.pulses or diagram.links else 0.0
+    small = BELOW if scene.clocks or scene.links else 0.0
     height = HEAD + graph + small + MARGIN
     figure = need("matplotlib.figure", "plot").Figure(figsize=(width / 72, height / 72))
     ax = figure.add_axes((0, (small + MARGIN) / height, 1, (graph + HEAD) / height), xlim=(0, width))
     ax.set_ylim(graph, -HEAD)
     ax.set_axis_off()
-    about = textwrap.shorten(diagram.about, int(width / 4.6), placeholder="…")
+    about = textwrap.shorten(scene.about, int(width / 4.6), placeholder="…")
     ax.text(MARGIN, 18 - HEAD, title, size=TITLE, weight="bold", color=INK, parse_math=False)
     ax.text(MARGIN, 32 - HEAD, about, size=SIZE, color=FAINT, parse_math=False)
     for edge in edges:
         (x, y, wide, high), (left, top, _, tall) = sorted((places[edge.one], places[edge.two]))
         style = {"color": FAINT, "linestyle": "--"} if edge.sent else {"color": INK}
         ax.plot((MARGIN + x + wide, MARGIN + left), (y + high / 2, top + tall / 2), lw=1, **style)
-    colours = _colours(diagram)
+    colours = _colours(scene)
     for box in boxes:
         _draw(ax, box, places[box.key], colours)
-    _draw_below(figure, diagram, small / height, colours)
+    _draw_below(figure, scene, small / height, colours)
     return figure
 
 
@@ -135,32 +127,30 @@ def _draw(ax: Any, box: Box, place: tuple[float, float, float, float], colours: 
         ax.text(left + width / 2, y, line, zorder=4, **look)
 
 
-def _colours(diagram: Diagram) -> dict[str, str]:
+def _colours(scene: Scene) -> dict[str, str]:
     """Return the colours of clocks, and from the other end those of groups."""
-    clocks = {f"clock {pulse.name}": COLOURS[1 + i % 6] for i, pulse in enumerate(diagram.pulses)}
-    groups = {f"group {crowd.name}": COLOURS[-1 - i % 6] for i, crowd in enumerate(diagram.groups)}
+    clocks = {f"clock {clock.name}": COLOURS[1 + i % 6] for i, clock in enumerate(scene.clocks)}
+    groups = {f"group {group.name}": COLOURS[-1 - i % 6] for i, group in enumerate(scene.groups)}
     return clocks | groups
 
 
-def _draw_below(figure: Any, diagram: Diagram, height: float, colours: dict[str, str]) -> None:
+def _draw_below(figure: Any, scene: Scene, height: float, colours: dict[str, str]) -> None:
     """Draw who hears whom over each link, and the ticks of each clock along a frame."""
-    owners = [crowd.name for crowd in diagram.groups for _ in range(min(crowd.count, MOST_PEERS))][
-        :MOST_PEERS
-    ]
-    shares = [*(1 for _ in diagram.links), *([2] if diagram.pulses else [])]
+    owners = [group.name for group in scene.groups for _ in range(min(group.count, MOST_PEERS))][:MOST_PEERS]
+    shares = [*(1 for _ in scene.links), *([2] if scene.clocks else [])]
     start = 0.02
-    for share, net in zip(shares, [*diagram.links, None], strict=False):
+    for share, link in zip(shares, [*scene.links, None], strict=False):
         width = 0.96 * share / sum(shares)
-        if net is None:
+        if link is None:
             ax = figure.add_axes((start + 0.35 * width, 0.3 * height, 0.62 * width, 0.5 * height))
-            _draw_ticks(ax, diagram, colours)
+            _draw_ticks(ax, scene, colours)
         else:
             ax = figure.add_axes((start, 0.04 * height, width, 0.74 * height), aspect="equal", anchor="S")
-            _draw_peers(ax, diagram, net, [colours[f"group {name}"] for name in owners])
+            _draw_peers(ax, scene, link, [colours[f"group {name}"] for name in owners])
         start += width
 
 
-def _draw_peers(ax: Any, diagram: Diagram, net: Net, fills: list[str]) -> None:
+def _draw_peers(ax: Any, scene: Scene, link: SceneLink, fills: list[str]) -> None:
     networkx = need("networkx", "plot")
     number = len(fills)
     shapes = {
@@ -168,31 +158,30 @@ def _draw_peers(ax: Any, diagram: Diagram, net: Net, fills: list[str]) -> None:
         "ring": networkx.cycle_graph,
         "star": lambda peers: networkx.star_graph(peers - 1),
     }
-    if net.graph in shapes:
-        graph = shapes[net.graph](number)
+    if link.graph.shape in shapes:
+        graph = shapes[link.graph.shape](number)
     else:
-        graph = networkx.DiGraph(pair for pair in net.arcs if max(pair) < number)
+        graph = networkx.DiGraph(pair for pair in link.graph.arcs.tolist() if max(pair) < number)
         graph.add_nodes_from(range(number))
-    inner = [0] if net.graph == "star" else []
+    inner = [0] if link.graph.shape == "star" else []
     shells = [one for one in (inner, [peer for peer in range(number) if peer not in inner]) if one]
     look = {"node_size": 40, "edge_color": FAINT, "width": 0.7, "with_labels": False}
     places = networkx.shell_layout(graph, shells)
     networkx.draw_networkx(graph, places, ax=ax, nodelist=range(number), node_color=fills, **look)
-    told = f"{net.name}: {counted(diagram.peers, 'peer', ',')}, {shape_of(net)}"
-    if diagram.peers > number:
-        told += f"\n{number} drawn, {diagram.peers - number:,} left out"
+    told = f"{link.name}: {counted(scene.peers, 'peer', ',')}, {shape_of(link)}"
+    if scene.peers > number:
+        told += f"\n{number} drawn, {scene.peers - number:,} left out"
     ax.set_title(told, size=SIZE, color=INK)
     ax.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2))
     ax.set_axis_off()
 
 
-def _draw_ticks(ax: Any, diagram: Diagram, colours: dict[str, str]) -> None:
-    frame = common_multiple(pulse.period for pulse in diagram.pulses)
-    for row, pulse in enumerate(diagram.pulses):
-        count, colour = int(frame / pulse.period), colours[f"clock {pulse.name}"]
-        ticks = (
-            [float(pulse.phase + k * pulse.period) * 1e3 for k in range(count)] if count <= MOST_TICKS else []
-        )
+def _draw_ticks(ax: Any, scene: Scene, colours: dict[str, str]) -> None:
+    frame = common_multiple(clock.period.number for clock in scene.clocks)
+    for row, clock in enumerate(scene.clocks):
+        count, colour = int(frame / clock.period.number), colours[f"clock {clock.name}"]
+        times = (clock.phase.number + k * clock.period.number for k in range(count))
+        ticks = [float(time) * 1e3 for time in times] if count <= MOST_TICKS else []
         ax.eventplot(ticks, lineoffsets=-row, linelengths=0.6, colors=colour)
         if not ticks:
             ax.text(
@@ -204,7 +193,7 @@ def _draw_ticks(ax: Any, diagram: Diagram, colours: dict[str, str]) -> None:
                 va="center",
                 color=colour,
             )
-    names = [f"{pulse.name}: every {seconds(pulse.period)}" for pulse in diagram.pulses]
+    names = [f"{clock.name}: every {seconds(clock.period.number)}" for clock in scene.clocks]
     ax.set_yticks([-row for row in range(len(names))], names, size=SIZE)
     ax.set_xlim(0, float(frame) * 1e3)
     ax.set_ylim(0.5 - len(names), 0.5)
