@@ -272,7 +272,7 @@ def _closed(
         at = relative_coordinates(standing_state(matrix, standing_motions(loop), loop, starts))
         bounded, inner = with_doubt(at), matrix[..., at.rest]
         answers = tuple(
-            Answer(places[h], *[forms[..., at.rest]] * 2, weights, listed[h])
+            Answer(places[h], forms[..., at.rest], forms[..., at.rest], weights, listed[h])
             for h in range(len(counts))
             for forms, weights in [_forms(receivers, h, only, counts, states)]
             if len(weights)
