@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from apc.eigen.dissipation import is_positive
 from apc.eigen.enclosure import enclose_eigenvalues
@@ -32,6 +31,7 @@ from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, wit
 from apc.frame.taylor import arithmetic_of, corners, hull
 from apc.moments.mean_loops import scaled
 from apc.moments.unserved import UnservedError
+from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -503,5 +503,5 @@ def _radius(of: Moments, least: float) -> tuple[float | None, float]:
         return None, 1.0
     while over(high := least + gap) < 0:
         low, gap = high, WIDER * gap
-    root = float(brentq(over, low, high, xtol=1e-300, rtol=CLOSE))
+    root = float(load_pool("scipy.optimize").brentq(over, low, high, xtol=1e-300, rtol=CLOSE))
     return root, max(1.0, over(root * (1 + STEP)) / STEP)
