@@ -65,7 +65,10 @@ def comparison_picture(found: Comparison) -> Any:
         _draw(ax, title, bars, BOUNDARY if place == 0 else 0.0)
     axes[0].set_yticks(range(len(names)), names, fontsize=8)
     axes[0].invert_yaxis()
-    _judge(axes[0], found.schemes)
+    axes[0].axvline(BOUNDARY, color="0.4", linewidth=0.8, linestyle=(0, (3, 2)))
+    for place, one in enumerate(found.schemes):
+        if said := _judged(one):
+            _write(axes[0], said, 0.0, place)
     lines = [line for text in (*found.left_out, *found.notes) for line in textwrap.wrap(text, 110)]
     if lines:
         figure.suptitle("\n".join(lines), fontsize=8.5)
@@ -100,26 +103,23 @@ def _draw(ax: Any, title: str, bars: Sequence[_Bar], beyond: float) -> None:
     """Draw one quantity of all schemes, the numbers behind the bars and behind what is `beyond`."""
     ax.set_title(title, fontsize=8.5)
     ax.tick_params(labelsize=8)
-    ax.spines[["top", "right"]].set_visible(False)
     ax.tick_params(axis="y", length=0)
-    known = [bar for bar in bars if not isinstance(bar, str)]
-    ended = max((length for length, on in known if not on), default=0.0)
-    # What ends nowhere may be looked at a thousand times as far, and would leave no room for the others.
-    longest = max((min(one, FURTHER * ended or one) if on else one for one, on in known), default=beyond)
-    longest = max(longest, beyond)
-    ax.set_xlim(0, 1.3 * longest if longest else 1.0)
-    ax.set_ylim(-0.6, len(bars) - 0.4)
-    ax.locator_params(axis="x", nbins=4)
+    ax.spines[["top", "right"]].set_visible(False)
+    ended = max((bar[0] for bar in bars if not isinstance(bar, str) and not bar[1]), default=0.0)
+    longest = beyond
     for place, bar in enumerate(bars):
         colour, hatch = COLOURS[place % len(COLOURS)], HATCHES[place % len(HATCHES)]
         if isinstance(bar, str):
             _write(ax, bar, 0.0, place)
             continue
-        length, on = bar
-        face = colour if not hatch else "white"
-        drawn = min(length, longest)
-        ax.barh(place, drawn, height=0.6, facecolor=face, edgecolor=colour, hatch=hatch, linewidth=0.8)
-        _write(ax, f"{'> ' if on else ''}{length:.4g}", max(drawn, beyond), place)
+        # What ends nowhere may be looked at a thousand times as far, and would leave no room for the others.
+        drawn = min(bar[0], FURTHER * ended or bar[0]) if bar[1] else bar[0]
+        longest = max(longest, drawn)
+        look = {"facecolor": "white" if hatch else colour, "edgecolor": colour, "hatch": hatch}
+        ax.barh(place, drawn, height=0.6, linewidth=0.8, **look)
+        _write(ax, f"{'> ' if bar[1] else ''}{bar[0]:.4g}", max(drawn, beyond), place)
+    ax.set(xlim=(0, 1.3 * longest or 1.0), ylim=(-0.6, len(bars) - 0.4))
+    ax.locator_params(axis="x", nbins=4)
 
 
 def _write(ax: Any, text: str, x: float, y: int) -> None:
@@ -128,12 +128,8 @@ def _write(ax: Any, text: str, x: float, y: int) -> None:
     ax.annotate(text, (x, y), (4, 0), textcoords="offset points", va="center", fontsize=8, bbox=box)
 
 
-def _judge(ax: Any, schemes: Sequence[Scheme]) -> None:
-    """Draw where the boundary is; write which scheme is not stable, and what one does that isn't linear."""
-    ax.axvline(BOUNDARY, color="0.4", linewidth=0.8, linestyle=(0, (3, 2)))
-    for place, one in enumerate(schemes):
-        said = [] if one.stable or one.refused else ["unstable" if one.stable is False else "undecided"]
-        if one.played is not None:
-            said.append(f"{one.played.summary.verdict} in time")
-        if said:
-            _write(ax, ", ".join(said), 0.0, place)
+def _judged(one: Scheme) -> str:
+    """Say of a scheme that it is not stable, and what one does that isn't linear."""
+    said = [] if one.stable or one.refused else ["unstable" if one.stable is False else "undecided"]
+    said += [] if one.played is None else [f"{one.played.summary.verdict} in time"]
+    return ", ".join(said)

@@ -1,8 +1,7 @@
 """What an export is, in words and as plain data.
 
 Takes: what `exports` makes.
-Gives: `state_space_text`, `state_space_document`, `state_space_control`; `modelica_text`,
-`modelica_document`.
+Gives: `state_space_text`, `state_space_document`, `state_space_control`; `modelica_text`.
 Guarantees: at most 80 columns.
 Does not: write files.
 """
@@ -14,7 +13,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import counted, wrapped
-from apc.present.forms import document, note
+from apc.present.forms import document, notes
 
 if TYPE_CHECKING:
     from apc.exports.lifted import StateSpace
@@ -31,7 +30,7 @@ def state_space_text(found: StateSpace) -> str:
         lines += wrapped(f"{counted(len(ports), word)}: {_named(ports)}", "  ", "    ")
     if found.free:
         lines += wrapped(f"A, B, C and D are a function of {_named(found.free)}", "  ", "    ")
-    lines += ["", *note(found.meaning), *(line for one in found.notes for line in note(one))]
+    lines += ["", *notes([found.meaning, *found.notes])]
     return "\n".join(lines)
 
 
@@ -50,8 +49,9 @@ def state_space_control(found: StateSpace) -> Any:
 def state_space_document(found: StateSpace) -> dict[str, Any]:
     """Return a state space as plain data."""
     function = found.function and found.function.serialize()
-    plain: dict[str, Any] = document(found, {"made_by": json.loads(found.made_by), "function": function})
-    return {**plain, "meaning": found.meaning}
+    instead = {"made_by": json.loads(found.made_by), "function": function, "meaning": found.meaning}
+    plain: dict[str, Any] = document(found, instead)
+    return plain
 
 
 def modelica_text(found: ModelicaModel) -> str:
@@ -59,9 +59,3 @@ def modelica_text(found: ModelicaModel) -> str:
     has = f"{counted(found.peers, 'peer')}, {counted(found.variables, 'variable')}, one equation each"
     lines = [f"{found.topology}: the model {found.name} of Modelica 3.3", "", f"  {has}"]
     return "\n".join([*lines, *(f"  {clock}" for clock in found.clocks)])
-
-
-def modelica_document(found: ModelicaModel) -> dict[str, Any]:
-    """Return a Modelica model as plain data."""
-    plain: dict[str, Any] = document(found)
-    return plain
