@@ -15,8 +15,8 @@ from math import floor, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apc.compiler.words import counted, in_hertz, measured, with_unit, wrapped
-from apc.present.forms import LINEARIZED, document, labelled, note, notes, table
+from apc.compiler.words import counted, in_hertz, measured, wrapped
+from apc.present.forms import LINEARIZED, document, labelled, note, notes, quantity, record, table
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
@@ -133,15 +133,13 @@ def analysis_text(result: Analysis) -> str:
 
 def analysis_document(result: Analysis) -> dict[str, Any]:
     """Return what `apc analyze --json` prints of the analysis itself."""
-    found: dict[str, Any] = document(result, {"modes": [_mode_document(mode) for mode in result.modes]})
-    return found
+    return record(result, {"modes": [_mode_document(mode) for mode in result.modes]})
 
 
 def _mode_document(mode: Mode) -> dict[str, Any]:
     (motion,) = mode.motion
     moved: dict[str, Any] = document(motion, {"participation": dict(motion.participation)})
-    told: dict[str, Any] = document(mode, {"motion": ..., **moved})
-    return told
+    return record(mode, {"motion": ..., **moved})
 
 
 def analysis_picture(result: Analysis, ax: Any = None) -> Any:
@@ -293,7 +291,7 @@ def _site(found: SiteNeeds) -> str:
 def box_proof_text(found: BoxProof) -> str:
     """Return what was proved of a box."""
     where = [
-        f"  {one.free.label} = {with_unit(f'{value:.12g}', one.unit)}"
+        f"  {one.free.label} = {quantity(value, one.unit, 12)}"
         for one, value in zip(found.ranges, found.point, strict=False)  # a proved box has no point
     ]
     cells = counted(found.cells, "cell")
@@ -314,7 +312,7 @@ def box_proof_text(found: BoxProof) -> str:
 
 
 def _range(found: Range) -> str:
-    low, high = (with_unit(f"{float(one):.9g}", found.unit) for one in (found.low, found.high))
+    low, high = (quantity(float(one), found.unit, 9) for one in (found.low, found.high))
     return f"{found.free.label} from {low} to {high}"
 
 
@@ -398,8 +396,7 @@ def _analysed(found: ContactMode | Outcome, instead: dict[str, Any], *more: str)
     """Return plain data of what may have been refused: then there are no numbers of an analysis."""
     if not found.verdict:
         instead |= dict.fromkeys(("verdict", "spectral_radius", "spectral_radius_error", *more))
-    told: dict[str, Any] = document(found, instead)
-    return told
+    return record(found, instead)
 
 
 def conventions_text(found: Conventions) -> str:
@@ -433,10 +430,7 @@ def conventions_text(found: Conventions) -> str:
 def conventions_document(found: Conventions) -> dict[str, Any]:
     """Return what every convention leads to as plain data."""
     outcomes = [_analysed(one, {}) for one in found.outcomes]
-    plain: dict[str, Any] = document(
-        found, {"flips": found.flips, "repeated": found.repeated, "outcomes": outcomes}
-    )
-    return plain
+    return record(found, {"flips": found.flips, "repeated": found.repeated, "outcomes": outcomes})
 
 
 def paper_route_text(found: PaperRoute) -> str:

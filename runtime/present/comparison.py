@@ -20,7 +20,7 @@ from apc.compiler.timings import part
 from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
 from apc.optional import need
 from apc.present.comparison_picture import comparison_picture  # noqa: F401 -- looked up
-from apc.present.forms import MEANT, document, notes, table
+from apc.present.forms import MEANT, notes, quantity, record, table
 from apc.present.pictures import write_result
 from apc.tables import Column, Row
 
@@ -146,7 +146,7 @@ def _reach(found: Critical) -> str:
         if found.verdict.startswith("stable"):
             return f"none up to {with_unit(high, found.unit)}"
         return f"{found.verdict.partition(' ')[0]} from {low} to {with_unit(high, found.unit)}"
-    value = with_unit(f"{found.value:.15g}", found.unit)
+    value = quantity(found.value, found.unit, 15)
     if found.error:
         value = measured(found.value, found.error, found.unit)
     return value if found.stable_side == "below" else f"{value}, stable above it"
@@ -170,8 +170,7 @@ def comparison_document(found: Comparison) -> dict[str, Any]:
 def _document(one: Scheme) -> dict[str, Any]:
     parts = ("analysis", "network", "passive", "played", "stiffness", "delay", "loss", "feel")
     told = {key: None if (had := getattr(one, key)) is None else had.to_dict() for key in parts}
-    plain: dict[str, Any] = document(one, {"stable": one.stable, **told, "missing": dict(one.missing)})
-    return plain
+    return record(one, {"stable": one.stable, **told, "missing": dict(one.missing)})
 
 
 def comparison_table(found: Comparison) -> pandas.DataFrame:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import counted, wrapped
-from apc.present.forms import document, notes
+from apc.present.forms import notes, record
 
 if TYPE_CHECKING:
     from apc.exports.lifted import StateSpace
@@ -50,8 +50,7 @@ def state_space_document(found: StateSpace) -> dict[str, Any]:
     """Return a state space as plain data."""
     function = found.function and found.function.serialize()
     instead = {"made_by": json.loads(found.made_by), "function": function, "meaning": found.meaning}
-    plain: dict[str, Any] = document(found, instead)
-    return plain
+    return record(found, instead)
 
 
 def modelica_text(found: ModelicaModel) -> str:

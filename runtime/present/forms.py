@@ -1,6 +1,7 @@
 """The forms that all results share: plain data, JSON, notes, labelled lines and tables.
 
-Takes: frozen values, texts. Gives: `document`, `json_text`; `note`, `notes`, `labelled`, `table`; `MEANT`.
+Takes: frozen values, texts.
+Gives: `document`, `record`, `picked`, `json_text`; `quantity`, `note`, `notes`, `labelled`, `table`; `MEANT`.
 Guarantees: a document is made of what JSON has words for; the same value gives the same text; a line is at
 most 80 columns wide where its words allow it.
 Does not: know a result.
@@ -15,7 +16,7 @@ from dataclasses import fields, is_dataclass
 from fractions import Fraction
 from typing import Any
 
-from apc.compiler.words import wrapped
+from apc.compiler.words import with_unit, wrapped
 from apc.later import Later
 
 # What stable means by a criterion, where it is not that motions die out.
@@ -56,12 +57,28 @@ def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
     return document(value.tolist())  # of an array
 
 
+def record(value: Any, instead: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return a dataclass as plain data, see `document`."""
+    plain: dict[str, Any] = document(value, instead)
+    return plain
+
+
+def picked(value: Any, *names: str) -> dict[str, Any]:
+    """Return some fields and properties of a value as plain data."""
+    return {name: document(getattr(value, name)) for name in names}
+
+
 def json_text(found: Any, *, indent: int | None = 2) -> str:
     """Return plain data as one JSON document, on one line if `indent` is None.
 
     JSON has no word for what is no finite number: null stands in its place, as in `document`.
     """
     return json.dumps(document(found), ensure_ascii=False, allow_nan=False, indent=indent)
+
+
+def quantity(value: float, unit: str, digits: int = 6) -> str:
+    """Return a number to so many digits with its unit."""
+    return with_unit(f"{value:.{digits}g}", unit)
 
 
 def note(text: str) -> list[str]:

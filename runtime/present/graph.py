@@ -57,13 +57,15 @@ def graph_picture(diagram: Diagram) -> Any:
     boxes, edges = boxes_of(diagram), edges_of(diagram)
     places = _places(boxes, edges)
     title = f"{diagram.title}, {one_of(diagram)}"
-    below = BESIDE * (len(diagram.links) + 2 * bool(diagram.pulses))
+    count = len(diagram.links) + bool(diagram.pulses)
     right = max(left + wide for left, _, wide, _ in places.values())
+    below = BESIDE * (count + bool(diagram.pulses))
     width = max(below, max(right, _width(title, TITLE)) + 2 * MARGIN)
     graph = max(top + high for _, top, _, high in places.values()) + BETWEEN
-    small = BELOW if diagram.pulses or diagram.links else 0.0
+    small = BELOW if count else 0.0
     height = HEAD + graph + small + MARGIN
-    figure = need("matplotlib.figure", "plot").Figure(figsize=(width / 72, height / 72))
+    size = (width / 72, height / 72)
+    figure = need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained")
     ax = figure.add_axes((0, (small + MARGIN) / height, 1, (graph + HEAD) / height), xlim=(0, width))
     ax.set_ylim(graph, -HEAD)
     ax.set_axis_off()
@@ -77,7 +79,14 @@ def graph_picture(diagram: Diagram) -> Any:
     colours = _colours(diagram)
     for box in boxes:
         _draw(ax, box, places[box.key], colours)
-    _draw_below(figure, diagram, small / height, colours)
+    if count:
+        figure.get_layout_engine().set(rect=(0, 0, 1, small / height))
+        shares = [*(1 for _ in diagram.links), *([2] if diagram.pulses else [])]
+        axes = figure.subplots(1, count, squeeze=False, width_ratios=shares)[0]
+        for small_ax, net in zip(axes, diagram.links, strict=False):
+            _draw_peers(small_ax, diagram, net, colours)
+        if diagram.pulses:
+            _draw_ticks(axes[-1], diagram, colours)
     return figure
 
 
@@ -142,39 +151,23 @@ def _colours(diagram: Diagram) -> dict[str, str]:
     return clocks | groups
 
 
-def _draw_below(figure: Any, diagram: Diagram, height: float, colours: dict[str, str]) -> None:
-    """Draw who hears whom over each link, and the ticks of each clock along a frame."""
-    owners = [crowd.name for crowd in diagram.groups for _ in range(min(crowd.count, MOST_PEERS))][
-        :MOST_PEERS
-    ]
-    shares = [*(1 for _ in diagram.links), *([2] if diagram.pulses else [])]
-    start = 0.02
-    for share, net in zip(shares, [*diagram.links, None], strict=False):
-        width = 0.96 * share / sum(shares)
-        if net is None:
-            ax = figure.add_axes((start + 0.35 * width, 0.3 * height, 0.62 * width, 0.5 * height))
-            _draw_ticks(ax, diagram, colours)
-        else:
-            ax = figure.add_axes((start, 0.04 * height, width, 0.74 * height), aspect="equal", anchor="S")
-            _draw_peers(ax, diagram, net, [colours[f"group {name}"] for name in owners])
-        start += width
-
-
-def _draw_peers(ax: Any, diagram: Diagram, net: Net, fills: list[str]) -> None:
+def _draw_peers(ax: Any, diagram: Diagram, net: Net, colours: dict[str, str]) -> None:
+    """Draw who hears whom over a link, in the colours of groups."""
     networkx = need("networkx", "plot")
+    owners = [crowd.name for crowd in diagram.groups for _ in range(min(crowd.count, MOST_PEERS))]
+    fills = [colours[f"group {name}"] for name in owners[:MOST_PEERS]]
     number = len(fills)
-    shapes = {
-        "complete": networkx.complete_graph,
-        "ring": networkx.cycle_graph,
-        "star": lambda peers: networkx.star_graph(peers - 1),
-    }
-    if net.graph in shapes:
-        graph = shapes[net.graph](number)
+    star = net.graph == "star"
+    if net.graph == "complete":
+        graph = networkx.complete_graph(number)
+    elif net.graph == "ring":
+        graph = networkx.cycle_graph(number)
+    elif star:
+        graph = networkx.star_graph(number - 1)
     else:
         graph = networkx.DiGraph(pair for pair in net.arcs if max(pair) < number)
         graph.add_nodes_from(range(number))
-    inner = [0] if net.graph == "star" else []
-    shells = [one for one in (inner, [peer for peer in range(number) if peer not in inner]) if one]
+    shells = [one for one in ([*range(star)], [*range(star, number)]) if one]
     look = {"node_size": 40, "edge_color": FAINT, "width": 0.7, "with_labels": False}
     places = networkx.shell_layout(graph, shells)
     networkx.draw_networkx(graph, places, ax=ax, nodelist=range(number), node_color=fills, **look)
@@ -182,32 +175,24 @@ def _draw_peers(ax: Any, diagram: Diagram, net: Net, fills: list[str]) -> None:
     if diagram.peers > number:
         told += f"\n{number} drawn, {diagram.peers - number:,} left out"
     ax.set_title(told, size=SIZE, color=INK)
-    ax.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2))
+    ax.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2), aspect="equal")
     ax.set_axis_off()
 
 
 def _draw_ticks(ax: Any, diagram: Diagram, colours: dict[str, str]) -> None:
+    """Draw the ticks of each clock along a frame."""
     frame = common_multiple(pulse.period for pulse in diagram.pulses)
     for row, pulse in enumerate(diagram.pulses):
         count, colour = int(frame / pulse.period), colours[f"clock {pulse.name}"]
-        ticks = (
-            [float(pulse.phase + k * pulse.period) * 1e3 for k in range(count)] if count <= MOST_TICKS else []
-        )
-        ax.eventplot(ticks, lineoffsets=-row, linelengths=0.6, colors=colour)
-        if not ticks:
-            ax.text(
-                float(frame) * 5e2,
-                -row,
-                f"{count:,} ticks",
-                size=SIZE,
-                ha="center",
-                va="center",
-                color=colour,
-            )
+        if count <= MOST_TICKS:
+            ticks = [float(pulse.phase + k * pulse.period) * 1e3 for k in range(count)]
+            ax.eventplot(ticks, lineoffsets=-row, linelengths=0.6, colors=colour)
+        else:
+            look = {"size": SIZE, "ha": "center", "va": "center", "color": colour}
+            ax.text(float(frame) * 5e2, -row, f"{count:,} ticks", **look)
     names = [f"{pulse.name}: every {seconds(pulse.period)}" for pulse in diagram.pulses]
     ax.set_yticks([-row for row in range(len(names))], names, size=SIZE)
-    ax.set_xlim(0, float(frame) * 1e3)
-    ax.set_ylim(0.5 - len(names), 0.5)
+    ax.set(xlim=(0, float(frame) * 1e3), ylim=(0.5 - len(names), 0.5))
     ax.tick_params(labelsize=SIZE, length=2)
     ax.set_xlabel(f"ms of one frame, {seconds(frame)}", size=SIZE, color=FAINT)
     ax.spines[["top", "right", "left"]].set_visible(False)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.words import known_digits, measured, wrapped
 from apc.optional import need
-from apc.present.forms import LINEARIZED, document, labelled, note, notes, table
+from apc.present.forms import LINEARIZED, document, labelled, note, notes, record, table
 from apc.present.pictures import COLOURS, write_result
 from apc.tables import Column, Row
 
@@ -191,8 +191,7 @@ def feel_document(found: Feel) -> dict[str, Any]:
         "hinf": {f"{one.mode} {one.of}": one for one in found.hinf},
         "h2": {one.source: one for one in found.h2},
     }
-    whole: dict[str, Any] = document(found, instead)
-    return whole
+    return record(found, instead)
 
 
 def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:

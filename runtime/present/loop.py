@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import counted, wrapped
 from apc.loop.packets import DROPPED
-from apc.present.forms import document, note, table
+from apc.present.forms import document, note, record, table
 from apc.present.recorded_network import recording_document
 
 if TYPE_CHECKING:
@@ -101,5 +101,4 @@ def run_comparison_document(found: RunComparison) -> dict[str, Any]:
         for one in found.measured
     ]
     ways = [document(one, {"came": recording_document(one.came)}) for one in found.ways]
-    plain: dict[str, Any] = document(found, {"ways": ways, "measured": measured})
-    return plain
+    return record(found, {"ways": ways, "measured": measured})

@@ -11,7 +11,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import measured, wrapped
-from apc.present.forms import LINEARIZED, document, labelled, notes
+from apc.present.forms import LINEARIZED, labelled, notes, record
 
 if TYPE_CHECKING:
     from apc.moments.network import LossesInARow, NetworkVerdict
@@ -71,5 +71,4 @@ def _losses(found: LossesInARow) -> list[tuple[str, str]]:
 
 def network_document(found: NetworkVerdict) -> dict[str, Any]:
     """Return what becomes of a scene over its network as plain data."""
-    plain: dict[str, Any] = document(found, {"topology": ...})
-    return plain
+    return record(found, {"topology": ...})

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from apc.compiler.words import with_unit, wrapped
-from apc.present.forms import table
+from apc.present.forms import quantity, table
 
 if TYPE_CHECKING:
     from apc.frame.settable import Parameters, Settable
@@ -29,7 +29,7 @@ def parameters_text(found: Parameters) -> str:
 
 def _value(one: Settable) -> str:
     if one.low == one.high:
-        return with_unit(f"{one.low:.9g}", one.unit)
+        return quantity(one.low, one.unit, 9)
     return with_unit(f"{one.low:.4g} to {one.high:.4g}", one.unit)
 
 

@@ -2,7 +2,7 @@
 
 Takes: a matplotlib Figure and a path.
 Gives: `COLOURS`, `LINES`, `colours_of`; `FORMATS`, `check_format`, `check_result_path`, `write_figure`,
-`write_result`, `svg_text`.
+`write_result`, `svg_text`, `svg_image`.
 Guarantees: the same figure gives the same bytes; a file is there whole or not at all; text in an SVG is text.
 Does not: draw, or need a display.
 
@@ -11,9 +11,11 @@ matplotlib is loaded when something is drawn and not before.
 
 from __future__ import annotations
 
+import base64
 import io
 import re
 from collections.abc import Callable, Iterable, Sequence
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,16 +89,21 @@ def svg_text(figure: Any) -> str:
     return re.sub(r"<metadata>.*?</metadata>", "", drawn[drawn.index("<svg") :], flags=re.DOTALL)
 
 
+def svg_image(figure: Any, title: str) -> str:
+    """Return a matplotlib Figure as an image of a page, so that no name in it meets one outside."""
+    image = base64.b64encode(svg_text(figure).encode("utf-8")).decode("ascii")
+    return f'<img alt="{escape(title)}" src="data:image/svg+xml;base64,{image}">'
+
+
 def write_figure(figure: Any, path: Path) -> None:
     """Write a matplotlib Figure, its format chosen by the suffix; the same figure gives the same bytes."""
-    # No date in the file.
     matplotlib = need("matplotlib", "plot")
-    dates: dict[str, dict[str, None]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+    date = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}  # none in the file
     suffix = check_suffix(path, FORMATS, "--plot")
 
     def write(temporary: Path) -> None:
         with matplotlib.rc_context(SVG):
-            figure.savefig(temporary, format=suffix[1:], dpi=DPI, metadata=dates.get(suffix))
+            figure.savefig(temporary, format=suffix[1:], dpi=DPI, metadata=date.get(suffix))
 
     write_file(path, write)
 

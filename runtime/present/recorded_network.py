@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import counted, wrapped
-from apc.present.forms import document, labelled, notes
+from apc.present.forms import document, labelled, notes, record
 
 if TYPE_CHECKING:
     from apc.network.recorded import NetworkRecording, Share
@@ -52,8 +52,7 @@ def recording_document(found: NetworkRecording) -> dict[str, Any]:
     """Return a recording as plain data: seconds, shares from 0 to 1."""
     shares = {name: getattr(found, name) for name in ("lost", "turns_bad", "turns_good")}
     instead = {name: document(share, {"share": share.value}) for name, share in shares.items()}
-    plain: dict[str, Any] = document(found, {"delays": ..., "entry": link_entry(found), **instead})
-    return plain
+    return record(found, {"delays": ..., "entry": link_entry(found), **instead})
 
 
 def recording_table(found: NetworkRecording) -> str:

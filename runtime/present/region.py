@@ -20,7 +20,7 @@ from apc.compiler.timings import part
 from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
 from apc.optional import need
 from apc.present.analysis import range_document
-from apc.present.forms import MEANT, document, notes, table
+from apc.present.forms import MEANT, document, notes, quantity, table
 from apc.present.pictures import write_result
 from apc.present.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up
 from apc.tables import Column, Row
@@ -60,7 +60,7 @@ def region_text(found: Region) -> str:
         what = f"{many} could not be followed to {found.tolerance:.0e} of a coordinate, but to {most:.0e}"
         lines += ["", *wrapped(what, "  ", "  ")]
     sizes = zip(found.cell, (found.x, found.y), strict=True)
-    cell = " × ".join(with_unit(f"{size:.4g}", axis.unit) for size, axis in sizes)
+    cell = " × ".join(quantity(size, axis.unit, 4) for size, axis in sizes)
     looked = f"Looked at in cells of {cell}, and finer where the eigenvalues hint at more; "
     lines += ["", *wrapped(f"{looked}an island inside one cell could be missed.", "  ", "  ")]
     if found.stepped and found.criterion == "passive":

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from apc.compiler.language.vectors import entry, whole_and_index
 from apc.compiler.timings import part
-from apc.compiler.words import counted, in_hertz, with_unit, wrapped
+from apc.compiler.words import counted, in_hertz, wrapped
 from apc.optional import need
-from apc.present.forms import document, json_text, labelled, note, notes, table
+from apc.present.forms import document, json_text, labelled, note, notes, quantity, record, table
 from apc.present.pictures import check_format, colours_of, write_figure
 from apc.simulation.settings import EXACT
 
@@ -154,7 +154,7 @@ def _quantity(value: float, unit: str) -> str:
     """Return a number with its unit, thousandths of it where it is small."""
     if value and abs(value) < 0.1 and unit in ("m", "s", "J", "N"):
         return f"{1e3 * value:.3g} m{unit}" if abs(value) >= 1e-4 else f"{1e6 * value:.3g} µ{unit}"
-    return with_unit(f"{value:.3g}", unit)
+    return quantity(value, unit, 3)
 
 
 def _method(provenance: Provenance) -> str:
@@ -221,8 +221,7 @@ def provenance_document(found: Provenance) -> dict[str, Any]:
         "timings_s": dict(found.timings),
         "versions": dict(found.versions),
     }
-    told: dict[str, Any] = document(found, instead)
-    return told
+    return record(found, instead)
 
 
 def provenance_json(found: Provenance) -> str:
@@ -498,5 +497,4 @@ def ensemble_document(found: Ensemble) -> dict[str, Any]:
             quantiles = dict(zip(map(str, QUANTILES), one.quantiles, strict=True))
             one = document(one, {"count": ..., "runs": one.count, "quantiles": quantiles})
         instead[name] = one
-    plain: dict[str, Any] = document(found, instead)
-    return plain
+    return record(found, instead)
