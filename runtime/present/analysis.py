@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import counted, in_hertz, measured, wrapped
-from apc.present.forms import LINEARIZED, document, labelled, note, notes, quantity, record, table
+from apc.present.forms import LINEARIZED, document, labelled, note, notes, picked, quantity, record, table
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
@@ -324,16 +324,10 @@ def range_document(found: Range) -> dict[str, Any]:
 def box_proof_document(found: BoxProof) -> dict[str, Any]:
     """Return what was proved of a box as plain data."""
     return {
-        "topology": found.topology,
-        "left_out": list(found.left_out),
+        **picked(found, "topology", "left_out", "verdict", "stable", "cells", "open_share", "notes"),
         "box": [range_document(one) for one in found.ranges],
-        "verdict": found.verdict,
-        "stable": found.stable,
-        "cells": found.cells,
-        "open_share": found.open_share,
         "unstable_at": list(found.point) if found.stable is False else None,
         "open_around": list(found.point) if found.stable is None and found.point else None,
-        "notes": list(found.notes),
     }
 
 
@@ -361,13 +355,8 @@ def contact_modes_text(found: ContactModes) -> str:
 
 def contact_modes_document(found: ContactModes) -> dict[str, Any]:
     """Return the modes of contact as plain data."""
-    return {
-        "topology": found.topology,
-        "parts": list(found.parts),
-        "unstable": list(found.unstable),
-        "modes": [_analysed(mode, {"on": dict(mode.on)}, "frequency_hz") for mode in found.modes],
-        "notes": list(found.notes),
-    }
+    modes = [_analysed(mode, {"on": dict(mode.on)}, "frequency_hz") for mode in found.modes]
+    return record(found, {"unstable": found.unstable, "modes": modes})
 
 
 def switching_text(found: Switching) -> str:

@@ -20,7 +20,7 @@ from apc.compiler.timings import part
 from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
 from apc.optional import need
 from apc.present.comparison_picture import comparison_picture  # noqa: F401 -- looked up
-from apc.present.forms import MEANT, notes, quantity, record, table
+from apc.present.forms import MEANT, notes, quantity, reached, record, table
 from apc.present.pictures import write_result
 from apc.tables import Column, Row
 
@@ -228,13 +228,7 @@ COLUMNS: list[tuple[Column, str]] = [
 def _row(one: Scheme) -> Row:
     """Return a row of the table."""
     missing = "; ".join(f"{key}: {text}" for key, text in one.missing) or one.refused or None
-    return *(_cell(one, place) for _, place in COLUMNS if place), missing
-
-
-def _cell(value: Any, place: str) -> Any:
-    """Return what stands at a place of a scheme, None where a part on the way is missing."""
-    for name in place.split("."):
-        if value is None:
-            return None
-        value = value[int(name)] if name.isdigit() else getattr(value, name)
-    return float(value) if isinstance(value, float) else None if value == "" else value
+    cells = (reached(one, path) for _, path in COLUMNS if path)
+    return *(
+        float(cell) if isinstance(cell, float) else None if cell == "" else cell for cell in cells
+    ), missing

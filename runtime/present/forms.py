@@ -1,7 +1,8 @@
 """The forms that all results share: plain data, JSON, notes, labelled lines and tables.
 
 Takes: frozen values, texts.
-Gives: `document`, `record`, `picked`, `json_text`; `quantity`, `note`, `notes`, `labelled`, `table`; `MEANT`.
+Gives: `document`, `record`, `picked`, `reached`, `json_text`; `quantity`, `note`, `notes`, `labelled`,
+`table`; `MEANT`.
 Guarantees: a document is made of what JSON has words for; the same value gives the same text; a line is at
 most 80 columns wide where its words allow it.
 Does not: know a result.
@@ -66,6 +67,15 @@ def record(value: Any, instead: Mapping[str, Any] | None = None) -> dict[str, An
 def picked(value: Any, *names: str) -> dict[str, Any]:
     """Return some fields and properties of a value as plain data."""
     return {name: document(getattr(value, name)) for name in names}
+
+
+def reached(value: Any, path: str) -> Any:
+    """Return what is at a path of attributes and places, such as "a.b.0"; None beyond a None."""
+    for name in path.split("."):
+        if value is None:
+            return None
+        value = value[int(name)] if name.isdigit() else getattr(value, name)
+    return value
 
 
 def json_text(found: Any, *, indent: int | None = 2) -> str:

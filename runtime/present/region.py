@@ -20,7 +20,7 @@ from apc.compiler.timings import part
 from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
 from apc.optional import need
 from apc.present.analysis import range_document
-from apc.present.forms import MEANT, document, notes, quantity, table
+from apc.present.forms import MEANT, notes, picked, quantity, table
 from apc.present.pictures import write_result
 from apc.present.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up
 from apc.tables import Column, Row
@@ -92,27 +92,22 @@ def _point(curve: Curve, place: int) -> str:
 
 def region_document(found: Region) -> dict[str, Any]:
     """Return what `apc region --json` prints of one region."""
+    names = ("topology", "tolerance", "stable_area", "stable_area_error", "cell", "criterion", "left_out")
     return {
-        "topology": found.topology,
+        **picked(found, *names),
         "x": range_document(found.x),
         "y": range_document(found.y),
-        "tolerance": found.tolerance,
         "coarse": [number for number, one in enumerate(found.curves) if one in found.coarse],
         "boundary": [_curve_document(curve) for curve in found.curves],
-        "stable_area": found.stable_area,
-        "stable_area_error": found.stable_area_error,
         "area_unit": _product(found.x.unit, found.y.unit),
-        "cell": list(found.cell),
         "finest_cell": found.finest,
-        "criterion": found.criterion,
-        "left_out": list(found.left_out),
         "origin": dict(found.system.origin.digests),
     }
 
 
 def _curve_document(curve: Curve) -> dict[str, Any]:
     names = ("points", "handles", "error", "mode", "frequency_hz", "closed", "smooth")
-    return {name: document(getattr(curve, name)) for name in names} | {"stable_side": "left"}
+    return picked(curve, *names) | {"stable_side": "left"}
 
 
 def _product(x: str, y: str) -> str:

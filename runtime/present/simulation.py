@@ -332,37 +332,27 @@ def _draw_paths(ax: Any, trajectory: Trajectory, paths: Sequence[tuple[int, int]
 
 def _panel(ax: Any, trajectory: Trajectory, unit: str, places: Sequence[int]) -> None:
     title, shown, scale = QUANTITIES.get(unit, ("", unit, 1.0))
-    signals = trajectory.signals
-    drawn = _by_group(trajectory, places) if _are_many(signals) else _one_by_one(trajectory, places)
-    for time, values, label, colour, dashes in drawn[:MOST_CURVES]:
-        look = {"color": colour, "linestyle": dashes, "linewidth": 1.0 if values.ndim == 1 else 0.4}
-        first, *_ = ax.plot(time, scale * values, **look)
-        first.set_label(label)
+    signals, values = trajectory.signals, scale * trajectory.values
+    many = _are_many(signals)
+    curves = _by_group(signals, places) if many else _identical(values, places)
+    for columns in curves[:MOST_CURVES]:
+        one = signals[columns[0]]
+        names = ", ".join(signals[place].name for place in columns)
+        label = f"{names}: identical" if len(columns) > 1 else names
+        if many:
+            label = f"{one.group}.{one.local}: {counted(len(columns), 'peer')}"
+        colour, dashes = _style(signals, places, columns[0])
+        look = {"color": colour, "linestyle": dashes, "linewidth": 0.4 if many else 1.0}
+        first, *_ = ax.plot(trajectory.time, values[:, columns if many else columns[:1]], **look)
+        first.set_label("\n".join(textwrap.wrap(label, LABEL)))
     ax.set_ylabel(f"{title} [{shown}]" if title else f"[{shown}]")
     ax.margins(x=0)
-    _finish(ax, len(drawn))
-
-
-# A curve: times (rows,), values (rows,) or of many peers (rows, peers), its name, colour and dashes.
-_Curve = tuple[Floats, Floats, str, Any, Any]
+    _finish(ax, len(curves))
 
 
 def _are_many(signals: Sequence[Signal]) -> bool:
     """Return whether there are more peers than colours that are told apart at a glance."""
     return len({(one.group, one.peer) for one in signals}) > MOST_COLOURS
-
-
-def _one_by_one(trajectory: Trajectory, places: Sequence[int]) -> list[_Curve]:
-    """Return a curve a signal, those that are the same as one: its name names them all."""
-    signals = trajectory.signals
-    found: list[_Curve] = []
-    for same in _identical(trajectory.values, places):
-        names = ", ".join(signals[place].name for place in same)
-        label = f"{names}: identical" if len(same) > 1 else names
-        look = _style(signals, places, same[0])
-        values = trajectory.values[:, same[0]]
-        found.append((trajectory.time, values, "\n".join(textwrap.wrap(label, LABEL)), *look))
-    return found
 
 
 def _identical(values: Floats, places: Sequence[int]) -> list[list[int]]:
@@ -379,34 +369,22 @@ def _identical(values: Floats, places: Sequence[int]) -> list[list[int]]:
     return found
 
 
-def _by_group(trajectory: Trajectory, places: Sequence[int]) -> list[_Curve]:
-    """Return the curves of all peers of a group as one, for each of its quantities."""
-    signals = trajectory.signals
-    members: dict[str, list[int]] = {}
+def _by_group(signals: Sequence[Signal], places: Sequence[int]) -> list[list[int]]:
+    """Return places by group and quantity."""
+    members: dict[tuple[str, str], list[int]] = {}
     for place in places:
-        members.setdefault(f"{signals[place].group}.{signals[place].local}", []).append(place)
-    return [
-        (
-            *(trajectory.time, trajectory.values[:, columns]),
-            f"{name}: {counted(len(columns), 'peer')}",
-            *_style(signals, places, columns[0]),
-        )
-        for name, columns in members.items()
-    ]
+        members.setdefault((signals[place].group, signals[place].local), []).append(place)
+    return [*members.values()]
 
 
 def _style(signals: Sequence[Signal], places: Sequence[int], place: int) -> tuple[Any, Any]:
     """Return a signal's colour, its peer's or where these are many its group's, and its dashes in a panel."""
-
-    def owner(signal: Signal) -> tuple[str, int]:
-        return (signal.group, 0 if many else signal.peer)
-
     many = _are_many(signals)
-    owners = list(dict.fromkeys(map(owner, signals)))
-    locals_ = list(dict.fromkeys(signals[other].local for other in places))
+    owners = list(dict.fromkeys((one.group, 0 if many else one.peer) for one in signals))
+    quantities = list(dict.fromkeys(signals[other].local for other in places))
     one = signals[place]
-    colour = colours_of(len(owners))[owners.index(owner(one))]
-    return colour, DASHES[locals_.index(one.local) % len(DASHES)]
+    colour = colours_of(len(owners))[owners.index((one.group, 0 if many else one.peer))]
+    return colour, DASHES[quantities.index(one.local) % len(DASHES)]
 
 
 def _finish(ax: Any, curves: int) -> None:
