@@ -16,7 +16,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import counted, in_hertz, measured, wrapped
-from apc.present.forms import LINEARIZED, document, labelled, note, notes, picked, quantity, record, table
+from apc.present.forms import (
+    LINEARIZED,
+    document,
+    labelled,
+    listed,
+    note,
+    notes,
+    picked,
+    quantity,
+    record,
+    table,
+)
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
@@ -115,14 +126,17 @@ def analysis_text(result: Analysis) -> str:
         words = "Nothing here is free to move."
     named = (("translation", result.translations), ("rotation", result.rotations))
     removed = " and ".join(counted(count, noun) for noun, count in named if count)
-    unfelt = ", ".join([*result.unfelt[:MOST_UNFELT], *["…"][: len(result.unfelt) - MOST_UNFELT]])
     radius = measured(result.spectral_radius, result.spectral_radius_error)
     facts = (
         ("spectral radius", f"{radius} per frame of {_time(result.frame_s)}"),
         ("peers", f"{result.peers}, {result.states_per_peer} states each"),
         ("method", result.method + (f", {removed} left out" if removed else "")),
         ("proof", result.proof),
-        ("left out", unfelt and f"{unfelt}, which nothing that moves reads at these values"),
+        (
+            "left out",
+            result.unfelt
+            and f"{listed(result.unfelt, MOST_UNFELT)}, which nothing that moves reads at these values",
+        ),
     )
     lines = [f"{result.topology}: {result.verdict}{LINEARIZED if result.linearized else ''}"]
     lines += [*notes(result.left_out), ""]

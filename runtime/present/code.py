@@ -7,7 +7,6 @@ Does not: write files.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any
 
@@ -16,9 +15,7 @@ from apc.exports.c_text import source
 from apc.exports.code import Code
 from apc.exports.fmu import Unit
 from apc.exports.peer import Line, Peer
-from apc.present.forms import document, note, picked
-
-MOST_NAMED = 6
+from apc.present.forms import document, listed, note, picked
 
 
 def code_text(found: Code) -> str:
@@ -36,8 +33,8 @@ def code_text(found: Code) -> str:
         ("moves itself", inside),
     ]
     lines = [f"{found.topology}: {peer.name} in C99, {name}_tick {every}", ""]
-    for what, listed in rows:
-        lines += wrapped(f"{what} {_named(listed)}", "  ", "    ")
+    for what, names in rows:
+        lines += wrapped(f"{what} {listed(names)}", "  ", "    ")
     return "\n".join([*lines, "", *note(f"method between ticks: {found.method}; all numbers in SI units")])
 
 
@@ -68,8 +65,8 @@ def unit_text(found: Unit) -> str:
     outputs = [one.name for one in found.scene.variables if not one.given]
     what = found.peer or counted(len(found.scene.peers), "peer")
     lines = [f"{found.system.name}: {what} for co-simulation, FMI 2.0", ""]
-    lines += wrapped(f"{counted(len(inputs), 'input')}: {_named(inputs)}", "  ", "    ")
-    lines += wrapped(f"{counted(len(outputs), 'output')}: {_named(outputs)}", "  ", "    ")
+    lines += wrapped(f"{counted(len(inputs), 'input')}: {listed(inputs)}", "  ", "    ")
+    lines += wrapped(f"{counted(len(outputs), 'output')}: {listed(outputs)}", "  ", "    ")
     told = f"steps of {found.step * 1e3:.6g} ms show every tick of the fastest clock, values before the tick"
     if found.peer:
         told += "; what it hears is set when it has arrived: delays and losses are the network's"
@@ -90,7 +87,3 @@ def unit_document(found: Unit) -> dict[str, Any]:
 
 def _sending(peer: Peer) -> list[Line]:
     return [line for line in peer.lines if line.sending >= 0]
-
-
-def _named(names: Sequence[str]) -> str:
-    return ", ".join([*names[:MOST_NAMED], "…"] if len(names) > MOST_NAMED else names) or "nothing"

@@ -9,34 +9,29 @@ Does not: write files.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import counted, wrapped
-from apc.present.forms import notes, record
+from apc.present.forms import listed, notes, record
 
 if TYPE_CHECKING:
     from apc.exports.lifted import StateSpace
     from apc.exports.modelica import ModelicaModel
-    from apc.exports.words import Port
-
-MOST_NAMED = 6
 
 
 def state_space_text(found: StateSpace) -> str:
     """Return what a state space has."""
     lines = [f"{found.topology}: {found.what} over one frame of {found.frame_s * 1e3:.6g} ms", ""]
     for word, ports in (("state", found.states), ("input", found.inputs), ("output", found.outputs)):
-        lines += wrapped(f"{counted(len(ports), word)}: {_named(ports)}", "  ", "    ")
+        lines += wrapped(
+            f"{counted(len(ports), word)}: {listed([port.name for port in ports])}", "  ", "    "
+        )
     if found.free:
-        lines += wrapped(f"A, B, C and D are a function of {_named(found.free)}", "  ", "    ")
+        lines += wrapped(
+            f"A, B, C and D are a function of {listed([port.name for port in found.free])}", "  ", "    "
+        )
     lines += ["", *notes([found.meaning, *found.notes])]
     return "\n".join(lines)
-
-
-def _named(ports: Sequence[Port]) -> str:
-    names = [port.name for port in ports[:MOST_NAMED]]
-    return ", ".join([*names, "…"] if len(ports) > MOST_NAMED else names) or "none"
 
 
 def state_space_control(found: StateSpace) -> Any:

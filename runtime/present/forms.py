@@ -1,8 +1,8 @@
 """The forms that all results share: plain data, JSON, notes, labelled lines and tables.
 
 Takes: frozen values, texts.
-Gives: `document`, `record`, `picked`, `reached`, `json_text`; `quantity`, `note`, `notes`, `labelled`,
-`table`; `MEANT`.
+Gives: `document`, `record`, `picked`, `reached`, `json_text`; `quantity`, `listed`, `note`, `notes`,
+`labelled`, `table`; `MEANT`.
 Guarantees: a document is made of what JSON has words for; the same value gives the same text; a line is at
 most 80 columns wide where its words allow it.
 Does not: know a result.
@@ -89,6 +89,11 @@ def json_text(found: Any, *, indent: int | None = 2) -> str:
 def quantity(value: float, unit: str, digits: int = 6) -> str:
     """Return a number to so many digits with its unit."""
     return with_unit(f"{value:.{digits}g}", unit)
+
+
+def listed(names: Sequence[str], most: int = 6) -> str:
+    """Return the first names of several, and "…" for the others; "none" where there are none."""
+    return ", ".join([*names[:most], *["…"][: max(len(names) - most, 0)]]) or "none"
 
 
 def note(text: str) -> list[str]:

@@ -45,9 +45,8 @@ def passive_text(found: PassiveHands) -> str:
         )
     lines += [line for text in told for line in wrapped(text, "  ", "  ")]
     clamped = measured(found.clamped_radius, found.clamped_error)
-    lines += ["", *labelled("devices clamped", f"spectral radius {clamped}"), *labelled("proof", found.proof)]
-    if not found.proof:
-        lines.pop()
+    lines += ["", *labelled("devices clamped", f"spectral radius {clamped}")]
+    lines += labelled("proof", found.proof) if found.proof else []
     if found.modes:
         headings = ("mode", "damping", "needed", "at", "at rest", "")
         lines += ["", *table([headings, *map(_mode, found.modes)])]
