@@ -77,7 +77,7 @@ class Result:
     def _shown(self, form: str, *arguments: Any) -> Any:
         """Return the result in another form: as a document by its fields, if nothing else is said."""
         module, _, name = self.shown_by.partition(":")
-        shown = getattr(import_module(f"apc.present.{module}"), f"{name}_{form}", None)
-        if shown is None and form == "document":
-            shown = import_module("apc.present.forms").document
-        return shown(self, *arguments)
+        forms: Any = import_module(f"apc.present.{module}")
+        if form == "document" and not hasattr(forms, f"{name}_{form}"):
+            return import_module("apc.present.forms").document(self)
+        return getattr(forms, f"{name}_{form}")(self, *arguments)
