@@ -7,21 +7,20 @@ weights                     exact sums of the decimals by which peers weigh one 
 source                      nodes, yaml_faults, compose: YAML to nodes; reading: typed values out of nodes
 language                    expression, parsing, grammar: text to trees; evaluation: trees to formulas and
                             values
-                            dimensions, si_forms, units, unit_text, unit_check
+                            dimensions, units, unit_text, unit_check
                             vectors; values, tables, recordings: numbers of a scene, and in CSV files
                             probes: of what ping and irtt wrote
 components                  component, parts, declarations, component_check, definitions, library
-scene                       named_numbers, timebase, instances, sections, channels, graphs, links, groups,
+scene                       named_numbers, timebase, instances, graphs, links, groups,
                             studies: a section each; oddities: warnings; scene: all of them
-equations                   connections: where connectors meet; flatten
-                            reductions: what is heard of the others; clock_inference: what ticks together;
-                            clocks
-                            terms, symbolic, zero_test: SymPy; solution, matching, residuals,
-                            elimination, tearing, blocks: solving; derivatives, aliases, index: derivatives
-                            and states; structure
+equations                   connections: where connectors meet; flatten: equations and crossings
+                            clocks: what ticks together; terms, zero_test: SymPy
+                            reductions: what is heard of the others; derivatives, solution: data types
+                            matching, elimination, blocks: solving; aliases, index: derivatives and states
+                            structure
 functions                   casadi_writer, reached: what is written; exchange: what lies beside;
                             functions
-compiled, plain, formula    the compiled model; operations of its functions; numbers that follow from others
+compiled, plain             the compiled model; operations of its functions
 interpolation               tables over time in these functions
 crowd                       how many peers there are, and how many each hears
 store                       the compiled model on disk

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import importlib.util
+import importlib.metadata
 import os
 import re
 from collections.abc import Mapping
@@ -36,7 +36,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, files_below, read_file
 from apc.compiler.seal import is_sealed, seal
 
-FORMAT = 13  # of NAME.apc
+FORMAT = 14  # of NAME.apc
 LARGEST = 256 * 2**20  # bytes of the file
 LARGEST_ORIGIN = 64 * 2**20  # bytes of its third line, each of which takes up to ten of memory
 SUFFIX = ".yaml"  # of the files in a folder of components
@@ -207,15 +207,9 @@ def builtin_files() -> dict[str, Path]:
 
 @functools.cache
 def program_digest() -> str:
-    """Return the SHA-256 of what compiles: every module of the compiler, and the version of CasADi.
-
-    The version is in the name of a folder beside it: importing it would take longer than all else here.
-    """
-    compiler, casadi = Path(__file__).resolve().parent, importlib.util.find_spec("casadi")
-    assert casadi is not None and casadi.origin is not None
-    versions = sorted(path.name for path in Path(casadi.origin).parents[1].glob("casadi-*-info"))
-    whole = hashlib.sha256("/".join(versions).encode())
-    for path in sorted(compiler.rglob("*.py")):
-        whole.update(f"\0{path.relative_to(compiler)}\0".encode())
-        whole.update(path.read_bytes())
+    """Return the SHA-256 of what compiles: every text of the compiler, and the version of CasADi."""
+    compiler = Path(__file__).resolve().parent
+    whole = hashlib.sha256(importlib.metadata.version("casadi").encode())
+    for path in sorted(path for path in compiler.rglob("*") if path.suffix in (".py", ".lark", ".txt")):
+        whole.update(f"\0{path.relative_to(compiler)}\0".encode() + path.read_bytes())
     return whole.hexdigest()

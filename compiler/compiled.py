@@ -26,7 +26,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.cache import Origin
-from apc.compiler.plain import PlainFunction
 
 # The units of positions: a length; an angle, or what stands for one where a body turns in space.
 LENGTH, ANGLES = "m", ("rad", "1")
@@ -142,18 +141,10 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class Formula:
-    """What a number follows from: other numbers by their `names` (n,), and `numbers` (m,) of its own text.
-
-    `function` of both, (n,) and (m,) → (1,), is plain data of a CasADi function that keeps a place for each
-    node of the `text`, so that it is computed in exact rationals as well (see `formula`). `spans` say from
-    where to where in the text its values stand: those of the names and numbers, then of the operations.
-    """
+    """What a number follows from: the `text` of an expression (see `language.evaluation`) and its `names`."""
 
     text: str
     names: tuple[str, ...]
-    numbers: tuple[Fraction, ...]
-    function: PlainFunction
-    spans: tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,37 +46,33 @@ def with_heard(groups: Sequence[Group], kinds: Sequence[Kind], links: Sequence[L
         Of the model; on a graph that isn't complete, every peer sends.
     """
     peers = sum(group.count for group in groups)
-    sums = {link.name: heard_sums(link, peers) for link in links if link.graph.shape == "arcs"}
-    senders = {
-        link.name: [any(one.link == link.name for one in kinds[group.kind].sends) for group in groups]
-        for link in links
-    }
-    totals = {
-        name: sum(group.count for group, does in zip(groups, sends, strict=True) if does)
-        for name, sends in senders.items()
-    }
-    found, start = [], 0
-    for place, group in enumerate(groups):
-        counted = {count_of(link.name) for link in links}
-        values = [one for one in group.values if one.name not in counted]
-        columns = [one for one in group.columns if one.name not in counted]
-        for link in links:
-            name = count_of(link.name)
+    starts = [0, *accumulate(group.count for group in groups)]
+    counts = {count_of(link.name) for link in links}
+    counted = [
+        replace(
+            group,
+            values=tuple(value for value in group.values if value.name not in counts),
+            columns=tuple(column for column in group.columns if column.name not in counts),
+        )
+        for group in groups
+    ]
+    for link in links:
+        name = count_of(link.name)
+        sums = heard_sums(link, peers) if link.graph.shape == "arcs" else None
+        sends = [any(sent.link == link.name for sent in kinds[group.kind].sends) for group in groups]
+        total = sum(group.count for group, does in zip(groups, sends, strict=True) if does)
+        for place, group in enumerate(counted):
             if name not in kinds[group.kind].parameters:
                 continue
-            if link.graph.shape == "complete":
-                heard: Fraction | NDArray[np.float64] = Fraction(
-                    totals[link.name] - senders[link.name][place]
-                )
-            else:
-                heard = _on_graph(link, group.count, start, peers, sums.get(link.name))
+            heard: Fraction | NDArray[np.float64] = Fraction(total - sends[place])
+            if link.graph.shape != "complete":
+                heard = _on_graph(link, group.count, starts[place], peers, sums)
             if isinstance(heard, Fraction):
-                values.append(Parameter(name, "1", float(heard), about=COUNT_ABOUT, exact=heard))
+                parameter = Parameter(name, "1", float(heard), about=COUNT_ABOUT, exact=heard)
+                counted[place] = replace(group, values=(*group.values, parameter))
             else:
-                columns.append(Column(name, heard))
-        found.append(replace(group, values=tuple(values), columns=tuple(columns)))
-        start += group.count
-    return tuple(found)
+                counted[place] = replace(group, columns=(*group.columns, Column(name, heard)))
+    return tuple(counted)
 
 
 def heard_sums(link: Link, peers: int) -> Sums:

@@ -154,6 +154,15 @@ class Mistakes:
         for mistake in error.mistakes:
             self._found[mistake] = None
 
+    def __enter__(self) -> None:
+        """Take what is raised within: `with mistakes:`."""
+
+    def __exit__(self, kind: object, error: BaseException | None, _: object) -> bool:
+        """Record an `ApcError`, and go on behind the block."""
+        if isinstance(error, ApcError):
+            self.take(error)
+        return isinstance(error, ApcError)
+
     def __bool__(self) -> bool:
         return bool(self._found)
 

@@ -14,11 +14,13 @@ Does not: know a format, or say at which line a file was named.
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import stat
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Literal
@@ -32,10 +34,7 @@ STDOUT = 1  # the descriptor of standard output
 KERNELS = ("/proc", "/sys")  # file systems whose files are answers of the kernel
 KERNELS_OWN = "is an answer of the system's kernel"
 
-MOST_WRITERS = 1000  # of one file at once
 UNFINISHED = ".unfinished"  # how the name of a temporary file ends that goes with the next writer
-
-_locks: dict[Path, int] = {}  # what keeps the temporary files of this process from being taken for left ones
 
 Why = Literal["missing", "folder", "special", "large", "forbidden", "unreadable"]
 
@@ -113,34 +112,33 @@ def read_file(path: Path, most: int) -> bytes:
 
 
 def _read(path: Path, most: int) -> bytes:
-    try:
-        check_file(path, most)  # first, as opening a device can already do something
-        with open(path, "rb", opener=_without_waiting) as stream:
-            found = os.fstat(stream.fileno())
-            _check(found, most)  # of what was opened
-            data = stream.read(found.st_size + 1)  # as many bytes are set aside
-            if len(data) > found.st_size:
-                data += stream.read(most + 1 - len(data))
-    except (OSError, ValueError) as error:
-        raise _refusal(error) from None
+    check_file(path, most)  # first, as opening a device can already do something
+    with _refusing(), open(path, "rb", opener=_without_waiting) as stream:
+        found = os.fstat(stream.fileno())
+        _check(found, most)  # of what was opened
+        data = stream.read(found.st_size + 1)  # as many bytes are set aside
+        if len(data) > found.st_size:
+            data += stream.read(most + 1 - len(data))
     return data
 
 
 def check_file(path: Path, most: int) -> None:
     """Refuse what `read_file` would refuse by what it is, without opening it. Raises RefusedError."""
-    try:
+    with _refusing():
         _check(path.stat(), most)
-    except (OSError, ValueError) as error:
-        raise _refusal(error) from None
 
 
-def _refusal(error: OSError | ValueError) -> RefusedError:
-    if isinstance(error, FileNotFoundError | NotADirectoryError):
-        return RefusedError("missing", "does not exist")
-    if isinstance(error, PermissionError):
-        return RefusedError("forbidden", "may not be read (no permission)")
-    # a name too long, a loop of links, a NUL in the name
-    return RefusedError("unreadable", f"can't be read: {_reason(error)}")
+@contextmanager
+def _refusing() -> Iterator[None]:
+    """Turn what the system says into RefusedError."""
+    try:
+        yield
+    except (FileNotFoundError, NotADirectoryError):
+        raise RefusedError("missing", "does not exist") from None
+    except PermissionError:
+        raise RefusedError("forbidden", "may not be read (no permission)") from None
+    except (OSError, ValueError) as error:  # a name too long, a loop of links, a NUL in the name
+        raise RefusedError("unreadable", f"can't be read: {_reason(error)}") from None
 
 
 def _check(found: os.stat_result, most: int) -> None:
@@ -155,11 +153,8 @@ def _check(found: os.stat_result, most: int) -> None:
 
 
 def _too_large(most: int) -> RefusedError:
-    return RefusedError("large", f"is larger than {_size(most)}, the most it may have")
-
-
-def _size(size: int) -> str:
-    return f"{size >> 20} MiB" if size % (1 << 20) == 0 else f"{size:,} bytes"
+    size = f"{most >> 20} MiB" if most % (1 << 20) == 0 else f"{most:,} bytes"
+    return RefusedError("large", f"is larger than {size}, the most it may have")
 
 
 def _kernels_devices() -> set[int]:
@@ -196,29 +191,24 @@ def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
 
 
 def _walked(folder: Path, suffix: str) -> tuple[Path, ...]:
-    kernels = _kernels_devices()
     found: list[Path] = []
-    seen = 0
-    waiting = [(folder, 1)]
-    while waiting:
-        here, depth = waiting.pop()
-        if depth > MOST_DEPTH:
-            raise RefusedError("large", f"is more than {MOST_DEPTH} folders deep")
-        try:
-            if os.stat(here).st_dev in kernels:  # noqa: PTH116 -- as in os.scandir
+    kernels, entries = _kernels_devices(), 0
+    with _refusing():
+        for name, folders, files in os.walk(folder, onerror=_raise):
+            path = Path(name)
+            if len(path.relative_to(folder).parts) >= MOST_DEPTH:
+                raise RefusedError("large", f"is more than {MOST_DEPTH} folders deep")
+            if path.stat().st_dev in kernels:
                 raise RefusedError("special", KERNELS_OWN)
-            with os.scandir(here) as entries:
-                for entry in entries:
-                    seen += 1
-                    if seen > MOST_ENTRIES:
-                        raise RefusedError("large", f"holds more than {MOST_ENTRIES} files and folders")
-                    if entry.is_dir(follow_symlinks=False):
-                        waiting.append((Path(entry.path), depth + 1))
-                    elif entry.name.endswith(suffix):
-                        found.append(Path(entry.path))
-        except (OSError, ValueError) as error:
-            raise _refusal(error) from None
+            entries += len(folders) + len(files)
+            if entries > MOST_ENTRIES:
+                raise RefusedError("large", f"holds more than {MOST_ENTRIES} files and folders")
+            found += [path / file for file in files if file.endswith(suffix)]
     return tuple(sorted(found))
+
+
+def _raise(error: OSError) -> None:
+    raise error
 
 
 def same_file(one: Path, other: Path) -> bool:
@@ -229,7 +219,7 @@ def same_file(one: Path, other: Path) -> bool:
         return False
 
 
-def write_file(path: Path, write: Callable[[Path], None]) -> None:
+def write_file(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file, then put it where it belongs.
 
     Parameters
@@ -244,28 +234,30 @@ def write_file(path: Path, write: Callable[[Path], None]) -> None:
     ApcError
         E601 it can't be written; then what was there before is as it was.
     """
-    try:
+    with _writing(path):
         temporary = begin_file(path)
-    except (OSError, ValueError) as error:
-        raise unwritable(path, error) from error
     try:
         write(temporary)
         finish_file(temporary, path)
-    except OSError as error:
+    except BaseException as error:
         drop_file(temporary)
-        raise unwritable(path, error) from error
-    except BaseException:
-        drop_file(temporary)
+        if isinstance(error, OSError):
+            raise unwritable(path, error) from error
         raise
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Turn what the system says of a file that is to be written into ApcError (E601)."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        raise unwritable(path, error) from error
 
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file, whole or not at all. Raises ApcError (E601) if it can't be written."""
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(content)
-
-    write_file(path, write)
+    write_file(path, lambda temporary: temporary.write_bytes(content))
 
 
 def write_text(path: Path, text: str) -> None:
@@ -278,17 +270,13 @@ def write_texts(texts: Mapping[Path, str]) -> None:
     ready: dict[Path, Path] = {}
     try:
         for path, text in texts.items():
-            try:
+            with _writing(path):
                 ready[path] = begin_file(path)
                 ready[path].write_bytes(text.encode())
-            except (OSError, ValueError) as error:
-                raise unwritable(path, error) from error
         for path in texts:
-            try:
+            with _writing(path):
                 finish_file(ready[path], path)
                 del ready[path]
-            except (OSError, ValueError) as error:
-                raise unwritable(path, error) from error
     finally:
         for temporary in ready.values():
             drop_file(temporary)
@@ -296,10 +284,8 @@ def write_texts(texts: Mapping[Path, str]) -> None:
 
 def check_target(path: Path) -> None:
     """Refuse a place where nothing can be written, before anything is computed: ApcError E601."""
-    try:
+    with _writing(path):
         drop_file(begin_file(path))
-    except (OSError, ValueError) as error:
-        raise unwritable(path, error) from error
 
 
 def unwritable(path: Path, error: OSError | ValueError) -> ApcError:
@@ -310,7 +296,8 @@ def unwritable(path: Path, error: OSError | ValueError) -> ApcError:
 def begin_file(path: Path) -> Path:
     """Make the empty temporary file of a path: beside what it leads to, so that a rename puts it there.
 
-    What writers of the same path left that were killed is removed.
+    What writers of the same path left that were killed on this machine is removed, unless another process has
+    got the number of the one that wrote it.
 
     Raises
     ------
@@ -323,83 +310,33 @@ def begin_file(path: Path) -> Path:
     target = _target(path)
     if target.is_dir():
         raise IsADirectoryError(None, "it is a folder")
-    if is_special(path) or sys.platform == "win32":
-        import tempfile  # where nothing is written it is not needed
-
-        folder = None if is_special(path) else target.parent
-        handle, name = tempfile.mkstemp(prefix=f".{target.name[:48]}.", dir=folder)
+    if is_special(path):
+        handle, name = tempfile.mkstemp(prefix=f".{target.name[:24]}.")
         os.close(handle)
         return Path(name)
     if target.exists() and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)):
         raise PermissionError(None, "it is read-only")
     # The name of the target need not fit: a temporary's is longer.
-    names = (target.with_name(f".{target.name[:48]}.{place}{UNFINISHED}") for place in range(MOST_WRITERS))
-    made = next((temporary for temporary in names if _is_begun(temporary)), None)
-    if made is None:
-        raise FileExistsError(None, "too many are writing it")
-    while (left := next(names, None)) is not None and os.path.lexists(left):
-        _remove_left(left)
-    return made
+    prefix = f".{target.name[:24]}.{platform.node()}."
+    handle, name = tempfile.mkstemp(UNFINISHED, f"{prefix}{os.getpid()}.", target.parent)
+    os.close(handle)
+    with suppress(OSError):  # a folder may be written to and not be read
+        for left in target.parent.iterdir():
+            if left.name.startswith(prefix) and left.name.endswith(UNFINISHED):
+                _remove_left(left, left.name.removeprefix(prefix).partition(".")[0])
+    return Path(name)
 
 
-def _is_begun(temporary: Path) -> bool:
-    """Make a temporary file and lock it, unless there is one that another writer has locked.
-
-    The lock ends with the process, however that ends.
-    """
-    while True:
-        try:
-            handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-        except FileExistsError:
-            if not _remove_left(temporary):
-                return False
-            continue
-        if _is_locked(handle) is not True and _leads_to(temporary, handle):
-            _locks[temporary] = handle
-            return True
-        os.close(handle)  # it was taken for one that was left, in the instant before it was locked
-
-
-def _remove_left(temporary: Path) -> bool:
-    """Remove a temporary file of this user's whose writer is no more, and say whether it is gone."""
+def _remove_left(temporary: Path, process: str) -> None:
+    """Remove a temporary file of this user's whose writer, a process of this machine, is no more."""
     try:
-        handle = os.open(temporary, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    except FileNotFoundError:
-        return True
-    except OSError:
-        return False
-    try:
-        found = os.fstat(handle)
-        if not stat.S_ISREG(found.st_mode) or found.st_uid != os.geteuid() or _is_locked(handle) is not False:
-            return False
-        if _leads_to(temporary, handle):
-            temporary.unlink()
-    except OSError:
-        return False
-    finally:
-        os.close(handle)
-    return True
-
-
-def _is_locked(handle: int) -> bool | None:
-    """Lock an open file, unless another writer has; say whether one has, None where there are no locks."""
-    import fcntl
-
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return None
-    return False
-
-
-def _leads_to(path: Path, handle: int) -> bool:
-    """Return whether a path still is that of an open file."""
-    try:
-        return os.path.samestat(path.lstat(), os.fstat(handle))
-    except FileNotFoundError:
-        return False
+        found = temporary.lstat()
+        if stat.S_ISREG(found.st_mode) and found.st_uid == os.geteuid() and process.isdecimal():
+            os.kill(int(process), 0)  # sends nothing
+    except ProcessLookupError:
+        temporary.unlink(missing_ok=True)
+    except (OSError, OverflowError, AttributeError):  # not on Windows, where to kill is to end
+        return
 
 
 def finish_file(temporary: Path, path: Path) -> None:
@@ -429,15 +366,7 @@ def finish_file(temporary: Path, path: Path) -> None:
         if (made.st_uid, made.st_gid) != (before.st_uid, before.st_gid):
             _give(temporary, before)
         temporary.chmod(stat.S_IMODE(before.st_mode))
-    handle = _locks.pop(temporary, None)
-    try:
-        temporary.replace(target)
-    except OSError:
-        if handle is not None:
-            _locks[temporary] = handle
-        raise
-    if handle is not None:
-        os.close(handle)
+    temporary.replace(target)
 
 
 def partial_name(path: Path) -> Path:
@@ -452,19 +381,14 @@ def unlink_link(path: Path) -> None:
 
     Raises ApcError (E601) if it can't be removed.
     """
-    try:
+    with _writing(path):
         if path.is_symlink():
             path.unlink()
-    except OSError as error:
-        raise unwritable(path, error) from error
 
 
 def drop_file(temporary: Path) -> None:
     """Remove a temporary file that was not put where it belongs."""
-    handle = _locks.pop(temporary, None)
     temporary.unlink(missing_ok=True)
-    if handle is not None:
-        os.close(handle)
 
 
 def _target(path: Path) -> Path:

@@ -36,47 +36,33 @@ class Interpolation:
         """The slopes of its lines, 0 before the first row and after the last (n + 1,)."""
         return np.pad(np.diff(self.numbers) / np.diff(self.times), 1)
 
-    @property
-    def is_consistent(self) -> bool:
-        """Whether its rows are finite numbers at rising times."""
-        rows = np.concatenate([self.times, self.numbers])
-        rising = len(self.times) > 1 and bool((np.diff(self.times) > 0).all())
-        return rising and len(self.times) == len(self.numbers) and bool(np.isfinite(rows).all())
-
     def value(self, at: Any, number: Callable[[float], Any]) -> Any:
         """Return what the table says at a number of some kind, which a float is turned into by `number`."""
-        place = self._place(at)
-        if place in (0, len(self.times)):
-            return number(float(self.numbers[0 if place == 0 else -1]))
-        start, low = number(float(self.times[place - 1])), number(float(self.numbers[place - 1]))
-        return low + self.slope(at, number) * (at - start)
+        place = bisect.bisect_right(self.times, float(at))
+        last = max(place - 1, 0)
+        low, start = number(float(self.numbers[last])), number(float(self.times[last]))
+        return low + self.slope(at, number) * (at - start) if 0 < place < len(self.times) else low
 
     def slope(self, at: Any, number: Callable[[float], Any]) -> Any:
         """Return how fast that changes with it."""
-        place = self._place(at)
+        place = bisect.bisect_right(self.times, float(at))
         if place in (0, len(self.times)):
             return number(0.0)
-        start, end = (number(float(one)) for one in self.times[place - 1 : place + 1])
-        low, high = (number(float(one)) for one in self.numbers[place - 1 : place + 1])
+        rows = (self.times[place - 1 : place + 1], self.numbers[place - 1 : place + 1])
+        (start, end), (low, high) = (map(number, map(float, row)) for row in rows)
         return (high - low) / (end - start)
 
     def values(self, at: Any) -> Any:
         """Return what the table says at floats, or at complex steps from them."""
         real = np.real(at)
-        place = self._places(real)
+        place = np.searchsorted(self.times, real, side="right")
         last = np.maximum(place - 1, 0)
         found = self.numbers[last] + self.rates[place] * (real - self.times[last])
         return found + 1j * self.rates[place] * np.imag(at) if np.iscomplexobj(at) else found
 
     def slopes(self, at: Any) -> Any:
         """Return how fast that changes with them."""
-        return self.rates[self._places(np.real(at))]
-
-    def _place(self, at: Any) -> int:
-        return bisect.bisect_right(self.times, float(at))
-
-    def _places(self, at: Any) -> Any:
-        return np.searchsorted(self.times, at, side="right")
+        return self.rates[np.searchsorted(self.times, np.real(at), side="right")]
 
     def positions(self) -> Interpolation:
         """Return the table that says how many rows have passed: whole at each row, and nowhere else."""

@@ -21,6 +21,7 @@ inputs and what all the loops found.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
@@ -172,39 +173,43 @@ def composed(name: str, loops: Sequence[Loop], result: Any, words: Sequence[str]
 def straight(function: Any) -> PlainFunction:
     """Return an SX function's data, the nonzeros of what is sparse. Raises ValueError if it has none."""
     inputs = tuple((word, int(function.nnz_in(i))) for i, word in enumerate(function.name_in()))
-    first = [sum(rows for _, rows in inputs[:i]) for i in range(len(inputs) + 1)]
-    instructions = [
-        (function.instruction_id(k), function.instruction_input(k), function.instruction_output(k), k)
-        for k in range(function.n_instructions())
-    ]
-    numbers = [function.instruction_constant(k) for code, _, _, k in instructions if code == casadi.OP_CONST]
-    constants = {number: first[-1] + place for place, number in enumerate(dict.fromkeys(map(_key, numbers)))}
-    called = _called(function, [k for code, _, _, k in instructions if code == casadi.OP_CALL])
+    starts = [0, *itertools.accumulate(size for _, size in inputs)]
+    codes = [function.instruction_id(k) for k in range(function.n_instructions())]
+    called = _called(function, [k for k, code in enumerate(codes) if code == casadi.OP_CALL])
     tables = tuple(dict.fromkeys(table for _, table in called.values()))
-    before = first[-1] + len(constants) + len(tables)
+    constants: dict[str, int] = {}
+    for k, code in enumerate(codes):
+        if code == casadi.OP_CONST:
+            constants.setdefault(_key(function.instruction_constant(k)), starts[-1] + len(constants))
+    first = starts[-1] + len(constants) + len(tables)
     work = [0] * function.sz_w()
     operations: list[tuple[Any, ...]] = []
     results = [[0] * function.nnz_out(i) for i in range(function.n_out())]
-    for code, taken, given, k in instructions:
-        if code == casadi.OP_INPUT:
-            work[given[0]] = first[taken[0]] + taken[1]
-        elif code == casadi.OP_OUTPUT:
+
+    def add(*operation: Any) -> int:
+        operations.append(operation)
+        return first + len(operations) - 1
+
+    for k, code in enumerate(codes):
+        taken, given = function.instruction_input(k), function.instruction_output(k)
+        if code == casadi.OP_OUTPUT:
             results[given[0]][given[1]] = work[taken[0]]
+            continue
+        if code == casadi.OP_INPUT:
+            value = starts[taken[0]] + taken[1]
         elif code == casadi.OP_CONST:
-            work[given[0]] = constants[_key(function.instruction_constant(k))]
+            value = constants[_key(function.instruction_constant(k))]
         elif code == casadi.OP_CALL:
             name, table = called[k]
-            at, by = work[taken[0]], work[taken[-1]]
-            number = first[-1] + len(constants) + tables.index(table)
-            operations.append((LOOK if name == TABLE else SLOPE, number, at))
+            number = first - len(tables) + tables.index(table)
+            value = add(LOOK if name == TABLE else SLOPE, number, work[taken[0]])
             if name != TABLE:  # a derivative, of any order, is the slope times what it is taken by
-                operations.append(("mul", before + len(operations) - 1, by))
-            work[given[0]] = before + len(operations) - 1
-        elif code not in _NAMES:
-            raise ValueError(f"CasADi's operation {code} of {function.name()} is none of ours")
+                value = add("mul", value, work[taken[-1]])
+        elif code in _NAMES:
+            value = add(_NAMES[code], *(work[place] for place in taken))
         else:
-            operations.append((_NAMES[code], *(work[place] for place in taken)))
-            work[given[0]] = before + len(operations) - 1
+            raise ValueError(f"CasADi's operation {code} of {function.name()} is none of ours")
+        work[given[0]] = value
     return PlainFunction(
         inputs, tuple(map(float, constants)), tuple(operations), tuple(map(tuple, results)), tables
     )

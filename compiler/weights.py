@@ -12,9 +12,9 @@ ground by a rounding: whether peers can move together is decided by equality.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Weights that are whole multiples of this, and add up to less than 2^40, add up exactly in doubles.
-BINARY = 2.0**-12
-MOST_BINARY = 2.0**40
+EXACT_DOUBLES = 2**53  # whole numbers below it add up exactly in doubles
 
 
 def exact_weight(weight: float) -> Fraction:
@@ -34,24 +32,28 @@ def exact_weight(weight: float) -> Fraction:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sums:
-    """What each peer hears in all: `floats` (N,) are the nearest to it, `rounded` the exact sums they round.
+    """What each peer hears in all: `totals` (N,), whole numbers of any size, over a common `denominator`."""
 
-    A sum that is a float is not among the `rounded`.
-    """
+    totals: NDArray[Any]
+    denominator: int
 
-    floats: Floats
-    rounded: Mapping[int, Fraction]
+    @property
+    def floats(self) -> Floats:
+        """The floats (N,) nearest to the sums."""
+        return np.asarray(self.totals / self.denominator, dtype=np.float64)
 
     def of(self, peer: int) -> Fraction:
         """Return the exact sum of a peer."""
-        return self.rounded[peer] if peer in self.rounded else Fraction(float(self.floats[peer]))
+        return Fraction(int(self.totals[peer]), self.denominator)
+
+    @property
+    def values(self) -> set[Fraction]:
+        """The different sums there are, exact."""
+        return {Fraction(total, self.denominator) for total in set(self.totals.tolist())}
 
     def alike(self, start: int, end: int) -> bool:
         """Say whether all peers from one up to another hear as much."""
-        first = self.of(start)
-        if np.any(self.floats[start:end] != self.floats[start]):
-            return False
-        return not self.rounded or all(self.of(peer) == first for peer in range(start, end))
+        return bool(np.all(self.totals[start:end] == self.totals[start]))
 
 
 def sum_weights(receivers: Integers, weights: Floats, peers: int) -> Sums:
@@ -64,22 +66,13 @@ def sum_weights(receivers: Integers, weights: Floats, peers: int) -> Sums:
     peers
         How many there are.
     """
-    sums = np.bincount(receivers, weights, minlength=peers).astype(np.float64)
-    sizes = np.bincount(receivers, np.abs(weights), minlength=peers)
-    scaled = weights / BINARY
-    if np.all(scaled == np.rint(scaled)) and sizes.max(initial=0.0) < MOST_BINARY:
-        return Sums(sums, {})
     different, place = np.unique(weights, return_inverse=True)
     exact = [exact_weight(weight) for weight in different.tolist()]
     denominator = math.lcm(*(weight.denominator for weight in exact))
-    numerators = [weight.numerator * (denominator // weight.denominator) for weight in exact]
-    totals = [0] * peers
-    for receiver, number in zip(receivers.tolist(), place.tolist(), strict=True):
-        totals[receiver] += numerators[number]
-    rounded = {}
-    for peer, total in enumerate(totals):
-        found = Fraction(total, denominator)
-        sums[peer] = float(found)
-        if Fraction(float(sums[peer])) != found:
-            rounded[peer] = found
-    return Sums(sums, rounded)
+    numerators = [int(weight * denominator) for weight in exact]
+    if max(map(abs, numerators), default=0) * len(weights) < EXACT_DOUBLES:
+        sums = np.bincount(receivers, np.array(numerators, np.float64)[place], minlength=peers)
+        return Sums(sums.astype(np.int64), denominator)
+    totals = np.zeros(peers, dtype=object)
+    np.add.at(totals, receivers, np.array(numerators, dtype=object)[place])
+    return Sums(totals, denominator)

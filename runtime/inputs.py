@@ -228,7 +228,7 @@ def check_topology_outputs(path: Path, outputs: Mapping[str, Path | None]) -> No
         scene = run_stages(path, until="scene")
         assert isinstance(scene, Scene)
         folders = (str(folder.resolve()) for folder in library_folders(read_source(path)))
-        check_outputs(path, (*(name for name, _ in scene.texts), *folders), outputs)
+        check_outputs(path, (*scene.texts, *folders), outputs)
 
 
 def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path | None]) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import TypeVar
 
 from apc.compiler.errors import Place
 from apc.compiler.language.dimensions import Dimension
@@ -18,13 +19,25 @@ from apc.compiler.language.units import Unit
 from apc.compiler.language.values import Binding, Bounds
 from apc.compiler.source.nodes import Node
 
+T = TypeVar("T")
+Named = tuple[tuple[str, T], ...]  # values by name, in order
+Joined = tuple[tuple[str, str, str], ...]  # connectors, each with a part and a connector of it
+
 OTHERS = "others"
 # Words of the language, which nothing may have as its name.
 RESERVED = frozenset(
     {"peers", "others", "time", "pi", "ground", "type", "at", "shared", "set", *FUNCTIONS, *KEYWORDS}
 )
 # A parameter of one of these roles isn't a number: it names, or describes, something of the scene.
-ROLES = ("clock", "link", "graph", "delays", "loss", "trace", "table")
+ROLES = {
+    "clock": "a clock",
+    "link": "a link",
+    "graph": "who hears whom",
+    "delays": "other delays: sending group, hearing group",
+    "loss": "how packets get lost",
+    "trace": "a CSV file of recorded delays, one a packet",
+    "table": "a CSV file of numbers over time",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +79,7 @@ class Number:
     open_minimum: bool
     maximum: Fraction | None
     divided: bool
-    words: tuple[tuple[str, Fraction], ...]
+    words: Named[Fraction]
     about: str
     place: Place
 
@@ -120,12 +133,12 @@ class Entry:
     connector to (part, connector); the part "ground" is fixed, an empty part is the component around.
     """
 
-    values: tuple[tuple[str, Binding], ...]
-    options: tuple[tuple[str, str], ...]
-    references: tuple[tuple[str, str], ...]
-    described: tuple[tuple[str, Node], ...]
-    starts: tuple[tuple[str, Binding], ...]
-    connections: tuple[tuple[str, str, str], ...]
+    values: Named[Binding]
+    options: Named[str]
+    references: Named[str]
+    described: Named[Node]
+    starts: Named[Binding]
+    connections: Joined
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,14 +164,14 @@ class Component:
     name: str
     about: str
     source: str
-    connectors: tuple[tuple[str, Connector], ...]
+    connectors: Named[Connector]
     parameters: tuple[Parameter, ...]
     variables: tuple[Variable, ...]
-    locals: tuple[tuple[str, Dimension], ...]
+    locals: Named[Dimension]
     sends: tuple[Send, ...]
     equations: tuple[Equation, ...]
     inner: tuple[Inner, ...]
-    passed: tuple[tuple[str, str, str], ...]
+    passed: Joined
     place: Place
     grips: tuple[str, ...] = ()
     peers: int = 0
@@ -175,6 +188,12 @@ class Component:
     def numbers(self) -> Iterator[Number]:
         """The parameters that are numbers."""
         return (parameter for parameter in self.parameters if isinstance(parameter, Number))
+
+    @property
+    def flows(self) -> Iterator[tuple[str, Variable]]:
+        """The flows of its own connectors, those of inner parts left out, each with its connector."""
+        passed = {connector for connector, _, _ in self.passed}
+        return ((name, flow) for name, kind in self.connectors if name not in passed for flow in kind.flows)
 
     @property
     def depth(self) -> int:

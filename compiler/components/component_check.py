@@ -12,20 +12,14 @@ scene give the rest.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from fractions import Fraction
 from itertools import count
+from typing import TypeVar
 
-from apc.compiler.components.component import (
-    OTHERS,
-    Component,
-    Option,
-    Reference,
-    Send,
-    option_test,
-)
-from apc.compiler.components.declarations import Sends
+from apc.compiler.components.component import OTHERS, Component, Named, Option, Reference, Send, option_test
+from apc.compiler.components.declarations import Written
 from apc.compiler.errors import ApcError, Mistakes, Place, place_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import (
@@ -44,7 +38,6 @@ from apc.compiler.language.expression import Number as Literal
 from apc.compiler.language.unit_check import ANY, check_equation, dimension_of
 from apc.compiler.language.values import PEERS
 from apc.compiler.language.vectors import (
-    VECTOR_WORDS,
     entries,
     entry,
     sizes_of,
@@ -52,13 +45,13 @@ from apc.compiler.language.vectors import (
     written_equation,
     written_out,
 )
-from apc.compiler.source.reading import (
-    add_unknown,
-    brief,
-)
+from apc.compiler.source.reading import brief, fault, unknown
 from apc.compiler.words import counted
 
 _TRUE = Compare("==", Literal(Fraction(1)), Literal(Fraction(1)))
+
+Path = tuple[str, ...]  # a name in an equation, between its dots
+T = TypeVar("T")
 
 
 class ComponentNames:
@@ -67,223 +60,168 @@ class ComponentNames:
     def __init__(self, component: Component, undefined: Collection[str] = ()) -> None:
         """Take a component, and the names given by equations that couldn't be read: of no known dimension."""
         self.component = component
-        self.dimensions: dict[tuple[str, ...], Dimension | None] = {(name,): None for name in undefined}
+        self.options = {p.name: p for p in component.parameters if isinstance(p, Option)}
+        self.dimensions: dict[Path, Dimension | None] = {(name,): None for name in undefined}
         self.dimensions |= dict(_visible_names(component))
-        passed = {connector for connector, _, _ in component.passed}
-        for name, connector in component.connectors:
-            if name not in passed:
-                for flow in connector.flows:
-                    self.dimensions[(name, flow.name)] = flow.unit.dimension
+        self.dimensions |= {(name, flow.name): flow.unit.dimension for name, flow in component.flows}
         self.variables = frozenset(self.dimensions)
-        self.dimensions |= {PEERS: DIMENSIONLESS, ("time",): SECOND}
-        for parameter in component.numbers:
-            self.dimensions[(parameter.name,)] = parameter.unit.dimension
-            for word, _ in parameter.words:
-                self.dimensions.setdefault((word,), parameter.unit.dimension)
-        for clock in component.parameters:
-            if isinstance(clock, Reference) and clock.role == "clock":
-                self.dimensions[(interval_of(clock.name),)] = SECOND
-        self.dimensions[(OTHERS,)] = DIMENSIONLESS  # for count(others)
-        for send in component.sends:
-            self.dimensions[(OTHERS, send.name)] = send.dimension
-        # The vectors of these names, and the entries of those found later; None while a size isn't known.
-        self.sizes: dict[tuple[str, ...], int | None] = {}
+        # `others` alone stands for count(others).
+        self.dimensions |= {PEERS: DIMENSIONLESS, ("time",): SECOND, (OTHERS,): DIMENSIONLESS}
+        words = {(word,): p.unit.dimension for p in component.numbers for word, _ in p.words}
+        self.dimensions = words | self.dimensions | {(p.name,): p.unit.dimension for p in component.numbers}
+        self.dimensions |= {(OTHERS, send.name): send.dimension for send in component.sends}
+        # The vectors of these names, and of those found later; None while a size isn't known.
+        self.sizes: dict[Path, int | None] = {}
         for vector, size in sizes_of(self.dimensions).items():
-            self._add_vector(vector, size, self.dimensions[(*vector[:-1], entry(vector[-1], 1))])
-        for table in component.parameters:
-            if isinstance(table, Reference) and table.role == "table" and table.unit is not None:
-                self.dimensions[(table.name,)] = table.unit.dimension
+            self._add(vector, size, self.dimensions[(*vector[:-1], entry(vector[-1], 1))])
+        for parameter in component.parameters:
+            if isinstance(parameter, Reference) and parameter.role == "clock":
+                self.dimensions[(interval_of(parameter.name),)] = SECOND
+            elif isinstance(parameter, Reference) and parameter.unit is not None:
+                self.dimensions[(parameter.name,)] = parameter.unit.dimension
 
-    def _add_vector(self, parts: tuple[str, ...], size: int, dimension: Dimension | None) -> None:
-        """Know a vector, and each of its entries."""
+    def _add(self, parts: Path, size: int, dimension: Dimension | None) -> None:
+        """Know a number or a vector, and each of its entries."""
         self.sizes[parts] = size
-        self.dimensions |= {(*parts[:-1], one): dimension for one in entries(parts[-1], size)}
+        self.dimensions |= dict.fromkeys([(*parts[:-1], one) for one in entries(parts[-1], size)], dimension)
         self.dimensions[parts] = dimension
 
-    def _is_of_numbers(self, text: str) -> bool:
-        """Return whether a text can hold no vector: it is written out as it is."""
-        return not any(self.sizes.values()) and not any(word in text for word in VECTOR_WORDS)
-
-    def size_of(self, parts: tuple[str, ...]) -> int | None:
+    def size_of(self, parts: Path) -> int | None:
         """Return the size of a name: 0 for a number, None for what is to be inferred."""
         return self.sizes.get(parts, 0)
 
-    def infer_sends(self, sends: Sends, mistakes: Mistakes) -> tuple[Send, ...]:
-        """Return the sends with the dimension of what they send."""
-        return tuple(
-            Send(name, expression, text, place, _known(self._dimension(expression, text, place, mistakes)))
-            for name, expression, text, place in sends
-            if self._is_of_numbers(text) or self._is_sized(expression, text, place, mistakes)
-        )
+    def completed(self, sends: Mapping[str, Written], mistakes: Mistakes) -> Component:
+        """Return the component with its locals and what it sends, checked, its vectors entry by entry."""
+        locals_, found = self._infer_locals(sends), []
+        for name, (expression, text, place) in sends.items():
+            with mistakes:
+                written_out(expression, self.size_of, text, place)  # or its sizes do not fit
+                dimension = _known(self._dimension(expression, text, place))
+                found.append(Send(name, expression, text, place, dimension))
+        own = self.component
+        component = replace(own, locals=(*own.locals, *locals_), sends=(*own.sends, *found))
+        return component if mistakes else self._checked(component, mistakes)
 
-    def _is_sized(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
-        """Record sizes that do not fit."""
-        try:
-            written_out(expression, self.size_of, text, place)
-        except ApcError as error:
-            mistakes.take(error)
-            return False
-        return True
-
-    def infer_locals(self, sends: Sends) -> tuple[tuple[str, Dimension], ...]:
+    def _infer_locals(self, sends: Mapping[str, Written]) -> Named[Dimension]:
         """Return the undeclared names that stand alone on the left of an equation.
 
-        What one is may hang on another, on itself, or on what is sent: each round settles some.
+        What one is may hang on another, on itself, or on what is sent: each round settles some. An unknown
+        name on the right is reported once, by `_checked`.
         """
-        equations = {
-            equation.left.parts: equation
+        undeclared: dict[Path, Written] = {
+            equation.left.parts: (equation.right, equation.text, equation.place)
             for equation in reversed(self.component.equations)
             if isinstance(equation.left, Name)
             and len(equation.left.parts) == 1
             and not equation.left.parts[0].endswith("]")
             and equation.left.parts not in self.dimensions
         }
-        # An unknown name on the right is reported once, by `check`.
-        open_: dict[tuple[str, ...], tuple[Expr, str, Place]] = {
-            name: (equation.right, equation.text, equation.place) for name, equation in equations.items()
-        }
-        open_ = {(OTHERS, name): (expression, text, place) for name, expression, text, place in sends} | open_
+        open_: dict[Path, Written] = {(OTHERS, name): written for name, written in sends.items()}
+        open_ |= undeclared
         self.dimensions |= dict.fromkeys(open_)
-        self._infer_sizes(open_)
-        settled = list(open_)
-        while settled:
-            found = {name: self._dimension(*one, Mistakes()) for name, one in open_.items()}
-            settled = [name for name, dimension in found.items() if dimension is not None]
-            for name in settled:
-                self._add_vector(name, self.sizes[name] or 0, found[name])
-            open_ = {name: one for name, one in open_.items() if name not in settled}
-        for name in open_:
-            self._add_vector(name, self.sizes[name] or 0, None)
-        return tuple((name[0], _known(self.dimensions[name])) for name in reversed(equations))
+        self.sizes |= dict.fromkeys(open_)
+        _settle(open_, self._size, self.sizes.__setitem__)
+        # A size that contradicts itself is none.
+        self.sizes |= {name: self._size(*written) for name, written in open_.items()}
 
-    def _infer_sizes(self, undeclared: Mapping[tuple[str, ...], tuple[Expr, str, Place]]) -> None:
-        """Find the sizes of names that are not declared; what hangs on itself alone is a number."""
+        def add(name: Path, dimension: Dimension | None) -> None:
+            self._add(name, self.sizes[name] or 0, dimension)
 
-        def size(expression: Expr, text: str, place: Place) -> int | None:
-            try:
-                found = written_out(expression, self.size_of, text, place)
-            except ApcError:
-                return 0  # told of by `check`
+        for name in _settle(open_, self._inferred, add):
+            add(name, None)
+        return tuple((name[0], _known(self.dimensions[name])) for name in reversed(undeclared))
+
+    def _size(self, expression: Expr, text: str, place: Place) -> int | None:
+        """Return the size of an expression; 0 of one at fault, which `_checked` reports."""
+        with Mistakes():
+            found = written_out(expression, self.size_of, text, place)
             return len(found) if isinstance(found, tuple) else None if found is None else 0
+        return 0
 
-        self.sizes |= dict.fromkeys(undeclared)
-        settled: dict[tuple[str, ...], int | None] = {}
-        for _ in range(
-            len(undeclared) + 1
-        ):  # each round settles some; a size that contradicts itself never is
-            if settled == (settled := {name: size(*one) for name, one in undeclared.items()}):
-                break
-            self.sizes |= settled
-        self.sizes |= {name: found or 0 for name, found in settled.items()}
+    def _inferred(self, expression: Expr, text: str, place: Place) -> Dimension | None:
+        with Mistakes():
+            return self._dimension(expression, text, place)
+        return None
 
-    def check(self, component: Component, mistakes: Mistakes) -> Component:
+    def _checked(self, component: Component, mistakes: Mistakes) -> Component:
         """Check names, then units and sizes, of every equation, and that what is sent is no reduction.
 
         Return the component without vectors, everything in terms of their entries.
         """
+        sends, written = [], list[Equation]()
         for send in component.sends:
-            self._check_sent(send, mistakes)
-        written: list[Equation] = []
+            with mistakes:
+                self._check_sent(send)
+                found = written_out(send.expression, self.size_of, send.text, send.place)
+                each = found if isinstance(found, tuple) else (found or send.expression,)
+                named = entries(send.name, len(each) if each is found else 0)
+                sends += [replace(send, name=n, expression=one) for n, one in zip(named, each, strict=True)]
         for equation in component.equations:
-            unknown = False
-            left, right = self._decided(equation.left), self._decided(equation.right)
-            for side in (left, right):
-                unknown |= self._check_names(side, equation.text, equation.place, mistakes)
-                unknown |= self._check_reductions(side, equation.text, equation.place, mistakes)
-            if not unknown:
-                try:
+            with mistakes:
+                left, right = self._decided(equation.left), self._decided(equation.right)
+                wrong = Mistakes()
+                for side in (left, right):
+                    self._check_names(side, equation.text, equation.place, wrong)
+                    self._check_reductions(side, equation.text, equation.place, wrong)
+                wrong.raise_if_any()
+                with mistakes:
                     check_equation(
-                        Equation(left, right, equation.text, equation.place),
+                        replace(equation, left=left, right=right),
                         lambda name: self.dimensions.get(name.parts),
                     )
-                except ApcError as error:
-                    mistakes.take(error)
-                if self._is_of_numbers(equation.text):
-                    written.append(equation)
-                    continue
-                try:
-                    written += written_equation(equation, self.size_of)
-                except ApcError as error:
-                    mistakes.take(error)
+                written += written_equation(equation, self.size_of)
         locals_ = (
             (one, dimension)
             for name, dimension in component.locals
             for one in entries(name, self.size_of((name,)) or 0)
         )
-        sends = (one for send in component.sends for one in self._sent_entries(send))
         return replace(component, locals=tuple(locals_), sends=tuple(sends), equations=tuple(written))
 
-    def _sent_entries(self, send: Send) -> Iterator[Send]:
-        """Yield what is sent of each entry of a vector."""
-        if self._is_of_numbers(send.text):
-            yield send
-            return
-        found = written_out(send.expression, self.size_of, send.text, send.place)
-        each = found if isinstance(found, tuple) else (found or send.expression,)
-        for name, one in zip(entries(send.name, len(each) if each is found else 0), each, strict=True):
-            yield replace(send, name=name, expression=one)
-
-    def _check_reductions(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
-        """Record a reduction that doesn't run over the other peers."""
-        wrong = False
+    def _check_reductions(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> None:
+        """Record a reduction that doesn't run over the other peers, and an age of what is not heard."""
         for node in walk(expression):
-            if isinstance(node, Call) and node.function == "age":
-                wrong |= self._is_age_of_nothing(node, text, place, mistakes)
+            if not isinstance(node, Call):
                 continue
-            if not isinstance(node, Call) or any(name.parts[0] == OTHERS for name in names(node)):
-                continue
-            if node.function in ("mean", "sum", "count"):
-                what, expected = f"{node.function} runs over the other peers and", "others.x in it"
-            elif node.function in ("max", "min") and len(node.arguments) == 1:
-                what, expected = node.function, "two values, or one of the other peers"
+            function, others = node.function, [name for name in names(node) if name.parts[0] == OTHERS]
+            hint = "count(others)" if function == "count" else f"{function}(others.x)"
+            if function == "age":
+                heard = [name for name in others if len(name.parts) > 1]
+                if heard and heard[0] is node.arguments[0]:
+                    continue
+                sent = [*(send.name for send in self.component.sends), "x"][0]
+                shown = format_expression(heard[0]) if heard else f"{OTHERS}.{sent}"
+                what, expected = "age is of one value that is heard of the others, and", f"{shown} in it"
+                hint = f"age({shown})"
+            elif function in ("mean", "sum", "count") and not others:
+                what, expected = f"{function} runs over the other peers and", "others.x in it"
+            elif function in ("max", "min") and len(node.arguments) == 1 and not others:
+                what, expected = function, "two values, or one of the other peers"
             else:
                 continue
-            wrong = True
-            hint = "count(others)" if node.function == "count" else f"{node.function}(others.x)"
             where, got = place_in(place, text, node.start), format_expression(node)
             mistakes.add("E506", where, what, expected=expected, got=got, hint=hint)
-        return wrong
 
-    def _is_age_of_nothing(self, call: Call, text: str, place: Place, mistakes: Mistakes) -> bool:
-        """Record an age of what is not heard of the others."""
-        (argument,) = call.arguments
-        if isinstance(argument, Name) and argument.parts[0] == OTHERS and len(argument.parts) > 1:
-            return False
-        named = next((n for n in names(argument) if n.parts[0] == OTHERS and len(n.parts) > 1), None)
-        sent = [*(send.name for send in self.component.sends)] or ["x"]
-        shown = format_expression(named) if named is not None else f"others.{sent[0]}"
-        mistakes.add(
-            "E506",
-            place_in(place, text, call.start),
-            "age is of one value that is heard of the others, and",
-            expected=f"{shown} in it",
-            got=format_expression(call),
-            hint=f"age({shown})",
-        )
-        return True
-
-    def _check_sent(self, send: Send, mistakes: Mistakes) -> None:
-        """Record a send of what is heard: that is known at ticks of the clock, not of the link."""
-        heard = next((n for n in walk(send.expression) if isinstance(n, Name) and n.parts[0] == OTHERS), None)
+    def _check_sent(self, send: Send) -> None:
+        """Refuse a send of what is heard: that is known at ticks of the clock, not of the link."""
+        heard = next((name for name in names(send.expression) if name.parts[0] == OTHERS), None)
         if heard is None:
             return
         name = next(one for n in count(1) if (one := f"sent{n}",) not in self.dimensions)
         shown = format_expression(heard)
         what = f"{send.name} is sent at ticks of the link, and {shown} is heard at those of the clock"
         hint = f"{name} = {send.text} among the equations, and sends: {{{send.name}: sample(hold({name}))}}"
-        mistakes.add("E505", place_in(send.place, send.text, heard.start), what, hint=hint)
+        raise fault("E505", place_in(send.place, send.text, heard.start), what, hint=hint)
 
     def _decided(self, expression: Expr) -> Expr:
         """Return the expression without what has no dimension: words of options, and clocks to sample at.
 
         Each test of an option becomes a true statement: both branches are checked.
         """
-        options = {p.name: p for p in self.component.parameters if isinstance(p, Option)}
 
         def decided(node: Expr) -> Expr | None:
             if isinstance(node, Call) and node.function == "sample" and len(node.arguments) == 2:
                 return replace(node, arguments=(transform(node.arguments[0], decided),))
-            return _TRUE if option_test(node, options) else None
+            return _TRUE if option_test(node, self.options) else None
 
         return transform(expression, decided)
 
@@ -291,62 +229,65 @@ class ComponentNames:
         """Return the dimension of a checked expression, or None if it is a variable, which has its own."""
         if isinstance(expression, Name) and expression.parts in self.variables:
             return None
-        return _known(self._dimension(expression, text, place, Mistakes()))
+        return _known(self._dimension(expression, text, place))
 
-    def _dimension(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> Dimension | None:
-        expression = self._decided(expression)
-        if self._check_names(expression, text, place, mistakes):
-            return None
-        try:
-            return dimension_of(expression, lambda name: self.dimensions.get(name.parts), text, place)
-        except ApcError as error:
-            mistakes.take(error)
-            return None
+    def _dimension(self, expression: Expr, text: str, place: Place) -> Dimension | None:
+        """Return the dimension of an expression. Raises ApcError for its names and units."""
+        expression, wrong = self._decided(expression), Mistakes()
+        self._check_names(expression, text, place, wrong)
+        wrong.raise_if_any()
+        return dimension_of(expression, lambda name: self.dimensions.get(name.parts), text, place)
 
-    def _check_names(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> bool:
-        options = {p.name: p for p in self.component.parameters if isinstance(p, Option)}
-        wrong, told = False, set[int]()
+    def _check_names(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> None:
+        """Record names that nothing of the component has, and words that an option hasn't got."""
+        told = set[int]()
         for node in walk(expression):
             if isinstance(node, Compare) and isinstance(node.left, Name) and isinstance(node.right, Name):
-                option, word = options.get(".".join(node.left.parts)), ".".join(node.right.parts)
+                option, word = self.options.get(".".join(node.left.parts)), ".".join(node.right.parts)
                 if option is not None and node.operator in ("==", "!="):  # else it was decided
-                    wrong = True
                     told |= {node.left.start, node.right.start}
                     what = f"{option.name} has no option {brief(word)}"
                     at = place_in(place, text, node.right.start)
-                    add_unknown("E206", at, what, word, option.words, mistakes)
+                    mistakes.take(unknown("E206", at, what, word, option.words))
             if isinstance(node, Name) and node.parts not in self.dimensions and node.start not in told:
-                wrong = True
-                shown = ".".join(node.parts)
-                if node.parts[0] == OTHERS:
-                    what = f"{self.component.name} sends nothing called {brief('.'.join(node.parts[1:]))}"
-                    mistakes.add(
-                        "E303", place_in(place, text, node.start), what, hint="sends: {x: sample(object.x)}"
-                    )
-                    continue
-                if self._is_bad_index(node.parts, place_in(place, text, node.start), mistakes):
-                    continue
-                known = sorted(
-                    ".".join(parts) for parts in self.dimensions if not whole_and_index(parts[-1])[1]
-                )
-                whole, _ = whole_and_index(shown)
-                what = f"{self.component.name} has no {brief(whole)}"
-                add_unknown("E303", place_in(place, text, node.start), what, whole, known, mistakes)
-        return wrong
+                mistakes.take(self._unknown(node.parts, place_in(place, text, node.start)))
 
-    def _is_bad_index(self, parts: tuple[str, ...], place: Place, mistakes: Mistakes) -> bool:
-        """Record an entry that a vector hasn't got, or an index behind a number."""
+    def _unknown(self, parts: Path, place: Place) -> ApcError:
+        """Return the mistake of a name there isn't, of an entry that a vector hasn't got among them."""
         name, index = whole_and_index(parts[-1])
         whole = (*parts[:-1], name)
-        if not index or whole not in self.dimensions:
-            return False
         shown, size = ".".join(whole), self.size_of(whole) or 0
-        if size:
-            expected, got, hint = f"an index from 1 to {size}", f"{index}", entry(shown, size)
-        else:
-            expected, got, hint = "a vector before the index", f"{shown}, which is a number", shown
-        mistakes.add("E408", place, entry(shown, index), expected=expected, got=got, hint=hint)
-        return True
+        if parts[0] == OTHERS:
+            what = f"{self.component.name} sends nothing called {brief('.'.join(parts[1:]))}"
+            return fault("E303", place, what, hint="sends: {x: sample(object.x)}")
+        if index and whole in self.dimensions:
+            told = entry(shown, index)
+            if size:
+                return fault(
+                    "E408", place, told, f"an index from 1 to {size}", f"{index}", entry(shown, size)
+                )
+            return fault(
+                "E408", place, told, "a vector before the index", f"{shown}, which is a number", shown
+            )
+        known = sorted(".".join(one) for one in self.dimensions if not whole_and_index(one[-1])[1])
+        return unknown("E303", place, f"{self.component.name} has no {brief(shown)}", shown, known)
+
+
+def _settle(
+    waiting: Mapping[Path, Written],
+    infer: Callable[[Expr, str, Place], T | None],
+    keep: Callable[[Path, T], None],
+) -> Collection[Path]:
+    """Infer something of each name, which may hang on others': each round settles some. Return the rest."""
+    while waiting:
+        found = {name: infer(*written) for name, written in waiting.items()}
+        for name, value in found.items():
+            if value is not None:
+                keep(name, value)
+        before, waiting = waiting, {name: one for name, one in waiting.items() if found[name] is None}
+        if len(before) == len(waiting):
+            break
+    return waiting
 
 
 def _visible_names(component: Component) -> Iterator[tuple[tuple[str, ...], Dimension]]:
@@ -368,23 +309,14 @@ def _known(dimension: Dimension | None) -> Dimension:
     return DIMENSIONLESS if dimension in (None, ANY) else dimension
 
 
-def check_balance(component: Component, mistakes: Mistakes) -> None:
-    """Record E501 for a component with more or fewer equations than it must have."""
-    passed = {connector for connector, _, _ in component.passed}
-    flows = [
-        f"{name}.{flow.name}"
-        for name, connector in component.connectors
-        if name not in passed
-        for flow in connector.flows
-    ]
+def check_balance(component: Component) -> None:
+    """Refuse (E501) a component with more or fewer equations than it must have."""
     unknowns = [variable.name for variable in component.variables]
-    unknowns += [name for name, _ in component.locals] + flows
+    unknowns += [name for name, _ in component.locals]
+    unknowns += [f"{name}.{flow.name}" for name, flow in component.flows]
     if len(component.equations) == len(unknowns):
         return
-    mistakes.add(
-        "E501",
-        component.place,
-        f"{component.name} is unbalanced: {counted(len(component.equations), 'equation')} for "
-        f"{counted(len(unknowns), 'unknown')} ({', '.join(unknowns) or 'none'})",
-        hint="one equation for each variable and one for each flow of a connector",
-    )
+    numbers = f"{counted(len(component.equations), 'equation')} for {counted(len(unknowns), 'unknown')}"
+    what = f"{component.name} is unbalanced: {numbers} ({', '.join(unknowns) or 'none'})"
+    hint = "one equation for each variable and one for each flow of a connector"
+    raise fault("E501", component.place, what, hint=hint)

@@ -8,15 +8,17 @@ Does not: read what is in a definition (see `definitions`).
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 from apc.compiler.cache import SUFFIX, builtin_files
 from apc.compiler.components.component import Component, Connector
 from apc.compiler.components.definitions import read_component, read_connector
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.files import RefusedError, files_below, read_file, same_file
 from apc.compiler.source.nodes import MAX_BYTES, Mapping, Scalar
-from apc.compiler.source.reading import brief
+from apc.compiler.source.reading import brief, fault
 from apc.compiler.source.source import Source, read_source
 
 LONGEST_CHAIN = 50  # of components that are read for one another, each by several calls of Python's stack
@@ -32,10 +34,8 @@ class Library:
 
     def __init__(self, folders: tuple[Path, ...] = (), aside: list[ApcError] | None = None) -> None:
         self._sources: dict[str, Source] = {}
-        self._components: dict[str, Component] = {}
-        self._connectors: dict[str, Connector] = {}
+        self._read: dict[str, Component | Connector | ApcError] = {}
         self._files: dict[str, Path] = dict(builtin_files())
-        self._failed: dict[str, ApcError] = {}
         self._open: list[str] = []  # the components being read, each asked for by the one before
         own: dict[str, Path] = {}
         for path in (path for folder in folders for path in files_below(folder, SUFFIX)):
@@ -51,9 +51,7 @@ class Library:
                 continue
             if own.setdefault(name, path) != path and not same_file(own[name], path):
                 what = f"{brief(name)} is defined in {own[name]} already"
-                raise ApcError(
-                    Mistake("E218", source.root.place, what, hint="another name in one of the two")
-                )
+                raise fault("E218", source.root.place, what, hint="another name in one of the two")
             self._sources[name] = source
         self._files |= own
 
@@ -69,41 +67,38 @@ class Library:
 
     def component(self, name: str) -> Component | None:
         """Return a component, or None if there is no such name. Raises ApcError if its text is at fault."""
-        if name not in self._files:
-            return None
-        if name not in self._components:
-            source = self._source(name)
-            if not _is_definition(source, "component"):
-                return None
-            if name in self._open:
-                chain = " → ".join([*self._open[self._open.index(name) :], name])
-                what = f"components contain or extend each other: {chain}"
-                raise ApcError(Mistake("E212", source.root.place, what))
-            if len(self._open) == LONGEST_CHAIN:
-                what = f"components contain or extend one another more than {LONGEST_CHAIN} deep"
-                raise ApcError(Mistake("E212", source.root.place, what, hint="fewer of them in one another"))
-            if name in self._failed:
-                raise self._failed[name]  # read once, even if a hundred parts are of it
-            self._open.append(name)
-            try:
-                self._components[name] = read_component(source, self)
-            except ApcError as error:
-                self._failed[name] = error
-                raise
-            finally:
-                self._open.pop()
-        return self._components[name]
+        found = self._definition(name, "component")
+        assert not isinstance(found, Connector)
+        return found
 
     def connector(self, name: str) -> Connector | None:
-        """Return a connector type, or None if there is no such name."""
-        if name not in self._files:
+        """Return a connector type as `component` does a component."""
+        found = self._definition(name, "connector")
+        assert not isinstance(found, Component)
+        return found
+
+    def _definition(self, name: str, kind: str) -> Component | Connector | None:
+        """Return what is called so and is of a kind, read once, even if a hundred parts are of it."""
+        if name not in self._files or not _is_definition(source := self._source(name), kind):
             return None
-        if name not in self._connectors:
-            source = self._source(name)
-            if not _is_definition(source, "connector"):
-                return None
-            self._connectors[name] = read_connector(source)
-        return self._connectors[name]
+        if name in self._open:
+            chain = " → ".join([*self._open[self._open.index(name) :], name])
+            what = f"components contain or extend each other: {chain}"
+            raise fault("E212", source.root.place, what)
+        if len(self._open) == LONGEST_CHAIN:
+            what = f"components contain or extend one another more than {LONGEST_CHAIN} deep"
+            raise fault("E212", source.root.place, what, hint="fewer of them in one another")
+        if name not in self._read:
+            self._open.append(name)
+            try:
+                is_component = kind == "component"
+                self._read[name] = read_component(source, self) if is_component else read_connector(source)
+            except ApcError as error:
+                self._read[name] = error
+            self._open.pop()
+        if isinstance(found := self._read[name], ApcError):
+            raise found
+        return found
 
     def _source(self, name: str) -> Source:
         if name not in self._sources:
@@ -117,19 +112,14 @@ def _read(path: Path) -> Source:
     try:
         return read_source(path)
     except ApcError as error:
-        if any(word in _text(path) for word in (b"component", b"connector")):
+        text = b"component"  # why a file is refused tells nothing of what is in it
+        with suppress(RefusedError):
+            text = read_file(path, MAX_BYTES)
+        if b"component" in text or b"connector" in text:
             raise
-        what = "a file of a library"
-        expected = "YAML that defines a component or connector"
-        places = [Place(one.place.file, one.place.line, one.place.column) for one in error.mistakes]
+        what, expected = "a file of a library", "YAML that defines a component or connector"
+        places = [replace(one.place, source_line="") for one in error.mistakes]
         raise ApcError(Mistake("E219", place, what, expected) for place in places) from None
-
-
-def _text(path: Path) -> bytes:
-    try:
-        return read_file(path, MAX_BYTES)
-    except RefusedError:
-        return b"component"  # why it is not read tells nothing of what is in it
 
 
 def definition_of(source: Source) -> tuple[str, str]:

@@ -11,10 +11,9 @@ from collections.abc import Sequence, Set
 
 from sympy import Add
 
-from apc.compiler.equations.derivatives import Derivative, Moving, derivative
-from apc.compiler.equations.residuals import Residual
-from apc.compiler.equations.solution import Assignment
-from apc.compiler.equations.terms import Term, symbol
+from apc.compiler.equations.derivatives import Derivative, Moving
+from apc.compiler.equations.solution import Assignment, Residual
+from apc.compiler.equations.terms import Term, derivative, symbol
 
 
 class Aliases:

@@ -5,46 +5,53 @@ Guarantees: every unknown is assigned once, from what was assigned before; linea
 Does not: differentiate anything (see `index`), or know of states and clocks.
 
 Matched and sorted by `matching`, the usual way of Modelica compilers (Cellier and Kofman, Continuous System
-Simulation, ch. 7); a block of linear equations is solved by `elimination`, a nonlinear loop is left to an
-iteration over the few unknowns that `tearing` chooses.
+Simulation, ch. 7); a block of linear equations is solved by `elimination`. A nonlinear loop is left to an
+iteration over few unknowns, from which the others follow one by one: it is torn (Elmqvist and Otter, Methods
+for tearing systems of equations in object-oriented modeling, 1994).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import functools
+from collections.abc import Mapping, Sequence
+from math import prod
 
 import sympy
 from sympy.matrices import dotprodsimp
 
 from apc.compiler.equations.elimination import eliminate
-from apc.compiler.equations.matching import match_columns, strong_components
-from apc.compiler.equations.residuals import (
+from apc.compiler.equations.matching import Incidence, alternating, match_columns, strong_components
+from apc.compiler.equations.solution import (
     MOST_LISTED,
-    SCENE,
+    Assignment,
+    ImplicitBlock,
+    Problem,
     Residual,
+    Step,
     listed,
-    report_no_number,
-    report_singular,
 )
-from apc.compiler.equations.solution import Step, expressions
-from apc.compiler.equations.symbolic import is_no_number, linear_form, slope, smooth_pieces
-from apc.compiler.equations.tearing import tear
-from apc.compiler.equations.terms import NoDerivativeError, Symbol, Term, symbol
+from apc.compiler.equations.terms import (
+    Abs,
+    If,
+    Max,
+    NoDerivativeError,
+    Symbol,
+    Term,
+    is_no_number,
+    linear_form,
+    slope,
+    symbol,
+)
 from apc.compiler.equations.zero_test import Divisors
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.words import counted
 
-# A loop of more guesses, or with more pieces between its corners, is not asked whether it has one solution.
+# A loop of more guesses isn't asked whether it has one solution, nor more pieces of it between its corners.
 MOST_GUESSES, MOST_PIECES = 3, 64
+BENT = (If, Max, Abs, sympy.Abs, sympy.sign, sympy.floor)
 
 
 def solve_blocks(
-    residuals: Sequence[Residual],
-    unknowns: Sequence[Symbol],
-    where: str,
-    mistakes: Mistakes,
-    divisors: Divisors | None = None,
-    place: Place = SCENE,
+    residuals: Sequence[Residual], unknowns: Sequence[Symbol], problem: Problem
 ) -> tuple[Step, ...]:
     """Match, sort and solve.
 
@@ -52,93 +59,170 @@ def solve_blocks(
     ----------
     residuals, unknowns
         As many equations as unknowns; a mistake if not.
-    where
-        What to call the equations in a message: "the continuous equations".
-    mistakes
+    problem
         Takes E502 equations or unknowns left over, E503 a loop without an unknown to solve for, E511 linear
         equations that depend on each other, E512 what is no number.
-    divisors
-        What may be divided by.
-    place
-        Where to point when there is no equation.
     """
     columns = {unknown: j for j, unknown in enumerate(unknowns)}
     incidence = [sorted(columns[s] for s in r.expression.free_symbols & columns.keys()) for r in residuals]
     match = match_columns(incidence, len(unknowns))
-    if len(residuals) != len(unknowns) or None in match:
-        report_singular(residuals, [u.name for u in unknowns], incidence, match, where, mistakes, place)
+    if not len(residuals) == len(unknowns) == len(match):
+        report_singular(residuals, [unknown.name for unknown in unknowns], incidence, match, problem)
         return ()
+    column_of = {row: column for column, row in match.items()}
     # Row i needs the rows that compute its other unknowns.
-    needs = [
-        [row for j in held if (row := match[j]) is not None and row != i] for i, held in enumerate(incidence)
-    ]
-    solver = _Solver(where, mistakes, divisors or Divisors())
+    needs = [[match[j] for j in held if match[j] != i] for i, held in enumerate(incidence)]
     steps: list[Step] = []
-    for block in map(set, strong_components(needs)):
-        own = [unknown for unknown, row in zip(unknowns, match, strict=True) if row in block]
-        steps += solver.checked([residuals[row] for row in sorted(block)], own)
+    for rows in strong_components(needs):
+        block = [residuals[row] for row in rows]
+        solved = _solved(block, [unknowns[j] for j in sorted(column_of[row] for row in rows)], problem)
+        parts = [one.expressions if isinstance(one, ImplicitBlock) else one[1:] for one in solved]
+        if any(is_no_number(expression) for part in parts for expression in part):
+            problem.report_no_number(block)  # what was divided may cancel
+        else:
+            steps += solved
     return tuple(steps)
 
 
-@dataclass(frozen=True, slots=True)
-class _Solver:
-    """Solves blocks; keeps what they share: what may be divided by, and where mistakes go."""
+def report_singular(
+    residuals: Sequence[Residual],
+    unknowns: Sequence[str],
+    incidence: Incidence,
+    match: Mapping[int, int],
+    problem: Problem,
+) -> None:
+    """Add the mistake E502: which equations and which unknowns are too many.
 
-    where: str
-    mistakes: Mistakes
-    divisors: Divisors
+    Parameters
+    ----------
+    residuals, unknowns
+        The equations, and the names of what they are to give.
+    incidence
+        For each equation the places of its unknowns.
+    match
+        The unknowns that are given, each with its equation.
+    problem
+        Takes the mistake.
+    """
+    columns = {row: column for column, row in match.items()}
+    holders = [[i for i, held in enumerate(incidence) if j in held] for j in range(len(unknowns))]
+    unmatched = [i for i in range(len(residuals)) if i not in columns]
+    over, over_columns = alternating(unmatched, incidence, match)
+    free = [j for j in range(len(unknowns)) if j not in match]
+    under_columns, under = alternating(free, holders, columns)
+    parts = []
+    if over:
+        names = [unknowns[j] for j in over_columns]
+        only = f"only {counted(len(names), 'unknown')} ({listed(names)})" if names else "no unknown"
+        parts.append(f"{counted(len(over), 'equation')} hold {only}: {listed([residuals[i] for i in over])}")
+    if under_columns:
+        names = [unknowns[j] for j in under_columns]
+        by = f"only {counted(len(under), 'equation')}, {listed([residuals[i] for i in under])}"
+        has = f"{'has' if len(names) == 1 else 'have'} {by if under else 'no equation'}"
+        parts.append(f"{counted(len(names), 'unknown')} ({listed(names)}) {has}")
+    first = [residuals[i] for i in unmatched] or residuals
+    problem.report("E502", first, f"{problem.where} can't be solved: {'; and '.join(parts)}")
 
-    def checked(self, block: Sequence[Residual], unknowns: Sequence[Symbol]) -> list[Step]:
-        """Solve one block; its expressions must be numbers: what was divided may cancel."""
-        steps = self.solve(block, unknowns)
-        if any(is_no_number(expression) for step in steps for expression in expressions(step)):
-            report_no_number(block, self.mistakes)
-            return []
-        return steps
 
-    def solve(self, block: Sequence[Residual], unknowns: Sequence[Symbol]) -> list[Step]:
-        """Return what gives the unknowns of one block, explicit where it is linear in them."""
-        known = frozenset(unknowns)
-        forms = [linear_form(residual.expression, known) for residual in block]
-        linear = [form for form in forms if form is not None]
-        if len(linear) < len(forms):
-            return self._loop(block, unknowns)
-        steps, free = eliminate(linear, unknowns, self.divisors)
+def _solved(block: Sequence[Residual], unknowns: Sequence[Symbol], problem: Problem) -> Sequence[Step]:
+    """Return what gives the unknowns of one block, explicit where it is linear in them."""
+    known = frozenset(unknowns)
+    forms = [linear_form(residual.expression, known) for residual in block]
+    linear = [form for form in forms if form is not None]
+    if len(linear) == len(forms):
+        steps, free = eliminate(linear, unknowns, problem.divisors)
         if free:
-            what = f"depend on each other and don't determine {listed([u.name for u in free])}"
-            self._report("E511", block, f"{what}: {listed([residual.shown for residual in block])}")
-        return list(steps)
+            what = f"depend on each other and don't determine {listed([one.name for one in free])}"
+            problem.report("E511", block, f"{problem.where} {what}: {listed(block)}")
+        return steps
+    loop = _torn(block, unknowns, problem.divisors)
+    residuals = loop.residuals
+    for name, value in reversed(loop.inner if len(loop.inner) <= MOST_LISTED else ()):
+        residuals = tuple(residual.xreplace({symbol(name): value}) for residual in residuals)
+    fault = ""
+    if not all(residual.free_symbols for residual in residuals):
+        fault = "hold a loop without an unknown left to solve for"
+    elif _is_open(residuals, [symbol(name) for name in loop.tearing], problem.divisors):
+        fault = "hold a loop that many values solve, or none"
+    if fault:
+        problem.report("E503", block, f"{problem.where} {fault}: {loop.chain}, by {listed(block)}")
+    return () if fault else (loop,)
 
-    def _loop(self, block: Sequence[Residual], unknowns: Sequence[Symbol]) -> list[Step]:
-        """Tear a nonlinear block; every residual of it must be one that the guesses can make zero."""
-        made = tear(block, unknowns, self.divisors)
-        residuals = made.residuals
-        if len(made.inner) <= MOST_LISTED:
-            for name, value in reversed(made.inner):
-                residuals = tuple(residual.xreplace({symbol(name): value}) for residual in residuals)
-        fault = ""
-        if not all(residual.free_symbols for residual in residuals):
-            fault = "hold a loop without an unknown left to solve for"
-        elif self._is_open(residuals, [symbol(name) for name in made.tearing]):
-            fault = "hold a loop that many values solve, or none"
-        if fault:
-            self._report("E503", block, f"{fault}: {made.chain}, by {listed(made.equations)}")
-        return [] if fault else [made]
 
-    def _is_open(self, residuals: Sequence[Term], guesses: Sequence[Symbol]) -> bool:
-        """Return whether between corners the residuals don't depend on the guesses, or only on some."""
-        if len(guesses) > MOST_GUESSES:
-            return False
-        for piece in smooth_pieces(residuals, MOST_PIECES) or ():
-            try:
-                slopes = sympy.Matrix([[slope(one, guess) for guess in guesses] for one in piece])
-            except NoDerivativeError:
-                continue
-            with dotprodsimp(False):  # which would expand it
-                determinant = slopes.det(method="laplace")
-            if not self.divisors.allow(determinant):
-                return True
-        return False
+def _torn(block: Sequence[Residual], unknowns: Sequence[Symbol], divisors: Divisors) -> ImplicitBlock:
+    """Guess as few unknowns as simply found, so that the others follow one by one.
 
-    def _report(self, code: str, block: Sequence[Residual], what: str) -> None:
-        self.mistakes.add(code, block[0].equation.place, f"{self.where} {what}")
+    When no equation computes an unknown, the open unknown in most of the open equations is torn, of several
+    the one that fewest of them could compute. What is computed stands linearly in its equation, with a factor
+    that is free of the loop's unknowns and isn't zero for all values.
+    """
+    members = frozenset(unknowns)
+    holds = [residual.expression.free_symbols & members for residual in block]
+
+    @functools.cache
+    def solved(i: int, unknown: Symbol) -> Term | None:
+        """Return an unknown by an equation, None where it can't be told from that."""
+        form = linear_form(block[i].expression, frozenset((unknown,)))
+        factor = form and form[0].get(unknown)
+        if not form or factor is None or factor.free_symbols & members or divisors.is_zero(factor):
+            return None
+        return -form[1] / factor
+
+    def gain(unknown: Symbol) -> tuple[int, int]:
+        rows = [i for i in left if unknown in holds[i]]
+        return len(rows), -sum(solved(i, unknown) is not None for i in rows)
+
+    left, remaining = dict.fromkeys(range(len(block))), dict.fromkeys(unknowns)
+    inner: list[Assignment] = []
+    torn: list[Symbol] = []
+    while remaining:
+        single = ((i, *still) for i in left if len(still := holds[i] & remaining.keys()) == 1)
+        ready = next(((i, unknown) for i, unknown in single if solved(i, unknown) is not None), None)
+        if ready is None:
+            torn.append(max(remaining, key=gain))
+            del remaining[torn[-1]]
+        else:
+            inner.append((ready[1].name, solved(*ready)))
+            del left[ready[0]], remaining[ready[1]]
+    names, guesses = (tuple(one.name for one in some) for some in (unknowns, torn))
+    return ImplicitBlock(names, guesses, tuple(inner), tuple(block[i].expression for i in left))
+
+
+def _is_open(residuals: Sequence[Term], guesses: Sequence[Symbol], divisors: Divisors) -> bool:
+    """Return whether between corners the residuals don't depend on the guesses, or only on some."""
+    bent = {node for one in residuals for node in one.atoms(*BENT)}
+    pieces = min(MOST_PIECES, prod(len(_branches(node)) for node in bent))
+    for number in range(pieces if len(guesses) <= MOST_GUESSES else 0):
+        piece = _piece(residuals, number)
+        try:
+            slopes = sympy.Matrix([[slope(one, guess) for guess in guesses] for one in piece])
+        except NoDerivativeError:
+            continue
+        with dotprodsimp(False):  # which would expand it
+            determinant = slopes.det(method="laplace")
+        if divisors.is_zero(determinant) or divisors.vanishes(determinant):
+            return True
+    return False
+
+
+def _piece(residuals: Sequence[Term], number: int) -> list[Term]:
+    """Return what residuals are between their corners and jumps, by the number of a choice of branches."""
+    chosen: dict[Term, Term] = {}
+
+    def choose(node: Term) -> Term:
+        nonlocal number
+        if node not in chosen:
+            branches = _branches(node)
+            number, digit = divmod(number, len(branches))
+            chosen[node] = branches[digit]
+        return chosen[node]
+
+    return [one.replace(lambda node: isinstance(node, BENT), choose) for one in residuals]
+
+
+def _branches(node: Term) -> tuple[Term, ...]:
+    """Return what a node is on either side of its corners; what jumps is constant between jumps."""
+    if isinstance(node, If | Max):
+        return tuple(node.args[isinstance(node, If) :])
+    is_size = isinstance(node, Abs | sympy.Abs)
+    return (node.args[0], -node.args[0]) if is_size else (symbol(f"constant {node}"),)

@@ -8,101 +8,70 @@ Does not: write out the parts' own equations (see `flatten`).
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 
 from apc.compiler.components.parts import GROUND
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.language.expression import (
-    Binary,
-    Expr,
-    Name,
-    Number,
-)
+from apc.compiler.language.expression import Binary, Expr, Name, Number
 from apc.compiler.scene.instances import Part
 
 Terminal = tuple[str, str]  # (part, connector)
-Meeting = tuple[Expr, Expr, Place]  # an equation, and where what meets is joined
+ZERO = Number(Fraction(0))
 
 
-def connection_equations(parts: list[Part], mistakes: Mistakes) -> Iterator[Meeting]:
-    """Yield, for each set of connectors that meet: potentials equal, flows summing to zero.
+def connection_equations(parts: Sequence[Part], mistakes: Mistakes) -> Iterator[tuple[Expr, Expr, Place]]:
+    """Yield the equations (left, right, place) of each set of connectors that meet.
 
-    In a set with the ground the potentials are zero and the flows are whatever they must be.
+    Each set reads from what is joined to outwards: a mass's connector stands before those joined to it. The
+    ground joins nothing: each set has its own.
     """
-    here = {part.name: part for part in parts}
-    passed: dict[Terminal, list[Terminal]] = {}
+    by_name = {part.name: part for part in parts}
+    connectors = {(part.name, own): type_ for part in parts for own, type_ in part.component.connectors}
+    meeting = {terminal: [terminal] for terminal in connectors}
+
+    def join(one: Terminal, other: Terminal) -> None:
+        joining, joined = meeting[one], meeting[other]
+        if joining is not joined:
+            joined.extend(joining)
+            meeting.update(dict.fromkeys(joining, joined))
+
+    passed, grounded = set(), set()
     for part in parts:
         for connector, inner, its in part.component.passed:
-            passed.setdefault((part.name, connector), []).append((f"{part.name}.{inner}", its))
-    for members in _meeting(parts, here, passed, mistakes):
-        grounded = (GROUND, "") in members
-        joined = [node for node in members if node[0] != GROUND and node not in passed]
-        first_part, first_connector = joined[0]
-        type_ = dict(here[first_part].component.connectors)[first_connector]
-        place = here[joined[-1][0]].place
-        for variable in type_.potentials:
-            names = [_whole_name(node, variable.name) for node in joined]
-            if grounded:
-                for name in names:
-                    yield name, Number(Fraction(0)), place
+            passed.add((part.name, connector))
+            join((part.name, connector), (f"{part.name}.{inner}", its))
+    for part in parts:
+        for connector, other, its in part.connections:
+            if other == GROUND:
+                grounded.add((part.name, connector))
+            elif other in by_name:
+                join((part.name, connector), (other, its))
             else:
-                for name in names[1:]:
-                    yield name, names[0], place
-        if grounded:
-            continue
-        for variable in type_.flows:
-            total = _sum([_whole_name(node, variable.name) for node in joined])
-            yield total, Number(Fraction(0)), place
+                what = f"{part.name} is at groups where {other}, which it joins, is not"
+                hint = f"at: the same groups at both {part.name} and {other}"
+                mistakes.add("E210", part.place, what, hint=hint)
+    for members in {id(members): members for members in meeting.values()}.values():
+        joined = [terminal for terminal in members if terminal not in passed]
+        place, type_ = by_name[joined[-1][0]].place, connectors[joined[0]]
+        for potential in type_.potentials:
+            first, *others = (_name(terminal, potential.name) for terminal in joined)
+            if grounded.isdisjoint(members):
+                yield from ((name, first, place) for name in others)
+            else:
+                yield from ((name, ZERO, place) for name in (first, *others))
+        if grounded.isdisjoint(members):
+            for flow in type_.flows:
+                yield _sum([_name(terminal, flow.name) for terminal in joined]), ZERO, place
+
+
+def _name(terminal: Terminal, variable: str) -> Name:
+    return Name((*terminal[0].split("."), terminal[1], variable))
 
 
 def _sum(terms: Sequence[Expr]) -> Expr:
     """Return a sum as a tree of little depth, so that a thousand parts may meet at one flange."""
-    if len(terms) <= 16:  # few read best as they are written, one after the other
-        return functools.reduce(lambda total, term: Binary("+", total, term), terms)
-    half = len(terms) // 2
+    if len(terms) == 1:
+        return terms[0]
+    half = len(terms) // 2 if len(terms) > 16 else -1  # few read best as they are written
     return Binary("+", _sum(terms[:half]), _sum(terms[half:]))
-
-
-def _whole_name(node: Terminal, variable: str) -> Name:
-    return Name((*node[0].split("."), node[1], variable))
-
-
-def _meeting(
-    parts: list[Part], here: dict[str, Part], passed: dict[Terminal, list[Terminal]], mistakes: Mistakes
-) -> Iterator[list[Terminal]]:
-    """Yield the sets of connectors that meet, each read from what is joined to outwards."""
-    sets: dict[Terminal, list[Terminal]] = {}
-    for part in parts:
-        for connector, _ in part.component.connectors:
-            sets[(part.name, connector)] = [(part.name, connector)]
-
-    def join(one: Terminal, two: Terminal) -> None:
-        mine, other = sets[one], sets[two]
-        if mine is not other:
-            # What is joined to comes first, so that a set reads from the mass outwards.
-            other.extend(mine)
-            for member in mine:
-                sets[member] = other
-
-    for outer, inside in passed.items():
-        for inner in inside:
-            join(outer, inner)
-    for part in parts:
-        for connector, other, its_connector in part.connections:
-            own = (part.name, connector)
-            if other == GROUND:
-                if (GROUND, "") not in sets[own]:
-                    sets[own].append((GROUND, ""))  # each set has its own: the ground joins nothing
-            elif other not in here:
-                what = f"{part.name} is at groups where {other}, which it joins, is not"
-                hint = f"at: the same groups at both {part.name} and {other}"
-                mistakes.add("E210", part.place, what, hint=hint)
-            else:
-                join(own, (other, its_connector))
-    seen: set[int] = set()
-    for members in sets.values():
-        if id(members) not in seen:
-            seen.add(id(members))
-            yield members

@@ -15,15 +15,13 @@ in some.
 from __future__ import annotations
 
 import sys
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 
 import sympy
 from sympy.matrices import dotprodsimp
 
 from apc.compiler.equations.solution import Assignment
-from apc.compiler.equations.symbolic import LinearForm
-from apc.compiler.equations.terms import ONE, ZERO, Symbol, Term, size, symbol
+from apc.compiler.equations.terms import ONE, ZERO, LinearForm, Symbol, Term, size, symbol
 from apc.compiler.equations.zero_test import Divisors
 
 # An entry with more nodes than this gets a name of its own: substituted into one another, the entries of a
@@ -33,7 +31,7 @@ MOST_BY_CRAMER = 3  # equations: the terms of a determinant grow with the factor
 
 
 class Elimination:
-    """Rows Σ coefficient·unknown + rest = 0, the rest under `ONE`, and what was taken out of the others.
+    """Open rows Σ coefficient·unknown + rest = 0, the rest under `ONE`, and the pivots taken out of them.
 
     Entries with more nodes than `longest` get names that begin with `name`.
     """
@@ -44,14 +42,13 @@ class Elimination:
         self.divisors = divisors
         self.name = name
         self.longest = longest
-        self.rows: dict[int, dict[Term, Term]] = {}  # those that are open
-        self.holders: defaultdict[Term, set[int]] = defaultdict(set)  # the open rows that hold an unknown
         self.named: list[Assignment] = []
         self.pivots: list[tuple[Symbol, dict[Term, Term]]] = []
+        self.rows: dict[int, dict[Term, Term]] = {}
         for i, row in enumerate(rows):
             self.rows[i] = {}
-            for unknown, value in row.items():
-                self._put(i, unknown, value)
+            for column, value in row.items():
+                self._put(self.rows[i], column, value)
 
     def next_pivot(self, *, stays: bool) -> tuple[int, Symbol] | None:
         """Return the shortest row that may be divided by a coefficient, and of these the one in fewest rows.
@@ -60,7 +57,7 @@ class Elimination:
         """
         for i in sorted(self.rows, key=lambda i: len(self.rows[i])):
             usable = [
-                (len(self.holders[unknown]), not factor.is_number, unknown.name)
+                (sum(unknown in row for row in self.rows.values()), not factor.is_number, unknown.name)
                 for unknown, factor in self.rows[i].items()
                 if unknown is not ONE and not self.divisors.vanishes(factor)
                 if not (stays and self.divisors.can_vanish(factor))
@@ -73,14 +70,10 @@ class Elimination:
         """Take an unknown out of every other open row, by row i."""
         pivot = self.rows.pop(i)
         self.pivots.append((unknown, pivot))
-        for column in pivot:
-            self.holders[column].discard(i)
-        for other in sorted(self.holders.pop(unknown)):
-            row = self.rows[other]
+        for row in (row for row in self.rows.values() if unknown in row):
             factor = self._short(row.pop(unknown) / pivot[unknown])
-            for column, value in pivot.items():
-                if column is not unknown:
-                    self._put(other, column, row.get(column, ZERO) - factor * value)
+            for column in (column for column in pivot if column is not unknown):
+                self._put(row, column, row.pop(column, ZERO) - factor * pivot[column])
 
     def by_cramer(self) -> list[Assignment]:
         """Solve the open rows by their determinant; nothing where that is zero."""
@@ -91,7 +84,7 @@ class Elimination:
         with dotprodsimp(False):
             matrix = sympy.Matrix([[row.get(column, ZERO) for column in columns] for row in rows])
             determinant = matrix.det(method="laplace")
-            if not self.divisors.allow(determinant):
+            if self.divisors.is_zero(determinant) or self.divisors.vanishes(determinant):
                 return []
             right = sympy.Matrix([-row.get(ONE, ZERO) for row in rows])
             solved = matrix.adjugate(method="laplace") * right
@@ -105,14 +98,10 @@ class Elimination:
             for unknown, row in reversed(self.pivots)
         ]
 
-    def _put(self, i: int, unknown: Term, value: Term) -> None:
+    def _put(self, row: dict[Term, Term], column: Term, value: Term) -> None:
         value = self._short(value)
-        if self.divisors.is_zero(value):
-            self.rows[i].pop(unknown, None)
-            self.holders[unknown].discard(i)
-            return
-        self.rows[i][unknown] = value
-        self.holders[unknown].add(i)
+        if not self.divisors.is_zero(value):
+            row[column] = value
 
     def _short(self, entry: Term) -> Term:
         """Return an entry, or the name it gets when it is long."""
@@ -145,18 +134,19 @@ def eliminate(
     free
         The unknowns that the equations leave open; if there are any, nothing is assigned.
     """
-    rows = ({**coefficients, ONE: rest} for coefficients, rest in forms)
     longest = LARGEST_ENTRY if len(unknowns) > 1 else sys.maxsize  # what is not put into another may be long
+    rows = ({**coefficients, ONE: rest} for coefficients, rest in forms)
     system = Elimination(rows, divisors, unknowns[0].name, longest)
-    while system.rows:
+    solved: list[Assignment] = []
+    while system.rows and not solved:
         pivot = system.next_pivot(stays=True)
-        if pivot is None and 1 < len(system.rows) <= MOST_BY_CRAMER and (solved := system.by_cramer()):
-            return system.named + solved + system.solution(), []
+        if pivot is None and 1 < len(system.rows) <= MOST_BY_CRAMER:
+            solved = system.by_cramer()
         pivot = pivot or system.next_pivot(stays=False)
-        if pivot is None:
+        if pivot is None or solved:
             break
         system.clear(*pivot)
-    free = set(unknowns) - {unknown for unknown, _ in system.pivots}
-    if free:
-        return [], [unknown for unknown in unknowns if unknown in free]
-    return system.named + system.solution(), []
+    if system.rows and not solved:
+        known = {unknown for unknown, _ in system.pivots}
+        return [], [unknown for unknown in unknowns if unknown not in known]
+    return system.named + solved + system.solution(), []

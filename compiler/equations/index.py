@@ -20,21 +20,28 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 
-from apc.compiler.equations.derivatives import TIME, Derivative, Moving, derivative
+import sympy
+
+from apc.compiler.equations.blocks import report_singular
+from apc.compiler.equations.derivatives import TIME, Derivative, Moving
 from apc.compiler.equations.elimination import Elimination
 from apc.compiler.equations.matching import alternating, match_columns
-from apc.compiler.equations.residuals import Residual, report_no_derivative, report_singular
-from apc.compiler.equations.symbolic import derivative_size, linear_form
-from apc.compiler.equations.terms import NoDerivativeError, Symbol, Term, text_of
-from apc.compiler.equations.zero_test import Divisors
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.equations.solution import Problem, Residual
+from apc.compiler.equations.terms import (
+    NoDerivativeError,
+    Symbol,
+    Term,
+    derivative,
+    linear_form,
+    size,
+    text_of,
+)
 
 # More derivatives than this of one variable: no mechanical model needs them (a constraint on a position
 # needs two), so the equations do not end.
 HIGHEST_ORDER = 8
 
-# Nodes a derivative may have, at most: that of a product of nonlinear factors is longer than the product. The
-# derivatives of the joints of a mechanism have some hundreds of them.
+# Nodes of a derivative, at most: that of a product is about as many times longer as the product has factors.
 LARGEST = 100_000
 
 
@@ -59,28 +66,16 @@ class IndexReduction:
         asked for even if no equation holds them.
     moving
         Knows the derivatives of the variables.
-    where
-        What to call the equations in a message.
-    mistakes
+    problem
         Takes E502 equations or unknowns left over or constraints that say the same, E508 the derivative of a
         value that jumps, E509 states that can't be chosen once and for all.
-    divisors
-        What may be divided by.
     """
 
     def __init__(
-        self,
-        residuals: Sequence[Residual],
-        orders: Mapping[str, int],
-        moving: Moving,
-        where: str,
-        mistakes: Mistakes,
-        divisors: Divisors,
+        self, residuals: Iterable[Residual], orders: Mapping[str, int], moving: Moving, problem: Problem
     ) -> None:
         self.moving = moving
-        self.where = where
-        self.mistakes = mistakes
-        self.divisors = divisors
+        self.problem = problem
         self.order = dict(orders)  # the highest of each variable
         self.residuals: list[Residual] = []
         self.held: list[dict[str, int]] = []  # for each equation, its variables and their highest orders
@@ -90,23 +85,18 @@ class IndexReduction:
             for name, order in self.held[-1].items():
                 self.order[name] = max(self.order[name], order)
 
-    def reduced(self, started: Set[Symbol], place: Place) -> Reduced | None:
+    def reduced(self, started: Set[Symbol]) -> Reduced | None:
         """Differentiate what must be and choose the states; None if the equations can't be solved.
 
-        Parameters
-        ----------
-        started
-            The variables and derivatives with a declared start value.
-        place
-            Where to point when there is no equation left.
+        `started` are the variables and derivatives with a declared start value.
         """
-        names = list(self.order)
-        incidence = [[j for j, name in enumerate(names) if name in held] for held in self.held]
-        match = match_columns(incidence, len(names))
-        if len(self.residuals) != len(names) or None in match:
-            report_singular(self.residuals, names, incidence, match, self.where, self.mistakes, place)
+        column = {name: j for j, name in enumerate(self.order)}
+        incidence = [sorted(column[name] for name in held) for held in self.held]
+        match = match_columns(incidence, len(column))
+        if not len(self.residuals) == len(column) == len(match):
+            report_singular(self.residuals, list(column), incidence, match, self.problem)
             return None
-        dummies = self.choose_dummies(started) if self.differentiate_constraints() else None
+        dummies = self._choose_dummies(started) if self._differentiate_constraints(column) else None
         if dummies is None:
             return None
         states: list[Symbol] = []
@@ -127,56 +117,55 @@ class IndexReduction:
 
     # ---- Pantelides ----
 
-    def differentiate_constraints(self) -> bool:
+    def _differentiate_constraints(self, column: Mapping[str, int]) -> bool:
         """Match every equation to a highest derivative, differentiating those that hold none of their own."""
-        names = list(self.order)
-        column = {name: j for j, name in enumerate(names)}
+        names = list(column)
         while True:
-            done = set(self.integral.values())
-            newest = [row for row in range(len(self.residuals)) if row not in done]
+            newest = sorted({*range(len(self.residuals))} - {*self.integral.values()})
             incidence = [
                 [column[name] for name, order in self.held[row].items() if order == self.order[name]]
                 for row in newest
             ]
-            partner = {j: i for j, i in enumerate(match_columns(incidence, len(names))) if i is not None}
-            left = sorted(set(range(len(newest))) - set(partner.values()))
-            if not left:
-                return True
+            partner = match_columns(incidence, len(names))
             passed: set[int] = set()
-            for start in left:
+            for start in sorted({*range(len(newest))} - {*partner.values()}):
                 rows, columns = alternating([start], incidence, partner)
                 if passed.isdisjoint(columns):
                     passed.update(columns)
                     if not self._pass_on([newest[i] for i in rows], [names[j] for j in columns]):
                         return False
+            if len(partner) == len(newest):
+                return True
 
     def _pass_on(self, rows: Sequence[int], names: Sequence[str]) -> bool:
         """Differentiate equations that block one another, and with them the order of what they hold."""
+        blocking = [self.residuals[row] for row in rows]
         for row in rows:
             if not self._moves_on(row):
                 what = (
                     "holds no unknown once what the connections and other equations say is put in: "
                     "it says what they say already, or contradicts them"
                 )
-                self._report("E502", row, f"{self.residuals[row].shown} {what}")
+                at_fault = self.residuals[row]
+                self.problem.report("E502", [at_fault], f"{at_fault.shown} {what}")
                 return False
         for name in names:
             self.order[name] += 1
-        if any(self.order[name] > HIGHEST_ORDER for name in names):
-            return self._report_endless(rows)
-        return all(self._differentiate(row) for row in rows)
-
-    def _differentiate(self, row: int) -> bool:
-        residual = self.residuals[row]
-        if derivative_size(residual.expression) > LARGEST:
-            return self._report_endless([row])
-        try:
-            expression = self.moving.differentiate(residual.expression)
-        except NoDerivativeError as missing:
-            report_no_derivative(residual, missing, self.mistakes)
+        # Each factor of a product stands beside the slopes of all the others.
+        sizes = (size(term) for one in blocking for term in sympy.Add.make_args(one.expression))
+        if any(self.order[name] > HIGHEST_ORDER for name in names) or sum(n * n for n in sizes) > LARGEST:
+            shown = ", ".join(dict.fromkeys(one.shown for one in blocking))
+            what = f"no number of derivatives of these equations determines what they hold: {shown}"
+            self.problem.report("E509", blocking, what)
             return False
-        self.integral[len(self.residuals)] = row
-        self._add(Residual(expression, residual.equation))
+        for row, residual in zip(rows, blocking, strict=True):
+            try:
+                expression = self.moving.differentiate(residual.expression)
+            except NoDerivativeError as missing:
+                report_no_derivative(residual, missing, self.problem)
+                return False
+            self.integral[len(self.residuals)] = row
+            self._add(Residual(expression, residual.equation))
         return True
 
     def _moves_on(self, row: int) -> bool:
@@ -190,26 +179,16 @@ class IndexReduction:
             row, same = before, same + 1
         return bool(held) and same <= max(held.values())
 
-    def _report_endless(self, rows: Iterable[int]) -> bool:
-        shown = list(dict.fromkeys(self.residuals[row].shown for row in rows))
-        what = f"no number of derivatives of these equations determines what they hold: {', '.join(shown)}"
-        self._report("E509", next(iter(rows)), what)
-        return False
-
-    def _report(self, code: str, row: int, what: str, hint: str = "") -> None:
-        self.mistakes.add(code, self.residuals[row].equation.place, what, hint=hint)
-
     # ---- dummy derivatives ----
 
-    def choose_dummies(self, started: Set[Symbol]) -> set[Derivative] | None:
+    def _choose_dummies(self, started: Set[Symbol]) -> set[Derivative] | None:
         """Return the derivatives that become unknowns, level by level from the highest order down.
 
         At each level as many as there are constraints, so that the constraints' Jacobian in them is regular.
         """
         rank = {name: j for j, name in enumerate(self.order)}
         chosen: set[Derivative] = set()
-        done = set(self.integral.values())
-        rows = [row for row in self.integral if row not in done]
+        rows = [row for row in self.integral if row not in self.integral.values()]
         candidates = [(name, order) for name, order in self.order.items() if order]
         while rows:
             candidates.sort(key=lambda it: (derivative(it[0], it[1] - 1) in started, -it[1], -rank[it[0]]))
@@ -228,46 +207,48 @@ class IndexReduction:
 
         Elimination column by column; a factor that moves, such as 2·x, may vanish and is no pivot.
         """
+        where, divisors = self.problem.where, self.problem.divisors
         symbols = {derivative(*one): one for one in candidates}
-        forms = [linear_form(self.residuals[row].expression, frozenset(symbols)) for row in rows]
-        linear = [form[0] for form in forms if form is not None]
-        if len(linear) < len(rows):  # else a derivative is linear in the highest derivatives
-            row = rows[forms.index(None)]
-            what = "a condition hangs on a derivative that it ties down"
-            what = f"{self.where}: in the constraint {self.residuals[row].shown} {what}"
-            self._report("E509", row, what, "a condition on positions, parameters or time")
-            return None
-        system = Elimination(linear, self.divisors, "", LARGEST)
+        constraints = [self.residuals[row] for row in rows]
+        linear: list[Mapping[Term, Term]] = []
+        for one in constraints:
+            form = linear_form(one.expression, symbols.keys())
+            if form is None:  # else a derivative is linear in the highest derivatives
+                what = f"in the constraint {one.shown} a condition hangs on a derivative that it ties down"
+                hint = "a condition on positions, parameters or time"
+                self.problem.report("E509", [one], f"{where}: {what}", hint)
+                return None
+            linear.append(form[0])
+        system = Elimination(linear, divisors, "", LARGEST)
         chosen = []
-        for s, one in symbols.items():
+        for s, candidate in symbols.items():
             fixed = [
-                (not system.rows[i][s].is_number, len(system.rows[i]), i)
-                for i in system.holders[s]
-                if self._stays(system.rows[i][s])
+                (not row[s].is_number, len(row), i)
+                for i, row in system.rows.items()
+                if s in row and not self._moves(row[s]) and not divisors.vanishes(row[s])
             ]
             if fixed:
                 system.clear(min(fixed)[-1], s)
-                chosen.append(one)
+                chosen.append(candidate)
         for i, entries in system.rows.items():
-            self._report_no_choice(rows[i], entries)
+            what = f"the constraint {constraints[i].shown} says what other constraints say already"
+            code, hint = "E502", ""
+            if not all(divisors.vanishes(factor) for factor in entries.values()):
+                held = self.moving.derivatives(sum(entries))
+                factors = ", ".join(
+                    f"{x} (by the factor {text_of(entries[s])})" for s, (x, _) in held.items()
+                )
+                what = f"no variable follows from the constraint {constraints[i].shown} in every position"
+                what, code = f"{what}, since the factor moves and may vanish: {factors}", "E509"
+                hint = "the constraint with an angle or another coordinate that gives every position"
+            self.problem.report(code, [constraints[i]], f"{where}: {what}", hint)
         return None if system.rows else chosen
 
-    def _stays(self, factor: Term) -> bool:
-        still = TIME not in factor.free_symbols and not self.moving.derivatives(factor)
-        return still and not self.divisors.vanishes(factor)
+    def _moves(self, factor: Term) -> bool:
+        return TIME in factor.free_symbols or bool(self.moving.derivatives(factor))
 
-    def _report_no_choice(self, row: int, entries: Mapping[Term, Term]) -> None:
-        """Say that from a constraint no variable follows."""
-        constraint = f"the constraint {self.residuals[row].shown}"
-        if all(self.divisors.vanishes(factor) for factor in entries.values()):
-            self._report("E502", row, f"{self.where}: {constraint} says what other constraints say already")
-            return
-        named = self.moving.derivatives(sum(entries))
-        factors = ", ".join(f"{x} (by the factor {text_of(entries[s])})" for s, (x, _) in named.items())
-        what = (
-            f"{self.where}: no variable follows from {constraint} in every position, "
-            f"since the factor moves and may vanish: {factors}"
-        )
-        self._report(
-            "E509", row, what, "the constraint with an angle or another coordinate that gives every position"
-        )
+
+def report_no_derivative(residual: Residual, missing: NoDerivativeError, problem: Problem) -> None:
+    """Add the mistake E508: an equation's derivative is needed, and what it holds has none."""
+    what = f"{residual.shown} needs the derivative of {missing}"
+    problem.report("E508", [residual], f"{what}; a position follows such a force only through a mass")

@@ -14,33 +14,25 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
 
-
-def _graph(rows: Sequence[Iterable[int]], columns: int) -> csr_array:
-    """Return a sparse matrix with ones where a row lists a column."""
-    lists = [list(row) for row in rows]
-    ends = np.cumsum([0, *map(len, lists)])
-    places = np.array([column for row in lists for column in row], dtype=np.int32)
-    return csr_array((np.ones(len(places)), places, ends), shape=(len(lists), columns))
+Incidence = Sequence[Sequence[int]]  # for each row, its columns
 
 
-def match_columns(incidence: Sequence[Sequence[int]], columns: int) -> list[int | None]:
-    """Return for each column the row matched to it, or None; as many as can be matched.
+def _graph(rows: Incidence, columns: int) -> csr_array:
+    ends = np.cumsum([0, *map(len, rows)])
+    places = np.array([column for row in rows for column in row], dtype=np.int32)
+    return csr_array((np.ones(len(places)), places, ends), shape=(len(rows), columns))
 
-    Parameters
-    ----------
-    incidence
-        For each row, the columns it may be matched to.
-    columns
-        The number of columns.
-    """
+
+def match_columns(incidence: Incidence, columns: int) -> dict[int, int]:
+    """Return the rows of the columns that are matched, as many as can be."""
     if not incidence or not columns:
-        return [None] * columns
+        return {}
     matched = maximum_bipartite_matching(_graph(incidence, columns), perm_type="row")
-    return [int(row) if row >= 0 else None for row in matched]
+    return {column: row for column, row in enumerate(matched.tolist()) if row >= 0}
 
 
 def alternating(
-    starts: Iterable[int], neighbours: Sequence[Iterable[int]], partner: Mapping[int, int]
+    starts: Iterable[int], neighbours: Incidence, partner: Mapping[int, int]
 ) -> tuple[list[int], list[int]]:
     """Return what alternating paths reach from nodes of one side, on that side and on the other.
 
@@ -54,20 +46,19 @@ def alternating(
     neighbours
         For each node of this side those of the other.
     partner
-        For each node of the other side its own on this side.
+        The matched nodes of the other side, with their nodes on this side.
     """
-    near, far = dict.fromkeys(starts), dict.fromkeys(range(0))
+    near, far = dict.fromkeys(starts), set[int]()
     queue = list(near)
     for node in queue:
-        for other in neighbours[node]:
-            far[other] = None
-            if (following := partner.get(other)) is not None and following not in near:
-                near[following] = None
-                queue.append(following)
+        far.update(neighbours[node])
+        new = [partner[one] for one in neighbours[node] if partner.get(one, node) not in near]
+        near |= dict.fromkeys(new)
+        queue += dict.fromkeys(new)
     return sorted(near), sorted(far)
 
 
-def strong_components(needs: Sequence[Iterable[int]]) -> list[list[int]]:
+def strong_components(needs: Incidence) -> list[list[int]]:
     """Return the strongly connected components of a graph, each after all it needs.
 
     SciPy numbers them as Pearce's algorithm ends with them, which is after all that can be reached from them.

@@ -1,138 +1,112 @@
-"""What a peer hears of the others: reductions, and linear ones taken apart.
+"""What a peer hears of the others, linear reductions taken apart.
 
-Takes: expressions that read `others`. Gives: `REDUCTIONS`, `hears_others`, `of_others`; `Of`,
-`affine_in_others`.
-Guarantees: c₀ + Σ cₖ·heardₖ has the value of the expression it was taken from.
-Does not: know clocks or links.
+Takes: `ReceiveCrossing`s. Gives: `Heard`, `taken_apart`.
+Guarantees: the term has the value of the reduction it was taken from.
+Does not: know how many others there are: that is a parameter of the site.
 
-What is heard is others.k, previous(others.k), the age of its packet, or age times others.k. A mean or sum of
-such a form is that of each by itself, so that N peers cost N, not N².
+What is heard is others.k, previous(others.k), the age of its packet, or age times others.k. A mean or sum
+that is linear in these is that of each by itself, so that N peers cost N, not N².
 """
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass, replace
-from fractions import Fraction
 
+import sympy
+
+from apc.compiler.compiled import count_of
 from apc.compiler.components.component import OTHERS
-from apc.compiler.language.expression import (
-    Binary,
-    Call,
-    Expr,
-    Name,
-    Negate,
-    Number,
-    names,
-)
+from apc.compiler.equations.flatten import HEARD_AGE, ReceiveCrossing
+from apc.compiler.equations.terms import ZERO, Symbol, Term, linear_form, symbol, to_term
+from apc.compiler.errors import Mistakes, Place
+from apc.compiler.language.expression import names
 
-REDUCTIONS = ("mean", "sum", "max", "min", "count")
-
-
-def hears_others(call: Call) -> bool:
-    """Return whether a call reduces the other peers to one value; max(a, b) is of two values, and doesn't."""
-    return (
-        call.function in REDUCTIONS
-        and len(call.arguments) == 1
-        and any(name.parts[0] == OTHERS for name in names(call))
-    )
-
-
-def of_others(call: Call) -> bool:
-    """Return whether a call is of one value that each other peer sends: its age, or what it was before."""
-    argument = call.arguments[0]
-    return call.function in ("age", "previous") and isinstance(argument, Name) and argument.parts[0] == OTHERS
+AGE = symbol(HEARD_AGE)
+TEXTS = {"": "others.{0}", "factor": "age(others.{0})*others.{0}", "alone": "age(others.{0})"}
 
 
 @dataclass(frozen=True, slots=True)
-class Of:
-    """What is heard of the send `send`: its value unless `value` is False, times its age if `aged`.
+class Heard:
+    """`symbol` stands at a tick for the `operator` over the peers that are heard over `link`.
 
-    With `before` it is what was heard at the tick before.
+    Without an `edge` it is of what they sent as `send`, as `age` and `before` say (see `compiled.Receive`);
+    with one, of the value that `edge` has for each of them.
     """
 
+    symbol: str
+    operator: str
     send: str
-    value: bool = True
-    aged: bool = False
+    link: str
+    clock: str
+    place: Place
+    age: str = ""
     before: bool = False
-
-    @property
-    def expression(self) -> Expr:
-        """It as the language has it."""
-        name = Name((OTHERS, *self.send.split(".")))
-        value: Expr = Call("previous", (name,)) if self.before else name
-        if not self.aged:
-            return value
-        age = Call("age", (name,))
-        return Binary("*", age, value) if self.value else age
+    edge: Term | None = None
 
 
-Affine = tuple[Expr | None, dict[Of, Expr | None]]  # constant and coefficients; None: 0, and 1
+def taken_apart(crossing: ReceiveCrossing, mistakes: Mistakes) -> tuple[Term, list[Heard]]:
+    """Return a reduction as a term, and what it holds that is heard; an edge where it is not linear.
 
-
-def affine_in_others(expression: Expr) -> Affine | None:
-    """Return an expression as c₀ + Σ cₖ·heardₖ, or None when it is not of that form.
-
-    c₀ is None for 0, cₖ None for 1.
+    Parameters
+    ----------
+    crossing
+        The reduction.
+    mistakes
+        Takes E506 what is asked of each peer by itself and is known of all together only.
     """
-    if not any(name.parts[0] == OTHERS for name in names(expression)):
-        return expression, {}
-    match expression:
-        case Name(parts=parts):
-            return None, {Of(".".join(parts[1:])): None}
-        case Call("age" | "previous", (Name(parts=parts),)):
-            aged = expression.function == "age"
-            return None, {Of(".".join(parts[1:]), value=not aged, aged=aged, before=not aged): None}
-        case Negate(operand=operand):
-            inside = affine_in_others(operand)
-            return None if inside is None else _scaled(inside, Number(Fraction(-1)), "*")
-        case Binary(operator="+" | "-" as operator, left=left, right=right):
-            one, two = affine_in_others(left), affine_in_others(right)
-            if one is None or two is None:
-                return None
-            return _added(one, two if operator == "+" else _scaled(two, Number(Fraction(-1)), "*"))
-        case Binary(operator="*" | "/" as operator, left=left, right=right):
-            one, two = affine_in_others(left), affine_in_others(right)
-            if one is None or two is None:
-                return None
-            if not two[1]:
-                return _scaled(one, right, operator)
-            if operator == "*":
-                return _scaled(two, left, "*") if not one[1] else _product(one, two)
-    return None
+    operator, link = crossing.operator, crossing.link
+    count = symbol(count_of(link))
+    values: dict[Symbol, tuple[str, bool]] = {}  # what others send: its name, and whether of the tick before
+    ages: dict[Symbol, str] = {}
+    for name in (".".join(one.parts) for one in names(crossing.argument)):
+        call, _, of = name.rpartition("(")
+        if of.startswith(f"{OTHERS}.") and call in ("", "age", "previous"):
+            send = of.removeprefix(f"{OTHERS}.").removesuffix(")")
+            if call == "age":
+                ages[symbol(name)] = send
+            else:
+                values[symbol(name)] = send, call == "previous"
+    term = to_term(crossing.argument).xreplace(dict.fromkeys(ages, AGE))
+    first = next(iter((*ages.values(), *(send for send, _ in values.values()))), "")
+    whole = Heard(crossing.symbol, operator, first, link, crossing.clock, crossing.place)
+    parts = _linear_parts(term, values.keys()) if operator in ("mean", "sum") else None
+    if parts is None or any(aged and value in values and values[value][1] for value, aged in parts):
+        for earlier in (send for send, before in values.values() if before):
+            previous = f"previous(others.{earlier.rpartition('.')[2]})"
+            hint, expected = f"mean({previous}), or sum", "a mean or sum that is linear in it"
+            mistakes.add("E506", crossing.place, previous, expected=expected, hint=hint)
+        if term not in values:
+            whole = replace(whole, edge=term, age="edge" if AGE in term.free_symbols else "")
+        if operator == "sum" and whole.age and values.keys().isdisjoint(term.free_symbols):
+            whole = replace(whole, symbol=f"mean{whole.symbol.removeprefix(operator)}", operator="mean")
+        return symbol(whole.symbol) * (1 if whole.operator == operator else count), [whole]
+    total, heard = ZERO, list[Heard]()
+    for (value, aged), coefficient in parts.items():
+        send, before = values.get(value, (first, False))
+        many = count if operator == "sum" and value is None else 1
+        if value is None and not aged:
+            total += many * coefficient
+            continue
+        age = "" if not aged else "alone" if value is None else "factor"
+        kind = operator if many == 1 else "mean"  # a sum of ages is their mean as often as any are heard
+        name = f"{kind}({f'previous(others.{send})' if before else TEXTS[age].format(send)})"
+        heard.append(replace(whole, symbol=name, operator=kind, send=send, age=age, before=before))
+        total += many * coefficient * symbol(name)
+    return total, heard
 
 
-def _product(one: Affine, two: Affine) -> Affine | None:
-    """Return the product of two forms that both hear: one hears nothing but ages, the other no age."""
-    if all(not of.value for of in two[1]):
-        one, two = two, one
-    if any(of.value for of in one[1]) or any(of.aged or of.before for of in two[1]):
-        return None
-    found: Affine = (None, {})
-    for of, factor in one[1].items():
-        terms: dict[Of, Expr | None] = {replace(heard, aged=True): c for heard, c in two[1].items()}
-        if two[0] is not None:
-            terms[of] = two[0]
-        found = _added(found, (None, terms) if factor is None else _scaled((None, terms), factor, "*"))
-    return found if one[0] is None else _added(found, _scaled(two, one[0], "*"))
+def _linear_parts(term: Term, values: Set[Symbol]) -> dict[tuple[Symbol | None, bool], Term] | None:
+    """Return a term's coefficients of what others send, None for the rest, and whether times its age.
 
-
-def _scaled(affine: Affine, factor: Expr, operator: str) -> Affine:
-    def scaled(expression: Expr | None) -> Expr:
-        if expression is None:
-            return factor if operator == "*" else Binary("/", Number(Fraction(1)), factor)
-        return Binary(operator, expression, factor)
-
-    constant, terms = affine
-    return (None if constant is None else scaled(constant)), {name: scaled(c) for name, c in terms.items()}
-
-
-def _added(one: Affine, two: Affine) -> Affine:
-    def added(a: Expr | None, b: Expr | None, nothing: Expr) -> Expr:
-        return Binary("+", a or nothing, b or nothing)
-
-    unit = Number(Fraction(1))
-    constant = one[0] if two[0] is None else two[0] if one[0] is None else Binary("+", one[0], two[0])
-    terms = dict(one[1])
-    for name, coefficient in two[1].items():
-        terms[name] = added(terms[name], coefficient, unit) if name in terms else coefficient
-    return constant, terms
+    None if it isn't a sum of such.
+    """
+    bent = any(not one.free_symbols.isdisjoint({*values, AGE}) for one in term.atoms(sympy.Function))
+    form = None if bent else linear_form(term, values)
+    parts: dict[tuple[Symbol | None, bool], Term] = {}
+    for value, coefficient in [] if form is None else [*form[0].items(), (None, form[1])]:
+        by_age = linear_form(coefficient, {AGE})
+        if by_age is None:
+            return None
+        parts |= {(value, False): by_age[1], (value, True): by_age[0].get(AGE, ZERO)}
+    return {key: value for key, value in parts.items() if value != 0} if form is not None else None

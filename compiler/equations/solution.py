@@ -1,18 +1,58 @@
-"""What solving equations gives: assignments, and loops that an iteration has to solve.
+"""Equations as residuals and what solving them gives: assignments, and loops that an iteration has to solve.
 
-Takes: nothing (data types). Gives: `Assignment`, `ImplicitBlock`, their union `Step`; `assigned`,
-`expressions` of one.
+Takes: nothing (data types). Gives: `Residual`, `Problem`; `Assignment`, `ImplicitBlock`, their union `Step`.
 Guarantees: plain frozen data.
 Does not: solve anything (see `blocks`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.terms import Symbol, Term, symbol
+from apc.compiler.equations.zero_test import Divisors
+from apc.compiler.errors import Mistakes, Place
 
 Assignment = tuple[str, Term]  # an unknown, and the expression that gives it
+MOST_LISTED = 8  # equations or unknowns in one message
+
+
+@dataclass(frozen=True, slots=True)
+class Residual:
+    """An equation as `expression = 0`, with its origin for messages."""
+
+    expression: Term
+    equation: FlatEquation
+
+    @property
+    def shown(self) -> str:
+        """The equation as the user wrote it, and where it comes from."""
+        return f"`{self.equation.text}` ({self.equation.origin})"
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """What equations are solved with: what may be divided by, and where mistakes go.
+
+    `where` is what a message calls the equations; `place` is where it points when there are none.
+    """
+
+    where: str
+    place: Place
+    divisors: Divisors
+    mistakes: Mistakes
+
+    def report(self, code: str, residuals: Sequence[Residual], what: str, hint: str = "") -> None:
+        """Add a mistake where the first of some equations stands."""
+        place = residuals[0].equation.place if residuals else self.place
+        self.mistakes.add(code, place, what, hint=hint)
+
+    def report_no_number(self, residuals: Sequence[Residual]) -> None:
+        """Add the mistake E512: equations in which a constant is none, maybe after others are put in."""
+        holds = f"{listed(residuals)} hold{'s' if len(residuals) == 1 else ''}"
+        self.report("E512", residuals, f"{holds} a constant that is no number, such as 1/0 or sqrt(-1)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,19 +60,23 @@ class ImplicitBlock:
     """A nonlinear loop: find the `tearing` unknowns that make every residual zero.
 
     `inner` computes the other unknowns, in this order, from the tearing unknowns. Unknowns keep the order of
-    the model's; `equations` are the loop's, as text.
+    the model's.
     """
 
     unknowns: tuple[str, ...]
     tearing: tuple[str, ...]
     inner: tuple[Assignment, ...]
     residuals: tuple[Term, ...]  # as many as tearing unknowns
-    equations: tuple[str, ...]
+
+    @property
+    def expressions(self) -> tuple[Term, ...]:
+        """The expressions it consists of."""
+        return (*self.residuals, *(value for _, value in self.inner))
 
     @property
     def free_symbols(self) -> set[Symbol]:
         """The symbols the block's solution depends on."""
-        found = {s for expression in expressions(self) for s in expression.free_symbols}
+        found = {s for expression in self.expressions for s in expression.free_symbols}
         return found - {symbol(name) for name in self.unknowns}
 
     @property
@@ -44,13 +88,8 @@ class ImplicitBlock:
 Step = Assignment | ImplicitBlock
 
 
-def assigned(step: Step) -> tuple[str, ...]:
-    """Return the names a step gives a value."""
-    return step.unknowns if isinstance(step, ImplicitBlock) else (step[0],)
-
-
-def expressions(step: Step) -> tuple[Term, ...]:
-    """Return the expressions a step consists of."""
-    if isinstance(step, ImplicitBlock):
-        return (*step.residuals, *(value for _, value in step.inner))
-    return (step[1],)
+def listed(texts: Sequence[str | Residual]) -> str:
+    """Join the first few texts, or equations, and say how many more there are."""
+    shown = [one.shown if isinstance(one, Residual) else one for one in texts[:MOST_LISTED]]
+    more = len(texts) - MOST_LISTED
+    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")

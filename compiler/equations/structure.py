@@ -12,27 +12,28 @@ variables with a start value the one named first; those of the others are not lo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence, Set
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
 from apc.compiler.equations.aliases import Aliases
 from apc.compiler.equations.blocks import solve_blocks
-from apc.compiler.equations.clock_inference import CONTINUOUS
-from apc.compiler.equations.clocks import (
-    ClockedKind,
-    ClockedSystem,
-    HoldCrossing,
-    PreviousCrossing,
-    ReceiveCrossing,
-)
-from apc.compiler.equations.derivatives import Moving, derivative
+from apc.compiler.equations.clocks import CONTINUOUS, ClockedKind, ClockedSystem, Partition
+from apc.compiler.equations.derivatives import Moving
 from apc.compiler.equations.flatten import FlatEquation
-from apc.compiler.equations.index import IndexReduction
-from apc.compiler.equations.residuals import SCENE, Residual, report_no_derivative, report_no_number
-from apc.compiler.equations.solution import Assignment, ImplicitBlock, Step, assigned
-from apc.compiler.equations.symbolic import is_no_number, no_derivative, to_term
-from apc.compiler.equations.terms import ZERO, NoDerivativeError, Symbol, Term, symbol
+from apc.compiler.equations.index import IndexReduction, report_no_derivative
+from apc.compiler.equations.reductions import Heard, taken_apart
+from apc.compiler.equations.solution import Assignment, ImplicitBlock, Problem, Residual, Step
+from apc.compiler.equations.terms import (
+    ZERO,
+    NoDerivativeError,
+    Symbol,
+    Term,
+    derivative,
+    is_no_number,
+    symbol,
+    to_term,
+)
 from apc.compiler.equations.zero_test import Divisors, Given
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.language.expression import Name, names
@@ -53,11 +54,13 @@ class SortedPartition:
     @property
     def definitions(self) -> dict[Symbol, Term | ImplicitBlock]:
         """What gives each unknown its value."""
-        return {
-            symbol(name): step if isinstance(step, ImplicitBlock) else step[1]
-            for step in self.assignments
-            for name in assigned(step)
-        }
+        found: dict[Symbol, Term | ImplicitBlock] = {}
+        for step in self.assignments:
+            if isinstance(step, ImplicitBlock):
+                found |= dict.fromkeys(map(symbol, step.unknowns), step)
+            else:
+                found[symbol(step[0])] = step[1]
+        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +81,8 @@ class SortedKind:
     states: tuple[str, ...]
     aliases: tuple[Assignment, ...]
     partitions: tuple[SortedPartition, ...]
-    samples: tuple[tuple[str, str, Term], ...]  # (symbol, clock, expression)
-    holds: tuple[HoldCrossing, ...]
-    previous: tuple[PreviousCrossing, ...]
-    receives: tuple[ReceiveCrossing, ...]
+    samples: tuple[Assignment, ...]
+    receives: tuple[Heard, ...]
     sends: tuple[SortedSend, ...]
 
 
@@ -95,158 +96,125 @@ class SortedSystem:
 
 def sort(clocked: ClockedSystem) -> SortedSystem:
     """Sort and solve every partition. Raises ApcError naming the equations and unknowns left over."""
-    mistakes = Mistakes(clocked.scene.names)
-    nonzero = _positive_parameters(clocked.scene)
-    kinds = tuple(
-        sort_kind(kind, mistakes, Divisors(nonzero, _numbers(clocked.scene, kind))) for kind in clocked.kinds
-    )
-    mistakes.raise_if_any()
-    return SortedSystem(clocked.scene, kinds)
-
-
-def _positive_parameters(scene: Scene) -> set[Symbol]:
-    """Return the parameters that no number can make zero: they are safe to divide by."""
-    return {symbol("peers")} | {
+    scene = clocked.scene
+    mistakes = Mistakes(scene.names)
+    nonzero = {symbol("peers")} | {  # the parameters that no number can make zero
         symbol(f"{part.name}.{declared.name}")
         for part in scene.parts
-        for declared in part.component.parameters
-        if getattr(declared, "open_minimum", False) and getattr(declared, "minimum", None) == 0
+        for declared in part.component.numbers
+        if declared.open_minimum and declared.minimum == 0
     }
+    kinds = [_sorted(kind, Divisors(nonzero, _numbers(scene, kind)), mistakes) for kind in clocked.kinds]
+    mistakes.raise_if_any()
+    return SortedSystem(scene, tuple(kind for kind in kinds if kind is not None))
 
 
 def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[Symbol, Given]]:
     """Return the numbers of each group of a kind, those that differ from peer to peer as they do."""
     common = {f"{part.name}.{name}": value for part in scene.parts for name, value in part.values}
     found = []
-    for group in scene.groups:
-        if group.name not in kind.flat.groups:
-            continue
+    for group in (group for group in scene.groups if group.name in kind.flat.groups):
         columns: dict[str, Given] = dict(group.columns)
         numbers: dict[str, Given] = {"peers": Fraction(scene.peers)}
         for name, value in (common | dict(group.values)).items():
             numbers[name] = value.number
-            if value.expression is None or name in columns:
-                continue
             # Inside a part, what depends on a number that differs from peer to peer does so too.
-            if any(".".join(node.parts) in columns for node in names(value.expression)):
-                columns[name] = to_term(value.expression, no_derivative)
+            used = () if value.expression is None or name in columns else names(value.expression)
+            if any(".".join(node.parts) in columns for node in used):
+                assert value.expression is not None
+                columns[name] = to_term(value.expression)
         found.append({symbol(name): number for name, number in (numbers | columns).items()})
     return found
 
 
-def sort_kind(kind: ClockedKind, mistakes: Mistakes, divisors: Divisors | None = None) -> SortedKind:
-    """Sort and solve one kind; when there are mistakes, the value returned is not whole.
+def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> SortedKind | None:
+    """Sort and solve a kind; None where there are mistakes."""
 
-    Parameters
-    ----------
-    kind
-        A kind of peer, partitioned by clock.
-    mistakes
-        Takes E502, E503, E508, E509, E511 and E512 as in `solve_blocks` and `IndexReduction`, and E510 a
-        state has no start value.
-    divisors
-        What may be divided by.
-    """
-    divisors = divisors or Divisors()
-    continuous = _sort_continuous(kind, divisors, mistakes) or _Continuous()
-    partitions = [SortedPartition(CONTINUOUS, continuous.steps)]
-    for clock in kind.partitions[1:]:
-        sides = _sides(clock.equations, no_derivative, mistakes)
-        if sides is not None:
-            residuals = _residuals(clock.equations, sides)
-            unknowns = [symbol(name) for name in clock.variables]
-            where, place = f"the equations of clock {clock.clock}", _place(kind, clock.equations)
-            steps = solve_blocks(residuals, unknowns, where, mistakes, divisors, place)
-            partitions.append(SortedPartition(clock.clock, steps))
-    sent = continuous.read[len(kind.samples) :]
+    def problem(where: str, part: Partition) -> Problem:
+        place = next((one.place for one in (*part.equations, *kind.flat.equations)), Place("topology"))
+        return Problem(where, place, divisors, mistakes)
+
+    heard: dict[str, Heard] = {}
+    reductions: dict[Symbol, Term] = {}
+    for crossing in kind.receives:
+        reductions[symbol(crossing.symbol)], parts = taken_apart(crossing, mistakes)
+        heard |= {one.symbol: one for one in parts if one.symbol not in heard}
+    partitions = []
+    for part in kind.partitions[1:]:
+        its = problem(f"the equations of clock {part.clock}", part)
+        if (sides := _sides(part.equations, None, its)) is not None:
+            equal = zip(part.equations, sides, strict=True)
+            residuals = [Residual((left - right).xreplace(reductions), one) for one, (left, right) in equal]
+            steps = solve_blocks(residuals, [symbol(name) for name in part.variables], its)
+            partitions.append(SortedPartition(part.clock, steps))
+    continuous = _sorted_continuous(kind, problem("the continuous equations", kind.partitions[0]))
+    if continuous is None or mistakes:
+        return None
+    states, aliases, steps, read = continuous
+    samples = zip((one.symbol for one in kind.samples), read, strict=False)
+    sends = zip(kind.flat.sends, read[len(kind.samples) :], strict=True)
     return SortedKind(
         kind,
-        continuous.states,
-        continuous.aliases,
-        tuple(partitions),
-        tuple((s.symbol, s.clock, e) for s, e in zip(kind.samples, continuous.read, strict=False)),
-        kind.holds,
-        kind.previous,
-        kind.receives,
-        tuple(
-            SortedSend(send.name, send.link, format_dimension(send.dimension), expression)
-            for send, expression in zip(kind.sends, sent, strict=False)
-        ),
+        states,
+        aliases,
+        (SortedPartition(CONTINUOUS, steps), *partitions),
+        tuple(samples),
+        tuple(heard.values()),
+        tuple(SortedSend(one.name, one.link, format_dimension(one.dimension), it) for one, it in sends),
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Continuous:
-    """The continuous partition, and what is sampled and sent of it."""
-
-    states: tuple[str, ...] = ()
-    aliases: tuple[Assignment, ...] = ()
-    steps: tuple[Step, ...] = ()
-    read: tuple[Term, ...] = ()
-
-
-def _sort_continuous(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> _Continuous | None:
-    partition = kind.partitions[0]
-    assert partition.clock == CONTINUOUS
-    where, place = "the continuous equations", _place(kind, partition.equations)
-    variables = dict.fromkeys(partition.variables)
-    moving = Moving(variables.keys(), {hold.symbol for hold in kind.holds})
-    # What is read, each as an equation of its own, `sample(x) = x`, for messages.
-    reads = [FlatEquation(Name((s.symbol,)), s.expression, s.clock, s.clock, place) for s in kind.samples]
-    reads += [FlatEquation(Name((s.name,)), s.expression, s.link, None, s.place) for s in kind.sends]
-    sides = _sides(partition.equations, moving.differentiate, mistakes)
-    values = _sides(reads, moving.differentiate, mistakes)
-    if sides is None or values is None:
-        return None
-
+def _sorted_continuous(
+    kind: ClockedKind, problem: Problem
+) -> tuple[tuple[str, ...], tuple[Assignment, ...], tuple[Step, ...], list[Term]] | None:
+    """Return states, aliases, steps, and what is sampled and sent; None where there are mistakes."""
+    variables, equations = kind.partitions[0].variables, kind.partitions[0].equations
     started = {variable.name for variable in kind.flat.variables if variable.start}
-    aliases = Aliases(moving, partition.variables, started)
-    residuals = aliases.remove(_residuals(partition.equations, sides))
-    read = [Residual(aliases.substitute(value), at) for (_, value), at in zip(values, reads, strict=True)]
+    moving = Moving(dict.fromkeys(variables), {hold.symbol for hold in kind.holds})
+    # What is read, each as an equation of its own, `sample(x) = x`, for messages.
+    where = problem.place
+    reads = [FlatEquation(Name((s.symbol,)), s.expression, s.clock, s.clock, where) for s in kind.samples]
+    reads += [FlatEquation(Name((s.name,)), s.expression, s.link, None, s.place) for s in kind.flat.sends]
+    sides = _sides((*equations, *reads), moving.differentiate, problem)
+    if sides is None:
+        return None
+    aliases = Aliases(moving, variables, started)
+    pairs = list(zip((*equations, *reads), sides, strict=True))
+    residuals = aliases.remove(
+        [Residual(left - right, one) for one, (left, right) in pairs[: len(equations)]]
+    )
+    read = [Residual(aliases.substitute(value), one) for one, (_, value) in pairs[len(equations) :]]
     if none := [one for one in (*residuals, *read) if is_no_number(one.expression)]:
-        report_no_number(none, mistakes)
+        problem.report_no_number(none)
         return None
     # A derivative that has a name of its own, or that is read, is asked for, even if no equation holds it.
     asked = [*aliases.velocities, *(it for one in read for it in moving.derivatives(one.expression).values())]
-    orders = {name: 0 for name in variables if name not in aliases.stands}
+    orders = dict.fromkeys((name for name in variables if name not in aliases.stands), 0)
     for name, order in asked:
         orders[name] = max(orders[name], order)
-    begun = {aliases.value(name) for name in started}
-    reduction = IndexReduction(residuals, orders, moving, where, mistakes, divisors)
-    reduced = reduction.reduced(begun, place)
+    reduction = IndexReduction(residuals, orders, moving, problem)
+    reduced = reduction.reduced({aliases.value(name) for name in started})
     if reduced is None:
         return None
     states = tuple(aliases.shown(s).name for s in reduced.states)
-    _check_starts(states, started, partition.equations, mistakes)
-    solved = solve_blocks(
-        [Residual(aliases.shown(one.expression), one.equation) for one in reduced.residuals],
-        [aliases.shown(s) for s in reduced.unknowns],
-        where,
-        mistakes,
-        divisors,
-        place,
-    )
+    for state in (state for state in states if state not in started):
+        holder = next((one for one in equations if f"der({state})" in one.text), equations[0])
+        what = f"{state} is a state, by `{holder.text}` ({holder.origin}), and has no start value"
+        hint = f"{state.rpartition('.')[2]}: {{…, start: …}}"
+        if state.startswith("der("):
+            hint = f"{state} = v, with a start value for v"
+        problem.mistakes.add("E510", holder.place, what, hint=hint)
+    shown = [Residual(aliases.shown(one.expression), one.equation) for one in reduced.residuals]
+    steps = solve_blocks(shown, [aliases.shown(s) for s in reduced.unknowns], problem)
     below = {v: aliases.shown(derivative(x, order - 1)).name for (x, order), v in aliases.velocities.items()}
-    named = [(f"der({x})", symbol(v)) for v, x in below.items() if x in states]
-    return _Continuous(
-        states,
-        aliases.assignments(),
-        (
-            *(step for step in named if step[1].name in states),
-            *solved,
-            *(step for step in named if step[1].name not in states),
-        ),
-        tuple(aliases.shown(one.expression) for one in read),
-    )
-
-
-def _place(kind: ClockedKind, equations: Sequence[FlatEquation]) -> Place:
-    """Return where to point when nothing better is known."""
-    return next((one.place for one in (*equations, *kind.flat.equations)), SCENE)
+    rates = [(f"der({x})", symbol(v)) for v, x in below.items() if x in states]
+    known = [rate for rate in rates if rate[1].name in states]
+    steps = (*known, *steps, *(rate for rate in rates if rate not in known))
+    return states, aliases.assignments(), steps, [aliases.shown(one.expression) for one in read]
 
 
 def _sides(
-    equations: Sequence[FlatEquation], differentiate: Callable[[Term], Term], mistakes: Mistakes
+    equations: Sequence[FlatEquation], differentiate: Callable[[Term], Term] | None, problem: Problem
 ) -> list[tuple[Term, Term]] | None:
     """Return both sides of equations; None where a derivative doesn't exist, or a constant is no number."""
     found = []
@@ -254,28 +222,10 @@ def _sides(
         try:
             sides = (to_term(equation.left, differentiate), to_term(equation.right, differentiate))
         except NoDerivativeError as missing:
-            report_no_derivative(Residual(ZERO, equation), missing, mistakes)
+            report_no_derivative(Residual(ZERO, equation), missing, problem)
             continue
         if any(map(is_no_number, sides)):
-            report_no_number([Residual(ZERO, equation)], mistakes)
+            problem.report_no_number([Residual(ZERO, equation)])
         else:
             found.append(sides)
     return found if len(found) == len(equations) else None
-
-
-def _residuals(equations: Sequence[FlatEquation], sides: Sequence[tuple[Term, Term]]) -> list[Residual]:
-    return [Residual(left - right, one) for (left, right), one in zip(sides, equations, strict=True)]
-
-
-def _check_starts(
-    states: Iterable[str], started: Set[str], equations: Sequence[FlatEquation], mistakes: Mistakes
-) -> None:
-    for state in states:
-        if state in started:
-            continue
-        holder = next((e for e in equations if f"der({state})" in e.text), equations[0])
-        what = f"{state} is a state, by `{holder.text}` ({holder.origin}), and has no start value"
-        hint = f"{state.rpartition('.')[2]}: {{…, start: …}}"
-        if state.startswith("der("):
-            hint = f"{state} = v, with a start value for v"
-        mistakes.add("E510", holder.place, what, hint=hint)

@@ -1,7 +1,9 @@
 """What the compiler thinks in: SymPy's expressions of real symbols and exact numbers.
 
-Takes: names, and the names of the language's functions. Gives: `Term`, `symbol`, `FUNCTIONS`, `text_of`.
-Guarantees: a name has one symbol; what bends or jumps by a choice stays as it is written.
+Takes: the language's expressions, and names. Gives: `Term`, `to_term`, `text_of`, `symbol`, `derivative`;
+`slope`, `differential`, `linear_form`, `is_no_number` of terms.
+Guarantees: a name has one symbol, and so has each time derivative of it: `x`, `der(x)`, `der(der(x))`; what
+bends or jumps by a choice stays as it is written.
 Does not: simplify anything beyond what SymPy does when an expression is made.
 
 A choice is an application of a function of our own: SymPy's Piecewise, Max and Min ask at every step
@@ -12,7 +14,9 @@ SymPy's `zoo` or `nan`, or has an imaginary part.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
+import operator
+import sys
+from collections.abc import Callable, Iterable, Set
 from fractions import Fraction
 from typing import Any, TypeAlias
 
@@ -31,20 +35,22 @@ from apc.compiler.language.expression import (
     Negate,
     Not,
     Number,
+    fold,
     format_expression,
 )
 
 Term: TypeAlias = Any  # sympy.Expr, which has no complete types
 Symbol: TypeAlias = Any  # sympy.Symbol
+LinearForm: TypeAlias = tuple[
+    dict[Symbol, Term], Term
+]  # coefficients and rest of Σ coefficient·unknown + rest
 
 ZERO, ONE, HALF = sympy.S.Zero, sympy.S.One, sympy.S.Half
+LARGEST = int(sys.float_info.max)
 
 
 class NoDerivativeError(Exception):
     """A value was to be differentiated that has no derivative, because it jumps or bends: which, and why."""
-
-    def __init__(self, what: str, why: str) -> None:
-        super().__init__(f"{what}, {why}")
 
 
 class Choice(sympy.Function):  # type: ignore[misc]  # SymPy has no types
@@ -109,10 +115,15 @@ class Interpolate(Choice):
 
     def _eval_derivative(self, by: Symbol) -> Term:
         del by
-        raise NoDerivativeError(text_of(self), "which has none")
+        raise NoDerivativeError(f"{text_of(self)}, which has none")
 
 
 FUNCTIONS: dict[str, Any] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "^": operator.pow,
     "if": If,
     "max": Max,
     "min": Min,
@@ -131,6 +142,11 @@ def symbol(name: str) -> Symbol:
     return sympy.Symbol(name, real=True)
 
 
+def derivative(name: str, order: int = 1) -> Symbol:
+    """Return the symbol of a time derivative of a variable."""
+    return symbol("der(" * order + name + ")" * order)
+
+
 def in_order(symbols: Iterable[Symbol]) -> list[Symbol]:
     """Return symbols by their names: a set has no order that is the same each time."""
     return sorted(symbols, key=lambda s: s.name)
@@ -139,6 +155,83 @@ def in_order(symbols: Iterable[Symbol]) -> list[Symbol]:
 def size(term: Term) -> int:
     """Return how many nodes a term has."""
     return sum(1 for _ in sympy.preorder_traversal(term))
+
+
+def to_term(expression: Expr, differentiate: Callable[[Term], Term] | None = None) -> Term:
+    """Build the term; `differentiate` gives the time derivative of one, where `der` can occur."""
+
+    def leaf(node: Name | Number) -> Term:
+        if isinstance(node, Name):
+            return symbol(".".join(node.parts))
+        return sympy.Rational(node.value.numerator, node.value.denominator)
+
+    def operation(node: Expr, *operands: Term) -> Term:
+        match node:
+            case Call("der"):
+                assert differentiate is not None, node
+                return differentiate(*operands)
+            case Negate():
+                return -operands[0]
+            case Call(function=name) | Binary(operator=name) | Compare(operator=name) | Logic(operator=name):
+                return FUNCTIONS[name](*operands)
+        return FUNCTIONS["if" if isinstance(node, Conditional) else "not"](*operands)
+
+    return fold(expression, leaf, operation)
+
+
+# ---- what is asked of terms ----
+
+
+def is_no_number(expression: Term) -> bool:
+    """Return whether an expression holds a constant that no float can be: 1/0, sqrt(-1), 1e300^2."""
+    return any(map(_is_none, sympy.preorder_traversal(expression)))
+
+
+def _is_none(node: Term) -> bool:
+    if node.is_Rational:
+        return bool(abs(node.p) > LARGEST * node.q)
+    if node is sympy.nan or isinstance(node, sympy.AccumBounds):
+        return True
+    return bool(node.is_number) and (node.is_extended_real is False or node.is_finite is False)
+
+
+def slope(expression: Term, by: Symbol) -> Term:
+    """Return the derivative by a symbol, that of the branch taken; what jumps is constant between jumps."""
+    found = expression.diff(by)
+    jumps = found.atoms(sympy.DiracDelta, sympy.Derivative, sympy.Subs)
+    return found.xreplace(dict.fromkeys(jumps, ZERO)) if jumps else found
+
+
+def differential(expression: Term, rate: Callable[[Symbol], Term]) -> Term:
+    """Return Σ ∂expression/∂s · rate(s) over the symbols s, by the chain rule.
+
+    Raises NoDerivativeError where a table is looked up at what moves, or from `rate`.
+    """
+    parts = (
+        along * rate(s)
+        for term in sympy.Add.make_args(expression)
+        for s in in_order(term.free_symbols)
+        if (along := slope(term, s)) != 0
+    )
+    return sympy.Add(*parts)
+
+
+def linear_form(expression: Term, unknowns: Set[Symbol]) -> LinearForm | None:
+    """Return the coefficients and the rest of Σ coefficient·unknown + rest, or None if it isn't linear."""
+    functions = (one for one in expression.atoms(sympy.Function) if not isinstance(one, If))
+    if any(not unknowns.isdisjoint(one.free_symbols) for one in functions):
+        return None
+    slopes: dict[Symbol, list[Term]] = {}
+    for term in sympy.Add.make_args(expression):
+        for unknown in in_order(term.free_symbols & unknowns):
+            slopes.setdefault(unknown, []).append(slope(term, unknown))
+    coefficients = {unknown: sympy.Add(*parts) for unknown, parts in slopes.items()}
+    if any(not unknowns.isdisjoint(coefficient.free_symbols) for coefficient in coefficients.values()):
+        return None
+    return coefficients, expression.xreplace(dict.fromkeys(coefficients, ZERO))
+
+
+# ---- terms as text ----
 
 
 def text_of(term: Term) -> str:
@@ -155,8 +248,6 @@ def _written(term: Term) -> Expr:
         return Name((term.name,))
     if term.is_Rational:
         return Number(Fraction(term.p, term.q))
-    if term.is_NumberSymbol:
-        return Name(("pi",)) if term is sympy.pi else Call("exp", (Number(Fraction(1)),))
     if term.is_Add:
         first, *others = sorted(term.args, key=_is_negative)
         total = _written(first)
@@ -164,14 +255,14 @@ def _written(term: Term) -> Expr:
             minus = _is_negative(part)
             total = Binary("-" if minus else "+", total, _written(-part if minus else part))
         return total
-    if term.is_Mul:
-        return Negate(_written(-term)) if _is_negative(term) else _written_product(term)
+    if term.is_Mul and _is_negative(term):
+        return Negate(_written(-term))
+    if term.is_Mul or (term.is_Pow and term.exp.is_negative):
+        return _written_product(term)
+    if term.is_Pow and term.exp != HALF:
+        return Binary("^", *map(_written, term.args))
     if term.is_Pow:
-        base, exponent = term.args
-        if exponent.is_negative:
-            return _written_product(term)
-        root = exponent == HALF
-        return Call("sqrt", (_written(base),)) if root else Binary("^", _written(base), _written(exponent))
+        return Call("sqrt", (_written(term.base),))
     arguments = tuple(map(_written, term.args))
     name = NAMES.get(term.func, term.func.__name__)
     if name == "if":

@@ -13,24 +13,20 @@ import random
 from collections.abc import Collection, Mapping, Sequence
 from fractions import Fraction
 from math import prod
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from apc.compiler.equations.terms import FUNCTIONS, Symbol, Term, in_order, size
-from apc.compiler.language.expression import SMOOTH
+from apc.compiler.equations.terms import Abs, Choice, Symbol, Term, in_order, size
 
 # A number of the scene: one for all peers, one a peer (count,), or an expression over other numbers.
 Given: TypeAlias = Fraction | NDArray[np.float64] | Term
-# A residue, or one a peer: an array of Python's integers, whose products outgrow 64 bits.
-Residue: TypeAlias = int | NDArray[np.object_]
+Residue: TypeAlias = Any  # an integer, or one a peer: an array of Python's integers, which outgrow 64 bits
 PRIME = (1 << 61) - 1
 MOST = 200  # nodes beyond which no identity is looked for: simplifying takes its time
 POINTS, NEARLY = 4, 1e-20  # at which an identity must vanish, and how nearly, of 30 digits
-# Functions of which SymPy knows identities.
-KNOWN_FUNCTIONS = (*(FUNCTIONS[name] for name in SMOOTH), sympy.Abs)
 
 
 class Divisors:
@@ -39,9 +35,7 @@ class Divisors:
     `nonzero` are the parameters that no number can make zero; `numbers` the numbers of each group of peers.
     """
 
-    def __init__(
-        self, nonzero: Collection[Symbol] = (), numbers: Sequence[Mapping[Symbol, Given]] = ()
-    ) -> None:
+    def __init__(self, nonzero: Collection[Symbol], numbers: Sequence[Mapping[Symbol, Given]]) -> None:
         self._any = _Residues({})
         self._least = _Residues({}, nonzero)
         self._groups = [_Residues(values) for values in numbers]
@@ -55,13 +49,9 @@ class Divisors:
         """Return whether an expression is zero for all values of its symbols."""
         return self._any.vanishes(expression)
 
-    def allow(self, expression: Term) -> bool:
-        """Return whether an expression is zero neither for all values nor with the scene's numbers."""
-        return not (self.is_zero(expression) or self.vanishes(expression))
-
     def can_vanish(self, expression: Term) -> bool:
         """Return whether an expression is zero when every parameter is that may be."""
-        return self._least.vanishes(expression)
+        return bool(self._least(expression) == 0)
 
     def vanishes(self, expression: Term) -> bool:
         """Return whether an expression is zero with the numbers of one of the peers."""
@@ -80,21 +70,18 @@ class _Residues:
     def __init__(self, given: Mapping[Symbol, Given], nonzero: Collection[Symbol] | None = None) -> None:
         self.given = given
         self.nonzero = nonzero
-        fractions = {name: value for name, value in given.items() if isinstance(value, Fraction)}
-        self.numbers = {
-            name: sympy.Rational(one.numerator, one.denominator) for name, one in fractions.items()
-        }
         self.known: dict[Term, Residue] = {}
-        self.chosen: dict[Term, int] = {}
         self.random = random.Random(0)
 
     def vanishes(self, expression: Term) -> bool:
         """Return whether an expression is zero, where numbers differ from peer to peer for one of them."""
         if np.any(np.equal(self(expression), 0)):
             return True
-        if self.nonzero is not None or not expression.has(sympy.Function):
+        if not expression.has(sympy.Function):
             return False
-        return _is_identity(expression.xreplace(self.numbers))
+        given = {s: self.given.get(s) for s in expression.free_symbols}
+        numbers = {s: sympy.Rational(one) for s, one in given.items() if isinstance(one, Fraction)}
+        return _is_identity(expression.xreplace(numbers))
 
     def __call__(self, node: Term) -> Residue:
         """Return the residue of an expression."""
@@ -106,11 +93,11 @@ class _Residues:
         return self.known[node]
 
     def _value(self, node: Term) -> Residue:
-        node = self.numbers.get(node, node)
         if node in self.given:
             value = self.given[node]
-            residues = np.frompyfunc(lambda one: _modular(Fraction(one)), 1, 1)
-            return residues(value) if isinstance(value, np.ndarray) else self(value)
+            if isinstance(value, np.ndarray):
+                return np.frompyfunc(lambda one: _modular(Fraction(one)), 1, 1)(value)
+            return _modular(value) if isinstance(value, Fraction) else self(value)
         if node.is_Rational:
             return _modular(node)
         if node.is_Add:
@@ -118,17 +105,14 @@ class _Residues:
         if node.is_Mul:
             return prod(map(self, node.args)) % PRIME
         if node.is_Pow and node.exp.is_Integer:
-
-            def raised(base: int) -> int:
-                return pow(base, int(node.exp), PRIME) if base or node.exp > 0 else self._some(node)
-
-            return np.frompyfunc(raised, 1, 1)(self(node.base))
+            base, exponent = self(node.base), int(node.exp)
+            some = self.random.randrange(1, PRIME)  # stands for what zero has none of, an inverse
+            raised = np.frompyfunc(
+                lambda one: pow(one, exponent, PRIME) if one or exponent > 0 else some, 1, 1
+            )
+            return raised(base)
         is_none = self.nonzero is not None and node.is_Symbol and node not in self.nonzero
-        return 0 if is_none else self._some(node)
-
-    def _some(self, node: Term) -> int:
-        """Return the random residue of a node, the same each time."""
-        return self.chosen.setdefault(node, self.random.randrange(1, PRIME))
+        return 0 if is_none else self.random.randrange(1, PRIME)
 
 
 def _modular(value: Fraction | Term) -> int:
@@ -137,9 +121,8 @@ def _modular(value: Fraction | Term) -> int:
 
 def _is_identity(expression: Term) -> bool:
     """Say whether an expression is zero for all values of its symbols, by what functions have in common."""
-    expression = expression.replace(FUNCTIONS["abs"], sympy.Abs)
-    functions = expression.atoms(sympy.Function)
-    if size(expression) > MOST or not all(isinstance(one, KNOWN_FUNCTIONS) for one in functions):
+    expression = expression.replace(Abs, sympy.Abs)
+    if size(expression) > MOST or expression.has(Choice):
         return bool(expression == 0)
     chance = random.Random(0)
     for _ in range(POINTS):

@@ -12,7 +12,6 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import casadi
@@ -31,6 +30,7 @@ MOST_FACTORS = 100  # of a power that is written as a product
 _SOMEWHERE_NONE = ("exp", "log", "tan", "asin", "acos", "sinh", "cosh", "atan2")
 HARMLESS = 0.5
 _CASADI: dict[str, Callable[..., Any]] = {
+    "+": operator.add,
     "min": casadi.fmin,
     "max": casadi.fmax,
     "abs": casadi.fabs,
@@ -47,16 +47,6 @@ _CASADI: dict[str, Callable[..., Any]] = {
     "==": operator.eq,
     "!=": operator.ne,
 }
-
-
-@dataclass(frozen=True, slots=True)
-class _Torn:
-    """A loop met while writing: its unknowns `z` (n,), where they begin, its residual of z and `q` (m,)."""
-
-    z: Any
-    begin: Any
-    q: Any
-    residual: Any  # casadi.Function
 
 
 class Writer:
@@ -76,17 +66,17 @@ class Writer:
         self.definitions = dict(definitions)
         self.tables = tables
         self.starts = starts
-        self.torn: list[_Torn] = []
+        self.loops: list[tuple[Any, Any, Any]] = []  # unknowns (n,), where they begin, what is to be zero
 
     def column(self, values: Iterable[Any]) -> Any:
         """Return a dense column of scalars, (0, 1) when there are none."""
         listed = list(values)
         return casadi.densify(casadi.vertcat(*listed)) if listed else casadi.SX(0, 1)
 
-    def extended(self, known: Mapping[Symbol, Any], definitions: Mapping[Symbol, Definition]) -> Writer:
+    def extended(self, known: Mapping[Symbol, Any]) -> Writer:
         """Return a writer that knows more."""
-        more = Writer({**self.known, **known}, {**self.definitions, **definitions}, self.tables, self.starts)
-        more.torn = list(self.torn)
+        more = Writer({**self.known, **known}, self.definitions, self.tables, self.starts)
+        more.loops = list(self.loops)
         return more
 
     def function(self, name: str, inputs: Mapping[str, Any], output: str, value: Any) -> Any:
@@ -96,86 +86,57 @@ class Writer:
         Newton's iteration for each loop.
         """
         words, columns = list(inputs), list(inputs.values())
-        needed: list[_Torn] = []
-        wanted = value
-        for one in reversed(self.torn):
-            if casadi.depends_on(wanted, one.z):
-                needed.insert(0, one)
-                wanted = casadi.vertcat(wanted, one.begin, one.q)
+        solved, wanted = list[Any](), value  # the unknowns of the loops that the value needs, in order
+        needed: list[tuple[Any, Any, Any]] = []
+        for z, begin, residual in reversed(self.loops):
+            if casadi.depends_on(wanted, z):
+                needed.insert(0, (z, begin, residual))
+                wanted = casadi.vertcat(wanted, begin, residual)
         if not needed:
             return casadi.Function(name, columns, [value], words, [output])
-        solved = []
-        for place, one in enumerate(needed):
-            found = [before.z for before in needed[:place]]
-            given = casadi.Function(
-                f"given{place}",
-                [*columns, *found],
-                [one.begin, one.q],
-                [*words, *(f"z{k}" for k in range(place))],
-                ["begin", "q"],
-            )
-            solved.append(Loop(given, one.residual))
-        result = casadi.Function(
-            "result",
-            [*columns, *(one.z for one in needed)],
-            [value],
-            [*words, *(f"z{k}" for k in range(len(needed)))],
-            [output],
-        )
-        return composed(name, solved, result, words)
+        loops = []
+        for z, begin, residual in needed:
+            q = casadi.vertcat(*(s for s in casadi.symvar(residual) if not casadi.depends_on(s, z)))
+            given = casadi.Function("given", [*columns, *solved], [begin, q])
+            loops.append(Loop(given, casadi.Function("residual", [z, q], [residual])))
+            solved.append(z)
+        more = [f"z{place}" for place in range(len(solved))]
+        result = casadi.Function("result", [*columns, *solved], [value], [*words, *more], [output])
+        return composed(name, loops, result, words)
 
-    def write(self, wanted: Symbol) -> Any:
-        """Return the value of a symbol, writing what it depends on first.
+    def write(self, wanted: Term) -> Any:
+        """Return the value of an expression, writing what it depends on first.
 
         A stack instead of recursion, so that the length of a chain of definitions is no limit.
         """
-        work = [wanted]
+        work = self._needed(wanted)
         while work:
             s = work[-1]
-            if s in self.known:
-                work.pop()
-                continue
-            missing = [t for t in self._needed(self.definitions[s]) if t not in self.known]
-            if missing:
-                work += missing
-            else:
+            missing = [] if s in self.known else self._needed(self.definitions[s])
+            if s not in self.known and not missing:
                 definition = self.definitions[s]
                 if isinstance(definition, ImplicitBlock):
                     self._tear(definition)
                 else:
                     self.known[s] = self._build(definition)
-        return self.known[wanted]
+            work += missing
+            if s in self.known:
+                work.pop()
+        return self._build(wanted)
+
+    def _needed(self, expression: Definition) -> list[Symbol]:
+        """Return the symbols that have to be written before an expression."""
+        return [
+            s for s in in_order(expression.free_symbols) if s not in self.known and s.name not in self.tables
+        ]
 
     def _tear(self, loop: ImplicitBlock) -> None:
         """Make known the unknowns of a loop that are torn; the others follow from them."""
-        outer = self._needed(loop)
-        own = {symbol(name): casadi.SX.sym(name) for name in loop.tearing}
-        given = {s: casadi.SX.sym(s.name) for s in outer}
-        others = {symbol(name): expression for name, expression in loop.inner}
-        inside = Writer({**own, **given}, others, self.tables, {})
-        z, q = inside.column(own.values()), inside.column(given.values())
-        residual = inside.column(inside.translate(expression) for expression in loop.residuals)
+        z = casadi.SX.sym("z", len(loop.tearing))
         begin = self.column(self.starts.get(name, casadi.SX(0)) for name in loop.tearing)
-        found = casadi.SX.sym("z", len(own))
-        self.torn.append(
-            _Torn(
-                found,
-                begin,
-                self.column(self.known[s] for s in outer),
-                casadi.Function("residual", [z, q], [residual], ["z", "q"], ["r"]),
-            )
-        )
-        self.known |= {s: found[i] for i, s in enumerate(own)}
-        self.definitions |= others
-
-    def translate(self, expression: Term) -> Any:
-        """Return the value of an expression."""
-        for s in self._needed(expression):
-            self.write(s)
-        return self._build(expression)
-
-    def _needed(self, expression: Definition) -> list[Symbol]:
-        return in_order(s for s in expression.free_symbols if s.name not in self.tables)
+        self.known |= {symbol(name): z[i] for i, name in enumerate(loop.tearing)}
+        self.definitions |= {symbol(name): expression for name, expression in loop.inner}
+        self.loops.append((z, begin, self.column(map(self.write, loop.residuals))))
 
     def _build(self, expression: Term, taken: Any = None) -> Any:
         """Return the value of an expression whose symbols are known.
@@ -190,54 +151,37 @@ class Writer:
             return casadi.SX(expression.p / expression.q)
         if expression.is_NumberSymbol:
             return casadi.SX(float(expression))
-        if expression.is_Add:
-            return functools.reduce(operator.add, (self._build(one, taken) for one in expression.args))
         if expression.is_Mul or expression.is_Pow:
             return self._product(expression, taken)
-        name = NAMES.get(expression.func)
+        name = "+" if expression.is_Add else NAMES.get(expression.func)
         if name is None:  # a cotangent, which SymPy makes of some tangents
             return self._build(expression.rewrite(tan), taken)
-        if name == "interpolate":
-            return self._interpolated(*expression.args)
+        if name == "interpolate":  # a table's value, linear between its rows and constant beyond its ends
+            rows = self.tables[expression.args[0].name]
+            return function_of(Interpolation(rows.times, rows.numbers))(self._build(expression.args[1]))
         if name == "if":
-            condition, then, otherwise = expression.args
-            return self._chosen(condition, then, otherwise, taken)
+            holds = self._build(expression.args[0], taken)
+            within = [holds, casadi.logic_not(holds)]
+            if taken is not None:
+                within = [casadi.logic_and(taken, one) for one in within]
+            return casadi.if_else(holds, *map(self._build, expression.args[1:], within))
         arguments = [self._build(argument, taken) for argument in expression.args]
         if taken is not None and name in _SOMEWHERE_NONE:
             arguments = [casadi.if_else(taken, one, HARMLESS) for one in arguments]
         function = _CASADI[name]
-        return functools.reduce(function, arguments) if name in ("max", "min") else function(*arguments)
-
-    def _chosen(self, condition: Term, then: Term, otherwise: Term, taken: Any) -> Any:
-        """Return the value of a conditional in a branch."""
-        holds = self._build(condition, taken)
-        first, second = holds, casadi.logic_not(holds)
-        if taken is not None:
-            first, second = casadi.logic_and(taken, first), casadi.logic_and(taken, second)
-        return casadi.if_else(holds, self._build(then, first), self._build(otherwise, second))
-
-    def _interpolated(self, table: Term, time: Term) -> Any:
-        """Return a table's value, linear between its rows and constant beyond its ends."""
-        rows = self.tables[table.name]
-        return function_of(Interpolation(rows.times, rows.numbers))(self._build(time))
+        return functools.reduce(function, arguments) if name in ("+", "max", "min") else function(*arguments)
 
     def _product(self, term: Term, taken: Any) -> Any:
         """Return a product, dividing by what has a negative power: a*(1/b) rounds twice."""
-        above, below = [], []
+        above, below, moving = casadi.SX(1), casadi.SX(1), False
         for factor in Mul.make_args(term):
             base, exponent = factor.args if factor.is_Pow else (factor, ONE)
             if exponent.is_negative:
-                below.append((base, -exponent))
+                below *= self._power(base, -exponent, taken)
+                moving = moving or bool(base.free_symbols)
             else:
-                above.append((base, exponent))
-        product, divisor = (
-            functools.reduce(operator.mul, [self._power(*one, taken) for one in powers] or [casadi.SX(1)])
-            for powers in (above, below)
-        )
-        if not below:
-            return product
-        moving = any(base.free_symbols for base, _ in below)
-        return product / (casadi.if_else(taken, divisor, 1) if taken is not None and moving else divisor)
+                above *= self._power(base, exponent, taken)
+        return above / (casadi.if_else(taken, below, 1) if taken is not None and moving else below)
 
     def _power(self, base: Term, exponent: Term, taken: Any) -> Any:
         """Return a power with a positive exponent."""

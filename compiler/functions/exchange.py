@@ -30,29 +30,23 @@ from apc.compiler.compiled import (
     count_of,
     group_count,
 )
+from apc.compiler.components.component import Component, Variable
 from apc.compiler.components.component import Number as NumberParameter
-from apc.compiler.components.component import Variable
 from apc.compiler.crowd import COUNT_ABOUT, heard_sums, with_heard
-from apc.compiler.equations.clocks import HoldCrossing
-from apc.compiler.equations.flatten import FlatKind
+from apc.compiler.equations.flatten import FlatKind, HoldCrossing
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
+from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND
 from apc.compiler.language.evaluation import evaluate, formula_of
 from apc.compiler.language.expression import Expr, Name, Number, transform
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import Value, renamed
-from apc.compiler.scene.channels import SceneChannel
-from apc.compiler.scene.links import SceneLink
-from apc.compiler.scene.scene import Scene, SceneGroup
+from apc.compiler.scene.groups import SceneGroup
+from apc.compiler.scene.links import PROBABILITIES
+from apc.compiler.scene.scene import Scene
 from apc.compiler.words import enumerated
 
 NO_DELAY = "no delay"
-MOST_DEAF = 3  # names of peers that hear nobody in one message
-LOSS_ABOUT = (
-    "probability that a good link turns bad after a packet",
-    "probability that a bad link turns good after a packet",
-    "probability that a bad link loses a packet",
-    "probability that a good link loses a packet",
-)
+Left = list[tuple[str, str]]  # what the scene names and nothing needs, with the reason
 
 
 def period_of(clock: str) -> str:
@@ -65,8 +59,8 @@ class Timings:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self._parts = {part.name: dict(part.values) for part in scene.parts}
-        self._periods = {period_of(clock.name): clock.period for clock in scene.clocks}
+        self._values = {period_of(clock.name): clock.period for clock in scene.clocks}
+        self._values |= {f"{part.name}.{name}": value for part in scene.parts for name, value in part.values}
         self._found: dict[str, Timing] = {}
 
     @property
@@ -76,57 +70,47 @@ class Timings:
 
     def use(self, name: str, value: Value) -> str:
         """Register a timing and return its name."""
-        self._found.setdefault(name, Timing(name, value.number, _formula(value.expression)))
+        if name not in self._found:
+            self._found[name] = Timing(name, value.number, _formula(value.expression))
         return name
 
     def delay(self, hold: HoldCrossing, kind: FlatKind) -> str:
         """Register the delay of a hold: none, a parameter of a part, or an expression over such."""
-        expression = hold.delay
-        own = {name: (group, value) for name, group, value in kind.delays}
-        if isinstance(expression, Number) and expression.value == 0:
-            self._found.setdefault(NO_DELAY, Timing(NO_DELAY, Fraction(0)))
-            return NO_DELAY
-        if isinstance(expression, Name):
-            return self._parameter(".".join(expression.parts), own)
-        named: list[str] = []
+        if isinstance(hold.delay, Number) and hold.delay.value == 0:
+            return self.use(NO_DELAY, Value(Fraction(0), SECOND, None, Place("")))
 
         def register(node: Expr) -> Expr | None:
             if isinstance(node, Name) and node.parts != (PEERS,):
-                named.append(self._parameter(".".join(node.parts), own))
-                return Name(tuple(named[-1].split(".")))
+                return Name(tuple(self._parameter(".".join(node.parts), kind).split(".")))
             return None
 
-        tree = transform(expression, register)
-        number = Fraction(evaluate(tree, self._number, place=Place(self.scene.name)))
-        name = f"delay of {hold.variable}" + (f" at {kind.name}" if own else "")
-        self._found.setdefault(name, Timing(name, number, formula_of(tree)))
-        return name
+        def number(parts: tuple[str, ...]) -> Fraction:
+            return Fraction(self.scene.peers) if parts == (PEERS,) else self._found[".".join(parts)].value
 
-    def _parameter(self, name: str, own: dict[str, tuple[str, Value]]) -> str:
+        tree = transform(hold.delay, register)
+        if isinstance(tree, Name):
+            return ".".join(tree.parts)
+        value = Fraction(evaluate(tree, number, place=Place(self.scene.name)))
+        name = f"delay of {hold.variable}" + (f" at {kind.name}" if kind.delays else "")
+        return self.use(name, Value(value, SECOND, tree, hold.place))
+
+    def _parameter(self, name: str, kind: FlatKind) -> str:
         """Register a delay parameter, under the group's name if it sets its own."""
-        if name in self._periods:
-            return self.use(name, self._periods[name])
+        own = dict(kind.delays)
         if name not in own:
-            part, _, parameter = name.rpartition(".")
-            return self.use(name, self._parts[part][parameter])
-        group, value = own[name]
-        if value.expression is None:
-            return self.use(f"{group}.{name}", value)
+            return self.use(name, self._values[name])
 
         def whole(parts: tuple[str, ...]) -> tuple[str, ...]:
             """Return what a group's own number depends on: its own as well, if it has one of that name."""
             other = ".".join(parts)
-            return tuple(self._parameter(other, own).split(".")) if other in own else parts
+            return tuple(self._parameter(other, kind).split(".")) if other in own else parts
 
-        return self.use(f"{group}.{name}", replace(value, expression=renamed(value.expression, whole)))
+        expression = own[name].expression
+        tree = None if expression is None else renamed(expression, whole)
+        return self.use(f"{kind.groups[0]}.{name}", replace(own[name], expression=tree))
 
-    def _number(self, parts: tuple[str, ...]) -> Fraction:
-        return Fraction(self.scene.peers) if parts == (PEERS,) else self._found[".".join(parts)].value
 
-
-def used_links(
-    scene: Scene, kinds: Sequence[Kind], timings: Timings
-) -> tuple[list[Link], list[tuple[str, str]]]:
+def used_links(scene: Scene, kinds: Sequence[Kind], timings: Timings) -> tuple[list[Link], Left]:
     """Return the links over which something is heard, and those left out with the reason.
 
     Parameters
@@ -137,13 +121,44 @@ def used_links(
         Takes the delays of the links that are used.
     """
     heard = {receive.link for kind in kinds for clock in kind.clocks for receive in clock.receives}
-    links, dropped = [], []
-    for link in scene.links:
-        if link.name in heard:
-            links.append(_link(link, timings))
-        else:
-            dropped.append((link.name, "nobody hears what it would carry"))
-    return links, dropped
+    links = []
+    for link in (link for link in scene.links if link.name in heard):
+        pairs = [
+            (pair, timings.use(f"{link.name}.delays.{pair.sender}.{pair.receiver}", pair.delay))
+            for pair in link.delays
+        ]
+        delays = tuple(PairDelay(pair.sender, pair.receiver, name) for pair, name in pairs)
+        delay, channel, its = timings.use(f"{link.name}.delay", link.delay), None, link.channel
+        if its is not None:
+            loss = Loss(*(name for name, _ in its.loss)) if its.loss else None
+            jitter = None if its.jitter is None else timings.use(f"{link.name}.jitter", its.jitter)
+            channel = Channel(loss, jitter, its.distribution, its.reorder, its.on_loss, its.trace)
+        links.append(Link(link.name, link.clock, delay, link.graph, delays, channel))
+    unheard = [link.name for link in scene.links if link.name not in heard]
+    return links, [(name, "nobody hears what it would carry") for name in unheard]
+
+
+def used_clocks(
+    scene: Scene, kinds: Sequence[Kind], links: Sequence[Link], timings: Timings
+) -> tuple[list[Clock], Left]:
+    """Return the clocks that something ticks with, and those left out with the reason.
+
+    Parameters
+    ----------
+    scene
+        The scene, all of its clocks.
+    kinds, links
+        What ticks.
+    timings
+        Takes the periods and phases that are used.
+    """
+    used = {link.clock for link in links} | {clock.clock for kind in kinds for clock in kind.clocks}
+    clocks = []
+    for clock in (clock for clock in scene.clocks if clock.name in used):
+        period = timings.use(period_of(clock.name), clock.period)
+        phase, place = timings.use(f"{clock.name}.phase", clock.phase), clock.period.place
+        clocks.append(Clock(clock.name, period, phase, place.line, place.column))
+    return clocks, [(one.name, "nothing ticks with it") for one in scene.clocks if one.name not in used]
 
 
 def check_channels(scene: Scene, kinds: Sequence[Kind]) -> None:
@@ -159,8 +174,7 @@ def check_channels(scene: Scene, kinds: Sequence[Kind]) -> None:
         sent = {kind.name: one.channels for kind in kinds for one in kind.sends if one.link == link.name}
         every = dict.fromkeys(channel for channels in sent.values() for channel in channels)
         missing = [(name, one) for one in every for name, channels in sent.items() if one not in channels]
-        if missing:
-            name, channel = missing[0]
+        for name, channel in missing[:1]:
             what = f"{channel} travels over {link.name}, and those of {name} send other values over it"
             hint = "a link of its own for what only some groups send"
             mistakes.add("E215", link.place, what, hint=hint)
@@ -183,37 +197,32 @@ def check_heard(scene: Scene, kinds: Mapping[str, Kind]) -> None:
         E801 for each such link.
     """
     mistakes = Mistakes()
-    counts = [group.count for group in scene.groups]
-    for link in scene.links:
-        if link.graph.shape != "arcs":
-            continue  # on any other everybody hears somebody
-        taken = [_taken(kinds[group.name], link.name) for group in scene.groups]
-        sends = [any(one.link == link.name for one in kinds[group.name].sends) for group in scene.groups]
+    groups = scene.groups
+    counts = np.array([group.count for group in groups])
+    for link in (link for link in scene.links if link.graph.shape == "arcs"):  # else all hear somebody
+        taken = [_taken(kinds[group.name], link.name) for group in groups]
+        sends = [any(one.link == link.name for one in kinds[group.name].sends) for group in groups]
+        owner = np.repeat(np.arange(len(groups)), counts)
         senders, receivers = link.graph.arcs.T
-        deaf = np.repeat([bool(one) for one in taken], counts)
-        deaf[receivers[np.repeat(sends, counts)[senders]]] = False
-        if deaf.any():
-            starts = np.cumsum([0, *counts])
-            alone = [
-                group.name
-                for group, start in zip(scene.groups, starts, strict=False)
-                if deaf[start : start + group.count].all()
-            ]
-            places = np.flatnonzero(deaf).tolist()
-            owners = (np.searchsorted(starts, places, "right") - 1).tolist()
-            names = [
-                f"{scene.groups[owner].name}[{place - starts[owner] + 1}]"
-                for place, owner in zip(places[:MOST_DEAF], owners, strict=False)
-            ]
-            if len(places) > MOST_DEAF:
-                names.append(f"{len(places) - MOST_DEAF} more")
-            hear = f"{enumerated(names)} {'hears' if len(places) == 1 else 'hear'} nobody over {link.name}"
-            what = f"{hear}: there is no {taken[owners[0]]} over nobody"
-            others = [group.name for group in scene.groups if group.name not in alone]
-            hint = f"an arc to {'each' if len(places) > 1 else names[0]} in its graph"
-            if alone and others:
-                hint += f", or at: [{', '.join(others)}] in what uses {link.name}"
-            mistakes.add("E801", link.place, what, hint=hint)
+        deaf = np.array([bool(one) for one in taken])[owner]
+        deaf[receivers[np.array(sends)[owner[senders]]]] = False
+        places = np.flatnonzero(deaf)
+        if not places.size:
+            continue
+        first = [
+            (groups[owner[place]].name, place - np.searchsorted(owner, owner[place])) for place in places[:3]
+        ]
+        names = [f"{name}[{place + 1}]" for name, place in first]
+        if len(places) > len(names):
+            names.append(f"{len(places) - len(names)} more")
+        hear = f"{enumerated(names)} {'hears' if len(places) == 1 else 'hear'} nobody over {link.name}"
+        what = f"{hear}: there is no {taken[owner[places[0]]]} over nobody"
+        hint = f"an arc to {'each' if len(places) > 1 else names[0]} in its graph"
+        hearing = np.bincount(owner[places], minlength=len(groups)) < counts
+        if not hearing.all() and hearing.any():
+            others = [group.name for group, hears in zip(groups, hearing, strict=True) if hears]
+            hint += f", or at: [{', '.join(others)}] in what uses {link.name}"
+        mistakes.add("E801", link.place, what, hint=hint)
     mistakes.raise_if_any()
 
 
@@ -221,57 +230,6 @@ def _taken(kind: Kind, link: str) -> str:
     """Return what a kind takes over those it hears over a link that is nothing over nobody, if anything."""
     found = (one.operator for clock in kind.clocks for one in clock.receives if one.link == link)
     return next((one for one in found if one in ("mean", "max", "min")), "")
-
-
-def _link(link: SceneLink, timings: Timings) -> Link:
-    delays = tuple(
-        PairDelay(
-            pair.sender,
-            pair.receiver,
-            timings.use(f"{link.name}.delays.{pair.sender}.{pair.receiver}", pair.delay),
-        )
-        for pair in link.delays
-    )
-    delay = timings.use(f"{link.name}.delay", link.delay)
-    channel = None if link.channel is None else _channel(link.name, link.channel, timings)
-    return Link(link.name, link.clock, delay, link.graph, delays, channel)
-
-
-def _channel(link: str, channel: SceneChannel, timings: Timings) -> Channel:
-    return Channel(
-        Loss(*(name for name, _ in channel.loss)) if channel.loss else None,
-        None if channel.jitter is None else timings.use(f"{link}.jitter", channel.jitter),
-        channel.distribution,
-        channel.reorder,
-        channel.on_loss,
-        channel.trace,
-    )
-
-
-def used_clocks(
-    scene: Scene, kinds: Sequence[Kind], links: Sequence[Link], timings: Timings
-) -> tuple[list[Clock], list[tuple[str, str]]]:
-    """Return the clocks that something ticks with, and those left out with the reason.
-
-    Parameters
-    ----------
-    scene
-        The scene, all of its clocks.
-    kinds, links
-        What ticks.
-    timings
-        Takes the periods and phases that are used.
-    """
-    used = {link.clock for link in links} | {clock.clock for kind in kinds for clock in kind.clocks}
-    clocks, dropped = [], []
-    for clock in scene.clocks:
-        if clock.name in used:
-            period = timings.use(period_of(clock.name), clock.period)
-            phase, place = timings.use(f"{clock.name}.phase", clock.phase), clock.period.place
-            clocks.append(Clock(clock.name, period, phase, place.line, place.column))
-        else:
-            dropped.append((clock.name, "nothing ticks with it"))
-    return clocks, dropped
 
 
 def compiled_groups(
@@ -296,26 +254,22 @@ def compiled_groups(
         E215 a graph some of whose peers send nothing.
     """
     exact = {timing.name for timing in timings.found}
+    components = {part.name: part.component for part in scene.parts}
     found = []
     for group in scene.groups:
         values = []
         for name, value in group.values:
-            timing = (group.name, *name.split("."))
-            own = replace(value, expression=Name(timing)) if ".".join(timing) in exact else value
-            values.append(compiled_parameter(scene, name, own))
+            timing = f"{group.name}.{name}"
+            own = replace(value, expression=Name(tuple(timing.split(".")))) if timing in exact else value
+            values.append(_of_part(name, own, components))
         columns = tuple(Column(name, numbers) for name, numbers in group.columns)
         found.append(Group(group.name, group.count, kind_of[group.name], tuple(values), columns))
-    for link in links:
-        silent = [
-            group.name
-            for group in found
-            if not any(sending.link == link.name for sending in kinds[group.kind].sends)
-        ]
-        counted = any(count_of(link.name) in kind.parameters for kind in kinds)
-        if silent and counted and link.graph.shape != "complete":
-            place = next(part.place for part in scene.links if part.name == link.name)
+    for link in (link for link in scene.links if link.graph.shape != "complete"):
+        senders = [any(one.link == link.name for one in kind.sends) for kind in kinds]
+        silent = [group.name for group in found if not senders[group.kind]]
+        if silent and any(count_of(link.name) in kind.parameters for kind in kinds):
             what = f"the graph of {link.name} joins all peers, and those of {silent[0]} send nothing over it"
-            raise ApcError(Mistake("E215", place, what))
+            raise ApcError(Mistake("E215", link.place, what))
     return with_heard(found, kinds, links)
 
 
@@ -327,61 +281,38 @@ def with_rounded(scene: Scene, kind: Kind, links: Sequence[Link]) -> Kind:
     ApcError
         E217 sums of weights that differ and are one in floats.
     """
+    places = {link.name: link.place for link in scene.links}
     rounded = []
     for link in links:
         if count_of(link.name) in kind.parameters and link.graph.shape == "arcs":
-            sums = heard_sums(link, scene.peers)
-            values = {sums.of(peer) for peer in range(scene.peers)} if sums.rounded else set()
+            values = heard_sums(link, scene.peers).values
             if len(set(map(float, values))) < len(values):
-                place = next(part.place for part in scene.links if part.name == link.name)
                 what = f"what two peers hear over {link.name} adds up to sums that doubles can't tell apart"
-                raise ApcError(Mistake("E217", place, what, hint="weights of at most 15 digits"))
-            if values:
+                raise ApcError(Mistake("E217", places[link.name], what, hint="weights of at most 15 digits"))
+            if any(Fraction(float(value)) != value for value in values):
                 rounded.append((kind.parameters.index(count_of(link.name)), tuple(sorted(values))))
     return replace(kind, rounded=tuple(rounded))
 
 
-def compiled_parameter(scene: Scene, name: str, value: Value) -> Parameter:
-    """Return a number of the scene as a parameter, with its unit, bounds and what it is about.
-
-    Parameters
-    ----------
-    scene
-        Knows what the component of a part declares.
-    name
-        The whole name: `contact.stiffness`, or that of a named number, which has no bounds.
-    value
-        The number, in SI.
-    """
-    unit = format_dimension(value.dimension)
-    number, formula = float(value.number), _formula(value.expression)
-    part, _, own = name.rpartition(".")
-    if not part:
-        return Parameter(name, unit, number, formula, exact=value.number)
-    component = scene.part(part).component
-    declared = component.parameter(own)
-    if isinstance(declared, NumberParameter):
-        return Parameter(
-            name,
-            unit,
-            number,
-            formula,
-            None if declared.minimum is None else float(declared.minimum),
-            declared.open_minimum,
-            None if declared.maximum is None else float(declared.maximum),
-            declared.about,
-            value.number,
-        )
-    variable = component.variable(own)
-    assert variable is not None
-    return _start_value(name, value, variable)
+# ---- numbers by name ----
 
 
-def _start_value(name: str, value: Value, variable: Variable) -> Parameter:
-    """Return the start value of a variable as a parameter of this whole name."""
+def _named(name: str, value: Value, about: str = "") -> Parameter:
+    """Return a number as a parameter without bounds."""
     unit, formula = format_dimension(value.dimension), _formula(value.expression)
-    about = f"start value: {variable.about}"
     return Parameter(name, unit, float(value.number), formula, about=about, exact=value.number)
+
+
+def _of_part(name: str, value: Value, components: Mapping[str, Component]) -> Parameter:
+    """Return a number or start value of a part, with its bounds and what it is about."""
+    part, _, own = name.rpartition(".")
+    declared = components[part].parameter(own) or components[part].variable(own)
+    if isinstance(declared, Variable):
+        return _named(name, value, f"start value: {declared.about}")
+    assert isinstance(declared, NumberParameter)
+    least, most = (None if one is None else float(one) for one in (declared.minimum, declared.maximum))
+    bare = _named(name, value, declared.about)
+    return replace(bare, minimum=least, open_minimum=declared.open_minimum, maximum=most)
 
 
 def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -> tuple[Parameter, ...]:
@@ -394,54 +325,35 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
     kinds, links
         What is compiled: whose start values and counts are in use, and which links.
     """
-    found = {name: compiled_parameter(scene, name, value) for name, value in scene.parameters}
+    components = {part.name: part.component for part in scene.parts}
     needed = {name for kind in kinds for name in kind.parameters}
+    used = {link.name for link in links}
+    found = [_named(name, value) for name, value in scene.parameters]
     for part in scene.parts:
-        for own, value in part.values:
-            name = f"{part.name}.{own}"
-            found[name] = compiled_parameter(scene, name, value)
-        given = dict(part.starts)
-        for variable in part.component.variables:
-            name = f"{part.name}.{variable.name}"
-            if name in needed and variable.start is not None:
-                default = Value(variable.start, variable.unit.dimension, None, part.place)
-                found[name] = _start_value(name, given.get(variable.name, default), variable)
+        starts = {
+            one.name: Value(one.start, one.unit.dimension, None, part.place)
+            for one in part.component.variables
+            if one.start is not None
+        } | dict(part.starts)
+        in_use = ((name, value) for name, value in starts.items() if f"{part.name}.{name}" in needed)
+        found += [_of_part(f"{part.name}.{own}", value, components) for own, value in (*part.values, *in_use)]
     for link in scene.links:
         if count_of(link.name) in needed:  # every group has its own value
-            name = count_of(link.name)
-            found[name] = Parameter(name, "1", float(scene.peers - 1), about=COUNT_ABOUT)
-        if link.channel is not None and any(used.name == link.name for used in links):
-            found |= {
-                name: Parameter(
-                    name,
-                    "1",
-                    float(value.number),
-                    _formula(value.expression),
-                    minimum=0.0,
-                    maximum=1.0,
-                    about=about,
-                    exact=value.number,
-                )
-                for (name, value), about in zip(link.channel.loss, LOSS_ABOUT, strict=False)
-            }
+            found.append(Parameter(count_of(link.name), "1", float(scene.peers - 1), about=COUNT_ABOUT))
+        if link.channel is not None and link.name in used:
+            for (name, value), about in zip(link.channel.loss, PROBABILITIES.values(), strict=False):
+                found.append(replace(_named(name, value, about), minimum=0.0, maximum=1.0))
     for clock in scene.clocks:
         if (name := period_of(clock.name)) in needed:  # by `interval`: the same number as the timing
-            value, about = clock.period, f"from one tick of {clock.name} to the next"
-            formula = _formula(value.expression)
-            found[name] = Parameter(
-                *(name, "s", float(value.number), formula, 0.0, True), about=about, exact=value.number
-            )
+            one = _named(name, clock.period, f"from one tick of {clock.name} to the next")
+            found.append(replace(one, minimum=0.0, open_minimum=True))
     for group in scene.groups:
-        name = group_count(group.name)
-        formula = _formula(None if group.counted is None else group.counted.expression)
-        exact = Fraction(group.count)
-        about = f"number of peers of group {group.name}"
-        most = _most_peers(scene, group)
-        found[name] = Parameter(
-            name, "1", float(exact), formula, minimum=1.0, maximum=most, about=about, exact=exact
-        )
-    found[PEERS] = Parameter(PEERS, "1", float(scene.peers), about="number of peers")
-    return tuple(found.values())
+        expression = None if group.counted is None else group.counted.expression
+        count = Value(Fraction(group.count), DIMENSIONLESS, expression, group.place)
+        one = _named(group_count(group.name), count, f"number of peers of group {group.name}")
+        found.append(replace(one, minimum=1.0, maximum=_most_peers(scene, group)))
+    found.append(Parameter(PEERS, "1", float(scene.peers), about="number of peers"))
+    return tuple({one.name: one for one in found}.values())
 
 
 def _most_peers(scene: Scene, group: SceneGroup) -> float | None:

@@ -1,46 +1,50 @@
-"""Expressions of parameters as formulas, and what they come to.
+"""What expressions of parameters come to: exactly, or in any kind of number.
 
-Takes: an `Expr` tree, and what its names stand for.
-Gives: `formula_of`; `Value`, `evaluate`.
-Guarantees: a formula has an operation or a few for each node, and keeps the exact numbers of its text;
-`evaluate` computes by the same operations.
+Takes: an `Expr` tree or a `Formula`, and the values of its names.
+Gives: `formula_of`; `evaluate`, `exact_value`; `exactly` and `computed`, by the rules of another kind of
+number; `FaultError`.
+Guarantees: exact as long as every operation is rational; exact rationals stay below 2^4096, so that computing
+always ends soon; a value is finite. A branch that is not taken is not evaluated.
 Does not: know units, or values that change with time or with the peers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
 from fractions import Fraction
-from functools import reduce
+from functools import lru_cache, reduce
 from typing import Any, NoReturn
 
 from apc.compiler.compiled import Formula
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.formula import FaultError, exactly
 from apc.compiler.language.expression import (
     SMOOTH,
-    Binary,
     Call,
     Compare,
     Conditional,
     Expr,
     Logic,
     Name,
-    Negate,
-    Not,
     Number,
+    children,
     fold,
     format_expression,
+    names,
+    operation,
     walk,
 )
 from apc.compiler.language.grammar import parse_expression
-from apc.compiler.plain import PlainFunction
+from apc.compiler.plain import ROUNDED, RULES
 from apc.compiler.words import cut
 
 Value = Fraction | float
+Rule = Callable[[str], Callable[..., Any]]
 
-_OPERATORS = {
+MAX_BITS = 4096  # of an exact numerator or denominator; beyond it a float takes over
+
+# The operations of `plain` by the operators and functions of the language.
+_OPERATIONS = {
     "+": "add",
     "-": "sub",
     "*": "mul",
@@ -48,18 +52,31 @@ _OPERATORS = {
     "^": "pow",
     "<": "lt",
     "<=": "le",
+    ">": "lt",
+    ">=": "le",
     "==": "eq",
     "!=": "ne",
     "and": "and",
     "or": "or",
-}
-_TURNED = {">": "lt", ">=": "le"}  # the same with its sides exchanged
-_FUNCTIONS = {
+    "Negate": "neg",
+    "Not": "not",
     "abs": "fabs",
     "max": "fmax",
     "min": "fmin",
     **{name: name for name in ("sign", "floor", "sqrt", "atan2", *SMOOTH)},
 }
+
+
+class FaultError(Exception):
+    """A node of an expression has no value: what is wrong with it in words, and why."""
+
+    def __init__(self, node: Expr, cause: Exception) -> None:
+        words = "has no real value"
+        if isinstance(cause, ArithmeticError):
+            by_zero = isinstance(cause, ZeroDivisionError)
+            words = "divides by zero" if by_zero else "is too large for a number"
+        super().__init__(words)
+        self.node, self.words, self.cause = node, words, cause
 
 
 def formula_of(expr: Expr) -> Formula:
@@ -71,10 +88,8 @@ def formula_of(expr: Expr) -> Formula:
         E332 a function that has no value in a parameter.
     """
     text = format_expression(expr)
-    place = Place("an expression", 1, 1, text)
-    listed = _listed(parse_expression(text, place), place)
-    spans = tuple((node.start, node.end) for node in listed.nodes)
-    return Formula(text, listed.names, listed.numbers, listed.function, spans)
+    _check_functions(expr, Place("an expression", 1, 1, text))
+    return Formula(text, tuple(dict.fromkeys(".".join(name.parts) for name in names(expr))))
 
 
 def evaluate(
@@ -102,84 +117,175 @@ def evaluate(
     ApcError
         E330 a name without a value, E331 no finite real value, E332 a function that has none in a parameter.
     """
-    where = place or Place("an expression")
-    listed = _listed(expr, where)
-    values: list[Any] = []
-    for name, node in zip(listed.names, listed.nodes, strict=False):
+    start = place or Place("an expression")
+    _check_functions(expr, start)
+    values: dict[str, Any] = {}
+    for name in names(expr):
         try:
-            values.append(lookup(tuple(name.split("."))))
+            values[".".join(name.parts)] = lookup(name.parts)
         except KeyError:
-            _fail(where, node, "E330", f"{name} has no value here")
+            _fail(start, name, "E330", f"{'.'.join(name.parts)} has no value here")
     try:
-        found: Value = exactly(listed.function, [*values, *listed.numbers])
+        value: Value = _exactly(expr, values, EXACT.__getitem__)
     except FaultError as fault:
-        node = listed.nodes[fault.place]
-        _fail(where, node, "E331", f"{cut(format_expression(node))} {fault.words}")
-    return found
+        _fail(start, fault.node, "E331", f"{cut(format_expression(fault.node))} {fault.words}")
+    return value
+
+
+def exact_value(name: str, formula: Formula, values: Sequence[Fraction]) -> Fraction:
+    """Return what a number comes to; beyond rational operations, the float it was rounded to.
+
+    Parameters
+    ----------
+    name
+        The number's, for messages.
+    formula, values
+        What it follows from, and the values of `Formula.names`.
+
+    Raises
+    ------
+    ApcError
+        E331 it has no finite real value.
+    """
+    by_parts = {tuple(key.split(".")): value for key, value in zip(formula.names, values, strict=True)}
+    return Fraction(evaluate(_tree(formula.text), by_parts.__getitem__, Place(name, 1, 1, formula.text)))
+
+
+def exactly(formula: Formula, values: Sequence[Any], rule: Rule) -> Any:
+    """Return a formula's value by the rules of exact numbers of another kind.
+
+    Parameters
+    ----------
+    formula, values
+        The formula, and the values of `Formula.names`.
+    rule
+        What an operation of `plain` is in this kind of number.
+
+    Raises
+    ------
+    FaultError
+        It has none.
+    """
+    return _exactly(_tree(formula.text), dict(zip(formula.names, values, strict=True)), rule)
+
+
+def computed(formula: Formula, values: Sequence[Any], rule: Rule) -> Any:
+    """Return a formula's value in numbers that may be arrays: both branches are computed, numbers are floats.
+
+    Parameters
+    ----------
+    formula, values
+        The formula, and the values of `Formula.names`.
+    rule
+        What an operation of `plain` is in this kind of number.
+    """
+    by_name = dict(zip(formula.names, values, strict=True))
+
+    def leaf(expr: Name | Number) -> Any:
+        return float(expr.value) if isinstance(expr, Number) else by_name[".".join(expr.parts)]
+
+    def node(expr: Expr, *operands: Any) -> Any:
+        if not isinstance(expr, Conditional):
+            return _operation(expr, operands, rule)
+        holds, then, otherwise = operands
+        branches = (holds, then), (rule("not")(holds), otherwise)
+        return rule("add")(*(rule("if_else_zero")(*branch) for branch in branches))
+
+    return fold(_tree(formula.text), leaf, node)
+
+
+def _exactly(expr: Expr, values: dict[str, Any], rule: Rule) -> Any:
+    """Return the value of an expression, evaluated only as far as it is needed. Raises FaultError."""
+
+    def value(expr: Expr) -> Any:
+        if isinstance(expr, Conditional):
+            return value(expr.then if value(expr.condition) != 0 else expr.otherwise)
+        if isinstance(expr, Logic) and ((left := value(expr.left)) != 0) == (expr.operator == "or"):
+            return left
+        parts = [value(part) for part in children(expr)]
+        try:
+            match expr:
+                case Number():
+                    return _finite(expr.value)
+                case Name():
+                    return _finite(values[".".join(expr.parts)])
+            return _operation(expr, parts, rule)
+        except (ArithmeticError, ValueError) as cause:
+            raise FaultError(expr, cause) from None
+
+    return value(expr)
+
+
+def _operation(expr: Expr, operands: Sequence[Any], rule: Rule) -> Any:
+    """Return what a node comes to, from what its sub-expressions come to."""
+    match expr:
+        case Compare(">" | ">="):
+            operands = operands[::-1]
+        case Call("max" | "min"):
+            return reduce(rule(_OPERATIONS[expr.function]), operands)
+    return rule(_OPERATIONS[operation(expr)])(*operands)
+
+
+def _check_functions(expr: Expr, place: Place) -> None:
+    for node in walk(expr):
+        if isinstance(node, Call) and node.function not in _OPERATIONS:
+            what = f"{node.function}(…) changes with time or with the peers: a parameter cannot hold it"
+            _fail(place, node, "E332", what)
 
 
 def _fail(place: Place, node: Expr, code: str, what: str) -> NoReturn:
     # Without the text we can only trust a column that exists.
-    line = place.source_line
-    fits = not line or place.column + node.start <= len(line)
+    fits = not place.source_line or place.column + node.start <= len(place.source_line)
     raise ApcError(Mistake(code, place.shifted(node.start) if fits else place, what))
 
 
-@dataclass(frozen=True, slots=True)
-class _Listed:
-    """A function of an expression's names and numbers, and the node of each value, these first."""
-
-    names: tuple[str, ...]
-    numbers: tuple[Fraction, ...]
-    function: PlainFunction
-    nodes: tuple[Expr, ...]
+@lru_cache(maxsize=1024)
+def _tree(text: str) -> Expr:
+    return parse_expression(text, Place("a formula", 1, 1, text))
 
 
-def _listed(expr: Expr, place: Place) -> _Listed:
-    """Return the operations of an expression, in the order in which they stand."""
-    names: dict[str, Expr] = {}
-    numbers: dict[Fraction, Expr] = {}
-    for node in walk(expr):
-        if isinstance(node, Name):
-            names.setdefault(".".join(node.parts), node)
-        elif isinstance(node, Number):
-            numbers.setdefault(node.value, node)
-    place_of = {key: k for k, key in enumerate((*names, *numbers))}
-    nodes: list[Expr] = [*names.values(), *numbers.values()]
-    operations: list[tuple[Any, ...]] = []
+def _finite(value: Any) -> Any:
+    """Return a value of Python's that is a finite float or could be one, exact only while that is cheap."""
+    if not isinstance(value, int | float | Fraction):
+        return value
+    rounded = float(value)
+    if not math.isfinite(rounded):
+        raise OverflowError
+    if isinstance(value, float):
+        return value
+    exact = Fraction(value)
+    return exact if _bits(exact) <= MAX_BITS else rounded
 
-    def leaf(node: Name | Number) -> int:
-        return place_of[".".join(node.parts) if isinstance(node, Name) else node.value]
 
-    def operation(node: Expr, *operands: int) -> int:
-        def add(word: str, *places: int) -> int:
-            operations.append((word, *places))
-            nodes.append(node)
-            return len(nodes) - 1
+def _bits(value: Fraction) -> int:
+    return max(value.numerator.bit_length(), value.denominator.bit_length())
 
-        match node:
-            case Negate():
-                return add("neg", *operands)
-            case Not():
-                return add("not", *operands)
-            case Compare() if node.operator in _TURNED:
-                return add(_TURNED[node.operator], *reversed(operands))
-            case Binary() | Compare() | Logic():
-                return add(_OPERATORS[node.operator], *operands)
-            case Call() if node.function in _FUNCTIONS:
-                word = _FUNCTIONS[node.function]
-                if node.function in ("max", "min"):
-                    return reduce(lambda one, other: add(word, one, other), operands)
-                return add(word, *operands)
-            case Conditional():
-                holds, then, otherwise = operands
-                taken, left = add("if_else_zero", holds, then), add("not", holds)
-                return add("add", taken, add("if_else_zero", left, otherwise))
-        assert isinstance(node, Call)
-        what = f"{node.function}(…) changes with time or with the peers: a parameter cannot hold it"
-        return _fail(place, node, "E332", what)
 
-    result = fold(expr, leaf, operation)
-    inputs = (("p", len(names)), ("c", len(numbers)))
-    function = PlainFunction(inputs, (), tuple(operations), ((result,),))
-    return _Listed(tuple(names), tuple(numbers), function, tuple(nodes))
+def _root(value: Value) -> Value:
+    """Return √value, exact when the value is the square of a rational."""
+    if isinstance(value, Fraction) and value >= 0:
+        numerator, denominator = math.isqrt(value.numerator), math.isqrt(value.denominator)
+        if numerator**2 == value.numerator and denominator**2 == value.denominator:
+            return Fraction(numerator, denominator)
+    return math.sqrt(value)
+
+
+def _power(base: Value, exponent: Value) -> Value:
+    """Return base^exponent; exact when the exponent is whole, or when it is a half and the base a square."""
+    power = Fraction(exponent)
+    if power.denominator == 2 and isinstance(base, Fraction):
+        base, power = _root(base), power * 2
+    if power.denominator == 1:
+        whole = power.numerator
+        exact = isinstance(base, Fraction) and _bits(base) * abs(whole) <= 2 * MAX_BITS
+        return (base if exact else float(base)) ** whole
+    return math.pow(base, power)
+
+
+def _kept_finite(rule: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda *operands: _finite(rule(*operands))
+
+
+# Exact where an operation is rational, and finite.
+_EXACT: dict[str, Callable[..., Any]] = {**RULES, **ROUNDED, "sqrt": _root, "pow": _power}
+EXACT = {word: _kept_finite(rule) for word, rule in _EXACT.items()}

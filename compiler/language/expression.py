@@ -1,8 +1,8 @@
 """The nodes of an expression's tree, walking and changing them, and their text.
 
 Takes: `Expr` trees.
-Gives: the node types, `Equation`, `format_expression`, `interval_of`, `children`, `rebuild`, `walk`, `names`,
-`transform`, `fold`.
+Gives: the node types, `Equation`, `format_expression`, `interval_of`, `operation`, `children`, `rebuild`,
+`walk`, `names`, `transform`, `fold`.
 Guarantees: plain frozen data; the text has no more parentheses than the tree needs.
 Does not: read text (see `grammar`), or know what a name means, or its unit.
 """
@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from decimal import Context, Decimal, Inexact
 from enum import IntEnum
 from fractions import Fraction
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from apc.compiler.errors import Place
 
@@ -130,28 +130,15 @@ SMOOTH = ("exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "co
 
 # function -> (fewest arguments, most arguments)
 FUNCTIONS: dict[str, tuple[int, int]] = {
-    "der": (1, 1),
+    **dict.fromkeys(
+        ("der", "previous", "initial", "age", "mean", "sum", "count", "interval", "norm"), (1, 1)
+    ),
+    **dict.fromkeys(("abs", "sign", "sqrt", "floor", *SMOOTH), (1, 1)),
+    **dict.fromkeys(("atan2", "interpolate", "dot", "cross"), (2, 2)),
     "sample": (1, 2),
     "hold": (1, 2),
-    "previous": (1, 1),
-    "initial": (1, 1),
-    "age": (1, 1),
     "max": (1, 16),
     "min": (1, 16),
-    "abs": (1, 1),
-    "sign": (1, 1),
-    "sqrt": (1, 1),
-    **dict.fromkeys(SMOOTH, (1, 1)),
-    "atan2": (2, 2),
-    "floor": (1, 1),
-    "interpolate": (2, 2),
-    "mean": (1, 1),
-    "sum": (1, 1),
-    "count": (1, 1),
-    "interval": (1, 1),
-    "dot": (2, 2),
-    "norm": (1, 1),
-    "cross": (2, 2),
 }
 
 KEYWORDS = frozenset(("if", "then", "elseif", "else", "and", "or", "not"))
@@ -244,38 +231,38 @@ def _format_number(value: Fraction) -> tuple[str, int]:
     return f"{sign}{number:f}", level
 
 
+_PARTS: dict[type[Spanned], tuple[str, ...]] = {
+    Negate: ("operand",),
+    Not: ("operand",),
+    **dict.fromkeys((Binary, Compare, Logic), ("left", "right")),
+    Call: ("arguments",),
+    Conditional: ("condition", "then", "otherwise"),
+    Vector: ("entries",),
+}
+
+
+def operation(expr: Expr) -> str:
+    """Return what a node does: its operator, its function, or else the name of its type."""
+    match expr:
+        case Binary() | Compare() | Logic():
+            return expr.operator
+        case Call():
+            return expr.function
+    return type(expr).__name__
+
+
 def children(expr: Expr) -> tuple[Expr, ...]:
     """Return the sub-expressions of a node, left to right."""
-    match expr:
-        case Number() | Name():
-            return ()
-        case Negate() | Not():
-            return (expr.operand,)
-        case Binary() | Compare() | Logic():
-            return (expr.left, expr.right)
-        case Call():
-            return expr.arguments
-        case Conditional():
-            return (expr.condition, expr.then, expr.otherwise)
-        case Vector():
-            return expr.entries
+    parts = [getattr(expr, name) for name in _PARTS.get(type(expr), ())]
+    several: tuple[Expr, ...] = parts[0] if isinstance(expr, Call | Vector) else tuple(parts)
+    return several
 
 
 def rebuild(expr: Expr, parts: tuple[Expr, ...]) -> Expr:
     """Return the node with other sub-expressions, in the order of `children`."""
-    match expr:
-        case Number() | Name():
-            return expr
-        case Negate() | Not():
-            return replace(expr, operand=parts[0])
-        case Binary() | Compare() | Logic():
-            return replace(expr, left=parts[0], right=parts[1])
-        case Call():
-            return replace(expr, arguments=parts)
-        case Conditional():
-            return replace(expr, condition=parts[0], then=parts[1], otherwise=parts[2])
-        case Vector():
-            return replace(expr, entries=parts)
+    values: tuple[Any, ...] = (parts,) if isinstance(expr, Call | Vector) else parts
+    changed: dict[str, Any] = dict(zip(_PARTS.get(type(expr), ()), values, strict=True))
+    return replace(expr, **changed)
 
 
 def interval_of(clock: str) -> str:

@@ -42,7 +42,7 @@ from apc.compiler.language.expression import (
     format_expression,
     interval_of,
 )
-from apc.compiler.language.parsing import TREE, FaultError, exponent_of, kind_of, parser, unclosed
+from apc.compiler.language.parsing import TREE, FaultError, exponent_of, kind_of, parser, placing, unclosed
 from apc.compiler.words import cut
 
 ALIKE = 0.8  # of the letters of a function's name, for another to be the one that was meant
@@ -94,17 +94,15 @@ def parse_expression(text: str, place: Place) -> Expr:
         E321 a character, E322 a wrong or missing token, E323 a number, E324 a name, E325 a function,
         E326 an exponent, E327 a condition where a number is due or the reverse, E328 too long or too deep.
     """
-    try:
+    with placing(text, place):
         expr: Expr = _parsed(text, "expression")[0]
         _check(expr, text)
         return expr
-    except FaultError as fault:
-        raise fault.placed(text, place) from None
 
 
 def parse_equation(text: str, place: Place) -> Equation:
     """Return both sides of `left = right`: as `parse_expression`, and E329 unless there is just one `=`."""
-    try:
+    with placing(text, place):
         left, *others = _parsed(text, "equation")
         if isinstance(left, Compare) and left.operator == "==" and not others:
             # The usual slip: `a == b` for `a = b`.
@@ -117,8 +115,6 @@ def parse_equation(text: str, place: Place) -> Equation:
         _check(left, text)
         _check(others[1], text)
         return Equation(left, others[1], text, place)
-    except FaultError as fault:
-        raise fault.placed(text, place) from None
 
 
 @lru_cache(maxsize=1024)
@@ -200,28 +196,22 @@ def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
     raise FaultError("E322", token, what)
 
 
-def _check(expr: Expr, text: str) -> None:
+def _check(expr: Expr, text: str, depth: int = 1, *, conditional: bool = False) -> None:
     """Raise E328 if a tree is too deep, E327 for a condition where a number is due or the reverse."""
-    fault: FaultError | None = None
-    waiting: list[tuple[Expr, int, bool]] = [(expr, 0, False)]
-    while waiting:
-        node, depth, conditional = waiting.pop()
-        if depth >= MAX_DEPTH:
-            raise FaultError("E328", node.start, TOO_DEEP)
-        condition = isinstance(node, Compare | Logic | Not)
-        # A name may stand for a condition; what it is, only its declaration can tell.
-        if condition != conditional and not isinstance(node, Name):
-            kinds = "a condition, and a number" if condition else "a number, and a condition"
-            what = f"{cut(text[node.start : node.end])} is {kinds} is due here"
-            fault = fault or FaultError("E327", node.start, what)
-        first, others = isinstance(node, Logic | Not | Conditional), isinstance(node, Logic)
+    if depth > MAX_DEPTH:
+        raise FaultError("E328", expr.start, TOO_DEEP)
+    condition = isinstance(expr, Compare | Logic | Not)
+    # A name may stand for a condition; what it is, only its declaration can tell.
+    if condition != conditional and not isinstance(expr, Name):
+        kinds = "a condition, and a number" if condition else "a number, and a condition"
+        what = f"{cut(text[expr.start : expr.end])} is {kinds} is due here"
+        raise FaultError("E327", expr.start, what)
+    parts = children(expr)
+    for place, part in enumerate(parts):
+        due = isinstance(expr, Logic) or (place == 0 and isinstance(expr, Not | Conditional))
         # A first operand that is a leaf is read at the level of its operator.
-        parts = children(node)
-        levels = [depth + 1 - (part is parts[0] is not parts[-1] and not children(part)) for part in parts]
-        due = [first, *(others for _ in parts[1:])]
-        waiting += reversed([*zip(parts, levels, due, strict=False)])
-    if fault is not None:
-        raise fault
+        deeper = bool(place or len(parts) == 1 or children(part))
+        _check(part, text, depth + deeper, conditional=due)
 
 
 def _check_name(token: Token) -> None:

@@ -1,14 +1,15 @@
 """The grammars of the language, read by Lark.
 
 Takes: a grammar beside this module, and what its rules build.
-Gives: `parser`, `FaultError`, `TREE`, `kind_of`, `unclosed`, `exponent_of`.
+Gives: `parser`, `FaultError`, `placing`, `TREE`, `kind_of`, `unclosed`, `exponent_of`.
 Guarantees: a mistake knows the offset in its text, and its place once it is placed.
 Does not: bound a text: whoever parses it does, before.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -33,9 +34,15 @@ class FaultError(Exception):
         self.offset = (at.start_pos if isinstance(at, Token) else at) or 0
         self.mistake = Mistake(code, Place(""), what, expected, got, hint)
 
-    def placed(self, text: str, place: Place) -> ApcError:
-        """Return the mistake of a text that starts at `place`."""
-        return ApcError(replace(self.mistake, place=place_in(place, text, self.offset)))
+
+@contextmanager
+def placing(text: str, place: Place) -> Iterator[None]:
+    """Turn a FaultError of a text that starts at `place` into ApcError."""
+    try:
+        yield
+    except FaultError as fault:
+        at = place_in(place, text, fault.offset)
+        raise ApcError(replace(fault.mistake, place=at)) from None
 
 
 def parser(grammar: str, starts: list[str], builder: TREE) -> Callable[[str, str], Any]:

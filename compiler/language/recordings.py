@@ -9,7 +9,6 @@ Does not: know what reads them.
 from __future__ import annotations
 
 import math
-from array import array
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.digits import plain_float
-from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.probes import read_probe
-from apc.compiler.language.tables import MOST_MISTAKES, Headings, open_table, read_bytes, read_table
+from apc.compiler.language.tables import Headings, open_table, read_bytes, read_table
 from apc.compiler.language.units import NO_UNIT, Unit
 from apc.compiler.source.reading import brief
 
@@ -33,15 +32,11 @@ LOST = "lost"  # a packet that never arrived, in a trace; so is a cell with noth
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeTable:
-    """A quantity over time: `times` (n,) in seconds, rising; `numbers` (n,) in SI.
-
-    `digest` is the SHA-256 of the file's bytes.
-    """
+    """A quantity over time: `times` (n,) in seconds, rising; `numbers` (n,) in SI."""
 
     name: str
     times: NDArray[np.float64]
     numbers: NDArray[np.float64]
-    digest: str
 
 
 def read_time_table(path: Path, name: str, unit: Unit, named_at: Place) -> TimeTable:
@@ -72,19 +67,18 @@ def read_time_table(path: Path, name: str, unit: Unit, named_at: Place) -> TimeT
     if table.rows < 2 or not (np.diff(times.numbers) > 0).all():
         expected = "two or more rows of rising time"
         raise ApcError(Mistake("E703", times.place, "a table over time", expected))
-    return TimeTable(name, times.numbers, numbers.numbers, table.digest)
+    return TimeTable(name, times.numbers, numbers.numbers)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trace:
     """Recorded one-way delays: `delays` (n,) in seconds, one a packet, infinite for one that was lost.
 
-    `digest` is the SHA-256 of the file's bytes; `program` wrote it, "" for a table; `interval` lies between
-    two packets, in seconds, not a number where the file doesn't say.
+    `program` wrote the file, "" for a table; `interval` lies between two packets, in seconds, not a number
+    where the file doesn't say.
     """
 
     delays: NDArray[np.float64]
-    digest: str
     program: str = ""
     interval: float = math.nan
 
@@ -109,31 +103,26 @@ def read_trace(path: Path, named_at: Place) -> Trace:
         fault, or there is none.
     """
     if path.suffix.lower() != TABLE_SUFFIX:
-        data, digest = read_bytes(path, named_at)
-        text = data.decode("utf-8-sig")
+        text = read_bytes(path, named_at).decode("utf-8-sig")
         if (probe := read_probe(text)) is not None:
-            return Trace(probe.delays, digest, probe.program, probe.interval)
+            return Trace(probe.delays, probe.program, probe.interval)
         if DELAY not in text.partition("\n")[0]:
             raise ApcError(Mistake("E702", Place(str(path), 1, 1), "a recording", RECORDINGS))
-    mistakes = Mistakes()
-    delays = array("d")
     with open_table(path, named_at, known=(DELAY,)) as opened:
         column = _delay_column(opened.headings)
-        scale, faults = float(opened.headings[column][1].scale), 0
-        for line, cells in opened.numbered():
-            if not cells or (len(cells) == 1 and cells[0].isspace()):
-                continue
-            delay = math.nan
-            if opened.is_whole(cells, line, mistakes):
-                delay = _delay(cells, column, scale, Place(opened.file, line, 1), mistakes)
-            delays.append(delay)
-            faults += math.isnan(delay)
-            if faults >= MOST_MISTAKES:
-                break
-        mistakes.raise_if_any()
-        if not delays:
-            raise ApcError(Mistake("E703", Place(opened.file, 2, 1), "the table has headings but no rows"))
-    return Trace(np.array(delays), opened.digest)
+        scale = float(opened.headings[column][1].scale)
+
+        def delay(cell: str) -> float:
+            if cell.strip() in ("", LOST):
+                return math.inf
+            seconds = plain_float(cell) * scale
+            if not 0 <= seconds <= LATEST_DELAY:
+                raise ValueError("no time of a packet")
+            return seconds
+
+        expected = f"a time from 0 to {LATEST_DELAY:.0e} s, or {LOST}"
+        delays, _ = opened.numbers([column], delay, "a delay", expected, empty_too=True)
+    return Trace(delays)
 
 
 def _delay_column(names: Headings) -> int:
@@ -146,20 +135,3 @@ def _delay_column(names: Headings) -> int:
             got, place = f"delay {'without a unit' if unit == NO_UNIT else f'in {unit.text}'}", at
     expected = "a column delay in a unit of time"
     raise ApcError(Mistake("E702", place, "a trace", expected, brief(got), "delay [ms]"))
-
-
-def _delay(cells: list[str], column: int, scale: float, row: Place, mistakes: Mistakes) -> float:
-    """Return a packet's delay in seconds: infinite if it was lost, not a number if its cell is at fault."""
-    cell = cells[column].strip()
-    if cell in ("", LOST):
-        return math.inf
-    try:
-        delay = plain_float(cell) * scale
-    except ValueError:
-        delay = math.nan
-    if 0 <= delay <= LATEST_DELAY:
-        return delay
-    place = row.shifted(sum(len(other) + 1 for other in cells[:column]))
-    expected = f"a time from 0 to {LATEST_DELAY:.0e} s, or {LOST}"
-    mistakes.add("E703", place, "a delay", expected=expected, got=brief(cell))
-    return math.nan

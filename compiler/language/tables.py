@@ -11,16 +11,15 @@ from __future__ import annotations
 
 import csv
 import gzip
-import hashlib
 import io
 import re
 import zlib
 from array import array
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,24 +41,16 @@ _HEADING = re.compile(r"(?P<name>[^\[\]]*(\[[0-9]+\][^\[\]]*)*?)(\[(?P<unit>[^\[
 Headings = tuple[tuple[str, Unit, Place], ...]  # name, unit and where it stands
 
 
-class Digested(Protocol):
-    """What was read of a file; `digest` is the SHA-256 of its bytes."""
-
-    @property
-    def digest(self) -> str:
-        """The digest."""
-
-
-F = TypeVar("F", bound=Digested)
+F = TypeVar("F")
 
 
 @dataclass(frozen=True, slots=True)
 class NamedFiles:
-    """The files a topology names, of a `folder`: the digests of those read, by name, and all `mistakes`."""
+    """The files a topology names, of a `folder`: the `names` of those read, and all `mistakes`."""
 
     folder: Path
     mistakes: Mistakes
-    digests: dict[str, str] = field(default_factory=dict)
+    names: set[str] = field(default_factory=set)
 
     def read(self, name: str, reader: Callable[[Path], F]) -> F | None:
         """Return what a reader finds in a file; None, and its mistakes are taken, if that is at fault."""
@@ -68,7 +59,7 @@ class NamedFiles:
         except ApcError as error:
             self.mistakes.take(error)
             return None
-        self.digests[name] = found.digest
+        self.names.add(name)
         return found
 
 
@@ -84,12 +75,11 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A CSV file, whole. `lines` are the lines its rows stand in, `digest` the SHA-256 of its bytes."""
+    """A CSV file, whole. `lines` are the lines its rows stand in."""
 
     file: str
     columns: tuple[Column, ...]
     lines: tuple[int, ...]
-    digest: str
 
     @property
     def rows(self) -> int:
@@ -113,18 +103,14 @@ def read_table(path: Path, named_at: Place) -> Table:
         E701 it can't be read, E702 a heading, E703 a row or cell is at fault.
     """
     with open_table(path, named_at) as opened:
-        mistakes = Mistakes()
         headings = opened.headings
-        cells, lines = _rows(opened, mistakes)
-        mistakes.raise_if_any()
-        if not lines:
-            raise ApcError(Mistake("E703", Place(opened.file, 2, 1), "the table has headings but no rows"))
-    numbers = np.frombuffer(cells, dtype=np.float64).reshape(len(lines), len(headings))
+        cells, lines = opened.numbers(range(len(headings)), plain_float, "a cell", "a finite number")
+    numbers = cells.reshape(len(lines), len(headings))
     columns = tuple(
         Column(name, unit, numbers[:, i] * float(unit.scale), place)
         for i, (name, unit, place) in enumerate(headings)
     )
-    return Table(opened.file, columns, tuple(lines), opened.digest)
+    return Table(opened.file, columns, lines)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,23 +118,67 @@ class Opened:
     """A CSV file whose headings are read, each a name, a unit and a place; `rows` are the rest."""
 
     file: str
-    digest: str
     headings: Headings
     rows: Any  # a reader of the module csv, whose type has no public name
 
-    def numbered(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield each row with the line it begins in: a cell in quotes may go over several."""
+    def numbers(
+        self,
+        columns: Sequence[int],
+        number: Callable[[str], float],
+        what: str,
+        expected: str,
+        *,
+        empty_too: bool = False,
+    ) -> tuple[NDArray[np.float64], tuple[int, ...]]:
+        """Return the numbers of some columns, row after row, and the line that each row begins in.
+
+        Parameters
+        ----------
+        columns
+            Which columns, counted from 0.
+        number
+            Gives the number of a cell, or raises ValueError.
+        what, expected
+            What a cell is and has to be, for messages.
+        empty_too
+            Read rows whose cells are all empty, too; a line without a character is no row.
+
+        Raises
+        ------
+        ApcError
+            E703 a row or cell is at fault, or there is none.
+        """
+        mistakes, numbers, lines, faults = Mistakes(), array("d"), array("q"), 0
         begin = self.rows.line_num + 1
         for cells in self.rows:
-            yield begin, cells
-            begin = self.rows.line_num + 1
-
-    def is_whole(self, cells: list[str], line: int, mistakes: Mistakes) -> bool:
-        """Say whether a row has as many cells as there are headings, and record it if not."""
-        if len(cells) != len(self.headings):
-            what = f"the row has {len(cells)} cells and there are {len(self.headings)} headings"
-            mistakes.add("E703", Place(self.file, line, 1), what)
-        return len(cells) == len(self.headings)
+            # A cell in quotes may go over several lines.
+            place, begin = Place(self.file, begin, 1), self.rows.line_num + 1
+            filled = len(cells) > 1 or (cells and not cells[0].isspace())
+            if not (filled if empty_too else any(map(str.strip, cells))):
+                continue
+            lines.append(place.line)
+            try:
+                if len(cells) != len(self.headings):
+                    reason = f"the row has {len(cells)} cells and there are {len(self.headings)} headings"
+                    mistakes.add("E703", place, reason)
+                    faults += 1
+                else:
+                    numbers.extend([number(cells[column]) for column in columns])
+            except ValueError:
+                for column in columns:
+                    try:
+                        number(cells[column])
+                    except ValueError:
+                        at = place.shifted(sum(len(cell) + 1 for cell in cells[:column]))
+                        got = brief(cells[column]) or "nothing"
+                        mistakes.add("E703", at, what, expected=expected, got=got)
+                faults += 1
+            if faults >= MOST_MISTAKES:
+                break
+        mistakes.raise_if_any()
+        if not lines:
+            raise ApcError(Mistake("E703", Place(self.file, 2, 1), "the table has headings but no rows"))
+        return np.frombuffer(numbers, dtype=np.float64), tuple(lines)
 
 
 @contextmanager
@@ -168,13 +198,13 @@ def open_table(path: Path, named_at: Place, known: Collection[str] = ()) -> Iter
         E701 it can't be read, E702 its headings; E703 its rows are no CSV. What the body raises passes, but
         of a file that does not begin as a table does only that is told: its text may be somebody's.
     """
-    data, digest = read_bytes(path, named_at)
+    data = read_bytes(path, named_at)
     file = str(path)
     rows = csv.reader(io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig"))
     first: list[str] = []
     try:
         first = next(rows, [])
-        yield Opened(file, digest, _headings(first, file), rows)
+        yield Opened(file, _headings(first, file), rows)
     except csv.Error as error:
         raise ApcError(Mistake("E703", Place(file, rows.line_num or 1, 1), f"is no CSV: {error}")) from None
     except ApcError:
@@ -194,8 +224,8 @@ def _is_table(headings: list[str], known: Collection[str]) -> bool:
     )
 
 
-def read_bytes(path: Path, named_at: Place) -> tuple[bytes, str]:
-    """Return a file's bytes, unpacked if it is called .gz, and the SHA-256 of those on disk.
+def read_bytes(path: Path, named_at: Place) -> bytes:
+    """Return a file's bytes, unpacked if it is called .gz.
 
     Raises
     ------
@@ -204,7 +234,6 @@ def read_bytes(path: Path, named_at: Place) -> tuple[bytes, str]:
     """
     try:
         data = read_file(path, MAX_BYTES)
-        digest = hashlib.sha256(data).hexdigest()
         if path.suffix.lower() == PACKED:
             with gzip.open(io.BytesIO(data)) as packed:
                 data = packed.read(MAX_BYTES + 1)
@@ -221,7 +250,7 @@ def read_bytes(path: Path, named_at: Place) -> tuple[bytes, str]:
         ) from None
     except (OSError, EOFError, zlib.error):
         raise ApcError(Mistake("E701", named_at, f"{path.name} is no whole gzip file")) from None
-    return data, digest
+    return data
 
 
 def _headings(texts: list[str], file: str) -> Headings:
@@ -234,7 +263,15 @@ def _headings(texts: list[str], file: str) -> Headings:
     mistakes = Mistakes()
     found: dict[str, tuple[str, Unit, Place]] = {}
     for text in texts:
-        name, unit = _heading(text, place, mistakes)
+        name, written = _parts(text)
+        unit = NO_UNIT
+        if not name:
+            expected, got = "a name and its unit", brief(text) or "nothing"
+            mistakes.add("E702", place, "a heading", expected=expected, got=got, hint="device.mass [kg]")
+        try:
+            unit = parse_unit(written, place) if written else NO_UNIT
+        except ApcError as error:
+            mistakes.take(error)
         if name in found:
             mistakes.add("E702", place, f"the heading {brief(name)} is used twice")
         found[name] = (name, unit, place)
@@ -250,45 +287,3 @@ def _parts(heading: str) -> tuple[str, str | None]:
         return "", None
     unit = found["unit"]
     return found["name"].strip(), None if unit is None else unit.strip()
-
-
-def _heading(text: str, place: Place, mistakes: Mistakes) -> tuple[str, Unit]:
-    name, written = _parts(text)
-    if not name:
-        expected, got = "a name and its unit", brief(text) or "nothing"
-        mistakes.add("E702", place, "a heading", expected=expected, got=got, hint="device.mass [kg]")
-    try:
-        return name, parse_unit(written, place) if written else NO_UNIT
-    except ApcError as error:
-        mistakes.take(error)
-        return name, NO_UNIT
-
-
-def _rows(opened: Opened, mistakes: Mistakes) -> tuple[array[float], array[int]]:
-    """Return all numbers, row after row, and the line of each row."""
-    numbers, lines = array("d"), array("q")
-    faults = 0
-    for line, cells in opened.numbered():
-        if not any(cell.strip() for cell in cells):
-            continue
-        try:
-            whole = opened.is_whole(cells, line, mistakes)
-            numbers.extend([plain_float(cell) for cell in cells] if whole else [])
-            lines.append(line)
-        except ValueError:
-            _add_bad_cells(cells, opened.file, line, mistakes)
-            whole = False
-        faults += not whole
-        if faults >= MOST_MISTAKES:
-            break
-    return numbers, lines
-
-
-def _add_bad_cells(cells: list[str], file: str, line: int, mistakes: Mistakes) -> None:
-    place = Place(file, line, 1)
-    for cell in cells:
-        try:
-            plain_float(cell)
-        except ValueError:
-            mistakes.add("E703", place, "a cell", expected="a finite number", got=brief(cell) or "nothing")
-        place = place.shifted(len(cell) + 1)

@@ -19,7 +19,6 @@ from apc.compiler.language.expression import (
     Binary,
     Call,
     Compare,
-    Conditional,
     Equation,
     Expr,
     Logic,
@@ -27,9 +26,9 @@ from apc.compiler.language.expression import (
     Negate,
     Not,
     Number,
-    Vector,
     children,
     format_expression,
+    operation,
 )
 from apc.compiler.language.unit_text import format_dimension
 
@@ -143,57 +142,30 @@ class _Checker:
         return DIMENSIONLESS if dimension == ANY else dimension
 
     def dimension(self, expr: Expr) -> Dimension | None:
-        match expr:
-            case Number(value):
-                return DIMENSIONLESS if value else ANY
-            case Name():
-                return self.lookup(expr)
-            case Binary("+" | "-") | Negate():
-                return self.agree("E402", _terms(expr))
-            case Binary():
-                return self.product(expr)
-            case Compare(_, left, right):
-                self.agree("E404", [left, right])
-                return DIMENSIONLESS
-            case Logic() | Not():
-                for part in children(expr):
-                    self.dimension(part)
-                return DIMENSIONLESS
-            case Conditional(condition, then, otherwise):
+        word, parts = operation(expr), children(expr)
+        if isinstance(expr, Number):
+            return DIMENSIONLESS if expr.value else ANY
+        if isinstance(expr, Name):
+            return self.lookup(expr)
+        if word in ("+", "-", "Negate"):
+            return self.agree("E402", _terms(expr))
+        if word in ("*", "/", "dot", "cross", "^"):
+            return self.product(word, *parts)
+        if word in ("floor", *SMOOTH):
+            self.fits(parts[0], DIMENSIONLESS, "E403", "a plain number")
+            return DIMENSIONLESS
+        if word in ("and", "or", "Not", "Conditional"):
+            conditions, parts = (parts[:1], parts[1:]) if word == "Conditional" else (parts, ())
+            for condition in conditions:
                 self.dimension(condition)
-                return self.agree("E404", [then, otherwise])
-            case Vector():
-                return self.agree("E404", list(expr.entries))
-            case Call():
-                return self.call(expr)
-
-    def product(self, expr: Binary) -> Dimension | None:
-        left = self.factor(expr.left)
-        if expr.operator == "^":
-            if isinstance(expr.right, Number):
-                return left and left.power(expr.right.value)
-            for part in (expr.right, expr.left):  # x^n has a unit only for a written n
-                self.fits(part, DIMENSIONLESS, "E403", "a plain number")
+        # Of the branches, sides or entries of one; atan2: of the sides of a triangle, whatever their unit.
+        equal = not isinstance(expr, Call) or word in ("max", "min", "atan2")
+        found = self.agree("E404", list(parts)) if equal else self.dimension(parts[0])
+        for time in parts[1:] if word in _TIMES else ():
+            self.fits(time, SECOND, "E405", _TIMES[word])
+        if isinstance(expr, Compare | Logic | Not) or word in ("atan2", "sign", "count"):
             return DIMENSIONLESS
-        right = self.factor(expr.right)
-        if left is None or right is None:
-            return None
-        return left.multiply(right) if expr.operator == "*" else left.divide(right)
-
-    def call(self, expr: Call) -> Dimension | None:
-        function, (first, *others) = expr.function, expr.arguments
-        if function in ("dot", "cross"):
-            return self.product(Binary("*", *expr.arguments))
-        if function in ("floor", *SMOOTH):
-            self.fits(first, DIMENSIONLESS, "E403", "a plain number")
-            return DIMENSIONLESS
-        alike = function in ("max", "min", "atan2")  # atan2: of the sides of a triangle, whatever their unit
-        found = self.agree("E404", list(expr.arguments)) if alike else self.dimension(first)
-        for time in others if function in _TIMES else ():
-            self.fits(time, SECOND, "E405", _TIMES[function])
-        match function:
-            case "atan2" | "sign" | "count":
-                return DIMENSIONLESS
+        match word:
             case "age":
                 return SECOND
             case "sqrt":
@@ -201,3 +173,16 @@ class _Checker:
             case "der":
                 return found if found == ANY else found and found.divide(SECOND)
         return found  # of max, min, hold, interpolate, sample, previous, initial, mean, sum, abs and norm
+
+    def product(self, word: str, left: Expr, right: Expr) -> Dimension | None:
+        base = self.factor(left)
+        if word == "^" and isinstance(right, Number):
+            return base and base.power(right.value)
+        if word == "^":
+            for part in (right, left):  # x^n has a unit only for a written n
+                self.fits(part, DIMENSIONLESS, "E403", "a plain number")
+            return DIMENSIONLESS
+        other = self.factor(right)
+        if base is None or other is None:
+            return None
+        return base.divide(other) if word == "/" else base.multiply(other)

@@ -12,8 +12,16 @@ from functools import cache
 
 from apc.compiler.errors import Place
 from apc.compiler.language.dimensions import Dimension
-from apc.compiler.language.si_forms import FORMS, TURNING
 from apc.compiler.language.units import Unit, parse_unit
+
+# Units with a name or a usual form, looked up by dimension; the first form of a dimension wins.
+FORMS = (
+    *("1", "kg", "m", "s", "A", "K", "mol", "cd"),
+    *("N", "N/m", "N*s/m", "N*s", "N*m", "N/m^2", "N*s^2/m^2", "N*s/m^2", "N*m*s", "N/s", "m/N"),
+    *("m/s", "m/s^2", "m/s^3", "m^2", "m^3", "1/s", "1/s^2", "1/m", "W", "V", "N*m/A", "kg*m^2"),
+)
+# How the same units are written where a quantity counts cycles or radians: of each, by its other form.
+TURNING = {"Hz": {"1/s": "Hz"}, "rad": {"1": "rad", "1/s": "rad/s", "1/s^2": "rad/s^2"}}
 
 
 def format_dimension(dimension: Dimension) -> str:

@@ -27,7 +27,7 @@ from lark.exceptions import UnexpectedCharacters, UnexpectedToken
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension, product
 from apc.compiler.language.expression import PI
-from apc.compiler.language.parsing import TREE, FaultError, exponent_of, kind_of, parser, unclosed
+from apc.compiler.language.parsing import TREE, FaultError, exponent_of, kind_of, parser, placing, unclosed
 from apc.compiler.words import cut
 
 TURN = 2 * PI  # a cycle in radians
@@ -119,9 +119,9 @@ class Quantity:
     @property
     def number(self) -> str:
         """The number as written, without its unit."""
-        found = _QUANTITY_START.match(self.text)
-        assert found is not None
-        return found.group().strip()
+        match = _QUANTITY_START.match(self.text)
+        assert match is not None
+        return match.group().strip()
 
 
 NO_UNIT = Unit("1", Fraction(1), DIMENSIONLESS)
@@ -136,10 +136,8 @@ def parse_unit(text: str, place: Place) -> Unit:
         E222 not the text of a unit, E223 no such unit, E224 a unit with an offset or a logarithm,
         E225 an exponent or scale that is too large.
     """
-    try:
+    with placing(text, place):
         return _unit(text)
-    except FaultError as fault:
-        raise fault.placed(text, place) from None
 
 
 def parse_quantity(text: str, place: Place) -> Quantity:
@@ -150,10 +148,8 @@ def parse_quantity(text: str, place: Place) -> Quantity:
     ApcError
         E221 not the text of a quantity, E226 a number that is too large; and those of `parse_unit`.
     """
-    try:
+    with placing(text, place):
         return _quantity(text)
-    except FaultError as fault:
-        raise fault.placed(text, place) from None
 
 
 def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
@@ -178,29 +174,30 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
     wanted = parse_unit(unit, place)
     named = "a plain number" if unit == "1" else unit
     try:
-        found = _quantity(text)
-    except FaultError as fault:
-        if fault.mistake.code == "E221" and not fault.mistake.hint:
-            example = f"{what}: 1" if unit == "1" else f"{what}: 1 {unit}"
-            raise ApcError(Mistake("E221", place, what, named, cut(text) or "nothing", example)) from None
-        raise fault.placed(text, place) from None
-    its, due = found.unit.dimension, wanted.dimension
+        parsed = parse_quantity(text, place)
+    except ApcError as error:
+        [mistake] = error.mistakes
+        if mistake.code != "E221" or mistake.hint:
+            raise
+        example = f"{what}: 1" if unit == "1" else f"{what}: 1 {unit}"
+        raise ApcError(Mistake("E221", place, what, named, cut(text) or "nothing", example)) from None
+    actual, due = parsed.unit.dimension, wanted.dimension
     got, right = cut(text.strip()), unit
-    if its == due and (found.unit != NO_UNIT or due == DIMENSIONLESS):
-        if not its.clashes(due):
-            return found
+    if actual == due and (parsed.unit != NO_UNIT or due == DIMENSIONLESS):
+        if not actual.clashes(due):
+            return parsed
         # 20 Hz are 125.66 rad/s.
         turns = TURN if due.turning == "rad" else 1 / TURN
-        same = f"{float(found.value * turns / wanted.scale):.9g} {unit}"
+        same = f"{float(parsed.value * turns / wanted.scale):.9g} {unit}"
         got += f", which is {same}"
-        hint = f"{what}: {same}, or {what}: {found.number} {unit}"
+        hint = f"{what}: {same}, or {what}: {parsed.number} {unit}"
     else:
-        if found.unit == NO_UNIT:
+        if parsed.unit == NO_UNIT:
             got += " (no unit)"
         else:
-            right, slip = _meant(found.unit, wanted)
+            right, slip = _meant(parsed.unit, wanted)
             got += f" ({slip} is {_long_name(slip)}: case matters)" if slip else ""
-        hint = f"{what}: {found.number} {right}".removesuffix(" 1") if right else ""
+        hint = f"{what}: {parsed.number} {right}".removesuffix(" 1") if right else ""
     raise ApcError(Mistake("E204", place, what, named, got, hint))
 
 
@@ -214,14 +211,17 @@ def _meant(unit: Unit, wanted: Unit) -> tuple[str, str]:
     others = [(name, other) for name in NAME.findall(unit.text) for other in COMMON if other != name]
     texts = [
         *((unit.text.replace(name, other), name) for name, other in others if other.lower() == name.lower()),
-        *((unit.text[: one.start()] + unit.text[one.end() :], "") for one in _EXPONENT.finditer(unit.text)),
+        *(
+            (unit.text[: match.start()] + unit.text[match.end() :], "")
+            for match in _EXPONENT.finditer(unit.text)
+        ),
         *(
             (re.sub(rf"\b{re.escape(name)}\b", other, unit.text), "")
             for name, other in others
             if other[:-1] == name
         ),
     ]
-    fitting = (found for found in texts if _is_of(found[0], wanted.dimension))
+    fitting = (candidate for candidate in texts if _is_of(candidate[0], wanted.dimension))
     return next(fitting, (wanted.text if unit.scale == wanted.scale else "", ""))
 
 
@@ -237,13 +237,13 @@ def _is_of(text: str, wanted: Dimension) -> bool:
 def _quantity(text: str) -> Quantity:
     if len(text) > MAX_LENGTH:
         raise FaultError("E221", 0, "a quantity", f"at most {MAX_LENGTH} characters", f"{len(text)}")
-    found = _QUANTITY_START.match(text)
-    if found is None:
+    match = _QUANTITY_START.match(text)
+    if match is None:
         bare = text.strip()
         expected = "a finite number" if _NOT_FINITE.match(bare) else "a number and its unit"
         hint = bare.replace("−", "-") if bare.startswith("−") else ""
         raise FaultError("E221", 0, "a quantity", expected, cut(bare) or "nothing", hint=hint)
-    number, rest, end = found.group().strip(), text[found.end() :], found.end()
+    number, rest, end = match.group().strip(), text[match.end() :], match.end()
     if re.match(r",[0-9]", rest):
         hint = cut(f"{number}.{rest[1:].strip()}")
         raise FaultError("E221", end, "a number has a decimal point, not a comma", hint=hint)
@@ -291,11 +291,9 @@ def _unit(text: str) -> Unit:
     if any(abs(power) > MAX_EXPONENT for power in (*powers.values(), *dimensions.values())):
         what = f"{cut(text.strip())} is no unit of this world: an exponent or its scale is too large"
         raise FaultError("E225", 0, what)
-    square: Fraction | float = Fraction(1)  # of the scale, so that the root of a square is exact
-    for name, power in powers.items():
-        grams = Fraction(1000) ** int(registry().get_dimensionality(name)["[mass]"])  # Pint's unit of mass
-        its = Fraction(registry().get_root_units(name)[0]) / grams
-        square *= 1 if its == 1 else its ** (2 * power)
+    # The square of the scale, so that the root of a square is exact; Pint's unit of mass is the gram.
+    square, _ = registry().get_root_units(powers**2)
+    square = square / Fraction(1000) ** (2 * dimensions["[mass]"])
     rational = Fraction(square)
     scale = Fraction(math.isqrt(rational.numerator), math.isqrt(rational.denominator))
     if isinstance(square, float) or scale**2 != square:
@@ -394,8 +392,8 @@ def _long_name(name: str) -> str:
 
 def _looked_up(name: Token) -> str:
     """Return the long name of a unit. Raises FaultError: E223 no such unit, E224 no multiple of SI."""
-    if found := _long_name(name):
-        return found
+    if long_name := _long_name(name):
+        return long_name
     every = _everything()
     # Nm is a yarn count to Pint, and a slip for N*m to everyone else.
     others = [(prefix, unit) for prefix, unit, _ in every.parse_unit_name(name) if unit != "number_meter"]
@@ -409,11 +407,11 @@ def _looked_up(name: Token) -> str:
         raise FaultError("E224", name, what, hint="K" if "degree_" in unit else "")
     dimension = every.get_dimensionality(unit)
     like = [other for other in COMMON if registry().get_dimensionality(other) == dimension]
-    told = f"; there are {', '.join(like[:3])}" if like else ""
-    what = f"there is no unit {name} here: {spelled} is out of use{told}"
+    proposed = f"; there are {', '.join(like[:3])}" if like else ""
+    what = f"there is no unit {name} here: {spelled} is out of use{proposed}"
     lower = name.lower()
-    alike = (other for other in like if lower == other.lower() or lower.startswith(other))
-    raise FaultError("E223", name, what, hint=next(alike, ""))
+    similar = (other for other in like if lower == other.lower() or lower.startswith(other))
+    raise FaultError("E223", name, what, hint=next(similar, ""))
 
 
 def _proposal(name: str) -> str:

@@ -65,8 +65,12 @@ class Value:
         return format_si(float(self.number), self.dimension)
 
 
-class AlreadyReportedError(Exception):
+class AlreadyReportedError(ApcError):
     """Raised by a look-up for a name whose own fault was reported: what depends on it needs no message."""
+
+    def __init__(self) -> None:
+        """Hold no mistake."""
+        self.mistakes = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,36 +167,34 @@ def read_binding(
     except ApcError as error:
         mistakes.take(error)
         return None
-    except AlreadyReportedError:
-        return None
 
 
 def _refuse_marks(text: str, place: Place, what: str) -> None:
     """Raise ApcError for a number with a decimal comma, or whose thousands are set apart."""
-    if (found := _COMMA.fullmatch(text.strip())) is not None:
-        hint = either_comma(what, found[1], found[2], found[3])
+    if (match := _COMMA.fullmatch(text.strip())) is not None:
+        hint = either_comma(what, match[1], match[2], match[3])
         raise ApcError(Mistake("E221", place, what, "a decimal point", brief(text), hint))
-    if (found := _SPACED.match(text.strip())) is not None:
-        joined = re.sub(r"[^0-9+-]", "", found[0]) + text.strip()[found.end() :]
-        told = "a number without spaces or marks inside"
-        raise ApcError(Mistake("E221", place, what, told, brief(text), f"{what}: {joined}"))
+    if (match := _SPACED.match(text.strip())) is not None:
+        joined = re.sub(r"[^0-9+-]", "", match[0]) + text.strip()[match.end() :]
+        expected = "a number without spaces or marks inside"
+        raise ApcError(Mistake("E221", place, what, expected, brief(text), f"{what}: {joined}"))
 
 
 def _refuse_computed(text: str, place: Place, what: str, unit: str) -> None:
     """Raise ApcError for numbers that are computed and have a unit behind them, as 2*pi*100 N/m."""
-    found = _COMPUTED.fullmatch(text.strip())
-    if found is None or is_quantity(text) or not found["numbers"].strip():
+    match = _COMPUTED.fullmatch(text.strip())
+    if match is None or is_quantity(text) or not match["numbers"].strip():
         return
     none: dict[tuple[str, ...], Fraction] = {}  # a name has no value here
     try:
-        number = evaluate(parse_expression(found["numbers"], place), none.__getitem__)
-        if parse_unit(found["unit"], place).dimension != parse_unit(unit, place).dimension:
+        number = evaluate(parse_expression(match["numbers"], place), none.__getitem__)
+        if parse_unit(match["unit"], place).dimension != parse_unit(unit, place).dimension:
             return
     except ApcError:
         return
-    told = "a number with its unit, or an expression without units"
-    hint = f"{what}: {float(number):.9g} {found['unit']}"
-    raise ApcError(Mistake("E204", place, what, told, brief(text), hint))
+    expected = "a number with its unit, or an expression without units"
+    hint = f"{what}: {float(number):.9g} {match['unit']}"
+    raise ApcError(Mistake("E204", place, what, expected, brief(text), hint))
 
 
 def _refuse_mixture(text: str, place: Place, what: str, names_known: Collection[str]) -> None:
@@ -223,16 +225,16 @@ def _expression(
 ) -> Expr:
     tree = number_of(parse_expression(text, place), text, place)
     check_names(tree, text, place, what, known, names_known)
-    found = dimension_of(tree, lambda name: known(name.parts), text, place)
-    if found is None or found == ANY or (found == dimension and not found.clashes(dimension)):
+    actual = dimension_of(tree, lambda name: known(name.parts), text, place)
+    if actual is None or actual == ANY or (actual == dimension and not actual.clashes(dimension)):
         return tree
-    its, hint = f"is in {format_dimension(found)}", f"1 {unit}"
-    if found == DIMENSIONLESS != dimension:
-        its = "has no unit"
-    elif found == dimension:  # of a name, a sum or a choice: no product counts cycles or radians
+    fault, hint = f"is in {format_dimension(actual)}", f"1 {unit}"
+    if actual == DIMENSIONLESS != dimension:
+        fault = "has no unit"
+    elif actual == dimension:  # of a name, a sum or a choice: no product counts cycles or radians
         whole = format_expression(tree) if isinstance(tree, Name) else f"({format_expression(tree)})"
         hint = f"2*pi*{whole}" if dimension.turning == "rad" else f"{whole}/(2*pi)"
-    raise ApcError(Mistake("E204", place, what, unit, f"{brief(text)}, which {its}", f"{what}: {hint}"))
+    raise ApcError(Mistake("E204", place, what, unit, f"{brief(text)}, which {fault}", f"{what}: {hint}"))
 
 
 def check_names(
@@ -265,8 +267,8 @@ def check_names(
     for node in names(tree):
         if known(node.parts) is None:
             shown = ".".join(node.parts)
-            told = f"{what} names {brief(shown)}, which is no parameter here"
-            add_unknown("E206", place_in(place, text, node.start), told, shown, names_known, mistakes)
+            fault = f"{what} names {brief(shown)}, which is no parameter here"
+            add_unknown("E206", place_in(place, text, node.start), fault, shown, names_known, mistakes)
     mistakes.raise_if_any()
 
 
@@ -286,8 +288,8 @@ def read_free(node: Node | None, what: str, mistakes: Mistakes) -> Binding | Non
         return None
     try:
         if is_quantity(text):
-            found = parse_quantity(text, node.place)
-            return Binding(found.value, None, found.unit.dimension, node.place)
+            parsed = parse_quantity(text, node.place)
+            return Binding(parsed.value, None, parsed.unit.dimension, node.place)
         place = text_place(node)
         return Binding(None, number_of(parse_expression(text, place), text, place), DIMENSIONLESS, place)
     except ApcError as error:
@@ -352,8 +354,8 @@ def _settled(name: str, binding: Binding, settled: Mapping[str, Value]) -> Value
     if tree is not None:
         text = format_expression(tree)
         check_names(tree, text, place, name, dimension, settled)
-        found = dimension_of(tree, lambda node: dimension(node.parts), text, place)
-        binding = replace(binding, dimension=DIMENSIONLESS if found in (None, ANY) else found)
+        actual = dimension_of(tree, lambda node: dimension(node.parts), text, place)
+        binding = replace(binding, dimension=DIMENSIONLESS if actual in (None, ANY) else actual)
     return settle(binding, lambda parts: settled[".".join(parts)].number)
 
 

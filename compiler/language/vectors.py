@@ -1,7 +1,8 @@
 """Vectors written out: an expression of vectors to one for each entry.
 
 Takes: `Expr` and `Equation`, and the size of every name: 0 for a number.
-Gives: `written_out`, `written_equation`, `number_of`; `entry`, `entries`, `whole_and_index`, `sizes_of`.
+Gives: `written_out`, `written_equation`, `number_of`; `entry`, `entries`, `whole_and_index`, `by_vector`,
+`sizes_of`.
 Guarantees: what is written out holds no vector; each piece keeps the place it has in the text; sizes that do
 not fit are refused with what to write.
 Does not: check units, or know what a name is of.
@@ -14,36 +15,43 @@ or `cross`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial, reduce
 from itertools import islice
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
 from apc.compiler.errors import ApcError, Mistake, Place, place_in
 from apc.compiler.language.expression import (
+    COMPARISONS,
     Binary,
     Call,
-    Compare,
-    Conditional,
     Equation,
     Expr,
-    Logic,
     Name,
-    Not,
     Number,
     Vector,
     children,
     format_expression,
+    operation,
     rebuild,
     walk,
 )
 from apc.compiler.language.grammar import MAX_LENGTH
 
+T = TypeVar("T")
 SIZES = (2, 3)
 VECTOR_WORDS = ("{", "dot", "norm", "cross")  # what makes or takes vectors is written with one of these
 LONGEST_REPEATED = 20  # characters of a number that a message writes once for each entry
+
+# Which parts of an operation are numbers, never vectors, and which are left as they are.
+NUMBERS: dict[str, tuple[int, ...]] = {
+    **dict.fromkeys((*COMPARISONS, "and", "or", "Not"), (0, 1)),
+    **dict.fromkeys(("/", "hold", "interpolate"), (1,)),
+    "Conditional": (0,),
+}
+AS_THEY_ARE: dict[str, tuple[int, ...]] = {"sample": (1,), "interpolate": (0,)}
 
 # An expression written out: a number, a vector's entries, or None where a name's size isn't known yet.
 Written = Expr | tuple[Expr, ...] | None
@@ -66,14 +74,22 @@ def whole_and_index(name: str) -> tuple[str, int]:
     return (whole, int(index)) if bracket and name.endswith("]") else (name, 0)
 
 
+def by_vector(items: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
+    """Return named items by the vectors whose entries they are of; what is of a number stands alone."""
+    vectors: dict[str, list[T]] = {}
+    for item in items:
+        vectors.setdefault(whole_and_index(name(item))[0], []).append(item)
+    return vectors
+
+
 def sizes_of(names: Iterable[tuple[str, ...]]) -> dict[tuple[str, ...], int]:
     """Return the vectors whose entries are among names, and the size of each."""
-    found: dict[tuple[str, ...], int] = {}
+    sizes: dict[tuple[str, ...], int] = {}
     for parts in names:
         if parts[-1].endswith("]"):
             whole, index = whole_and_index(parts[-1])
-            found[*parts[:-1], whole] = max(index, found.get((*parts[:-1], whole), 0))
-    return found
+            sizes[*parts[:-1], whole] = max(index, sizes.get((*parts[:-1], whole), 0))
+    return sizes
 
 
 def written_out(expr: Expr, size_of: SizeOf, text: str, place: Place) -> Written:
@@ -98,12 +114,12 @@ def written_out(expr: Expr, size_of: SizeOf, text: str, place: Place) -> Written
         E328 it gets too long, E406 sizes that differ, E407 a vector where a number is due or the reverse.
     """
     writer = _Writer(size_of, text, place)
-    found = writer.written(expr)
-    for one in found if isinstance(found, tuple) else (found or expr,):
-        if len(list(islice(walk(one), MAX_LENGTH + 1))) > MAX_LENGTH:
+    written = writer.written(expr)
+    for tree in written if isinstance(written, tuple) else (written or expr,):
+        if len(list(islice(walk(tree), MAX_LENGTH + 1))) > MAX_LENGTH:
             what = f"entry by entry this has more than {MAX_LENGTH} terms: give a part of it a name"
             writer.fail("E328", expr, what)
-    return found
+    return written
 
 
 def written_equation(equation: Equation, size_of: SizeOf) -> tuple[Equation, ...]:
@@ -115,7 +131,7 @@ def written_equation(equation: Equation, size_of: SizeOf) -> tuple[Equation, ...
     if not isinstance(left, tuple) or not isinstance(right, tuple):
         assert isinstance(left, Expr) and isinstance(right, Expr)
         return (replace(equation, left=left, right=right),)
-    return tuple(replace(equation, left=one, right=two) for one, two in zip(left, right, strict=True))
+    return tuple(replace(equation, left=lhs, right=rhs) for lhs, rhs in zip(left, right, strict=True))
 
 
 def number_of(expr: Expr, text: str, place: Place) -> Expr:
@@ -129,7 +145,7 @@ class _Writer:
     def __init__(self, size_of: SizeOf, text: str, place: Place) -> None:
         self.size_of, self.text, self.place = size_of, text, place
 
-    def said(self, expr: Expr) -> str:
+    def source(self, expr: Expr) -> str:
         """Return a part as it is written, or as it would be when it comes from somewhere else."""
         return self.text[expr.start : expr.end] or format_expression(expr)
 
@@ -140,81 +156,67 @@ class _Writer:
 
     def written(self, expr: Expr) -> Written:
         match expr:
-            case Number():
+            case Number() | Call("count"):  # peers are counted, whatever they send
                 return expr
             case Name(path):
                 size = self.size_of(path)
                 if size is None:
                     return None
-                whole = (replace(expr, parts=(*path[:-1], one)) for one in entries(path[-1], size))
-                return tuple(whole) if size else expr
+                names = (replace(expr, parts=(*path[:-1], name)) for name in entries(path[-1], size))
+                return tuple(names) if size else expr
             case Vector():
                 if len(expr.entries) not in SIZES:
                     got = f"{len(expr.entries)}"
-                    self.fail("E406", expr, self.said(expr), f"{_or(SIZES)} entries", got)
-                return tuple(self.number(one) for one in expr.entries)
-            case Binary("*"):
-                parts = [self.written(expr.left), self.written(expr.right)]
-                if all(isinstance(part, tuple) for part in parts):
-                    hint = f"dot({format_expression(expr.left)}, {format_expression(expr.right)})"
-                    self.fail("E407", expr, self.said(expr), "one vector at most in a product", "two", hint)
-                return self.each(expr, parts)
+                    self.fail("E406", expr, self.source(expr), f"{_or(SIZES)} entries", got)
+                return tuple(map(self.number, expr.entries))
+            case Call("dot" | "cross" | "norm"):
+                return self.product(expr)
             case Binary("^"):
                 inner, power = format_expression(expr.left), format_expression(expr.right)
                 hint = f"dot({inner}, {inner})" if power == "2" else f"norm({inner})^{power}"
                 return self.each(expr, [self.number(expr.left, hint), expr.right])
-            case Compare() | Logic() | Not():
-                return self.of_parts(expr, numbers=range(2))
-            case Conditional():
-                return self.of_parts(expr, numbers=(0,))
-            case Call():
-                return self.call(expr)
-            case _:
-                divided = isinstance(expr, Binary) and expr.operator == "/"
-                return self.of_parts(expr, numbers=(1,) if divided else ())
-
-    def of_parts(self, expr: Expr, *, numbers: Container[int]) -> Written:
-        """Write a node out whose parts have to be numbers at some places, and of one size at the others."""
-        parts = children(expr)
-        found = [self.number(p) if k in numbers else self.written(p) for k, p in enumerate(parts)]
-        alike = [k for k in range(len(parts)) if k not in numbers]
-        if isinstance(expr, Call):  # which takes numbers beside vectors
-            alike = [k for k in alike if isinstance(found[k], tuple)]
-        self.agree([parts[k] for k in alike], [found[k] for k in alike])
-        return self.each(expr, found)
-
-    def call(self, expr: Call) -> Written:
-        first, *others = expr.arguments
-        match expr.function:
-            case "dot" | "cross" | "norm":
-                return self.product(expr)
-            case "count":
-                return expr  # of peers, whatever they send
-            case "age":  # of a vector, which travels in one packet
-                found = self.written(first)
-                return replace(expr, arguments=found[:1]) if isinstance(found, tuple) else expr
-            case "sample":
-                return self.each(expr, [self.written(first), *others])  # the second is a clock
-            case "interpolate":
-                return self.each(expr, [first, *map(self.number, others)])
-        return self.of_parts(expr, numbers=(1,) if expr.function == "hold" else ())
+        parts, word = children(expr), operation(expr)
+        numbers, skipped = NUMBERS.get(word, ()), AS_THEY_ARE.get(word, ())
+        written = [
+            part if k in skipped else self.number(part) if k in numbers else self.written(part)
+            for k, part in enumerate(parts)
+        ]
+        is_vector = [isinstance(part, tuple) for part in written]
+        if word == "age":  # of a vector, which travels in one packet
+            return rebuild(expr, written[0][:1]) if isinstance(written[0], tuple) else expr
+        if word == "*" and all(is_vector):
+            hint = f"dot({', '.join(map(format_expression, parts))})"
+            self.fail("E407", expr, self.source(expr), "one vector at most in a product", "two", hint)
+        if word != "*":
+            # A function takes numbers beside vectors.
+            equal = [k for k in range(len(parts)) if k not in (*numbers, *skipped)]
+            equal = [k for k in equal if is_vector[k] or not isinstance(expr, Call)]
+            self.agree([parts[k] for k in equal], [written[k] for k in equal])
+        return self.each(expr, written)
 
     def product(self, expr: Call) -> Written:
         """Write out `dot`, `cross` and `norm`, each piece of which stands where the whole does."""
         vectors: list[tuple[Expr, ...]] = []
-        for one in expr.arguments:
-            found = self.written(one)
-            if found is None:
+        for argument in expr.arguments:
+            written = self.written(argument)
+            if written is None:
                 return None if expr.function == "cross" else Number(Fraction(0))
-            if not isinstance(found, tuple):
+            if not isinstance(written, tuple):
                 shown = [format_expression(part) for part in expr.arguments]
                 hint = {"norm": f"abs({shown[0]})", "dot": "*".join(shown)}.get(expr.function, "")
-                self.fail("E407", one, f"{self.said(one)} in {expr.function}", "a vector", "a number", hint)
-            vectors.append(found)
+                self.fail(
+                    "E407",
+                    argument,
+                    f"{self.source(argument)} in {expr.function}",
+                    "a vector",
+                    "a number",
+                    hint,
+                )
+            vectors.append(written)
         self.agree(expr.arguments, vectors)
 
-        def binary(operator: str, one: Expr, two: Expr) -> Expr:
-            return Binary(operator, one, two, start=expr.start, end=expr.end)
+        def binary(operator: str, left: Expr, right: Expr) -> Expr:
+            return Binary(operator, left, right, start=expr.start, end=expr.end)
 
         a, b = vectors[0], vectors[-1]
         if expr.function == "cross":
@@ -228,24 +230,26 @@ class _Writer:
 
     def number(self, expr: Expr, hint: str = "") -> Expr:
         """Return an expression that has to be a number."""
-        found = self.written(expr)
-        if isinstance(found, tuple):
-            self.fail("E407", expr, self.said(expr), "a number", _size(found), hint or self.of_vector(expr))
-        return expr if found is None else found
+        written = self.written(expr)
+        if isinstance(written, tuple):
+            self.fail(
+                "E407", expr, self.source(expr), "a number", _size(written), hint or self.of_vector(expr)
+            )
+        return expr if written is None else written
 
-    def agree(self, parts: Sequence[Expr], found: Sequence[Written]) -> None:
+    def agree(self, parts: Sequence[Expr], written: Sequence[Written]) -> None:
         """Refuse parts that are not of one size."""
-        known = [(part, one) for part, one in zip(parts, found, strict=True) if one is not None]
-        for part, one in known[1:]:
-            like, first = known[0]
-            size, its = _length(first), _length(one)
-            if its == size:
+        known = [(part, other) for part, other in zip(parts, written, strict=True) if other is not None]
+        for part, other in known[1:]:
+            model, first = known[0]
+            size, length = _length(first), _length(other)
+            if length == size:
                 continue
             text, hint = format_expression(part), "" if size else self.of_vector(part)
-            if not its and len(text) <= LONGEST_REPEATED:
+            if not length and len(text) <= LONGEST_REPEATED:
                 hint = "{" + ", ".join([text] * size) + "}"
-            expected = f"{_size(first)} like {self.said(like)}"
-            self.fail("E406", part, self.said(part), expected, _size(one), hint)
+            expected = f"{_size(first)} like {self.source(model)}"
+            self.fail("E406", part, self.source(part), expected, _size(other), hint)
 
     def each(self, node: Expr, parts: Sequence[Written]) -> Written:
         """Return a node of other parts: one for each entry, where one of them is a vector."""
@@ -256,8 +260,8 @@ class _Writer:
         rows = zip(
             *(part if isinstance(part, tuple) else (part,) * (size or 1) for part in known), strict=True
         )
-        found = tuple(rebuild(node, row) for row in rows)
-        return found if size else found[0]
+        nodes = tuple(rebuild(node, row) for row in rows)
+        return nodes if size else nodes[0]
 
     def of_vector(self, expr: Expr) -> str:
         """Return numbers that somebody may have meant who wrote a vector."""
@@ -265,12 +269,12 @@ class _Writer:
         return f"{entry(of, 1)}, or norm({of})" if isinstance(expr, Name) else f"norm({of})"
 
 
-def _length(found: Written) -> int:
-    return len(found) if isinstance(found, tuple) else 0
+def _length(written: Written) -> int:
+    return len(written) if isinstance(written, tuple) else 0
 
 
-def _size(found: Written) -> str:
-    return f"a vector of {len(found)}" if isinstance(found, tuple) else "a number"
+def _size(written: Written) -> str:
+    return f"a vector of {len(written)}" if isinstance(written, tuple) else "a number"
 
 
 def _or(numbers: Iterable[int]) -> str:

@@ -1,28 +1,103 @@
 """The links of a topology: who hears whom over each, how late, and how unreliably.
 
-Takes: a part of the section `links`, and its entry. Gives: `SceneLink`, `read_link`.
-Guarantees: delays are 0 or more; graph, delays and channel fit the peers there are.
-Does not: know what is sent.
+Takes: a part of the section `links`, and its entry. Gives: `SceneLink`, `SceneChannel`, `read_link`;
+`PROBABILITY`.
+Guarantees: delays are 0 or more, probabilities lie from 0 to 1; graph, delays and channel fit the peers there
+are; nothing is said that has no effect.
+Does not: know what is sent, or draw a packet (see the runtime).
+
+The loss model is netem's `gemodel p [r [1-h [1-k]]]` (tc-netem(8), after Gilbert and Elliott): a link in its
+good state loses a packet with the probability 1-k and one in its bad state with 1-h; after each packet a good
+one turns bad with the probability p, a bad one good with r. Its defaults are netem's, r = 1-p, 1-h = 1 and
+1-k = 0, which make losses independent: `loss: 2 %` is `loss: {p: 2 %}`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping as MappingType
+from collections.abc import Mapping
 from dataclasses import dataclass
+from fractions import Fraction
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
 
 from apc.compiler.compiled import Graph
-from apc.compiler.components.component import Reference
+from apc.compiler.components.component import Named, Reference
+from apc.compiler.components.component import Number as Parameter
+from apc.compiler.components.parts import PartEntry
 from apc.compiler.errors import Place
-from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND
+from apc.compiler.language.dimensions import DIMENSIONLESS
+from apc.compiler.language.expression import Binary, Name, Number
+from apc.compiler.language.recordings import read_trace
 from apc.compiler.language.tables import NamedFiles
+from apc.compiler.language.units import Unit
 from apc.compiler.language.values import Value
-from apc.compiler.scene.channels import SceneChannel, read_channel
-from apc.compiler.scene.graphs import COMPLETE, SceneDelay, read_graph, read_pairs
+from apc.compiler.scene.graphs import COMPLETE, SceneDelay, read_delays, read_graph
 from apc.compiler.scene.instances import Part
 from apc.compiler.scene.named_numbers import NamedNumbers
-from apc.compiler.source.nodes import Mapping, Node
+from apc.compiler.source.nodes import Mapping as MappingNode
+from apc.compiler.source.nodes import Node, Scalar
+from apc.compiler.source.reading import Body, brief, fault, text_of
 
 OBEYED = ("delay", "jitter", "distribution", "reorder", "on_loss")  # a link's numbers and words
+# Those of netem, in its order.
+PROBABILITIES = {
+    "p": "probability that a good link turns bad after a packet",
+    "r": "probability that a bad link turns good after a packet",
+    "1-h": "probability that a bad link loses a packet",
+    "1-k": "probability that a good link loses a packet",
+}
+LOSS_EXAMPLE = "loss: {p: 1 %, r: 25 %}"
+_EXAMPLES = {"loss": "loss: 2 %", "jitter": "jitter: 2 ms", "trace": "trace: delays.csv"}
+# What a number of a link's losses is, where one is read.
+PROBABILITY = Parameter(
+    name="probability",
+    unit=Unit("%", Fraction(1, 100), DIMENSIONLESS),
+    default=None,
+    minimum=Fraction(0),
+    open_minimum=False,
+    maximum=Fraction(1),
+    divided=False,
+    words=(),
+    about="",
+    place=Place("probability"),
+)
+
+# What each word is where a link does not say it, and what it is about: on a link without, it says nothing.
+_DEFAULTS = {"distribution": "uniform", "reorder": "newest", "on_loss": "hold"}
+_ABOUT = {"distribution": ("jitter",), "reorder": ("jitter", "trace"), "on_loss": ("loss", "trace")}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneChannel:
+    """What makes a link unreliable.
+
+    `loss` has the names and values of p, r, 1-h and 1-k, or is empty; `jitter` is None on a link without.
+    `trace` (n,) holds recorded delays in seconds, infinite for a lost packet, or is None.
+    """
+
+    loss: Named[Value]
+    jitter: Value | None
+    distribution: str
+    reorder: str
+    on_loss: str
+    trace: NDArray[np.float64] | None
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """What it is, in words."""
+        lines = []
+        if self.loss:
+            p, r, one_minus_h, one_minus_k = (float(100 * value.number) for _, value in self.loss)
+            lines.append(f"loss: p {p:.6g} %, r {r:.6g} %, 1-h {one_minus_h:.6g} %, 1-k {one_minus_k:.6g} %")
+        if self.jitter is not None:
+            lines.append(f"jitter {float(1000 * self.jitter.number):.6g} ms, {self.distribution}")
+        if self.trace is not None:
+            lines.append(f"a recorded trace of {self.trace.size} packets")
+        newest = "sent last" if self.reorder == "newest" else "that arrived last"
+        missing = "a lost one changes nothing" if self.on_loss == "hold" else "a lost one exerts no force"
+        return (*lines, f"the packet {newest} counts; {missing}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,78 +114,141 @@ class SceneLink:
 
 
 def read_link(
-    part: Part,
-    body: Mapping,
-    counts: MappingType[str, int],
-    numbers: NamedNumbers,
-    files: NamedFiles,
+    part: Part, entry: PartEntry, counts: Mapping[str, int], numbers: NamedNumbers, files: NamedFiles
 ) -> SceneLink | None:
     """Read what a link's entry says beyond numbers and words.
 
     Parameters
     ----------
-    part, body
+    part, entry
         The link as a part, and its entry.
     counts
         How many peers each group has.
     numbers
-        Reads the delays.
+        Reads delays and probabilities.
     files
-        Reads tables and traces, and takes what is at fault.
+        Reads tables and traces.
 
     Returns
     -------
-    None if it is no link, or its clock or delay is at fault.
+    None if its clock or delay is at fault, which was reported.
+
+    Raises
+    ------
+    ApcError
+        E210 it is no link.
     """
-    values = dict(part.values)
-    clock = part.reference("clock")
-    roles = {p.role: p.name for p in part.component.parameters if isinstance(p, Reference)}
-    graph = COMPLETE
-    if "graph" in roles:
-        graph = read_graph(body.get(roles["graph"]), counts, files)
-    delays = _read_delays(body.get(roles["delays"]), counts, numbers) if "delays" in roles else ()
-    if "clock" not in roles or part.component.parameter("delay") is None:
-        what = f"{part.name} is a {part.component.name}, which is no link: it has no clock and delay"
-        files.mistakes.add("E210", part.place, what, hint="type: Link")
+    component, clock, delay = part.component, part.reference("clock"), dict(part.values).get("delay")
+    roles = {p.name: p.role for p in component.parameters if isinstance(p, Reference)}
+    nodes = {roles.get(key.text, key.text): node for key, node in entry.body.entries}
+    graph, delays = COMPLETE, tuple[SceneDelay, ...]()
+    if "graph" in roles.values() and "graph" in nodes:
+        with numbers.mistakes:
+            graph = read_graph(nodes["graph"], counts, files)
+    if "delays" in roles.values() and "delays" in nodes:
+        with numbers.mistakes:
+            delays = read_delays(nodes["delays"], counts, numbers)
+    told = f"{part.name} is a {component.name}, which is no link:"
+    if "clock" not in roles.values() or component.parameter("delay") is None:
+        raise fault("E210", part.place, f"{told} it has no clock and delay", hint="type: Link")
+    # Of a link's component nothing may be declared that no link obeys.
+    idle = [name for name, _ in component.connectors]
+    idle += [
+        one.name for one in (*component.variables, *component.parameters) if one.name not in (*OBEYED, *roles)
+    ]
+    idle += [name for name, role in roles.items() if role == "link"]
+    idle += ["equations"] * bool(component.equations or component.inner)
+    if idle:
+        raise fault("E210", part.place, f"{told} a link has no {idle[0]}", hint="type: Link")
+    channel = _read_channel(part.name, nodes, dict(part.values), dict(part.options), numbers, files)
+    if clock is None or delay is None:
         return None
-    if idle := _idle(part):
-        what = f"{part.name} is a {part.component.name}, which is no link: a link has no {idle}"
-        files.mistakes.add("E210", part.place, what, hint="type: Link")
+    return SceneLink(part.name, clock, delay, graph, delays, channel, part.place)
+
+
+def _read_channel(
+    link: str,
+    nodes: Mapping[str, Node],
+    values: Mapping[str, Value],
+    words: Mapping[str, str],
+    numbers: NamedNumbers,
+    files: NamedFiles,
+) -> SceneChannel | None:
+    """Read what makes a link unreliable; None when its entry says nothing of the kind.
+
+    Parameters
+    ----------
+    link
+        The link's name.
+    nodes
+        What its entry gives, by key, but its loss, trace and delays by their roles.
+    values, words
+        The link's numbers and words, given or by default.
+    numbers
+        Reads probabilities.
+    files
+        Reads a trace.
+    """
+    mistakes = numbers.mistakes
+    given = {key for key in _EXAMPLES if key in nodes}
+    for word, about in _ABOUT.items():
+        if word in nodes and not given.intersection(about):
+            what = f"{link} says {word} but has no {' or '.join(about)} that this would be about"
+            mistakes.add("E262", nodes[word].place, what, hint=_EXAMPLES[about[0]])
+    if not given:
         return None
-    channel = read_channel(
-        part.name,
-        body,
-        {role: body.get(name) for role, name in roles.items()} | {"jitter": body.get("jitter")},
-        values.get("jitter"),
-        dict(part.options),
-        lambda node, what: numbers.read(node, what, DIMENSIONLESS, "%"),
-        files,
-    )
-    if clock is None or "delay" not in values:
-        return None  # reported where it is
-    return SceneLink(part.name, clock, values["delay"], graph, delays, channel, part.place)
+    loss: dict[str, Value] = {}
+    trace = None
+    if "loss" in nodes:
+        with mistakes:
+            loss = _loss(link, nodes["loss"], numbers)
+    if "trace" in nodes:
+        place = nodes["trace"].place
+        for key in ("loss", "jitter", "delays"):
+            if key in nodes:
+                told = (
+                    f"{link} has a trace, which says when every packet arrives: it can't have {key} as well"
+                )
+                mistakes.add("E262", nodes[key].place, told)
+        with mistakes:
+            text = text_of(nodes["trace"], "trace", _EXAMPLES["trace"])
+            trace = files.read(text, lambda path: read_trace(path, place))
+    jitter = values.get("jitter") if "jitter" in given else None
+    distribution, reorder, on_loss = (words.get(key, default) for key, default in _DEFAULTS.items())
+    delays = None if trace is None else trace.delays
+    return SceneChannel(tuple(loss.items()), jitter, distribution, reorder, on_loss, delays)
 
 
-def _idle(part: Part) -> str:
-    """Return something that a link's component has and no link obeys, if there is such a thing."""
-    component = part.component
-    named = (*(name for name, _ in component.connectors), *(one.name for one in component.variables))
-    named += tuple(p.name for p in component.parameters if isinstance(p, Reference) and p.role == "link")
-    named += tuple(
-        p.name for p in component.parameters if not isinstance(p, Reference) and p.name not in OBEYED
-    )
-    return next(iter((*named, *("equations" for _ in (*component.equations, *component.inner)))), "")
+def _loss(link: str, node: Node, numbers: NamedNumbers) -> dict[str, Value]:
+    """Read a probability, or a mapping of netem's four; those not given are as netem has them."""
+    name = f"{link}.loss"
+    if not isinstance(node, MappingNode):
+        return _completed(name, name, {"p": _probability(node, "loss", numbers)})
+    body = Body(node, PROBABILITIES, f"the loss of {link}", numbers.mistakes)
+    read = {key: body.read(key, partial(_probability, numbers=numbers), None) for key in PROBABILITIES}
+    if "p" not in body.nodes:
+        raise fault("E201", node.place, f"the loss of {link} has no p", hint=LOSS_EXAMPLE)
+    known = {key: value for key, value in read.items() if value is not None}
+    return _completed(name, f"{name}.p", known) if "p" in known else {}
 
 
-def _read_delays(
-    node: Node | None, counts: MappingType[str, int], numbers: NamedNumbers
-) -> tuple[SceneDelay, ...]:
-    """Read the delays of pairs of groups that differ from the link's."""
-    delays = []
-    for sender, receiver, written in read_pairs(node, counts, numbers.mistakes):
-        value = numbers.read(written, f"the delay from {sender} to {receiver}", SECOND, "ms")
-        if value is not None and value.number < 0:
-            numbers.mistakes.add("E207", value.place, "a delay", expected="0 s or more", got=str(value))
-        elif value is not None:
-            delays.append(SceneDelay(sender, receiver, value))
-    return tuple(delays)
+def _completed(name: str, name_p: str, given: Mapping[str, Value]) -> dict[str, Value]:
+    """Return all four probabilities by their whole names."""
+    p = given["p"]
+    rest = Binary("-", Number(Fraction(1)), Name(tuple(name_p.split("."))))
+    known = {
+        "r": Value(1 - p.number, DIMENSIONLESS, rest, p.place),
+        "1-h": Value(Fraction(1), DIMENSIONLESS, None, p.place),
+        "1-k": Value(Fraction(0), DIMENSIONLESS, None, p.place),
+    }
+    return {name_p: p} | {f"{name}.{key}": given.get(key, value) for key, value in known.items()}
+
+
+def _probability(node: Node, what: str, numbers: NamedNumbers) -> Value:
+    value = numbers.read(node, what, DIMENSIONLESS, "%")
+    if 0 <= value.number <= 1:
+        return value
+    got = brief(node.text) if isinstance(node, Scalar) else ""
+    bare = isinstance(node, Scalar) and isinstance(node.value, int | float) and 1 < value.number <= 100
+    hint = f"{what}: {got} %" if bare else ""
+    raise fault("E261", value.place, what, "a probability, 0 % to 100 %", got, hint)

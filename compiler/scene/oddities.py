@@ -7,14 +7,11 @@ Does not: look into equations, or decide what was meant.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
-from apc.compiler.components.parts import GROUND
+from apc.compiler.components.parts import GROUND, PartEntry
 from apc.compiler.errors import Mistake, Place
-from apc.compiler.scene.instances import Part, PartEntry
-
-# Of each part, those it is joined to, by any number of others too, and itself.
-Joined = Mapping[str, frozenset[str]]
+from apc.compiler.scene.instances import Part
 
 
 def oddities(
@@ -36,93 +33,55 @@ def oddities(
     set_by_groups
         The whole names of what groups set for themselves.
     """
-    outer = [part for part in parts if part.name.partition("[")[0] in entries and "." not in part.name]
-    apart = {group: _joined(part for part in outer if group in part.groups) for group in counts}
+    used = {word for part in parts for _, word in part.references}
     found = [
-        *_idle_links(parts, entries),
-        *_alone(outer, apart),
-        *_copies(outer, apart, entries, counts, set_by_groups),
+        Mistake("W271", entry.place, f"nobody uses the link {name}")
+        for name, entry in entries.items()
+        if entry.section == "links" and name not in used
     ]
+    outer = [part for part in parts if part.name.partition("[")[0] in entries and "." not in part.name]
+    joined = {group: _joined([part for part in outer if group in part.groups]) for group in counts}
+    hearing = {part.name: part for part in outer if part.component.hears_others}
+    masses = [part for part in outer if part.section == "masses"]
+    for part in masses:
+        alone = [group for group in part.groups if len(joined[group][part.name]) == 1]
+        if alone and part.component.connectors and not part.connections:
+            where = "" if len(alone) == len(part.groups) else f" of {' and '.join(alone)}"
+            what = f"{part.name}{where} is joined to nothing: no coupler, no hand and no other mass"
+            found.append(Mistake("W272", part.place, what))
+        near = {name for group in part.groups for name in joined[group][part.name]}
+        if sum(counts[group] for group in part.groups) < 2:
+            continue
+        if part.shared and not near & hearing.keys():
+            what = f"{part.name} is shared, and nothing couples its copies"
+            found.append(Mistake("W273", part.place, what))
+        # A mass is taken for a copy if a coupler follows the others by it alone, the same in all groups, and
+        # something else of the peer moves it too.
+        followed = [
+            one for one in hearing.values() if [other for _, other, _ in one.connections] == [part.name]
+        ]
+        divided = [number.name for number in part.component.numbers if number.divided]
+        own = {f"{part.name}.{name}" for name in divided}
+        own |= {f"{one.name}.{name}" for one in followed for name, _ in one.options}
+        touched = any(one is not part and one.name in near for one in masses)
+        said = entries[part.name.partition("[")[0]].body.get("shared") is not None
+        if not said and followed and divided and touched and own.isdisjoint(set_by_groups):
+            follows = f"{part.name} follows the other peers' by {followed[0].name} and is not shared"
+            hint = "shared: true, or shared: false where each is a mass of its own"
+            what = f"{follows}: its {divided[0]} counts once a peer"
+            found.append(Mistake("W274", part.place, what, hint=hint))
     return tuple(sorted(dict.fromkeys(found), key=lambda one: (one.place, one.code)))
 
 
-def _joined(parts: Iterator[Part]) -> Joined:
+def _joined(parts: Iterable[Part]) -> dict[str, set[str]]:
     """Return what is joined to each part of one group, directly or by others; the ground joins nothing."""
-    listed = list(parts)
-    found = {part.name: {part.name} for part in listed}
-    for part in listed:
+    found = {part.name: {part.name} for part in parts}
+    for part in parts:
         for _, other, _ in part.connections:
-            if other != GROUND and other in found and found[other] is not found[part.name]:
-                found[other] |= found[part.name]
-                for name in found[other]:
-                    found[name] = found[other]
-    return {name: frozenset(together) for name, together in found.items()}
-
-
-def _idle_links(parts: Sequence[Part], entries: Mapping[str, PartEntry]) -> Iterator[Mistake]:
-    """Yield a warning for each link that no part names."""
-    named = {word for part in parts for _, word in part.references}
-    for name, entry in entries.items():
-        if entry.section == "links" and name not in named:
-            yield Mistake("W271", entry.place, f"nobody uses the link {name}")
-
-
-def _alone(outer: Sequence[Part], apart: Mapping[str, Joined]) -> Iterator[Mistake]:
-    """Yield a warning for each mass that nothing is joined to and that is joined to nothing."""
-    for part in outer:
-        groups = [group for group in part.groups if len(apart[group][part.name]) == 1]
-        if part.section == "masses" and groups and part.component.connectors and not part.connections:
-            where = "" if len(groups) == len(part.groups) else f" of {' and '.join(groups)}"
-            what = f"{part.name}{where} is joined to nothing: no coupler, no hand and no other mass"
-            yield Mistake("W272", part.place, what)
-
-
-def _copies(
-    outer: Sequence[Part],
-    apart: Mapping[str, Joined],
-    entries: Mapping[str, PartEntry],
-    counts: Mapping[str, int],
-    set_by_groups: Collection[str],
-) -> Iterator[Mistake]:
-    """Yield a warning for each copy that nothing couples, and for each coupled mass that may be meant as one.
-
-    A mass is taken for a copy if a coupler follows the others by it alone, the same in all groups, and
-    something else of the peer moves it too.
-    """
-    hearing = {part.name: part for part in outer if part.component.hears_others}
-    for part in outer:
-        if part.section != "masses":
-            continue
-        peers = sum(counts[group] for group in part.groups)
-        if part.shared and peers > 1:
-            if not any(apart[group][part.name] & hearing.keys() for group in part.groups):
-                what = f"{part.name} is shared, and nothing couples its copies"
-                yield Mistake("W273", part.place, what)
-        elif peers > 1 and entries[part.name.partition("[")[0]].body.get("shared") is None:
-            yield from _unshared(part, apart, hearing.values(), outer, set_by_groups)
-
-
-def _unshared(
-    part: Part,
-    apart: Mapping[str, Joined],
-    hearing: Collection[Part],
-    outer: Sequence[Part],
-    set_by_groups: Collection[str],
-) -> Iterator[Mistake]:
-    """Yield a warning for a mass that is taken for a copy, see `_copies`, and is not shared."""
-    followed = [one for one in hearing if [other for _, other, _ in one.connections] == [part.name]]
-    divided = [number.name for number in part.component.numbers if number.divided]
-    divides = {f"{part.name}.{name}" for name in divided}
-    divides |= {f"{one.name}.{name}" for one in followed for name, _ in one.options}
-    masses = {one.name for one in outer if one.section == "masses"} - {part.name}
-    touched = any(apart[group][part.name] & masses for group in part.groups)
-    if followed and divided and touched and divides.isdisjoint(set_by_groups):
-        what = (
-            f"{part.name} follows the other peers' by {followed[0].name} and is not shared: its "
-            f"{divided[0]} counts once a peer"
-        )
-        hint = "shared: true, or shared: false where each is a mass of its own"
-        yield Mistake("W274", part.place, what, hint=hint)
+            if other != GROUND and other in found:
+                found[part.name] |= found[other]
+                found |= dict.fromkeys(found[part.name], found[part.name])
+    return found
 
 
 def warning_texts(warnings: Collection[Mistake]) -> tuple[str, ...]:

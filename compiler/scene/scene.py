@@ -5,87 +5,74 @@ Guarantees: parts, clocks, links, parameters and connections that are named exis
 their parameter wants and lie within its bounds; parts inside parts and arrays are written out; all mistakes
 of the file are reported together.
 Does not: look into a component's equations, or read a section itself: each has a module of its own
-(`groups`, `named_numbers`, `timebase`, `sections`, `instances`, `links`, `studies`).
+(`groups`, `named_numbers`, `timebase`, `instances`, `links`, `studies`).
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
-from collections.abc import Mapping as MappingType
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from apc.compiler.cache import SUFFIX
 from apc.compiler.compiled import Axis, Experiment
-from apc.compiler.components.component import Settable
+from apc.compiler.components.component import Named, Settable
 from apc.compiler.components.library import Library, definition_of
+from apc.compiler.components.parts import Parts, Scope
 from apc.compiler.errors import Mistake, Mistakes, Place, visible
 from apc.compiler.files import RefusedError, files_below
 from apc.compiler.language.tables import NamedFiles
-from apc.compiler.language.values import Value
-from apc.compiler.scene.channels import PROBABILITY
-from apc.compiler.scene.groups import Columns, GroupBody, read_counts, read_settings, with_followers
+from apc.compiler.language.values import AlreadyReportedError, Value
+from apc.compiler.scene.groups import GroupReader, SceneGroup, read_counts
 from apc.compiler.scene.instances import Part, PartReader, settable_names
-from apc.compiler.scene.links import SceneLink, read_link
-from apc.compiler.scene.named_numbers import NamedNumbers, read_count_by_names, read_named_numbers
+from apc.compiler.scene.links import PROBABILITY, SceneLink, read_link
+from apc.compiler.scene.named_numbers import read_named_numbers
 from apc.compiler.scene.oddities import oddities
-from apc.compiler.scene.sections import SECTIONS, PartSections
 from apc.compiler.scene.studies import read_experiment, read_region
 from apc.compiler.scene.timebase import SceneClock, read_clocks
-from apc.compiler.source.nodes import Mapping, Node, Sequence
-from apc.compiler.source.reading import (
-    brief,
-    check_keys,
-    read_mapping,
-    read_text,
-)
+from apc.compiler.source.nodes import Mapping, Sequence
+from apc.compiler.source.reading import Body, brief, fault, mapping_of, text_of
 from apc.compiler.source.source import Source
 
-KEYS = (
-    "topology",
-    "about",
-    "library",
-    "clocks",
-    "parameters",
-    "peers",
-    *SECTIONS,
-    "experiment",
-    "studies",
-)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SceneGroup:
-    """`count` peers.
-
-    `values` are the group's own settings by whole name (`contact.stiffness`) and what follows from them
-    inside parts, `words` its own options and clocks, `columns` settings that differ from peer to peer,
-    `counted` its count where that follows from named numbers.
-    """
-
-    name: str
-    count: int
-    values: tuple[tuple[str, Value], ...]
-    words: tuple[tuple[str, str], ...]
-    columns: Columns
-    place: Place
-    counted: Value | None = None
+SECTIONS = ("masses", "couplers", "links", "hands")  # those of parts
+# The sections of a topology, and what each is.
+TOPOLOGY = {
+    "topology": "the scene's name",
+    "about": "one sentence",
+    "library": "folders of components of one's own, from this file's folder",
+    "clocks": "what ticks, and how often",
+    "parameters": "named quantities, for use in expressions",
+    "peers": "who is there: groups of peers",
+    "masses": "what each peer has",
+    "couplers": "what pulls at masses",
+    "links": "what carries samples to the other peers",
+    "hands": "what moves a device",
+    "experiment": "what a simulation runs for",
+    "studies": "which parameters a study varies",
+}
+# Those that it must have, and what to write.
+REQUIRED = {
+    "topology": "my-scene",
+    "peers": "{user: {count: 3}}",
+    "masses": "{device: {mass: 0.1 kg}}",
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A topology, whole. `texts` are the digests of the files it names; `warnings` are no mistakes."""
+    """A topology, whole. `texts` are the files it names; `warnings` are no mistakes."""
 
     name: str
     about: str
     clocks: tuple[SceneClock, ...]
-    parameters: tuple[tuple[str, Value], ...]
+    parameters: Named[Value]
     groups: tuple[SceneGroup, ...]
     parts: tuple[Part, ...]
     links: tuple[SceneLink, ...]
     experiment: Experiment
     region: tuple[Axis, ...]
-    texts: tuple[tuple[str, str], ...]
+    texts: tuple[str, ...]
     place: Place
     warnings: tuple[Mistake, ...] = ()
 
@@ -104,38 +91,22 @@ class Scene:
         return next(part for part in self.parts if part.name == name)
 
 
-def build_scene(source: Source, library: Library) -> Scene:
-    """Read a topology. Raises ApcError with every mistake of the file."""
-    mistakes = Mistakes()
-    scene = _read_scene(source, library, mistakes)
-    mistakes.raise_if_any()
-    assert scene is not None
-    return scene
-
-
 def library_folders(source: Source) -> tuple[Path, ...]:
     """Return the folders of components that a topology names. Raises ApcError for one that isn't there."""
-    if not isinstance(source.root, Mapping):
-        return ()
-    node = source.root.get("library")
-    nodes = node.items if isinstance(node, Sequence) else () if node is None else (node,)
+    node = source.root.get("library") if isinstance(source.root, Mapping) else None
     mistakes = Mistakes()
     found = []
-    for item in nodes:
-        text = read_text(item, "library", mistakes, hint="library: ./parts")
-        if text is not None:
+    for item in node.items if isinstance(node, Sequence) else () if node is None else (node,):
+        with mistakes:
+            text = text_of(item, "library", "library: ./parts")
             folder = _folder_of(source) / text
             try:
                 files_below(folder, SUFFIX)
             except RefusedError as refused:
-                mistakes.add(
-                    "E214",
-                    item.place,
-                    f"the library folder {brief(text)} {refused.words}",
-                    hint="library: ./parts" if refused.why == "large" else "",
-                )
-            else:
-                found.append(folder)
+                what = f"the library folder {brief(text)} {refused.words}"
+                hint = "library: ./parts" if refused.why == "large" else ""
+                raise fault("E214", item.place, what, hint=hint) from None
+            found.append(folder)
     mistakes.raise_if_any()
     return tuple(found)
 
@@ -144,111 +115,113 @@ def _folder_of(source: Source) -> Path:
     return source.path.parent if source.path is not None else Path()
 
 
-def _read_scene(source: Source, library: Library, mistakes: Mistakes) -> Scene | None:
-    """Read every section, those first that others refer to."""
+def build_scene(source: Source, library: Library) -> Scene:
+    """Read a topology, those sections first that others refer to. Raises ApcError with all its mistakes."""
+    mistakes = Mistakes()
     files = NamedFiles(_folder_of(source), mistakes)
-    root = read_mapping(source.root, "a topology", mistakes, hint="topology: my-scene")
-    if root is None:
-        return None
+    node = mapping_of(source.root, "a topology", "topology: my-scene")
     kind, name = definition_of(source)
     if kind:
         what = f"{name} is a {kind}; a topology has parts of its type, and names the folder it is in"
-        mistakes.add("E201", root.place, what, hint="library: ./parts")
-        return None
-    root = check_keys(root, KEYS, "a topology", mistakes)
-    title = visible(read_text(_required(root, "topology", "my-scene", mistakes), "topology", mistakes) or "")
-    about = visible(read_text(root.get("about"), "about", mistakes) or "")
-    peers = _required(root, "peers", "{user: {count: 3}}", mistakes)
-    _required(root, "masses", "{device: {mass: 0.1 kg}}", mistakes)
-    named = root.get("parameters")
-    bodies = read_counts(peers, files, lambda node: read_count_by_names(node, named, mistakes))
+        raise fault("E201", node.place, what, hint="library: ./parts")
+    root = Body(node, TOPOLOGY, "a topology", mistakes)
+    for key, example in REQUIRED.items():
+        if key not in root.nodes:
+            what = f"the topology has no {key}" + ("" if key == "topology" else " section")
+            mistakes.add("E201", root.place, what, hint=f"{key}: {example}")
+    bodies = read_counts(root, files)
     counts = {name: group.count for name, group in bodies.items()}
     mistakes.names = tuple(counts)
-    numbers = read_named_numbers(named, sum(counts.values()), mistakes)
-    clocks = read_clocks(root.get("clocks"), numbers, {*numbers.values, *counts}, mistakes)
-    sections = PartSections(root, library, {*numbers.values, *counts, *clocks}, mistakes)
-    reader = PartReader(sections.entries, sections.scope(numbers, clocks), numbers, counts, files)
-    parts = [part for name in sections.entries for part in reader.read(name)]
-    links = [
-        read_link(part, sections.entries[part.name].body, counts, numbers, files)
-        for part in parts
-        if part.section == "links" and "." not in part.name
-    ]
+    numbers = read_named_numbers(root, sum(counts.values()), mistakes)
+    clocks = read_clocks(root, numbers, {*numbers.values, *counts})
+    sections = Parts(library, mistakes, {*numbers.values, *counts, *clocks})
+    for section in SECTIONS:
+        sections.read(section, root)
+    names = _Names(root, sections, clocks, tuple(counts))
+    entries = sections.entries
+    scope = Scope(numbers.dimension, numbers.names, names.of_role, sections, "this topology", names.complete)
+    reader = PartReader(scope, numbers, counts, files)
+    parts = [part for entry in entries.values() for part in reader.read(entry)]
+    links: list[SceneLink | None] = []
+    for part in parts:
+        if part.section == "links" and "." not in part.name:
+            with mistakes:
+                links.append(read_link(part, entries[part.name], counts, numbers, files))
     read_links = tuple(link for link in links if link is not None)
     settable = settable_names(parts)
-    varied = settable | _of_losses(read_links)
-    groups = _read_groups(bodies, settable, parts, clocks, sections, numbers)
+    of_groups = {name: items for name, items in settable.items() if not names.is_of_link(name)}
+    group_reader = GroupReader(of_groups, parts, clocks, numbers, names.explain)
+    groups = tuple(group_reader.read(group) for group in bodies.values())
+    # What a link loses by can vary where it follows from no other number.
+    losses: dict[str, list[tuple[str, Settable]]] = {
+        name: [(name, PROBABILITY)]
+        for link in read_links
+        for name, value in (link.channel.loss if link.channel is not None else ())
+        if value.expression is None
+    }
     set_by_groups = {name for group in groups for name, _ in (*group.values, *group.words, *group.columns)}
-    # Where there are mistakes, what is missing for one would be told a second time.
-    warnings = () if mistakes else oddities(parts, sections.entries, counts, set_by_groups)
-    return Scene(
-        title,
-        about,
+    scene = Scene(
+        visible(root.text("topology")),
+        visible(root.text("about")),
         tuple(clocks.values()),
         tuple(numbers.values.items()),
         groups,
         tuple(part for part in parts if part.section != "links"),
         read_links,
-        read_experiment(root.get("experiment"), numbers.read_time, mistakes),
-        read_region(root.get("studies"), varied, sections.is_reported, numbers.read_for, mistakes),
-        tuple(sorted(files.digests.items())),
+        read_experiment(root, numbers),
+        read_region(root, settable | losses, numbers, names.is_reported),
+        tuple(sorted(files.names)),
         root.place,
-        warnings,
     )
+    mistakes.raise_if_any()  # before warnings, which would tell a second time what is missing for a mistake
+    return replace(scene, warnings=oddities(parts, entries, counts, set_by_groups))
 
 
-def _of_losses(links: Collection[SceneLink]) -> dict[str, list[tuple[str, Settable]]]:
-    """Return the probabilities of links' losses that can vary: those that follow from no other."""
-    return {
-        name: [(name, PROBABILITY)]
-        for link in links
-        if link.channel is not None
-        for name, value in link.channel.loss
-        if value.expression is None
-    }
+@dataclass(frozen=True, slots=True)
+class _Names:
+    """What the names in a topology stand for, and whether it was said why one stands for nothing."""
 
+    root: Body
+    sections: Parts
+    clocks: Collection[str]
+    groups: tuple[str, ...]
 
-def _required(root: Mapping, key: str, example: str, mistakes: Mistakes) -> Node | None:
-    """Return the node of a key that a topology must have."""
-    node = root.get(key)
-    if node is None:
-        what = f"the topology has no {key}" + ("" if key == "topology" else " section")
-        mistakes.add("E201", root.place, what, hint=f"{key}: {example}")
-    return node
+    @property
+    def complete(self) -> bool:
+        """Whether no section of parts is missing that has to be there, or is none."""
+        nodes = self.root.nodes
+        return "masses" in nodes and all(isinstance(nodes.get(key), Mapping | None) for key in SECTIONS)
 
+    def of_role(self, role: str, word: str) -> Collection[str]:
+        """Return the clocks or links, unused ones first. Raises what is wrong with their section."""
+        section = f"{role}s"
+        node, entries = self.root.nodes.get(section), self.sections.entries
+        if word and node is None:
+            example = "clocks: {haptic: 1 ms}" if role == "clock" else "links: {lan: {clock: network}}"
+            raise fault("E201", self.root.place, f"the topology has no {section} section", hint=example)
+        links = [name for name, entry in entries.items() if entry.section == "links"]
+        known = self.clocks if role == "clock" else links
+        if word and word not in known and not (isinstance(node, Mapping) and node.get(word) is None):
+            raise AlreadyReportedError
+        said = set[str]().union(*(entry.words for entry in entries.values())) if not word else set()
+        return sorted(known, key=lambda name: name in said)
 
-def _read_groups(
-    bodies: MappingType[str, GroupBody],
-    settable: MappingType[str, list[tuple[str, Settable]]],
-    parts: list[Part],
-    clocks: Collection[str],
-    sections: PartSections,
-    numbers: NamedNumbers,
-) -> tuple[SceneGroup, ...]:
-    """Read what each group of peers sets for itself: anything but what is of a link."""
-    own = {name: items for name, items in settable.items() if not sections.is_of_link(name)}
-    places = {part.name: part.groups for part in parts}
+    def is_reported(self, name: str) -> bool:
+        """Return whether `part.parameter` is of a part that is missing for a fault that was reported."""
+        part = re.split(r"[.\[]", name)[0]
+        return part in self.sections.faulty or (not self.complete and part not in self.sections.entries)
 
-    def explained(name: str, place: Place) -> bool:
-        """Return whether it was said why a group can't set `part.parameter`; of a link's, say it here."""
-        if not sections.is_of_link(name):
-            return sections.is_reported(name)
-        link, _, parameter = name.partition(".")
-        sender, receiver = next(iter(bodies)), list(bodies)[-1]
-        hint = f"{link}: {{delays: {{{sender}: {{{receiver}: 12 ms}}}}}}" if parameter == "delay" else ""
-        what = f"{name} is of a link, the same for all peers: a group can't set it"
-        numbers.mistakes.add("E211", place, what, hint=hint)
-        return True
+    def is_of_link(self, name: str) -> bool:
+        """Return whether `part.parameter` is of a link."""
+        entry = self.sections.entries.get(name.partition(".")[0])
+        return entry is not None and entry.section == "links"
 
-    found = []
-    for group in bodies.values():
-        place = group.body.place
-        settings = read_settings(group, own, places, clocks, numbers.read_for, explained, numbers.mistakes)
-        settings = with_followers(settings, parts, numbers.values, numbers.peers, place, numbers.mistakes)
-        found.append(
-            SceneGroup(
-                *(group.name, group.count, settings.values, settings.words, settings.columns, place),
-                counted=group.counted,
-            )
-        )
-    return tuple(found)
+    def explain(self, name: str, place: Place) -> None:
+        """Raise why a group can't set `part.parameter`, if that is known or was reported."""
+        if self.is_of_link(name):
+            link, _, parameter = name.partition(".")
+            example = f"{link}: {{delays: {{{self.groups[0]}: {{{self.groups[-1]}: 12 ms}}}}}}"
+            what = f"{name} is of a link, the same for all peers: a group can't set it"
+            raise fault("E211", place, what, hint=example if parameter == "delay" else "")
+        if self.is_reported(name):
+            raise AlreadyReportedError

@@ -7,114 +7,84 @@ Does not: do it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from fractions import Fraction
 
 from apc.compiler.compiled import Axis, Experiment
-from apc.compiler.components.component import Number, Settable
-from apc.compiler.errors import Mistakes
-from apc.compiler.language.values import Value
-from apc.compiler.source.nodes import Node, Sequence
-from apc.compiler.source.reading import add_unknown, brief, check_keys, form, read_mapping, whole_number
+from apc.compiler.components.component import Number
+from apc.compiler.language.values import AlreadyReportedError
+from apc.compiler.scene.instances import SettableNames
+from apc.compiler.scene.named_numbers import NamedNumbers
+from apc.compiler.source.nodes import Mapping, Node, Sequence
+from apc.compiler.source.reading import Body, brief, fault, form, mapping_of, unknown, whole_number
 
-# What can be set: by the name a person writes, the whole names it stands for.
-SettableNames = Mapping[str, list[tuple[str, Settable]]]
+EXPERIMENT = ("duration", "seed")
+AXES = ("x", "y")
 
 
-def read_experiment(
-    node: Node | None, read_time: Callable[[Node | None, str, str], Value | None], mistakes: Mistakes
-) -> Experiment:
-    """Read `experiment: {duration: 3 s, seed: 1}`.
+def read_experiment(root: Body, numbers: NamedNumbers) -> Experiment:
+    """Read `experiment: {duration: 3 s, seed: 1}`; `numbers` reads the duration, in seconds."""
 
-    Parameters
-    ----------
-    node
-        The section.
-    read_time
-        Reads a duration in seconds; its other arguments say what it is, and in what unit, for messages.
-    mistakes
-        Takes E203 and E207.
-    """
-    section = read_mapping(node, "experiment", mistakes, hint="experiment: {duration: 3 s}")
-    if section is None:
-        return Experiment()
-    section = check_keys(section, ("duration", "seed"), "experiment", mistakes)
-    duration = read_time(section.get("duration"), "duration", "s")
-    if duration is not None and duration.number <= 0:
-        got = str(duration)
-        mistakes.add("E207", duration.place, "duration", expected="more than 0 s", got=got)
-    seed = section.get("seed")
-    number = 0 if seed is None else whole_number(seed)
-    if seed is not None and (number is None or not 0 <= number < 2**63):
-        mistakes.add("E203", seed.place, "seed", expected="a whole number, 0 or more", got=form(seed))
-    return Experiment(duration.number if duration is not None else None, number or 0)
+    def duration(node: Node, what: str) -> Fraction:
+        value = numbers.read_time(node, what, "s")
+        if value.number <= 0:
+            raise fault("E207", value.place, what, "more than 0 s", str(value))
+        return value.number
+
+    def seed(node: Node, what: str) -> int:
+        number = whole_number(node)
+        if number is None or not 0 <= number < 2**63:
+            raise fault("E203", node.place, what, "a whole number, 0 or more", form(node))
+        return number
+
+    section = _section(root, "experiment", EXPERIMENT, "{duration: 3 s}")
+    return Experiment(section.read("duration", duration, None), section.read("seed", seed, 0))
+
+
+def _section(around: Body, key: str, keys: tuple[str, ...], hint: str) -> Body:
+    """Return what stands in a section, which may be missing."""
+    node = around.read(key, lambda node, _: mapping_of(node, key, f"{key}: {hint}"), None)
+    return Body(node or Mapping((), around.place), keys, key, around.mistakes)
 
 
 def read_region(
-    node: Node | None,
-    settable: SettableNames,
-    is_reported: Callable[[str], bool],
-    read_number: Callable[[Node, str, Settable], Value | None],
-    mistakes: Mistakes,
+    root: Body, settable: SettableNames, numbers: NamedNumbers, is_reported: Callable[[str], bool]
 ) -> tuple[Axis, ...]:
     """Read `studies: {region: {x: {contact.stiffness: [0 N/m, 5000 N/m]}, y: …}}`.
 
     Parameters
     ----------
-    node
-        The section `studies`.
+    root
+        The topology.
     settable
         What can be set, by the name a person writes.
+    numbers
+        Reads a value of a parameter.
     is_reported
         Whether a name's part was reported as faulty, so that its absence needs no message.
-    read_number
-        Reads a value of a parameter.
-    mistakes
-        Where faults go.
     """
-    section = read_mapping(node, "studies", mistakes, hint="studies: {region: {x: …, y: …}}")
-    if section is None:
-        return ()
-    section = check_keys(section, ("region",), "studies", mistakes)
-    region = read_mapping(section.get("region"), "region", mistakes, hint="region: {x: …, y: …}")
-    if region is None:
-        return ()
-    region = check_keys(region, ("x", "y"), "region", mistakes)
-    axes = (_axis(key, region.get(key), settable, is_reported, read_number, mistakes) for key in ("x", "y"))
-    return tuple(axis for axis in axes if axis is not None)
 
-
-def _axis(
-    key: str,
-    node: Node | None,
-    settable: SettableNames,
-    is_reported: Callable[[str], bool],
-    read_number: Callable[[Node, str, Settable], Value | None],
-    mistakes: Mistakes,
-) -> Axis | None:
-    hint = f"{key}: {{contact.stiffness: [0 N/m, 5000 N/m]}}"
-    body = read_mapping(node, key, mistakes, hint=hint)
-    if body is None:
-        return None
-    if len(body.entries) != 1:
-        mistakes.add("E203", body.place, key, expected="one parameter and its range", hint=hint)
-        return None
-    name, span = body.entries[0]
-    if not (isinstance(span, Sequence) and len(span.items) == 2):
-        got = form(span)
-        mistakes.add("E203", span.place, name.text, expected="a list of two values", got=got, hint=hint)
-        return None
-    items = settable.get(name.text)
-    if not items or not isinstance(items[0][1], Number):
-        if not is_reported(name.text):
+    def axis(node: Node, key: str) -> Axis:
+        hint = f"{key}: {{contact.stiffness: [0 N/m, 5000 N/m]}}"
+        body = mapping_of(node, key, hint)
+        if len(body.entries) != 1:
+            raise fault("E203", body.place, key, "one parameter and its range", hint=hint)
+        name, span = body.entries[0]
+        if not (isinstance(span, Sequence) and len(span.items) == 2):
+            raise fault("E203", span.place, name.text, "a list of two values", form(span), hint)
+        known = {known: items[0][1] for known, items in settable.items() if isinstance(items[0][1], Number)}
+        if name.text not in known:
+            if is_reported(name.text):
+                raise AlreadyReportedError
             what = f"{key} names {brief(name.text)}, which is no parameter of a part"
-            known = [known for known, found in settable.items() if isinstance(found[0][1], Number)]
-            add_unknown("E206", name.place, what, name.text, known, mistakes)
-        return None
-    low, high = (read_number(item, name.text, items[0][1]) for item in span.items)
-    if low is None or high is None:
-        return None
-    if low.number >= high.number:
-        what, got = f"the range of {name.text}", f"{low} to {high}"
-        mistakes.add("E207", span.place, what, expected="its lower end first", got=got)
-        return None
-    return Axis(name.text, low.number, high.number)
+            raise unknown("E206", name.place, what, name.text, known)
+        low, high = (numbers.read_for(item, name.text, known[name.text]) for item in span.items)
+        if low.number >= high.number:
+            what = f"the range of {name.text}"
+            raise fault("E207", span.place, what, "its lower end first", f"{low} to {high}")
+        return Axis(name.text, low.number, high.number)
+
+    studies = _section(root, "studies", ("region",), "{region: {x: …, y: …}}")
+    region = _section(studies, "region", AXES, "{x: …, y: …}")
+    axes = (region.read(key, axis, None) for key in AXES)
+    return tuple(axis for axis in axes if axis is not None)

@@ -2,15 +2,14 @@
 
 Takes: a text and its lines. Gives: `compose`, the root node.
 Guarantees: scalars read by YAML 1.2's core schema (`on`, `no`, `1:30` are words); keys are scalars, unique in
-their mapping; depth and the number of nodes are bounded; nothing recurses and nothing is constructed.
+their mapping; depth and the number of nodes are bounded, and nothing is constructed.
 Does not: read files, or know what any key means.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import yaml
@@ -25,12 +24,10 @@ MAX_DEPTH = 64  # levels of nesting; a scene needs about six
 MAX_NODES = 100_000  # after aliases are expanded
 MAX_NUMBER = 400  # characters of a scalar still tried as a number: Python refuses an integer of 4300 digits
 
-
 _CORE = "tag:yaml.org,2002:"
 _INTEGER = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
-_WHOLE = re.compile(r"[-+]?[0-9]+")
-_DIGITS = re.compile(r"[0-9]+")
+_COMMA = re.compile(r"([-+]?[0-9]+),([0-9]+)(.*)", re.DOTALL)
 _WORDS: dict[str, bool | float | None] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL")),
     **dict.fromkeys(("true", "True", "TRUE"), True),
@@ -38,25 +35,16 @@ _WORDS: dict[str, bool | float | None] = {
     **{sign + word: float(sign + "inf") for sign in ("", "+", "-") for word in (".inf", ".Inf", ".INF")},
     **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
 }
+_TAGGED = {"null": (type(None),), "bool": (bool,), "int": (int,), "float": (int, float)}
 
 
 def _core_value(text: str) -> bool | int | float | str | None:
     """Resolve a plain scalar; source: YAML 1.2.2, section 10.3.2."""
     if text in _WORDS:
         return _WORDS[text]
-    if len(text) > MAX_NUMBER:
-        return text
-    if _INTEGER.fullmatch(text):
+    if len(text) <= MAX_NUMBER and _INTEGER.fullmatch(text):
         return int(text, {"0o": 8, "0x": 16}.get(text[:2], 10))
-    return float(text) if _FLOAT.fullmatch(text) else text
-
-
-_TAGGED: dict[str, tuple[type, ...]] = {
-    "null": (type(None),),
-    "bool": (bool,),
-    "int": (int,),
-    "float": (int, float),
-}
+    return float(text) if len(text) <= MAX_NUMBER and _FLOAT.fullmatch(text) else text
 
 
 def compose(text: str, lines: Lines) -> Node:
@@ -69,172 +57,135 @@ def compose(text: str, lines: Lines) -> Node:
         E113 a tag, E114 an alias without end or without anchor, E115 nested too deep, E116 a merge key,
         E117 too many nodes.
     """
-    return _Composer(lines).build(text)
+    composer = _Composer(text, lines)
+    root: Node | None = None
+    try:
+        for event in composer.events:
+            if isinstance(event, yaml.DocumentStartEvent):
+                if root is not None:
+                    place, got = lines.of(event.start_mark), "the start of a second one"
+                    composer.mistakes.add("E110", place, "a file", expected="one YAML document", got=got)
+                    break
+                root = composer.tree(next(composer.events), 1).node
+    except yaml.MarkedYAMLError as error:
+        composer.mistakes.take(ApcError(not_yaml(error, lines)))
+    except yaml.YAMLError as error:
+        composer.mistakes.add("E109", Place(lines.file), f"this is not YAML: {error}")
+    composer.mistakes.raise_if_any()
+    if root is None or (isinstance(root, Scalar) and root.plain and not root.text):
+        raise ApcError(Mistake("E108", Place(lines.file), "this file is empty"))
+    return root
 
 
-@dataclass(slots=True)
-class _Open:
-    """A collection whose end has not come yet."""
+@dataclass(frozen=True, slots=True)
+class _Tree:
+    """A node, where it or the alias of it stands, how many nodes it holds, and how many levels."""
 
-    mapping: bool
+    node: Node
     place: Place
-    anchor: str | None
-    nodes: list[Node] = field(default_factory=list)  # of a mapping: key, value, key, value, …
-    seen: dict[str, Place] = field(default_factory=dict)
     size: int = 1
     height: int = 1
 
 
-@dataclass(frozen=True, slots=True)
-class _Anchored:
-    """A finished node with an anchor: how many nodes it stands for, and how many levels."""
-
-    node: Node
-    size: int
-    height: int
-
-
 class _Composer:
-    """Builds the tree from YAML's events on a stack of its own."""
+    """Builds trees from YAML's events; mistakes that leave the rest readable are collected."""
 
-    def __init__(self, lines: Lines) -> None:
+    def __init__(self, text: str, lines: Lines) -> None:
+        # The C parser, where PyYAML has it, is about ten times faster.
+        self.events: Any = yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         self.lines = lines
         self.mistakes = Mistakes()
-        self.stack: list[_Open] = []
-        self.anchors: dict[str, _Anchored | None] = {}  # None: not finished yet
-        self.root: Node | None = None
+        self.anchors: dict[str, _Tree | None] = {}  # None: not finished yet
         self.nodes = 0
 
-    def build(self, text: str) -> Node:
-        """Return the root; mistakes that leave the rest readable are raised together at the end."""
-        documents = 0
-        try:
-            for event in _events(text):
-                if isinstance(event, yaml.DocumentStartEvent):
-                    documents += 1
-                    if documents > 1:
-                        place = self.lines.of(event.start_mark)
-                        got = "the start of a second one"
-                        self.mistakes.add("E110", place, "a file", expected="one YAML document", got=got)
-                        break
-                else:
-                    self._take(event)
-        except yaml.MarkedYAMLError as error:
-            self.mistakes.take(ApcError(not_yaml(error, self.lines)))
-        except yaml.YAMLError as error:
-            self.mistakes.add("E109", Place(self.lines.file), f"this is not YAML: {error}")
-        self.mistakes.raise_if_any()
-        root = self.root
-        if root is None or (isinstance(root, Scalar) and root.plain and not root.text):
-            raise ApcError(Mistake("E108", Place(self.lines.file), "this file is empty"))
-        return root
-
-    def _take(self, event: Any) -> None:
-        """Put one event into the tree."""
-        match event:
-            case yaml.AliasEvent():
-                self._alias(event)
-            case yaml.ScalarEvent():
-                place = self.lines.of(event.start_mark)
-                plain = not event.style
-                self._add(Scalar(event.value, self._value(event, place), plain, place), event.anchor, 1, 1)
-            case yaml.SequenceStartEvent() | yaml.MappingStartEvent():
-                self._start(event)
-            case yaml.SequenceEndEvent() | yaml.MappingEndEvent():
-                self._end(self.stack.pop())
-
-    def _start(self, event: Any) -> None:
+    def tree(self, event: Any, depth: int) -> _Tree:
+        """Return the tree that starts with an event, at a depth counted from 1."""
         place = self.lines.of(event.start_mark)
-        mapping = isinstance(event, yaml.MappingStartEvent)
-        if event.tag not in (None, "!", _CORE + ("map" if mapping else "seq")):
-            self._refuse_tag(event.tag, place)
-        if len(self.stack) >= MAX_DEPTH:
-            self._give_up("E115", place, f"this is nested deeper than {MAX_DEPTH} levels")
+        if isinstance(event, yaml.AliasEvent):
+            tree = self.alias(event.anchor or "", place, depth)
+            self.count(tree.size, place)
+            return tree
+        if isinstance(event, yaml.ScalarEvent):
+            tree = _Tree(Scalar(event.value, self.value(event, place), not event.style, place), place)
+        else:
+            tree = self.collection(event, place, depth)
+        self.count(1, place)
+        if event.anchor is not None:
+            self.anchors[event.anchor] = tree
+        return tree
+
+    def count(self, nodes: int, place: Place) -> None:
+        self.nodes += nodes
+        if self.nodes > MAX_NODES:
+            self.give_up("E117", place, f"this file has more than {MAX_NODES} nodes, aliases written out")
+
+    def collection(self, event: Any, place: Place, depth: int) -> _Tree:
+        is_mapping = isinstance(event, yaml.MappingStartEvent)
+        if event.tag not in (None, "!", _CORE + ("map" if is_mapping else "seq")):
+            self.refuse_tag(event.tag, place)
+        self.check_depth(depth, place)
         if event.anchor is not None:
             self.anchors[event.anchor] = None
-        self.stack.append(_Open(mapping, place, event.anchor))
-
-    def _end(self, done: _Open) -> None:
-        node: Node
-        if done.mapping:
-            pairs = zip(done.nodes[::2], done.nodes[1::2], strict=True)
+        trees: list[_Tree] = []  # of a mapping: key, value, key, value, …
+        seen: dict[str, Place] = {}
+        while not isinstance(event := next(self.events), yaml.CollectionEndEvent):
+            tree = self.tree(event, depth + 1)
+            if is_mapping and len(trees) % 2 == 0:
+                self.check_key(tree.node, seen, tree.place)
+            trees.append(tree)
+        nodes = tuple(tree.node for tree in trees)
+        node: Node = Sequence(nodes, place)
+        if is_mapping:
             # A key that is no scalar has been reported; it is left out so that the rest can be read.
-            entries = tuple((key, value) for key, value in pairs if isinstance(key, Scalar))
-            self._check_entries(entries)
-            node = Mapping(entries, done.place)
-        else:
-            node = Sequence(tuple(done.nodes), done.place)
-        self._add(node, done.anchor, done.size, done.height)
+            pairs = zip(nodes[::2], nodes[1::2], strict=True)
+            node = Mapping(tuple((key, value) for key, value in pairs if isinstance(key, Scalar)), place)
+            self.check_entries(node)
+        size = 1 + sum(tree.size for tree in trees)
+        return _Tree(node, place, size, 1 + max((tree.height for tree in trees), default=0))
 
-    def _check_entries(self, entries: tuple[tuple[Scalar, Node], ...]) -> None:
+    def check_depth(self, depth: int, place: Place) -> None:
+        if depth > MAX_DEPTH:
+            self.give_up("E115", place, f"this is nested deeper than {MAX_DEPTH} levels")
+
+    def check_entries(self, mapping: Mapping) -> None:
         """Record a decimal comma, which ends a value, and a key without its colon."""
         before: tuple[Scalar, Node] | None = None
-        for key, node in entries:
+        for key, node in mapping.entries:
             if isinstance(node, Scalar) and node.value is None and not node.text and key.plain:
-                given = before[1] if before is not None else None
-                if key.text[:1].isdigit() and isinstance(given, Scalar) and _WHOLE.fullmatch(given.text):
-                    assert before is not None
-                    name, number = before[0].text, f"{given.text},{key.text}"
-                    digits = _DIGITS.match(key.text)
-                    assert digits is not None
-                    hint = either_comma(name, given.text, digits[0], key.text[digits.end() :])
-                    self.mistakes.add(
-                        "E203", given.place, name, expected="a decimal point", got=number, hint=hint
-                    )
+                given = before[1] if before and isinstance(before[1], Scalar) else None
+                if before and given and (number := _COMMA.fullmatch(f"{given.text},{key.text}")):
+                    name, hint = before[0].text, either_comma(before[0].text, *number.groups())
+                    expected, got = "a decimal point", number[0]
+                    self.mistakes.add("E203", given.place, name, expected=expected, got=got, hint=hint)
                 elif line := with_colon(key.text):
                     self.mistakes.add("E109", key.place, NO_COLON, hint=line)
             before = key, node
 
-    def _alias(self, event: Any) -> None:
-        place, name = self.lines.of(event.start_mark), event.anchor
+    def alias(self, name: str, place: Place, depth: int) -> _Tree:
         if name not in self.anchors:
             close = nearest(name, self.anchors)
-            hint = f"*{close}" if close else ""
-            self._give_up("E114", place, f"*{name} has no &{name} before it", hint)
-        target = self.anchors[name]
-        if target is None:
-            self._give_up("E114", place, f"*{name} stands inside what it repeats: it would never end")
-        if len(self.stack) + target.height - 1 > MAX_DEPTH:
-            self._give_up("E115", place, f"this is nested deeper than {MAX_DEPTH} levels")
-        self._add(target.node, None, target.size, target.height, at=place)
+            self.give_up("E114", place, f"*{name} has no &{name} before it", f"*{close}" if close else "")
+        tree = self.anchors[name]
+        if tree is None:
+            self.give_up("E114", place, f"*{name} stands inside what it repeats: it would never end")
+        self.check_depth(depth + tree.height - 2, place)
+        return _Tree(tree.node, place, tree.size, tree.height)
 
-    def _add(
-        self, node: Node, anchor: str | None, size: int, height: int, *, at: Place | None = None
-    ) -> None:
-        """Give a finished node to the collection it stands in; `at` is where an alias stands."""
-        place = at or node.place
-        # Leaves and aliases are counted once here; a collection's own nodes were counted as they came.
-        self.nodes += size if at or isinstance(node, Scalar) else 1
-        if self.nodes > MAX_NODES:
-            self._give_up("E117", place, f"this file has more than {MAX_NODES} nodes, aliases written out")
-        if anchor is not None:
-            self.anchors[anchor] = _Anchored(node, size, height)
-        if not self.stack:
-            self.root = node
-            return
-        parent = self.stack[-1]
-        if parent.mapping and len(parent.nodes) % 2 == 0:
-            self._check_key(node, parent, place)
-        parent.nodes.append(node)
-        parent.size += size
-        parent.height = max(parent.height, height + 1)
-
-    def _check_key(self, key: Node, parent: _Open, place: Place) -> None:
-        if not isinstance(key, Scalar):
-            kind = "a mapping" if isinstance(key, Mapping) else "a list"
-            self.mistakes.add("E112", place, "a key", expected="a name", got=kind)
-        elif not key.text:
-            self.mistakes.add("E112", place, "a key", expected="a name", got="nothing")
+    def check_key(self, key: Node, seen: dict[str, Place], place: Place) -> None:
+        if not isinstance(key, Scalar) or not key.text:
+            got = "nothing" if isinstance(key, Scalar) else "a list"
+            got = "a mapping" if isinstance(key, Mapping) else got
+            self.mistakes.add("E112", place, "a key", expected="a name", got=got)
         elif key.plain and key.text == "<<":
             hint = "the keys themselves, or an alias as the value of a key"
             self.mistakes.add("E116", place, "the merge key << is not part of this language", hint=hint)
-        elif key.text in parent.seen:
-            first = parent.seen[key.text].line
-            self.mistakes.add("E111", place, f"{_shown(key.text)} stands twice, first in line {first}")
+        elif key.text in seen:
+            first = seen[key.text].line
+            self.mistakes.add("E111", place, f"{cut(key.text)!r} stands twice, first in line {first}")
         else:
-            parent.seen[key.text] = place
+            seen[key.text] = place
 
-    def _value(self, event: Any, place: Place) -> bool | int | float | str | None:
+    def value(self, event: Any, place: Place) -> bool | int | float | str | None:
         tag = event.tag
         if tag in (None, "!", _CORE + "str"):
             # "!" and !!str say: text, whatever it looks like.
@@ -242,30 +193,19 @@ class _Composer:
             return str(event.value) if text_only else _core_value(event.value)
         value = _core_value(event.value)
         name = tag.removeprefix(_CORE)
-        if name not in _TAGGED or not tag.startswith(_CORE):
-            self._refuse_tag(tag, place)
+        if name not in _TAGGED or name == tag:
+            self.refuse_tag(tag, place)
         elif type(value) not in _TAGGED[name]:
-            self.mistakes.add("E113", place, f"!!{name}", expected="such a value", got=_shown(event.value))
+            got = repr(cut(event.value))
+            self.mistakes.add("E113", place, f"!!{name}", expected="such a value", got=got)
         return float(value) if name == "float" and type(value) is int else value
 
-    def _refuse_tag(self, tag: str, place: Place) -> None:
+    def refuse_tag(self, tag: str, place: Place) -> None:
         shown = "!!" + tag.removeprefix(_CORE) if tag.startswith(_CORE) else tag
-        self.mistakes.add("E113", place, f"the tag {_shown(shown)} is not part of this language")
+        self.mistakes.add("E113", place, f"the tag {cut(shown)!r} is not part of this language")
 
-    def _give_up(self, code: str, place: Place, what: str, hint: str = "") -> NoReturn:
+    def give_up(self, code: str, place: Place, what: str, hint: str = "") -> NoReturn:
         """Raise at once, with what was found before: reading on would mislead, or not end."""
         self.mistakes.add(code, place, what, hint=hint)
         self.mistakes.raise_if_any()
         raise AssertionError("a mistake was added")
-
-
-def _events(text: str) -> Iterator[Any]:
-    """Return YAML's events, by the C parser where PyYAML has it (about ten times faster)."""
-    loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    events: Iterator[Any] = yaml.parse(text, Loader=loader)
-    return events
-
-
-def _shown(text: str) -> str:
-    """Return a text short enough for a message, in quotes."""
-    return repr(cut(text))

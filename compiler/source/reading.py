@@ -1,17 +1,23 @@
-"""Reads typed values out of YAML nodes, recording a mistake where a node is not what it should be.
+"""Reads typed values out of YAML nodes; a node that is not what it should be raises what to write instead.
 
-Takes: nodes of the stage `source`. Gives: texts, mappings, entries.
-Guarantees: a node of the wrong form adds one mistake and yields None, so that reading goes on.
+Takes: nodes of the stage `source`. Gives: texts, names, numbers and lists of nodes; `Body`, a mapping that is
+read key by key.
+Guarantees: a node of the wrong form is one mistake, an `ApcError` that `with mistakes:` records, so that
+reading goes on behind it.
 Does not: know any section, component or unit.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Container
+from typing import TypeVar
 
-from apc.compiler.errors import Mistakes, Place, nearest, visible
+from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, nearest, visible
 from apc.compiler.source.nodes import Mapping, Node, Scalar, Sequence
+
+T = TypeVar("T")
+D = TypeVar("D")
 
 IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}\Z")
 
@@ -40,60 +46,47 @@ def brief(text: str) -> str:
     return visible(flat if len(flat) <= 60 else flat[:57] + "...")
 
 
-def read_mapping(node: Node | None, what: str, mistakes: Mistakes, *, hint: str = "") -> Mapping | None:
-    """Return the node when it is a mapping.
+def fault(code: str, place: Place, what: str, expected: str = "", got: str = "", hint: str = "") -> ApcError:
+    """Return one mistake to raise, its parts as `Mistake` has them."""
+    return ApcError(Mistake(code, place, what, expected, got, hint))
+
+
+def mapping_of(node: Node, what: str, hint: str = "") -> Mapping:
+    """Return a node that is a mapping.
 
     Parameters
     ----------
     node
-        What to read; None gives None.
+        What to read.
     what
         What it is the value of, for a message.
-    mistakes
-        Takes E203 when it is none.
     hint
         The line to write instead.
+
+    Raises
+    ------
+    ApcError
+        E203 if it is none.
     """
-    if node is None or isinstance(node, Mapping):
+    if isinstance(node, Mapping):
         return node
-    mistakes.add("E203", node.place, what, expected="a mapping of keys to values", got=form(node), hint=hint)
-    return None
+    raise fault("E203", node.place, what, "a mapping of keys to values", form(node), hint)
 
 
-def read_text(node: Node | None, what: str, mistakes: Mistakes, *, hint: str = "") -> str | None:
-    """Return the text of a scalar that isn't empty.
-
-    Parameters
-    ----------
-    node, what, mistakes, hint
-        As for `read_mapping`.
-    """
-    if node is None:
-        return None
+def text_of(node: Node, what: str, hint: str = "") -> str:
+    """Return the text of a scalar that isn't empty; arguments and error as for `mapping_of`."""
     if isinstance(node, Scalar) and node.text.strip() and node.value is not None:
         return node.text
-    mistakes.add("E203", node.place, what, expected="a single value", got=form(node), hint=hint)
-    return None
+    raise fault("E203", node.place, what, "a single value", form(node), hint)
 
 
-def listed(node: Node, what: str, size: int, one: str, mistakes: Mistakes) -> tuple[Node, ...] | None:
-    """Return the items of a list that has as many as a vector has entries.
-
-    Parameters
-    ----------
-    node, what, mistakes
-        As for `read_mapping`.
-    size
-        How many there must be.
-    one
-        An item to show in a message.
-    """
+def list_of(node: Node, what: str, size: int, item: str) -> tuple[Node, ...]:
+    """Return the items of a list with `size` of them; `item` is one to show in a message. Raises E203."""
     if isinstance(node, Sequence) and len(node.items) == size:
         return node.items
     got = f"{len(node.items)}" if isinstance(node, Sequence) else form(node)
-    hint = f"{what}: [{', '.join([one] * size)}]"
-    mistakes.add("E203", node.place, what, expected=f"a list of {size} values", got=got, hint=hint)
-    return None
+    hint = f"{what}: [{', '.join([item] * size)}]"
+    raise fault("E203", node.place, what, f"a list of {size} values", got, hint)
 
 
 def whole_number(node: Node) -> int | None:
@@ -102,55 +95,75 @@ def whole_number(node: Node) -> int | None:
     return value if isinstance(value, int) and not isinstance(value, bool) else None
 
 
-def read_name(node: Scalar, what: str, mistakes: Mistakes) -> str | None:
-    """Return the text of a scalar that can serve as a name: a letter, then letters, digits, underscores."""
-    if IDENTIFIER.match(node.text):
-        return node.text
-    mistakes.add(
-        "E205",
-        node.place,
-        f"the name of {what}",
-        expected="a letter followed by letters, digits or underscores (63 at most)",
-        got=brief(node.text) or "nothing",
-    )
-    return None
-
-
-def check_keys(mapping: Mapping, allowed: Collection[str], what: str, mistakes: Mistakes) -> Mapping:
-    """Record every key that isn't allowed, with the nearest allowed one.
+def name_of(
+    key: Scalar, what: str, taken: Container[str] = (), whole: str = "", words: Container[str] = ()
+) -> str:
+    """Return the text of a scalar that can serve as a name: a letter, then letters, digits, underscores.
 
     Parameters
     ----------
-    mapping
-        What to check.
-    allowed
-        The keys it may have.
-    what
-        What it is, for a message.
-    mistakes
-        Takes E202 for each other key.
+    key, what
+        The scalar, and what it names, for a message.
+    taken, whole
+        The names that are used already, and in what.
+    words
+        The words of the language, which can't be names.
 
-    Returns
-    -------
-    The mapping as it was meant: a misspelt key reads as the one nearest to it, so that one slip is not
-    reported a second time as something missing.
+    Raises
+    ------
+    ApcError
+        E205 if it can't.
     """
-    meant: dict[str, tuple[Scalar, Node]] = {key.text: (key, node) for key, node in mapping.entries}
-    for key, node in mapping.entries:
-        if key.text not in allowed:
-            told = f"{what} has no key {brief(key.text)}"
-            left = [one for one in allowed if one not in meant]  # what stands there already was not meant
-            close = nearest(key.text, left)
-            add_unknown("E202", key.place, told, close, [close] if close else allowed, mistakes)
-            if close and close not in meant:
-                meant[close] = (Scalar(close, close, key.plain, key.place), node)
-    return Mapping(tuple(meant.values()), mapping.place)
+    name = key.text
+    if not IDENTIFIER.match(name):
+        expected = "a letter followed by letters, digits or underscores (63 at most)"
+        raise fault("E205", key.place, f"the name of {what}", expected, brief(name) or "nothing")
+    if name in words:
+        raise fault("E205", key.place, f"{name} is a word of the language and can't be a name")
+    if name in taken:
+        raise fault("E205", key.place, f"the name {name} is used twice in {whole}")
+    return name
 
 
-def add_unknown(
-    code: str, place: Place, what: str, name: str, known: Collection[str], mistakes: Mistakes
-) -> None:
-    """Record an unknown name, with the nearest known one or, failing that, a list of them.
+class Body:
+    """A mapping that is read key by key; a value at fault is recorded and reads as one that isn't there.
+
+    A key that isn't allowed is recorded, with the nearest allowed one, and reads as the one it was meant to
+    be, so that one slip is not reported a second time as something missing.
+    """
+
+    def __init__(self, node: Mapping, allowed: Collection[str], what: str, mistakes: Mistakes) -> None:
+        """Take a mapping, the keys it may have, what it is, for messages, and what takes E202 for others."""
+        self.place = node.place
+        self.mistakes = mistakes
+        self.nodes = {key.text: value for key, value in node.entries}
+        for key, value in node.entries:
+            if key.text not in allowed:
+                left = [known for known in allowed if known not in self.nodes]  # what is there was meant
+                close = nearest(key.text, left)
+                told = f"{what} has no key {brief(key.text)}"
+                mistakes.take(unknown("E202", key.place, told, close, [close] if close else allowed))
+                if close:
+                    self.nodes.setdefault(close, value)
+
+    def read(self, key: str, reader: Callable[[Node, str], T], default: D) -> T | D:
+        """Return what a reader makes of the value of a key, which it takes with the key."""
+        if (node := self.nodes.get(key)) is not None:
+            with self.mistakes:
+                return reader(node, key)
+        return default
+
+    def text(self, key: str, hint: str = "") -> str:
+        """Return the text of a key, empty without one."""
+        return self.read(key, lambda node, _: text_of(node, key, hint), "")
+
+    def section(self, key: str, hint: str) -> tuple[tuple[Scalar, Node], ...]:
+        """Return the entries of the mapping that a key has; `hint` is what to write instead of another."""
+        return self.read(key, lambda node, _: mapping_of(node, key, f"{key}: {hint}").entries, ())
+
+
+def unknown(code: str, place: Place, what: str, name: str, known: Collection[str]) -> ApcError:
+    """Return the mistake of an unknown name, with the nearest known one or, failing that, a list of them.
 
     Parameters
     ----------
@@ -160,20 +173,43 @@ def add_unknown(
         The name as written.
     known
         The names there are.
-    mistakes
-        Takes the mistake.
     """
     close = nearest(name, known)
     if close:
-        mistakes.add(code, place, f"{what}; the nearest is {close}", hint=close)
-    elif known:
-        listed = ", ".join(list(known)[:12]) + (", …" if len(known) > 12 else "")
-        mistakes.add(code, place, f"{what}; there are: {listed}")
-    else:
-        mistakes.add(code, place, f"{what}; there is none")
+        return fault(code, place, f"{what}; the nearest is {close}", hint=close)
+    listed = ", ".join(list(known)[:12]) + (", …" if len(known) > 12 else "")
+    return fault(code, place, f"{what}; there are: {listed}" if listed else f"{what}; there is none")
 
 
-def entries(mapping: Mapping | None) -> Iterator[tuple[Scalar, Node]]:
-    """Yield the entries of a mapping that may be missing."""
-    if mapping is not None:
-        yield from mapping.entries
+def among(name: str, known: Collection[str], place: Place, what: str, code: str = "E206") -> str:
+    """Return a name that is known.
+
+    Parameters
+    ----------
+    name, known
+        The name as written, and the names there are.
+    place, what, code
+        Where it stands, what is wrong with another, whose name takes the place of `{}`, and the code of that.
+
+    Raises
+    ------
+    ApcError
+        The name is not known.
+    """
+    if name in known:
+        return name
+    raise unknown(code, place, what.replace("{}", brief(name)), name, known)
+
+
+def read_text(node: Node | None, what: str, mistakes: Mistakes, *, hint: str = "") -> str | None:
+    """Return the text of a scalar as `text_of`; None without one, whose fault is recorded."""
+    with mistakes:
+        return None if node is None else text_of(node, what, hint)
+    return None
+
+
+def add_unknown(
+    code: str, place: Place, what: str, name: str, known: Collection[str], mistakes: Mistakes
+) -> None:
+    """Record an unknown name; the arguments are those of `unknown`."""
+    mistakes.take(unknown(code, place, what, name, known))

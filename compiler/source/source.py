@@ -1,13 +1,12 @@
 """A file, or its bytes, to the YAML nodes in it.
 
-Takes: a path, or bytes. Gives: `Source`: the text, its digest and its tree of nodes (see `nodes`).
+Takes: a path, or bytes. Gives: `Source`: the text and its tree of nodes (see `nodes`).
 Guarantees: a regular file of bounded size (see `files`), UTF-8 without control characters, one YAML document.
 Does not: know what a topology is, or what any key means.
 """
 
 from __future__ import annotations
 
-import hashlib
 import re
 import unicodedata
 from dataclasses import dataclass
@@ -21,12 +20,11 @@ from apc.compiler.source.nodes import MAX_BYTES, Lines, Node
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A text that was read: `file` is its name in messages, `digest` the SHA-256 of its bytes (hex)."""
+    """A text that was read: `file` is its name in messages."""
 
     file: str
     path: Path | None
     text: str
-    digest: str
     root: Node
 
 
@@ -58,14 +56,12 @@ def _not_read(path: Path, place: Place, refused: RefusedError) -> Mistake:
     match refused.why:
         case "missing":
             return Mistake("E101", place, _missing(path))
-        case "folder":
-            return Mistake("E102", place, "this", "a YAML file", "a folder")
-        case "special":
-            return Mistake("E104", place, "this", "a YAML file", refused.words.removeprefix("is "))
+        case "folder" | "special":
+            code = "E102" if refused.why == "folder" else "E104"
+            return Mistake(code, place, "this", "a YAML file", refused.words.removeprefix("is "))
         case "large":
             return _too_large(place)
-        case _:
-            return Mistake("E103", place, f"this file {refused.words}")
+    return Mistake("E103", place, f"this file {refused.words}")
 
 
 def _too_large(place: Place) -> Mistake:
@@ -99,7 +95,7 @@ def parse_source(data: bytes, *, file: str, path: Path | None = None) -> Source:
     lines = Lines(file, text)
     _refuse_control_characters(text, lines)
     root = compose(text, lines)
-    return Source(file, path, text, hashlib.sha256(data).hexdigest(), root)
+    return Source(file, path, text, root)
 
 
 def _missing(path: Path) -> str:

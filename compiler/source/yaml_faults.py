@@ -72,25 +72,26 @@ def _line_above(line: int, lines: Lines) -> int:
 
 
 def _without_colon(line: int, lines: Lines) -> Mistake | None:
-    """Return what is told of a line whose key has no colon; None if it has one."""
-    text = lines.lines[line].partition(" #")[0] if 0 <= line < len(lines.lines) else ""
-    stripped = text.strip()
-    found = _KEY_ONLY.fullmatch(stripped)
-    if bracket := _OPENED.match(stripped):
-        found, stripped = bracket, f"{bracket[1]} {stripped[bracket.end() - 1 :]}"
-    elif found is None or ": " in stripped or stripped.endswith(":") or stripped.startswith("- "):
+    """Return the mistake of a line whose key has no colon; None if it has one."""
+    text, place = _code(line, lines)
+    match = _KEY_ONLY.fullmatch(text)
+    if bracket := _OPENED.match(text):
+        text = f"{bracket[1]} {text[bracket.end() - 1 :]}"
+    elif match is None or ": " in text or text.endswith(":") or text.startswith("- "):
         return None
-    place = lines.place(line, len(text) - len(text.lstrip()))
-    return Mistake("E109", place, NO_COLON, hint=with_colon(stripped) or f"{stripped}:")
+    return Mistake("E109", place, NO_COLON, hint=with_colon(text) or f"{text}:")
 
 
 def _item_among_keys(line: int, lines: Lines) -> Mistake | None:
-    """Return what is told of a line that is an item where keys stand around it; None if it is none."""
+    """Return the mistake of a line that is an item where keys stand around it; None if it is none."""
+    text, place = _code(line, lines)
+    return Mistake("E109", place, AMONG_KEYS, hint=text[2:].strip()) if text.startswith("- ") else None
+
+
+def _code(line: int, lines: Lines) -> tuple[str, Place]:
+    """Return a line without its indent and comment, and where it starts; an empty text where none is."""
     text = lines.lines[line].partition(" #")[0] if 0 <= line < len(lines.lines) else ""
-    if not text.lstrip().startswith("- "):
-        return None
-    place = lines.place(line, len(text) - len(text.lstrip()))
-    return Mistake("E109", place, AMONG_KEYS, hint=text.strip().removeprefix("- ").strip())
+    return text.strip(), lines.place(line, len(text) - len(text.lstrip()))
 
 
 def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Mistake:

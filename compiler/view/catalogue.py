@@ -19,7 +19,7 @@ from apc.compiler.cache import SUFFIX, builtin_files
 from apc.compiler.components.component import Component, Connector, Number, Option, Parameter
 from apc.compiler.components.library import Library
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.compiler.language.vectors import whole_and_index
+from apc.compiler.language.vectors import by_vector
 from apc.compiler.pipeline import run_stages
 from apc.compiler.scene.scene import Scene
 from apc.compiler.source.nodes import Mapping, Scalar
@@ -109,15 +109,13 @@ def component_document(name: str) -> dict[str, Any]:
     }
     if isinstance(found, Connector):
         return facts
-    wholes: dict[str, list[Parameter]] = {}
-    for one in found.parameters:
-        wholes.setdefault(whole_and_index(one.name)[0], []).append(one)
+    vectors = by_vector(found.parameters, lambda parameter: parameter.name)
     return {
         **facts,
         "kind": "component",
         "source": found.source,
         "connectors": {own: kind.name for own, kind in found.connectors},
-        "parameters": [_parameter(own, entries) for own, entries in wholes.items()],
+        "parameters": [_parameter(own, entries) for own, entries in vectors.items()],
         "equations": list(dict.fromkeys(one.text for one in found.equations)),
     }
 
@@ -141,13 +139,13 @@ def _parameter(name: str, entries: list[Parameter]) -> dict[str, str]:
 
 def _definitions(name: str) -> dict[str, str]:
     """Return the texts that define something: its own, then that of what it extends, by name."""
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     while name:
-        source = read_source(path := builtin_files()[name])
-        found[name] = path.read_text(encoding="utf-8").rstrip()
+        source = read_source(builtin_files()[name])
+        texts[name] = source.text.rstrip()
         base = source.root.get("extends") if isinstance(source.root, Mapping) else None
         name = base.text if isinstance(base, Scalar) else ""
-    return found
+    return texts
 
 
 # ---- scenes ----
@@ -186,4 +184,4 @@ def tables_of(scene: Path) -> tuple[Path, ...]:
     """Return the files that a topology names from its folder."""
     built = run_stages(scene, until="scene")
     assert isinstance(built, Scene)
-    return tuple(scene.parent / name for name, _ in built.texts)
+    return tuple(scene.parent / name for name in built.texts)

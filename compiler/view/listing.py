@@ -17,16 +17,16 @@ from pathlib import Path
 from typing import Any
 
 from apc.compiler.compiled import CompiledSystem, Kind
-from apc.compiler.equations.clocks import ClockedSystem
-from apc.compiler.equations.flatten import FlatSystem
+from apc.compiler.equations.clocks import ClockedKind
+from apc.compiler.equations.flatten import FlatKind
 from apc.compiler.equations.solution import ImplicitBlock
-from apc.compiler.equations.structure import SortedSystem
+from apc.compiler.equations.structure import SortedKind
 from apc.compiler.equations.terms import text_of
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.multiples import common_multiple
 from apc.compiler.pipeline import each_stage, run_stages
 from apc.compiler.scene.scene import Scene
-from apc.compiler.view.diagram import Diagram, boxes_of, build_diagram, edges_of, one_of, seconds
+from apc.compiler.view.diagram import Diagram, build_diagram, one_of, seconds, shape_of
 from apc.compiler.view.stages import describe
 from apc.compiler.words import wrapped
 
@@ -35,16 +35,16 @@ PAIRWISE = ("max", "min")
 
 def show_text(path: Path) -> str:
     """Return graph, equations and schedule of a topology as text."""
-    scene, flat, _, ordered, compiled = _stages(path)
-    diagram = build_diagram(scene)
-    lines = [diagram.title, *wrapped(diagram.about)]
-    lines += ["", f"GRAPH of {one_of(diagram)}", *_graph_lines(diagram)]
-    lines += ["", "EQUATIONS", *_stage_lines(flat), "", "COMPUTED", *_stage_lines(ordered)]
-    lines += ["", "SCHEDULE", *_schedule_lines(schedule(compiled))]
+    stages: dict[str, Any] = dict(each_stage(path))
+    scene: Scene = stages["scene"]
+    lines = [scene.name, *wrapped(scene.about)]
+    lines += ["", f"GRAPH of {one_of(scene)}", *_graph_lines(build_diagram(scene))]
+    lines += ["", "EQUATIONS", *_stage_lines(stages["flat"]), "", "COMPUTED", *_stage_lines(stages["sorted"])]
+    lines += ["", "SCHEDULE", *_schedule_lines(schedule(stages["compiled"]))]
     return "\n".join(lines)
 
 
-def _stage_lines(value: FlatSystem | SortedSystem) -> Iterator[str]:
+def _stage_lines(value: object) -> Iterator[str]:
     for line in describe(value).splitlines():
         indent = " " * (2 + len(line) - len(line.lstrip()))
         yield from wrapped(line, indent, indent + "    ")
@@ -52,40 +52,52 @@ def _stage_lines(value: FlatSystem | SortedSystem) -> Iterator[str]:
 
 def show_document(path: Path) -> dict[str, Any]:
     """Return graph, equations and schedule of a topology as plain data."""
-    scene, flat, clocked, ordered, compiled = _stages(path)
+    stages: dict[str, Any] = dict(each_stage(path))
+    scene, compiled = stages["scene"], stages["compiled"]
     diagram = build_diagram(scene)
-    whole = asdict(diagram)
+    kinds = zip(stages["flat"].kinds, stages["clocked"].kinds, stages["sorted"].kinds, strict=True)
     return {
-        "topology": diagram.title,
-        "about": diagram.about,
-        "peers": diagram.peers,
-        "graph": {key: whole[key] for key in ("parts", "joints", "links", "groups")},
-        "kinds": [
-            {
-                "name": one.name,
-                "groups": list(one.groups),
-                "unknowns": [{"name": v.name, "unit": format_dimension(v.dimension)} for v in one.variables],
-                "equations": [{"equation": e.text, "origin": e.origin} for e in one.equations],
-                "partitions": [
-                    {
-                        "clock": p.clock,
-                        "variables": list(p.variables),
-                        "equations": [e.text for e in p.equations],
-                    }
-                    for p in two.partitions
-                ],
-                "states": list(three.states),
-                "aliases": [{"name": name, "is": text_of(value)} for name, value in three.aliases],
-                "computed": [
-                    {"clock": p.clock, "steps": [_step_document(step) for step in p.assignments]}
-                    for p in three.partitions
-                ],
-                "sent": [{"name": s.name, "link": s.link, "is": text_of(s.expression)} for s in three.sends],
-            }
-            for one, two, three in zip(flat.kinds, clocked.kinds, ordered.kinds, strict=True)
-        ],
+        "topology": scene.name,
+        "about": scene.about,
+        "peers": scene.peers,
+        "graph": {
+            "boxes": [asdict(box) for box in diagram.boxes],
+            "edges": [asdict(edge) for edge in diagram.edges],
+            "links": [
+                {
+                    "name": one.name,
+                    "clock": one.clock,
+                    "shape": shape_of(one),
+                    "arcs": one.graph.arcs.tolist(),
+                }
+                for one in scene.links
+            ],
+            "groups": [{"name": group.name, "count": group.count} for group in scene.groups],
+        },
+        "kinds": [_kind_document(*kind) for kind in kinds],
         "schedule": schedule(compiled),
         "dropped": [{"name": name, "reason": reason} for name, reason in compiled.dropped],
+    }
+
+
+def _kind_document(flat: FlatKind, clocked: ClockedKind, ordered: SortedKind) -> dict[str, Any]:
+    """Return the equations of the peers of one structure, as they are written and as they are computed."""
+    return {
+        "name": flat.name,
+        "groups": list(flat.groups),
+        "unknowns": [{"name": v.name, "unit": format_dimension(v.dimension)} for v in flat.variables],
+        "equations": [{"equation": e.text, "origin": e.origin} for e in flat.equations],
+        "partitions": [
+            {"clock": p.clock, "variables": list(p.variables), "equations": [e.text for e in p.equations]}
+            for p in clocked.partitions
+        ],
+        "states": list(ordered.states),
+        "aliases": [{"name": name, "is": text_of(value)} for name, value in ordered.aliases],
+        "computed": [
+            {"clock": p.clock, "steps": [_step_document(step) for step in p.assignments]}
+            for p in ordered.partitions
+        ],
+        "sent": [{"name": s.name, "link": s.link, "is": text_of(s.expression)} for s in ordered.sends],
     }
 
 
@@ -96,30 +108,16 @@ def diagram_of(path: Path) -> Diagram:
     return build_diagram(scene)
 
 
-def _stages(path: Path) -> tuple[Scene, FlatSystem, ClockedSystem, SortedSystem, CompiledSystem]:
-    values = [value for stage, value in each_stage(path) if stage != "source"]
-    scene, flat, clocked, ordered, compiled = values
-    assert isinstance(scene, Scene)
-    assert isinstance(flat, FlatSystem)
-    assert isinstance(clocked, ClockedSystem)
-    assert isinstance(ordered, SortedSystem)
-    assert isinstance(compiled, CompiledSystem)
-    return scene, flat, clocked, ordered, compiled
-
-
 def _graph_lines(diagram: Diagram) -> Iterator[str]:
     """Yield each part, link and group, and what it is joined to."""
-    boxes = {box.key: box for box in boxes_of(diagram)}
-    joined: dict[str, list[str]] = {key: [] for key in boxes}
-    for edge in edges_of(diagram):
-        joined[edge.one].append(boxes[edge.two].lines[0])
-        joined[edge.two].append(boxes[edge.one].lines[0])
-    for box in boxes.values():
+    titles = {box.key: box.lines[0] for box in diagram.boxes}
+    for box in diagram.boxes:
         ticks = [f"at each tick of {box.clock}"] if box.clock and box.role != "link" else []
         about = ", ".join((*box.lines[1:], *ticks))
         yield from wrapped(f"{box.lines[0]}: {about}" if about else box.lines[0], "  ", "    ")
-        if joined[box.key]:
-            yield from wrapped(f"joined to {', '.join(joined[box.key])}", "    ", "      ")
+        ends = [(edge.one, edge.two) for edge in diagram.edges if box.key in (edge.one, edge.two)]
+        if joined := [titles[two if one == box.key else one] for one, two in ends]:
+            yield from wrapped(f"joined to {', '.join(joined)}", "    ", "      ")
 
 
 def _step_document(step: Any) -> dict[str, Any]:

@@ -1,184 +1,102 @@
 """The language of topologies as a JSON Schema, so that an editor completes and checks while one types.
 
-Takes: a `Library`. Gives: `topology_schema`, a JSON Schema document (draft 2020-12); `limits_of`,
-`in_unit`, `is_required` of a declared parameter.
-Guarantees: generated from what the compiler reads by, and the same library gives the same document; what
-the compiler accepts fits it.
+Takes: a `Library`. Gives: `topology_schema`, a JSON Schema document (draft 2020-12); `limits_of`, `in_unit`,
+`is_required` of a declared parameter.
+Guarantees: what the compiler accepts fits it; the same library gives the same document.
 Does not: catch everything: names that refer to each other, and bounds in other units, stay the compiler's.
+
+What no component adds to is written in schema.yaml.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
-from apc.compiler.compiled import LARGEST_COUNT
+import yaml
+
 from apc.compiler.components.component import Component, Number, Option, Parameter, Reference
 from apc.compiler.components.library import Library
-from apc.compiler.components.parts import LARGEST_ARRAY
+from apc.compiler.components.parts import PART_KEYS
 from apc.compiler.errors import Place
-from apc.compiler.functions.exchange import LOSS_ABOUT
-from apc.compiler.language.dimensions import Dimension
+from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.units import Unit, parse_unit
 from apc.compiler.language.vectors import whole_and_index
-from apc.compiler.scene.channels import PROBABILITIES
-from apc.compiler.scene.graphs import SHAPES
-from apc.compiler.scene.instances import PART_KEYS
-from apc.compiler.scene.sections import DEFAULT_TYPES, SECTIONS
-from apc.compiler.source.reading import IDENTIFIER
+from apc.compiler.scene.scene import SECTIONS
 
 Schema = dict[str, Any]
 
-DIALECT = "https://json-schema.org/draft/2020-12/schema"
-ABOUT = {
-    "topology": "the scene's name",
-    "about": "one sentence",
-    "library": "folders of components of one's own, from this file's folder",
-    "clocks": "what ticks, and how often",
-    "parameters": "named quantities, for use in expressions",
-    "peers": "who is there: groups of peers",
-    "masses": "what each peer has",
-    "couplers": "what pulls at masses",
-    "links": "what carries samples to the other peers",
-    "hands": "what moves a device",
-    "experiment": "what a simulation runs for",
-    "studies": "which parameters a study varies",
-}
-REQUIRED = ("topology", "peers", "masses")
+BASE = Path(__file__).with_suffix(".yaml")
 # Any unit may be written; of these an editor can say at once that one does not fit, or propose one that does.
 EVERYDAY_UNITS = (
     *("kg", "g", "mg", "m", "mm", "cm", "um", "s", "ms", "us", "min", "h", "Hz", "kHz"),
     *("N", "mN", "kN", "N/m", "N/mm", "kN/m", "N*s/m", "m/s", "mm/s", "rad", "deg"),
 )
 _NUMBER = r"[+-]?\s*(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?(\s*/\s*\d+\.?\d*)?"
-_TARGET = r"^[A-Za-z]\w*(\[\d{1,6}(:\d{1,6})?\])?(\.[A-Za-z]\w*)?$"
-_SETTING = r"^[A-Za-z]\w*(\[\d{1,6}\])?(\.[A-Za-z]\w*(\[\d{1,6}\])?)+$"
-_NOWHERE = Place("schema")
 
 
 def topology_schema(library: Library) -> Schema:
     """Return the schema of a topology whose parts are of the library's components."""
+    base: Schema = yaml.safe_load(BASE.read_text(encoding="utf-8"))
     components = [c for name in library.component_names if (c := library.component(name)) is not None]
-    quantities = _Quantities()
+    quantities: dict[str, Schema] = {}
+    _quantity(parse_unit("s", Place("schema")), quantities)
+    _quantity(parse_unit("s", Place("schema")), quantities, or_rate=True)
     parts = {component.name: _part(component, quantities) for component in components}
-    properties = {
-        "topology": _string(),
-        "about": _string(),
-        "library": {"anyOf": [_string(), {"type": "array", "items": _string()}]},
-        "clocks": _named({"$ref": "#/$defs/clock"}),
-        "parameters": _named({"type": ["number", "string"]}),
-        "peers": _named({"$ref": "#/$defs/group"}) | {"minProperties": 1},
-        **{section: _section(section) for section in SECTIONS},
-        "experiment": _object(
-            {"duration": quantities.of(_unit("s")), "seed": {"type": "integer", "minimum": 0}}
-        ),
-        "studies": _object(
-            {"region": _object({"x": {"$ref": "#/$defs/axis"}, "y": {"$ref": "#/$defs/axis"}})}
-        ),
+    joined = {
+        # A connector that another part names may be left out, but hardly all of them.
+        c.name: {"anyOf": [{"required": [name]} for name, _ in c.connectors]}
+        for c in components
+        if c.connectors
     }
-    clock = quantities.of(_unit("s"), or_rate=True)
-    definitions = {
-        "name": {"type": "string", "pattern": _pattern(IDENTIFIER)},
-        "joined": {"type": "string", "pattern": _TARGET, "examples": ["ground"]},
-        "at": {"type": "array", "items": {"$ref": "#/$defs/name"}, "description": "only at these groups"},
-        "count": {"type": "integer", "minimum": 1, "maximum": LARGEST_ARRAY, "description": "an array"},
-        "shared": {"type": "boolean", "description": "a copy at each peer of one object"},
-        "clock": {"anyOf": [clock, _object({"period": clock, "phase": clock}, required=("period",))]},
-        "group": _group(),
+    of_parts = {
         "part": _by_type({name: {"$ref": f"#/$defs/{name}"} for name in parts}),
-        "joined_part": _by_type(
-            # A connector that another part names may be left out, but hardly all of them.
-            {
-                c.name: {"anyOf": [{"required": [name]} for name, _ in c.connectors]}
-                for c in components
-                if c.connectors
-            }
-        ),
-        "graph": _graph(),
-        "delays": _named(_named(quantities.of(_unit("s")))),
-        "probability": _probability(),
-        "loss": _loss(),
-        "axis": {
-            **_object({}),
-            "additionalProperties": {
-                "type": "array",
-                "items": {"type": ["string", "number"]},
-                "minItems": 2,
-                "maxItems": 2,
-            },
-            "minProperties": 1,
-            "maxProperties": 1,
-        },
+        "joined_part": _by_type(joined),
     }
-    types = {"properties": {"type": {"enum": [component.name for component in components]}}}
+    types = {"properties": {"type": {"enum": list(parts)}}}
     return {
-        "$schema": DIALECT,
-        "title": "A topology of apc",
-        "type": "object",
-        "properties": {key: {"description": ABOUT[key], **schema} for key, schema in properties.items()},
-        "required": list(REQUIRED),
-        "additionalProperties": False,
+        **base,
         # Components of one's own are known to the compiler alone.
         "if": {"not": {"required": ["library"]}},
         "then": {"properties": {section: {"additionalProperties": types} for section in SECTIONS}},
-        "$defs": {**definitions, **quantities.found, **parts},
+        "$defs": {**base["$defs"], **of_parts, **quantities, **parts},
     }
 
 
-class _Quantities:
-    """The schemas of quantities, one a dimension."""
-
-    def __init__(self) -> None:
-        self.found: dict[str, Schema] = {}
-        self._names: dict[tuple[Dimension, bool], str] = {}
-
-    def of(self, unit: Unit, *, or_rate: bool = False) -> Schema:
-        """Return a reference to the schema of quantities that fit a unit."""
-        key = (unit.dimension, or_rate)
-        if key not in self._names:
-            plain = unit.text.replace("/", "_per_").replace("*", "_").replace("^", "")
-            name = f"quantity_{'number' if unit.text == '1' else plain}{'_or_rate' if or_rate else ''}"
-            self._names[key] = name
-            self.found[name] = (
-                _number_schema() if unit.text == "1" else _quantity_schema(unit, or_rate=or_rate)
-            )
-        return {"$ref": f"#/$defs/{self._names[key]}"}
-
-
-def _probability() -> Schema:
+def _by_type(choices: dict[str, Schema]) -> Schema:
+    """Return the schema that asks of an object what the choice of its type asks."""
     return {
-        "type": ["number", "string"],
-        "minimum": 0,
-        "maximum": 1,
-        "description": "a number from 0 to 1, a percentage, or an expression",
-        "examples": ["2 %"],
+        "allOf": [
+            {"if": {"properties": {"type": {"const": name}}, "required": ["type"]}, "then": schema}
+            for name, schema in choices.items()
+        ]
     }
 
 
-def _number_schema() -> Schema:
-    return {"type": ["number", "string"], "description": "a number without a unit, or an expression"}
+def _quantity(unit: Unit, quantities: dict[str, Schema], *, or_rate: bool = False) -> Schema:
+    """Return a reference to the schema of quantities that fit a unit, which is added to the others."""
+    plain = format_dimension(unit.dimension).replace("*", "_").replace("/", "_per_")
+    name = f"quantity_{re.sub(r'[^a-zA-Z0-9_]', '', plain)}{'_or_rate' if or_rate else ''}"
+    if name not in quantities and unit.text == "1":
+        about = "a number without a unit, or an expression"
+        quantities[name] = {"type": ["number", "string"], "description": about}
+    elif name not in quantities:
+        dimensions = {text: parse_unit(text, Place("schema")).dimension for text in EVERYDAY_UNITS}
+        fits = {unit.dimension, unit.dimension.power(-1)} if or_rate else {unit.dimension}
+        wrong = "|".join(re.escape(text) for text, d in dimensions.items() if d not in fits)
+        right = [text for text, dimension in dimensions.items() if dimension in fits] or [unit.text]
+        quantities[name] = {
+            "type": "string",
+            # No bare number, none with an everyday unit of another dimension, no text without a letter.
+            "pattern": rf"^(?!\s*{_NUMBER}\s*({wrong})?\s*$)[\s\S]*[A-Za-z°%µΩ]",
+            "description": f"a number and its unit, such as 1 {unit.text}, or an expression",
+            "examples": [f"1 {text}" for text in right],
+        }
+    return {"$ref": f"#/$defs/{name}"}
 
 
-def _quantity_schema(unit: Unit, *, or_rate: bool) -> Schema:
-    """Return the schema of a number with a unit, or of an expression: anything but a bare number.
-
-    The pattern refuses a bare number, one with an everyday unit of another dimension, and a text without a
-    letter.
-    """
-    dimensions = {text: _unit(text).dimension for text in EVERYDAY_UNITS}
-    fits = {unit.dimension, unit.dimension.power(-1)} if or_rate else {unit.dimension}
-    wrong = "|".join(re.escape(text) for text, d in dimensions.items() if d not in fits)
-    right = [text for text, dimension in dimensions.items() if dimension in fits] or [unit.text]
-    return {
-        "type": "string",
-        "pattern": rf"^(?!\s*{_NUMBER}\s*({wrong})?\s*$)[\s\S]*[A-Za-z°%µΩ]",
-        "description": f"a number and its unit, such as 1 {unit.text}, or an expression",
-        "examples": [f"1 {text}" for text in right],
-    }
-
-
-def _part(component: Component, quantities: _Quantities) -> Schema:
+def _part(component: Component, quantities: dict[str, Schema]) -> Schema:
     """Return the schema of a part of a component, its connectors left optional."""
     properties: dict[str, Schema] = {
         "type": {"const": component.name},
@@ -193,63 +111,44 @@ def _part(component: Component, quantities: _Quantities) -> Schema:
     for variable in component.variables:
         if variable.start is not None:
             name, _ = whole_and_index(variable.name)
-            about = f"start value of the {variable.about or name}"
-            entries.setdefault(name, []).append({**quantities.of(variable.unit), "description": about})
-    properties |= {name: found[0] if len(found) == 1 else _vector(found) for name, found in entries.items()}
-    required = [whole_and_index(p.name)[0] for p in component.parameters if is_required(p)]
+            start = {"description": f"start value of the {variable.about or name}"}
+            entries.setdefault(name, []).append(_quantity(variable.unit, quantities) | start)
+    for name, schemas in entries.items():
+        size, about = len(schemas), schemas[0].get("description", "")
+        vector: Schema = {"type": "array", "description": about, "prefixItems": schemas}
+        vector |= {"minItems": size, "maxItems": size}
+        properties[name] = schemas[0] if size == 1 else vector
+    required = dict.fromkeys(whole_and_index(p.name)[0] for p in component.parameters if is_required(p))
     return {
         "description": component.about,
-        **_object(properties, required=dict.fromkeys(required)),
+        "type": "object",
+        "properties": properties,
+        "required": list(required),
+        "additionalProperties": False,
     }
 
 
-def _vector(entries: list[Schema]) -> Schema:
-    """Return the schema of a list with a value for each entry of a vector."""
-    size, about = len(entries), entries[0].get("description", "")
-    return {
-        "type": "array",
-        "description": about,
-        "prefixItems": entries,
-        "minItems": size,
-        "maxItems": size,
-    }
-
-
-def _parameter(parameter: Parameter, quantities: _Quantities) -> Schema:
+def _parameter(parameter: Parameter, quantities: dict[str, Schema]) -> Schema:
     about = {"description": parameter.about} if parameter.about else {}
     if isinstance(parameter, Option):
         default = {} if parameter.default is None else {"default": parameter.default}
         return {"enum": list(parameter.words), **default, **about}
     if isinstance(parameter, Reference):
-        by_role = {
-            "clock": {"$ref": "#/$defs/name", "description": "a clock"},
-            "link": {"$ref": "#/$defs/name", "description": "a link"},
-            "graph": {"$ref": "#/$defs/graph", "description": "who hears whom"},
-            "delays": {"$ref": "#/$defs/delays", "description": "other delays: sending group, hearing group"},
-            "loss": {"$ref": "#/$defs/loss", "description": "how packets get lost"},
-            "trace": {**_string(), "description": "a CSV file of recorded delays, one a packet"},
-            "table": {**_string(), "description": "a CSV file of numbers over time"},
-        }
-        return {**by_role[parameter.role], **about}
-    schema = quantities.of(parameter.unit)
+        role = {"clock": "name"}.get(parameter.role, parameter.role)
+        return {"$ref": f"#/$defs/{role}", **(about or {"description": f"a {parameter.role}"})}
+    schema = _quantity(parameter.unit, quantities)
     if parameter.words:
         schema = {"anyOf": [{"enum": [word for word, _ in parameter.words]}, schema]}
-    told = about.get("description", "")
-    return {**schema, "description": f"{told or parameter.name} [{parameter.unit.text}]{_bounds(parameter)}"}
-
-
-def _bounds(parameter: Number) -> str:
-    told = "".join(f", {limit}" for limit in limits_of(parameter))
-    return (
-        told if parameter.default is None else f"{told}, {in_unit(parameter, parameter.default)} if not given"
-    )
+    limits = [f"{parameter.about or parameter.name} [{parameter.unit.text}]", *limits_of(parameter)]
+    limits += [] if is_required(parameter) else [f"{in_unit(parameter, parameter.default)} if not given"]
+    return {**schema, "description": ", ".join(limits)}
 
 
 def limits_of(parameter: Number) -> list[str]:
     """Return where a parameter's values must lie, in its unit."""
     low, high = parameter.minimum, parameter.maximum
-    told = [] if low is None else [f"{'>' if parameter.open_minimum else '≥'} {in_unit(parameter, low)}"]
-    return told if high is None else [*told, f"≤ {in_unit(parameter, high)}"]
+    limits = [] if low is None else [f"{'>' if parameter.open_minimum else '≥'} {in_unit(parameter, low)}"]
+    return limits if high is None else [*limits, f"≤ {in_unit(parameter, high)}"]
 
 
 def in_unit(parameter: Number, number: Any) -> str:
@@ -262,96 +161,3 @@ def is_required(parameter: Parameter) -> bool:
     if isinstance(parameter, Reference):
         return parameter.role in ("clock", "link", "table")
     return parameter.default is None
-
-
-def _section(section: str) -> Schema:
-    """Return the schema of a section of parts: which keys a part has follows from its type."""
-    default = DEFAULT_TYPES.get(section)
-    part: Schema = {
-        "type": "object",
-        "properties": {"type": {"type": "string", **({"default": default} if default else {})}},
-        "required": [] if default else ["type"],
-        "allOf": [{"$ref": "#/$defs/part"}],
-    }
-    if section != "masses":  # a mass need not be joined to anything
-        part["allOf"].append({"$ref": "#/$defs/joined_part"})
-    if default:
-        part["allOf"].append({"if": {"not": {"required": ["type"]}}, "then": {"$ref": f"#/$defs/{default}"}})
-    if section == "links":
-        part["not"] = {"required": ["count"]}
-    return _named(part)
-
-
-def _by_type(choices: dict[str, Schema]) -> Schema:
-    """Return the schema that asks of an object what the choice of its type asks."""
-    return {
-        "allOf": [
-            {"if": {"properties": {"type": {"const": name}}, "required": ["type"]}, "then": schema}
-            for name, schema in choices.items()
-        ]
-    }
-
-
-def _group() -> Schema:
-    value = {"type": ["string", "number"]}
-    values = {"type": "array", "items": value}
-    return {
-        "anyOf": [{"required": [key]} for key in ("count", "set", "table")],
-        **_object(
-            {
-                "count": {
-                    "type": "integer",
-                    "minimum": 1,
-                    "maximum": LARGEST_COUNT,
-                    "description": "how many",
-                },
-                "set": {
-                    "type": "object",
-                    "description": "this group's own settings; a list has a value a peer",
-                    "propertyNames": {"pattern": _SETTING},
-                    "additionalProperties": {"anyOf": [value, values, {"type": "array", "items": values}]},
-                },
-                "table": {**_string(), "description": "a CSV file with a row a peer"},
-            }
-        ),
-    }
-
-
-def _graph() -> Schema:
-    peer = {"type": ["integer", "string"]}
-    pair = {"type": "array", "prefixItems": [peer, peer, {"type": "number"}], "minItems": 2, "maxItems": 3}
-    pairs = {"anyOf": [{"type": "array", "items": pair}, {"type": "string", "pattern": r"\.csv$"}]}
-    either = {**_object({"edges": pairs, "arcs": pairs}), "minProperties": 1, "maxProperties": 1}
-    return {"anyOf": [{"enum": list(SHAPES)}, either]}
-
-
-def _loss() -> Schema:
-    told = dict(zip(PROBABILITIES, LOSS_ABOUT, strict=True))
-    each = {name: {"$ref": "#/$defs/probability", "description": about} for name, about in told.items()}
-    return {"anyOf": [{"$ref": "#/$defs/probability"}, _object(each, required=["p"])]}
-
-
-def _named(schema: Schema) -> Schema:
-    """Return the schema of a mapping from names to what `schema` says."""
-    return {"type": "object", "propertyNames": {"$ref": "#/$defs/name"}, "additionalProperties": schema}
-
-
-def _object(properties: dict[str, Schema], *, required: Iterable[str] = ()) -> Schema:
-    return {
-        "type": "object",
-        "properties": properties,
-        "required": list(required),
-        "additionalProperties": False,
-    }
-
-
-def _string() -> Schema:
-    return {"type": "string", "minLength": 1}
-
-
-def _pattern(compiled: re.Pattern[str]) -> str:
-    return f"^{compiled.pattern.removesuffix(chr(92) + 'Z')}$"
-
-
-def _unit(text: str) -> Unit:
-    return parse_unit(text, _NOWHERE)

@@ -1,4 +1,4 @@
-"""The value of any stage as text for a person to read: what `apc compile --until` prints.
+"""The value of any stage before the last as text for a person to read: what `apc compile --until` prints.
 
 Takes: the value of a stage. Gives: `describe`; `step_lines`, of what is computed.
 Guarantees: the same topology gives the same bytes.
@@ -7,24 +7,20 @@ Does not: compute anything new.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from functools import singledispatch
-from typing import Any
 
-import casadi
-
-from apc.compiler.compiled import CompiledSystem
-from apc.compiler.equations.clocks import ClockedSystem, ReceiveCrossing
+from apc.compiler.equations.clocks import ClockedSystem
 from apc.compiler.equations.flatten import FlatKind, FlatSystem
 from apc.compiler.equations.solution import Assignment, ImplicitBlock
 from apc.compiler.equations.structure import SortedSystem
 from apc.compiler.equations.terms import text_of
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.unit_text import format_dimension
-from apc.compiler.language.values import Value
 from apc.compiler.scene.scene import Scene
 from apc.compiler.source.nodes import Mapping, Node, Scalar
 from apc.compiler.source.source import Source
+from apc.compiler.view.diagram import build_diagram
 
 
 def step_lines(step: Assignment | ImplicitBlock) -> Iterator[str]:
@@ -66,35 +62,15 @@ def _nodes(node: Node, indent: str) -> Iterator[str]:
 @describe.register
 def _(scene: Scene) -> str:
     lines = [f"topology {scene.name}: {scene.about}"]
-    lines += [
-        f"clock {c.name}: every {_quantity(c.period)}, first at {_quantity(c.phase)}" for c in scene.clocks
-    ]
-    lines += [f"parameter {name} = {_quantity(value)}" for name, value in scene.parameters]
-    for group in scene.groups:
-        lines.append(f"group {group.name}: {group.count} peers")
-        lines += [f"  {name} = {_quantity(value)}" for name, value in group.values]
-        lines += [f"  {name} = {word}" for name, word in group.words]
-        lines += [f"  {name}: a value a peer" for name, _ in group.columns]
-    for part in scene.parts:
-        shared = ", shared" if part.shared else ""
-        lines.append(
-            f"{part.section} {part.name}: {part.component.name}{shared}, at {', '.join(part.groups)}"
-        )
-        lines += [f"  {name} = {_quantity(value)}" for name, value in (*part.values, *part.starts)]
-        lines += [f"  {name} = {word}" for name, word in (*part.options, *part.references)]
-        lines += [
-            f"  {own} joins {f'{other}.{its}' if its else other}" for own, other, its in part.connections
-        ]
-    for link in scene.links:
-        lines.append(f"link {link.name}: {link.graph.shape}, on {link.clock}, delay {_quantity(link.delay)}")
-        lines += [f"  from {d.sender} to {d.receiver}: {_quantity(d.delay)}" for d in link.delays]
-        if link.channel is not None:
-            lines += [f"  {told}" for told in link.channel.told]
+    lines += [f"clock {c.name}: every {c.period}, first at {c.phase}" for c in scene.clocks]
+    for name, value in scene.parameters:
+        expression = f"{format_expression(value.expression)} = " if value.expression else ""
+        lines.append(f"parameter {name} = {expression}{value}")
+    diagram = build_diagram(scene)
+    for box in diagram.boxes:
+        lines += [f"{box.role} {box.lines[0]}", *(f"  {line}" for line in box.lines[1:])]
+    lines += [f"{edge.one} joins {edge.two}" for edge in diagram.edges if not edge.sent]
     return "\n".join(lines)
-
-
-def _quantity(value: Value) -> str:
-    return f"{format_expression(value.expression)} = {value}" if value.expression else str(value)
 
 
 @describe.register
@@ -122,14 +98,14 @@ def _(clocked: ClockedSystem) -> str:
             f"  hold of {h.clock}: {h.variable}, after {format_expression(h.delay)} s" for h in kind.holds
         ]
         lines += [f"  previous on {p.clock}: {p.variable}" for p in kind.previous]
-        lines += [f"  receive on {r.clock} over {r.link}: {_heard(r)}" for r in kind.receives]
-        lines += [f"  send over {s.link}: {s.name} = {format_expression(s.expression)}" for s in kind.sends]
+        lines += [
+            f"  receive on {r.clock} over {r.link}: {r.operator} of {format_expression(r.argument)}"
+            for r in kind.receives
+        ]
+        lines += [
+            f"  send over {s.link}: {s.name} = {format_expression(s.expression)}" for s in kind.flat.sends
+        ]
     return "\n".join(lines)
-
-
-def _heard(receive: ReceiveCrossing) -> str:
-    what = format_expression(receive.of.expression if receive.edge is None else receive.edge)
-    return f"{receive.operator} of {what}"
 
 
 @describe.register
@@ -141,30 +117,6 @@ def _(system: SortedSystem) -> str:
         for partition in kind.partitions:
             lines.append(f"  {partition.clock}:")
             lines += [line for step in partition.assignments for line in step_lines(step)]
-        lines += [f"  {name} := {text_of(expression)}" for name, _, expression in kind.samples]
+        lines += [f"  {name} := {text_of(expression)}" for name, expression in kind.samples]
         lines += [f"  send over {s.link}: {s.name} := {text_of(s.expression)}" for s in kind.sends]
     return "\n".join(lines)
-
-
-@describe.register
-def _(system: CompiledSystem) -> str:
-    lines = [f"{system.name}: {system.about}"]
-    lines += [f"timing {t.name} = {t.value} s" for t in system.timings]
-    lines += [f"parameter {p.name} = {p.value:.12g} {p.unit}" for p in system.parameters]
-    for kind in system.kinds:
-        lines.append(f"kind {kind.name}")
-        lines += _function_lines(kind.derivative, [f"der({state.name})" for state in kind.states])
-        for clock in kind.clocks:
-            lines += _function_lines(clock.tick, clock.outputs)
-        for send in kind.sends:
-            lines += _function_lines(send.send, send.channels)
-    lines += [f"dropped {name}: {reason}" for name, reason in system.dropped]
-    return "\n".join(lines)
-
-
-def _function_lines(function: Any, names: Iterable[str]) -> Iterator[str]:
-    yield f"  {function}"
-    if not function.is_a("SXFunction"):
-        return  # it solves a loop: a graph of matrices, whose entries have no text of their own
-    values = function(*function.sx_in())
-    yield from (f"    {name} = {casadi.SX(values[row])}" for row, name in enumerate(names))

@@ -22,7 +22,7 @@ from apc.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.compiler.compiled import CompiledSystem, Formula, Group, Parameter
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.formula import FaultError, carrying, exactly
+from apc.compiler.language.evaluation import FaultError, exactly
 from apc.compiler.plain import RULES
 from apc.compiler.words import with_unit
 from apc.eigen.closing import ClosedSystem
@@ -278,7 +278,7 @@ def _opened(system: CompiledSystem, group: Group, ranges: Sequence[Range], field
             what = f"{name} depends on {own[0]}, which differs from peer to peer of {group.name}"
             raise ApcError(Mistake("E832", _PLACE, what))
         try:
-            return exactly(formula.function, [*values, *formula.numbers], _quotients)
+            return exactly(formula, values, _quotients)
         except FaultError as fault:
             reason = fault.cause if isinstance(fault.cause, NotRational) else fault.words
             what = f"{name} = {formula.text[:60]} {reason}"
@@ -302,7 +302,7 @@ def _quotients(word: str) -> Callable[..., Any]:
     def refuse(*_: Any) -> Any:
         raise NotRational(f"takes {word}() of a parameter that is left open")
 
-    return carrying(word, _RULES.get(word, refuse))
+    return _RULES.get(word, refuse)
 
 
 _RULES: dict[str, Callable[..., Any]] = {

@@ -20,7 +20,7 @@ import numpy as np
 from apc.compiler.compiled import CompiledSystem, Group, Parameter, Timing, group_count
 from apc.compiler.crowd import peers_of, recounted
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
-from apc.compiler.formula import exact_value
+from apc.compiler.language.evaluation import exact_value
 from apc.compiler.words import with_unit
 from apc.frame.names import GIVEN, OVERRIDE, Free, find, unit_of
 from apc.frame.parameters import Scope, columns_of, scope_of

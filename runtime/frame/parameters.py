@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Formula, Group, Kind, Parameter, Timing
 from apc.compiler.errors import ApcError, Mistake
-from apc.compiler.formula import computed
+from apc.compiler.language.evaluation import computed
 from apc.frame.exact import ROWS
 from apc.frame.names import OVERRIDE, Free
 

@@ -17,17 +17,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from apc.compiler.multiples import common_multiple
-from apc.compiler.view.diagram import (
-    Box,
-    Diagram,
-    Edge,
-    Net,
-    boxes_of,
-    edges_of,
-    one_of,
-    seconds,
-    shape_of,
-)
+from apc.compiler.scene.links import SceneLink
+from apc.compiler.scene.scene import Scene
+from apc.compiler.view.diagram import Box, Diagram, Edge, one_of, seconds, shape_of
 from apc.compiler.words import counted
 from apc.optional import need
 from apc.present.pictures import COLOURS
@@ -54,12 +46,12 @@ def graph_picture(diagram: Diagram) -> Any:
     ApcError
         E875 matplotlib or networkx is not installed.
     """
-    boxes, edges = boxes_of(diagram), edges_of(diagram)
+    scene, boxes, edges = diagram.scene, diagram.boxes, diagram.edges
     places = _places(boxes, edges)
-    title = f"{diagram.title}, {one_of(diagram)}"
-    count = len(diagram.links) + bool(diagram.pulses)
+    title = f"{scene.name}, {one_of(scene)}"
+    count = len(scene.links) + bool(scene.clocks)
     right = max(left + wide for left, _, wide, _ in places.values())
-    below = BESIDE * (count + bool(diagram.pulses))
+    below = BESIDE * (count + bool(scene.clocks))
     width = max(below, max(right, _width(title, TITLE)) + 2 * MARGIN)
     graph = max(top + high for _, top, _, high in places.values()) + BETWEEN
     small = BELOW if count else 0.0
@@ -69,24 +61,24 @@ def graph_picture(diagram: Diagram) -> Any:
     ax = figure.add_axes((0, (small + MARGIN) / height, 1, (graph + HEAD) / height), xlim=(0, width))
     ax.set_ylim(graph, -HEAD)
     ax.set_axis_off()
-    about = textwrap.shorten(diagram.about, int(width / 4.6), placeholder="…")
+    about = textwrap.shorten(scene.about, int(width / 4.6), placeholder="…")
     ax.text(MARGIN, 18 - HEAD, title, size=TITLE, weight="bold", color=INK, parse_math=False)
     ax.text(MARGIN, 32 - HEAD, about, size=SIZE, color=FAINT, parse_math=False)
     for edge in edges:
         (x, y, wide, high), (left, top, _, tall) = sorted((places[edge.one], places[edge.two]))
         style = {"color": FAINT, "linestyle": "--"} if edge.sent else {"color": INK}
         ax.plot((MARGIN + x + wide, MARGIN + left), (y + high / 2, top + tall / 2), lw=1, **style)
-    colours = _colours(diagram)
+    colours = _colours(scene)
     for box in boxes:
         _draw(ax, box, places[box.key], colours)
     if count:
         figure.get_layout_engine().set(rect=(0, 0, 1, small / height))
-        shares = [*(1 for _ in diagram.links), *([2] if diagram.pulses else [])]
+        shares = [*(1 for _ in scene.links), *([2] if scene.clocks else [])]
         axes = figure.subplots(1, count, squeeze=False, width_ratios=shares)[0]
-        for small_ax, net in zip(axes, diagram.links, strict=False):
-            _draw_peers(small_ax, diagram, net, colours)
-        if diagram.pulses:
-            _draw_ticks(axes[-1], diagram, colours)
+        for small_ax, link in zip(axes, scene.links, strict=False):
+            _draw_peers(small_ax, scene, link, colours)
+        if scene.clocks:
+            _draw_ticks(axes[-1], scene, colours)
     return figure
 
 
@@ -144,53 +136,54 @@ def _draw(ax: Any, box: Box, place: tuple[float, float, float, float], colours: 
         ax.text(left + width / 2, y, line, zorder=4, **look)
 
 
-def _colours(diagram: Diagram) -> dict[str, str]:
+def _colours(scene: Scene) -> dict[str, str]:
     """Return the colours of clocks, and from the other end those of groups."""
-    clocks = {f"clock {pulse.name}": COLOURS[1 + i % 6] for i, pulse in enumerate(diagram.pulses)}
-    groups = {f"group {crowd.name}": COLOURS[-1 - i % 6] for i, crowd in enumerate(diagram.groups)}
+    clocks = {f"clock {clock.name}": COLOURS[1 + i % 6] for i, clock in enumerate(scene.clocks)}
+    groups = {f"group {group.name}": COLOURS[-1 - i % 6] for i, group in enumerate(scene.groups)}
     return clocks | groups
 
 
-def _draw_peers(ax: Any, diagram: Diagram, net: Net, colours: dict[str, str]) -> None:
+def _draw_peers(ax: Any, scene: Scene, link: SceneLink, colours: dict[str, str]) -> None:
     """Draw who hears whom over a link, in the colours of groups."""
     networkx = need("networkx", "plot")
-    owners = [crowd.name for crowd in diagram.groups for _ in range(min(crowd.count, MOST_PEERS))]
+    owners = [group.name for group in scene.groups for _ in range(min(group.count, MOST_PEERS))]
     fills = [colours[f"group {name}"] for name in owners[:MOST_PEERS]]
     number = len(fills)
-    star = net.graph == "star"
-    if net.graph == "complete":
+    star = link.graph.shape == "star"
+    if link.graph.shape == "complete":
         graph = networkx.complete_graph(number)
-    elif net.graph == "ring":
+    elif link.graph.shape == "ring":
         graph = networkx.cycle_graph(number)
     elif star:
         graph = networkx.star_graph(number - 1)
     else:
-        graph = networkx.DiGraph(pair for pair in net.arcs if max(pair) < number)
+        graph = networkx.DiGraph(pair for pair in link.graph.arcs.tolist() if max(pair) < number)
         graph.add_nodes_from(range(number))
     shells = [one for one in ([*range(star)], [*range(star, number)]) if one]
     look = {"node_size": 40, "edge_color": FAINT, "width": 0.7, "with_labels": False}
     places = networkx.shell_layout(graph, shells)
     networkx.draw_networkx(graph, places, ax=ax, nodelist=range(number), node_color=fills, **look)
-    told = f"{net.name}: {counted(diagram.peers, 'peer', ',')}, {shape_of(net)}"
-    if diagram.peers > number:
-        told += f"\n{number} drawn, {diagram.peers - number:,} left out"
+    told = f"{link.name}: {counted(scene.peers, 'peer', ',')}, {shape_of(link)}"
+    if scene.peers > number:
+        told += f"\n{number} drawn, {scene.peers - number:,} left out"
     ax.set_title(told, size=SIZE, color=INK)
     ax.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2), aspect="equal")
     ax.set_axis_off()
 
 
-def _draw_ticks(ax: Any, diagram: Diagram, colours: dict[str, str]) -> None:
+def _draw_ticks(ax: Any, scene: Scene, colours: dict[str, str]) -> None:
     """Draw the ticks of each clock along a frame."""
-    frame = common_multiple(pulse.period for pulse in diagram.pulses)
-    for row, pulse in enumerate(diagram.pulses):
-        count, colour = int(frame / pulse.period), colours[f"clock {pulse.name}"]
+    frame = common_multiple(clock.period.number for clock in scene.clocks)
+    for row, clock in enumerate(scene.clocks):
+        period, phase = clock.period.number, clock.phase.number
+        count, colour = int(frame / period), colours[f"clock {clock.name}"]
         if count <= MOST_TICKS:
-            ticks = [float(pulse.phase + k * pulse.period) * 1e3 for k in range(count)]
+            ticks = [float(phase + k * period) * 1e3 for k in range(count)]
             ax.eventplot(ticks, lineoffsets=-row, linelengths=0.6, colors=colour)
         else:
             look = {"size": SIZE, "ha": "center", "va": "center", "color": colour}
             ax.text(float(frame) * 5e2, -row, f"{count:,} ticks", **look)
-    names = [f"{pulse.name}: every {seconds(pulse.period)}" for pulse in diagram.pulses]
+    names = [f"{clock.name}: every {seconds(clock.period.number)}" for clock in scene.clocks]
     ax.set_yticks([-row for row in range(len(names))], names, size=SIZE)
     ax.set(xlim=(0, float(frame) * 1e3), ylim=(0.5 - len(names), 0.5))
     ax.tick_params(labelsize=SIZE, length=2)

@@ -167,7 +167,7 @@ def _scene(one: SceneReport) -> str:
     from apc.compiler.view.listing import diagram_of  # of the topology as written
 
     diagram = diagram_of(one.path)
-    title = f"{diagram.title}. {diagram.about}".strip()
+    title = f"{diagram.scene.name}. {diagram.scene.about}".strip()
     texts = "".join(f"<h3>{escape(name)}</h3><pre>{escape(text)}</pre>" for name, text in one.texts)
     settings = "".join(f"<li>{_code(text)}</li>" for text in one.settings)
     told = f"<p>{escape(one.about)}</p>" + (f"<p>Set first:</p><ul>{settings}</ul>" if settings else "")

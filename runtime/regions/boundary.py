@@ -102,7 +102,8 @@ class Arc:
     @property
     def normals(self) -> Floats:
         """Unit normals (k, 2) at its points, towards the unstable side."""
-        return tangents(self.points, self.handles)[:, ::-1] * np.array([1.0, -1.0])
+        normals: Floats = tangents(self.points, self.handles)[:, ::-1] * np.array([1.0, -1.0])
+        return normals
 
     @property
     def closed(self) -> bool:

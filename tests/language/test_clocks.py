@@ -8,7 +8,7 @@ import pytest
 
 import apc
 from tests.library.parts import listed, ticked, values
-from tests.topologies import ONE_MASS, compiled, library, replaced
+from tests.topologies import ONE_MASS, compiled, library, replaced, told
 
 # ---- the tick before, and what is held ----
 
@@ -82,6 +82,15 @@ def test_a_reduction_that_is_not_linear_is_taken_over_each_pair(tmp_path: Path) 
     run = apc.simulate(system, duration="2 ms", signals=["*.v"], jit=False)
     assert run["user[1].device.v"][1] == pytest.approx(-7 * 3 * 0.010 / 2 * 1e-3, rel=1e-2)
     assert [run[f"user[{peer}].device.v"][1] for peer in (2, 3, 4)] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("force", ["sum(max(k*others.x, f/2))", "sum(max(others.x, mean(others.x)))*k"])
+def test_a_pair_of_peers_does_not_know_what_all_say_together(force: str, tmp_path: Path) -> None:
+    """E506 at the line, where the value of one pair would take what is heard of all at the same tick."""
+    more = FOLLOWER.format(f"k*mean(others.x)', 'g = {force}").replace("hold(f)", "hold(f + g)")
+    [line] = told(compiled, FOUR, library(tmp_path, more))
+    assert "E506 sum(max(" in line
+    assert "asks of each other peer what depends on all that are heard" in line
 
 
 # ---- an expression means in every place what a variable of its name means there ----

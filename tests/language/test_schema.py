@@ -13,6 +13,11 @@ import yaml
 
 import apc
 from apc.__main__ import run
+from apc.compiler.compiled import LARGEST_COUNT
+from apc.compiler.components.parts import DEFAULT_TYPES, LARGEST_ARRAY
+from apc.compiler.scene.graphs import SHAPES
+from apc.compiler.scene.links import PROBABILITIES
+from apc.compiler.source.reading import IDENTIFIER
 from tests.topologies import AVERAGE, ROOT, SCENES, replaced
 
 jsonschema = pytest.importorskip("jsonschema")
@@ -177,3 +182,16 @@ def test_a_new_topology_names_the_schema_that_lies_beside_it(
     assert run(["new", "helped"]) == 0
     first = Path("helped.yaml").read_text(encoding="utf-8").splitlines()[0]
     assert first == "# yaml-language-server: $schema=topology.schema.json"
+
+
+def test_what_is_written_by_hand_agrees_with_the_compiler() -> None:
+    schema = apc.schema()
+    definitions, sections = schema["$defs"], schema["properties"]
+    assert definitions["count"]["maximum"] == LARGEST_ARRAY
+    assert definitions["group"]["properties"]["count"]["maximum"] == LARGEST_COUNT
+    assert definitions["name"]["pattern"] == "^" + IDENTIFIER.pattern.replace(r"\Z", "$")
+    assert definitions["graph"]["anyOf"][0]["enum"] == list(SHAPES)
+    channels = definitions["loss"]["anyOf"][1]["properties"]
+    assert {name: one["description"] for name, one in channels.items()} == PROBABILITIES
+    for section, default in DEFAULT_TYPES.items():
+        assert sections[section]["additionalProperties"]["properties"]["type"]["default"] == default

@@ -9,6 +9,16 @@ import click
 import pytest
 
 from apc.cli.commands import apc as group
+from apc.compiler.components import declarations
+from apc.compiler.components.component import ROLES
+from apc.compiler.components.definitions import COMPONENT, CONNECTOR
+from apc.compiler.components.parts import PART_KEYS
+from apc.compiler.scene.graphs import PAIRS
+from apc.compiler.scene.groups import GROUP
+from apc.compiler.scene.links import PROBABILITIES
+from apc.compiler.scene.scene import TOPOLOGY
+from apc.compiler.scene.studies import AXES, EXPERIMENT
+from apc.compiler.scene.timebase import CLOCK
 from tests.commands import Cli, write
 from tests.topologies import ROOT
 
@@ -85,6 +95,15 @@ def test_every_component_of_the_library_stands_in_its_reference() -> None:
         found = re.match(r"component: (\w+)", text)
         if found:
             assert f"[`{found.group(1)}`]({path.relative_to(ROOT / 'models')})" in page, path
+
+
+def test_every_key_that_is_read_stands_in_the_reference() -> None:
+    page = (ROOT / "models" / "README.md").read_text(encoding="utf-8")
+    words = {*re.findall(r"[\w-]+", page)}
+    tables = (TOPOLOGY, GROUP, CLOCK, EXPERIMENT, AXES, PART_KEYS, PAIRS, PROBABILITIES)
+    tables += (COMPONENT, CONNECTOR, ROLES, declarations.VARIABLE, declarations.NUMBER)
+    tables += (declarations.OPTION, declarations.TABLE)
+    assert {key for table in tables for key in table} <= words
 
 
 def test_the_reference_shows_the_grammar() -> None:
