@@ -20,7 +20,7 @@ from apc.compiler.timings import part
 from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
 from apc.optional import need
 from apc.present.comparison_picture import comparison_picture  # noqa: F401 -- looked up
-from apc.present.forms import MEANT, notes, quantity, reached, record, table
+from apc.present.forms import MEANT, notes, picked, quantity, reached, record, table
 from apc.present.pictures import write_result
 from apc.tables import Column, Row
 
@@ -170,7 +170,7 @@ def comparison_document(found: Comparison) -> dict[str, Any]:
 def _document(one: Scheme) -> dict[str, Any]:
     parts = ("analysis", "network", "passive", "played", "stiffness", "delay", "loss", "feel")
     told = {key: None if (had := getattr(one, key)) is None else had.to_dict() for key in parts}
-    return record(one, {"stable": one.stable, **told, "missing": dict(one.missing)})
+    return record(one, {**picked(one, "verdict", "stable", "left_out"), **told, "missing": dict(one.missing)})
 
 
 def comparison_table(found: Comparison) -> pandas.DataFrame:
