@@ -28,6 +28,7 @@ MM = 1e3
 COLUMNS, PANEL, MARGIN = 4, 3.2, 1.0  # planes in a row; inches: of a plane, of title and labels
 WIDTH, ROW = 7.0, 0.62  # inches: of a picture of rows, and of a row
 HALF = 0.36  # half of a body's height, of the distance of two rows
+LARGEST = 11  # mark of a body, in points
 ROOM = 0.12  # of what is drawn, around it
 
 
@@ -90,7 +91,9 @@ def draw_actors(system: CompiledSystem) -> tuple[Any, list[Actor]]:
         for surface in view.surfaces:
             _draw_surface(ax, surface, row, view.bodies)
         bodies = sorted(view.bodies, key=lambda one: -one.radius)
-        actors += [_actor(ax, view.name, body, row, colours[body.name]) for body in bodies]
+        for place, body in enumerate(bodies):
+            size = max(LARGEST - 2 * place, 7)  # what is covered is seen around what covers it
+            actors.append(_actor(ax, view.name, body, row, colours[body.name], size))
     keep_in_sight(axes)
     figure = axes[0].figure
     handles = {actor.artists[0].get_label(): actor.artists[0] for actor in actors}
@@ -131,26 +134,21 @@ def _rows(views: Sequence[PeerView]) -> list[Any]:
     return [ax] * len(views)
 
 
-def _actor(ax: Any, peer: str, body: Body, row: int, colour: Any) -> Actor:
-    """Draw a body around the origin, shifted to its place."""
+def _actor(ax: Any, peer: str, body: Body, row: int, colour: Any, size: int) -> Actor:
+    """Draw a body around the origin, shifted to its place; `size` is that of its mark, in points."""
     patches = need("matplotlib.patches", "plot")
     shift = need("matplotlib.transforms", "plot").Affine2D()
-    half = MM * body.radius
-    actor_states = tuple(f"{peer}.{state}" for state in body.states[:2])
-    actor = Actor(ax, actor_states, half, row, shift, ())
-    actor.move([MM * value for value in body.place[:2]])
-    look = {"color": colour, "markersize": 7, "markeredgecolor": "k", "transform": shift + ax.transData}
-    artists = ax.plot(0, 0, "s" if half else "o", label=body.name, **look)
+    half, flat = MM * body.radius, len(body.place) == 1
+    look = {"markersize": size, "markeredgecolor": "k", "transform": shift + ax.transData}
+    x, y, *_ = (*(MM * value for value in body.place), row)
+    shift.translate(x, y)
+    artists = ax.plot(0, 0, "s" if half else "o", color=colour, label=body.name, **look)
     if half:
-        look = {"facecolor": colour, "alpha": 0.35, "edgecolor": "k", "transform": shift + ax.transData}
-        flat = len(body.place) == 1
-        shape = (
-            patches.Rectangle((-half, -HALF), 2 * half, 2 * HALF, **look)
-            if flat
-            else patches.Circle((0, 0), half, **look)
-        )
+        look = {"facecolor": colour, "alpha": 0.35, "edgecolor": "k", "transform": look["transform"]}
+        corner, sides = (-half, -HALF), (2 * half, 2 * HALF)
+        shape = patches.Rectangle(corner, *sides, **look) if flat else patches.Circle((0, 0), half, **look)
         artists.append(ax.add_patch(shape))
-    return Actor(ax, actor_states, half, row, shift, tuple(artists))
+    return Actor(ax, tuple(f"{peer}.{state}" for state in body.states[:2]), half, row, shift, tuple(artists))
 
 
 def _draw_surface(ax: Any, surface: Disc | Line, row: int, bodies: Sequence[Body]) -> None:
