@@ -8,8 +8,7 @@ import pytest
 
 import apc
 from apc.compiler.compiled import CompiledSystem
-from apc.present.simulation import paths_of
-from apc.present.simulation import save_picture
+from apc.present.simulation import paths_of, save_picture
 from apc.present.still import draw_still, save_still
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 
