@@ -114,7 +114,7 @@ def _planes(views: Sequence[PeerView]) -> list[Any]:
     lines = -(-len(views) // columns)
     size = (PANEL * columns + 1, PANEL * lines + MARGIN)
     figure = need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(lines, columns, squeeze=False).ravel().tolist()
+    axes: list[Any] = figure.subplots(lines, columns, squeeze=False).ravel().tolist()
     for ax in axes[len(views) :]:
         ax.set_visible(False)
     for ax, view in zip(axes, views, strict=False):
