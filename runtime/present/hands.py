@@ -115,8 +115,8 @@ def feel_text(found: Feel) -> str:
     slow = found.low_frequency
     if slow is not None:
         lines.append("  Of slow motions, the other hands as the scene has them:")
-        units = zip(("mass", "damping", "stiffness"), ("kg", "N*s/m", "N/m"), slow.errors, strict=True)
-        for name, unit, error in units:
+        parts = zip(("mass", "damping", "stiffness"), ("kg", "N*s/m", "N/m"), slow.errors, strict=True)
+        for name, unit, error in parts:
             lines += labelled(name, measured(getattr(slow, name), error, unit))
         if (network := found.network_viscosity) is not None:
             share = measured(network.network, network.error, "N*s/m")
@@ -227,11 +227,11 @@ def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
         phase.set_ylabel("phase of the impedance (°)")
         if np.abs(degrees).max() <= 90:
             phase.set_yticks(range(-90, 91, 45))
-    look = {"fontsize": 8, "frameon": False, "ncols": 2 if kind == "nyquist" else 1}
+    legend: dict[str, Any] = {"fontsize": 8, "frameon": False, "ncols": 2 if kind == "nyquist" else 1}
     if ax is None:
-        size.figure.legend(*size.get_legend_handles_labels(), loc="outside lower center", **look)
+        size.figure.legend(*size.get_legend_handles_labels(), loc="outside lower center", **legend)
     else:
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), **look)
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), **legend)
     return size.figure
 
 

@@ -49,7 +49,7 @@ def ticks_text(ticks: Iterable[Ticks]) -> list[str]:
     listed = list(ticks)
     lines = []
     for what, shares in (("late by", "late"), ("took", "took")):
-        rows = [("instants", *HEADINGS, what)]
+        rows: list[tuple[str, ...]] = [("instants", *HEADINGS, what)]
         rows += [(f"{one.ticks:,}", *map(_ms, getattr(one, shares)), one.peer) for one in listed]
         lines += table(rows, ">>>>><")
     for one in listed:

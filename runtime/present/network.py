@@ -14,7 +14,8 @@ from apc.compiler.words import measured, wrapped
 from apc.present.forms import LINEARIZED, labelled, notes, record
 
 if TYPE_CHECKING:
-    from apc.moments.network import LossesInARow, NetworkVerdict
+    from apc.moments.network import NetworkVerdict
+    from apc.moments.worst import LossesInARow
 
 _WORDS = {
     "stable in mean square": "Over the network as it is, the mean square of every motion dies out.",

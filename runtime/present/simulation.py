@@ -415,7 +415,7 @@ def ensemble_text(ensemble: Ensemble) -> str:
         low, high = share_interval(count, n)
         told = f"{100 * count / n:.3g} % (95 % sure: {100 * low:.3g} % to {100 * high:.3g} %)"
         shares.append((verdict, str(count), told))
-    rows = [("", "mean", "± error", "5 %", "median", "95 %", "most")]
+    rows: list[tuple[str, ...]] = [("", "mean", "± error", "5 %", "median", "95 %", "most")]
     for name, label in LABELS.items():
         one = ensemble.statistics(name)
         if one is not None:

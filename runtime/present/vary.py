@@ -148,7 +148,7 @@ def sensitivities_text(found: Sensitivities) -> str:
     if not same:
         told = found.note if len(found.active) < 2 else ""
         return "\n".join(note(told or NONE_TOLD))
-    rows = [("what moves it most", f"{'value':<15}", "per percent")]
+    rows: list[tuple[str, ...]] = [("what moves it most", f"{'value':<15}", "per percent")]
     for (*cells, change), modes in list(same.items())[:SHOWN]:
         which = f"  mode {', '.join(modes)}" if len(modes) < len(found.active) else ""
         rows.append((*cells, change + which))

@@ -192,7 +192,7 @@ def _compiled(system: CompiledSystem, call: str) -> Section:
     found = needs(system)
     told = [f"Warning: {one}" for one in system.warnings]
     told += [f"left out: {name}, as {reason}" for name, reason in system.dropped]
-    facts = (
+    facts: tuple[tuple[str, Cell], ...] = (
         ("peers", system.peers),
         ("frame [s]", float(found.frame)),
         ("method", found.method),
