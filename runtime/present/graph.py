@@ -57,7 +57,7 @@ def graph_picture(diagram: Diagram) -> Any:
     small = BELOW if count else 0.0
     height = HEAD + graph + small + MARGIN
     size = (width / 72, height / 72)
-    figure = need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained")
+    figure = need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained" if count else None)
     ax = figure.add_axes((0, (small + MARGIN) / height, 1, (graph + HEAD) / height), xlim=(0, width))
     ax.set_ylim(graph, -HEAD)
     ax.set_axis_off()
