@@ -44,7 +44,7 @@ from apc.eigen.balls import (
 )
 from apc.eigen.certify import schur_cohn
 from apc.eigen.closing import ClosedSystem
-from apc.eigen.dominant import misses_one
+from apc.eigen.enclosure import misses_one
 from apc.eigen.ratios import Ratio
 from apc.eigen.relative import independent_places, relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here, stays_rigid, what_stands
@@ -168,7 +168,7 @@ def _rigid_modes(system: ClosedSystem) -> RigidModes:
     """Return the rigid modes of a system; drifts are not looked for where its matrix tells of none."""
     free = rigid_modes_here(system)
     left = relative_bounded(system.matrix, system.error, relative_coordinates(free.basis))
-    return free if misses_one(*(one[None] for one in left))[0] else find_rigid_modes(system)
+    return free if misses_one(*left) else find_rigid_modes(system)
 
 
 @dataclass(frozen=True, slots=True)

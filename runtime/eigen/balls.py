@@ -13,6 +13,7 @@ side by side, so that a frame of a thousand ticks needs no more columns than the
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,23 +24,23 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.closing import ClosedSystem, Loop, Packet, shift_packets
+from apc.eigen.closing import ClosedSystem, Loop, Packet
 from apc.eigen.graph_modes import Surd
 from apc.eigen.relative import Relative, relative
 from apc.frame.discretize import step_balls
 from apc.frame.exact import is_rational
-from apc.frame.lift import follow
+from apc.frame.lift import Seen, follow
 from apc.frame.radius import Arithmetic
 from apc.frame.schedule import Propagate, Schedule, Way
 from apc.frame.site import LinearSite, entrywise
 
 Balls = NDArray[Any]  # of flint.arb, and the integers 0 and 1 where these are exact
 
-# Products of matrices that take fewer of numbers are not worth matrices of python-flint.
-FEW_PRODUCTS = 4096
-
 # [F G] by duration in quanta, for one site.
 Steps = Mapping[int, Balls]
+
+# Whom each site hears with what weight, way by way and site by site.
+Weights = Mapping[Way, Sequence[Sequence[tuple[int, Any]]]]
 
 
 @contextmanager
@@ -107,7 +108,15 @@ def frame_balls(system: ClosedSystem | Loop) -> Balls:
     return closed_frame(system, sites, steps)
 
 
-def closed_frame(system: ClosedSystem | Loop, sites: Sequence[LinearSite], steps: Sequence[Steps]) -> Balls:
+def closed_frame(
+    system: ClosedSystem | Loop,
+    sites: Sequence[LinearSite],
+    steps: Sequence[Steps],
+    *,
+    weights: Weights | None = None,
+    state: Balls | None = None,
+    watch: Callable[[int, Seen], None] | None = None,
+) -> Balls:
     """Follow all sites of a closed system through one frame, over its state.
 
     Parameters
@@ -116,76 +125,74 @@ def closed_frame(system: ClosedSystem | Loop, sites: Sequence[LinearSite], steps
         The closed system: who hears whom.
     sites, steps
         Every site's matrices and exponentials, over numbers that can be added and multiplied with each other,
-        with integers and with balls.
+        with integers and with the weights.
+    weights
+        Whom each site hears with what weight; without it, those of `weight_balls`.
+    state
+        The states (n, columns) at the start of the frame; without it, the unit matrix.
+    watch
+        Is shown each site's steps before they are made (see `lift.follow`).
 
     Returns
     -------
-    The closed matrix (n, n).
+    The states at its end (n, columns), without `state` the closed matrix (n, n).
     """
     layout = system.layout
     n = len(layout.names)
-    unit = np.eye(n, dtype=np.int64).astype(object)
+    start = np.eye(n, dtype=np.int64).astype(object) if state is None else state
     place_of = layout.places
     rows_of = [{one: row for row, one in enumerate(group.schedule.sent)} for group in system.sites]
-    weights = weight_balls(system)
+    weights = weight_balls(system) if weights is None else weights
     sent: dict[tuple[int, int], Balls] = {}
-
-    def touched(g: int, own: range) -> NDArray[np.intp]:
-        """Return the columns that a site's rows may differ from zero in: all, if it hears of this frame."""
-        found = set(own)
-        for one in system.sites[g].schedule.heard:
-            if not one.lag:
-                return np.arange(n)
-            found |= {place_of[Packet(h, rows_of[h][one.sent], one.lag)] for h, _ in weights[one.way][g]}
-        return np.array(sorted(found), dtype=np.intp)
 
     def hearing(g: int) -> Callable[[int], Balls | None]:
         def hear(line: int) -> Balls | None:
             one = system.sites[g].schedule.heard[line]
-            total = np.zeros(n, dtype=object)
+            total = np.zeros(start.shape[1], dtype=object)
             for h, weight in weights[one.way][g]:
                 row = rows_of[h][one.sent]
                 if one.lag:
-                    total[place_of[Packet(h, row, one.lag)]] += weight
+                    total = total + start[place_of[Packet(h, row, one.lag)]] * weight
                 elif (h, row) in sent:
                     total = total + sent[h, row] * weight
                 else:
                     return None
-            return np.asarray(total[columns[g]])
+            return total
 
         return hear
 
-    def whole(g: int, rows: Balls) -> Balls:
-        found = np.zeros((*rows.shape[:-1], n), dtype=object)
-        found[..., columns[g]] = rows
-        return found
-
-    matrix = np.zeros((n, n), dtype=object)
-    courses, columns = {}, list[NDArray[np.intp]]()
-    for g, (group, site, own) in enumerate(zip(system.sites, sites, steps, strict=True)):
-        end = layout.offsets[g] + len(group.z_names)
-        columns.append(touched(g, range(layout.offsets[g], end)))
-        start = unit[layout.offsets[g] : end, columns[g]]
-        courses[g] = follow(site, group.schedule, own, start, hearing(g), numbers=BALLS)
+    matrix = np.zeros(start.shape, dtype=object)
+    courses = {
+        g: follow(
+            *(site, group.schedule, own, start[offset : offset + len(group.z_names)], hearing(g)),
+            numbers=BALLS,
+            watch=watch and functools.partial(watch, g),
+        )
+        for g, (group, site, own, offset) in enumerate(
+            zip(system.sites, sites, steps, layout.offsets, strict=True)
+        )
+    }
     while courses:
         known = len(courses), len(sent)
         for g, course in tuple(courses.items()):
             try:
                 # On until it has to wait, so that everybody is sooner or later heard.
                 while (spoken := next(course))[0] >= 0:
-                    sent[g, spoken[0]] = whole(g, spoken[1])
+                    sent[g, spoken[0]] = spoken[1]
             except StopIteration as end_of_frame:
-                state = end_of_frame.value
-                matrix[layout.offsets[g] : layout.offsets[g] + len(state)] = whole(g, state)
+                moved = end_of_frame.value
+                matrix[layout.offsets[g] : layout.offsets[g] + len(moved)] = moved
                 del courses[g]
         assert (len(courses), len(sent)) != known, "a packet is heard before it is sent"
-    shift_packets(matrix, layout, lambda packet: sent[packet.site, packet.row])
+    for packet, place in place_of.items():
+        older = Packet(packet.site, packet.row, packet.lag - 1)
+        matrix[place] = sent[packet.site, packet.row] if packet.lag == 1 else start[place_of[older]]
     return matrix
 
 
-def weight_balls(system: ClosedSystem | Loop) -> dict[Way, list[list[tuple[int, Any]]]]:
+def weight_balls(system: ClosedSystem | Loop) -> Weights:
     """Return, way by way and site by site, whom it hears with what weight, the doubts included."""
-    found: dict[Way, list[list[tuple[int, Any]]]] = {}
+    found = {}
     for way, rows in system.coupling.items():
         if way in system.surds:
             found[way] = [[(0, _surd_ball(system.surds[way]))]]
@@ -206,45 +213,17 @@ def _surd_ball(surd: Surd) -> Any:
 
 
 def _multiply(matrix: Balls, rows: Balls) -> Balls:
-    """Return the product with a matrix that is mostly zeros, as rows may be; an exact zero is the integer.
-
-    Enough balls are multiplied by python-flint at once; numbers with slopes, and few, one by one.
-    """
+    """Return the product with a matrix that is mostly zeros, as rows may be; an exact zero is the integer."""
     product = np.zeros((len(matrix), rows.shape[1]), dtype=object)
-    if matrix.size * rows.shape[1] > FEW_PRODUCTS and _all_balls(matrix, rows):
-        left, right = _maybe(matrix), _maybe(rows)
-        between = np.flatnonzero(left.any(axis=0) & right.any(axis=1))
-        lines = np.flatnonzero(left[:, between].any(axis=1))
-        columns = np.flatnonzero(right[between].any(axis=0))
-        whole = _flint(matrix[np.ix_(lines, between)]) * _flint(rows[np.ix_(between, columns)])
-        entries = np.empty(len(lines) * len(columns), dtype=object)
-        entries[:] = whole.entries()
-        found = entries.reshape(len(lines), len(columns))
-        found[~(left[np.ix_(lines, between)] @ right[np.ix_(between, columns)])] = 0
-        product[np.ix_(lines, columns)] = found
-        return product
-    columns = rows.T.tolist()
+    columns = [
+        [(row, other) for row, other in enumerate(column) if not isinstance(other, int) or other]
+        for column in rows.T.tolist()
+    ]
     for line, entries in zip(product, matrix.tolist(), strict=True):
-        used = [(row, entry) for row, entry in enumerate(entries) if not isinstance(entry, int) or entry]
+        used = {row: entry for row, entry in enumerate(entries) if not isinstance(entry, int) or entry}
         for place, column in enumerate(columns):
-            total = 0
-            for row, entry in used:
-                other = column[row]
-                if not isinstance(other, int) or other:
-                    total = other * entry + total
-            line[place] = total
+            line[place] = sum((other * used[row] for row, other in column if row in used), 0)
     return product
-
-
-def _maybe(numbers: Balls) -> NDArray[np.bool_]:
-    """Say which of an array of numbers may be other than zero: all but exact zeros."""
-    known = [isinstance(one, int) and not one for one in numbers.ravel().tolist()]
-    return ~np.array(known, dtype=np.bool_).reshape(numbers.shape)
-
-
-def _all_balls(*blocks: Balls) -> bool:
-    """Say whether all numbers are balls or integers."""
-    return all({*map(type, block.ravel())} <= {flint.arb, int} for block in blocks)
 
 
 def _flint(block: Balls) -> Any:

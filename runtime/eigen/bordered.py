@@ -1,7 +1,7 @@
 """The characteristic polynomial of a loop by a matrix that holds no packet: without poles, for any delay.
 
 Takes: the one-frame maps of the sites of a loop, many at once, and how what they send comes back to them.
-Gives: `Wires`, `wires_of`, `side_by_side`; `Bordered`, `bordered`, `Logarithm`, `logarithm`.
+Gives: `wires_of`, `side_by_side`; `Bordered`, `bordered`, `Logarithm`, `logarithm`.
 Guarantees: the logarithm is finite wherever the function is not 0, however long the delays.
 Does not: know where zeros may be (see `vary.encirclements`).
 
@@ -16,7 +16,7 @@ number.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from apc.eigen.closing import Coupling, bounded_weight
 from apc.eigen.peer_group import PeerGroup
-from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap
 from apc.frame.schedule import Way
+from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -39,46 +39,10 @@ Matrix = NDArray[Any]
 TOGETHER = 1 << 17
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Wires:
-    """How what all sites send comes back to them: r = Σ_l W_l ζ^(−l) s.
-
-    `weights` (l, n_r, n_s) are W_l, right to `errors`, and `lags` the l.
-    """
-
-    lags: tuple[int, ...]
-    weights: Floats
-    errors: Floats
-
-    def at(self, points: Complexes) -> tuple[Complexes, Complexes]:
-        """Return W (z, n_r, n_s) at points, and dW/dζ."""
-        lags = np.array(self.lags)
-        powers = points[:, None] ** -lags
-        flat = self.weights.reshape(len(lags), -1).astype(np.complex128)
-        shape = (len(points), *self.weights.shape[1:])
-        slopes = (-lags * powers / points[:, None]) @ flat
-        return (powers @ flat).reshape(shape), slopes.reshape(shape)
-
-    def doubt(self, points: Complexes, reach: Floats) -> tuple[Floats, Floats]:
-        """Return a bound on |W| at points, and what W in discs may be off by from value and slope there."""
-        lags = np.array(self.lags)
-        # Taylor's remainder of ζ^−l; a power by way of logarithms loses a rounding a turn.
-        near = np.maximum(np.abs(points) - reach, np.finfo(np.float64).tiny)[:, None]
-        share, largest = reach[:, None] / near, near**-lags
-        wander = largest * (share**2 * lags * (lags + 1) / 2 + (1 + lags * share) * (16 + 8 * lags) * UNIT)
-        doubt = np.einsum("zl,lrs->zrs", wander, np.abs(self.weights))
-        doubt += np.einsum("zl,lrs->zrs", largest, self.errors)
-        return np.einsum("zl,lrs->zrs", np.abs(points[:, None]) ** -lags, np.abs(self.weights)), doubt
-
-
 def wires_of(
-    sites: Sequence[PeerGroup],
-    coupling: Coupling,
-    doubts: Mapping[Way, float],
-    *,
-    only: Callable[[Way], bool] = lambda way: True,
-) -> Wires:
-    """Return how the sites of a loop hear each other.
+    sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way, float]
+) -> tuple[tuple[int, ...], Floats, Floats]:
+    """Return how what the sites of a loop send comes back to them, r = Σ_l W_l ζ^(−l) s.
 
     Parameters
     ----------
@@ -88,49 +52,37 @@ def wires_of(
         What each hears of each, W (K, K) by way.
     doubts
         By how much each entry of a way's W may be off, where it isn't exact.
-    only
-        Which ways count.
+
+    Returns
+    -------
+    The lags l, the weights W_l (l, n_r, n_s), and what these may be off by.
     """
     sent_starts = np.cumsum([0, *(len(group.schedule.sent) for group in sites)])
     heard_starts = np.cumsum([0, *(len(group.schedule.heard) for group in sites)])
-    lags = sorted({heard.lag for group in sites for heard in group.schedule.heard if only(heard.way)})
+    lags = sorted({heard.lag for group in sites for heard in group.schedule.heard})
     weights = np.zeros((2, len(lags), int(heard_starts[-1]), int(sent_starts[-1])))
     for g, group in enumerate(sites):
         for line, heard in enumerate(group.schedule.heard):
-            if not only(heard.way):
-                continue
-            layer = lags.index(heard.lag)
             for h, sender in enumerate(sites):
-                weight = coupling[heard.way][g][h]
                 if heard.sent in sender.schedule.sent:
                     row = sent_starts[h] + sender.schedule.sent.index(heard.sent)
-                    known = bounded_weight(weight, doubts.get(heard.way, 0.0))
-                    weights[:, layer, heard_starts[g] + line, row] = known
-    return Wires(tuple(lags), *weights)
+                    known = bounded_weight(coupling[heard.way][g][h], doubts.get(heard.way, 0.0))
+                    weights[:, lags.index(heard.lag), heard_starts[g] + line, row] = known
+    return tuple(lags), *weights
 
 
 def side_by_side(maps: Sequence[FrameMap]) -> FrameMap:
-    """Return the map of all sites as of one, of many with a leading axis (k)."""
-
-    def diagonal(blocks: Sequence[Matrix]) -> Matrix:
-        rows, columns = (np.cumsum([0, *(one.shape[axis] for one in blocks)]) for axis in (-2, -1))
-        many = np.broadcast_shapes(*(one.shape[:-2] for one in blocks))
-        found = np.zeros((*many, rows[-1], columns[-1]), dtype=np.result_type(*blocks))
-        for place, one in enumerate(blocks):
-            found[..., rows[place] : rows[place + 1], columns[place] : columns[place + 1]] = one
-        return found
-
-    if len(maps) == 1:
-        return FrameMap(*maps[0].blocks)
-    return FrameMap(*(diagonal(blocks) for blocks in zip(*(one.blocks for one in maps), strict=True)))
+    """Return the map of all sites as of one."""
+    block_diag = load_pool("scipy.linalg").block_diag
+    return FrameMap(*(block_diag(*blocks) for blocks in zip(*(one.blocks for one in maps), strict=True)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bordered:
     """M(ζ) = ζ E + C + Σ_l ζ^(−l) C_l of many loops, E the unit matrix over z alone.
 
-    `fixed` (k, n, n) is C, `heard` (l, k, n, n_s) the last columns of C_l, which has no others; `states` says
-    how many rows z has.
+    `fixed` (n, n) is C, that of all loops, `heard` (l, k, n, n_s) the last columns of C_l, which has no
+    others; `states` says how many rows z has.
     """
 
     fixed: Floats
@@ -138,48 +90,37 @@ class Bordered:
     states: int
 
 
-def bordered(maps: FrameMap, weights: Floats, unit: float = 1.0) -> Bordered:
-    """Return the matrices of many loops, or with `unit` 0 the derivatives of them.
+def bordered(maps: FrameMap, weights: Floats) -> Bordered:
+    """Return the matrices of many loops.
 
     Parameters
     ----------
     maps
-        The maps (k, …) of all sites as of one, or their derivatives.
+        The map of all sites as of one.
     weights
-        W_l (l, n_r, n_s), or those of each loop (l, k, n_r, n_s).
-    unit
-        What stands for 1.
+        W_l of each loop (l, k, n_r, n_s).
     """
-    weights = weights if weights.ndim > 3 else weights[:, None]
-    n_s, n_z = maps.s.shape[-2:]
-    count = max(len(maps.s), weights.shape[1])
-    fixed = np.zeros((count, n_z + n_s, n_z + n_s))
-    fixed[:, :n_z, :n_z], fixed[:, n_z:, :n_z] = -maps.p, -maps.s
-    fixed[:, n_z:, n_z:] = unit * np.eye(n_s)
-    back = np.concatenate([maps.q, maps.d], axis=-2)
-    return Bordered(fixed, -(back @ weights), n_z)
+    fixed = np.block([[-maps.p, np.zeros((len(maps.p), len(maps.s)))], [-maps.s, np.eye(len(maps.s))]])
+    return Bordered(fixed, -(np.concatenate([maps.q, maps.d]) @ weights), len(maps.p))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Logarithm:
-    """log F (z,) at points, its derivative over the angle and that over what varies in the maps."""
+    """log F (z,) at points, and its derivative over the angle."""
 
     value: Complexes
     turning: Complexes
-    moving: Complexes
 
 
-def logarithm(
-    loops: Bordered, slopes: Bordered | None, lags: Integers, rows: Integers, points: Complexes, rigid: int
-) -> Logarithm:
+def logarithm(loops: Bordered, lags: Integers, rows: Integers, points: Complexes, rigid: int) -> Logarithm:
     """Return the logarithm of F at points, its `rigid` zeros at 1 divided out.
 
     Parameters
     ----------
-    loops, slopes
-        The matrices of many loops, and their derivatives over what varies, None for nothing.
+    loops
+        The matrices of many loops.
     lags
-        The l of all points, or of each (z, l).
+        The l of each point (z, l).
     rows, points
         Of which loop (z,), and ζ there.
     rigid
@@ -190,15 +131,14 @@ def logarithm(
     d log det M = tr(M⁻¹ dM).
     """
     n_z, n = loops.states, loops.fixed.shape[-1]
-    value, turning, moving = np.full((3, len(rows)), np.nan, np.complex128)
+    value, turning = np.full((2, len(rows)), np.nan, np.complex128)
     place = np.arange(n_z)
     chunk = max(1, TOGETHER // n**2)
     for start in range(0, len(rows), chunk):
         some = slice(start, start + chunk)
-        row, at = rows[some], points[some]
-        exponents = np.broadcast_to(lags, (len(rows), lags.shape[-1]))[some].T
+        row, at, exponents = rows[some], points[some], lags[some].T
         powers = [at**-lag for lag in exponents]
-        matrix = loops.fixed[row].astype(np.complex128)
+        matrix = np.repeat(loops.fixed[None].astype(np.complex128), len(at), axis=0)
         matrix[:, place, place] += at[:, None]
         for power, heard in zip(powers, loops.heard, strict=True):
             matrix[:, :, n_z:] += power[:, None, None] * heard[row]
@@ -208,19 +148,8 @@ def logarithm(
         inverse = np.linalg.inv(matrix).swapaxes(1, 2)
         turn = at * inverse[:, place, place].sum(axis=1)
         for lag, power, heard in zip(exponents, powers, loops.heard, strict=True):
-            turn -= lag * power * _product(inverse[:, :, n_z:], heard[row])
-        move = np.zeros(len(at), np.complex128)
-        if slopes is not None:
-            move += _product(inverse, slopes.fixed[row])
-            for power, slope in zip(powers, slopes.heard, strict=True):
-                move += power * _product(inverse[:, :, n_z:], slope[row])
+            turn -= lag * power * np.einsum("zij,zij->z", inverse[:, :, n_z:], heard[row])
         with np.errstate(all="ignore"):
             value[some] = np.where(good, size + 1j * np.angle(sign) - rigid * np.log(1 - 1 / at), np.nan)
             turning[some] = 1j * (turn - rigid / (at - 1))
-            moving[some] = move
-    return Logarithm(value, turning, moving)
-
-
-def _product(one: Matrix, other: Floats) -> Matrix:
-    """Return the sums of matrices' products entry by entry (z,)."""
-    return np.asarray(np.einsum("zij,zij->z", one, other))
+    return Logarithm(value, turning)

@@ -2,8 +2,7 @@
 
 Takes: groups of equal peers, and what each weighs the packets of each other by.
 Gives: `Loop`, `Coupling`, `without_packets`; `Packet`, `StateLayout`, `lay_out`; `ClosedSystem`,
-`close_loop`; `Feedback`, `bounded_weight`, `feedback_of`, `close`, `close_outside`,
-`shift_packets`.
+`close_loop`; `Feedback`, `bounded_weight`, `feedback_of`, `close`, `close_outside`.
 Guarantees: the state holds, site by site, z and then the packets on their way, in order of row and age. The
 matrix of `close_loop` comes with a bound on its rounding error, entry by entry; `close` takes one system or
 many (k, …), real or complex.
@@ -14,8 +13,7 @@ Does not: know where the weights come from (see `modes`, `graph_loops`); compute
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
@@ -32,9 +30,6 @@ from apc.frame.schedule import Schedule, Way
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]  # float64 or complex128; of balls where it says so
-
-# Loops whose layout and weights are remembered, and of how many states.
-KEPT, FEW_STATES = 64, 200
 
 # What site g hears of site h on a way: the weight on h's packet.
 Coupling = Mapping[Way, tuple[tuple[Fraction, ...], ...]]
@@ -184,8 +179,8 @@ class ClosedSystem:
 def close_loop(loop: Loop | ClosedSystem) -> ClosedSystem:
     """Let K sites hear each other: r_g = Σ_h W_gh s_h, each packet as old as its receiver finds it."""
     lifted = [group.lifted for group in loop.sites]
-    layout, feedback = _wired(loop)
-    closed = close([site.bounded for site in lifted], feedback, layout, numbers=RADII)
+    layout = lay_out_loop(loop)
+    closed = close([site.bounded for site in lifted], feedback_of(loop, layout), layout, numbers=RADII)
     return ClosedSystem(
         name=loop.name,
         multiplicity=loop.multiplicity,
@@ -204,36 +199,6 @@ def close_loop(loop: Loop | ClosedSystem) -> ClosedSystem:
         doubts=loop.doubts,
         surds=loop.surds,
     )
-
-
-def _wired(loop: Loop | ClosedSystem) -> tuple[StateLayout, Sequence[Feedback]]:
-    """Return the layout of a loop's state and what each site hears of it: the same whatever its numbers.
-
-    That of few states is remembered, by all that it follows from: the names of the states, the schedules and
-    the weights, both of which are known by identity and kept.
-    """
-    z_names = [group.lifted.z_names for group in loop.sites]
-    states = sum(map(len, z_names)) + sum(sum(group.schedule.depths) for group in loop.sites)
-    if loop.doubts or states > FEW_STATES:
-        layout = lay_out_loop(loop)
-        return layout, feedback_of(loop, layout)
-    named = (
-        (group.name, names, id(group.schedule)) for group, names in zip(loop.sites, z_names, strict=True)
-    )
-    known = _known_wiring((id(loop.coupling), *named))
-    if not known:
-        layout = lay_out_loop(loop)
-        feedback = feedback_of(loop, layout)
-        for one in feedback:
-            one.now.flags.writeable = one.before.flags.writeable = False
-        known.append((layout, feedback, (loop.coupling, [group.schedule for group in loop.sites])))
-    return known[0][:2]
-
-
-@functools.lru_cache(maxsize=KEPT)
-def _known_wiring(key: tuple[Hashable, ...]) -> list[tuple[StateLayout, Sequence[Feedback], Any]]:
-    """Return a place for a loop's layout and feedback, and for what the key knows by identity."""
-    return []
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -347,7 +312,12 @@ def close(
         r = numbers.add(numbers.multiply(heard.now, sent), heard.before) if at_once else heard.before
         received.append(r)
         _put(matrix[..., place, :], place, one.p, one.q, r, numbers)
-    shift_packets(matrix, layout, lambda packet: sent[..., starts[packet.site] + packet.row, :], numbers)
+    unit = numbers.exact(np.array(1))
+    for packet, at in layout.places.items():  # each grows older by a frame
+        if packet.lag == 1:
+            matrix[..., at, :] = sent[..., starts[packet.site] + packet.row, :]
+        else:
+            matrix[..., at, layout.places[Packet(packet.site, packet.row, packet.lag - 1)]] = unit
     return Closed(matrix, tuple(received), sent)
 
 
@@ -406,30 +376,3 @@ def _sent_in_turn(within: Matrix, alone: Matrix, numbers: Arithmetic) -> Matrix:
         sent = numbers.add(sent, term)
     assert not (np.isfinite(term) & (term != 0)).any(), "a packet is heard before it is sent"
     return sent
-
-
-def shift_packets(
-    matrix: Matrix,
-    layout: StateLayout,
-    sent: Callable[[Packet], Matrix],
-    numbers: Arithmetic = FLOATS,
-) -> None:
-    """Write how packets grow older: the youngest of a row is what was `sent`, each other the one before it.
-
-    Parameters
-    ----------
-    matrix
-        The closed matrix (…, n, columns), of any kind of number, whose rows of packets are still zero.
-    layout
-        Its state's.
-    sent
-        Gives what was sent (…, columns).
-    numbers
-        What the matrix is of.
-    """
-    one = numbers.exact(np.array(1))
-    for packet, place in layout.places.items():
-        if packet.lag == 1:
-            matrix[..., place, :] = sent(packet)
-        else:
-            matrix[..., place, layout.places[Packet(packet.site, packet.row, packet.lag - 1)]] = one

@@ -1,7 +1,7 @@
 """The eigenvalues of a graph's weights W: in closed form, or from floats with a bound on their errors.
 
 Takes: a `Graph` of a link and the number of its peers.
-Gives: `GraphMode`, `Surd`, `graph_modes`, `ring_mode`; `QUICK_PRIME`.
+Gives: `GraphMode`, `Surd`, `graph_modes`, `ring_mode`.
 Guarantees: an eigenvalue that equal row sums make exact, or that is a simple fraction, is exact, with its
 multiplicity proven; any other comes with a bound on its error.
 Does not: know what is sent over the graph, or close a loop (see `graph_loops`).
@@ -13,12 +13,12 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 
-import flint
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Graph
 from apc.compiler.weights import exact_weight, sum_weights
+from apc.eigen.null_space import null_space
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import arcs
 
@@ -39,9 +39,6 @@ MOST_EXACT = 300
 # An eigenvalue that may be a fraction with no larger a denominator, such as −1 of two peers or −1/2 of three,
 # is asked whether it is one.
 MOST_DENOMINATOR = 12
-
-# A prime for the quick look: the null space modulo a prime is at least as large as the true one.
-QUICK_PRIME = 2**61 - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,10 +196,7 @@ def _row_sum(graph: Graph, n: int, *, mean: bool) -> Fraction | None:
 
 
 def _is_exact(graph: Graph, n: int, value: Fraction, multiplicity: int, *, mean: bool) -> bool:
-    """Say whether W − value is proven to have a null space of exactly this dimension.
-
-    Equal row sums make it one at least; modulo a prime it is never smaller than over the rationals.
-    """
+    """Say whether W − value is proven to have a null space of exactly this dimension."""
     pairs, weights = arcs(graph, n)
     rows: dict[tuple[int, int], Fraction] = {}
     for (sender, receiver), weight in zip(pairs.tolist(), weights.tolist(), strict=True):
@@ -218,17 +212,9 @@ def _is_exact(graph: Graph, n: int, value: Fraction, multiplicity: int, *, mean:
     else:
         for peer in range(n):
             rows[peer, peer] -= value
-    quick = flint.nmod_mat(n, n, QUICK_PRIME)
-    for place, entry in rows.items():
-        if entry.denominator % QUICK_PRIME == 0:
-            return False
-        quick[place] = entry.numerator * pow(entry.denominator, -1, QUICK_PRIME) % QUICK_PRIME
-    nullity = n - quick.rank()
-    if nullity == multiplicity == 1:
-        return True
-    if n > MOST_EXACT or nullity < multiplicity:
+    if n > MOST_EXACT and multiplicity > 1:
         return False
-    matrix = flint.fmpq_mat(n, n)
+    matrix = np.zeros((n, n), dtype=object)
     for place, entry in rows.items():
-        matrix[place] = flint.fmpq(entry.numerator, entry.denominator)
-    return bool(n - matrix.rref()[1] == multiplicity)
+        matrix[place] = entry
+    return len(null_space(matrix)) == multiplicity

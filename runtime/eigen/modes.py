@@ -25,11 +25,9 @@ and all else at rest, each of them hearing w_own âˆ’ w_other times itself, n_c â
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 
@@ -40,9 +38,6 @@ from apc.eigen.graph_modes import graph_modes
 from apc.eigen.peer_group import MOST_STATES, PeerGroup, group_name, states_of, too_large, used_ways
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.schedule import Way
-
-# Structures whose loops are remembered, and of how many groups: their weights grow with its square.
-KEPT, FEW_GROUPS = 64, 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,49 +144,12 @@ def complete_loops(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loo
     exchange
         The links, all of them complete.
     """
-    return tuple(
-        Loop(name, many, tuple(groups[place] for place in places), coupling)
-        for name, many, places, coupling in _wiring_of(groups, exchange)
-    )
-
-
-# Loops but for their sites' numbers: name, multiplicity, which of the groups are sites, weights.
-_Wiring = tuple[tuple[str, int, tuple[int, ...], Coupling], ...]
-
-
-def _wiring_of(groups: Sequence[PeerGroup], exchange: Exchange) -> _Wiring:
-    """Return `_complete_wiring`; that of few groups is remembered."""
-    if len(groups) > FEW_GROUPS:
-        return _complete_wiring(groups, exchange)
-    known = _known_loops((id(exchange), *(_structure(group) for group in groups)))
-    if not known:
-        held = exchange, [(group.schedule, group.jacobians.kind) for group in groups]
-        known.append((_complete_wiring(groups, exchange), held))
-    return known[0][0]
-
-
-@functools.lru_cache(maxsize=KEPT)
-def _known_loops(key: tuple[Hashable, ...]) -> list[tuple[_Wiring, Any]]:
-    """Return a place for the loops of groups of this structure, and for what the key knows by identity."""
-    return []
-
-
-def _structure(group: PeerGroup) -> tuple[Hashable, ...]:
-    """Return all of a group that its loops' weights follow from; its schedule and its kind by identity."""
-    gains = tuple(group.gains.items())
-    known = id(group.schedule), id(group.jacobians.kind)
-    return group.name, group.count, group.role, group.place, int(group.peers[0]), gains, *known
-
-
-def _complete_wiring(groups: Sequence[PeerGroup], exchange: Exchange) -> _Wiring:
-    """Return the loops of `complete_loops`, but for their sites."""
     peers = sum(group.count for group in groups)
     degrees = complete_degrees(groups, exchange)
     weights = couple(
         groups, exchange, lambda way, g, h: Fraction(groups[h].count - (1 if g == h else 0)), degrees
     )
-    everyone = tuple(range(len(groups)))
-    loops = [("single" if peers == 1 else "common", 1, everyone, weights)]
+    loops = [Loop("single" if peers == 1 else "common", 1, tuple(groups), weights)]
     if all(group.count < 2 for group in groups):
         return tuple(loops)
     apart = couple(groups, exchange, lambda way, g, h: Fraction(-1 if g == h else 0), degrees)
@@ -200,7 +158,7 @@ def _complete_wiring(groups: Sequence[PeerGroup], exchange: Exchange) -> _Wiring
             continue
         own = {key: ((rows[place][place],),) for key, rows in apart.items()}
         name = "difference" if len(groups) == 1 else f"difference {group.name}"
-        loops.append((name, group.count - 1, (place,), own))
+        loops.append(Loop(name, group.count - 1, (group,), own))
     return tuple(loops)
 
 

@@ -12,7 +12,6 @@ The ε-pseudospectrum holds the eigenvalues of all matrices within ε (in the 2-
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -27,23 +26,18 @@ Matrix = NDArray[Any]  # float64 or complex128
 # classical bound is 1 for real and 2√2 for complex matrices (Higham, Accuracy and Stability, 3.6).
 PRODUCT_ROUNDINGS = 4
 
-# How many powers' norms are taken one by one, fewer of a matrix so large that they would fill the memory;
-# then how many times the last of them is squared.
-POWERS, FEWER_POWERS, LARGE = 64, 16, 300
-SQUARINGS = 24
+# How many powers of a matrix are taken one by one, and how often the last of them is squared at most: what is
+# smaller than 1 by 1e-6 has vanished by then.
+POWERS, SQUARINGS = 8, 23
 
 # Bounds tried: from the largest, the norm, towards the estimate, each time nearer by this factor.
-RADII, STRIDE, NEARER = 224, 16, 2.0**-0.25
+RADII, NEARER = 224, 2.0**-0.25
 
 # Relative error charged to ‖M^k‖ R^(−k) by way of logarithms: k·|log| below 10¹⁰, times UNIT.
 LOGARITHMS = 1e-5
 
-# Sweeps of balancing; chains that nobody answers would go on forever, to no one's use.
-SWEEPS = 12
-
-
-# A norm below it can't be scaled to 1 within the range of floats.
-SMALLEST = 2.0**-1000
+# Sweeps of balancing: after twice as many the bounds are hardly less.
+SWEEPS = 8
 
 
 def norms(stack: Matrix) -> Floats:
@@ -51,45 +45,50 @@ def norms(stack: Matrix) -> Floats:
     size = np.abs(stack)
     if 0 in size.shape[-2:]:
         return np.zeros(size.shape[:-2])
-    frobenius = _frobenius(size)
+    peak = size.max(axis=(-2, -1), keepdims=True)  # relative to it no square is lost
+    peak = np.where(peak > 0, peak, 1.0)
+    frobenius = np.sqrt(np.square(size / peak).sum(axis=(-2, -1))) * peak[..., 0, 0]
     mixed = np.sqrt(size.sum(axis=-2).max(axis=-1)) * np.sqrt(size.sum(axis=-1).max(axis=-1))
     return np.asarray(np.minimum(frobenius, mixed) * (1 + 4 * sum(size.shape[-2:]) * UNIT))
 
 
 def balance(size: Floats) -> Floats:
-    """Return d, powers of two, that make the rows and columns of D⁻¹ |M| D alike in norm.
+    """Return d (…, n), powers of two, that make rows and columns of D⁻¹ |M| D about alike in norm.
 
     Parameters
     ----------
     size
-        Magnitudes |M| (n, n). Where an entry is zero by chance but uncertain, its error should be added: it
-        must not grow without limit.
+        Magnitudes |M| (…, n, n). Where an entry is zero by chance but uncertain, its error should be added:
+        it must not grow without limit.
 
     Notes
     -----
-    Parlett and Reinsch's loop (Numerische Mathematik 13, 1969) in the 2-norm, the diagonal left out.
+    As Parlett and Reinsch (Numerische Mathematik 13, 1969) in the 2-norm, the diagonal left out; of all
+    states at once, so that each goes half-way, as those beside it go as well.
     """
-    squared = np.square(size)
-    np.fill_diagonal(squared, 0.0)
-    scale = np.ones(len(size))
-    for _ in range(SWEEPS):
-        columns, rows = squared.sum(axis=0), squared.sum(axis=1)
-        told = (columns > 0) & (columns < np.inf) & (rows > 0) & (rows < np.inf)
-        quarters = np.round(np.log2(rows[told] / columns[told]) / 4)
-        unsettled = np.flatnonzero(told)[quarters != 0]
-        if not len(unsettled):
-            break
-        for i in unsettled.tolist():  # one after another, as each changes the sums of others
-            column, row = float(squared[:, i].sum()), float(squared[i].sum())
-            factor = 2.0 ** round(math.log2(row / column) / 4)
-            scale[i] *= factor
-            squared[:, i] *= factor * factor
-            squared[i] /= factor * factor
-    return scale
+    with np.errstate(all="ignore"):
+        squared = np.where(np.eye(size.shape[-1], dtype=np.bool_), 0.0, np.square(size))
+        turned = squared.swapaxes(-1, -2)
+        scale = np.ones((*size.shape[:-1], 1))  # squared
+        free = (squared @ scale > 0) & (turned @ scale > 0)
+        for _ in range(SWEEPS):
+            step = (squared @ scale) / (turned @ (1 / scale))  # rows by columns, times the scale squared
+            scale *= np.where(free, np.sqrt(np.sqrt(step) / scale), 1.0)
+        exponents = np.log2(scale[..., 0]) / 2
+        return np.asarray(np.exp2(np.round(np.where(np.isfinite(exponents), exponents, 0.0))))
 
 
-def pseudospectral_radius(matrix: Matrix, error: float) -> float:
-    """Return R such that no matrix within `error` (in the 2-norm) of this one has an eigenvalue beyond R.
+def pseudospectral_radius(matrix: Matrix, error: Floats, nearest: Floats) -> Floats:
+    """Return R (k,) such that no matrix within an error (in the 2-norm) has an eigenvalue beyond R.
+
+    Parameters
+    ----------
+    matrix
+        The matrices (k, n, n).
+    error
+        How far the others may be from each (k,).
+    nearest
+        About how large the largest eigenvalue of each is (k,): bounds are tried near it.
 
     Notes
     -----
@@ -101,112 +100,43 @@ def pseudospectral_radius(matrix: Matrix, error: float) -> float:
     at most 1 + q. The bound falls with R, so that one R is as good a proof as the whole circle; a chain of
     packets, whose eigenvalues rounding scatters far out, has powers that simply end.
     """
-    n = len(matrix)
-    if not n:
-        return 0.0
-    if n == 1:
-        return float((abs(matrix[0, 0]) + error) * (1 + 4 * UNIT))
-    if n == 2:
-        return _radius_of_two(matrix, error)
-    largest = float(norms(matrix)) * (1 + UNIT) + error  # no eigenvalue is larger than the norm
-    if not 0 < largest < np.inf:
-        return largest
-    nearest = float(np.abs(np.linalg.eigvals(matrix)).max())
-    # A power of two near the estimate keeps the powers within the range of floats.
-    unit = 2.0 ** np.ceil(np.log2(max(nearest, largest * 2.0**-8)))
-    exponents, logs = _powers(matrix / unit)
-    steps = (largest - nearest) * NEARER ** np.arange(RADII)
-
-    def least(radii: Floats) -> float:
-        return float(radii[_outside(exponents, logs, radii, unit, error, _base(n))].min(initial=largest))
-
-    # Bounds far apart first, then those between the least that serves and the next, which does not.
-    coarse = nearest + steps[::STRIDE]
-    place = STRIDE * int((coarse > least(coarse)).sum())
-    return min(least(np.append(nearest + steps[place : place + STRIDE], 1.0)), largest)
+    largest = norms(matrix) * (1 + UNIT) + error  # no eigenvalue is larger than the norm
+    logs = _power_norms(matrix)
+    radii = nearest[:, None] + np.maximum(largest - nearest, 0.0)[:, None] * NEARER ** np.arange(RADII)
+    with np.errstate(all="ignore"):
+        exponents = np.array([*range(1, POWERS), *(POWERS * 2**j for j in range(SQUARINGS))])
+        depth = exponents[: logs.shape[-1]] * np.log(radii)[..., None]
+        terms = np.exp(logs[:, None] - depth) * (1 + LOGARITHMS)
+        first, share = 1 + terms[..., : POWERS - 1].sum(axis=-1), terms[..., POWERS - 1 :]
+        bound = (first / radii)[..., None] * np.cumprod(1 + share, axis=-1) / (1 + share) * (1 + LOGARITHMS)
+        proved = (share < 1) & (bound * error[:, None, None] < (1 - share) * (1 - LOGARITHMS))
+    least = np.where(proved.any(axis=-1), radii, np.inf).min(axis=-1)
+    return np.asarray(np.minimum(least, largest))
 
 
-def _radius_of_two(matrix: Matrix, error: float) -> float:
-    """Return the same of two states, in closed form.
-
-    Notes
-    -----
-    For |z| = r, ‖(z − M)⁻¹‖ ≤ ‖z − M‖ / |det(z − M)| ≤ (√2 r + ‖M‖) / (r² − |tr M| r − |det M|), with norms
-    of Frobenius: less than 1/ε beyond the positive root of r² − (|tr M| + √2 ε) r − (|det M| + ε ‖M‖).
-    """
-    (a, b), (c, d) = matrix.tolist()
-    trace, size = abs(a + d), math.hypot(*map(abs, (a, b, c, d)))
-    determinant = abs(a * d - b * c) + 8 * UNIT * (abs(a * d) + abs(b * c))
-    if (a and d) or (b and c):  # what vanishes of a product is less than the smallest float
-        determinant += float(np.finfo(np.float64).tiny)
-    linear = trace + 4 * UNIT * (abs(a) + abs(d)) + math.sqrt(2) * error
-    root = math.sqrt(linear * linear + 4 * (determinant + error * size))
-    return float((linear + root) / 2 * (1 + 16 * UNIT))
-
-
-def _outside(
-    exponents: Floats, logs: Floats, radii: Floats, unit: float, error: float, base: int
-) -> NDArray[np.bool_]:
-    """Say of each R whether the powers prove that no eigenvalue is beyond it."""
-    depth = np.log(radii / unit)[:, None]
-    with np.errstate(over="ignore", invalid="ignore", under="ignore"):
-        terms = np.exp(logs - exponents * depth) * (1 + LOGARITHMS)
-        first, q = terms[:, :base].sum(axis=1) / radii * (1 + 8 * base * UNIT), terms[:, base:]
-        bound = first[:, None] * np.cumprod(1 + q, axis=1) / (1 + q) * (1 + LOGARITHMS)
-        return np.asarray(((q < 1) & (bound * error < (1 - q) * (1 - LOGARITHMS))).any(axis=1))
-
-
-def _base(n: int) -> int:
-    """Return how many powers of a matrix of order n are taken one by one."""
-    return POWERS if n <= LARGE else FEWER_POWERS
-
-
-def _powers(matrix: Matrix) -> tuple[Floats, Floats]:
-    """Return exponents k = 0, 1, … K−1, K, 2K, 4K, … and the logarithms of bounds on ‖M^k‖.
+def _power_norms(matrix: Matrix) -> Floats:
+    """Return the logarithms of bounds on ‖M^k‖ for k = 1, 2, … K, 2K, 4K, … (k, m).
 
     An error of P ≈ M^i and one of Q ≈ M^j make one of at most ‖ΔP‖‖Q‖ + ‖P‖‖ΔQ‖ + ‖ΔP‖‖ΔQ‖ in P Q, and the
-    product adds its roundings, `PRODUCT_ROUNDINGS`·n·UNIT·|P||Q|; `norms` bounds the 2-norm of |P| too.
+    product adds its roundings.
     """
-    n = len(matrix)
-    base = _base(n)
-    charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
-    tiny = n * n * float(np.finfo(np.float64).tiny)  # what underflow hides
-
-    def worse(off: Any, size: Any, other_off: float, other_size: float) -> Any:
-        return off * other_size + size * other_off + off * other_off + charge * size * other_size + tiny
-
-    # M, M², then M³ and M⁴ from these, and so on, doubling to the K-th; `off` bounds what each is off by.
-    stack = np.array(matrix, ndmin=3)
-    size, off = norms(stack), np.zeros(1)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore", under="ignore"):
-        while len(stack) < base:
-            last, last_size, last_off = stack[-1], float(size[-1]), float(off[-1])
-            off = np.append(off, worse(off, size, last_off, last_size))
-            further = stack @ last
-            stack, size = np.concatenate([stack, further]), np.append(size, norms(further))
-        logs = [0.0, *np.log(size + off).tolist()]
-        exponents = list(range(base + 1))
-        power, power_off, power_size = stack[-1], float(off[-1]), float(size[-1])
-        shift = 0.0  # the power is 2^shift times what is kept of it, near 1 so that nothing is lost
-        for _ in range(SQUARINGS):
-            if not SMALLEST < power_size < np.inf:  # nothing of it is left to square
-                break
-            step = -round(math.log2(power_size))
-            power, power_size, power_off = power * 2.0**step, power_size * 2.0**step, power_off * 2.0**step
-            shift = 2 * (shift - step)
-            power_off = float(worse(power_off, power_size, power_off, power_size))
-            power = power @ power
-            power_size = float(norms(power))
-            logs.append(float(np.log(power_size + power_off)) + shift * math.log(2.0))
-            exponents.append(2 * exponents[-1])
-            if not power_off < 1:  # nothing is known any more
-                break
-        return np.array(exponents, dtype=np.float64), np.array(logs)
-
-
-def _frobenius(stack: Matrix) -> Floats:
-    """Return the Frobenius norms, of entries however small: squares of these would vanish."""
-    size = np.abs(stack)
-    peak = size.max(axis=(-2, -1), keepdims=True)
-    peak = np.where(peak > 0, peak, 1.0)
-    return np.asarray(np.sqrt(np.square(size / peak).sum(axis=(-2, -1))) * peak[..., 0, 0])
+    n = matrix.shape[-1]
+    charge, tiny = PRODUCT_ROUNDINGS * (n + 2) * UNIT, n * n * float(np.finfo(np.float64).tiny)
+    found: list[tuple[Matrix, Floats, Floats, Floats]] = []
+    with np.errstate(all="ignore"):
+        for step in range(1, POWERS + SQUARINGS):
+            if step == 1:
+                power, off, shift = matrix, np.zeros(len(matrix)), np.zeros(len(matrix))
+            else:
+                factors = (step // 2 - 1, step - step // 2 - 1) if step <= POWERS else (-1, -1)
+                (one, one_off, one_size, one_shift), (two, two_off, two_size, two_shift) = (
+                    found[place] for place in factors
+                )
+                power, shift = one @ two, one_shift + two_shift
+                off = one_off * two_size + one_size * two_off + one_off * two_off
+                off += charge * one_size * two_size + tiny
+            # The power is e^shift times what stands for it, near 1 so that nothing is lost.
+            size = norms(power)
+            unit = np.exp2(np.round(np.log2(np.where(size > 0, size, 1.0))))
+            found.append((power / unit[:, None, None], off / unit, size / unit, shift + np.log(unit)))
+        return np.stack([np.log(size + off) + shift for _, off, size, shift in found], axis=-1)

@@ -7,6 +7,7 @@ Does not: compare what depends on the parameters, or take a root of it.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -53,6 +54,7 @@ class Ratios:
         return self.context.constant(_fraction(value))
 
 
+@functools.total_ordering
 @dataclass(frozen=True, slots=True, eq=False)
 class Ratio:
     """`top`/`bottom`, polynomials over the rationals; computes with whole numbers, fractions and floats."""
@@ -134,15 +136,6 @@ class Ratio:
 
     def __lt__(self, value: Any) -> bool:
         return bool((self - value).constant() < 0)
-
-    def __le__(self, value: Any) -> bool:
-        return bool((self - value).constant() <= 0)
-
-    def __gt__(self, value: Any) -> bool:
-        return bool((self - value).constant() > 0)
-
-    def __ge__(self, value: Any) -> bool:
-        return bool((self - value).constant() >= 0)
 
     def __abs__(self) -> Fraction:
         return abs(self.constant())

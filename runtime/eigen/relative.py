@@ -27,10 +27,6 @@ Floats = NDArray[np.float64]
 Places = NDArray[np.intp]
 Matrix = NDArray[Any]  # float64 or complex128; of balls where it says so
 
-# Rows of which columns are chosen one by one, each the best of all; of more, by an LU decomposition, which
-# pivots on columns alone and costs a cube, not as many passes over all.
-MOST_PIVOTED = 64
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Relative:
@@ -84,21 +80,11 @@ def relative_bounded(matrix: Matrix, error: Floats, at: Relative) -> tuple[Matri
 
 def independent_places(rows: NDArray[Any]) -> NDArray[np.intp]:
     """Return the places (m,) of m columns of rows (m, n) of which the others are small combinations."""
-    if len(rows) > MOST_PIVOTED:
-        scaled = rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
-        order = load_pool("scipy.linalg").lu(scaled.T, p_indices=True, check_finite=False)[0]
-        return np.flatnonzero(order < len(rows))
-    left = np.array(rows)
-    size = np.abs(rows).max(axis=1, keepdims=True, initial=np.finfo(np.float64).tiny)
-    places: list[int] = []
-    for _ in range(len(rows)):
-        line, place = divmod(int(np.argmax(np.abs(left) / size)), rows.shape[1])
-        places.append(place)
-        if left[line, place] != 0:
-            pivot = left[line] / left[line, place]
-            left -= left[:, [place]] * pivot
-            left[line] = 0.0
-    return np.array(sorted(places), dtype=np.intp)
+    if not len(rows):
+        return np.zeros(0, dtype=np.intp)
+    scaled = rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    order = load_pool("scipy.linalg").qr(scaled, mode="r", pivoting=True, check_finite=False)[1]
+    return np.asarray(np.sort(order[: len(rows)]), dtype=np.intp)
 
 
 def relative_places(basis: Floats) -> tuple[Places, Places]:

@@ -12,25 +12,21 @@ Does not: close the loop (see `modes`).
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.apart import SMALL
 from apc.eigen.balls import unprovable
 from apc.eigen.certify import MOST_PROVED, prove
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.eigenpairs import Eigenpairs, components, pairs_to
-from apc.eigen.enclosure import WIDE, Enclosure, discs, enclose_all
-from apc.eigen.peer_group import PeerGroup
-from apc.eigen.relative import Relative, independent_places, relative_bounded, relative_coordinates
-from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_before, rigid_modes_here
+from apc.eigen.enclosure import SMALL, WIDE, Enclosure, descending, discs, enclose_eigenvalues
+from apc.eigen.relative import Relative, relative_bounded, relative_coordinates
+from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here
 from apc.frame.course import turns
 from apc.frame.discretize import UNIT
 from apc.frame.schedule import Propagate
@@ -54,9 +50,6 @@ LOOKED_AT = 64
 
 # A mode that shrinks to less than this in a frame is one that ends in finite time, computed in floats.
 DEADBEAT = 1e-12
-
-# Rigid modes whose relative coordinates are remembered.
-KEPT = 64
 
 # A proof serves for all that is told where it knows the radius to this many times the bound of floats.
 AS_SHARP = 4.0
@@ -135,11 +128,7 @@ class Spectrum:
 
 
 def solve_spectrum(
-    systems: Sequence[ClosedSystem],
-    *,
-    certify: bool = False,
-    in_balls: bool = True,
-    verdict_only: bool = False,
+    systems: Sequence[ClosedSystem], *, certify: bool = False, in_balls: bool = True
 ) -> Spectrum:
     """Compute the spectrum of a whole system given as independent closed systems.
 
@@ -152,19 +141,13 @@ def solve_spectrum(
         open.
     in_balls
         Whether these are worth their time; else they stay open.
-    verdict_only
-        Whether balls leave the eigenvalues as floats have them, which takes less time.
 
     Notes
     -----
     A drift leaves a second eigenvalue 1 behind when only the rigid direction is removed. So when every error
     disc keeps clear of 1 there is none, and the exact search for one is spared.
     """
-    solved = _solve(systems, [rigid_modes_before(system) for system in systems])
-    for place, system in enumerate(systems):
-        free = solved[place].free
-        if not solved[place].clear_of_one and (more := rigid_modes_here(system)).exact != free.exact:
-            solved[place] = _solve([system], [more])[0]
+    solved = [_solve(system, rigid_modes_here(system)) for system in systems]
     lowest = max((one.low for one in solved), default=0.0)
     notes: list[str] = []
     for place, system in enumerate(systems):
@@ -178,12 +161,12 @@ def solve_spectrum(
         elif not reason and (states := _tied(system)) > MOST_PROVED:
             reason = f"it has {states} states, more than the {MOST_PROVED} that are proved"
         if not reason:
-            solved[place] = _prove(system, one, verdict_only=verdict_only)
+            solved[place] = _prove(system, one)
             continue
         if certify or _is_open(one, lowest):
             notes.append(f"{system.name}: not proved, as {reason}")
         if drifting and (free := find_rigid_modes(system)).drifts:
-            solved[place] = _solve([system], [free])[0]
+            solved[place] = _solve(system, free)
     low = max((one.low for one in solved), default=0.0)
     high = max((one.high for one in solved), default=0.0)
     largest = max((float(np.abs(one.pairs.values).max(initial=0.0)) for one in solved), default=0.0)
@@ -223,8 +206,8 @@ class _Solved:
 
     free: RigidModes
     at: Relative
-    matrix: Floats | None  # of the relative coordinates; None where `pairs` are all there is to know of it
-    pairs: Eigenpairs  # of these, or of each part of them by itself
+    matrix: Floats  # of the relative coordinates
+    pairs: Eigenpairs  # of each strongly connected part by itself
     bounds: Enclosure
     low: float
     high: float
@@ -234,51 +217,12 @@ class _Solved:
     @property
     def whole(self) -> Eigenpairs:
         """The vectors that the whole state follows from: where some is held, those of all that is left."""
-        if self.matrix is None or not len(self.at.held):
-            return self.pairs
-        parts = components(self.matrix != 0)
-        several = [part for part in parts if len(part) > 1]
-        # Vectors of a part are 0 beside it: what reaches farther was solved as a whole.
-        reached = np.sum([self.pairs.right[part].any(axis=0) for part in parts], axis=0)
-        if len(parts) == 1 or np.any(reached > 1):
-            return self.pairs
-        if len(several) == 1:
-            alone = np.array([part[0] for part in parts if len(part) == 1], dtype=np.intp)
-            if (found := _with_queues(self.matrix, self.pairs, several[0], alone)) is not None:
-                return found
-        return pairs_to(self.matrix, self.pairs.values)
+        return pairs_to(self.matrix, self.pairs.values) if len(self.at.held) else self.pairs
 
     @property
     def clear_of_one(self) -> bool:
         """Whether no eigenvalue can be 1."""
-        return bool((np.abs(self.pairs.values - 1) > self.bounds.near).all())
-
-
-def _with_queues(matrix: Floats, pairs: Eigenpairs, part: Integers, alone: Integers) -> Eigenpairs | None:
-    """Return vectors of a whole matrix, given those of a part and of states that keep what it was.
-
-    None where these do more than that, or the vectors don't follow.
-    """
-    driven = matrix[alone[:, None], part]
-    if matrix[:, alone].any():
-        return None
-    own = pairs.right[alone].any(axis=0)
-    late, rest = np.flatnonzero(own), np.flatnonzero(~own)
-    if pairs.values[late].any() or not pairs.values[rest].all():
-        return None
-    right, left = pairs.right.copy(), pairs.left.copy()
-    try:
-        # λ x_a = M_ap x_p of the part's; w_p M_pp + w_a M_ap = 0 of theirs.
-        right[alone[:, None], rest] = driven @ right[part[:, None], rest] / pairs.values[rest]
-        late_left = left[late[:, None], alone] @ driven
-        left[late[:, None], part] = -np.linalg.solve(matrix[part[:, None], part].T, late_left.T).T
-    except np.linalg.LinAlgError:
-        return None
-    return (
-        Eigenpairs(pairs.values, right, left)
-        if np.isfinite(right).all() and np.isfinite(left).all()
-        else None
-    )
+        return bool((np.abs(self.pairs.values - 1) > self.bounds.errors).all())
 
 
 def _tied(system: ClosedSystem) -> int:
@@ -333,75 +277,54 @@ def up_to(translations: int, rotations: int = 0) -> str:
     return STABLE_TURNING if rotations else STABLE
 
 
-def _solve(systems: Sequence[ClosedSystem], free: Sequence[RigidModes]) -> list[_Solved]:
-    """Solve systems in floats, rigid modes taken out, all at once."""
-    listed = [_relative_to(one) for one in free]
-    given = [
-        (*relative_bounded(system.matrix, system.error, at), len(at.held) > 0)
-        for system, at in zip(systems, listed, strict=True)
-    ]
-    found = []
-    for one, at, (matrix, _, _), (pairs, bounds) in zip(free, listed, given, enclose_all(given), strict=True):
-        inside = False if bounds.low > 1 else True if bounds.high < 1 else None  # NaN decides nothing
-        found.append(_Solved(one, at, matrix, pairs, bounds, bounds.low, bounds.high, inside, 0))
-    return found
+def _solve(system: ClosedSystem, free: RigidModes) -> _Solved:
+    """Solve a system in floats, rigid modes taken out."""
+    at = relative_coordinates(free.basis)
+    matrix, error = relative_bounded(system.matrix, system.error, at)
+    pairs, bounds = enclose_eigenvalues(matrix, error)
+    inside = False if bounds.low > 1 else True if bounds.high < 1 else None  # NaN decides nothing
+    return _Solved(free, at, matrix, pairs, bounds, bounds.low, bounds.high, inside, 0)
 
 
-@functools.lru_cache(maxsize=KEPT)
-def _relative_to(free: RigidModes) -> Relative:
-    """Return the coordinates relative to rigid modes; systems of other numbers mostly share theirs."""
-    return relative_coordinates(free.basis)
-
-
-def _prove(system: ClosedSystem, estimate: _Solved, *, verdict_only: bool) -> _Solved:
+def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
     """Solve one system in balls; what these leave open stays as floats found it."""
-    places = independent_places(estimate.free.basis.T)
-    proof = prove(system, estimate.free, places, verdict_only=verdict_only)
+    proof = prove(system, estimate.free)
     if proof.free.drifts != estimate.free.drifts:
-        (estimate,) = _solve([system], [proof.free])
+        estimate = _solve(system, proof.free)
     inside, bits = proof.inside, proof.bits
     if inside is None and not estimate.free.names:
         # Weights known as floats only can cost balls more than floats: their bound counts these, too.
         inside, bits = estimate.inside, 0 if estimate.inside is not None else bits
-    if not len(proof.values):
-        return replace(estimate, inside=inside, bits=bits)
     found = discs(proof.values, proof.values, proof.radii)
-    low, high = max(estimate.low, found.low), min(estimate.high, found.high)
+    low, high = max(estimate.low, float(found.low)), min(estimate.high, float(found.high))
+    proved = replace(estimate, low=low, high=high, inside=inside, bits=bits)
     # A radius that floats know as well: the other eigenvalues a proof knows far better.
-    known = not found.high - found.low > AS_SHARP * (estimate.high - estimate.low)
-    if not known or proof.right is None or proof.left is None:
-        return replace(estimate, low=low, high=high, inside=inside, bits=bits)
-    pairs = Eigenpairs(proof.values, proof.right, proof.left)
-    at = relative_coordinates(proof.free.basis)
-    return _Solved(proof.free, at, None, pairs, found, low, high, inside, bits)
+    if found.high - found.low > AS_SHARP * (estimate.high - estimate.low):
+        return proved
+    order = descending(proof.values)
+    pairs = pairs_to(estimate.matrix, proof.values[order])
+    return replace(proved, pairs=pairs, bounds=Enclosure(found.low, found.high, found.errors[order]))
 
 
 def _modes(systems: Sequence[ClosedSystem], solved: Sequence[_Solved]) -> tuple[Mode, ...]:
     """List the eigenvalues of all systems, the largest first; how they move is made when it is looked at."""
-    with single_threaded(), np.errstate(all="ignore"):
-        ranked = sorted(
-            (
-                ((-abs(value), system.name, value.real, -value.imag), value, bound, (place, row))
-                for place, (system, one) in enumerate(zip(systems, solved, strict=True))
-                for row, (value, bound) in enumerate(
-                    zip(one.pairs.values.tolist(), one.bounds.errors.tolist(), strict=True)
-                )
-            ),
-            key=itemgetter(0),
-        )
-    vectors = [Later(functools.partial(_whole, one)) for one in solved]
+    ranked = sorted(
+        (-abs(value), system.name, value.real, -value.imag, place, row)
+        for place, (system, one) in enumerate(zip(systems, solved, strict=True))
+        for row, value in enumerate(one.pairs.values.tolist())
+    )
     modes = []
     for some in (ranked[:LOOKED_AT], ranked[LOOKED_AT:]):
-        places = [place for *_, place in some]
-        motions = Later(functools.partial(_motions, systems, solved, vectors, places))
-        for number, (_, value, bound, (place, _)) in enumerate(some):
+        motions = Later(functools.partial(_motions, systems, solved, [one[-2:] for one in some]))
+        for number, (*_, place, row) in enumerate(some):
+            value = complex(solved[place].pairs.values[row])
             modes.append(
                 Mode(
                     eigenvalue=value,
                     magnitude=abs(value),
                     multiplicity=systems[place].multiplicity,
                     shape=systems[place].name,
-                    error=bound,
+                    error=float(solved[place].bounds.errors[row]),
                     motion=Later(functools.partial(_one_of, motions, number)),
                 )
             )
@@ -412,61 +335,38 @@ def _one_of(motions: Sequence[Motion], number: int) -> tuple[Motion]:
     return (motions[number],)
 
 
-def _whole(one: _Solved) -> tuple[Eigenpairs]:
-    with single_threaded(), np.errstate(all="ignore"):
-        return (one.whole,)
-
-
 def _motions(
-    systems: Sequence[ClosedSystem],
-    solved: Sequence[_Solved],
-    vectors: Sequence[Sequence[Eigenpairs]],
-    places: Sequence[tuple[int, int]],
+    systems: Sequence[ClosedSystem], solved: Sequence[_Solved], places: Sequence[tuple[int, int]]
 ) -> tuple[Motion, ...]:
-    """Describe some eigenvalues, given by their systems and rows; of each system the vectors are at hand."""
+    """Describe some eigenvalues, given by their systems and rows."""
+    found: dict[tuple[int, int], Motion] = {}
     with single_threaded(), np.errstate(all="ignore"):
-        rows = [
-            np.array([row for own, row in places if own == s], dtype=np.intp) for s in range(len(systems))
-        ]
-        own = [iter(one) for one in _described(systems, solved, vectors, rows)]
-        return tuple(next(own[s]) for s, _ in places)
+        for s, (system, one) in enumerate(zip(systems, solved, strict=True)):
+            rows = [row for own, row in places if own == s]
+            if rows:
+                motions = _described(system, one, np.array(rows, dtype=np.intp))
+                found |= {(s, row): motion for row, motion in zip(rows, motions, strict=True)}
+    return tuple(found[place] for place in places)
 
 
-def _described(
-    systems: Sequence[ClosedSystem],
-    solved: Sequence[_Solved],
-    vectors: Sequence[Sequence[Eigenpairs]],
-    rows: Sequence[Integers],
-) -> list[list[Motion]]:
-    """Describe the eigenvalues of some rows of each system, in their order."""
-    vague: list[NDArray[np.bool_]] = []
-    parts: list[tuple[ClosedSystem, Complexes, Complexes, Floats]] = []
-    described: list[tuple[Complexes, Floats]] = []
-    for system, one, (pairs,), own in zip(systems, solved, vectors, rows, strict=True):
-        pairs = pairs.at(own)
-        vector, shares = whole_vectors(system, one.at, pairs)
-        errors = one.bounds.errors[own]
-        described.append((pairs.values, shares))
-        magnitudes = np.abs(pairs.values)
-        gone = magnitudes <= np.maximum(DEADBEAT * len(system.names), np.minimum(errors, SMALL))
-        vague.append(gone)
-        parts.append((system, pairs.values[~gone], vector[:, ~gone], shares[:, ~gone]))
-    found = []
-    for system, (values, shares), gone, known in zip(
-        systems, described, vague, angles_in_frame(parts), strict=True
+def _described(system: ClosedSystem, one: _Solved, rows: Integers) -> list[Motion]:
+    """Describe the eigenvalues of some rows of a system, in their order."""
+    pairs = one.whole.at(rows)
+    vectors, shares = whole_vectors(system, one.at, pairs)
+    sizes = np.abs(pairs.values)
+    gone = sizes <= np.maximum(DEADBEAT * len(system.names), np.minimum(one.bounds.errors[rows], SMALL))
+    # What ends in finite time has no frequency; but what is never computed anew can't end.
+    angles = np.full(len(rows), 0.0 if _ticks(system) else np.nan)
+    angles[~gone] = angles_in_frame(system, pairs.values[~gone], vectors[:, ~gone], shares[:, ~gone])
+    motions = []
+    for size, angle, ends, taking in zip(
+        sizes.tolist(), angles.tolist(), gone.tolist(), shares.T.tolist(), strict=True
     ):
-        # What ends in finite time has no frequency; but what is never computed anew can't end.
-        angles = np.full(len(gone), 0.0 if _ticks(system) else np.nan)
-        angles[~gone] = known
-        listed = zip(values.tolist(), angles.tolist(), gone.tolist(), shares.T.tolist(), strict=True)
-        motions = []
-        for value, angle, ends, taking in listed:
-            frequency, damping = 0.0, 1.0
-            if not ends or math.isnan(angle):
-                frequency, damping = oscillation(abs(value), angle, system.frame_s)
-            motions.append(Motion(frequency, damping, tuple(zip(system.names, taking, strict=True))))
-        found.append(motions)
-    return found
+        frequency, damping = 0.0, 1.0
+        if not ends or math.isnan(angle):
+            frequency, damping = oscillation(size, angle, system.frame_s)
+        motions.append(Motion(frequency, damping, tuple(zip(system.names, taking, strict=True))))
+    return motions
 
 
 def _ticks(system: ClosedSystem) -> bool:
@@ -480,8 +380,6 @@ def whole_vectors(
     system: ClosedSystem,
     at: Relative,
     pairs: Eigenpairs,
-    *,
-    aside: float = 0.0,
 ) -> tuple[Complexes, Floats]:
     """Return the vectors (n, k) over the whole state, and how much each state takes part (n, k), shares of 1.
 
@@ -491,9 +389,6 @@ def whole_vectors(
         The closed system and its relative coordinates.
     pairs
         Eigenvalues (k,) of the relative coordinates, with their vectors.
-    aside
-        By how much larger, relatively, each eigenvalue is taken: one of 1 leaves open how far the peers stand
-        aside together.
     """
     matrix = system.matrix
     held, rest, weights, count = at.held, at.rest, at.weights, len(at.held)
@@ -504,8 +399,9 @@ def whole_vectors(
         across = matrix[held[:, None], rest]
         corner = matrix[held[:, None], held] + across @ weights
         driven = across @ pairs.right
-        shifted = (pairs.values * (1 + aside))[:, None, None] * np.eye(count) - corner
-        vectors[held] = _least(shifted, driven)
+        shifted = pairs.values[:, None, None] * np.eye(count) - corner
+        inverse = np.linalg.pinv(shifted, rcond=count * 2 * UNIT)
+        vectors[held] = np.einsum("kij,jk->ik", inverse, driven)
         vectors[rest] += weights @ vectors[held]
         covectors[held] = -(pairs.left @ weights).T
     shares = np.abs(vectors * covectors)
@@ -513,15 +409,6 @@ def whole_vectors(
     sizes = np.abs(vectors)
     shares = np.where(total > 0, shares, sizes)
     return vectors, shares / shares.sum(axis=0)
-
-
-def _least(matrix: Complexes, right: Complexes) -> Complexes:
-    """Return the least solutions (n, k) of M x = r, of matrices (k, n, n) and right sides (n, k)."""
-    if len(right) == 1:
-        alone = matrix[:, 0, 0]
-        return np.where(alone == 0, 0.0, right / alone)
-    inverse = np.linalg.pinv(matrix, rcond=len(right) * 2 * UNIT)
-    return np.asarray(np.einsum("kij,jk->ik", inverse, right))
 
 
 def oscillation(magnitude: float, angle: float, frame_s: float) -> tuple[float, float]:
@@ -541,52 +428,34 @@ def finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def angles_in_frame(parts: Sequence[tuple[ClosedSystem, Complexes, Complexes, Floats]]) -> list[Floats]:
-    """Return by how much modes turn in a frame, in radians, with whole turns; NaN if it can't be told.
+def angles_in_frame(system: ClosedSystem, values: Complexes, vectors: Complexes, shares: Floats) -> Floats:
+    """Return by how much modes turn in a frame (k,), in radians, with whole turns; NaN if it can't be told.
 
     The eigenvalue knows the angle up to whole turns; these are counted on the continuous state that takes
     most part. Where none does, as in what only packets carry, the angle is the eigenvalue's.
 
     Parameters
     ----------
-    parts
-        Closed systems, each with eigenvalues (k,), their vectors (n, k) over the state, and how much each
-        state takes part (n, k).
-
-    Returns
-    -------
-    Of each the angles (k,).
+    system
+        The closed system.
+    values, vectors, shares
+        Eigenvalues (k,), their vectors (n, k) over the state, and how much each state takes part (n, k).
     """
-    found = [np.angle(values) for _, values, _, _ in parts]
-    sites: dict[tuple[int, int], list[tuple[PeerGroup, Complexes, Complexes, Integers, Complexes]]] = {}
-    places: dict[tuple[int, int], list[tuple[Floats, Integers]]] = {}
-    for (system, values, vectors, shares), angles in zip(parts, found, strict=True):
-        if not system.motion or not len(values):
-            continue
-        motion = np.array(system.motion)
-        dominant = motion[np.argmax(shares[motion], axis=0)]
-        moving = shares[dominant, np.arange(len(values))] > LEAST_SHARE
-        if not system.sites:
-            angles[moving] = np.nan
-            continue
-        site_of = np.searchsorted(system.offsets, dominant, side="right") - 1
-        for g, (group, offset, heard) in enumerate(
-            zip(system.sites, system.offsets, system.heard, strict=True)
-        ):
-            own = np.flatnonzero(moving & (site_of == g))
-            if not len(own):
-                continue
+    angles = np.angle(values)
+    if not system.motion or not len(values):
+        return angles
+    motion = np.array(system.motion)
+    dominant = motion[np.argmax(shares[motion], axis=0)]
+    moving = shares[dominant, np.arange(len(values))] > LEAST_SHARE
+    if not system.sites:
+        return np.where(moving, np.nan, angles)
+    site_of = np.searchsorted(system.offsets, dominant, side="right") - 1
+    for g, (group, offset, heard) in enumerate(zip(system.sites, system.offsets, system.heard, strict=True)):
+        own = np.flatnonzero(moving & (site_of == g))
+        if len(own):
             start = vectors[offset : offset + len(group.lifted.z_names), own]
-            key = id(group.site), id(group.schedule)
-            sites.setdefault(key, []).append(
-                (group, start, heard @ vectors[:, own], dominant[own] - offset, values[own])
+            received = heard @ vectors[:, own]
+            angles[own] = turns(
+                group.site, group.schedule, start, received, dominant[own] - offset, values[own]
             )
-            places.setdefault(key, []).append((angles, own))
-    # What moves on like sites is followed together.
-    for key, listed in sites.items():
-        group = listed[0][0]
-        columns = [np.concatenate(one, axis=-1) for one in list(zip(*listed, strict=True))[1:]]
-        turned = iter(turns(group.site, group.schedule, *columns))
-        for angles, own in places[key]:
-            angles[own] = list(itertools.islice(turned, len(own)))
-    return found
+    return angles

@@ -46,26 +46,11 @@ FIRST_ARCS = 32
 # hundred.
 MOST_POINTS, POINTS_AN_ARC = 3000, 4
 
-# Arcs beside a zero grow by this factor from one to the next: each keeps clear of the zero by its own length.
-GRADING = 2.4
-
 # An arc narrower than this many radians has a zero as good as on it: given up.
 NARROWEST = 1e-14
 
 # Steps of the power method for a scaling, and the least ratio of its entries.
 POWER_STEPS, FLOOR, TINY = 4, 1e-12, 1e-300
-
-
-def _graded(edges: Floats, close: Complexes) -> Floats:
-    """Add edges about the angles of points near the unit circle, as dense as the points are near."""
-    whole = [edges]
-    for angle, size in zip(np.angle(close).tolist(), np.abs(close).tolist(), strict=True):
-        first, widest = max(abs(size - 1), NARROWEST * GRADING) / 2, float(edges[1])
-        steps = max(0, int(np.log(widest / first) / np.log(GRADING)) + 1)
-        aside = first * GRADING ** np.arange(steps)
-        whole.append(angle % (2 * np.pi) + np.concatenate([-aside, aside]))
-    found = np.unique(np.concatenate(whole))
-    return np.asarray(found[(found >= edges[0]) & (found <= edges[-1])])
 
 
 def wind(
@@ -75,7 +60,6 @@ def wind(
     *,
     arcs: int = FIRST_ARCS,
     most: int | None = None,
-    close: Complexes | None = None,
 ) -> int | None:
     """Return how often a function goes around 0 along a circle, counter-clockwise; None if it can't be told.
 
@@ -89,14 +73,10 @@ def wind(
         How many arcs to begin with.
     most
         Evaluations after which to give up, or as many as serve.
-    close
-        Zeros (z,) that the circle passes closely: there arcs begin as short as they have to be.
     """
     half = not complex(centre).imag
     most = MOST_POINTS + POINTS_AN_ARC * arcs if most is None else most
     edges = np.linspace(0.0, np.pi if half else 2 * np.pi, (arcs // 2 if half else arcs) + 1)
-    if close is not None and len(close):
-        edges = _graded(edges, (close - centre) / radius)
     starts, ends = edges[:-1], edges[1:]
     settled: list[tuple[Floats, Complexes]] = []
     spent = 0

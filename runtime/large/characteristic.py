@@ -135,7 +135,6 @@ def count_around(
     *,
     arcs: int,
     most: int | None = None,
-    close: Complexes | None = None,
 ) -> int | None:
     """Return zeros less poles of f within a circle, None if that can't be told.
 
@@ -143,7 +142,7 @@ def count_around(
     ----------
     function
         f.
-    centre, radius, arcs, most, close
+    centre, radius, arcs, most
         As `winding.wind` has them.
     """
     return wind(
@@ -152,7 +151,6 @@ def count_around(
         radius,
         arcs=arcs,
         most=most,
-        close=close,
     )
 
 

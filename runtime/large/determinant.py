@@ -159,8 +159,7 @@ def of_loop(sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way,
         lines = np.arange(heard_starts[g], heard_starts[g + 1])
         placed = _placed(rows_of(group.lifted, 1), rows, lines, n_s, n_r)
         transfers.append(build_transfer(placed, np.ones(1)))
-    wires = wires_of(sites, coupling, doubts)
-    return Characteristic(tuple(transfers), wires.lags, wires.weights, wires.errors)
+    return Characteristic(tuple(transfers), *wires_of(sites, coupling, doubts))
 
 
 def _placed(maps: BoundedMap, rows: Integers, lines: Integers, n_s: int, n_r: int) -> BoundedMap:

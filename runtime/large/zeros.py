@@ -61,9 +61,6 @@ SMALL_ARCS, SMALL_POINTS = 12, 300
 # relatively, at the cost of no more counts than these; a circle that can't be counted is tried so far aside.
 BRACKETED, MOST_COUNTS, BESIDE = 1e-3, 40, 1e-4
 
-# Known zeros this close to a circle, relatively, no more than so many, tell where its arcs have to be short.
-CLOSE_BY, MOST_CLOSE = 1e-5, 16
-
 # Points from which a circle about a zero is looked for, and circles tried from each.
 LOOKS = 4
 
@@ -111,7 +108,7 @@ def _poles_beyond(function: Characteristic, radius: float) -> int | None:
     return total
 
 
-def beyond(function: Characteristic, radius: float, rigid: int, zeros: Complexes | None = None) -> int | None:
+def beyond(function: Characteristic, radius: float, rigid: int) -> int | None:
     """Return how many eigenvalues lie beyond a circle about zero, the rigid ones left out, or None.
 
     Parameters
@@ -122,14 +119,9 @@ def beyond(function: Characteristic, radius: float, rigid: int, zeros: Complexes
         The circle's.
     rigid
         How many eigenvalues are 1.
-    zeros
-        Zeros in the upper half plane (z,), where they are known.
     """
     poles = _poles_beyond(function, radius)
-    if zeros is not None:
-        gaps = np.abs(np.abs(zeros) - radius)
-        zeros = zeros[gaps < CLOSE_BY * radius][:MOST_CLOSE]
-    turns = None if poles is None else count_around(function, 0.0, radius, arcs=_arcs(function), close=zeros)
+    turns = None if poles is None else count_around(function, 0.0, radius, arcs=_arcs(function))
     if poles is None or turns is None:
         return None
     return poles - turns - (rigid if radius < 1 else 0)
@@ -141,7 +133,7 @@ def _arcs(function: Characteristic) -> int:
 
 
 def just_outside(
-    function: Characteristic, zeros: Complexes, largest: float, error: float, rigid: int, rigid_radius: float
+    function: Characteristic, largest: float, error: float, rigid: int, rigid_radius: float
 ) -> tuple[float, int]:
     """Return a circle just outside of the largest zero, and how many eigenvalues are beyond, or −1.
 
@@ -149,8 +141,6 @@ def just_outside(
     ----------
     function
         f.
-    zeros
-        Those that are known (z,).
     largest, error
         The largest one's magnitude, and what it may be off by.
     rigid, rigid_radius
@@ -161,7 +151,7 @@ def just_outside(
         radius = max(largest + width, function.innermost * INMOST)
         if rigid and abs(radius - 1) <= rigid_radius:
             radius = 1 + 2 * rigid_radius
-        found = beyond(function, radius, rigid, zeros)
+        found = beyond(function, radius, rigid)
         if found is not None:
             return radius, found
         width *= WIDER
@@ -298,7 +288,7 @@ def find_zeros(
     low, high, beyond = 0.0, 0.0, -1
     for search in range(SEARCHES):
         largest, error = _largest(zeros, exact, error_of)
-        high, beyond = just_outside(function, zeros, largest, error, rigid, rigid_radius)
+        high, beyond = just_outside(function, largest, error, rigid, rigid_radius)
         if not beyond:
             break
         if beyond < 0 or search:  # from where it must be, if nothing was found from around what is known

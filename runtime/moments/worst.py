@@ -488,4 +488,4 @@ def _is_proved(part: HeldPart, word: Sequence[int]) -> bool:
     product = RADII.exact(np.eye(heard.shape[-1]))
     for gone in pattern_of(word):
         product = RADII.multiply(lost if gone else heard, product)
-    return enclose_eigenvalues(value_of(product), radius_of(product))[1].low > 1
+    return bool(enclose_eigenvalues(value_of(product), radius_of(product))[1].low > 1)

@@ -113,7 +113,7 @@ class _LateSheet:
         """Return the logarithm of F at points (z,), each at the delay with the number of its row."""
         number = values.astype(np.intp)[rows]
         if self.apart is None:
-            return logarithm(self.loops, None, self.lags[number], self.alike[number], points, self.rigid)
+            return logarithm(self.loops, self.lags[number], self.alike[number], points, self.rigid)
         parts = [self._at(number[some], points[some]) for some in self._chunks(len(points))]
         return _joined(parts, axis=0)
 
@@ -129,7 +129,7 @@ class _LateSheet:
             whole[~good] = np.eye(gains.shape[-1])
             value[some] += np.where(good, size + 1j * np.angle(sign), np.nan)
             slope[some] += np.trace(np.linalg.solve(whole, moved), axis1=1, axis2=2)
-        return Logarithm(value, slope, np.zeros_like(value))
+        return Logarithm(value, slope)
 
     def over(self, values: Floats, points: Complexes) -> Logarithm:
         """Return the logarithm of F (k, z) at all values (k,) and points (z,), some points after others."""
@@ -149,7 +149,7 @@ class _LateSheet:
         """
         n_z, turn = self.loops.states, 1j * points
         if self.apart is None:
-            matrix = np.repeat(self.loops.fixed[:1].astype(np.complex128), len(points), axis=0)
+            matrix = np.repeat(self.loops.fixed[None].astype(np.complex128), len(points), axis=0)
             place = np.arange(n_z)
             matrix[:, place, place] += points[:, None]
             sign, size = np.linalg.slogdet(matrix)
@@ -160,7 +160,7 @@ class _LateSheet:
         else:
             near = 1 / (points[:, None] - self.apart.values)
             value, slope = -np.log(near).sum(axis=1), turn * near.sum(axis=1)
-            out = -self.loops.fixed[0, n_z:, :n_z] @ self.apart.right * near[:, None]
+            out = -self.loops.fixed[n_z:, :n_z] @ self.apart.right * near[:, None]
             unit = np.eye(out.shape[1], dtype=np.complex128)
             sent = np.concatenate([out, np.broadcast_to(unit, (len(points), *unit.shape))], axis=2)
             turned = -turn[:, None, None] * out * near[:, None]
@@ -211,7 +211,7 @@ class _LateSheet:
         if len(vague[0]):
             again = self.at(values, vague[0], points[vague[1]])
             value[vague], turning[vague] = again.value, again.turning
-        return Logarithm(value, turning, np.zeros_like(value))
+        return Logarithm(value, turning)
 
 
 def _joined(parts: Sequence[Logarithm], axis: int) -> Logarithm:
@@ -414,8 +414,7 @@ def _sheet(loop: Loop, rows: Sequence[Sequence[Sequence[_Packet] | None]], count
             for h, weight in enumerate(loop.coupling[one.way][g]):
                 if weight and slot >= 0:
                     weights[layer, kind, line, starts[h] + sent[h].index(packet)] = float(weight)
-    maps = side_by_side([group.lifted for group in loop.sites]).mapped(lambda one: one[None])
-    loops = bordered(maps, weights)
+    loops = bordered(side_by_side([group.lifted for group in loop.sites]), weights)
     rigid = find_rigid_modes(without_packets(loop), with_drifts=False).directions.shape[1]
     ages = np.array([one + [0] * (most - len(one)) for one in lags])
     return _LateSheet(loops, _taken_apart(loops), np.array(alike), ages, rigid, int(ages.max()))
@@ -425,7 +424,7 @@ def _taken_apart(loops: Bordered) -> Response | None:
     """Return the eigenvalues and vectors of loops that nobody hears; None of small ones or a poor basis."""
     if loops.states <= LARGE:
         return None
-    found = response_of(-loops.fixed[0, : loops.states, : loops.states])
+    found = response_of(-loops.fixed[: loops.states, : loops.states])
     if found is None or not np.linalg.norm(found.right, 2) * np.linalg.norm(found.inverse, 2) < WORST:
         return None
     return found

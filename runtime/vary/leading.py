@@ -2,7 +2,7 @@
 
 Takes: a `BatchEvaluator`, and what its systems are at some points (`BatchEvaluator.bounded`).
 Gives: `Part`, `parts_of`; `Leading`, `leading`.
-Guarantees: what is said to be certain is proved, as in `eigen.dominant`: which eigenvalue is the largest of
+Guarantees: what is said to be certain is proved, as in `eigen.enclosure`: which eigenvalue is the largest of
 all systems, how far it may be off, on which side of 1 it is, and that no other one is 1.
 Does not: say anything of the points where that is not clear.
 """
@@ -15,10 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.apart import SMALL
-from apc.eigen.dominant import all_within, enclosed, largest_pairs, misses_one
 from apc.eigen.eigenpairs import components
-from apc.eigen.pseudospectrum import balance
+from apc.eigen.enclosure import SMALL, enclose_stack
 from apc.eigen.relative import relative_bounded
 from apc.eigen.spectrum import LEAST_SHARE, STRAIGHT
 from apc.frame.course import turns_of_many
@@ -35,17 +33,19 @@ Truths = NDArray[np.bool_]
 # better: its exponentials are balls.
 SHARP = 1e-11
 
+# The largest has to be larger than all others by this share of it.
+APART = 1e-6
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
     """States of a system that drive each other: its eigenvalues are those of its parts.
 
-    `states` are their places among the relative coordinates; `scale`, powers of two, makes them alike.
+    `states` are their places among the relative coordinates.
     """
 
     system: int
     states: Places
-    scale: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,18 +64,15 @@ class Leading:
 
 def parts_of(evaluator: BatchEvaluator) -> tuple[tuple[Part, ...], tuple[Truths, ...]]:
     """Return the parts of all systems, and which entries (n, n) of each one's matrix may be other than 0."""
-    patterns, parts, sizes = [], [], []
+    patterns, parts = [], []
     for place, wiring in enumerate(evaluator.wirings):
         matrix, error = relative_bounded(wiring.system.matrix, wiring.system.error, wiring.relative)
         size = np.abs(matrix) + error
         patterns.append(size != 0)
-        for states in components(size != 0):
-            block = size[np.ix_(states, states)]
-            if block.any():
-                parts.append(Part(place, states, balance(block)))
-                sizes.append(-float(np.abs(np.linalg.eigvals(matrix[np.ix_(states, states)])).max()))
-    # What leads where the scene stands first, as it often does elsewhere.
-    return tuple(parts[place] for place in np.argsort(sizes, kind="stable")), tuple(patterns)
+        parts += [
+            Part(place, states) for states in components(size != 0) if size[np.ix_(states, states)].any()
+        ]
+    return tuple(parts), tuple(patterns)
 
 
 def leading(
@@ -99,56 +96,42 @@ def leading(
 def _leading(
     evaluator: BatchEvaluator, parts: Sequence[Part], systems: Sequence[Bounded], count: int
 ) -> Leading:
-    value = np.full(count, np.nan, dtype=np.complex128)
-    error, angle = np.full((2, count), np.nan)
-    leads, others, alone = np.full(count, -1), np.zeros(count), np.zeros(count, dtype=np.bool_)
-    vectors: list[tuple[Places, Complexes, Complexes]] = []
-    blocks = []
-    bounds = np.zeros((len(parts), count))  # how large a part may be that is not yet shown to be less
-    below = np.zeros((len(parts), count), dtype=np.bool_)  # and which are shown to be below 1
-    for number, part in enumerate(parts):
+    enclosed = []
+    for part in parts:
         one = systems[part.system]
-        scaling = part.scale / part.scale[:, None]
-        matrix, off = (
-            np.broadcast_to(_block(whole, part.states) * scaling, (count, *scaling.shape))
-            for whole in (one.matrix, one.error)
-        )
-        blocks.append((matrix, off))
-        open_still = np.ones(count, dtype=np.bool_)
-        if number:
-            # Where the whole grows it is asked first whether this does not: then 1 is no value of it either.
-            below[number] = all_within(matrix, off, np.minimum(others, 1.0))
-            open_still = ~below[number]
-            grown = np.flatnonzero(open_still & (others > 1))
-            open_still[grown] = ~all_within(matrix[grown], off[grown], others[grown])
-        larger = np.flatnonzero(open_still)
-        tried, doubt = _of(matrix, larger), _of(off, larger)
-        guess, right, left = largest_pairs(tried)
-        found = enclosed(tried, doubt, guess, right, left)
-        bounds[number, larger] = np.abs(found.value) + found.error
-        wins = ~(np.abs(found.value) <= np.abs(value[larger])) & ~np.isnan(found.value)
-        ahead = larger[wins]
-        value[ahead], error[ahead], others[ahead] = found.value[wins], found.error[wins], found.others[wins]
-        leads[ahead], alone[ahead] = number, found.alone[wins]
-        vectors.append((ahead, right[wins] * part.scale, left[wins] / part.scale))
-    radius = np.abs(value)
+        # What is the same at all points is there once.
+        block, off = (_block(whole, part.states) for whole in (one.matrix, one.error))
+        enclosed.append(enclose_stack(*np.broadcast_arrays(block, off)))
+    value = np.zeros((len(parts), count), dtype=np.complex128)
+    low, high, second, clear = np.zeros((4, len(parts), count))
+    for number, (pairs, bounds) in enumerate(enclosed):
+        value[number], low[number], high[number] = pairs.values[:, 0], bounds.low, bounds.high
+        clear[number] = (np.abs(pairs.values - 1) > bounds.errors).all(axis=1)
+        outer = np.abs(pairs.values) + bounds.errors
+        outer[:, 0] = 0.0
+        outer[pairs.values[:, 0].imag != 0, 1:2] = 0.0  # the conjugate
+        second[number] = outer.max(axis=1)
+    leads = np.abs(value).argmax(axis=0)
+    is_first = leads == np.arange(len(parts))[:, None]
+    others = np.where(is_first, second, high).max(axis=0, initial=0.0)
+    largest = value[leads, np.arange(count)]
+    radius = np.abs(largest)
+    error = np.maximum(high.max(axis=0) - radius, radius - low.max(axis=0))
     # A mode that is over in a frame is another matter.
-    certain = (error <= SHARP * np.maximum(radius, 1.0)) & (radius > SMALL)
-    unstable = radius - error > 1 + 4 * UNIT
-    certain &= unstable | (radius + error < 1 - 4 * UNIT)
-    for number, (matrix, off) in enumerate(blocks):
-        again = np.flatnonzero(certain & (leads != number) & ~(bounds[number] < others))
-        certain[again] = all_within(matrix[again], off[again], others[again])
-        # An eigenvalue of 1 may be another rigid motion.
-        grown = np.flatnonzero(certain & unstable & ~below[number] & ~(alone & (leads == number)))
-        certain[grown] = misses_one(matrix[grown], off[grown])
+    certain = (error <= SHARP * np.maximum(radius, 1.0)) & (radius > SMALL) & (others < radius * (1 - APART))
+    # Where it grows, an eigenvalue of 1 may be another rigid motion.
+    certain &= (radius + error < 1 - 4 * UNIT) | ((radius - error > 1 + 4 * UNIT) & clear.all(axis=0))
+    angle = np.full(count, np.nan)
     frame_s = evaluator.wirings[0].system.frame_s
-    for number, (part, (ahead, right, left)) in enumerate(zip(parts, vectors, strict=True)):
-        still = certain[ahead] & (leads[ahead] == number)
-        mine = ahead[still]
+    for number, (part, (pairs, _)) in enumerate(zip(parts, enclosed, strict=True)):
+        mine = np.flatnonzero(certain & (leads == number))
         if len(mine):
             wiring, one = evaluator.wirings[part.system], systems[part.system].at(mine)
-            angle[mine] = _angles(wiring, one, part, value[mine], right[still], left[still])
+            right, left = (
+                np.broadcast_to(vectors, (count, len(part.states)))[mine]
+                for vectors in (pairs.right[:, :, 0], pairs.left[:, 0])
+            )
+            angle[mine] = _angles(wiring, one, part, largest[mine], right, left)
     rate = (np.log(radius) + 1j * np.where(np.abs(angle) > STRAIGHT, angle, 0.0)) / frame_s
     return Leading(
         radius=radius,
@@ -157,11 +140,6 @@ def _leading(
         damping_ratio=-rate.real / np.abs(rate),
         certain=certain & ~np.isnan(angle),
     )
-
-
-def _of(matrix: Floats, places: Places) -> Floats:
-    """Return some of matrices (k, …), places in rising order."""
-    return matrix if len(places) == len(matrix) else matrix[places]
 
 
 def _block(matrix: Floats, states: Places) -> Floats:

@@ -66,7 +66,7 @@ EVERY, FURTHER = 32, 1.25
 
 def judged(systems: Sequence[ClosedSystem]) -> Verdict:
     """Return the verdict of closed systems; what drifts does so on both sides of a crossing."""
-    found = solve_spectrum(systems, verdict_only=True)
+    found = solve_spectrum(systems)
     return _verdict(found, found.stable if found.verdict != DRIFTS else True)
 
 

@@ -8,7 +8,7 @@ Does not: give all modes, or share out work among processes (see `sweeps`).
 
 Points whose times and numbers of peers are the same have the same schedules, and one `BatchEvaluator`; the
 matrices come with their bounds (`BatchEvaluator.bounded`), the largest eigenvalue with its own
-(`eigen.dominant`), and the turns of its mode are counted along its own motion (`frame.course`).
+(`eigen.enclosure`), and the turns of its mode are counted along its own motion (`frame.course`).
 """
 
 from __future__ import annotations
@@ -170,9 +170,9 @@ class ManyAnalyses:
 
     def _family(self, timing: tuple[int, ...], count: int) -> _Family | None:
         """Return what points of these times share, None where each of them has an analysis of its own."""
+        if count < FEWEST:  # whatever was asked before: the same points have the same bits each time
+            return None
         if timing not in self.families:
-            if count < FEWEST:
-                return None
             while len(self.families) >= KEPT:
                 self.families.pop(next(iter(self.families)))
             given = tuple(
