@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from apc.simulation.accuracy import ErrorEstimate
     from apc.simulation.buzz import Buzz
     from apc.simulation.ensemble import Ensemble, MeanSquare
-    from apc.simulation.limits import Broken
     from apc.simulation.signals import Signal
+    from apc.simulation.summary import Broken
     from apc.simulation.trajectory import Played, Provenance, Trajectory
 
 Floats = NDArray[np.float64]
