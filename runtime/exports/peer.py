@@ -403,7 +403,7 @@ def _moves(
         what = f"{name}: {pushed} is pushed by a force that changes with time between ticks"
         raise refused(system, f"{what}; its exact integral is not written as C", STEPS)
     seconds = [length * quantum for length in lengths]
-    matrices = transition_rows(linear, vector[None], seconds).matrices
+    matrices = transition_rows(linear, vector[None], seconds)
     moves = []
     for length, duration, matrix in zip(lengths, seconds, matrices, strict=True):
         function = flow.over(duration) if flow is not None else None
