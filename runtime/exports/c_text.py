@@ -19,6 +19,7 @@ from collections.abc import Iterable, Sequence
 from itertools import accumulate
 from pathlib import Path
 from string import Template
+from typing import Any
 
 import numpy as np
 
@@ -105,10 +106,7 @@ def header(peer: Peer) -> str:
     ]
     packets = ""
     for line in peer.lines:
-        rows = [
-            (f"double {own}", f"{channel} [{unit}]")
-            for own, channel, unit in zip(line.members, line.channels, line.units, strict=True)
-        ]
+        rows = [(f"double {one.member}", f"{one.name} [{one.unit}]") for one in line.packet]
         if line.missing:
             rows.append(("int missing", "1: it is late, and what this peer would send stands in for it"))
         type_ = f"{name}_{line.name}"
@@ -172,10 +170,10 @@ def source(peer: Peer, include: str) -> str:
         for o in range(len(partition.outputs))
     ]
     unheard = [
-        f"in->{line.name}[{k}].{own} = {number(value)};"
+        f"in->{line.name}[{k}].{one.member} = {number(value)};"
         for line in peer.lines
         for k, sender in enumerate(line.senders)
-        for own, value in zip(line.members, sender.start, strict=True)
+        for one, value in zip(line.packet, sender.start, strict=True)
     ]
     unheard += [
         f"for (int k = 0; k < {len(line.senders)}; k++) in->{line.name}[k].missing = 0;"
@@ -253,29 +251,32 @@ def _memories(peer: Peer, p: int) -> list[str]:
     return [f"peer->{_output(peer, p, o)}" for o in peer.kind.clocks[p].memories]
 
 
+def _computed(function: Any, arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the lines of C that compute a function of some arguments, and the names of its values."""
+    plain = straight(function)
+    names, lines = straight_lines(plain, arguments)
+    return lines, [names[place] for place in plain.results[0]]
+
+
 def _own(peer: Peer, line: Line) -> str:
     """Return what the peer would send over a line now."""
     sending, name = peer.kind.sends[line.sending], f"{peer.identifier}_{line.name}"
-    function = straight(sending.send)
-    names, lines = straight_lines(function, [*_moving(peer), *_parameters(peer), "t"])
-    stores = [
-        f"packet->{own} = {names[function.results[0][sending.channels.index(channel)]]};"
-        for own, channel in zip(line.members, line.channels, strict=True)
-        if channel in sending.channels
-    ]
-    stores += ["packet->missing = 0;"] if line.missing else []
+    lines, values = _computed(sending.send, [*_moving(peer), *_parameters(peer), "t"])
+    sent = dict(zip(sending.channels, values, strict=True))
+    lines += [f"packet->{one.member} = {sent[one.name]};" for one in line.packet if one.name in sent]
+    lines += ["packet->missing = 0;"] if line.missing else []
     return f"""\
 static void {name}_own(const {peer.identifier} *peer, const {peer.identifier}_in *in, {name} *packet) {{
   const double t = {peer.identifier}_now(peer);
   (void)in;
   (void)t;
-{block([*lines, *stores])}}}
+{block(lines)}}}
 """
 
 
 def _tick(peer: Peer, p: int) -> str:
     """Return what a clock partition computes at a tick."""
-    partition, name, function = peer.kind.clocks[p], peer.identifier, straight(peer.kind.clocks[p].tick)
+    partition, name = peer.kind.clocks[p], peer.identifier
     body: list[str] = []
     read = [place for place in range(len(partition.receives)) if (p, place) in peer.channels]
     lines = {link: peer.line(link) for link in sorted({partition.receives[place].link for place in read})}
@@ -287,8 +288,8 @@ def _tick(peer: Peer, p: int) -> str:
         body += _receive(peer, p, place)
     receives = [f"r{place}" for place in range(len(partition.receives))]
     arguments = [*_moving(peer), *_memories(peer, p), *receives, *_parameters(peer), "t"]
-    names, computed = straight_lines(function, arguments)
-    stores = [f"peer->{_output(peer, p, o)} = {names[one]};" for o, one in enumerate(function.results[0])]
+    computed, values = _computed(partition.tick, arguments)
+    stores = [f"peer->{_output(peer, p, o)} = {value};" for o, value in enumerate(values)]
     for h, hold in enumerate(peer.kind.holds):
         if hold.clock == partition.clock:
             late = f"peer->late[{h}]"
@@ -309,7 +310,7 @@ def _receive(peer: Peer, p: int, place: int) -> list[str]:
     line = peer.line(receive.link) if (p, place) in peer.channels else None
     if line is None or not line.senders:
         return [f"const double {total} = 0.0;", f"(void){total};"]
-    names = [line.members[channel] for channel in peer.channels[p, place]]
+    names = [line.packet[channel].member for channel in peer.channels[p, place]]
     count, packet = len(line.senders), f"in->{line.name}[k]"
     mean, edge = receive.operator == "mean", has_edge(peer.kind, p, place)
     looked: list[str] = []
@@ -337,12 +338,12 @@ def _receive(peer: Peer, p: int, place: int) -> list[str]:
 def _look(peer: Peer, p: int, place: int, line: Line, names: Sequence[str]) -> tuple[list[str], str]:
     """Return the lines that look at one sender's packet, and what they make of it."""
     pair, own = pair_function(peer.kind, p, place)
-    function, packet = straight(pair), f"in->{line.name}[k]"
+    packet = f"in->{line.name}[k]"
     every = [*_moving(peer), *_memories(peer, p), *_parameters(peer)]
     missing = f"{packet}.missing" if line.missing else "0.0"
     heard = [f"({missing} ? 0.0 : {packet}.{name})" if line.missing else f"{packet}.{name}" for name in names]
-    values, lines = straight_lines(function, [*(every[i] for i in own), *heard, missing, "t"])
-    return [f"  {one}" for one in lines], values[function.results[0][0]]
+    lines, (value,) = _computed(pair, [*(every[i] for i in own), *heard, missing, "t"])
+    return [f"  {one}" for one in lines], value
 
 
 def _move(peer: Peer, place: int, move: Move) -> str:
@@ -359,12 +360,11 @@ def _move(peer: Peer, place: int, move: Move) -> str:
         lines.append(f"const double x{i} = {' + '.join(terms) or '0.0'};")
         stores[i] = f"x{i}"
     if move.flow is not None:
-        function = straight(move.flow)
         flowing = [moving[i] for i in move.flowing]
         arguments = [*flowing, *moving[len(peer.start) :], *_parameters(peer), "t"]
-        names, more = straight_lines(function, arguments)
+        more, values = _computed(move.flow, arguments)
         lines += more
-        stores |= {i: names[one] for i, one in zip(move.flowing, function.results[0], strict=True)}
+        stores |= zip(move.flowing, values, strict=True)
     return f"""\
 /* What this computer moves, over {float(move.quanta * peer.schedule.quantum)!r} s. */
 static void {name}_move_{place}({name} *peer) {{
@@ -387,18 +387,13 @@ def driver(peer: Peer, include: str) -> str:
     for line in peer.lines:
         for k, sender in enumerate(line.senders):
             begin, label = f"{line.name}[{k}]", f"{line.link} {sender.name}"
-            read += [
-                ("%lf", f"{begin}.{own}", f"{label} {channel}")
-                for own, channel in zip(line.members, line.channels, strict=True)
-            ]
+            read += [("%lf", f"{begin}.{one.member}", f"{label} {one.name}") for one in line.packet]
             read += [("%d", f"{begin}.missing", f"{label} missing")] if line.missing else []
     shown = [("%.17g", f"out.{own}", force.name) for own, force in peer.forces.items()]
     for line in peer.sending:
         shown.append(("%d", f"out.{line.name}_sent", f"{line.link} sent"))
-        shown += [
-            ("%.17g", f"out.{line.name}.{own}", f"{line.link} {channel}")
-            for own, channel in zip(line.members, line.channels, strict=True)
-        ]
+        own = f"out.{line.name}"
+        shown += [("%.17g", f"{own}.{one.member}", f"{line.link} {one.name}") for one in line.packet]
     shown += [
         ("%.17g", f"peer.{memory(peer, one)}", one.name) for one in peer.signals if one.role == "output"
     ]

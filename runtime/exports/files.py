@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,6 @@ from apc.optional import need
 
 if TYPE_CHECKING:
     from apc.exports.lifted import StateSpace
-    from apc.exports.words import Port
 
 LARGEST_MAT = 2**31 - 2**20  # bytes: a variable of a MAT-file of version 5 is less than 2 GiB
 
@@ -52,13 +51,16 @@ D = {d}
 
 made_by = {made_by}
 
+state_words = {state_words}
+input_words = {input_words}
+output_words = {output_words}
 
 system = control.StateSpace(
     *(A, B, C, D, dt),
     name={name},
-    states={state_words},
-    inputs={input_words},
-    outputs={output_words},
+    states=state_words,
+    inputs=input_words,
+    outputs=output_words,
 )
 '''
 
@@ -77,22 +79,24 @@ def as_control(found: StateSpace) -> Any:
 
 def write_script(path: Path, found: StateSpace) -> None:
     """Write a Python script that makes a `control.StateSpace`. Raises ApcError (E601)."""
-    listed = (words(ports) for ports in (found.states, found.inputs, found.outputs))
-    state_words, input_words, output_words = map(_listed, listed)
+    ports = {"states": found.states, "inputs": found.inputs, "outputs": found.outputs}
+    matrices = zip("abcd", found.matrices, strict=True)
     text = _SCRIPT.format(
         title=_quotable(f"{found.topology}, {found.what}, as a state space."),
         told=_quotable("\n".join(textwrap.fill(one, 100) for one in (found.meaning, *found.notes))),
         module=path.stem if path.stem.isidentifier() else "this_file",
         dt=found.frame_s,
-        states=_pairs(found.states),
-        inputs=_pairs(found.inputs),
-        outputs=_pairs(found.outputs),
-        **{name: _rows(matrix) for name, matrix in zip("abcd", found.matrices, strict=True)},
+        **{name: _listed(repr(row) for row in (matrix + 0.0).tolist()) for name, matrix in matrices},
+        **{
+            name: _listed(f"({json.dumps(one.name)}, {json.dumps(one.unit)})" for one in listed)
+            for name, listed in ports.items()
+        },
+        **{
+            f"{name.removesuffix('s')}_words": _listed(map(json.dumps, words(listed)))
+            for name, listed in ports.items()
+        },
         made_by=json.dumps(found.made_by),
         name=json.dumps(word(found.topology)),
-        state_words=state_words,
-        input_words=input_words,
-        output_words=output_words,
     )
     write_text(path, text.rstrip("\n"))
 
@@ -104,28 +108,24 @@ def write_mat(path: Path, found: StateSpace) -> None:
         raise ApcError(Mistake("E951", Place(str(path)), what, hint="--to npz"))
     from scipy.io import savemat
 
-    variables: dict[str, Any] = {
+    variables = {
         name: np.array(one, dtype=object).reshape(-1, 1) if isinstance(one, list) else one
         for name, one in _variables(found).items()
     }
-
-    def write(temporary: Path) -> None:
-        with temporary.open("wb") as file:
-            savemat(file, variables, do_compression=True)
-
-    write_file(path, write)
+    # The name has another suffix until the file is whole, and SciPy would add its own.
+    write_file(path, lambda temporary: savemat(temporary, variables, appendmat=False, do_compression=True))
 
 
 def write_npz(path: Path, found: StateSpace) -> None:
     """Write an archive of arrays, without pickles. Raises ApcError (E601)."""
-    arrays = {
+    arrays: dict[str, Any] = {
         name: np.array(one, dtype=np.str_) if isinstance(one, list | str) else np.asarray(one)
         for name, one in _variables(found).items()
     }
 
     def write(temporary: Path) -> None:
-        with temporary.open("wb") as file:
-            np.savez_compressed(file, **arrays)  # type: ignore[arg-type] # its stubs forget what it takes
+        with temporary.open("wb") as file:  # NumPy would add its suffix to a name
+            np.savez_compressed(file, **arrays)
 
     write_file(path, write)
 
@@ -146,20 +146,9 @@ def _variables(found: StateSpace) -> dict[str, Any]:
     return variables
 
 
-def _rows(matrix: Any) -> str:
-    """Return a matrix as rows of numbers that are read back to the last bit."""
-    rows = [f"    [{', '.join(map(repr, row))}],\n" for row in (matrix + 0.0).tolist()]
-    return f"[\n{''.join(rows)}]"
-
-
-def _pairs(ports: Sequence[Port]) -> str:
-    """Return names with their units, as text of Python: JSON's texts are texts of Python too."""
-    rows = [f"    ({json.dumps(port.name)}, {json.dumps(port.unit)}),\n" for port in ports]
-    return f"[\n{''.join(rows)}]"
-
-
-def _listed(words: Sequence[str]) -> str:
-    return f"[\n{''.join(f'        {json.dumps(word)},' + chr(10) for word in words)}    ]"
+def _listed(texts: Iterable[str]) -> str:
+    """Return texts as a list of Python, one a line; JSON's texts are texts of Python too."""
+    return f"[\n{''.join(f'    {text},' + chr(10) for text in texts)}]"
 
 
 def _quotable(text: str) -> str:

@@ -116,59 +116,34 @@ static int given(unsigned which) {{
 
 def _description(unit: Unit) -> str:
     """Return modelDescription.xml."""
-    scene, system, name = unit.scene, unit.system, _identifier(unit.scene)
-    what = f"{unit.peer} of {system.name}" if unit.peer else system.name
-    root = xml.Element(
-        "fmiModelDescription",
-        fmiVersion="2.0",
-        modelName=what,
-        guid=_guid(unit),
-        generationTool=f"apc {program_version()}",
-        variableNamingConvention="flat",
-    )
+    scene, system = unit.scene, unit.system
+    root = xml.parse(Path(__file__).with_name("fmu.xml")).getroot()
+    part = {one.tag: one for one in root.iter()}
+    root.set("modelName", f"{unit.peer} of {system.name}" if unit.peer else system.name)
+    root.set("guid", _guid(unit))
+    root.set("generationTool", f"apc {program_version()}")
     if system.about:
         root.set("description", system.about)
-    run = xml.SubElement(
-        root,
-        "CoSimulation",
-        modelIdentifier=name,
-        canHandleVariableCommunicationStepSize="true",
-        canGetAndSetFMUstate="true",
-        canSerializeFMUstate="true",
-    )
-    files = xml.SubElement(run, "SourceFiles")
+    part["CoSimulation"].set("modelIdentifier", _identifier(scene))
+    part["DefaultExperiment"].set("stopTime", repr(unit.duration))
+    part["DefaultExperiment"].set("stepSize", repr(unit.step))
     for one in sorted(unit.texts):
         if one.endswith(".c"):
-            xml.SubElement(files, "File", name=one)
-    units = xml.SubElement(root, "UnitDefinitions")
+            xml.SubElement(part["SourceFiles"], "File", name=one)
     for one in dict.fromkeys(own.unit for own in scene.variables if not own.flag):
-        xml.SubElement(units, "Unit", name=one)
-    xml.SubElement(
-        root, "DefaultExperiment", startTime="0", stopTime=repr(unit.duration), stepSize=repr(unit.step)
-    )
-    variables = xml.SubElement(root, "ModelVariables")
-    outputs = []
+        xml.SubElement(part["UnitDefinitions"], "Unit", name=one)
     for place, own in enumerate(scene.variables):
-        row = xml.SubElement(
-            variables,
-            "ScalarVariable",
-            name=own.name,
-            valueReference=str(place),
-            causality="input" if own.given else "output",
-            variability="discrete",
-        )
+        causality = "input" if own.given else "output"
+        row = xml.SubElement(part["ModelVariables"], "ScalarVariable", name=own.name, causality=causality)
+        row.attrib |= {"valueReference": str(place), "variability": "discrete"}
         if own.flag:
             xml.SubElement(row, "Boolean", start="false")
         elif own.given:
             xml.SubElement(row, "Real", start=repr(own.start), unit=own.unit)
         else:
             xml.SubElement(row, "Real", unit=own.unit)
-            outputs.append(place + 1)
-    structure = xml.SubElement(root, "ModelStructure")
-    for group in ("Outputs", "InitialUnknowns"):
-        listed = xml.SubElement(structure, group)
-        for place in outputs:
-            xml.SubElement(listed, "Unknown", index=str(place))
+            for group in ("Outputs", "InitialUnknowns"):
+                xml.SubElement(part[group], "Unknown", index=str(place + 1))
     xml.indent(root)
     return xml.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
 

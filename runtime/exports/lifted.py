@@ -46,11 +46,12 @@ from apc.frame.exchange import Exchange
 from apc.frame.lift import MOST_PACKETS, FrameMap, check_packets, compose, named, step_durations
 from apc.frame.ports import OUTSIDE, with_cuts, with_holds, with_ports
 from apc.frame.radius import FLOATS, Arithmetic
-from apc.frame.schedule import Heard, Propagate, Schedule, Tick, Value
+from apc.frame.schedule import Heard, Schedule, Tick, Value
 from apc.frame.site import LinearSite
 from apc.memory import refuse_beyond
 from apc.network.nominal import left_out
 from apc.result import Result
+from apc.simulation.program import timed_events
 from apc.simulation.signals import local_signals, ticking_partitions
 from apc.simulation.trajectory import parameters_of, texts_of
 from apc.threads import single_threaded
@@ -258,7 +259,7 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
     schedule, kind = _remembering(group), group.jacobians.kind
     (forces, unpushed), noises = _masses(system, group), _measured(group.site)
     inverses = [numbers.inverses(group, one) for one in forces]
-    wide = with_inputs(numbers.site(group), forces, inverses, noises)
+    wide = _with_inputs(numbers.site(group), forces, inverses, noises)
     count = len(forces) + len(noises)
     nothing = np.zeros((0, sum(wide.b.shape)), dtype=wide.b.dtype)
     (site,), full, ports = with_ports([wide], schedule, count, [0], [nothing], [])
@@ -315,11 +316,8 @@ def _remembering(group: PeerGroup) -> Schedule:
 def _instants(schedule: Schedule) -> dict[int, list[int]]:
     """Return when in a frame each clock partition ticks, in quanta."""
     found: dict[int, list[int]] = {}
-    now = 0
-    for event in schedule.events:
-        if isinstance(event, Propagate):
-            now += event.duration
-        elif isinstance(event, Tick):
+    for now, event in timed_events(schedule):
+        if isinstance(event, Tick):
             found.setdefault(event.partition, []).append(now)
     return found
 
@@ -327,50 +325,40 @@ def _instants(schedule: Schedule) -> dict[int, list[int]]:
 def _masses(system: CompiledSystem, group: PeerGroup) -> tuple[list[Push], list[str]]:
     """Return what of a peer has a mass, and so can be pushed, each axis by itself; and why what can't."""
     unit_of = {one.name: one.unit for one in system.parameters}
-    found: dict[str, Push] = {}
-    refused: dict[str, None] = {}
     known: dict[str, Device | str | None] = {}
-    for place, state in enumerate(group.jacobians.kind.states):
-        if state.unit == "m":
-            one = find_push(group.jacobians, group.parameters, unit_of, group.listening, place, known)
-            if isinstance(one, Push):
-                found.setdefault(one.part, one)
-            elif one is not None:
-                refused[f"no force of its own: {one}"] = None
-    return list(found.values()), list(refused)
+    found = [
+        find_push(group.jacobians, group.parameters, unit_of, group.listening, place, known)
+        for place, state in enumerate(group.jacobians.kind.states)
+        if state.unit == "m"
+    ]
+    pushes: dict[str, Push] = {}
+    for one in found:
+        if isinstance(one, Push):
+            pushes.setdefault(one.part, one)
+    refused = dict.fromkeys(f"no force of its own: {one}" for one in found if isinstance(one, str))
+    return list(pushes.values()), list(refused)
 
 
 def _measured(site: LinearSite) -> list[int]:
     """Return the states that something samples."""
-    looking = [*(tick.x for tick in site.ticks), *(send.x for send in site.sends)]
-    if not looking:
-        return []
-    return [int(place) for place in np.flatnonzero(np.concatenate(looking).any(axis=0))]
+    looking = [one.x.any(axis=0) for one in (*site.ticks, *site.sends)]
+    places: list[int] = np.flatnonzero(np.any(looking, axis=0)).tolist() if looking else []
+    return places
 
 
-def with_inputs(
+def _with_inputs(
     site: LinearSite, forces: Sequence[Push], inverses: Sequence[Sequence[Any]], noises: Sequence[int]
 ) -> LinearSite:
     """Return a site with a hold for each force and for each noise, which is added to what is sampled.
 
-    Parameters
-    ----------
-    site
-        In any kind of number.
-    forces, inverses
-        What is pushed, and what that does to each of its velocities.
-    noises
-        The states whose samples are noisy.
+    `inverses` are what each force does to each of its velocities, `noises` the states with noisy samples.
     """
     columns = np.zeros((len(site.a), len(forces) + len(noises)), dtype=site.b.dtype)
     for place, (push, listed) in enumerate(zip(forces, inverses, strict=True)):
-        for velocity, inverse in zip(push.velocities, listed, strict=True):
-            columns[velocity, place] = inverse
+        columns[list(push.velocities), place] = listed
     wide = with_holds(site, columns)
-    if noises:
-        matrices = [*((tick.u, tick.x) for tick in wide.ticks), *((send.u, send.x) for send in wide.sends)]
-        for u, x in matrices:
-            u[:, -len(noises) :] = x[:, noises]
+    for one in (*wide.ticks, *wide.sends) if noises else ():
+        one.u[:, -len(noises) :] = one.x[:, noises]
     return wide
 
 

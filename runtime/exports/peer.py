@@ -82,22 +82,34 @@ class Sender:
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
-    """A link as one peer has it: what is sent over it, who is heard, whether it can miss a packet.
+class Number:
+    """A number of a packet: its channel's name, its unit, and what it is called in C."""
 
-    `sending` is the peer's own send partition, −1 if it sends nothing there; `complete` says that everybody
-    hears everybody. In C the line is called `name`, and the channels of a packet `members`.
+    name: str
+    unit: str
+    member: str
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A link as one peer has it: what a packet holds, who is heard, whether it can miss a packet.
+
+    In C the line is called `name`. `sending` is the peer's own send partition, −1 if it sends nothing there;
+    `complete` says that everybody hears everybody.
     """
 
     link: str
     name: str
-    channels: tuple[str, ...]
-    units: tuple[str, ...]
-    members: tuple[str, ...]
+    packet: tuple[Number, ...]
     sending: int
     senders: tuple[Sender, ...]
     missing: bool
     complete: bool
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The names of a packet's channels."""
+        return tuple(one.name for one in self.packet)
 
 
 @dataclass(frozen=True, slots=True)
@@ -470,6 +482,7 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int,
         used = [i for i, one in enumerate(known.channels) if i in hears or one in sent]
         places |= {key: tuple(map(used.index, channels)) for key, channels in of.items()}
         channels = tuple(known.channels[i] for i in used)
+        members = unique(map(identifier, channels))
         senders = [*_heard(plan, link, number)] if hears else []
         if len(senders) > MOST_HEARD:
             what = f"{exchange.peer_name(number)} hears {len(senders):,} peers over {link}"
@@ -480,9 +493,7 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int,
             Line(
                 link=link,
                 name=name,
-                channels=channels,
-                units=tuple(known.units[i] for i in used),
-                members=unique(map(identifier, channels)),
+                packet=tuple(map(Number, channels, [known.units[i] for i in used], members)),
                 sending=place if sent else -1,
                 senders=tuple(
                     Sender(one, exchange.peer_name(one), weight, first_packet(plan, link, one, channels))

@@ -92,20 +92,19 @@ def one_peer(plan: Plan, number: int, method: Method) -> CScene:
     peer = peer_of(plan, number, method)
     variables = []
     for line in peer.lines:
-        described = [*zip(line.channels, line.units, line.members, strict=True)]
         for k, sender in enumerate(line.senders):
             label, member = f"{line.link}.{sender.name}", f"in0[0].{line.name}[{k}]"
             variables += [
-                Variable(f"{label}.{channel}", unit, f"{member}.{own}", given=True, start=start)
-                for (channel, unit, own), start in zip(described, sender.start, strict=True)
+                Variable(f"{label}.{one.name}", one.unit, f"{member}.{one.member}", given=True, start=start)
+                for one, start in zip(line.packet, sender.start, strict=True)
             ]
             if line.missing:
                 flag = Variable(f"{label}.missing", "1", f"{member}.missing", given=True, flag=True)
                 variables.append(flag)
     variables += [
-        Variable(f"{line.link}.{channel}", unit, f"out0[0].{line.name}.{own}")
+        Variable(f"{line.link}.{one.name}", one.unit, f"out0[0].{line.name}.{one.member}")
         for line in peer.sending
-        for channel, unit, own in zip(line.channels, line.units, line.members, strict=True)
+        for one in line.packet
     ]
     variables += [Variable(one.name, one.unit, f"peer0[0].{memory(peer, one)}") for one in peer.signals]
     return CScene(peer.identifier, peer.schedule.quantum, (peer,), ((0, 0),), (), tuple(variables))
@@ -272,9 +271,7 @@ def _site(scene: CScene, s: int) -> str:
         line = next((one for one in code.lines if one.link == link.link), None)
         if line is None:
             continue
-        members = [
-            (link.channels.index(one), own) for one, own in zip(line.channels, line.members, strict=True)
-        ]
+        members = [(link.channels.index(one.name), one.member) for one in line.packet]
         if line.sending >= 0:
             posted += [
                 f"if (m->out{s}[i].{line.name}_sent) {{",

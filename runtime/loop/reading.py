@@ -115,9 +115,10 @@ def _peer(found: dict[str, NDArray[Any]]) -> PeerRun:
     routes = range((len(found) - len(ARRAYS) - 1) // 2)
     packets, missing = ([f"{name}{at}" for at in routes] for name in ("packets", "missing"))
     _want(found.keys() == {"told", *ARRAYS, *packets, *missing}, "it hears no route, or one by half")
+    plain: dict[str, Any] = {one.name: getattr(words, one.name) for one in fields(Words)}
+    plain |= {name: found[name] for name in ARRAYS}
     return PeerRun(
-        **{one.name: getattr(words, one.name) for one in fields(Words)},
-        **{name: found[name] for name in ARRAYS},
+        **plain,
         packets=tuple(found[name] for name in packets),
         missing=tuple(found[name] for name in missing),
     )

@@ -127,40 +127,25 @@ def play_one(
     ApcError
         Those of `Loop` and `Loop.meet`.
     """
-    with _interrupts() if stop is None else nullcontext(stop) as told:
-        return _play(system, peer, listening, addresses, how, told, device)
-
-
-def _play(
-    system: CompiledSystem,
-    peer: str,
-    listening: socket.socket,
-    addresses: Mapping[str, Address],
-    how: Play,
-    stop: Connection,
-    device: DeviceFunction | None,
-) -> Part:
     digest = digest_of(system)
-    loop = Loop(
-        system,
-        peer,
-        listening,
-        addresses,
-        digest=digest,
-        duration=how.duration,
-        secret=how.secret,
-        emulate=how.emulate,
-        seed=how.seed,
-        stop=stop,
-        device=device,
-    )
-    not_given = claim()
-    try:
-        loop.meet(how.patience)
-    except StoppedError:
-        return Part(None)
-    loop.run()
-    return Part(run_of(loop, digest, not_given) if any(map(len, loop.rows)) else None, loop.trouble)
+    with _interrupts() if stop is None else nullcontext(stop) as stopping:
+        loop = Loop(
+            *(system, peer, listening, addresses),
+            digest=digest,
+            duration=how.duration,
+            secret=how.secret,
+            emulate=how.emulate,
+            seed=how.seed,
+            stop=stopping,
+            device=device,
+        )
+        not_given = claim()
+        try:
+            loop.meet(how.patience)
+        except StoppedError:
+            return Part(None)
+        loop.run()
+        return Part(run_of(loop, digest, not_given) if any(map(len, loop.rows)) else None, loop.trouble)
 
 
 @contextmanager
