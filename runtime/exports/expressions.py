@@ -22,6 +22,8 @@ from apc.compiler.plain import straight, walk
 # How tightly a text binds, loosest first.
 IF, OR, AND, NOT, RELATION, SUM, PRODUCT, POWER, ATOM = range(9)
 
+NONE = "^("  # a unit that Modelica has no words for
+
 # Letters of an expression that is written again wherever it is used.
 LONGEST = 120
 
@@ -43,12 +45,17 @@ _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """An expression: how tightly it binds, whether it is a Boolean; of `if c then v else 0`, c and v."""
+    """An expression: how tightly it binds, whether it is a Boolean; of `if c then v else 0`, c and v.
+
+    Of a variable `unit` is its unit in SI, and `start` what it is before the first tick.
+    """
 
     text: str
     binds: int = ATOM
     truth: bool = False
     branch: tuple[Text, Text] | None = None
+    unit: str = NONE
+    start: Text | None = None
 
     def within(self, least: int) -> str:
         """Return it as an operand of what binds so tightly."""

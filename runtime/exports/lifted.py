@@ -341,7 +341,9 @@ def _masses(system: CompiledSystem, group: PeerGroup) -> tuple[list[Push], list[
 
 def _measured(site: LinearSite) -> list[int]:
     """Return the states that something samples."""
-    looking = [one.x.any(axis=0) for one in (*site.ticks, *site.sends)]
+    looking = [
+        one.any(axis=0) for one in (*(tick.x for tick in site.ticks), *(send.x for send in site.sends))
+    ]
     places: list[int] = np.flatnonzero(np.any(looking, axis=0)).tolist() if looking else []
     return places
 
@@ -357,8 +359,9 @@ def _with_inputs(
     for place, (push, listed) in enumerate(zip(forces, inverses, strict=True)):
         columns[list(push.velocities), place] = listed
     wide = with_holds(site, columns)
-    for one in (*wide.ticks, *wide.sends) if noises else ():
-        one.u[:, -len(noises) :] = one.x[:, noises]
+    sampled = [*((tick.u, tick.x) for tick in wide.ticks), *((send.u, send.x) for send in wide.sends)]
+    for u, x in sampled if noises else ():
+        u[:, -len(noises) :] = x[:, noises]
     return wide
 
 

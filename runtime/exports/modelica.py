@@ -32,6 +32,7 @@ from apc.compiler.files import write_text
 from apc.compiler.weights import exact_weight
 from apc.distribution import program_version
 from apc.exports.expressions import (
+    NONE,
     SUM,
     Text,
     identifier,
@@ -57,8 +58,7 @@ MOST_TERMS = 20_000
 LARGEST_COUNTER = 2**31 - 1
 
 SECOND = Fraction(1)
-TIME, ZERO = Text("time"), number(0.0)
-NONE = "^("  # a unit that Modelica has no words for
+TIME, ZERO = Text("time", unit="s"), number(0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +117,7 @@ class _Writer:
         _refuse_what_has_no_words(system, self.exchange)
         self.clocks, self.clock_lines = self._clocks()
         self.named: dict[Any, Text] = {}  # variables that are written once for all who need them
-        self.sent: dict[tuple[int, str], list[tuple[Text, str, str, Text]]] = {}  # and channel, unit, start
+        self.sent: dict[tuple[int, str], list[tuple[Text, str]]] = {}  # and its channel
         self.senders: dict[str, dict[int, list[tuple[int, Fraction]]]] = {}
 
     def model(self) -> ModelicaModel:
@@ -194,13 +194,17 @@ class _Writer:
         modifiers += ["fixed=true"] if fixed else []
         listed = f"({', '.join(modifiers)})" if modifiers else ""
         self.declared.append(f"  {'Boolean' if truth else 'Real'} {variable}{listed};")
-        return Text(variable, truth=truth)
+        return Text(variable, truth=truth, unit=unit, start=start)
 
-    def let(self, name: str, unit: str, value: str, start: Text | None = None) -> Text:
+    def let(self, name: str, value: str, unit: str, start: Text | None = None) -> Text:
         """Declare a variable that is a value, and return it."""
         variable = self.declare(name, unit, start)
         self.define(variable.text, value)
         return variable
+
+    def like(self, variable: Text, name: str, value: str) -> Text:
+        """Declare a variable that is a value, of the unit and start of another, and return it."""
+        return self.let(name, value, variable.unit, variable.start)
 
     def define(self, variable: str, value: str) -> None:
         self.equations.append(f"  {variable} = {value};")
@@ -218,24 +222,24 @@ class _Writer:
             self.parameters[label] = Text(name), line
         return self.parameters[label][0]
 
-    def sampled(self, variable: Text, unit: str, clock: str) -> Text:
+    def sampled(self, variable: Text, clock: str) -> Text:
         """Return a continuous value as a clock samples it."""
         key, value = (variable.text, self.clocks[clock]), f"sample({variable.text}, {self.clocks[clock]})"
         if key not in self.named:
             bare = variable.text.strip("'").replace("\\'", "'")
-            self.named[key] = self.let(f"{bare} at {clock}", unit, value)
+            self.named[key] = self.let(f"{bare} at {clock}", value, variable.unit)
         return self.named[key]
 
-    def late(self, value: Text, label: str, unit: str, clock: str, delay: Fraction, start: Text) -> Text:
+    def late(self, value: Text, label: str, clock: str, delay: Fraction) -> Text:
         """Return a clocked value so much later: whole ticks by previous, what is left by shiftSample."""
         ticks, rest = divmod(delay / self.grids[clock][0], 1)
         for count in range(int(ticks)):
             ago = f"{label} {count + 1} tick{'s' if count else ''} ago"
-            value = self.let(ago, unit, f"previous({value.text})", start)
+            value = self.like(value, ago, f"previous({value.text})")
         if rest:
             self._check(rest.numerator, rest.denominator)
             shifted = f"shiftSample({value.text}, {rest.numerator}, {rest.denominator})"
-            value = self.let(f"{label} late", unit, shifted, start)
+            value = self.like(value, f"{label} late", shifted)
         return value
 
     def heard_of(self, peer: int, link: str) -> list[tuple[int, Fraction]]:
@@ -259,26 +263,26 @@ class _Writer:
     def _crossing(self, sender: int, link: str, channel: int, delay: Fraction, clock: str) -> Text:
         """Write how a value goes from the clock of its link to that of a force."""
         sends_at = self.clock_of[link]
-        value, name, unit, start = self.sent[sender, link][channel]
+        value, name = self.sent[sender, link][channel]
         label = f"{self.exchange.peer_name(sender)}.{name}"
         after = f"{label} after {float(delay) * 1e3:.6g} ms"
         (slow, first), (fast, second) = self.grids[sends_at], self.grids[clock]
         if first == second and delay % slow == 0:
-            value, ratio = self.late(value, f"{label} sent", unit, sends_at, delay, start), slow / fast
+            value, ratio = self.late(value, f"{label} sent", sends_at, delay), slow / fast
             for operator, factor in (("superSample", ratio.numerator), ("subSample", ratio.denominator)):
                 if factor > 1:
                     self._check(factor)
                     last = operator == "subSample" or ratio.denominator == 1
                     seen = f"{after} {'at' if last else 'for'} {clock}"
-                    value = self.let(seen, unit, f"{operator}({value.text}, {factor})", start)
+                    value = self.like(value, seen, f"{operator}({value.text}, {factor})")
             return value
         if not delay and (second - first) % _grid([slow, fast]) == 0:
             what = f"{link} without delay to {clock}: their ticks meet, and begin at different times"
             raise _refused(self.system, what, f'--set {link}.delay="…", or clocks of one phase')
         early = delay - _grid([slow, fast, first, second, delay]) / 2 if delay else delay
-        value = self.late(value, f"{label} sent for {clock}", unit, sends_at, early, start)
-        acting = self.let(f"{after} for {clock}", unit, f"hold({value.text})", start)
-        return self.let(f"{after} at {clock}", unit, f"sample({acting.text}, {self.clocks[clock]})", start)
+        value = self.late(value, f"{label} sent for {clock}", sends_at, early)
+        acting = self.like(value, f"{after} for {clock}", f"hold({value.text})")
+        return self.like(acting, f"{after} at {clock}", f"sample({acting.text}, {self.clocks[clock]})")
 
     def _check(self, *counters: int) -> None:
         if max(counters) > LARGEST_COUNTER:
@@ -331,14 +335,10 @@ class _Peer:
     def __init__(self, writer: _Writer, number: int, group: int) -> None:
         self.writer, self.number, self.group = writer, number, writer.system.groups[group]
         system, numbers, exchange = writer.system, writer.numbers, writer.exchange
-        self.kind, self.name, self.role = (
-            system.kinds[self.group.kind],
-            exchange.peer_name(number),
-            exchange.role(group),
-        )
+        self.kind, self.name = system.kinds[self.group.kind], exchange.peer_name(number)
+        self.role = exchange.role(group)
         rows = numbers.parameters[group]
         self.vector = rows[numbers.rows[group][number - int(exchange.starts[group])]].tolist()
-        self.jacobians = jacobians(self.kind)
         described = {one.name: one for one in system.parameters}
         begins = {state.start for state in self.kind.states}
         self.p: list[Text] = []
@@ -373,37 +373,25 @@ class _Peer:
         self.writer.define(part.text, long.text)
         return part
 
-    def _sampled(self, clock: str) -> tuple[list[Any], list[Any], list[Any]]:
+    def _sampled(self, clock: str) -> list[list[Callable[[], Text]]]:
         """Return states, holds and time as a clock samples them, those that are needed."""
-
-        def lazily(variable: Text, unit: str) -> Callable[[], Text]:
-            return lambda: self.writer.sampled(variable, unit, clock)
-
-        x = [lazily(one, state.unit) for one, state in zip(self.x, self.kind.states, strict=True)]
-        u = [
-            lazily(one, self.units[hold.clock][hold.output])
-            for one, hold in zip(self.u, self.kind.holds, strict=True)
+        sampled = self.writer.sampled
+        return [
+            [functools.partial(sampled, one, clock) for one in listed] for listed in (self.x, self.u, [TIME])
         ]
-        return x, u, [lazily(TIME, "s")]
 
     def sends(self) -> None:
         """Write what it sends."""
-        begin = start_sends(self.jacobians, self.vector, float) if self.kind.sends else {}
+        begin = start_sends(jacobians(self.kind), self.vector, float) if self.kind.sends else {}
         for sending in self.kind.sends:
             self.writer.comment(f"{self.name}: what it sends over {sending.link}")
             x, u, t = self._sampled(self.writer.clock_of[sending.link])
             values = written(sending.send, [x, u, self.p, t], self.keep)
             starts = [number(float(one)) for one in begin[sending.link]]
-            listed = zip(sending.channels, sending.units, starts, values, strict=True)
-            self.writer.sent[self.number, sending.link] = [
-                (
-                    self.writer.let(f"{self.name}.{channel} sent", unit, value.text, start),
-                    channel,
-                    unit,
-                    start,
-                )
-                for channel, unit, start, value in listed
-            ]
+            names = [f"{self.name}.{channel} sent" for channel in sending.channels]
+            texts = [value.text for value in values]
+            variables = map(self.writer.let, names, texts, sending.units, starts)
+            self.writer.sent[self.number, sending.link] = [*zip(variables, sending.channels, strict=True)]
 
     def tick(self, partition: ClockPartition) -> None:
         """Write what it computes at a clock's ticks, and how it acts."""
@@ -416,7 +404,7 @@ class _Peer:
             for row, (output, unit) in enumerate(zip(outputs, units, strict=True))
         ]
         m = [
-            writer.let(f"{name}.{outputs[row]} before", units[row], f"previous({y[row].text})")
+            writer.let(f"{name}.{outputs[row]} before", f"previous({y[row].text})", units[row])
             for row in partition.memories
         ]
         r = [self._received(one, partition.clock, [x, u, m], t) for one in partition.receives]
@@ -425,11 +413,11 @@ class _Peer:
             writer.define(variable.text, value.text)
         for acting, hold in zip(self.u, self.kind.holds, strict=True):
             if hold.clock == partition.clock:
-                value, unit, label = y[hold.output], units[hold.output], f"{name}.{hold.name}"
+                value, label = y[hold.output], f"{name}.{hold.name}"
                 if hold.output in starts:  # what was never computed acts as zero, whatever it starts from
-                    value = writer.let(f"{label} to act", unit, value.text, ZERO)
+                    value = writer.let(f"{label} to act", value.text, value.unit, ZERO)
                 delay = writer.numbers.timings[hold.delay]
-                value = writer.late(value, label, unit, partition.clock, delay, ZERO)
+                value = writer.late(value, label, partition.clock, delay)
                 writer.define(acting.text, f"hold({value.text})")
 
     def _received(self, receive: Receive, clock: str, inside: Sequence[Any], t: Sequence[Any]) -> Text:
@@ -445,7 +433,7 @@ class _Peer:
             ]
             if receive.edge is None:
                 terms.append(heard[receive.channel]())
-                unit = writer.sent[sender, link][receive.channel][2]
+                unit = terms[-1].unit
             else:
                 terms.append(written(receive.edge, [*inside, heard, self.p, t], self.keep)[0])
             weights.append(weight)
@@ -463,7 +451,7 @@ class _Peer:
             )
             if receive.operator == "mean" and total != 1:
                 value = f"({value})/{number(float(total)).within(SUM + 1)}"
-        return writer.let(f"{self.name}.{receive.name}", unit, value or "0")
+        return writer.let(f"{self.name}.{receive.name}", value or "0", unit)
 
 
 def _refuse_what_has_no_words(system: CompiledSystem, exchange: Exchange) -> None:

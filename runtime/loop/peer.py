@@ -409,7 +409,7 @@ class _OnePeer(Stepwise):
             column = self.population.hearing.column_of[loop.own]
             values = tuple(self.packets[number % self.population.hearing.ring, keys, column].tolist())
             instant = link.instant(count)
-            for other in link.told:
+            for other in sorted(link.receivers):
                 delay = self.network.delay(link, other, count) if self.network else 0
                 self.sent[link.place, other] += loop.begins != 0
                 if delay is not None and loop.begins:
@@ -452,36 +452,41 @@ class _OnePeer(Stepwise):
 
 
 class _OfLink:
-    """What a peer needs of a link: `place` and `name`; `slots` a frame; whom it tells and whom it hears."""
+    """What a peer needs of a link: `place` and `name`; `slots` a frame; whom it tells and whom it hears.
+
+    `channels` are what each peer sends over it, in the order of a packet's values, `keys` where they are
+    kept, `ways` the routes and ways on which each other is heard, `counts` the packets that came of each.
+    """
 
     def __init__(self, loop: Loop, place: int) -> None:
-        population, hearing = loop.simulation.population, loop.simulation.population.hearing
+        simulation, population = loop.simulation, loop.simulation.population
         self.place, self.name = place, loop.system.links[place].name
-        over = [(at, one) for at, one in enumerate(hearing.routes) if one.link == self.name]
-        quantum_ns = loop.simulation.quantum * NANO
-        lucks = [loop.simulation.lucks[at] for at, _ in over]
-        self.phase = lucks[0].phase * quantum_ns if lucks else Fraction(0)
-        self.period = lucks[0].period * quantum_ns if lucks else Fraction(1)
-        self.newest = lucks[0].newest if lucks else True
-        self.slots = over[0][1].slots if over else 1
-        schedules = [one.program.schedule for one in population.members]
-        self.channels = [
-            sorted({one.channel for one in schedule.sent if one.link == self.name}) for schedule in schedules
-        ]
-        self.keys = {
-            (one.channel, one.slot): row for row, one in enumerate(hearing.keys) if one.link == self.name
-        }
-        self.member_of = {peer: g for g, one in enumerate(population.members) for peer in one.peers.tolist()}
-        self.told = sorted({int(r) for _, one in over for s, r in one.pairs if s == loop.own})
+        over = [at for at, one in enumerate(population.hearing.routes) if one.link == self.name]
+        routes = {at: population.hearing.routes[at] for at in over}
+        luck = simulation.lucks[over[0]] if over else None
+        self.phase = luck.phase * simulation.quantum * NANO if luck else Fraction(0)
+        self.period = luck.period * simulation.quantum * NANO if luck else Fraction(1)
+        self.newest = luck is None or luck.newest
+        self.slots = routes[over[0]].slots if over else 1
+        self.channels: dict[int, list[str]] = {}
+        for member in population.members:
+            sent = sorted({one.channel for one in member.program.schedule.sent if one.link == self.name})
+            self.channels |= dict.fromkeys(member.peers.tolist(), sent)
+        listed = enumerate(population.hearing.keys)
+        self.keys = {(one.channel, one.slot): row for row, one in listed if one.link == self.name}
+        self.receivers: set[int] = set()
         self.ways: dict[int, list[tuple[int, int]]] = {}
-        for at, one in over:
-            for way in np.flatnonzero(one.pairs[:, 1] == loop.own).tolist():
-                self.ways.setdefault(int(one.pairs[way, 0]), []).append((at, way))
+        for at, route in routes.items():
+            for way, (sender, receiver) in enumerate(route.pairs.tolist()):
+                if sender == loop.own:
+                    self.receivers.add(receiver)
+                if receiver == loop.own:
+                    self.ways.setdefault(sender, []).append((at, way))
         self.counts: dict[int, set[int]] = {}
 
     def channels_of(self, peer: int) -> list[str]:
         """Return what a peer sends over the link, in the order of a packet's values."""
-        return self.channels[self.member_of[peer]]
+        return self.channels[peer]
 
     def instant(self, count: int) -> int:
         """Return when a packet's sample is taken, in nanoseconds of the scene."""
@@ -498,7 +503,9 @@ class _Emulated:
 
     def delay(self, link: _OfLink, other: int, count: int) -> int | None:
         """Return the delay of a packet in nanoseconds, None if it gets lost."""
-        source, delays = self.sources.setdefault((link.place, other), (self._source(link, other), []))
+        if (link.place, other) not in self.sources:
+            self.sources[link.place, other] = self._source(link, other), []
+        source, delays = self.sources[link.place, other]
         while source.taken <= count:
             delays[:] = source.take(AHEAD)[0].tolist()
         found = delays[count - source.taken]
@@ -506,14 +513,13 @@ class _Emulated:
 
     def _source(self, link: _OfLink, other: int) -> PacketSource:
         loop, exchange = self.loop, self.loop.exchange
-        of, to = (int(np.searchsorted(exchange.starts, one, side="right")) - 1 for one in (loop.own, other))
-        delay, own = self.timings[exchange.delay(link.name, of, to)], loop.system.links[link.place]
-        law = (
-            ChannelLaw(0.0, 1.0, 1.0, 0.0, float(delay), 0.0, "uniform", None)
-            if own.channel is None
-            else channel_law(loop.system, own, delay)
-        )
-        return PacketSource(law, link.name, [[loop.own, other]], seed=loop.simulation.seed)
+        way, declared = (loop.own, other), loop.system.links[link.place]
+        of, to = (int(np.searchsorted(exchange.starts, one, side="right")) - 1 for one in way)
+        delay = self.timings[exchange.delay(link.name, of, to)]
+        law = ChannelLaw(0.0, 1.0, 1.0, 0.0, float(delay), 0.0, "uniform", None)
+        if declared.channel is not None:
+            law = channel_law(loop.system, declared, delay)
+        return PacketSource(law, link.name, [way], seed=loop.simulation.seed)
 
 
 def number_of(exchange: Exchange, name: str, option: str) -> int:
