@@ -69,7 +69,7 @@ def memory(peer: Peer, signal: LocalSignal) -> str:
 
 
 def _output(peer: Peer, partition: int, output: int) -> str:
-    first = [*accumulate((len(one.outputs) for one in peer.kind.clocks), initial=0)]
+    first = [*accumulate((len(clock.outputs) for clock in peer.kind.clocks), initial=0)]
     return f"y[{first[partition] + output}]"
 
 
@@ -77,9 +77,11 @@ def _title(peer: Peer) -> str:
     """Return the comment that a text begins with."""
     system, clocks = peer.system, {partition.clock for partition in peer.kind.clocks}
     texts = [f"     {comment(digest)}  {comment(path)}" for path, digest in system.origin.digests]
-    timings = {one.name: float(one.value) for one in system.timings}
+    timings = {timing.name: float(timing.value) for timing in system.timings}
     periods = [
-        f"{comment(one.name)} every {timings[one.period]!r} s" for one in system.clocks if one.name in clocks
+        f"{comment(clock.name)} every {timings[clock.period]!r} s"
+        for clock in system.clocks
+        if clock.name in clocks
     ]
     made = f"{comment(peer.name)} of {comment(system.name)}, written by apc {program_version()}"
     return "\n".join([f"/* {made}. {', '.join(periods)}.", "   Made from (SHA-256):", *texts]) + " */"
@@ -106,7 +108,7 @@ def header(peer: Peer) -> str:
     ]
     packets = ""
     for line in peer.lines:
-        rows = [(f"double {one.member}", f"{one.name} [{one.unit}]") for one in line.packet]
+        rows = [(f"double {entry.member}", f"{entry.name} [{entry.unit}]") for entry in line.packet]
         if line.missing:
             rows.append(("int missing", "1: it is late, and what this peer would send stands in for it"))
         type_ = f"{name}_{line.name}"
@@ -151,7 +153,7 @@ def header(peer: Peer) -> str:
 
 def _kept(peer: Peer) -> int:
     """Return how many computed values of each hold are remembered."""
-    return 1 + max((act.lag for one in peer.instants for act in one.acts), default=0)
+    return 1 + max((act.lag for instant in peer.instants for act in instant.acts), default=0)
 
 
 # ---- what it computes
@@ -161,7 +163,7 @@ def source(peer: Peer, include: str) -> str:
     """Return the code; `include` is the name of the header."""
     kind, name = peer.kind, peer.identifier
     kinds = tuple(dict.fromkeys(peer.instants))
-    units = {one.name: one.unit for one in peer.system.parameters}
+    units = {parameter.name: parameter.unit for parameter in peer.system.parameters}
     named = zip(_parameters(peer), kind.parameters, peer.parameters.tolist(), strict=True)
     over = {line.sending: line.name for line in peer.sending}
     begin = [
@@ -263,7 +265,7 @@ def _own(peer: Peer, line: Line) -> str:
     sending, name = peer.kind.sends[line.sending], f"{peer.identifier}_{line.name}"
     lines, values = _computed(sending.send, [*_moving(peer), *_parameters(peer), "t"])
     sent = dict(zip(sending.channels, values, strict=True))
-    lines += [f"packet->{one.member} = {sent[one.name]};" for one in line.packet if one.name in sent]
+    lines += [f"packet->{entry.member} = {sent[entry.name]};" for entry in line.packet if entry.name in sent]
     lines += ["packet->missing = 0;"] if line.missing else []
     return f"""\
 static void {name}_own(const {peer.identifier} *peer, const {peer.identifier}_in *in, {name} *packet) {{
@@ -323,7 +325,7 @@ def _receive(peer: Peer, p: int, place: int) -> list[str]:
     if receive.operator in ("max", "min"):
         larger = f"  {total} = f{receive.operator}({total}, {value});"
         return [f"double {total} = NAN;", loop, *looked, larger, "}"]
-    weights = np.array([one.weight for one in line.senders])
+    weights = np.array([sender.weight for sender in line.senders])
     divided = mean and line.complete and not edge
     if mean and not divided:
         weights = weights / sum_weights(np.zeros(count, np.int64), weights, 1).floats[0]
@@ -387,15 +389,17 @@ def driver(peer: Peer, include: str) -> str:
     for line in peer.lines:
         for k, sender in enumerate(line.senders):
             begin, label = f"{line.name}[{k}]", f"{line.link} {sender.name}"
-            read += [("%lf", f"{begin}.{one.member}", f"{label} {one.name}") for one in line.packet]
+            read += [("%lf", f"{begin}.{entry.member}", f"{label} {entry.name}") for entry in line.packet]
             read += [("%d", f"{begin}.missing", f"{label} missing")] if line.missing else []
     shown = [("%.17g", f"out.{own}", force.name) for own, force in peer.forces.items()]
     for line in peer.sending:
         shown.append(("%d", f"out.{line.name}_sent", f"{line.link} sent"))
         own = f"out.{line.name}"
-        shown += [("%.17g", f"{own}.{one.member}", f"{line.link} {one.name}") for one in line.packet]
+        shown += [("%.17g", f"{own}.{entry.member}", f"{line.link} {entry.name}") for entry in line.packet]
     shown += [
-        ("%.17g", f"peer.{memory(peer, one)}", one.name) for one in peer.signals if one.role == "output"
+        ("%.17g", f"peer.{memory(peer, signal)}", signal.name)
+        for signal in peer.signals
+        if signal.role == "output"
     ]
     tests = [f'scanf("{form}", &in.{own}) == 1' for form, own, _ in read]
     return filled(

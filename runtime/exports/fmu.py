@@ -59,8 +59,8 @@ class Unit(Result):
 
 def unit_of(system: CompiledSystem, scene: CScene, *, peer: str = "") -> Unit:
     """Return the FMU of a scene, or of the peer of that name."""
-    timings = {one.name: one.value for one in system.timings}
-    step = float(min(timings[one.period] for one in system.clocks))
+    timings = {timing.name: timing.value for timing in system.timings}
+    step = float(min(timings[clock.period] for clock in system.clocks))
     duration = system.experiment.duration
     texts: dict[str, str] = {}
     for code in scene.codes:
@@ -83,7 +83,7 @@ def _guid(unit: Unit) -> str:
 
 def _main(scene: CScene) -> str:
     """Return the text between the peers' and the simulator."""
-    inputs = sum(one.given for one in scene.variables)
+    inputs = sum(variable.given for variable in scene.variables)
     numbers = [(k, one) for k, one in enumerate(scene.variables) if not one.flag]
     flags = [(k, one) for k, one in enumerate(scene.variables) if one.flag]
     accessors = ""

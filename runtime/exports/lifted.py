@@ -201,7 +201,7 @@ def made_by(system: CompiledSystem) -> str:
         "topology": system.name,
         "texts": texts_of(system),
         "parameters": parameters_of(system),
-        "timings": [(one.name, str(one.value)) for one in system.timings],
+        "timings": [(timing.name, str(timing.value)) for timing in system.timings],
         "versions": versions("casadi", "numpy"),
     }
     return json.dumps(told, ensure_ascii=False)
@@ -258,7 +258,7 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
     """Let forces and noise into some peers, and cut the forces of a coupler open."""
     schedule, kind = _remembering(group), group.jacobians.kind
     (forces, unpushed), noises = _masses(system, group), _measured(group.site)
-    inverses = [numbers.inverses(group, one) for one in forces]
+    inverses = [numbers.inverses(group, force) for force in forces]
     wide = _with_inputs(numbers.site(group), forces, inverses, noises)
     count = len(forces) + len(noises)
     nothing = np.zeros((0, sum(wide.b.shape)), dtype=wide.b.dtype)
@@ -269,7 +269,7 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
     units += ["1"] * (len(kind.states) + len(full.carried) - len(units))
     check_packets(full)
     durations = step_durations(full)
-    steps = numbers.steps(group, forces, count, [one * full.quantum for one in durations])
+    steps = numbers.steps(group, forces, count, [duration * full.quantum for duration in durations])
     frame = compose(site, full, dict(zip(durations, steps, strict=True)), numbers=numbers.arithmetic)
     first = {one: len(kind.states) + k for k, one in enumerate(schedule.carried)}
     signals = [
@@ -324,7 +324,7 @@ def _instants(schedule: Schedule) -> dict[int, list[int]]:
 
 def _masses(system: CompiledSystem, group: PeerGroup) -> tuple[list[Push], list[str]]:
     """Return what of a peer has a mass, and so can be pushed, each axis by itself; and why what can't."""
-    unit_of = {one.name: one.unit for one in system.parameters}
+    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     known: dict[str, Device | str | None] = {}
     found = [
         find_push(group.jacobians, group.parameters, unit_of, group.listening, place, known)
@@ -430,7 +430,7 @@ def _closed(
     """Close a loop, but where it is cut; return A, B, C and D, and the names of states, inputs, outputs."""
     layout = lay_out_loop(loop)
     n, peers = len(layout.names), [site.name for site in loop.sites]
-    heard = [one.group.schedule.heard for one in sites]
+    heard = [site.group.schedule.heard for site in sites]
     opened = [
         [row for row, what in enumerate(rows) if what is OUTSIDE or (link and what.way.link == link)]
         for rows in heard
@@ -444,7 +444,7 @@ def _closed(
         before[rows, given + np.arange(len(rows))] = 1.0
         feedback.append(Feedback(now, before))
         given += len(rows)
-    whole = close([one.map for one in sites], feedback, layout, numbers=arithmetic)
+    whole = close([site.map for site in sites], feedback, layout, numbers=arithmetic)
 
     def spread(listed: Sequence[Placed]) -> tuple[Labels, Places]:
         """Return what each site has, by its peer's name, and where in the state."""
@@ -455,15 +455,15 @@ def _closed(
         ]
         return tuple(port for port, _ in every), np.array([place for _, place in every], np.intp)
 
-    inputs, drawn = spread([one.inputs for one in sites])
-    forces, computed = spread([one.cuts for one in sites])
+    inputs, drawn = spread([site.inputs for site in sites])
+    forces, computed = spread([site.cuts for site in sites])
     kept = np.delete(np.arange(n), np.concatenate([drawn, computed]))
     names = layout.names if len(sites) > 1 else tuple(f"{peers[0]}.{name}" for name in layout.names)
-    of_states = [unit for one in sites for unit in _units(one, units)]
+    of_states = [unit for site in sites for unit in _units(site, units)]
     states = tuple(Port(names[place], of_states[place]) for place in kept)
     matrix, outer = whole.matrix, n + np.arange(outside)
     if not cut:
-        outputs, seen = spread([one.signals for one in sites])
+        outputs, seen = spread([site.signals for site in sites])
         c = (kept[None, :] == seen[:, None]).astype(np.float64)
         blocks = matrix[np.ix_(kept, kept)], matrix[np.ix_(kept, drawn)], c, np.zeros((len(c), len(drawn)))
         return blocks, (states, inputs, outputs)

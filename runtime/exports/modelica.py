@@ -108,7 +108,7 @@ class _Writer:
         self.numbers = resolve(system)
         self.exchange: Exchange = build_exchange(system, self.numbers.timings)
         timing = self.numbers.timings
-        self.grids = {one.name: (timing[one.period], timing[one.phase]) for one in system.clocks}
+        self.grids = {clock.name: (timing[clock.period], timing[clock.phase]) for clock in system.clocks}
         self.clock_of = {link.name: link.clock for link in system.links}
         self.taken: set[str] = set()
         self.parameters: dict[str, tuple[Text, str]] = {}
@@ -292,7 +292,7 @@ class _Writer:
     def _clocks(self) -> tuple[dict[str, str], list[str]]:
         """Return what each clock is called, and the lines that declare them, the fastest first."""
         used = {part.clock for kind in self.system.kinds for part in kind.clocks}
-        used |= {self.clock_of[one.link] for kind in self.system.kinds for one in kind.sends}
+        used |= {self.clock_of[sending.link] for kind in self.system.kinds for sending in kind.sends}
         made: dict[tuple[Fraction, Fraction], str] = {}
         names: dict[str, str] = {}
         lines: list[str] = []
@@ -339,7 +339,7 @@ class _Peer:
         self.role = exchange.role(group)
         rows = numbers.parameters[group]
         self.vector = rows[numbers.rows[group][number - int(exchange.starts[group])]].tolist()
-        described = {one.name: one for one in system.parameters}
+        described = {parameter.name: parameter for parameter in system.parameters}
         begins = {state.start for state in self.kind.states}
         self.p: list[Text] = []
         for place, (name, value) in enumerate(zip(self.kind.parameters, self.vector, strict=True)):
@@ -352,7 +352,7 @@ class _Peer:
             unit, about = (declared.unit, declared.about) if declared else ("1", "")
             self.p.append(writer.parameter(label, value, unit, about))
         self.place = {name: self.p[place] for place, name in enumerate(self.kind.parameters)}
-        self.units = {one.clock: one.units for one in self.kind.clocks}
+        self.units = {clock.clock: clock.units for clock in self.kind.clocks}
 
     def declare(self) -> None:
         """Declare what moves, and what acts on it."""
@@ -407,7 +407,7 @@ class _Peer:
             writer.let(f"{name}.{outputs[row]} before", f"previous({y[row].text})", units[row])
             for row in partition.memories
         ]
-        r = [self._received(one, partition.clock, [x, u, m], t) for one in partition.receives]
+        r = [self._received(receive, partition.clock, [x, u, m], t) for receive in partition.receives]
         values = written(partition.tick, [x, u, m, r, self.p, t], self.keep)
         for variable, value in zip(y, values, strict=True):
             writer.define(variable.text, value.text)
@@ -462,10 +462,13 @@ def _refuse_what_has_no_words(system: CompiledSystem, exchange: Exchange) -> Non
     for kind in system.kinds:
         functions = [(kind.derivative, "what moves")]
         functions += [
-            (one.edge, "a look at others") for part in kind.clocks for one in part.receives if one.edge
+            (receive.edge, "a look at others")
+            for part in kind.clocks
+            for receive in part.receives
+            if receive.edge
         ]
         functions += [(part.tick, ", ".join(part.outputs)) for part in kind.clocks]
-        functions += [(one.send, ", ".join(one.channels)) for one in kind.sends]
+        functions += [(sending.send, ", ".join(sending.channels)) for sending in kind.sends]
         for function, what in functions:
             if not function.is_a("SXFunction"):
                 solved = f"the nonlinear loop of {kind.name} that Newton's method solves for {what[:120]}"

@@ -82,8 +82,8 @@ class Sender:
 
 
 @dataclass(frozen=True, slots=True)
-class Number:
-    """A number of a packet: its channel's name, its unit, and what it is called in C."""
+class Entry:
+    """An entry of a packet: its channel's name, its unit, and what it is called in C."""
 
     name: str
     unit: str
@@ -100,7 +100,7 @@ class Line:
 
     link: str
     name: str
-    packet: tuple[Number, ...]
+    packet: tuple[Entry, ...]
     sending: int
     senders: tuple[Sender, ...]
     missing: bool
@@ -109,7 +109,7 @@ class Line:
     @property
     def channels(self) -> tuple[str, ...]:
         """The names of a packet's channels."""
-        return tuple(one.name for one in self.packet)
+        return tuple(entry.name for entry in self.packet)
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +175,7 @@ class Peer:
 
     def line(self, link: str) -> Line:
         """Return what it has of a link."""
-        return next(one for one in self.lines if one.link == link)
+        return next(line for line in self.lines if line.link == link)
 
 
 def peer_of(
@@ -213,7 +213,9 @@ def peer_of(
     looked_at = sorted(outside & _read(kind))
     measured = unique((identifier(kind.states[row].name) for row in looked_at), names)
     forces = _forces(system, label, site, vector, outside)
-    pushed = unique((identifier(one.name) for one in forces), [*names, *(f"{line}_sent" for line in names)])
+    pushed = unique(
+        (identifier(force.name) for force in forces), [*names, *(f"{line}_sent" for line in names)]
+    )
     x, _, memories = start_values(site, [float(one) for one in vector])
     return Peer(
         system=system,
@@ -266,8 +268,10 @@ def refused(system: CompiledSystem, what: str, hint: str = "") -> ApcError:
 
 def _refuse_what_iterates(system: CompiledSystem, name: str, kind: Kind) -> None:
     """Refuse a peer of which something is solved by Newton's method."""
-    computed = [(one.tick, f"at a tick of {one.clock} {', '.join(one.outputs)}") for one in kind.clocks]
-    computed += [(one.send, f"{', '.join(one.channels)} of {one.link}") for one in kind.sends]
+    computed = [
+        (clock.tick, f"at a tick of {clock.clock} {', '.join(clock.outputs)}") for clock in kind.clocks
+    ]
+    computed += [(sending.send, f"{', '.join(sending.channels)} of {sending.link}") for sending in kind.sends]
     for function, what in computed:
         if not function.is_a("SXFunction"):
             what = f"{name}: {what} are solved for by iteration, which is not written as C"
@@ -287,7 +291,7 @@ def _outside(
     kind = site.kind
     if device == NO_DEVICE:
         return frozenset()
-    parts = [whole_and_index(one.name)[0].rpartition(".")[0] for one in kind.states]
+    parts = [whole_and_index(state.name)[0].rpartition(".")[0] for state in kind.states]
     masses = {part for row, part in enumerate(parts) if _is_position(kind, site, row)}
     sent = {parts[int(row)] for send in site.pattern.sends for row in np.flatnonzero(send.x.any(axis=0))}
     pattern = structural_pattern(kind.derivative.jac_sparsity(0, 0)).astype(float)
@@ -299,7 +303,9 @@ def _outside(
             what = f"--device: no mass of {name} is called {one[:40] or 'so'}"
             raise _undecided(system, what, f"--device {near}")
     else:
-        devices = find_devices(site, vector, {one.name: one.unit for one in system.parameters})
+        devices = find_devices(
+            site, vector, {parameter.name: parameter.unit for parameter in system.parameters}
+        )
         chosen = {one.rpartition(".")[0] if one.endswith("]") else one for one in devices}
     if not chosen:
         hint = f"--device {NO_DEVICE} if its computer moves them all, or --device "
@@ -338,8 +344,10 @@ def _is_position(kind: Kind, site: SiteJacobians, row: int) -> bool:
 
 def _read(kind: Kind) -> frozenset[int]:
     """Return the states that anything computed at an instant looks at."""
-    functions = [one.tick for one in kind.clocks] + [one.send for one in kind.sends]
-    functions += [receive.edge for one in kind.clocks for receive in one.receives if receive.edge is not None]
+    functions = [clock.tick for clock in kind.clocks] + [sending.send for sending in kind.sends]
+    functions += [
+        receive.edge for clock in kind.clocks for receive in clock.receives if receive.edge is not None
+    ]
     reads = [structural_pattern(function.jac_sparsity(0, 0)).any(axis=0) for function in functions]
     return frozenset(np.flatnonzero(np.any(reads, axis=0)).tolist())
 
@@ -351,7 +359,7 @@ def _forces(
     kind = site.kind
     if not outside:
         return ()
-    unit_of = {one.name: one.unit for one in system.parameters}
+    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     x, u, p, t = kind.derivative.sx_in()
     slopes = jacobian(kind.derivative(x, u, p, t), u)
     varying = casadi.vertcat(x, u, t)
@@ -493,7 +501,7 @@ def lines_of(plan: Plan, number: int) -> tuple[tuple[Line, ...], dict[tuple[int,
             Line(
                 link=link,
                 name=name,
-                packet=tuple(map(Number, channels, [known.units[i] for i in used], members)),
+                packet=tuple(map(Entry, channels, [known.units[i] for i in used], members)),
                 sending=place if sent else -1,
                 senders=tuple(
                     Sender(one, exchange.peer_name(one), weight, first_packet(plan, link, one, channels))
@@ -522,7 +530,9 @@ def first_packet(plan: Plan, link: str, number: int, channels: Sequence[str]) ->
 def _heard(plan: Plan, link: str, number: int) -> Iterator[tuple[int, float]]:
     """Yield the peers that one hears over a link, with their weights, in the scene's order."""
     system, exchange = plan.system, plan.exchange
-    sends = [any(one.link == link for one in system.kinds[group.kind].sends) for group in system.groups]
+    sends = [
+        any(sending.link == link for sending in system.kinds[group.kind].sends) for group in system.groups
+    ]
     if exchange.is_complete(link):
         listed = [(one, 1.0) for one in range(exchange.peers) if one != number]
     else:

@@ -102,11 +102,13 @@ def one_peer(plan: Plan, number: int, method: Method) -> CScene:
                 flag = Variable(f"{label}.missing", "1", f"{member}.missing", given=True, flag=True)
                 variables.append(flag)
     variables += [
-        Variable(f"{line.link}.{one.name}", one.unit, f"out0[0].{line.name}.{one.member}")
+        Variable(f"{line.link}.{entry.name}", entry.unit, f"out0[0].{line.name}.{entry.member}")
         for line in peer.sending
-        for one in line.packet
+        for entry in line.packet
     ]
-    variables += [Variable(one.name, one.unit, f"peer0[0].{memory(peer, one)}") for one in peer.signals]
+    variables += [
+        Variable(signal.name, signal.unit, f"peer0[0].{memory(peer, signal)}") for signal in peer.signals
+    ]
     return CScene(peer.identifier, peer.schedule.quantum, (peer,), ((0, 0),), (), tuple(variables))
 
 
@@ -126,7 +128,7 @@ def c_scene(plan: Plan, method: Method) -> CScene:
         raise refused(system, what, alone)
     first = sites_of(plan)
     sites = [*dict.fromkeys(first)]
-    names = unique(identifier(exchange.peer_name(one)) for one in sites)
+    names = unique(identifier(exchange.peer_name(site)) for site in sites)
     codes = tuple(peer_of(plan, one, method, name=name) for one, name in zip(sites, names, strict=True))
     placed: Counter[int] = Counter()
     peers = []
@@ -136,10 +138,12 @@ def c_scene(plan: Plan, method: Method) -> CScene:
     quantum = codes[0].schedule.quantum
     variables = [
         Variable(
-            f"{exchange.peer_name(k)}.{one.name}", one.unit, f"peer{site}[{place}].{memory(codes[site], one)}"
+            f"{exchange.peer_name(k)}.{signal.name}",
+            signal.unit,
+            f"peer{site}[{place}].{memory(codes[site], signal)}",
         )
         for k, (site, place) in enumerate(peers)
-        for one in codes[site].signals
+        for signal in codes[site].signals
     ]
     links = _links(plan, quantum)
     return CScene(identifier(system.name), quantum, codes, tuple(peers), links, tuple(variables))
@@ -271,7 +275,7 @@ def _site(scene: CScene, s: int) -> str:
         line = next((one for one in code.lines if one.link == link.link), None)
         if line is None:
             continue
-        members = [(link.channels.index(one.name), one.member) for one in line.packet]
+        members = [(link.channels.index(entry.name), entry.member) for entry in line.packet]
         if line.sending >= 0:
             posted += [
                 f"if (m->out{s}[i].{line.name}_sent) {{",

@@ -127,13 +127,13 @@ def compare_run(run: Run) -> RunComparison:
     simulation = prepare(live_scene(system), Settings(_duration(peers), jit=False))
     frame = float(simulation.frame * simulation.quantum)
     why_not, ways = _incomplete(system, peers), _ways(run)
-    heard = [[one for one in ways if one.link == link.name and one.came.law] for link in system.links]
+    heard = [[way for way in ways if way.link == link.name and way.came.law] for link in system.links]
     return RunComparison(
         topology=system.name,
         folder=run.folder,
-        seconds=max((float(one.time[-1]) for one in peers if len(one.time)), default=0.0),
-        emulated=any(one.emulated for one in peers),
-        ticks=tuple(ticks_of(one, frame) for one in peers),
+        seconds=max((float(peer.time[-1]) for peer in peers if len(peer.time)), default=0.0),
+        emulated=any(peer.emulated for peer in peers),
+        ticks=tuple(ticks_of(peer, frame) for peer in peers),
         ways=ways,
         apart={} if why_not else _apart(run),
         why_not=why_not,
@@ -146,7 +146,7 @@ def compare_run(run: Run) -> RunComparison:
 
 
 def _duration(peers: tuple[PeerRun, ...]) -> Fraction:
-    ends = [float(one.time[-1]) for one in peers if len(one.time)]
+    ends = [float(peer.time[-1]) for peer in peers if len(peer.time)]
     return Fraction(max(min(ends, default=0.0), 1e-3)).limit_denominator(10**6)
 
 
@@ -154,11 +154,11 @@ def _incomplete(system: CompiledSystem, peers: tuple[PeerRun, ...]) -> str:
     """Return why the run can't be simulated again, empty if it can."""
     if len(peers) < system.peers:
         return f"of {system.peers} peers {len(peers)} left their part of the run"
-    if own := [one.name for one in peers if one.outside]:
+    if own := [peer.name for peer in peers if peer.outside]:
         return f"{', '.join(own)} had a device outside, whose motion is not known"
-    if none := [one.name for one in peers if not all(map(len, one.packets))]:
+    if none := [peer.name for peer in peers if not all(map(len, peer.packets))]:
         return f"{', '.join(none)} ended before the first tick that hears"
-    late = [one.name for one in peers if one.first]
+    late = [peer.name for peer in peers if peer.first]
     return f"{', '.join(late)} joined later, or again, in a state that others had not" if late else ""
 
 
@@ -210,8 +210,8 @@ def _apart(run: Run) -> dict[str, tuple[float, float]]:
 
 def _ways(run: Run) -> tuple[WayRun, ...]:
     system, peers = run.system, {one.number: one for one in run.peers}
-    timings = {one.name: float(one.value) for one in system.timings}
-    periods = {one.name: timings[one.period] for one in system.clocks}
+    timings = {timing.name: float(timing.value) for timing in system.timings}
+    periods = {clock.name: timings[clock.period] for clock in system.clocks}
     found = []
     for peer in run.peers:
         for number, sender in peer.ways:
@@ -234,14 +234,16 @@ def _ways(run: Run) -> tuple[WayRun, ...]:
 def _measured(system: CompiledSystem, link: Link, ways: Sequence[WayRun]) -> Measured:
     """Return what is said of the scene with a link as the worst of its ways was: most lost, then latest."""
     worst = max(ways, key=lambda one: (one.came.lost.value, one.came.mean))
-    came, clocks = worst.came, {one.name: one.period for one in system.clocks}
-    tick = min(float(one.value) for one in system.timings if one.name in clocks.values())
+    came, clocks = worst.came, {clock.name: clock.period for clock in system.clocks}
+    tick = min(float(timing.value) for timing in system.timings if timing.name in clocks.values())
     median = dict(came.quantiles).get(0.5, came.mean)
     delay = Fraction(int(np.ceil(median / tick - 1e-9))) * Fraction(tick).limit_denominator(10**9)
     usual = link.channel or Channel(None, None, "uniform", "newest", "hold", None)
     channel = Channel(None, None, "uniform", usual.reorder, usual.on_loss, came.delays)
-    timings = tuple(replace(one, value=delay) if one.name == link.delay else one for one in system.timings)
-    period = next(float(one.value) for one in timings if one.name == clocks[link.clock])
+    timings = tuple(
+        replace(timing, value=delay) if timing.name == link.delay else timing for timing in system.timings
+    )
+    period = next(float(timing.value) for timing in timings if timing.name == clocks[link.clock])
     links = tuple(replace(one, channel=channel, delays=()) if one is link else one for one in system.links)
     measured = replace(system, timings=timings, links=links)
     late = came.longest > LATEST * period or came.packets > LONGEST

@@ -66,7 +66,7 @@ PEER = re.compile(r"(?P<group>[A-Za-z_][A-Za-z0-9_]*)\[(?P<place>[0-9]{1,9})\]\Z
 
 def live_scene(system: CompiledSystem) -> CompiledSystem:
     """Return a scene whose links take what the network does: each way's packets are heard as they come."""
-    timings = {one.name: one.value for one in system.timings}
+    timings = {timing.name: timing.value for timing in system.timings}
     links = []
     for link in system.links:
         usual = max(timings[one] for one in (link.delay, *(pair.delay for pair in link.delays)))

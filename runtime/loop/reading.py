@@ -80,10 +80,10 @@ def read_run(folder: Path) -> Run:
     scene = _Scene(names, tuple(link.name for link in system.links), simulation)
     peers = tuple(sorted((_read_peer(path, scene) for path in files), key=lambda one: one.number))
     apart = "holds peers that did not play together: of other runs, of other scenes, or with another --set"
-    refuse(len({(one.digest, one.session) for one in peers}) > 1, apart)
+    refuse(len({(peer.digest, peer.session) for peer in peers}) > 1, apart)
     played = hashlib.sha256(archive.model).hexdigest()
     refuse(peers[0].digest != played, f"its {SCENE} is not the scene that was played")
-    refuse(len({one.number for one in peers}) < len(peers), "holds a peer twice")
+    refuse(len({peer.number for peer in peers}) < len(peers), "holds a peer twice")
     return Run(str(folder), system, peers)
 
 
@@ -144,7 +144,7 @@ def _check_signals(peer: PeerRun, scene: _Scene) -> None:
     """Check what was recorded at instants: their order, and that each is within a frame of the last."""
     simulation = scene.simulation
     frame = float(simulation.frame * simulation.quantum)
-    signals = tuple(one.name for one in simulation.signals if one.name.startswith(f"{peer.name}."))
+    signals = tuple(signal.name for signal in simulation.signals if signal.name.startswith(f"{peer.name}."))
     _want(peer.signals == signals, "its signals are not those of the scene")
     _want(
         peer.values.shape == (len(peer.time), len(signals)),

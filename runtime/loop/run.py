@@ -126,7 +126,7 @@ def run_of(loop: Loop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun:
         stopped=loop.stopped,
         emulated=loop.player.network is not None,
         outside=loop.player.outside is not None,
-        signals=tuple(one.name for one in simulation.signals),
+        signals=tuple(signal.name for signal in simulation.signals),
         dropped=dict(loop.post.dropped),
         not_given=not_given,
         sent=sent,
