@@ -1,31 +1,29 @@
 """A scene handed over as code: a peer in C99, or an FMU of a peer or of all.
 
 Takes: a `CompiledSystem`, a peer's name, a device, a method. Gives: `Code`, `peer_code`, `write_code`;
-`scene_unit`; `peer_named`.
+`scene_unit`.
 Guarantees: three texts are written together or not at all: `left.c`, `left.h`, and the driver `left_test.c`.
 Does not: compile what is written as C.
 """
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import write_texts
 from apc.exports.c_text import driver, header, source
 from apc.exports.fmu import Unit, unit_of
 from apc.exports.peer import Peer, peer_of, refused, sites_of
 from apc.exports.scene_text import c_scene, one_peer
 from apc.finite_equations import finite_equations
+from apc.loop.peer import number_of
 from apc.result import Result
 from apc.simulation.settings import DEFAULT, Method, parse_method
 from apc.simulation.simulation import Plan, plan_of
-
-_NAME = re.compile(r"(?P<group>.+)\[(?P<number>[1-9][0-9]{0,8})\]\Z")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,21 +54,21 @@ def peer_code(system: CompiledSystem, *, peer: str = "", device: str = "", metho
     Raises
     ------
     ApcError
-        E963 no such peer, or several that differ and no name; and as `peer_of`, `parse_method`.
+        E963 the peers differ, and no name; E970 no such peer; and as `peer_of`, `parse_method`.
     """
     how, plan = _plan(system, method)
     if not peer and len(set(sites_of(plan))) > 1:
         what = "--peer: the peers differ, and a text of C is of one"
         hint = f'--peer "{plan.exchange.peer_name(0)}"'
         raise ApcError(Mistake("E963", Place(system.origin.topology), what, hint=hint))
-    found = peer_of(plan, peer_named(plan, peer) if peer else 0, how, device=device or None)
+    found = peer_of(plan, number_of(plan.exchange, peer, "--peer") if peer else 0, how, device=device or None)
     return Code(system.name, found, str(how))
 
 
 def scene_unit(system: CompiledSystem, *, peer: str = "", method: str = "") -> Unit:
     """Make an FMU of a scene, or of one peer of it; parameters, and what is raised, as for `peer_code`."""
     how, plan = _plan(system, method)
-    scene = one_peer(plan, peer_named(plan, peer), how) if peer else c_scene(plan, how)
+    scene = one_peer(plan, number_of(plan.exchange, peer, "--peer"), how) if peer else c_scene(plan, how)
     return unit_of(system, scene, peer=peer)
 
 
@@ -80,25 +78,6 @@ def _plan(system: CompiledSystem, method: str) -> tuple[Method, Plan]:
         raise refused(system, f"{system.name} has no clock: nothing is computed at any tick")
     with finite_equations(system.name):
         return how, plan_of(system, how)
-
-
-def peer_named(plan: Plan, name: str) -> int:
-    """Return the number of a peer, counted from 0 over all groups. Raises ApcError (E963)."""
-    system, starts = plan.system, plan.exchange.starts
-    groups = [group.name for group in system.groups]
-    matched = _NAME.match(name.strip())
-    group = matched["group"] if matched else name.strip().partition("[")[0]
-    if group not in groups:
-        near = nearest(group, groups) or groups[0]
-        what = f"--peer: no group of peers is called {group[:40] or 'so'}"
-        raise ApcError(Mistake("E963", Place(system.origin.topology), what, hint=f'--peer "{near}[1]"'))
-    place = groups.index(group)
-    count = system.groups[place].count
-    number = int(matched["number"]) if matched else 0
-    if not 1 <= number <= count:
-        what = f"--peer: {name.strip()[:40]} is none of the peers {group}[1] to {group}[{count}]"
-        raise ApcError(Mistake("E963", Place(system.origin.topology), what, hint=f'--peer "{group}[1]"'))
-    return int(starts[place]) + number - 1
 
 
 def write_code(path: Path, found: Code) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import write_file, write_text
-from apc.exports.words import word, words
+from apc.exports.words import identifier, words
 from apc.optional import need
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def as_control(found: StateSpace) -> Any:
     control = need("control", "control")
     return control.StateSpace(
         *(found.a, found.b, found.c, found.d, found.frame_s),
-        name=word(found.topology),
+        name=identifier(found.topology),
         states=words(found.states),
         inputs=words(found.inputs),
         outputs=words(found.outputs),
@@ -96,7 +96,7 @@ def write_script(path: Path, found: StateSpace) -> None:
             for name, listed in ports.items()
         },
         made_by=json.dumps(found.made_by),
-        name=json.dumps(word(found.topology)),
+        name=json.dumps(identifier(found.topology)),
     )
     write_text(path, text.rstrip("\n"))
 

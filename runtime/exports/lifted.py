@@ -265,7 +265,7 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
     (site,), full, ports = with_ports([wide], schedule, count, [0], [nothing], [])
     units = [*(state.unit for state in kind.states)]
     units += [kind.clocks[one.partition].units[one.output] for one in schedule.carried]
-    site, full, cuts = _cut_open(site, full, _cut_forces(group, cut) if cut else [])
+    site, full, cuts = _cut_open(site, full, cut)
     units += ["1"] * (len(kind.states) + len(full.carried) - len(units))
     check_packets(full)
     durations = step_durations(full)
@@ -380,22 +380,16 @@ def _link_of(system: CompiledSystem, cut: str) -> str:
     return ""
 
 
-def _cut_forces(group: PeerGroup, cut: str) -> list[tuple[int, int]]:
-    """Return the clock partition and output of each force of a coupler."""
-    kind = group.jacobians.kind
+def _cut_open(site: LinearSite, schedule: Schedule, cut: str) -> tuple[LinearSite, Schedule, Placed]:
+    """Let the forces of a coupler come from outside at each tick; what the tick computes of them is in z."""
+    kind = site.kind
     numbers = {partition.clock: p for p, partition in enumerate(kind.clocks)}
-    found = [(numbers[hold.clock], hold.output) for hold in kind.holds if hold.name.rpartition(".")[0] == cut]
-    return list(dict.fromkeys(found))
-
-
-def _cut_open(
-    site: LinearSite, schedule: Schedule, listed: Sequence[tuple[int, int]]
-) -> tuple[LinearSite, Schedule, Placed]:
-    """Let forces come from outside at each tick; what the tick computes of them is remembered in z."""
-    cuts = [(partition, output) for partition, output in listed if schedule.ticks[partition]]
+    forces = [hold for hold in kind.holds if cut and hold.name.rpartition(".")[0] == cut]
+    cuts = list(dict.fromkeys((numbers[hold.clock], hold.output) for hold in forces))
+    cuts = [(partition, output) for partition, output in cuts if schedule.ticks[partition]]
     at, ports = _instants(schedule), []
     for partition, output in cuts:
-        clock = site.kind.clocks[partition]
+        clock = kind.clocks[partition]
         times = [float(one * schedule.quantum * 1000) for one in at[partition]]
         ports += [Port(f"{clock.outputs[output]} at {when:.6g} ms", clock.units[output]) for when in times]
     if len(schedule.heard) + len(ports) > MOST_PACKETS:
@@ -403,7 +397,7 @@ def _cut_open(
         raise ApcError(Mistake("E951", Place("--cut"), what, hint="--cut LINK"))
     wide, whole = with_cuts(site, schedule, cuts)
     names = (*schedule.value_names, *(f"{port.name} computed" for port in ports))
-    first = len(site.kind.states) + len(schedule.carried)
+    first = len(kind.states) + len(schedule.carried)
     computed = [(port, first + place) for place, port in enumerate(ports)]
     return wide, replace(whole, value_names=names), computed
 

@@ -40,7 +40,7 @@ from apc.exports.expressions import (
     unit_of_modelica,
     written,
 )
-from apc.exports.words import word
+from apc.exports.words import identifier as word
 from apc.finite_equations import finite_equations
 from apc.frame.ages import stamped
 from apc.frame.exchange import Exchange, build_exchange, check_mean

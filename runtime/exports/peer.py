@@ -114,9 +114,8 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Force:
-    """What pushes a device along an axis, in N: `terms` are (hold, factor). `state` is the axis' position."""
+    """What pushes a device along an axis, in N: `terms` are (hold, factor)."""
 
-    state: int
     name: str
     terms: tuple[tuple[int, float], ...]
 
@@ -261,9 +260,9 @@ def sites_of(plan: Plan) -> tuple[int, ...]:
     return tuple(found)
 
 
-def refused(system: CompiledSystem, what: str, hint: str = "") -> ApcError:
-    """Return the message (E960) of what can't be written as C."""
-    return ApcError(Mistake("E960", Place(system.origin.topology), what, hint=hint))
+def refused(system: CompiledSystem, what: str, hint: str = "", code: str = "E960") -> ApcError:
+    """Return the message of what can't be written as C."""
+    return ApcError(Mistake(code, Place(system.origin.topology), what, hint=hint))
 
 
 def _refuse_what_iterates(system: CompiledSystem, name: str, kind: Kind) -> None:
@@ -301,7 +300,7 @@ def _outside(
         for one in sorted(chosen - masses):
             near = nearest(one, masses) or min(masses, default=NO_DEVICE)
             what = f"--device: no mass of {name} is called {one[:40] or 'so'}"
-            raise _undecided(system, what, f"--device {near}")
+            raise refused(system, what, f"--device {near}", "E961")
     else:
         devices = find_devices(
             site, vector, {parameter.name: parameter.unit for parameter in system.parameters}
@@ -310,11 +309,11 @@ def _outside(
     if not chosen:
         hint = f"--device {NO_DEVICE} if its computer moves them all, or --device "
         what = f"{name} has no device: others are told of every mass of it"
-        raise _undecided(system, what, hint + min(masses, default=NO_DEVICE))
+        raise refused(system, what, hint + min(masses, default=NO_DEVICE), "E961")
     listed = sorted(chosen)
     if device is None and not kind.held and len(listed) > 1:
         what = f"{name}: {' and '.join(listed)} may be devices, or copies that its computer moves"
-        raise _undecided(system, what, f"--device {','.join(listed)} or --device {listed[0]}")
+        raise refused(system, what, f"--device {','.join(listed)} or --device {listed[0]}", "E961")
     outside: set[int] = set()
     for rows in tied:
         inside = {parts[row] for row in rows}
@@ -327,14 +326,9 @@ def _outside(
                 f"{copied} where {moving} moves by itself"
             )
             hint = f"a part with a clock between them, as SampledSpringDamper, or --device {NO_DEVICE}"
-            raise _undecided(system, what, hint)
+            raise refused(system, what, hint, "E961")
         outside |= rows
     return frozenset(outside)
-
-
-def _undecided(system: CompiledSystem, what: str, hint: str = "") -> ApcError:
-    """Return the message (E961) of a device that can't be told apart."""
-    return ApcError(Mistake("E961", Place(system.origin.topology), what, hint=hint))
 
 
 def _is_position(kind: Kind, site: SiteJacobians, row: int) -> bool:
@@ -376,15 +370,15 @@ def _forces(
         if casadi.depends_on(axis, varying):
             what = f"{name}: what pushes {state} is no sum of what ticks compute: it bends with the motion"
             hint = "a motor without a limit, which the real one has"
-            raise _undecided(system, what, hint)
+            raise refused(system, what, hint, "E961")
         device = find_device(site, vector, unit_of, part=state)
         if not isinstance(device, Device):
-            raise _undecided(system, f"{name}: {device or f'{state} is no mass'}")
+            raise refused(system, f"{name}: {device or f'{state} is no mass'}", code="E961")
         function = casadi.Function("slopes", [x, u, p, t], [casadi.densify(axis)])
         values = evaluate_exact(function, [numbers[0], numbers[1], numbers[4], numbers[5]])[0]
         terms = tuple((h, float(one / device.inverse)) for h, one in enumerate(values) if one)
         part, _, own = state.rpartition(".")
-        found.append(Force(row, f"{part}.f{own.removeprefix(whole_and_index(own)[0])}", terms))
+        found.append(Force(f"{part}.f{own.removeprefix(whole_and_index(own)[0])}", terms))
     return tuple(found)
 
 

@@ -217,7 +217,7 @@ def scene_source(scene: CScene) -> str:
         includes="\n".join(f'#include "{code.identifier}.h"' for code in scene.codes),
         luck=luck,
         members=block(members),
-        links="".join(map(_link, scene.links, [scene] * len(scene.links))),
+        links="".join(_link(link, scene.quantum) for link in scene.links),
         sites="".join(_site(scene, s) for s in sites),
         begin=block([*(f"begin_{s}(m);" for s in sites), *(f"begin_{link.name}(m);" for link in lucky)]),
         next=block((f"at = next_{s}(m, at);" for s in sites), 4),
@@ -227,7 +227,7 @@ def scene_source(scene: CScene) -> str:
     )
 
 
-def _link(link: Link, scene: CScene) -> str:
+def _link(link: Link, quantum: Fraction) -> str:
     """Return what keeps a link's packets, and brings them in effect."""
     shared: dict[str, Any] = {
         "own": link.name,
@@ -237,7 +237,7 @@ def _link(link: Link, scene: CScene) -> str:
         "ring": link.ring,
         "count": len(link.ways) or 1,
         "senders": row(sender for sender, _ in link.ways),
-        "delays": row(int(one / scene.quantum) for one in link.delays),
+        "delays": row(int(one / quantum) for one in link.delays),
     }
     start = row(f"{{{row(map(number, values))}}}" for values in link.start)
     packets = filled("link.c", **shared, peers=len(link.start), start=start)
@@ -260,7 +260,7 @@ def _link(link: Link, scene: CScene) -> str:
         traced=int(bool(trace)),
         rows=len(trace) or 1,
         distribution=law.distribution.upper(),
-        quantum=number(float(scene.quantum)),
+        quantum=number(float(quantum)),
         newest=int(link.luck.newest),
     )
 

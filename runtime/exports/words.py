@@ -1,8 +1,8 @@
 """Names out of a scene as other tools want them.
 
-Takes: names such as `left[2].cube.x`. Gives: `Port`, `word`, `words`; `identifier`; `unique`.
-Guarantees: a word is made of letters, digits and `_`, and begins with a letter; an identifier is none of C's
-words; of several no two are equal.
+Takes: names such as `left[2].cube.x`. Gives: `Port`, `words`; `identifier`; `unique`.
+Guarantees: an identifier is made of letters, digits and `_`, begins with a letter, and is none of C's words;
+of several no two are equal.
 Does not: say which tool wants that.
 """
 
@@ -30,18 +30,12 @@ class Port:
 
 
 def words(ports: Sequence[Port]) -> list[str]:
-    """Return a word for each of some names."""
-    return [*unique(word(port.name) for port in ports)]
-
-
-def word(name: str) -> str:
-    """Return a name as a word."""
-    found = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
-    return found if found[:1].isalpha() else f"x_{found}".rstrip("_")
+    """Return an identifier for each of some names, of which no two are equal."""
+    return [*unique(identifier(port.name) for port in ports)]
 
 
 def identifier(name: str) -> str:
-    """Return a name as C has it: letters, digits and _, no word of the language."""
+    """Return a name as programs have it: letters, digits and _, no word of C."""
     found = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or "n"
     return f"n{found}" if found[0].isdigit() else f"{found}_" if found in RESERVED else found
 

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Channel, CompiledSystem
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.words import counted, cut
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.parameters import resolve
@@ -164,20 +164,33 @@ class Loop:
     def _check_addresses(self) -> None:
         pairs = {tuple(pair) for route in self.player.routes for pair in route.pairs.tolist()}
         needed = {one for pair in pairs if self.own in pair for one in pair} - {self.own}
-        if not needed:
-            what = f"{self.name} sends nothing over a link and hears nothing: there is nobody to play with"
-            raise ApcError(Mistake("E971", Place(self.system.name), what, hint="apc simulate"))
-        if self.own in self.others:
-            what = f"{self.name} is the peer that is played: --to says where the others are"
-            raise ApcError(Mistake("E971", Place("--to"), what, hint=f"--listen HOST:PORT for {self.name}"))
-        if len(set(self.others.values())) < len(self.others):
-            what = "two peers have one address: a packet is known by where it comes from"
-            raise ApcError(Mistake("E971", Place("--to"), what, hint="a port of its own for each"))
-        missing = [self.exchange.peer_name(one) for one in sorted(needed - set(self.others))]
-        if missing:
-            hint = " ".join(f'--to "{one}=HOST:PORT"' for one in missing[:4])
-            what = f"{self.name} sends to or hears {', '.join(missing[:4])}, which have no address"
-            raise ApcError(Mistake("E971", Place("--to"), what, hint=hint))
+        unknown = [self.exchange.peer_name(one) for one in sorted(needed - set(self.others))][:4]
+        wrong = (
+            (
+                not needed,
+                f"{self.name} sends nothing over a link and hears nothing: there is nobody to play with",
+                "apc simulate",
+            ),
+            (
+                self.own in self.others,
+                f"{self.name} is the peer that is played: --to says where the others are",
+                f"--listen HOST:PORT for {self.name}",
+            ),
+            (
+                len(set(self.others.values())) < len(self.others),
+                "two peers have one address: a packet is known by where it comes from",
+                "a port of its own for each",
+            ),
+            (
+                bool(unknown),
+                f"{self.name} sends to or hears {', '.join(unknown)}, which have no address",
+                " ".join(f'--to "{one}=HOST:PORT"' for one in unknown),
+            ),
+        )
+        for is_wrong, what, hint in wrong:
+            if is_wrong:
+                place = Place("--to" if needed else self.system.name)
+                raise ApcError(Mistake("E971", place, what, hint=hint))
 
     # ---- meeting
 
@@ -544,5 +557,6 @@ def number_of(exchange: Exchange, name: str, option: str) -> int:
         return int(exchange.starts[group]) + place - 1
     names = [exchange.peer_name(one) for one in range(min(exchange.peers, 4))]
     expected = f"one of {', '.join(names)}{', …' if exchange.peers > len(names) else ''}"
-    hint = f'{option} "{names[0]}{"=HOST:PORT" if option == "--to" else ""}"'
+    near = nearest(name, [f"{one}[1]" for one in exchange.groups]) or names[0]
+    hint = f'{option} "{near}{"=HOST:PORT" if option == "--to" else ""}"'
     raise ApcError(Mistake("E970", Place(option), "a peer", expected, cut(name) or "nothing", hint))

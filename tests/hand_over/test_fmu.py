@@ -251,10 +251,13 @@ def test_another_program_is_not_given_another_scene(fmpy: Any, tmp_path: Path) -
     [
         (["scene.fmu"], "E960 user[1]: between ticks cube.x, cube.v move by CVODES"),
         (["peer.c"], 'E963 --peer: the peers differ, and a text of C is of one. Write: --peer "user[1]"'),
-        (["peer.c", "--peer", "user[4]"], "E963 --peer: user[4] is none of the peers user[1] to user[3]"),
+        (
+            ["peer.c", "--peer", "user[4]"],
+            'E970 a peer wants one of user[1], user[2], user[3], got user[4]. Write: --peer "user[1]"',
+        ),
         (
             ["scene.fmu", "--peer", "usr[1]"],
-            'E963 --peer: no group of peers is called usr. Write: --peer "user[1]"',
+            'E970 a peer wants one of user[1], user[2], user[3], got usr[1]. Write: --peer "user[1]"',
         ),
         (["scene.fmu", "--device", "device"], "E953 --device means nothing to the format fmu. Write: --to c"),
     ],
