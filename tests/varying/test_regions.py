@@ -517,4 +517,5 @@ def test_the_drawn_outlines_enclose_the_stable_area(name: str) -> None:
     for outline in stable_outlines(found):
         x, y = np.concatenate([outline, outline[:1]]).T
         area += float(((x[:-1] + x[1:]) / 2) @ np.diff(y))
-    assert area == pytest.approx(found.stable_area, rel=1e-4)  # of polylines that are fine enough for the eye
+    # n chords of a circle leave out 2π²/(3n²) of it: of the 270 that are drawn, not all alike, 1e-4.
+    assert area == pytest.approx(found.stable_area, rel=2e-4)
