@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
 from apc.exports.peer import peer_of
@@ -87,6 +88,15 @@ BENT = replaced(
 TIED = replaced(
     MOVED, ("type: SampledSpringDamper", "type: SpringDamper"), (", clock: haptic, delay: 1 ms}", "}")
 )  # fmt: skip
+
+
+def test_the_device_is_what_a_hand_holds() -> None:
+    """A finger on a spring moves with it, so it is outside too; what is asked of a motor is no member."""
+    plan = plan_of(apc.compile(SCENES / "finger.yaml"), DEFAULT)
+    peer = peer_of(plan, 0, DEFAULT, device=None)
+    assert {peer.kind.states[row].name for row in peer.outside} >= {"device.x", "device.v", "finger.bone.x"}
+    assert [force.name for force in peer.forces.values()] == ["device.f"]
+    assert not any(signal.name == "device.asked" for signal in peer.signals)
 
 
 @pytest.mark.whole
