@@ -1,7 +1,7 @@
 """Which parameters a box leaves open, and how far: `contact.stiffness=±1%`.
 
 Takes: a `CompiledSystem` and ranges as text.
-Gives: `parse_range`; `Box`, `open_box`; `OpenSites`, `open_sites`.
+Gives: `parse_range`; `open_systems`; `OpenSites`, `open_sites`.
 Guarantees: a site's matrices are exact quotients of polynomials in the open parameters, and what depends on
 these by an expression follows.
 Does not: prove anything (see `box_proof`).
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups, prepare
+from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem, Formula, Group, Parameter
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -42,19 +42,6 @@ _PLACE = Place("box")
 # alike there only if they are alike all over the box: of each range another power of it, as two groups may
 # have the same ranges. Three, in case one of them is met by chance.
 GENERIC = (Fraction(6180339887, 10**10), Fraction(4142135623, 10**10), Fraction(7320508075, 10**10))
-
-
-@dataclass(frozen=True, slots=True)
-class Box:
-    """A scene with parameters left open.
-
-    `systems` are its closed systems (at some point of the box); `sites[s][g]` are the matrices of site g of
-    system s, over `Fraction` and `Ratio` in the order of `ranges`.
-    """
-
-    ranges: tuple[Range, ...]
-    systems: tuple[ClosedSystem, ...]
-    sites: tuple[tuple[LinearSite, ...], ...]
 
 
 def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Range:
@@ -160,8 +147,19 @@ def _check_limits(parameter: Parameter, low: Fraction, high: Fraction, name: str
         raise ApcError(Mistake("E833", place, f"the box of {name}", wanted, high_text))
 
 
-def open_box(system: CompiledSystem, ranges: Sequence[Range]) -> Box:
-    """Return a scene with parameters left open, as closed systems over these.
+def open_systems(
+    system: CompiledSystem, ranges: Sequence[Range], prepared: Prepared
+) -> list[tuple[ClosedSystem, tuple[LinearSite, ...]]]:
+    """Return the closed systems of a scene with parameters left open, at some point of the box.
+
+    With each come the matrices of its sites, over `Fraction` and `Ratio` in the order of `ranges`.
+
+    Parameters
+    ----------
+    system, ranges
+        The compiled scene and what is left open.
+    prepared
+        From `analysis.prepare`.
 
     Raises
     ------
@@ -172,12 +170,12 @@ def open_box(system: CompiledSystem, ranges: Sequence[Range]) -> Box:
         raise ApcError(Mistake("E830", _PLACE, "no parameter is left open", hint="contact.stiffness=±1%"))
     for one in ranges:
         refuse_channel_number(system, one.free, _PLACE)
-    prepared = prepare(system)
     found = open_sites(system, ranges, prepared, lambda changed: lifted_groups(changed, prepared=prepared))
-    systems = split(found.groups, found.exchange).systems
     by_site = {id(group.site): found.sites[group.name] for group in found.groups}
-    sites = tuple(tuple(by_site[id(group.site)] for group in one.sites) for one in systems)
-    return Box(tuple(ranges), systems, sites)
+    return [
+        (one, tuple(by_site[id(group.site)] for group in one.sites))
+        for one in split(found.groups, found.exchange).systems
+    ]
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ eigenvalues inside the circle. A norm is convex: it is largest at a corner of th
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -85,18 +86,12 @@ class OpenLoop:
     frames: OpenFrames
     feedback: tuple[Feedback, ...]
 
-    @property
-    def sites(self) -> tuple[LinearSite, ...]:
-        """Its sites' matrices, over `Fraction` and `Ratio`."""
-        return self.frames.sites
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenSystem:
-    """A closed system over a box, and its rigid motions, which are so all over it."""
+    """A closed system over a box, and its relative coordinates, which serve all over it."""
 
     loop: OpenLoop
-    rigid: RigidModes
     relative: Relative
 
 
@@ -122,7 +117,7 @@ def open_system(system: ClosedSystem, sites: Sequence[LinearSite], rigid: RigidM
     rigid
         Its rigid motions, which are so all over the box.
     """
-    return OpenSystem(open_loop(system, sites), rigid, with_doubt(relative_coordinates(rigid.basis)))
+    return OpenSystem(open_loop(system, sites), with_doubt(relative_coordinates(rigid.basis)))
 
 
 def open_loop(system: ClosedSystem, sites: Sequence[LinearSite], beside: Matrix | None = None) -> OpenLoop:
@@ -267,18 +262,20 @@ def _norm_below(matrix: Floats, limit: Floats) -> Truths:
     less than it by more than that rounds, γ_{n+1} tr / (1 − γ_{n+1}) (Rump, Verification of positive
     definiteness, 2006), and by what N ᵀN rounds.
     """
-    # Column by column for all at once: NumPy's own decomposition refuses a whole stack where it refuses one.
     n = matrix.shape[-1]
     rounded = (n + 2) * UNIT * (np.square(matrix).sum(axis=(1, 2)) + n) * 2
     left = -(matrix.swapaxes(1, 2) @ matrix)
     np.einsum("kii->ki", left)[:] += (np.square(limit) * (1 - 4 * UNIT) - rounded)[:, None]
-    below = np.ones(len(matrix), dtype=np.bool_)
-    for column in range(n):
-        pivot = left[:, column, column]
-        below &= pivot > 0
-        under = left[:, column + 1 :, column] / np.sqrt(np.where(below, pivot, 1.0))[:, None]
-        left[:, column + 1 :, column + 1 :] -= under[:, :, None] * under[:, None]
-    return below
+    return np.asarray(np.isfinite(_cholesky(left)).all(axis=(1, 2)))
+
+
+def _cholesky(matrix: Floats) -> Floats:
+    """Return the lower triangular L (k, n, n) of matrices L Lᵀ, NaN where there is none."""
+    found = np.full(matrix.shape, np.nan)
+    for place, one in enumerate(matrix):  # NumPy refuses a whole stack where it refuses one of it
+        with contextlib.suppress(np.linalg.LinAlgError):
+            found[place] = np.linalg.cholesky(one)
+    return found
 
 
 def change_of_basis(matrix: Floats) -> Floats:
@@ -308,18 +305,8 @@ def change_of_basis(matrix: Floats) -> Floats:
         power_of = power_of @ power_of
         if not np.abs(power_of).max() > np.finfo(np.float64).tiny:
             break
-    found[some] = _roots((total + total.swapaxes(1, 2)) / 2) / scale
+    found[some] = _cholesky((total + total.swapaxes(1, 2)) / 2).swapaxes(1, 2) / scale
     return found
-
-
-def _roots(matrix: Floats) -> Floats:
-    """Return R (k, n, n) of matrices RᵀR, NaN where there is none."""
-    try:
-        return np.asarray(np.linalg.cholesky(matrix)).swapaxes(1, 2)
-    except np.linalg.LinAlgError:
-        if len(matrix) == 1:
-            return np.full(matrix.shape, np.nan)
-        return np.concatenate([_roots(one[None]) for one in matrix])
 
 
 def _matrices(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:

@@ -28,13 +28,14 @@ nilpotent: a force moves later samples only. All matrices are computed with thei
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from apc.analysis.analysis import Analysis, lifted_groups
 from apc.analysis.methods import PAPER
@@ -149,7 +150,7 @@ def analyze_paper(system: CompiledSystem) -> Analysis:
         loop = _open_loop(system, whole)
         rigid = find_rigid_modes(whole)
         if rigid.drifts:
-            raise _not_of_the_form(system, {"a scene in which nothing drifts": None})
+            raise _not_of_the_form(system, ["a scene in which nothing drifts"])
         spectrum = _with_turns(solve_spectrum([_without_rigid(loop, whole, rigid)]), solve_spectrum([whole]))
     translations = len(rigid.names)
     translates = bool(translations) and spectrum.verdict == STABLE
@@ -179,21 +180,16 @@ def analyze_paper(system: CompiledSystem) -> Analysis:
 # ---- eq. (18): the loop cut open ----
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Signal:
-    """An input or a row of y_n: Σ weight · (the entry at place), `delay` force ticks or frames late."""
+    """An input, over x or over y_n, or a row of y_n, over x: its exact weights, and how late it is.
+
+    An input is late by force ticks, a row of y_n by frames.
+    """
 
     name: str
     delay: int
-    weights: Mapping[int, Fraction]
-
-
-@dataclass(frozen=True, slots=True)
-class _Input(_Signal):
-    """An input, which acts through column `hold` of the B of site `site`; its places are in x or in y_n."""
-
-    site: int
-    hold: int
+    weights: Matrix  # of `Fraction`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,8 +199,8 @@ class _OpenLoop:
     ratio: int
     period: Fraction  # s
     states: tuple[str, ...]
-    fast: tuple[_Input, ...]  # u_c, over x
-    slow: tuple[_Input, ...]  # u_n, over y_n
+    fast: tuple[_Signal, ...]  # u_c, over x
+    slow: tuple[_Signal, ...]  # u_n, over y_n
     heard: tuple[_Signal, ...]  # y_n, over x
     ab: Floats  # [A B] (n, n + n_u)
     step: Matrix  # (2, n, n + n_u), with its radii
@@ -226,23 +222,15 @@ class _OpenLoop:
         first = self.ratio * len(self.states)
         return list(itertools.accumulate(self.depths, initial=first))
 
-    @property
-    def c_n(self) -> Matrix:
-        """Return y_n over x, exactly."""
-        return _rows(self.heard, len(self.states))
+
+def _weights(signals: Sequence[_Signal], width: int) -> Matrix:
+    """Return the exact weights of signals (len(signals), width)."""
+    return np.array([one.weights for one in signals], dtype=object).reshape(len(signals), width)
 
 
-def _rows(signals: Sequence[_Signal], width: int) -> Matrix:
-    """Return the weights of signals as an exact matrix (len(signals), width)."""
-    matrix = np.full((len(signals), width), Fraction(0), dtype=object)
-    for line, one in enumerate(signals):
-        for place, weight in one.weights.items():
-            matrix[line, place] = weight
-    return matrix
-
-
-def _floats(exact: Matrix) -> Floats:
-    return exact.astype(np.float64)
+def _floats(signals: Sequence[_Signal], width: int) -> Floats:
+    """Return the weights of signals (len(signals), width), each rounded once."""
+    return _weights(signals, width).astype(np.float64)
 
 
 def _open_loop(system: CompiledSystem, whole: ClosedSystem) -> _OpenLoop:
@@ -252,87 +240,87 @@ def _open_loop(system: CompiledSystem, whole: ClosedSystem) -> _OpenLoop:
     ratio = int(frame / period)
     timings = {timing.name: timing.value for timing in system.timings}
     starts = [0, *itertools.accumulate(len(group.jacobians.kind.states) for group in sites)]
-    if (starts[-1] + 2 * len(sites)) * ratio > MOST_ROWS:
+    n = starts[-1]
+    if (n + 2 * len(sites)) * ratio > MOST_ROWS:
         what = (
             f"the paper's matrices for {len(sites)} peers at {ratio} force ticks a frame have more than "
             f"{MOST_ROWS:,} rows"
         )
         raise ApcError(Mistake("E862", Place(system.origin.topology), what, hint=_INSTEAD))
-    heard: list[_Signal] = []
-    fast: list[_Input] = []
-    slow: list[_Input] = []
+    sent = [
+        {
+            (sending.link, channel): row
+            for sending, send in zip(group.jacobians.kind.sends, group.exact.sends, strict=True)
+            for channel, row in zip(sending.channels, send.x, strict=True)
+        }
+        for group in sites
+    ]
+    heard: dict[tuple[int, Way, str], _Signal] = {}
     for i, group in enumerate(sites):
-        kind, ticks = group.jacobians.kind, group.exact.ticks
-        place_of: dict[tuple[Way, str], int] = {}
         several = len({one.way.delay for one in group.schedule.heard}) > 1
-        for p, partition in enumerate(kind.clocks):
-            pairs = (pair for k in range(len(partition.receives)) for pair in group.schedule.ways(p, k))
-            for way, channel in pairs:
-                if (way, channel) in place_of:
-                    continue
-                place_of[way, channel] = len(heard)
-                delay = int(timings[way.delay] / frame)
-                name = f"{group.name}.{way.operator}(others.{channel})"
-                name += f" {delay} frames late" if several else ""
-                heard.append(_Signal(name, delay, _sent(whole, way, channel, i, starts)))
-        partition_of = {partition.clock: p for p, partition in enumerate(kind.clocks)}
-        for h, hold in enumerate(kind.holds):
-            if group.schedule.acting[h] is None:
+        places = (
+            (p, k) for p, one in enumerate(group.jacobians.kind.clocks) for k in range(len(one.receives))
+        )
+        for way, channel in (pair for place in places for pair in group.schedule.ways(*place)):
+            row = np.full(n, Fraction(0), dtype=object)
+            for j, weight in enumerate(whole.coupling[way][i]):
+                row[starts[j] : starts[j + 1]] += weight * sent[j].get((way.link, channel), 0)
+            delay = int(timings[way.delay] / frame)
+            late = f" {delay} frames late" if several else ""
+            name = f"{group.name}.{way.operator}(others.{channel}){late}"
+            heard[i, way, channel] = _Signal(name, delay, row)
+    place_of = {key: place for place, key in enumerate(heard)}
+    fast: list[_Signal] = []
+    slow: list[_Signal] = []
+    columns: tuple[list[int], list[int]] = [], []  # of the holds of all sites, side by side
+    first = 0
+    for i, group in enumerate(sites):
+        kind, own = group.jacobians.kind, slice(starts[i], starts[i + 1])
+        clocks = [partition.clock for partition in kind.clocks]
+        for column, hold in enumerate(kind.holds, first):
+            if group.schedule.acting[column - first] is None:
                 continue
-            p, name = partition_of[hold.clock], f"{group.name}.{hold.name}"
-            delay = int(timings[hold.delay] / period)
-            pattern = group.jacobians.pattern.ticks[p]
+            p, name, delay = (
+                clocks.index(hold.clock),
+                f"{group.name}.{hold.name}",
+                timings[hold.delay] / period,
+            )
+            pattern, tick = group.jacobians.pattern.ticks[p], group.exact.ticks[p]
             received = pattern.r[hold.output].any()
             if pattern.x[hold.output].any() or not received:
-                weights = {starts[i] + k: Fraction(w) for k, w in enumerate(ticks[p].x[hold.output]) if w}
-                fast.append(_Input(f"{name} own" if received else name, delay, weights, i, h))
+                row = np.full(n, Fraction(0), dtype=object)
+                row[own] += tick.x[hold.output]
+                fast.append(_Signal(f"{name} own" if received else name, int(delay), row))
+                columns[0].append(column)
             if received:
-                weights = {}
-                for k, w in enumerate(ticks[p].r[hold.output]):
-                    for one in group.schedule.ways(p, k) if w else ():
-                        weights[place_of[one]] = weights.get(place_of[one], Fraction(0)) + Fraction(w)
-                slow.append(_Input(f"{name} received", delay, weights, i, h))
-    inputs = (*fast, *slow)
-    steps = {id(g.site): discretize(g.exact.a, g.exact.b, [period])[0] for g in sites}
-    blocks = [steps[id(group.site)] for group in sites]
+                row = np.full(len(heard), Fraction(0), dtype=object)
+                for k, weight in enumerate(tick.r[hold.output]):
+                    row[[place_of[i, *pair] for pair in group.schedule.ways(p, k)]] += weight
+                slow.append(_Signal(f"{name} received", int(delay), row))
+                columns[1].append(column)
+        first += len(kind.holds)
+
+    def side_by_side(blocks: Iterable[Floats]) -> Floats:
+        """Return the blocks [A B] (n_x, n_x + n_u) of the sites as one of all states and inputs."""
+        split = [np.split(block, [len(block)], axis=1) for block in blocks]
+        a, b = (block_diag(*listed) for listed in zip(*split, strict=True))
+        return np.hstack([a, b[:, columns[0]], b[:, columns[1]]])
+
+    known = {id(one.site): discretize(one.exact.a, one.exact.b, [period])[0] for one in sites}
+    steps = [known[id(one.site)] for one in sites]
     return _OpenLoop(
         ratio=ratio,
         period=period,
         states=tuple(f"{group.name}.{one.name}" for group in sites for one in group.jacobians.kind.states),
         fast=tuple(fast),
         slow=tuple(slow),
-        heard=tuple(heard),
-        ab=_side_by_side([np.hstack([g.site.a, g.site.b]) for g in sites], inputs, starts),
-        step=_side_by_side(
-            [with_radius(one.matrix, one.roundings * UNIT * one.size) for one in blocks], inputs, starts
+        heard=tuple(heard.values()),
+        ab=side_by_side(np.hstack([one.site.a, one.site.b]) for one in sites),
+        step=with_radius(
+            side_by_side(one.matrix for one in steps),
+            side_by_side(one.roundings * UNIT * one.size for one in steps),
         ),
     )
-
-
-def _side_by_side(blocks: Sequence[Matrix], inputs: Sequence[_Input], starts: Sequence[int]) -> Matrix:
-    """Return the blocks [A B] (…, n_x, n_x + n_u) of the sites as one of all states and inputs."""
-    n = starts[-1]
-    found = np.zeros((*blocks[0].shape[:-2], n, n + len(inputs)))
-    for block, (first, last) in zip(blocks, itertools.pairwise(starts), strict=True):
-        found[..., first:last, first:last] = block[..., : last - first]
-    for column, one in enumerate(inputs, n):
-        first, last = starts[one.site], starts[one.site + 1]
-        found[..., first:last, column] = blocks[one.site][..., last - first + one.hold]
-    return found
-
-
-def _sent(
-    whole: ClosedSystem, way: Way, channel: str, receiver: int, starts: Sequence[int]
-) -> dict[int, Fraction]:
-    """Return what a site hears on a way, of one channel, over x."""
-    found: dict[int, Fraction] = {}
-    for j, (weight, group) in enumerate(zip(whole.coupling[way][receiver], whole.sites, strict=True)):
-        for sending, send in zip(group.jacobians.kind.sends, group.exact.sends, strict=True):
-            if weight and sending.link == way.link and channel in sending.channels:
-                for place, k in enumerate(send.x[sending.channels.index(channel)], starts[j]):
-                    if k:
-                        found[place] = found.get(place, Fraction(0)) + weight * Fraction(k)
-    return found
 
 
 # ---- eqs. (19) and (20): lifted, delayed, closed ----
@@ -362,7 +350,7 @@ def _lift(loop: _OpenLoop) -> FrameMap:
         newest = ratio if i < n_c else 1
         columns = [value(i, newest - age) for age in range(1, loop.depths[i] + 1)]
         waiting.append(unit[:, np.array(columns, dtype=np.intp)])
-    heard = RADII.multiply(rounded(_floats(loop.c_n)), course[0])
+    heard = RADII.multiply(rounded(_floats(loop.heard, n)), course[0])
     for row, (one, start) in enumerate(zip(loop.heard, starts[len(inputs) :], strict=False)):
         line = np.concatenate([heard[:, row : row + 1], unit[:, start : start + one.delay]], axis=1)
         waiting.append(line[:, : one.delay])
@@ -376,8 +364,8 @@ def _feedback(loop: _OpenLoop) -> Floats:
     """Return F_D: the forces of each tick of the samples there, and those of what is heard."""
     n, n_c, ratio = len(loop.states), len(loop.fast), loop.ratio
     f = np.zeros((ratio * n_c + len(loop.slow), ratio * n + len(loop.heard)))
-    f[: ratio * n_c, : ratio * n] = np.kron(np.eye(ratio), _floats(_rows(loop.fast, n)))
-    f[ratio * n_c :, ratio * n :] = _floats(_rows(loop.slow, len(loop.heard)))
+    f[: ratio * n_c, : ratio * n] = np.kron(np.eye(ratio), _floats(loop.fast, n))
+    f[ratio * n_c :, ratio * n :] = _floats(loop.slow, len(loop.heard))
     return f
 
 
@@ -409,7 +397,7 @@ def _named(loop: _OpenLoop) -> PaperRoute:
         frame_s=loop.frame_s,
         a=NamedMatrix(loop.ab[:, :n], loop.states, loop.states),
         b=NamedMatrix(loop.ab[:, n:], loop.states, (*forces, *received)),
-        c=NamedMatrix(np.vstack([np.eye(n), _floats(loop.c_n)]), (*loop.states, *heard), loop.states),
+        c=NamedMatrix(np.vstack([np.eye(n), _floats(loop.heard, n)]), (*loop.states, *heard), loop.states),
         **_blocks("d", lifted, stacked, inputs, outputs),
         **_blocks("aug", delayed, augmented, inputs, outputs),
         f_d=NamedMatrix(f, inputs, outputs),
@@ -459,8 +447,8 @@ def _without_rigid(loop: _OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> C
     motions = []
     for motion in rigid.exact:
         x = np.array([motion[place] for place in whole.motion], dtype=object)
-        heard = loop.c_n @ x
-        signals = [*(_rows(loop.fast, n) @ x), *(_rows(loop.slow, len(heard)) @ heard), *heard]
+        heard = _weights(loop.heard, n) @ x
+        signals = [*(_weights(loop.fast, n) @ x), *(_weights(loop.slow, len(heard)) @ heard), *heard]
         motions.append([*x, *np.repeat(np.array(signals, dtype=object), loop.depths)])
     basis = np.array(motions, dtype=np.float64).reshape(len(motions), closed.shape[-1]).T
     held, _ = relative_places(basis[:n])
@@ -505,37 +493,40 @@ def _with_turns(spectrum: Spectrum, whole: Spectrum) -> Spectrum:
 def _periods(system: CompiledSystem, sites: Sequence[PeerGroup]) -> tuple[Fraction, Fraction]:
     """Return T_c and T_n, or say everything that keeps a scene from having the paper's form."""
     timings = {timing.name: timing.value for timing in system.timings}
-    clock_of = {clock.name: clock for clock in system.clocks}
     link_clock = {link.name: link.clock for link in system.links}
-    missing: dict[str, None] = {}
-    forces: dict[str, None] = {}
-    networks: dict[str, None] = {}
-    for group in {id(group.site): group for group in sites}.values():
-        missing |= dict.fromkeys(_misfits(group))
-        for h, hold in enumerate(group.jacobians.kind.holds):
-            if group.schedule.acting[h] is not None:
-                forces[hold.clock] = None
-        networks |= {link_clock[one.way.link]: None for one in group.schedule.heard}
+    holds = [
+        hold
+        for group in sites
+        for hold, acting in zip(group.jacobians.kind.holds, group.schedule.acting, strict=True)
+        if acting is not None
+    ]
+    ways = [one.way for group in sites for one in group.schedule.heard]
+    forces = dict.fromkeys(hold.clock for hold in holds)
+    networks = dict.fromkeys(link_clock[way.link] for way in ways)
+    missing = [text for group in {id(one.site): one for one in sites}.values() for text in _misfits(group)]
     for what, found in (("clock of forces", forces), ("network clock", networks)):
         if len(found) != 1:
             listed = f"here are {' and '.join(found)}" if found else "here is none"
-            missing[f"one {what} ({listed})"] = None
+            missing.append(f"one {what} ({listed})")
     if missing:
         raise _not_of_the_form(system, missing)
-    fast, slow = clock_of[next(iter(forces))], clock_of[next(iter(networks))]
+    fast, slow = (
+        next(clock for clock in system.clocks if clock.name in names) for names in (forces, networks)
+    )
     period, frame = timings[fast.period], timings[slow.period]
-    if (frame / period).denominator != 1:
-        missing[f"a network period that is a whole multiple of that of {fast.name}"] = None
-    elif ((timings[slow.phase] - timings[fast.phase]) / period).denominator != 1:
-        missing[f"ticks of {slow.name} that fall on ticks of {fast.name}"] = None
-    for group in sites:
-        for h, hold in enumerate(group.jacobians.kind.holds):
-            if group.schedule.acting[h] is not None and (timings[hold.delay] / period).denominator != 1:
-                missing[f"a computational delay of {hold.name} of whole ticks of {fast.name}"] = None
-        for one in group.schedule.heard:
-            if (timings[one.way.delay] / frame).denominator != 1:
-                missing[f"a delay of {one.way.link} of whole ticks of {slow.name}"] = None
-    if missing:
+    apart = timings[slow.phase] - timings[fast.phase]
+    whole = [
+        (frame / period, f"a network period that is a whole multiple of that of {fast.name}"),
+        (apart / period, f"ticks of {slow.name} that fall on ticks of {fast.name}"),
+    ]
+    whole += [
+        (timings[one.delay] / period, f"a computational delay of {one.name} of whole ticks of {fast.name}")
+        for one in holds
+    ]
+    whole += [
+        (timings[way.delay] / frame, f"a delay of {way.link} of whole ticks of {slow.name}") for way in ways
+    ]
+    if missing := [wanted for number, wanted in whole if number.denominator != 1]:
         raise _not_of_the_form(system, missing)
     return period, frame
 
@@ -559,6 +550,8 @@ def _misfits(group: PeerGroup) -> Iterator[str]:
         yield "packets of the motion alone (a held force is sent)"
 
 
-def _not_of_the_form(system: CompiledSystem, missing: Mapping[str, None]) -> ApcError:
-    what = "the paper's route is written for another form of scene; missing: " + "; ".join(missing)
+def _not_of_the_form(system: CompiledSystem, missing: Iterable[str]) -> ApcError:
+    what = "the paper's route is written for another form of scene; missing: " + "; ".join(
+        dict.fromkeys(missing)
+    )
     return ApcError(Mistake("E861", Place(system.origin.topology), what, hint=_INSTEAD))
