@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem, Formula, Group, Parameter
 from apc.compiler.digits import plain_float
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.language.evaluation import FaultError, exactly
 from apc.compiler.plain import RULES
 from apc.compiler.words import with_unit
@@ -31,7 +31,7 @@ from apc.eigen.peer_group import PeerGroup, Runs
 from apc.eigen.ratios import NotRational, Ratio, Ratios, open_site
 from apc.frame.exchange import Exchange
 from apc.frame.names import Free, Range, find
-from apc.frame.overrides import Override, apply
+from apc.frame.overrides import Override, apply, check_bounds
 from apc.frame.parameters import exact_numbers, scope_of
 from apc.frame.site import LinearSite
 from apc.network.nominal import refuse_channel_number
@@ -132,19 +132,13 @@ def _parameter(system: CompiledSystem, free: Free, place: Place) -> Parameter:
 
 def _check_limits(parameter: Parameter, low: Fraction, high: Fraction, name: str, place: Place) -> None:
     """Refuse an empty range, and one beyond the parameter's bounds."""
-    low_text, high_text = (with_unit(f"{float(one):g}", parameter.unit) for one in (low, high))
+    what, mistakes = f"the box of {name}", Mistakes()
     if not low < high:
-        raise ApcError(
-            Mistake("E833", place, f"the box of {name}", "a low below the high", f"{low_text} to {high_text}")
-        )
-    least, most = parameter.minimum, parameter.maximum
-    if least is not None and (low < Fraction(least) or (parameter.open_minimum and low == Fraction(least))):
-        end = with_unit(f"{least:g}", parameter.unit)
-        wanted = f"{'more than' if parameter.open_minimum else 'at least'} {end}"
-        raise ApcError(Mistake("E833", place, f"the box of {name}", wanted, low_text))
-    if most is not None and high > Fraction(most):
-        wanted = f"at most {with_unit(f'{most:g}', parameter.unit)}"
-        raise ApcError(Mistake("E833", place, f"the box of {name}", wanted, high_text))
+        ends = " to ".join(with_unit(f"{float(end):g}", parameter.unit) for end in (low, high))
+        mistakes.add("E833", place, what, expected="a low below the high", got=ends)
+    for end in (low, high):
+        check_bounds(replace(parameter, value=float(end), exact=None), what, mistakes, "E833", place)
+    mistakes.raise_if_any()
 
 
 def open_systems(

@@ -113,22 +113,21 @@ def contact_groups(
         bind(one, site, settings(listed, on=True)) if one.decisions else site
         for one, site, listed in zip(switched, prepared.jacobians, parts, strict=True)
     )
-    for place, group in enumerate(system.groups):
-        kind, vector = group.kind, numbers.parameters[place][0]
-        told = [push_of(switched[kind], one, prepared.jacobians[kind], vector) for one in parts[kind]]
-        for one in told:
-            if isinstance(one, str):
-                return one
-        if not on[kind].parameters_suffice:
+    for group in system.groups:
+        if not on[group.kind].parameters_suffice:
             return f"some force at {group.name} is not linear, or looks at each of the others by itself"
     exchange = build_exchange(system, numbers.timings)
     kinds = {id(one): kind for kind, one in enumerate(on)}
     found = []
     for peers in peer_groups(system, on, prepared.schedules, numbers, exchange):
         kind = kinds[id(peers.jacobians)]
-        site = prepared.jacobians[kind]
-        pushes = [push_of(switched[kind], one, site, peers.parameters) for one in parts[kind]]
-        found.append((peers, tuple(one for one in pushes if isinstance(one, Push))))
+        pushes = []
+        for one in parts[kind]:
+            push = push_of(switched[kind], one, prepared.jacobians[kind], peers.parameters)
+            if isinstance(push, str):
+                return push
+            pushes += [push] if push else []
+        found.append((peers, tuple(pushes)))
     return found
 
 
@@ -151,11 +150,10 @@ def _pushing(site: LinearSite, pushes: Sequence[Push], gain: Fraction) -> Linear
     ticks = list(site.ticks)
     for one in pushes:
         tick = ticks[one.partition]
-        blocks = [np.array(block) for block in (tick.x, tick.u, tick.m, tick.r)]
+        blocks = [block.copy() for block in (tick.x, tick.u, tick.m, tick.r)]
         for block in blocks:
             block[one.output] *= gain if block.dtype == object else float(gain)
-        x, u, m, r = blocks
-        ticks[one.partition] = replace(tick, x=x, u=u, m=m, r=r)
+        ticks[one.partition] = replace(tick, **dict(zip("xumr", blocks, strict=True)))
     return replace(site, ticks=tuple(ticks))
 
 
