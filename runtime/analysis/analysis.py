@@ -121,18 +121,16 @@ class Analysis(Result):
         )
 
 
-def prepare(system: CompiledSystem, *, order: Sequence[str] = ORDER) -> Prepared:
+def prepare(system: CompiledSystem) -> Prepared:
     """Do what analyses with different numbers can share.
 
     Parameters
     ----------
     system
         The compiled scene.
-    order
-        The order of coincident events, see `schedule.ORDER`.
     """
     timings = {timing.name: timing.value for timing in system.timings}
-    return _scheduled(system, linear_sites(system, timings, order), timings, tuple(order))
+    return _scheduled(system, linear_sites(system, timings, ORDER), timings, ORDER)
 
 
 def prepare_at_start(system: CompiledSystem, prepared: Prepared) -> Prepared | None:

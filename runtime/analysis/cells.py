@@ -29,9 +29,9 @@ from apc.eigen.pseudospectrum import balance
 from apc.eigen.ratios import Ratio
 from apc.eigen.relative import Relative, relative, relative_coordinates, with_doubt
 from apc.eigen.rigid import RigidModes
-from apc.frame.discretize import UNIT, discretize
+from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap, compose, step_durations
-from apc.frame.radius import Arithmetic, radius_of, value_of, with_radius
+from apc.frame.radius import Arithmetic, radius_of, value_of
 from apc.frame.schedule import Schedule
 from apc.frame.site import LinearSite, every_matrix
 from apc.frame.taylor import reciprocal, step_over, taylor, within
@@ -66,15 +66,13 @@ class OpenFrames:
     """Sites over the open parameters of a box, ready to be lifted over cells.
 
     `written` are the sites in floats, `beside` another matrix that is wanted, `quotients` the numerators and
-    denominators in these, none where this is 1; `steps` are [F G] by duration in quanta of the sites whose A
-    and B stay.
+    denominators in these, none where this is 1.
     """
 
     sites: tuple[LinearSite, ...]
     schedules: tuple[Schedule, ...]
     written: tuple[LinearSite, ...]
     beside: Matrix
-    steps: tuple[Mapping[int, Matrix], ...]
     quotients: tuple[tuple[Polynomial, Polynomial | None], ...]
 
 
@@ -174,7 +172,6 @@ def open_frames(
         schedules=tuple(schedules),
         written=tuple(alike[id(site)] for site in sites),
         beside=wanted,
-        steps=tuple(_steps(site, schedule) for site, schedule in zip(sites, schedules, strict=True)),
         quotients=tuple(quotients),
     )
 
@@ -360,16 +357,15 @@ def frames_over(asked: OpenFrames, cells: Sequence[Cell]) -> tuple[list[FrameMap
 
     known: dict[tuple[int, int], FrameMap] = {}
     maps = []
-    for site, steps, schedule in zip(asked.written, asked.steps, asked.schedules, strict=True):
+    for site, schedule in zip(asked.written, asked.schedules, strict=True):
         key = id(site), id(schedule)
         if key not in known:
             here = every_matrix(site, over)
-            durations = {one: float(one * schedule.quantum) for one in step_durations(schedule)}
-            own = {
-                duration: within(steps[duration], count) if steps else step_over(here.a, here.b, seconds)
-                for duration, seconds in durations.items()
+            steps = {
+                one: step_over(here.a, here.b, float(one * schedule.quantum))
+                for one in step_durations(schedule)
             }
-            known[key] = compose(here, schedule, own, numbers=numbers)
+            known[key] = compose(here, schedule, steps, numbers=numbers)
         maps.append(known[key])
     return maps, over(asked.beside)
 
@@ -427,19 +423,6 @@ def _polynomial(terms: Polynomial, parameters: Sequence[Matrix], numbers: Arithm
         radius_of(term)[...] = off
         for number, power in zip(parameters, powers, strict=True):
             for _ in range(power):
-                one = coefficient == 1 and not off and term.ndim == 3
-                term = number if one else numbers.multiply(term, number)
+                term = numbers.multiply(term, number)
         total = numbers.add(total, term) if place else term
     return total
-
-
-def _steps(site: LinearSite, schedule: Schedule) -> Mapping[int, Matrix]:
-    """Return [F G] with its radii by duration in quanta, as an analysis has it; none if A or B moves."""
-    if any(isinstance(entry, Ratio) for block in (site.a, site.b) for entry in block.ravel()):
-        return {}
-    durations = step_durations(schedule)
-    steps = discretize(site.a, site.b, [duration * schedule.quantum for duration in durations])
-    return {
-        duration: with_radius(step.matrix, step.roundings * UNIT * step.size)[None]
-        for duration, step in zip(durations, steps, strict=True)
-    }
