@@ -280,23 +280,20 @@ def _open_loop(system: CompiledSystem, whole: ClosedSystem) -> _OpenLoop:
         for column, hold in enumerate(kind.holds, first):
             if group.schedule.acting[column - first] is None:
                 continue
-            p, name, delay = (
-                clocks.index(hold.clock),
-                f"{group.name}.{hold.name}",
-                timings[hold.delay] / period,
-            )
+            p, name = clocks.index(hold.clock), f"{group.name}.{hold.name}"
+            delay = int(timings[hold.delay] / period)
             pattern, tick = group.jacobians.pattern.ticks[p], group.exact.ticks[p]
             received = pattern.r[hold.output].any()
             if pattern.x[hold.output].any() or not received:
                 row = np.full(n, Fraction(0), dtype=object)
                 row[own] += tick.x[hold.output]
-                fast.append(_Signal(f"{name} own" if received else name, int(delay), row))
+                fast.append(_Signal(f"{name} own" if received else name, delay, row))
                 columns[0].append(column)
             if received:
                 row = np.full(len(heard), Fraction(0), dtype=object)
                 for k, weight in enumerate(tick.r[hold.output]):
                     row[[place_of[i, *pair] for pair in group.schedule.ways(p, k)]] += weight
-                slow.append(_Signal(f"{name} received", int(delay), row))
+                slow.append(_Signal(f"{name} received", delay, row))
                 columns[1].append(column)
         first += len(kind.holds)
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -62,9 +62,9 @@ class _Opened:
     output: Any  # casadi.SX
     rows: tuple[str, ...]
 
-    def names(self, depends: Callable[[int], bool]) -> list[str]:
-        """Return the names of the rows that depend on something, each once."""
-        rows = filter(depends, range(self.output.numel()))
+    def names(self, expression: Any, symbol: Any) -> list[str]:
+        """Return the names of the rows of an expression of them that depend on a symbol, each once."""
+        rows = [row for row in range(expression.size1()) if casadi.depends_on(expression[row, :], symbol)]
         return list(dict.fromkeys(self.rows[row % len(self.rows)] for row in rows))
 
 
@@ -203,7 +203,7 @@ def varying_slopes(site: SiteJacobians) -> tuple[str, ...]:
     for one in find_switches(site.kind).functions:
         *moving, _, t = one.inputs
         slopes = jacobian(one.output, casadi.vertcat(*moving))
-        found |= dict.fromkeys(one.names(lambda row, s=slopes, t=t: casadi.depends_on(s[row, :], t)))
+        found |= dict.fromkeys(one.names(slopes, t))
     return tuple(found)
 
 
@@ -282,12 +282,13 @@ def _functions(kind: Kind) -> list[tuple[tuple[str, int, int], Any, tuple[str, .
 def _changed(kind: Kind, one: _Opened, symbol: Any, operands: Sequence[Any]) -> list[str]:
     """Return the names of what a decision changes in a function."""
     what, p, place = one.where
-    changed = one.names(lambda row: casadi.depends_on(one.output[row], symbol))
+    changed = one.names(one.output, symbol)
     if what == "edge":  # what is computed of what is heard
         partition = kind.clocks[p]
         inputs = partition.tick.sx_in()
-        tick = _Opened(("tick", p, 0), inputs, partition.tick(*inputs), partition.outputs)
-        return tick.names(lambda row: casadi.depends_on(tick.output[row], inputs[3][place]))
+        computed = partition.tick(*inputs)
+        tick = _Opened(("tick", p, 0), tuple(inputs), computed, partition.outputs)
+        return tick.names(computed, inputs[3][place])
     if what != "derivative":
         return changed
     # A continuous force has no name in the equations of motion; the part whose parameters decide has.
