@@ -30,8 +30,8 @@ class Look(TypedDict, total=False):
 class Result:
     """What is found, abstract. `shown_by` names its module of `apc.present`, and it there: "vary:critical".
 
-    That module has a function for each form of it: `critical_text`, `critical_document`, and what it has
-    more, such as `critical_picture`.
+    That module has a function for each form of it: `critical_text`, `critical_picture`. Its document is its
+    fields (`forms.document`), unless there is a `critical_document`.
     """
 
     __slots__ = ()
@@ -75,6 +75,9 @@ class Result:
         return drawn
 
     def _shown(self, form: str, *arguments: Any) -> Any:
-        """Return the result in another form."""
+        """Return the result in another form: as a document by its fields, if nothing else is said."""
         module, _, name = self.shown_by.partition(":")
-        return getattr(import_module(f"apc.present.{module}"), f"{name}_{form}")(self, *arguments)
+        forms: Any = import_module(f"apc.present.{module}")
+        if form == "document" and not hasattr(forms, f"{name}_{form}"):
+            return import_module("apc.present.forms").document(self)
+        return getattr(forms, f"{name}_{form}")(self, *arguments)

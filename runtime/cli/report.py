@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -19,6 +19,7 @@ from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Mistake, Place
 
 if TYPE_CHECKING:
+    from apc.present.report import KeptScene
     from apc.reports.contents import Report
 
 
@@ -98,7 +99,7 @@ def _check(path: Path) -> None:
     tell(f"{path}: every number is the same, computed anew")
 
 
-def _differs(kept: dict[str, Any], again: Report) -> Iterator[str]:
+def _differs(kept: KeptScene, again: Report) -> Iterator[str]:
     """Yield what differs between the sections of a scene that a report keeps and those made anew."""
     from apc.present.report import TITLES
     from apc.reports.contents import differences

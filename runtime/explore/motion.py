@@ -9,19 +9,15 @@ Does not: draw.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Column, CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.language.vectors import entry, whole_and_index
-from apc.present.planar import Disc, moves_in_plane, spots_of
-from apc.present.still import bodies_of, rows_of
+from apc.present.bodies import Disc, moves_in_plane, views_of
 from apc.simulation.signals import sent_states
 from apc.simulation.trajectory import simulate
 
@@ -82,17 +78,12 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
         E983 nothing to strike or to see; those of `trajectory.simulate`.
     """
     planar = moves_in_plane(system)
-    rows: Sequence[Any] = rows_of(system, spots_of if planar else bodies_of)
+    views = views_of(system)
     told = []
     if struck:
         system, what = _struck(system)
         told.append(f"{what} is struck: it starts at {STRUCK * MM:g} mm/s.")
-    names = [
-        f"{peer}.{one}"
-        for peer, bodies, _ in rows
-        for body in bodies
-        for one in _coordinates(system, peer, body)
-    ]
+    names = [f"{view.name}.{state}" for view in views for body in view.bodies for state in body.states[:2]]
     if not names:
         raise ApcError(Mistake("E983", Place(system.name), "nothing here has a position that could be shown"))
     duration = system.experiment.duration or WATCHED
@@ -106,17 +97,16 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
     some = np.unique(np.linspace(0, len(time) - 1, min(ROWS, len(time))).astype(int))
     columns = {one.name: MM * values[some, place] for place, one in enumerate(played.signals)}
     found = []
-    for row, (peer, bodies, _) in enumerate(rows):
-        for body in bodies:
-            own = [columns[f"{peer}.{one}"] for one in _coordinates(system, peer, body)]
-            size = MM * (body.radius if planar else body.half_width)
-            found.append(Body(peer, body.name, row, own[0], own[1] if planar else None, size))
-    fixed = [(row, one) for row, (_, _, walls) in enumerate(rows) for one in walls]
+    for row, view in enumerate(views):
+        for body in view.bodies:
+            x, *rest = (columns[f"{view.name}.{state}"] for state in body.states[:2])
+            found.append(Body(view.name, body.name, row, x, rest[0] if rest else None, MM * body.radius))
+    fixed = [(row, surface) for row, view in enumerate(views) for surface in view.surfaces]
     told.append(f"It {played.summary.verdict}.")
     return Motion(
         time=time[some],
         bodies=tuple(found),
-        walls=tuple((row, MM * one.place) for row, one in fixed if not planar),
+        walls=tuple((row, MM * one.offset) for row, one in fixed if not planar and not isinstance(one, Disc)),
         discs=tuple(
             dict.fromkeys(
                 (MM * one.centre[0], MM * one.centre[1], MM * one.radius)
@@ -125,17 +115,8 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
             )
         ),
         told=tuple(told),
-        others=system.peers - len(rows),
+        others=system.peers - len(views),
     )
-
-
-def _coordinates(system: CompiledSystem, peer: str, body: Any) -> list[str]:
-    """Return the signals that say where a body is: one, or the first two of a vector."""
-    group = next(one for one in system.groups if one.name == peer.partition("[")[0])
-    states = [one.name for one in system.kinds[group.kind].states if one.unit == "m"]
-    own = [one for one in states if whole_and_index(one)[0].rpartition(".")[0] == body.name]
-    wholes = [whole_and_index(one)[0] for one in own if whole_and_index(one)[1]]
-    return [entry(wholes[0], 1), entry(wholes[0], 2)] if wholes else own[:1]
 
 
 def _struck(system: CompiledSystem) -> tuple[CompiledSystem, str]:

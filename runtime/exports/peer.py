@@ -431,7 +431,7 @@ def _moves(
     seconds = [length * schedule.quantum for length in lengths]
     found = transition_rows(linear, vector[None], seconds)
     moves = []
-    for length, duration, matrix in zip(lengths, seconds, found.matrices, strict=True):
+    for length, duration, matrix in zip(lengths, seconds, found, strict=True):
         function = flow.over(duration) if flow is not None else None
         if function is not None and not function.is_a("SXFunction"):
             what = (

@@ -346,8 +346,6 @@ class _OnePeer(Stepwise):
         seen: tuple[Seen, ...],
         rows: Floats,
         pushes: Sequence[Floats | None],
-        marks: list[int],
-        pushed: list[int],
     ) -> None:
         """Wait for a segment's instant, play it, and hand over what it sends at its end."""
         instant = number * self.loop.frame_ns + self.begin_at[index]
@@ -356,9 +354,9 @@ class _OnePeer(Stepwise):
         outside = self.outside if self.loop.begins else None
         if outside and (index == 0 or self.begin_at[index] > self.begin_at[index - 1]):
             self._of_device(outside.measure, instant / NANO, self.carries[self.member])
-        super()._segment(number, index, seen, rows, pushes, marks, pushed)
+        super()._segment(number, index, seen, rows, pushes)
         if outside and index:  # before it nothing ticks: a frame begins with what is sent then
-            self._push(outside, index)
+            self._push(outside)
         self._hand_over(number, index)
         took = now() - begun
         if self.log and self.log[-1][0] == instant:  # what a frame begins with, and its first tick
@@ -374,13 +372,11 @@ class _OnePeer(Stepwise):
             self.loop.trouble = error
             raise StoppedError from None
 
-    def _push(self, outside: Outside, index: int) -> None:
+    def _push(self, outside: Outside) -> None:
         """Tell the device outside what force acts from this instant on."""
-        program = self.population.members[self.member].program
-        held = list(program.segments[index].held)
+        layout = self.population.members[self.member].program.layout
         carry = self.carries[self.member][:, 0]
-        u = np.where(np.array(held) < 0, 0.0, carry[held])
-        self._of_device(outside.push, self.instant / NANO, carry[: program.layout.states], u)
+        self._of_device(outside.push, self.instant / NANO, carry[: layout.states], carry[layout.held])
 
     def _sees(self, place: int, tick: int, seen: tuple[Seen, ...]) -> tuple[Integers, Flags]:
         """Return the packets that are here, and which should be.

@@ -1,7 +1,7 @@
 """How fast a scene settles almost surely: its growth per frame over an endless course of luck, estimated.
 
 Takes: a `CompiledSystem` whose links lose packets, whose receivers hold what they heard last.
-Gives: `AlmostSure`, `almost_sure`, `unplayed`; `every_channel`, `Chance`, `exponent`.
+Gives: `AlmostSure`, `almost_sure`.
 Guarantees: equal seeds give equal numbers. The interval is of independent courses, each of which begins and
 ends at a frame of its own once directions have settled, so that it holds what a norm's choice makes of both
 ends, O(1/T).
@@ -15,21 +15,18 @@ is the exponent itself, at every k and in any norm.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Loop
 from apc.eigen.enclosure import enclose_eigenvalues
-from apc.eigen.modes import dense_loop
 from apc.frame.radius import RADII, radius_of, value_of
-from apc.moments.held import Ear, HeldLoop, held_loop, held_scene, lossy_rows
-from apc.moments.memory import is_memoryless
-from apc.network.channel import ChannelLaw, channel_law
+from apc.moments.held import Chance, HeldLoop, every_channel, held_scene
 
 Floats = NDArray[np.float64]
 
@@ -41,16 +38,13 @@ MOST_STATES = 180
 COURSES, FRAMES = 64, 16_384
 
 # Parts of a course that go before: for directions to settle, and by which courses differ.
-SETTLING, APART = 1 / 16, 1 / 32
+SETTLING, SPREAD = 1 / 16, 1 / 32
 
 # Frames from one look at a norm to the next, in which nothing under- or overflows.
 STRIDE = 8
 
-# Frames whose luck is drawn at once.
-BATCH = 32
-
-# The normal distribution's quantile for 95 % on both sides together.
-NORMAL = 1.959963984540054
+# The quantile of 95 % on both sides together.
+QUANTILE = 0.975
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,28 +55,8 @@ class AlmostSure:
     interval: tuple[float, float]
 
 
-@dataclass(frozen=True, slots=True)
-class Chance:
-    """What channels lose: by which `law` the ears `ears` of one way from peer to peer do, all together."""
-
-    law: ChannelLaw
-    ears: tuple[int, ...]
-
-
-def unplayed(system: CompiledSystem, prepared: Prepared) -> str:
-    """Say why a scene's exponent is not estimated, "" where it is.
-
-    Parameters
-    ----------
-    system, prepared
-        As for `almost_sure`.
-    """
-    found = every_channel(system, prepared)
-    return found if isinstance(found, str) else ""
-
-
-def almost_sure(system: CompiledSystem, prepared: Prepared, *, seed: int = 0) -> AlmostSure | None:
-    """Estimate a scene's growth per frame over one endless course of luck, None where it is `unplayed`.
+def almost_sure(system: CompiledSystem, prepared: Prepared, *, seed: int = 0) -> AlmostSure:
+    """Estimate a scene's growth per frame over one endless course of luck.
 
     Parameters
     ----------
@@ -93,118 +67,42 @@ def almost_sure(system: CompiledSystem, prepared: Prepared, *, seed: int = 0) ->
     seed
         Of the luck.
     """
-    found = every_channel(system, prepared)
-    return None if isinstance(found, str) else exponent(*found, seed=seed)
-
-
-def every_channel(system: CompiledSystem, prepared: Prepared) -> tuple[HeldLoop, list[Chance]] | str:
-    """Put a whole scene in one loop, every channel by itself, or say why not.
-
-    Parameters
-    ----------
-    system, prepared
-        As for `almost_sure`.
-    """
-    scene = held_scene(system, prepared)
-    if isinstance(scene, str):
-        return scene
-    peers = scene.exchange.peers
-    if peers > MOST_STATES:
-        return f"{peers:,} peers don't fit in one matrix of {MOST_STATES} states"
-    loop = dense_loop(scene.groups, scene.exchange)
-    ears, ways = _ears(loop, scene.lossy)
-    states = sum(len(site.lifted.z_names) for site in loop.sites) + len(ears)
-    if states > MOST_STATES:
-        return f"{peers:,} peers and their channels have {states:,} states, and {MOST_STATES} are the most"
-    held = held_loop(loop, ears, scene.lossy)
-    if held is None:
-        return "a packet follows from another one of its frame"
-    of_way: dict[tuple[str, int, int], list[int]] = {}
-    for place, way in enumerate(ways):
-        of_way.setdefault(way, []).append(place)
-    timings = {timing.name: timing.value for timing in system.timings}
-    laws = {
-        link.name: channel_law(system, link, timings[link.delay])
-        for link in system.links
-        if link.channel is not None
-    }
-    return held, [Chance(laws[link], tuple(places)) for (link, *_), places in of_way.items()]
-
-
-def _ears(loop: Loop, lossy: frozenset[str]) -> tuple[list[Ear], list[tuple[str, int, int]]]:
-    """Return an ear for each number that a peer hears of another one, and its (link, receiver, sender)."""
-    ears, ways = [], []
-    for g, receiver in enumerate(loop.sites):
-        rows = lossy_rows(receiver, lossy)
-        for h, sender in enumerate(loop.sites):
-            for row, sent in enumerate(sender.schedule.sent):
-                weights = {
-                    (g, line): loop.coupling[one.way][g][h]
-                    for line, one in rows
-                    if one.sent == sent and loop.coupling[one.way][g][h]
-                }
-                if weights:
-                    ears.append(Ear(weights, h, row))
-                    ways.append((sent.link, g, h))
-    return ears, ways
-
-
-def exponent(
-    held: HeldLoop,
-    chances: Sequence[Chance],
-    *,
-    seed: int = 0,
-    courses: int = COURSES,
-    frames: int = FRAMES,
-) -> AlmostSure:
-    """Estimate what a loop grows by in a frame, almost surely, its channels losing packets by chance.
-
-    Parameters
-    ----------
-    held
-        The loop.
-    chances
-        Which of its ears lose packets together, and by what law.
-    seed
-        Of the luck.
-    courses, frames
-        How many independent courses, and how many frames of each count.
-    """
+    held, chances = every_channel(system, held_scene(system, prepared), MOST_STATES)
+    held = held.relative()
     if all(chance.law.mean_loss in (0, 1) for chance in chances):
         return _without_chance(held, chances)
     f, g, s, e = (value_of(one) for one in (held.f, held.g, held.s, held.e))
     n = len(f)
     luck = np.random.Generator(np.random.Philox(seed))
-    draws = _Losses(chances, len(s), courses, luck)
     # Everything lost, and what is heard on top of it.
     both = np.concatenate([f + g @ e, s - e])
-    x, weights = luck.standard_normal((n, courses)), np.ones((n, 1))
-    settling, apart = math.ceil(SETTLING * frames), math.ceil(APART * frames)
-    starts = settling + luck.integers(0, apart, courses)
+    x, weights = luck.standard_normal((n, COURSES)), np.ones((n, 1))
+    settling, spread = math.ceil(SETTLING * FRAMES), math.ceil(SPREAD * FRAMES)
+    starts = settling + luck.integers(0, spread, COURSES)
     looks = {
         settling,
-        *range(0, settling + apart + frames, STRIDE),
+        *range(0, settling + spread + FRAMES, STRIDE),
         *starts.tolist(),
-        *(starts + frames).tolist(),
+        *(starts + FRAMES).tolist(),
     }
-    total, begun, ended = np.zeros(courses), np.zeros(courses), np.zeros(courses)
-    for frame, heard in enumerate(draws.take(settling + apart + frames)):
+    total, begun, ended = np.zeros((3, COURSES))
+    for frame, heard in enumerate(_heard(chances, len(s), COURSES, settling + spread + FRAMES, luck)):
         if frame in looks:
             if frame == settling:  # a norm in which all coordinates are of one size
-                spread = np.sqrt((x**2).mean(axis=1))
-                weights = 1 / np.maximum(spread, np.finfo(np.float64).eps * spread.max())[:, None]
+                sizes = np.sqrt((x**2).mean(axis=1))
+                weights = 1 / np.maximum(sizes, np.finfo(np.float64).eps * sizes.max())[:, None]
             size = np.sqrt(((weights * x) ** 2).sum(axis=0))
             if not size.all():  # nothing is left
                 return AlmostSure(-math.inf, (-math.inf, -math.inf))
             x /= size
             total += np.log(size)
             begun = np.where(starts == frame, total, begun)
-            ended = np.where(starts + frames == frame, total, ended)
+            ended = np.where(starts + FRAMES == frame, total, ended)
         moved = both @ x
         x = moved[:n] + g @ (moved[n:] * heard)
-    found = (ended - begun) / frames
+    found = (ended - begun) / FRAMES
     middle = float(found.mean())
-    half = _quantile(courses - 1) * float(found.std(ddof=1)) / math.sqrt(courses)
+    half = float(stdtrit(COURSES - 1, QUANTILE)) * float(found.std(ddof=1)) / math.sqrt(COURSES)
     return AlmostSure(middle, (middle - half, middle + half))
 
 
@@ -221,52 +119,22 @@ def _without_chance(held: HeldLoop, chances: Sequence[Chance]) -> AlmostSure:
     return AlmostSure(middle, (min(low, middle), max(middle, high)))
 
 
-class _Losses:
-    """The packets of some channels, frame by frame: which are heard, in many courses at once."""
+def _heard(
+    chances: Sequence[Chance], ears: int, courses: int, frames: int, luck: np.random.Generator
+) -> Iterator[Floats]:
+    """Give, frame by frame, 1 for each ear and course that hears and 0 where a packet is lost.
 
-    def __init__(self, chances: Sequence[Chance], ears: int, courses: int, luck: np.random.Generator) -> None:
-        """Start in each channel's stationary state.
-
-        Parameters
-        ----------
-        chances
-            What each way from peer to peer loses.
-        ears
-            How many ears there are.
-        courses
-            How many courses.
-        luck
-            Gives the numbers to draw.
-        """
-        self._luck, self._shape = luck, (len(chances), courses)
-        self._of_ear = np.zeros(ears, np.intp)
-        for place, chance in enumerate(chances):
-            self._of_ear[list(chance.ears)] = place
-        self._bursts = any(not is_memoryless(chance.law) for chance in chances)
-
-        def column(of: Callable[[ChannelLaw], float]) -> Floats:
-            return np.array([of(chance.law) for chance in chances]).reshape(-1, 1)
-
-        self._mean = column(lambda law: law.mean_loss)
-        self._p, self._r = column(lambda law: law.p), column(lambda law: law.r)
-        self._in_bad, self._in_good = column(lambda law: law.one_minus_h), column(lambda law: law.one_minus_k)
-        if self._bursts:
-            self._bad = luck.random(self._shape) < column(lambda law: law.bad)
-
-    def take(self, count: int) -> Iterator[Floats]:
-        """Give, frame by frame, 1 for each ear and course that hears and 0 where a packet is lost."""
-        for first in range(0, count, BATCH):
-            drawn = self._luck.random((min(BATCH, count - first), 1 + self._bursts, *self._shape))
-            if not self._bursts:
-                yield from (drawn[:, 0] >= self._mean)[:, self._of_ear].astype(np.float64)
-                continue
-            for loss, change in drawn:
-                lost = loss < np.where(self._bad, self._in_bad, self._in_good)
-                self._bad = np.where(self._bad, change >= self._r, change < self._p)
-                yield (~lost)[self._of_ear].astype(np.float64)
-
-
-def _quantile(freedom: int) -> float:
-    """Return Student's quantile for 95 % on both sides, of ten or more (Abramowitz and Stegun, 26.7.5)."""
-    z = NORMAL
-    return z + (z**3 + z) / (4 * freedom) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * freedom**2)
+    Each channel starts in its stationary state.
+    """
+    of_ear = np.zeros(ears, np.intp)
+    for place, chance in enumerate(chances):
+        of_ear[list(chance.ears)] = place
+    laws = [chance.law for chance in chances]
+    p, r, share = (np.array([[getattr(law, name)] for law in laws]) for name in ("p", "r", "bad"))
+    in_bad, in_good = (np.array([[getattr(law, f"one_minus_{name}")] for law in laws]) for name in "hk")
+    bad = luck.random((len(laws), courses)) < share
+    for _ in range(frames):
+        loss, change = luck.random((2, len(laws), courses))
+        lost = loss < np.where(bad, in_bad, in_good)
+        bad = np.where(bad, change >= r, change < p)
+        yield (~lost)[of_ear].astype(np.float64)

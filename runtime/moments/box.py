@@ -33,7 +33,6 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.eigen.closing import Loop, without_packets
-from apc.eigen.peer_group import PeerGroup
 from apc.eigen.rigid import stays_rigid
 from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap, named
@@ -59,9 +58,6 @@ PLACE = Place("box")
 # What a cell takes, in cells in balls.
 WORK = 0.5
 
-# How often a range is halved until it is proved alone: what is left of it then is nothing.
-MOST_HALVINGS = 20
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Question:
@@ -76,7 +72,6 @@ class _Question:
     places: Mapping[str, int]  # which of these each site of a loop is, by its name
     wide: Loop  # of all classes, its maps those of the whole box
     memories: Sequence[Remembered]
-    weights: Floats  # how much each range matters
 
 
 @part("box")
@@ -132,7 +127,12 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
     frames = open_frames(sites, [group.schedule for group in told.groups])
     whole = tuple((ranges[place].low, ranges[place].high) for place in own)
     maps = [one.mapped(lambda block: hull(block)[0]) for one in frames_over(frames, [whole])[0]]
-    lifted_wide = [_with_map(*pair) for pair in zip(told.groups, maps, strict=True)]
+    lifted_wide = [
+        group.with_lifted(
+            named(group.jacobians.kind, group.schedule, frame.mapped(value_of), frame.mapped(radius_of))
+        )
+        for group, frame in zip(told.groups, maps, strict=True)
+    ]
     wide = peer_classes(replace(told, groups=tuple(lifted_wide)))[0][0]
     memories = remembered_of(opened.at, told, wide)
     classes = classes_of(told)
@@ -141,32 +141,7 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
         for loop in classes.loops
         for site in loop.sites
     }
-    of = classes, frames, places, wide, memories
-    asked = _Question(system, prepared, tuple(ranges), own, *of, np.ones(0))
-    return replace(asked, weights=np.array([1 / _alone(asked, place) for place in range(len(ranges))]))
-
-
-def _alone(asked: _Question, place: int) -> float:
-    """Return up to what width about the box's middle a cell is proved in which one range moves alone.
-
-    How much a range matters in a cell is what it adds to bounds there, not how much it moves the radius.
-    """
-    inner = middle(tuple((one.low, one.high) for one in asked.ranges))
-    half = (asked.ranges[place].high - asked.ranges[place].low) / 2
-    for _ in range(MOST_HALVINGS):
-        cell = [(value, value) for value in inner]
-        cell[place] = inner[place] - half, inner[place] + half
-        maps, _ = frames_over(asked.frames, [tuple(cell[own] for own in asked.own)])
-        if _look(asked, tuple(cell), maps, 0)[0]:
-            break
-        half /= 2
-    return float(2 * half)
-
-
-def _with_map(group: PeerGroup, frame: FrameMap) -> PeerGroup:
-    """Return peers with a map that has its radii (2, n, n')."""
-    parts = frame.mapped(value_of), frame.mapped(radius_of)
-    return group.with_lifted(named(group.jacobians.kind, group.schedule, *parts))
+    return _Question(system, prepared, tuple(ranges), own, classes, frames, places, wide, memories)
 
 
 def _refuse(system: CompiledSystem, prepared: Prepared, one: Range) -> None:
@@ -205,31 +180,24 @@ def _growth_at(asked: _Question, point: Sequence[Fraction], *, bounded: bool) ->
 
 def _is_unstable(asked: _Question, point: Sequence[Fraction]) -> bool:
     """Say whether it is proved that second moments grow at a point of the box."""
-    if _growth_at(asked, point, bounded=False).radius < 1:
+    system = _changed(asked.system, asked.ranges, point)
+    if growth(system, asked.prepared, bounded=False).radius < 1:
         return False
-    found = _growth_at(asked, point, bounded=True)
+    found = growth(system, asked.prepared)
     return found.proved and found.stable is False
 
 
 def _looked(asked: _Question, cells: Sequence[Cell]) -> Iterator[Looked]:
     """Look at cells, their frames lifted many at a time, until one is found unstable."""
+    widths = np.array([float(one.high - one.low) for one in asked.ranges])
     for start in range(0, len(cells), TOGETHER):
         some = cells[start : start + TOGETHER]
-        own = [tuple(cell[place] for place in asked.own) for cell in some]
-        maps, _ = frames_over(asked.frames, own)
+        maps, _ = frames_over(asked.frames, [tuple(cell[place] for place in asked.own) for cell in some])
         for place, cell in enumerate(some):
-            proved, sound = _look(asked, cell, maps, place)
-            reach = asked.weights * [float(high - low) for low, high in cell]
-            unstable = not sound and _is_unstable(asked, middle(cell))
-            yield Looked(None if proved else reach, unstable, WORK)
-
-
-def _look(asked: _Question, cell: Cell, maps: Sequence[FrameMap], place: int) -> tuple[bool, bool]:
-    """Return `_proved` of a cell of some that peers' frames were lifted over together."""
-    here = [one.mapped(partial(_of_cell, place, len(cell))) for one in maps]
-    finite = all(np.isfinite(block).all() for one in here for block in one.blocks)
-    frames = {name: here[which] for name, which in asked.places.items()}
-    return _proved(asked, cell, frames) if finite else (False, False)
+            lifted = [one.mapped(partial(_of_cell, place, len(cell))) for one in maps]
+            proved, sound = _proved(asked, cell, lifted)
+            reach = np.array([float(high - low) for low, high in cell]) / widths
+            yield Looked(None if proved else reach, not sound and _is_unstable(asked, middle(cell)), WORK)
 
 
 def _of_cell(place: int, count: int, block: Matrix) -> Matrix:
@@ -238,8 +206,11 @@ def _of_cell(place: int, count: int, block: Matrix) -> Matrix:
     return within(one, count - len(one) + 2)
 
 
-def _proved(asked: _Question, cell: Cell, frames: Mapping[str, FrameMap]) -> tuple[bool, bool]:
+def _proved(asked: _Question, cell: Cell, lifted: Sequence[FrameMap]) -> tuple[bool, bool]:
     """Say whether second moments die out, proved all over a cell, and in floats in its middle."""
+    if not all(np.isfinite(block).all() for one in lifted for block in one.blocks):
+        return False, False
+    frames = {name: lifted[which] for name, which in asked.places.items()}
     of = moments_of(asked.classes, _memories(asked, cell), frames)
     for matrix in of.means[1]:
         found = contracted(matrix[None])
@@ -266,14 +237,17 @@ def _moves(asked: _Question, cell: Cell, shares: Sequence[int]) -> dict[str, tup
     inner = middle(cell)
 
     def lost(point: Sequence[Fraction]) -> dict[str, float]:
-        return _lost(_changed(asked.system, asked.ranges, point, shares))
+        changed = _changed(asked.system, asked.ranges, point, shares)
+        timings = resolve(changed).timings
+        links = [link for link in changed.links if link.channel is not None]
+        return {link.name: channel_law(changed, link, timings[link.delay]).mean_loss for link in links}
 
     still, sides = lost(inner), []
     for place in shares:
         ends = [lost([*inner[:place], end, *inner[place + 1 :]]) for end in cell[place]]
         sides.append({name: (ends[1][name] - ends[0][name]) / 2 for name in still})
     off = dict.fromkeys(still, 0.0)
-    for turns in itertools.product((0, 1), repeat=len(shares)) if len(shares) > 1 else ():
+    for turns in itertools.product((0, 1), repeat=len(shares)):
         point = list(inner)
         for place, turn in zip(shares, turns, strict=True):
             point[place] = cell[place][turn]
@@ -282,13 +256,3 @@ def _moves(asked: _Question, cell: Cell, shares: Sequence[int]) -> dict[str, tup
             off[name] = max(off[name], abs(share - still[name] - straight))
     first = len(asked.own) * (0.0,)
     return {name: (off[name] + 16 * UNIT, *first, *(side[name] for side in sides)) for name in still}
-
-
-def _lost(system: CompiledSystem) -> dict[str, float]:
-    """Return the share that each link loses."""
-    timings = resolve(system).timings
-    return {
-        link.name: channel_law(system, link, timings[link.delay]).mean_loss
-        for link in system.links
-        if link.channel is not None
-    }

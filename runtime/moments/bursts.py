@@ -1,7 +1,7 @@
 """Second moments under bursts of losses, tag by tag: exact for few channels, an estimate for many.
 
 Takes: a scene of equal peers that all hear each other, or any few, whose receivers hold what they miss.
-Gives: `tagged_radius`, `tagged_moments`.
+Gives: `Affine`, `affine`; `tagged_radius`, `tagged_error`.
 Guarantees: with as many tags as there are channels it is exact but for rounding; with fewer, an estimate.
 Does not: bound its rounding, or what fewer tags leave out.
 
@@ -19,20 +19,19 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from fractions import Fraction
-from functools import partial
+from dataclasses import dataclass
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared
-from apc.compiler.compiled import CompiledSystem
 from apc.eigen.pseudospectrum import balance
-from apc.eigen.relative import relative_places
-from apc.moments.crowd import Hearing
-from apc.moments.patterns import Frames, frames, largest, settled
+from apc.eigen.relative import Relative, relative_places, relative_rows
+from apc.frame.radius import value_of
+from apc.moments.errors import Peer, largest_error
+from apc.moments.held import Chance, HeldLoop
+from apc.moments.patterns import largest, settled
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
@@ -45,11 +44,11 @@ Terms = list[tuple[float, Tags]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Affine:
+class Affine:
     """A frame as it is affine in the channels' states: A, and U_c F_c of each (C, n, m), (C, m, n).
 
     `chance` is that of a bad state, `last` how much of it is left a frame later. States are divided by
-    `scale` (n,).
+    `scale` (n,); those of each peer start at `offsets`, those that each channel holds are `held`.
     """
 
     mean: Floats
@@ -58,142 +57,96 @@ class _Affine:
     chance: float
     last: float
     arcs: tuple[Arc, ...]
-    peers: int
-    sites: tuple[int, ...]
-    held: tuple[range, ...]
+    offsets: tuple[int, ...]
+    held: tuple[tuple[int, ...], ...]
     scale: Floats
+    at: Relative
+
+    @property
+    def peers(self) -> int:
+        """How many peers there are."""
+        return len(self.offsets) - 1
 
 
-def tagged_radius(
-    system: CompiledSystem, prepared: Prepared, first: Fraction, orders: Sequence[int]
-) -> list[float]:
+def affine(held: HeldLoop, chances: Sequence[Chance]) -> Affine:
+    """Return the frame as it depends on who is bad, motions that nothing holds back projected out.
+
+    Parameters
+    ----------
+    held, chances
+        Of `held.every_channel`, of equal peers that all hear each other.
+    """
+    law = chances[0].law
+    f, g, s, e = (value_of(matrix) for matrix in (held.f, held.g, held.s, held.e))
+    n, size, peers = len(f), held.offsets[1], len(held.offsets) - 1
+    # The mean of all peers is taken off what moves with them: peers may still change places.
+    basis, project = np.zeros((n, len(held.at.held))), np.eye(n)
+    basis[held.at.held], basis[held.at.rest] = np.eye(len(held.at.held)), held.at.weights
+    if basis.shape[1]:
+        places, _ = relative_places(basis[:size])
+        taken = np.zeros((len(places), n))
+        for line, place in enumerate(places):
+            taken[line, [start + place for start in held.offsets[:-1]]] = 1 / peers
+        project -= basis @ np.linalg.solve(taken @ basis, taken)
+    states = [[place for ear in chance.ears for place in held.places[ear]] for chance in chances]
+    enters = np.stack([project @ g[:, list(chance.ears)] for chance in chances])
+    misses = np.stack([(e - s)[list(chance.ears)] @ project for chance in chances])
+    mean = project @ (f + g @ s) @ project
+    each = np.abs(enters) @ np.abs(misses)
+    scale = balance(np.abs(mean) + each.max(axis=0))
+    # The same for all peers and channels, powers of two.
+    for rows in (np.arange(size) + np.array(held.offsets[:-1])[:, None], np.array(states)):
+        scale[rows] = 2.0 ** np.round(np.log2(scale[rows]).mean(axis=0))
+    enters, misses = enters / scale[:, None], misses * scale
+    return Affine(
+        mean=mean / scale[:, None] * scale + law.bad * (enters @ misses).sum(axis=0),
+        enters=enters,
+        misses=misses,
+        chance=law.bad,
+        last=1 - law.p - law.r,
+        arcs=tuple((chance.receiver, chance.sender) for chance in chances),
+        offsets=held.offsets,
+        held=tuple(map(tuple, states)),
+        scale=scale,
+        at=held.at,
+    )
+
+
+def tagged_radius(of: Affine, order: int) -> float:
     """Return the spectral radius of second moments, with so many tags at most, in floats.
 
     Parameters
     ----------
-    system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
-    first
-        When frames begin: all packets that may be lost are due then.
-    orders
-        How many tags there are at most, one after another.
-    """
-    found = frames(*(system, prepared, first), _alone)
-    affine = _affine(found)
-    return [_radius(affine, order) for order in orders]
-
-
-def tagged_moments(
-    system: CompiledSystem, prepared: Prepared, first: Fraction, order: int, *, told: Hearing, drawn: range
-) -> tuple[Frames, Floats] | None:
-    """Return the second moments (n, n) of a long run, motions that nothing holds back projected out.
-
-    They come with the frames whose states they are of; None where they are not found.
-
-    Parameters
-    ----------
-    system, prepared, first
-        As for `tagged_radius`.
+    of
+        The frame.
     order
         How many tags there are at most.
-    told
-        The peers.
-    drawn
-        Which states of each peer are of variance 1 as a frame begins, by chance of their own, and forgotten.
     """
-    found = frames(*(system, prepared, first), _alone, told=told)
-    of = _affine(found)
-    n, peers = len(of.mean), of.peers
-    pushes = np.array([start + state for start in found.sites[:-1] for state in drawn])
-    rest, fewer = np.delete(np.arange(n), pushes), len(drawn)
-    added = np.zeros((n, n))
-    added[pushes, pushes] = of.scale[pushes] ** -2.0
-    whole = _tagged(of, min(order, len(of.arcs)))
-    after = _step(whole, whole.shortened(np.stack([added * (not one) for one in whole.sets])))[whole.entries]
-    # What is drawn anew is there for a frame: all that lasts is over the other states.
-    inner = replace(
-        of,
-        mean=of.mean[np.ix_(rest, rest)],
-        enters=of.enters[:, rest],
-        misses=of.misses[..., rest],
-        sites=tuple(start - place * fewer for place, start in enumerate(of.sites)),
-        held=tuple(range(one.start - peers * fewer, one.stop - peers * fewer) for one in of.held),
-    )
-    tags = replace(
-        whole,
-        of=inner,
-        entries=(entries := _orbits(inner, whole.sets)),
-        many=np.bincount(entries.ravel()),
-        columns=np.array([np.argsort(_states(inner, one)) for one in whole.permutations]),
-    )
-    lasting = settled(partial(_step, tags), tags.shortened(after[:, rest[:, None], rest]))
-    if lasting is None:
-        return None
-    added[np.ix_(rest, rest)] = lasting[tags.entries[0]]
-    return found, added * np.outer(of.scale, of.scale)
-
-
-def _alone(channels: int) -> NDArray[np.int64]:
-    """Return the patterns in which no packet is lost, and each one's alone (C + 1, C)."""
-    return np.concatenate([np.zeros((1, channels), np.int64), np.eye(channels, dtype=np.int64)])
-
-
-def _affine(found: Frames) -> _Affine:
-    """Return the frame as it depends on who is bad, motions that nothing holds back projected out."""
-    law = found.laws[0]
-    n, peers = found.matrices.shape[-1], len(found.sites) - 1
-    own = found.sites[1]
-    # The mean of all peers is taken off what moves with them: peers may still change places.
-    project = np.eye(n)
-    if found.basis.shape[1]:
-        places, _ = relative_places(found.basis[:own])
-        taken = np.zeros((len(places), n))
-        for line, place in enumerate(places):
-            taken[line, [start + place for start in found.sites[:-1]]] = 1 / peers
-        project -= found.basis @ np.linalg.solve(taken @ found.basis, taken)
-    count = len(found.channels)
-    held = tuple(found.held[place] for place in range(count))
-    chance = law.bad
-    moved = project @ found.matrices
-    size = np.abs(moved).max(axis=0)
-    scale = _alike(balance(size), found, held)
-    moved = moved / scale[:, None] * scale
-    apart = moved[1:] - moved[0]
-    misses = np.zeros((count, len(held[0]), n))
-    for place, states in enumerate(held):
-        # What is held, less what would have come: how the held states differ from pattern to pattern.
-        misses[place] = apart[place, list(states)]
-    misses = misses @ (project / scale[:, None] * scale)
-    enters = apart @ np.linalg.pinv(misses)
-    return _Affine(
-        mean=moved[0] + chance * apart.sum(axis=0),
-        enters=enters,
-        misses=misses,
-        chance=chance,
-        last=1 - law.p - law.r,
-        arcs=tuple((g, h) for *_, g, h in found.channels),
-        peers=peers,
-        sites=found.sites,
-        held=held,
-        scale=scale,
-    )
-
-
-def _alike(scale: Floats, found: Frames, held: Sequence[range]) -> Floats:
-    """Return scales that are the same for all peers and channels, powers of two."""
-    own = found.sites[1]
-    listed = [np.arange(start, start + own) for start in found.sites[:-1]]
-    result = np.array(scale)
-    for rows in (np.array(listed), np.array([list(states) for states in held])):
-        result[rows] = 2.0 ** np.round(np.log2(scale[rows]).mean(axis=0))
-    return result
-
-
-def _radius(of: _Affine, order: int) -> float:
-    """Return the largest eigenvalue of all moments of so many tags at most."""
     tags = _tagged(of, min(order, len(of.arcs)))
     start = np.stack([np.eye(len(of.mean)) * (not one) for one in tags.sets])
     return largest(partial(_step, tags), tags.shortened(start))
+
+
+def tagged_error(of: Affine, order: int, classes: Sequence[tuple[int, Peer]]) -> float:
+    """Return the largest error of copies in m, with so many tags at most.
+
+    Parameters
+    ----------
+    of, order
+        As for `tagged_radius`.
+    classes
+        What each peer got, as for `errors.moments_error`.
+    """
+    starts = zip(of.offsets, classes, strict=False)
+    pushes = [start + state for start, (_, peer) in starts for state in peer.drawn]
+    added = np.zeros((len(of.mean),) * 2)
+    added[pushes, pushes] = of.scale[pushes] ** -2.0
+    tags = _tagged(of, min(order, len(of.arcs)))
+    step = partial(_step, tags)
+    lasting = settled(step, step(tags.shortened(np.stack([added * (not one) for one in tags.sets]))))
+    moments = (added + lasting[tags.entries[0]]) * np.outer(of.scale, of.scale)
+    inner = relative_rows(relative_rows(moments, of.at).T, of.at)
+    return largest_error(inner, of.at, of.offsets, classes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -206,7 +159,7 @@ class _Tagged:
     set, channel, channel), follow from those of the sets that stand for them: sparse matrices.
     """
 
-    of: _Affine
+    of: Affine
     sets: tuple[Tags, ...]
     entries: Integers
     many: Integers
@@ -223,24 +176,14 @@ class _Tagged:
         return np.asarray(found)
 
 
-class _Names:
-    """What stands for each set of tags, and the permutation that takes that one to it; remembered."""
-
-    def __init__(self, peers: int) -> None:
-        """Start with nothing remembered."""
-        self.peers = peers
-        self._known: dict[Tags, tuple[Tags, tuple[int, ...]]] = {}
-
-    def of(self, tags: Tags) -> tuple[Tags, tuple[int, ...]]:
-        """Return the set that stands for all like it, and which peers its peers 0, 1, … are here."""
-        if tags not in self._known:
-            touched, rest = _touched(tags, self.peers)
-            renamed = (
-                (_renamed(tags, {peer: place for place, peer in enumerate(chosen)}), (*chosen, *rest))
-                for chosen in itertools.permutations(touched)
-            )
-            self._known[tags] = min(renamed)
-        return self._known[tags]
+@cache
+def _named(tags: Tags, peers: int) -> tuple[Tags, tuple[int, ...]]:
+    """Return the set that stands for all like some tags, and which peers its peers 0, 1, … are in these."""
+    touched, rest = _touched(tags, peers)
+    return min(
+        (_renamed(tags, {peer: place for place, peer in enumerate(chosen)}), (*chosen, *rest))
+        for chosen in itertools.permutations(touched)
+    )
 
 
 def _touched(tags: Tags, peers: int) -> tuple[list[int], list[int]]:
@@ -253,13 +196,12 @@ def _renamed(tags: Tags, label: Mapping[int, int]) -> Tags:
     return tuple(sorted((label[g], label[h]) for g, h in tags))
 
 
-def _tagged(of: _Affine, order: int) -> _Tagged:
+def _tagged(of: Affine, order: int) -> _Tagged:
     """Find the sets of so many tags at most, and what each one's moments follow from."""
-    names = _Names(of.peers)
     layers: list[dict[Tags, None]] = [{(): None}]
     for _ in range(order):  # each larger set is a smaller one with an arc more
         larger = ((*one, arc) for one in layers[-1] for arc in of.arcs if arc not in one)
-        layers.append(dict.fromkeys(names.of(tuple(sorted(tags)))[0] for tags in larger))
+        layers.append(dict.fromkeys(_named(tuple(sorted(tags)), of.peers)[0] for tags in larger))
     sets = tuple(one for layer in layers for one in layer)
     entries = _orbits(of, sets)
     kappa = (1 - 2 * of.chance) / np.sqrt(of.chance * (1 - of.chance))
@@ -286,7 +228,7 @@ def _tagged(of: _Affine, order: int) -> _Tagged:
             once = times([(1.0, tags)], arc)
             for factor, one in once:
                 if len(one) <= order:
-                    stands, peers = names.of(one)
+                    stands, peers = _named(one, of.peers)
                     (own,) = _renamed((arc,), {peer: label for label, peer in enumerate(peers)})
                     first.append((factor, s * count + c, len(origin)))
                     origin.append(
@@ -295,7 +237,7 @@ def _tagged(of: _Affine, order: int) -> _Tagged:
             for d, other in enumerate(of.arcs):
                 for factor, one in times(once, other):
                     if len(one) <= order:
-                        stands, peers = names.of(one)
+                        stands, peers = _named(one, of.peers)
                         label = {peer: name for name, peer in enumerate(peers)}
                         to = [number[label[g], label[h]] for g, h in (arc, other)]
                         source = (place[stands] * count + to[0]) * count + to[1]
@@ -319,7 +261,7 @@ def _sparse(terms: Sequence[tuple[float, int, int]], rows: int, columns: int) ->
     return load_pool("scipy.sparse").csr_matrix((entries, (row, column)), shape=(rows, columns))
 
 
-def _orbits(of: _Affine, sets: Sequence[Tags]) -> Integers:
+def _orbits(of: Affine, sets: Sequence[Tags]) -> Integers:
     """Number the entries of each set's matrix, those alike that the set's own permutations exchange."""
     sparse, graph = load_pool("scipy.sparse"), load_pool("scipy.sparse.csgraph")
     n, first = len(of.mean), 0
@@ -346,13 +288,13 @@ def _orbits(of: _Affine, sets: Sequence[Tags]) -> Integers:
     return found
 
 
-def _states(of: _Affine, peers: Sequence[int]) -> Integers:
+def _states(of: Affine, peers: Sequence[int]) -> Integers:
     """Return which state comes from where when peer i becomes `peers[i]`: new[states] = old."""
     found = np.zeros(len(of.mean), np.intp)
     number = {arc: place for place, arc in enumerate(of.arcs)}
-    own = of.sites[1]
+    own = of.offsets[1]
     for peer, to in enumerate(peers):
-        found[of.sites[peer] : of.sites[peer] + own] = of.sites[to] + np.arange(own)
+        found[of.offsets[peer] : of.offsets[peer] + own] = of.offsets[to] + np.arange(own)
     for place, (g, h) in enumerate(of.arcs):
         found[list(of.held[place])] = list(of.held[number[peers[g], peers[h]]])
     return found

@@ -10,7 +10,7 @@ Does not: say what it can't serve (see `network`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -29,8 +29,9 @@ from apc.frame.lift import FrameMap
 from apc.frame.parameters import resolve
 from apc.frame.schedule import Event, Schedule, Selected, Send, Sent, Tick, Way, tick_by_tick
 from apc.frame.scheduling import build_schedules
-from apc.moments.gains import Luck, Moments, Part
-from apc.moments.mean_loops import Listened, Remembered, Route, mean_loop, remember
+from apc.frame.taylor import arithmetic_of
+from apc.moments.gains import Answer, Drive, Moments, Part, number_of
+from apc.moments.mean_loops import Listened, Remembered, Route, mean_loop, remember, scaled
 from apc.moments.memory import memory_of
 from apc.network.channel import ChannelLaw, channel_law
 
@@ -69,7 +70,7 @@ def hearing(
     Parameters
     ----------
     system, prepared
-        As for `crowd`.
+        The compiled scene, and what `analysis.prepare` made of it.
     first
         When frames begin, in seconds.
     stand_in
@@ -139,6 +140,11 @@ class Classes:
     weights: Coupling
     standing: tuple[Floats, ...]
 
+    def only(self, place: int) -> int | None:
+        """Return the class whose peers a loop moves against each other, None for the loop of all classes."""
+        names = [site.name for site in self.loops[0].sites]
+        return names.index(self.loops[place].sites[0].name) if place else None
+
 
 def classes_of(told: Hearing) -> Classes:
     """Return the loops of a scene with their rigid motions."""
@@ -146,19 +152,33 @@ def classes_of(told: Hearing) -> Classes:
     return Classes(told, loops, weights, tuple(map(standing_motions, loops)))
 
 
-def crowd(system: CompiledSystem, prepared: Prepared, *, told: Hearing | None = None) -> Moments:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Luck:
+    """The luck of the channels from peers of class `sender` to those of `listened.site`.
+
+    `places` are where each slot's covariances stand in G, `entries` which rows and columns (2, entries) of it
+    they are, `units` a unit of each over the luck of all slots (b, k, k).
+    """
+
+    sender: int
+    listened: Listened
+    spreads: tuple[Matrix, ...]
+    places: tuple[slice, ...]
+    entries: tuple[NDArray[np.intp], ...]
+    units: Floats
+
+
+def crowd(system: CompiledSystem, told: Hearing) -> Moments:
     """Make the mean loops of a scene and the luck that drives them.
 
     Parameters
     ----------
     system
         The compiled scene, with the numbers to analyse.
-    prepared
-        From `analysis.prepare`, of this system with any numbers.
     told
-        Its peers, where they are not those of `hearing`.
+        Its peers.
     """
-    of = classes_of(told or hearing(system, prepared))
+    of = classes_of(told)
     return moments_of(of, remembered_of(system, of.told, of.loops[0]))
 
 
@@ -176,53 +196,107 @@ def moments_of(
     frames
         As for `mean_loops.mean_loop`.
     """
-    told, loops, weights, common = of.told, of.loops, of.weights, of.loops[0]
-    remembered = {one.route: one for one in memories}
-    listened = _listened(common, weights, memories)
-    luck = [
-        Luck(
-            route=one.route,
-            sender=g,
-            receiver=one.site,
-            receivers=common.sites[one.site].count,
-            heard=common.sites[g].count - (1 if g == one.site else 0),
-            spreads=_spreads(remembered[one.route]),
+    luck = _luck(of.loops[0], of.weights, memories)
+    parts, drives = [], []
+    for number, loop in enumerate(of.loops):
+        only = of.only(number)
+        driving = [one for one in luck if only in (None, one.listened.site)]
+        listened = [one.listened if only is None else replace(one.listened, site=0) for one in driving]
+        mean, channels = mean_loop(loop, of.told.of(loop), memories, listened, of.standing[number], frames)
+        classes = tuple(range(len(loop.sites))) if only is None else (only,)
+        parts.append(
+            Part(mean.matrix, only, mean.at, mean.offsets, tuple(_answers(mean.misses, luck, classes)))
         )
-        for g, one in listened
-    ]
-    parts = []
-    for place, loop in enumerate(loops):
-        alone = _class_apart(loops, place)
-        own = {
-            d: one if alone is None else replace(one, site=0)
-            for d, (_, one) in enumerate(listened)
-            if alone is None or one.site == alone
-        }
-        mean, channels = mean_loop(
-            loop, told.of(loop), memories, list(own.values()), of.standing[place], frames
-        )
-        classes = tuple(range(len(loop.sites))) if alone is None else (alone,)
-        parts.append(Part(mean, alone, classes, dict(zip(own, channels, strict=True))))
-    return Moments(tuple(parts), tuple(luck))
+        for one, channel in zip(driving, channels, strict=True):
+            receivers = of.loops[0].sites[one.listened.site].count
+            heard = of.loops[0].sites[one.sender].count - (one.sender == one.listened.site)
+            # One channel drives the mean of all receivers by 1/n, and their differences by 1 − 1/n or −1/n.
+            by = 1 / receivers
+            share = heard * (by if only is None else 1 - by)
+            own = one, channel.own, by if only is None else -by
+            answers = tuple(_answers(channel.misses, luck, classes, share, *own))
+            place = slice(one.places[0].start, one.places[-1].stop)
+            drives.append(Drive(channel.matrix, channel.into, one.units, place, answers, number, share))
+    return Moments(tuple(parts), tuple(drives), luck[-1].places[-1].stop if luck else 0)
+
+
+def _answers(
+    misses: Mapping[tuple[int, Route, int], Matrix],
+    luck: Sequence[_Luck],
+    classes: Sequence[int],
+    share: float = 1.0,
+    driving: _Luck | None = None,
+    own: Sequence[Matrix] = (),
+    by: float = 0.0,
+) -> Iterator[Answer]:
+    """Give the covariances of luck that follow from a loop's moments.
+
+    Parameters
+    ----------
+    misses
+        How far packets are from what is heard, by site, route and slot, over the loop's states.
+    luck
+        All kinds of luck.
+    classes
+        The classes of the loop's sites.
+    share
+        How many channels drive the loop.
+    driving, own, by
+        Of a loop driven by a channel: which kind, how far its packets are from what it hears by itself, slot
+        by slot, and how much of it the loop takes part in.
+    """
+    for (site, route, slot), miss in misses.items():
+        for kind in luck:
+            if (kind.listened.route, kind.sender) != (route, classes[site]):
+                continue
+            left, right, weights = miss[None], miss[None], np.array([share])
+            if kind is driving:
+                # by (m oᵀ + o mᵀ), and o oᵀ itself once, in the loop of all.
+                numbers = arithmetic_of(miss)
+                more = scaled(miss, number_of(2 * by, numbers), numbers)
+                more = numbers.add(more, own[slot]) if by > 0 else more
+                left, right = np.stack([miss, more]), np.stack([miss, own[slot]])
+                weights = np.array([share, 1.0])
+            yield Answer(kind.places[slot], left, right, weights, kind.entries[slot], kind.spreads[slot])
+
+
+def _luck(common: Loop, weights: Coupling, memories: Sequence[Remembered]) -> list[_Luck]:
+    """Return the luck of the channels left to chance, one of each kind."""
+    kinds: list[_Luck] = []
+    first = 0
+    for one in memories:
+        count, total = len(one.channels), sum(one.sizes)
+        starts = np.cumsum([0, *one.sizes])
+        numbers = np.ones((count, count))  # all numbers of a packet are lost together
+        spreads = tuple(np.kron(numbers, one.memory.spread(slot)) for slot in range(one.memory.slots))
+        entries = tuple(np.array(np.triu_indices(count * size)) for size in one.sizes)
+        units = []
+        for start, size, listed in zip(starts, one.sizes, entries, strict=False):
+            where = (np.arange(count)[:, None] * total + start + np.arange(size)).ravel()
+            for a, b in where[listed].T:
+                unit = np.zeros((count * total, count * total))
+                unit[a, b] = unit[b, a] = 1.0
+                units.append(unit)
+        if not units:
+            continue
+        for h, site in enumerate(common.sites):
+            for g in range(len(common.sites)):
+                weighed = {
+                    way: rows[h][g] for way, rows in weights.items() if (way.link, way.delay) == one.route
+                }
+                if any(weighed.values()) and (g != h or site.count > 1):
+                    ends = np.cumsum([first, *(listed.shape[1] for listed in entries)]).tolist()
+                    places = tuple(map(slice, ends, ends[1:]))
+                    listened = Listened(h, one.route, weighed)
+                    kinds.append(_Luck(g, listened, spreads, places, entries, np.array(units)))
+                    first = ends[-1]
+    return kinds
 
 
 def standing_motions(loop: Loop) -> Floats:
     """Return the rigid motions of a loop over its sites' own states."""
     states = sum(len(site.lifted.z_names) for site in loop.sites)
     return find_rigid_modes(without_packets(loop), with_drifts=False).directions[:states]
-
-
-def _class_apart(loops: Sequence[Loop], place: int) -> int | None:
-    """Return the class whose peers a loop moves apart, None for that of all alike."""
-    names = [site.name for site in loops[0].sites]
-    return names.index(loops[place].sites[0].name) if place else None
-
-
-def _spreads(one: Remembered) -> tuple[Matrix, ...]:
-    """Return the covariances of each slot's luck: all numbers of a packet have the same."""
-    numbers = np.ones((len(one.channels), len(one.channels)))
-    spreads = [one.memory.spread(slot) for slot in range(one.memory.slots)]
-    return tuple(np.stack([np.kron(numbers, layer) for layer in spread]) for spread in spreads)
 
 
 def peer_classes(told: Hearing) -> tuple[tuple[Loop, ...], Coupling]:
@@ -298,19 +372,3 @@ def instants(told: Hearing, clock: Clock) -> list[Fraction]:
     """Return when a clock ticks in a frame, in seconds."""
     phase, period = told.timings[clock.phase], told.timings[clock.period]
     return [phase % period + number * period for number in range(int(told.frame / period))]
-
-
-def _listened(
-    common: Loop, weights: Coupling, remembered: Sequence[Remembered]
-) -> list[tuple[int, Listened]]:
-    """Return the channels left to chance, one of each kind, by the class that sends."""
-    found = []
-    for one in remembered:
-        if not any(len(one.memory.uncertain(slot)) for slot in range(one.memory.slots)):
-            continue
-        for h, site in enumerate(common.sites):
-            for g in range(len(common.sites)):
-                own = {way: rows[h][g] for way, rows in weights.items() if (way.link, way.delay) == one.route}
-                if any(own.values()) and (g != h or site.count > 1):
-                    found.append((g, Listened(h, one.route, own)))
-    return found

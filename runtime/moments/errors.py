@@ -1,412 +1,285 @@
 """How far copies are from each other while hands push at random, over the network as it is.
 
-Takes: a scene that is stable in mean square, and how its second moments move (`crowd`, `patterns`).
-Gives: `Told`; `crowd_error`, `standing_error`, `pattern_error`, `tagged_error`.
-Guarantees: a value whose digits rounding leaves in doubt is none.
-Does not: say whether the scene is stable (see `network`).
+Takes: a scene that is stable in mean square, and how its second moments move.
+Gives: `Forced`, `forced`, `Peer`; `moments_error`, `largest_error`.
+Guarantees: the peers move as before, and are pushed besides; positions are those at the start of a frame of
+the scene, whenever frames are said to begin.
+Does not: say whether the scene is stable (see `network`); bound rounding.
 
-Every device is pushed by a force of its own of variance 1 N², drawn anew at each tick of the fastest clock;
-the error of a copy is its position less the mean of the others', as frames begin. Of pushes the loops of
-means make moments X, and of these come covariances V₀ of the luck of channels; luck drives itself,
-V = V₀ + G(1) V (see `gains`), and the moments of positions are X and what the loops make of V.
+Every device is pushed by a force of its own of variance 1 N², drawn anew at each tick of the fastest clock as
+a frame begins; the error of a copy is its position less the mean of the others', as frames begin. Of pushes
+the loops of means make moments, and of these come covariances V₀ of luck; luck drives itself, V = V₀ + G(1) V
+(see `gains`), and the moments of positions are what pushes and V make together.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import CompiledSystem, Kind
 from apc.eigen.modes import dense_loop
-from apc.eigen.relative import Relative, relative_coordinates
-from apc.frame.discretize import UNIT
-from apc.frame.radius import RADII, radius_of, rounded, solve, value_of
-from apc.moments.bursts import tagged_moments
-from apc.moments.crowd import crowd, hearing, peer_classes
-from apc.moments.gains import Moments, around, gain_of, number_of, stein, units_of
-from apc.moments.hands import Copy, Peer, forced
-from apc.moments.mean_loops import scaled
-from apc.moments.patterns import every_pattern, frames, of_all, resting_moments
-from apc.moments.stand_in import Classes, entries_of, luck_after, luck_of_luck, spread_of, standing_in
+from apc.eigen.peer_group import PeerGroup
+from apc.eigen.relative import Relative
+from apc.frame.devices import Device, find_device
+from apc.frame.ports import with_holds, with_ports
+from apc.frame.radius import FLOATS, RADII
+from apc.frame.site import LinearSite
+from apc.moments.crowd import Hearing, instants
+from apc.moments.gains import Answer, Drive, Moments, Part, gain
+from apc.moments.unserved import UnservedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
 
-# How far rounding may put a variance in doubt, relatively.
-DOUBT = 1e-6
+# How far a motion that nothing holds back may move copies: those of rational weights are rounded.
+STANDING = 1e-9
 
-# Frames after which the sizes of covariances are known well enough to measure errors by.
-SIZED = 40
-
-# By what factor of its rounding a covariance that vanishes is taken to be there.
-VANISHING = 1e3
-
-# How far a motion that nothing holds back may move copies apart: those of rational weights are rounded.
-APART = 1e-9
-
-NO_COPIES = "no position of a mass is told to others"
-IN_DOUBT = "rounding leaves its digits in doubt"
-NO_END = "its iteration did not come to an end"
-DRIFTING = "nothing holds the copies together: what they differ by grows for ever"
+# A copy is called by the link and channel that tell others where it is.
+Copy = tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """The largest error of copies in m; or None, and `why`. Of an estimate `why` says what it leaves out."""
+class Peer:
+    """What of z a peer got: `drawn` are forces in N as a frame begins, `copies` positions in m."""
 
-    metres: float | None
-    why: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class _Class:
-    """Equal peers: how many, and what of their z they got."""
-
-    count: int
-    got: Peer
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Spread:
-    """Second moments (2, n, n) of all classes' means, or of peers of class `apart` less the mean of these.
-
-    They are over the relative coordinates `at` of states that begin at `offsets`, class by class.
-    """
-
-    apart: int | None
-    at: Relative
-    offsets: tuple[int, ...]
-    moments: Matrix
+    drawn: range
+    copies: Mapping[Copy, int]
 
 
 @dataclass(frozen=True, slots=True)
-class _Error:
-    """The error of a copy of a peer of class `of`: `own` times its position, `means` times those of all."""
+class Forced:
+    """The peers of a scene, pushed; `peers` says what of z they got, by the schedule's id."""
 
-    of: int
-    copy: Copy
-    own: Fraction
-    means: tuple[Fraction, ...]
+    told: Hearing
+    peers: Mapping[int, Peer]
+
+    def of(self, sites: Sequence[PeerGroup]) -> list[tuple[int, Peer]]:
+        """Return of each class of peers how many there are, and what they got."""
+        return [(site.count, self.peers[id(site.schedule)]) for site in sites]
+
+    def peer_by_peer(self) -> list[tuple[int, Peer]]:
+        """Return what each peer got, one after another."""
+        return self.of(dense_loop(self.told.groups, self.told.exchange).sites)
 
 
-def crowd_error(system: CompiledSystem, prepared: Prepared) -> Told:
-    """Return the largest error of copies, or why there is none: what is missed is held, packet by packet.
+def forced(system: CompiledSystem, told: Hearing, first: Fraction = Fraction(0)) -> Forced:
+    """Push what hands hold, each for itself, by a force of variance 1 N².
 
     Parameters
     ----------
     system
-        The compiled scene, stable in mean square, with the numbers to analyse.
-    prepared
-        From `analysis.prepare`, of this system with any numbers.
-    """
-    pushed = forced(system, hearing(system, prepared))
-    if isinstance(pushed, str):
-        return Told(None, pushed)
-    loops, _ = peer_classes(pushed.told)
-    classes = [_Class(site.count, pushed.peers[id(site.schedule)]) for site in loops[0].sites]
-    of = crowd(system, prepared, told=pushed.told)
-    spreads = [
-        _pushed(part.loop.matrix, part.apart, part.loop.at, part.loop.offsets, classes) for part in of.parts
-    ]
-    known = [one for one in spreads if one is not None]
-    if len(known) == len(spreads) and of.luck:
-        known = _with_luck(of, known) or []
-    return _largest(known, classes) if known else Told(None, IN_DOUBT)
-
-
-def standing_error(system: CompiledSystem, prepared: Prepared, first: Fraction) -> Told:
-    """Return the largest error of copies, or why there is none: own values stand in for missed ones.
-
-    Parameters
-    ----------
-    system, prepared
-        As for `crowd_error`.
+        The compiled scene.
+    told
+        Its peers.
     first
-        When frames begin: all packets that may be lost are due then.
+        When frames begin there, in seconds.
+
+    Raises
+    ------
+    UnservedError
+        It is not clear what hands hold.
     """
-    pushed = forced(system, hearing(system, prepared, first=first, stand_in=True), first)
-    if isinstance(pushed, str):
-        return Told(None, pushed)
-    loops, _ = peer_classes(pushed.told)
-    classes = [_Class(site.count, pushed.peers[id(site.schedule)]) for site in loops[0].sites]
-    plain = standing_in(system, prepared, first)
-    of = standing_in(system, prepared, first, told=pushed.told)
-    if isinstance(plain, str) or isinstance(of, str):
-        return Told(None, str(plain))
-    # What a peer gets in a frame beside what moves it on the mean: its pushes, and Ω by luck.
-    pushes = [np.zeros((2, of.size(d), of.size(d))) for d in range(len(classes))]
-    for one, own in zip(classes, pushes, strict=True):
-        own[0, one.got.drawn, one.got.drawn] = 1.0
-    matrix, start = luck_of_luck(plain, 1.0, RADII), _lucky(of, pushes)
-    if matrix is None or start is None:
-        return Told(None, IN_DOUBT)
-    # What luck adds to what a peer has without them goes on as it does without them.
-    lasting = [np.delete(np.arange(of.size(d)), one.got.added) for d, one in enumerate(classes)]
-    entries = entries_of(plain)
-    places = [np.array(listed, np.intp).T for listed in entries]
-    known = [own[:, kept[a], kept[b]] for own, kept, (a, b) in zip(start, lasting, places, strict=True)]
-    found = _solved(matrix, np.concatenate(known, axis=-1), _squares(entries))
-    if found is None:
-        return Told(None, IN_DOUBT)
-    number = 0
-    whole = [own.copy() for own in pushes]
-    for own, kept, (a, b) in zip(whole, lasting, places, strict=True):
-        own[:, kept[a], kept[b]] = own[:, kept[b], kept[a]] = found[:, number : number + len(a)]
-        number += len(a)
-    luck = _lucky(of, whole)
-    totals: dict[int | None, Matrix] = {}
-    for d, own in enumerate(pushes):
-        added = None if luck is None else RADII.add(own, luck[d])
-        spread = None if added is None else spread_of(of, d, added[None], 1.0, RADII)
-        if spread is None:
-            return Told(None, IN_DOUBT)
-        for apart, (moments,) in spread.items():
-            more = moments
-            if apart is not None:
-                more = scaled(moments, number_of(1 - 1 / of.counts[d], RADII), RADII)
-            totals[apart] = RADII.add(totals[apart], more) if apart in totals else more
-    spreads = [
-        _Spread(apart, at, of.offsets, totals[apart][:, at.rest[:, None], at.rest])
-        for apart, _, at in of.parts
-    ]
-    return _largest(spreads, classes)
-
-
-def _lucky(of: Classes, added: Sequence[Matrix]) -> list[Matrix] | None:
-    """Return what luck adds to peers of each class who get so much a frame, None where it has no bound."""
-    found = [np.zeros_like(own) for own in added]
-    for d, own in enumerate(added):
-        after = luck_after(of, d, own[None], 1.0, RADII)
-        if after is None:
-            return None
-        found = [RADII.add(one, more[0]) for one, more in zip(found, after, strict=True)]
-    return found
-
-
-def pattern_error(system: CompiledSystem, prepared: Prepared, first: Fraction) -> Told:
-    """Return the largest error of copies, or why there is none, pattern by pattern of lost packets.
-
-    It is right to what an iteration and rounding leave, of which there is no bound.
-
-    Parameters
-    ----------
-    system, prepared, first
-        As for `standing_error`.
-    """
-    pushed = forced(system, hearing(system, prepared, first=first, stand_in=True), first)
-    if isinstance(pushed, str):
-        return Told(None, pushed)
-    peers = dense_loop(pushed.told.groups, pushed.told.exchange).sites
-    classes = [_Class(1, pushed.peers[id(site.schedule)]) for site in peers]
-    found = frames(system, prepared, first, every_pattern, told=pushed.told)
-    of = of_all(found)
-    drawn = np.zeros(len(of.at.held) + len(of.at.rest))
-    for start, one in zip(found.sites, classes, strict=False):
-        drawn[start + np.array(one.got.drawn, np.intp)] = 1.0
-    moments = resting_moments(of, np.diag(drawn[of.at.rest]))
-    if moments is None:
-        return Told(None, NO_END)
-    return _largest([_Spread(None, of.at, found.sites, RADII.exact(moments))], classes)
-
-
-def tagged_error(system: CompiledSystem, prepared: Prepared, first: Fraction, orders: Sequence[int]) -> Told:
-    """Return the largest error of copies, or why there is none: bursts between equal peers, tag by tag.
-
-    Parameters
-    ----------
-    system, prepared, first
-        As for `standing_error`.
-    orders
-        How many tags there are at most; of two, what the last gives is an estimate.
-    """
-    pushed = forced(system, hearing(system, prepared, first=first, stand_in=True), first)
-    if isinstance(pushed, str):
-        return Told(None, pushed)
-    (got,) = {id(one): one for one in pushed.peers.values()}.values()
-    classes = [_Class(1, got)] * system.peers
-    told = Told(None, "")
-    before: list[float] = []
-    for order in orders:
-        found = tagged_moments(system, prepared, first, order, told=pushed.told, drawn=got.drawn)
-        if found is None:
-            return Told(None, NO_END)
-        at = relative_coordinates(found[0].basis)
-        take = np.zeros((len(at.rest), len(found[1])))
-        take[np.arange(len(at.rest)), at.rest], take[:, at.held] = 1.0, -at.weights
-        inner = RADII.exact(take @ found[1] @ take.T)
-        told = _largest([_Spread(None, at, found[0].sites, inner)], classes)
-        if told.metres is None:
-            return told
-        before.append(told.metres)
-    if len(orders) == 1:
-        return told
-    note = f"an estimate: moments of at most {orders[1]} channels' states together; with {orders[0]} it is "
-    return Told(before[-1], f"{note}{before[0]:.9g} m")
+    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
+    used = {part.clock for kind in system.kinds for part in kind.clocks} | {one.clock for one in system.links}
+    fastest = min(
+        (clock for clock in system.clocks if clock.name in used), key=lambda clock: told.timings[clock.period]
+    )
+    ticks = instants(told, fastest)
+    groups, rows, peers = [], {}, {}
+    built: dict[tuple[int, int], tuple[PeerGroup, Peer]] = {}
+    for group in told.groups:
+        key = id(group.schedule), id(group.lifting)
+        if key not in built:
+            held = find_device(group.jacobians, group.parameters, unit_of, group.listening)
+            if isinstance(held, str):
+                raise UnservedError(held)
+            built[key] = _pushed(group, held, ticks, -first % told.frame)
+        pushed, peer = built[key]
+        groups.append(
+            replace(
+                group,
+                jacobians=pushed.jacobians,
+                site=pushed.site,
+                exacting=pushed.exacting,
+                schedule=pushed.schedule,
+                lifting=pushed.lifting,
+            )
+        )
+        rows[id(pushed.schedule)] = told.rows.get(id(group.schedule), ())
+        peers[id(pushed.schedule)] = peer
+    if not any(peer.drawn for peer in peers.values()):
+        raise UnservedError("no peer holds anything but what it tells others about")
+    return Forced(replace(told, groups=tuple(groups), rows=rows), peers)
 
 
 def _pushed(
-    matrix: Matrix, apart: int | None, at: Relative, offsets: Sequence[int], classes: Sequence[_Class]
-) -> _Spread | None:
-    """Return the moments that pushes make of a loop of means (2, n, n), None where they have no bound."""
-    place = {state: number for number, state in enumerate(at.rest.tolist())}
-    drawn = np.zeros((2, len(place), len(place)))
-    for g, one in enumerate(classes):
-        if apart not in (None, g):
-            continue
-        start = offsets[g] if apart is None else 0
-        variance = Fraction(1, one.count)
-        for state in one.got.drawn:
-            drawn[:, place[start + state], place[start + state]] = _rounded(
-                variance if apart is None else 1 - variance
-            )
-    moments = stein(matrix, drawn[None], RADII)
-    return None if moments is None else _Spread(apart, at, tuple(offsets), moments[0])
+    group: PeerGroup, device: Device | None, ticks: Sequence[Fraction], start: Fraction
+) -> tuple[PeerGroup, Peer]:
+    """Return the first peer of a group with forces, drawn as a frame begins, and its copies' positions.
 
-
-def _rounded(number: Fraction) -> tuple[float, float]:
-    """Return a number as a float, and what that may be off by."""
-    value = float(number)
-    return value, UNIT * abs(value) if value != number else 0.0
-
-
-def _with_luck(of: Moments, spreads: Sequence[_Spread]) -> list[_Spread] | None:
-    """Return moments with what the luck of channels adds, None where rounding leaves them open."""
-    matrix = gain_of(of)(1.0, RADII)
-    if matrix is None:
-        return None
-    first = _first_luck(of, spreads)
-    found = _solved(matrix, first, _squares([slot for kind in of.luck for slot in kind.entries]))
-    if found is None:
-        return None
-    result, starts = [], np.cumsum([0] + [sum(map(len, kind.entries)) for kind in of.luck])
-    for part, spread in zip(of.parts, spreads, strict=True):
-        total, n = spread.moments, spread.moments.shape[-1]
-        for d, channel in part.channels.items():
-            kind = of.luck[d]
-            units = RADII.exact(units_of(kind).reshape(starts[d + 1] - starts[d], -1).T)
-            k = channel.driven.shape[-1]
-            covariance = RADII.multiply(units, found[:, starts[d] : starts[d + 1], None]).reshape(2, k, k)
-            moved = stein(channel.matrix, around(channel.driven, covariance, RADII)[None], RADII)
-            if moved is None:
-                return None
-            alone = 1 / kind.receivers
-            share = kind.heard * (alone if part.apart is None else 1 - alone)
-            total = RADII.add(total, scaled(moved[0][:, :n, :n], number_of(share, RADII), RADII))
-        result.append(_Spread(spread.apart, spread.at, spread.offsets, total))
-    return result
-
-
-def _first_luck(of: Moments, spreads: Sequence[_Spread]) -> Matrix:
-    """Return V₀ (2, entries): the covariances of luck for moments that pushes make."""
-    found = []
-    for kind in of.luck:
-        for slot, listed in enumerate(kind.entries):
-            total = np.zeros_like(kind.spreads[slot])
-            for part, spread in zip(of.parts, spreads, strict=True):
-                for site, sender in enumerate(part.classes):
-                    rows = part.loop.misses.get((site, kind.route, slot))
-                    if sender == kind.sender and rows is not None:
-                        total = RADII.add(total, around(rows, spread.moments, RADII))
-            total = scaled(total, kind.spreads[slot], RADII)
-            found += [total[:, a, b] for a, b in listed]
-    return np.array(found).reshape(-1, 2).T
-
-
-def _squares(entries: Sequence[Sequence[tuple[int, int]]]) -> list[tuple[int, int]]:
-    """Return where the entries (a, a) and (b, b) of the same matrix are, of the entries (a, b) of several."""
-    found: list[tuple[int, int]] = []
-    for listed in entries:
-        own = {entry: len(found) + number for number, entry in enumerate(listed)}
-        found += [(own[a, a], own[b, b]) for a, b in listed]
-    return found
-
-
-def _solved(matrix: Matrix, known: Matrix, squares: Sequence[tuple[int, int]]) -> Matrix | None:
-    """Return V of V = V₀ + G V with its radius (2, n), None where rounding leaves open whether there is one.
-
-    Notes
-    -----
-    Entries are solved for beside their sizes, those of covariances, √(V_aa V_bb), of a few frames: `squares`
-    says where each entry's a and b are.
+    Parameters
+    ----------
+    group
+        The peers.
+    device
+        What a hand pushes.
+    ticks
+        When each force begins to act, in seconds of a frame.
+    start
+        When positions are taken, in seconds of a frame.
     """
-    a, b = np.array(squares).T
-    few = known[0]
-    for _ in range(SIZED):
-        few = known[0] + value_of(matrix) @ few
-    size = np.sqrt(np.maximum(few[a], 0.0)) * np.sqrt(np.maximum(few[b], 0.0))
-    few = np.maximum(few, VANISHING * (radius_of(matrix) @ size))  # where it would vanish but for rounding
-    size = np.sqrt(np.maximum(few[a], 0.0)) * np.sqrt(np.maximum(few[b], 0.0))
-    kept = np.flatnonzero(size)
-    if known[:, size == 0].any() or matrix[:, size == 0].any():
-        return None
-    found, size = np.zeros_like(known), size[kept]
-    inner = matrix[:, kept[:, None], kept] / size[:, None] * size
-    inner[1] += 4 * UNIT * np.abs(inner[0])
-    of = known[:, kept] / size
-    of[1] += 2 * UNIT * np.abs(of[0])
-    solved = solve(RADII.subtract(RADII.exact(np.eye(len(kept))), inner), of[..., None])
-    if solved is None:
-        return None
-    solved[1] += 2 * UNIT * np.abs(solved[0])
-    found[:, kept] = solved[..., 0] * size
-    found[1] *= 1 + 8 * UNIT
-    return found
+    kind, schedule = group.jacobians.kind, group.schedule
+    copies = [
+        (sending.link, name)
+        for sending in kind.sends
+        for name, unit in zip(sending.channels, sending.units, strict=True)
+        if unit == "m"
+    ]
+    sites, readings = [], []
+    for site in (group.site, group.exact):
+        push = np.zeros((len(site.a), 1), dtype=site.a.dtype)
+        if device is not None:
+            push[device.velocity] += device.inverse if site.a.dtype == object else float(device.inverse)
+        sites.append(with_holds(site, push))
+        readings.append(_positions(sites[-1], kind))
+    at = [int(time / schedule.quantum) for time in ticks] if device is not None else []
+    taken = int(start / schedule.quantum)
+    (site, exact), full, ports = with_ports(sites, schedule, 1, at, readings, [taken])
+    drawn = ports.drawn.ravel().tolist()
+    peer = Peer(
+        drawn=range(drawn[0], drawn[-1] + 1) if drawn else range(0),
+        copies=dict(zip(copies, ports.read[0].tolist(), strict=True)),
+    )
+    return group.with_site(site, exact, full), peer
 
 
-def _largest(spreads: Sequence[_Spread], classes: Sequence[_Class]) -> Told:
-    """Return the root of the largest variance of an error, or why there is none."""
-    forms = _errors(classes)
-    if not forms:
-        return Told(None, NO_COPIES)
-    largest = 0.0
-    for form in forms:
-        total = np.zeros((2, 1, 1))
-        for one in spreads:
-            row = _over(one, form, classes)
-            if row is None:
-                return Told(None, DRIFTING)
-            total = RADII.add(total, around(row, one.moments, RADII))
-        variance, radius = total[:, 0, 0].tolist()
-        if not radius <= DOUBT * variance and radius:
-            return Told(None, IN_DOUBT)
-        largest = max(largest, variance)
-    return Told(math.sqrt(largest))
+def _positions(site: LinearSite, kind: Kind) -> Matrix:
+    """Return what of states and holds the positions depend on that are sent (positions, n_x + n_u)."""
+    rows = [
+        np.concatenate([send.x[place], send.u[place]])
+        for send, sending in zip(site.sends, kind.sends, strict=True)
+        for place, unit in enumerate(sending.units)
+        if unit == "m"
+    ]
+    return np.array(rows, dtype=site.b.dtype).reshape(len(rows), sum(site.b.shape))
 
 
-def _errors(classes: Sequence[_Class]) -> list[_Error]:
-    """Return the error of a copy of each class that has others: x_i − (Σ_j x_j − x_i)/(N − 1)."""
-    found = []
-    for copy in dict.fromkeys(copy for one in classes for copy in one.got.copies):
-        counts = [one.count if copy in one.got.copies else 0 for one in classes]
-        others = sum(counts) - 1
-        if others:
-            means = tuple(Fraction(-count, others) for count in counts)
-            of = [place for place, count in enumerate(counts) if count]
-            found += [_Error(place, copy, 1 + Fraction(1, others), means) for place in of]
-    return found
+def moments_error(of: Moments, classes: Sequence[tuple[int, Peer]]) -> float:
+    """Return the largest error of copies in m.
+
+    Parameters
+    ----------
+    of
+        The loops of peers that are pushed, and their luck.
+    classes
+        How many peers each class has, and what they got.
+    """
+    rows = _error_rows([(part.only, part.at, part.offsets) for part in of.parts], classes)
+    count = of.entries
+    entry = np.zeros((2, 1), np.intp)
+
+    def read(drive: Drive) -> Drive:
+        added = []
+        for number, row in enumerate(listed[drive.part] for listed in rows):
+            form = np.zeros((1, 2, 1, drive.matrix.shape[-1]))
+            form[0, 0, 0, : len(row)] = row
+            place = slice(count + number, count + number + 1)
+            added.append(Answer(place, form, form, np.array([drive.share]), entry))
+        return replace(drive, answers=(*drive.answers, *added))
+
+    drives = list(of.drives)
+    for number, part in enumerate(of.parts):
+        drawn, n = _pushes(part, classes), len(part.at.rest)
+        into = RADII.exact(np.eye(n))
+        drives.append(
+            Drive(part.matrix, into, drawn[None], slice(count, count + 1), part.answers, number, 1.0)
+        )
+    matrix = gain([read(drive) for drive in drives], (count + len(rows), count + 1), 1.0, FLOATS)
+    assert matrix is not None, "means grow, and second moments were to die out"
+    luck = np.linalg.solve(np.eye(count) - matrix[:count, :count], matrix[:count, count])
+    return _largest(matrix[count:, :count] @ luck + matrix[count:, count])
 
 
-def _over(spread: _Spread, form: _Error, classes: Sequence[_Class]) -> Matrix | None:
-    """Return an error (2, 1, n) over the coordinates of a spread; None where standing motions move it."""
-    row: dict[int, Fraction] = {}
-    if spread.apart is None:
-        for g, weight in enumerate(form.means):
-            if weight:
-                own = weight + (form.own if g == form.of else 0)
-                row[spread.offsets[g] + classes[g].got.copies[form.copy]] = own
-    elif spread.apart == form.of:
-        row[classes[form.of].got.copies[form.copy]] = form.own
-    whole = np.zeros(len(spread.at.held) + len(spread.at.rest))
-    for place, weight in row.items():
-        whole[place] = float(weight)
-    moved = whole[spread.at.held] + whole[spread.at.rest] @ spread.at.weights
-    if np.abs(moved).max(initial=0.0) > APART * np.abs(whole).max(initial=0.0):
-        return None
-    return rounded(whole[spread.at.rest][None])
+def largest_error(
+    moments: Floats, at: Relative, offsets: Sequence[int], classes: Sequence[tuple[int, Peer]]
+) -> float:
+    """Return the largest error of copies in m of peers that are followed one by one.
+
+    Parameters
+    ----------
+    moments
+        The second moments (n, n) of a long run over relative coordinates.
+    at, offsets
+        These, of states that begin at the offsets, peer by peer.
+    classes
+        What each peer got, as for `moments_error`.
+    """
+    rows = _error_rows([(None, at, offsets)], classes)
+    return _largest(np.array([row @ moments @ row for (row,) in rows]))
+
+
+def _largest(variances: Floats) -> float:
+    """Return the root of the largest variance."""
+    largest = float(variances.max())
+    if not largest >= 0:
+        raise UnservedError("rounding leaves its digits in doubt")
+    return math.sqrt(largest)
+
+
+def _pushes(part: Part, classes: Sequence[tuple[int, Peer]]) -> Floats:
+    """Return the moments (n, n) that pushes add to a loop of means as a frame begins."""
+    variance = np.zeros(len(part.at.held) + len(part.at.rest))
+    for g, (count, peer) in enumerate(classes):
+        if part.only in (None, g):
+            start = part.offsets[g] if part.only is None else 0
+            share = 1 / count if part.only is None else 1 - 1 / count
+            variance[start + np.array(peer.drawn, np.intp)] = share
+    return np.diag(variance[part.at.rest])
+
+
+def _error_rows(
+    loops: Sequence[tuple[int | None, Relative, Sequence[int]]], classes: Sequence[tuple[int, Peer]]
+) -> list[list[Floats]]:
+    """Return the error of a copy of each class that has others, over the coordinates (n,) of each loop.
+
+    It is x_i − (Σ_j x_j − x_i)/(N − 1).
+
+    Parameters
+    ----------
+    loops
+        Of each loop the class whose peers' differences it holds, None where it holds all classes; its
+        coordinates; and where each class's states begin.
+    classes
+        How many peers each class has, and what they got.
+    """
+    errors = []
+    for copy in dict.fromkeys(copy for _, peer in classes for copy in peer.copies):
+        places = {g: peer.copies[copy] for g, (_, peer) in enumerate(classes) if copy in peer.copies}
+        others = sum(classes[g][0] for g in places) - 1
+        for g in places if others else ():
+            rows = []
+            for only, at, offsets in loops:
+                row = np.zeros(len(at.held) + len(at.rest))
+                if only is None:
+                    for k, place in places.items():
+                        row[offsets[k] + place] = -classes[k][0] / others
+                start = offsets[g] if only is None else 0
+                if only in (None, g):
+                    row[start + places[g]] += 1 + 1 / others
+                moved = row[at.held] + row[at.rest] @ at.weights
+                if np.abs(moved).max(initial=0.0) > STANDING * np.abs(row).max(initial=0.0):
+                    raise UnservedError(
+                        "nothing holds the copies together: what they differ by grows for ever"
+                    )
+                rows.append(row[at.rest])
+            errors.append(rows)
+    if not errors:
+        raise UnservedError("no position of a mass is told to others")
+    return errors

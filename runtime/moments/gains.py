@@ -1,22 +1,22 @@
 """The spectral radius of second moments, from how luck drives itself.
 
-Takes: the mean loops of a scene and what the luck of its channels does to them.
-Gives: `Luck`, `Part`, `Moments`; `gain_of`, `mean_square_radius`, `Enclosed`, `Gain`; `below_1`; `stein`,
-`around`, `of_kind`, `number_of`, `units_of`, `too_much`.
+Takes: loops of means, and the covariances of luck that drive them.
+Gives: `Answer`, `Drive`, `Part`, `Moments`; `gain`, `mean_square_radius`, `Enclosed`, `below_1`; `stein`,
+`around`, `weighted`, `number_of`.
 Guarantees: a radius between `low` and `high` for every loop within the radii of its matrices.
-Does not: know where the loops come from (see `crowd`).
+Does not: know where the loops come from (see `crowd` and `stand_in`).
 
-Let V hold the covariances of the luck of one channel of each kind, growing by λ a frame. The means answer to
-it, once for each channel of a kind, with moments Σ_f λ^−f A^(f−1) B V Bᵀ A^(f−1)ᵀ, a Stein equation; of these
-follows how far packets are from what is heard, and of that, by the law of chance, V again: V = G(λ) V. G maps
-covariances to covariances and falls as λ rises, so second moments grow by the λ > ρ(A)² at which the largest
-eigenvalue of G is 1, or by ρ(A)² where it is smaller than 1 all the way down.
+Let V hold the covariances of luck, growing by λ a frame. The means answer to it with moments
+X = Σ_f λ^−f A^f B(V) A^fᵀ, a Stein equation; of these follows, by the law of chance, V again: V = G(λ) V. G
+maps covariances to covariances and falls as λ rises, so second moments grow by the λ > ρ(A)² at which the
+largest eigenvalue of G is 1, or by ρ(A)² where it is smaller than 1 all the way down.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -25,10 +25,13 @@ from numpy.typing import NDArray
 from apc.eigen.dissipation import is_positive
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.pseudospectrum import balance
+from apc.eigen.relative import Relative
 from apc.frame.discretize import UNIT
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
 from apc.frame.taylor import arithmetic_of, corners, hull
-from apc.moments.mean_loops import Channel, MeanLoop, Route, scaled
+from apc.moments.mean_loops import scaled
+from apc.moments.unserved import UnservedError
+from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -47,83 +50,133 @@ LARGE, SHARES, MOST_SIDES = 0.5, (0.1, 0.5, 0.9), 6
 
 TINY = float(np.finfo(np.float64).tiny)
 
-# Steps towards the radius; secants need some five. After so many without a λ at which G is large, it is
-# looked at so near above the means' own growth.
-STEPS, BLIND, NEAR = 60, 4, 1e-9
+# G is looked at so near above the means' own growth, where it has its pole; and so many times farther from it
+# each time until its largest eigenvalue is below 1.
+NEAR, WIDER = 1e-9, 4.0
 
-# G is first looked at where it decides the verdict, at 1, if the means decay by more than this; else so far
-# above their own growth, and at most so many times farther each time.
-NEAR_ONE, FIRST_GAP, WIDER = 0.99999, 0.1, 30
+# How near the radius is near enough, relatively.
+CLOSE = 1e-14
 
-# How near the radius is near enough, relatively; and as far from 1, the slopes of G are not rounding.
-CLOSE, ROUGH = 1e-14, 1e-6
+# The step over which the slope of G at the radius is taken, relatively.
+STEP = 1e-6
 
-# How near it is enclosed at first, relatively, and how much farther at last.
+# How near the radius is enclosed at first, relatively, and how much farther at last.
 FIRST_WIDTH, LAST_WIDTH = 1e-12, 1e-3
 
 # Covariances of luck times cubes of the means' states: as much takes some ten seconds.
 MOST_WORK = 20_000_000
 
-
-def too_much(entries: int, states: int) -> str:
-    """Return why so many covariances of luck that drive loops of so many states are not followed, or ""."""
-    if entries * states**3 <= MOST_WORK:
-        return ""
-    return (
-        f"{entries:,} covariances of luck that drive loops of {states} states would take minutes: fewer "
-        "ticks at which a packet may arrive, a shorter delay, or fewer peers that differ"
-    )
+# Roundings of a weight, of a product with it and of a symmetric part.
+WEIGHT_ROUNDINGS = 18
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Luck:
-    """The luck of equal channels, on `route` from each of `senders` peers of class `sender` to each of some.
+class Answer:
+    """Covariances that moments X of a loop make: `spread` ∘ Σ_k w_k L_k X R_kᵀ, of which some entries count.
 
-    Each of the `receivers` peers of class `receiver` hears `heard` of them. `spreads` are the covariances of
-    whether what is uncertain of each slot's packet is replaced, number by number (k_slot, k_slot).
+    Of a product that is not symmetric its symmetric part is meant.
+
+    Attributes
+    ----------
+    place
+        The rows of G that they stand in.
+    left, right
+        L and R (k, 2, p, n), each with its radius or over a cell.
+    weights
+        w (k,).
+    entries
+        The rows and columns (2, entries) that count.
+    spread
+        The covariance (2, p, p) of what is left to chance, None where it is 1 throughout.
     """
 
-    route: Route
-    sender: int
-    receiver: int
-    receivers: int
-    heard: int
-    spreads: tuple[Matrix, ...]
-
-    @property
-    def entries(self) -> list[list[tuple[int, int]]]:
-        """The entries (a, b) of each slot's covariance, a ≤ b."""
-        return [
-            [(a, b) for a in range(spread.shape[-1]) for b in range(a, spread.shape[-1])]
-            for spread in self.spreads
-        ]
+    place: slice
+    left: Matrix
+    right: Matrix
+    weights: Floats
+    entries: NDArray[np.intp]
+    spread: Matrix | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """A loop of means driven by luck of one kind.
+
+    Attributes
+    ----------
+    matrix
+        The loop (2, n, n) with its radius or over a cell.
+    into
+        How luck, which is drawn as a frame begins, enters its states (2, n, k).
+    units
+        The covariances (b, k, k) of luck that G has a column for each.
+    place
+        Which columns these are.
+    answers
+        The covariances that follow; their forms are over states (n,), or over these and luck (n + k,).
+    part
+        Which loop of means this is, its own states first.
+    share
+        How many times as much all luck of this kind moves that loop.
+    """
+
+    matrix: Matrix
+    into: Matrix
+    units: Floats
+    place: slice
+    answers: tuple[Answer, ...]
+    part: int
+    share: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A loop of means: all peers of each class alike (`apart` is None), or those of class `apart` apart.
+    """A loop of means: of all classes of peers, or of what peers of the class `only` differ by.
 
-    `classes` are the peers' classes of its sites; `channels` the kinds of luck, by number, that drive it.
+    Attributes
+    ----------
+    matrix
+        The loop (2, n, n) with its radius or over a cell.
+    only
+        The class, None for the loop of all.
+    at
+        Its coordinates, relative to motions that nothing holds back.
+    offsets
+        Where each site's states begin.
+    answers
+        The covariances of luck that follow from its moments.
     """
 
-    loop: MeanLoop
-    apart: int | None
-    classes: tuple[int, ...]
-    channels: Mapping[int, Channel]
+    matrix: Matrix
+    only: int | None
+    at: Relative
+    offsets: tuple[int, ...]
+    answers: tuple[Answer, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Moments:
-    """All loops and all kinds of luck of a scene."""
+    """What second moments of a scene follow from: its loops, the luck that drives them, and how many
+    covariances of luck there are.
+    """
 
     parts: tuple[Part, ...]
-    luck: tuple[Luck, ...]
+    drives: tuple[Drive, ...]
+    entries: int
 
     @property
     def means(self) -> tuple[list[Matrix], list[Matrix]]:
-        """The matrices of the loops, those that luck drives first."""
-        own = [part.loop.matrix for part in self.parts if part.channels]
-        return own, [part.loop.matrix for part in self.parts if not part.channels]
+        """The loops of means (2, n, n): those that luck drives, and those that it does not."""
+        driven = {drive.part for drive in self.drives}
+        return (
+            [part.matrix for number, part in enumerate(self.parts) if number in driven],
+            [part.matrix for number, part in enumerate(self.parts) if number not in driven],
+        )
+
+    @property
+    def states(self) -> int:
+        """The states of the largest loop that luck drives."""
+        return max((drive.matrix.shape[-1] for drive in self.drives), default=0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,124 +307,66 @@ def around(left: Matrix, inner: Matrix, numbers: Arithmetic, right: Matrix | Non
     return numbers.multiply(numbers.multiply(left, inner), np.swapaxes(other, -1, -2))
 
 
-def gain_of(of: Moments) -> Gain:
-    """Return G(λ) over the entries of all covariances of luck, None where the means grow faster.
-
-    What does not depend on λ is worked out once.
+def gain(
+    drives: Sequence[Drive], shape: tuple[int, int], growth: float, numbers: Arithmetic
+) -> Matrix | None:
+    """Return G(λ) over covariances of luck, None where the means grow faster.
 
     Parameters
     ----------
-    of
-        The loops and their luck.
+    drives
+        The loops and the luck that drives them.
+    shape
+        How many rows and columns G has.
+    growth
+        λ, what second moments grow by in a frame.
+    numbers
+        What G is of: floats, floats with their radii, or those over cells.
     """
-    firsts = np.cumsum([0] + [sum(map(len, one.entries)) for one in of.luck]).tolist()
-    known: dict[bool, list[_Driven]] = {}
-
-    def at(growth: float, numbers: Arithmetic) -> Matrix | None:
-        exact = numbers is FLOATS
-        if exact not in known:
-            known[exact] = [_driven(of, part, d, firsts, numbers) for part in of.parts for d in part.channels]
-        found = numbers.exact(np.zeros((firsts[-1], firsts[-1])))
-        shrink, root = number_of(1 / growth, numbers), number_of(growth**-0.5, numbers)
-        for one in known[exact]:
-            matrix, driven = scaled(one.matrix, root, numbers), scaled(one.driven, shrink, numbers)
-            moments = stein(matrix, driven, numbers)
-            if moments is None:
-                return None
-            for answer in one.answers:
-                same = answer.miss.of(moments, numbers)
-                for place, entries, spread, own in answer.heard:
-                    moved = same if own is None else numbers.add(same, own.of(moments, numbers))
-                    moved = scaled(moved, spread, numbers)
-                    block = np.moveaxis(moved[..., entries[0], entries[1]], 0, -1)
-                    found[place] = numbers.add(found[place], block)
-        return found
-
-    return at
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Form:
-    """The moments E[l rᵀ] + E[r lᵀ] of forms of states times `by`, each unit of luck by itself, and `own`."""
-
-    left: Matrix
-    right: Matrix
-    by: Matrix
-    own: Matrix
-
-    def of(self, moments: Matrix, numbers: Arithmetic) -> Matrix:
-        """Return them for the moments of states (b, n, n)."""
-        found = around(self.left, moments, numbers, self.right)
-        found = numbers.add(found, np.swapaxes(found, -1, -2))
-        return numbers.add(scaled(found, self.by, numbers), self.own)
+    result = numbers.exact(np.zeros(shape))
+    shrink, root = number_of(1 / growth, numbers), number_of(growth**-0.5, numbers)
+    for drive in drives:
+        units = numbers.exact(drive.units)
+        driven = scaled(around(of_kind(drive.into, numbers), units, numbers), shrink, numbers)
+        moments = stein(scaled(of_kind(drive.matrix, numbers), root, numbers), driven, numbers)
+        if moments is None:
+            return None
+        n = moments.shape[-1]
+        for answer in drive.answers:
+            size = answer.left.shape[-1]
+            over = np.zeros((*moments.shape[:-2], size, size))
+            over[..., :n, :n] = moments
+            if size > n:
+                over[..., n:, n:] = units
+            left, right = of_kind(answer.left, numbers), of_kind(answer.right, numbers)
+            total = weighted(around(left, over[:, None], numbers, right), answer.weights, numbers)
+            total = (total + np.swapaxes(total, -1, -2)) / 2
+            if answer.spread is not None:
+                total = scaled(total, of_kind(answer.spread, numbers), numbers)
+            block = np.moveaxis(total[..., answer.entries[0], answer.entries[1]], 0, -1)
+            place = np.s_[..., answer.place, drive.place]
+            result[place] = numbers.add(result[place], block)
+    return result
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Answers:
-    """How far packets are from what is heard, `miss`, and what luck that is to channels.
+def weighted(blocks: Matrix, weights: Floats, numbers: Arithmetic) -> Matrix:
+    """Return Σ_k w_k X_k of matrices X (b, k, …), the weights w (k,) rounded.
 
-    `heard`: where each stands in G, its entries, whether it is lucky, and what the channel itself adds.
+    Parameters
+    ----------
+    blocks, weights
+        X and w.
+    numbers
+        What X are of.
     """
-
-    miss: _Form
-    heard: tuple[tuple[Any, NDArray[np.intp], Matrix, _Form | None], ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Driven:
-    """A part driven by the luck of a channel: states by `matrix` and, for each unit, `driven` (b, n, n)."""
-
-    matrix: Matrix
-    driven: Matrix
-    answers: tuple[_Answers, ...]
-
-
-def _driven(of: Moments, part: Part, d: int, firsts: Sequence[int], numbers: Arithmetic) -> _Driven:
-    """Return how a part answers to the luck of channels of kind d."""
-    kind, channel = of.luck[d], part.channels[d]
-    n = channel.matrix.shape[-1]
-    covariances, full = numbers.exact(units_of(kind)), arithmetic_of(channel.matrix)
-
-    def form(left: Matrix, right: Matrix, by: float) -> _Form:
-        left, right, factor = of_kind(left, numbers), of_kind(right, numbers), number_of(by / 2, numbers)
-        own = around(left[..., n:], covariances, numbers, right[..., n:])
-        own = scaled(numbers.add(own, np.swapaxes(own, -1, -2)), factor, numbers)
-        return _Form(left[..., :n], right[..., :n], factor, own)
-
-    # One channel drives the mean of all receivers by 1/n, and them apart by 1 − 1/n or −1/n.
-    alone = 1 / kind.receivers
-    share = kind.heard * (alone if part.apart is None else 1 - alone)
-    answers = []
-    for (site, route, slot), miss in channel.misses.items():
-        heard = []
-        for c, other in enumerate(of.luck):
-            if (other.route, other.sender) != (route, part.classes[site]):
-                continue
-            own = None
-            if c == d and part.apart is None:
-                # o oᵀ + (m oᵀ + o mᵀ)/n, of which the form has both halves
-                mixed = full.add(scaled(miss, number_of(2 * alone, full), full), channel.own[slot])
-                own = form(mixed, channel.own[slot], 1.0)
-            elif c == d:
-                own = form(miss, channel.own[slot], -2 * alone)
-            entries = np.array(other.entries[slot], np.intp).reshape(-1, 2).T
-            first = firsts[c] + sum(map(len, other.entries[:slot]))
-            place = np.s_[..., first : first + entries.shape[1], firsts[d] : firsts[d + 1]]
-            heard.append((place, entries, of_kind(other.spreads[slot], numbers), own))
-        answers.append(_Answers(form(miss, miss, share), tuple(heard)))
-    driven = around(of_kind(channel.driven, numbers), covariances, numbers)
-    return _Driven(of_kind(channel.matrix, numbers), driven, tuple(answers))
-
-
-def units_of(kind: Luck) -> Floats:
-    """Return a unit of each entry of its covariances, over the luck of all slots (b, k, k)."""
-    sizes = [spread.shape[-1] for spread in kind.spreads]
-    starts = np.cumsum([0, *sizes])
-    found = np.zeros((sum(map(len, kind.entries)), starts[-1], starts[-1]))
-    listed = [(starts[slot] + a, starts[slot] + b) for slot, own in enumerate(kind.entries) for a, b in own]
-    for number, (a, b) in enumerate(listed):
-        found[number, a, b] = found[number, b, a] = 1.0
-    return found
+    if numbers is FLOATS:
+        return np.asarray(np.einsum("k,bkij->bij", weights, blocks))
+    size = np.abs(weights)
+    result = np.einsum("k,bklij->blij", weights, blocks)
+    radius = np.einsum("k,bkij->bij", size, radius_of(blocks))
+    rounding = np.einsum("k,bklij->bij", size, np.abs(blocks)) - radius
+    radius_of(result)[...] = (radius + (WEIGHT_ROUNDINGS + len(weights)) * UNIT * rounding) * (1 + 16 * UNIT)
+    return np.asarray(result)
 
 
 def of_kind(matrix: Matrix, numbers: Arithmetic) -> Matrix:
@@ -386,33 +381,40 @@ def number_of(value: float, numbers: Arithmetic) -> Matrix:
     return np.array([value, 4 * UNIT * abs(value)]).reshape(2, 1, 1)
 
 
-def mean_square_radius(
-    driven: Sequence[Matrix], alone: Sequence[Matrix], of: Gain, *, bounded: bool = True
-) -> Enclosed:
+def mean_square_radius(of: Moments, *, bounded: bool = True) -> Enclosed:
     """Enclose what second moments grow by in a frame, for all start states.
 
     Parameters
     ----------
-    driven, alone
-        The loops of means (2, n, n), each with its radius: those that luck drives, and those that it doesn't.
     of
-        G(λ).
+        The loops and their luck.
     bounded
         Whether bounds are asked for; without them, they are the radius itself.
+
+    Raises
+    ------
+    UnservedError
+        There are too many covariances of luck.
     """
-    own, others = _growth(driven), _growth(alone)
-    if not np.isfinite(own + others):
+    if of.entries * of.states**3 > MOST_WORK:
+        raise UnservedError(
+            f"{of.entries:,} covariances of luck that drive loops of {of.states} states would take minutes: "
+            "fewer ticks at which a packet may arrive, a shorter delay, or fewer peers that differ"
+        )
+    driven, undriven = of.means
+    largest_driven, largest_undriven = _growth(driven), _growth(undriven)
+    if not np.isfinite(largest_driven + largest_undriven):
         return Enclosed(np.nan, 0.0, np.inf)
-    found, steep = _radius(of, max(own, TINY)) if driven else (None, 1.0)
-    radius = max(others, own if found is None else found)
+    root, steep = _radius(of, max(largest_driven, TINY)) if driven else (None, 1.0)
+    radius = max(largest_undriven, largest_driven if root is None else root)
     if not bounded:
         return Enclosed(radius, radius, radius)
     if not driven:
-        return Enclosed(radius, *_square(alone))
+        return Enclosed(radius, *_square(undriven))
     # Bounds on G at λ prove that the means it comes from grow by less.
-    square = _square([*driven, *alone] if found is None else alone)
+    square = _square([*driven, *undriven] if root is None else undriven)
     above, wide = np.inf, None
-    start, width = (max(square[1], TINY), NEAR) if found is None else (found, FIRST_WIDTH)
+    start, width = (max(square[1], TINY), NEAR) if root is None else (root, FIRST_WIDTH)
     while width <= LAST_WIDTH and above > start * (1 + width):
         bounds = _bounds(of, start * (1 + width))
         if bounds is not None:
@@ -421,10 +423,10 @@ def mean_square_radius(
         # What bounds say near a pole says little of farther on.
         width = min(max(8 * width, 0.0 if wide is None else wide), 64 * width)
     below, width = square[0], FIRST_WIDTH if wide is None else max(wide, FIRST_WIDTH / 8)
-    while found is not None and width <= LAST_WIDTH and below < found * (1 - width):
-        bounds = _bounds(of, found * (1 - width))
+    while root is not None and width <= LAST_WIDTH and below < root * (1 - width):
+        bounds = _bounds(of, root * (1 - width))
         if bounds is not None:
-            below = max(below, found * (1 - width) * min(bounds[0], 1.0) * (1 - 2 * UNIT))
+            below = max(below, root * (1 - width) * min(bounds[0], 1.0) * (1 - 2 * UNIT))
         width *= 8
     if not below:  # so near the growth of the means, G has no bounds
         below = _square(driven)[0]
@@ -439,21 +441,20 @@ def below_1(of: Moments) -> tuple[bool, bool]:
     driven, _ = of.means
     if not driven:
         return True, True
-    gain = gain_of(of)
-    bounds = _bounds(gain, 1.0, arithmetic_of(driven[0]))
+    bounds = _bounds(of, 1.0, arithmetic_of(driven[0]))
     proved = bounds is not None and bounds[1] < 1
-    return proved, proved or _largest(gain, 1.0) < 1
+    return proved, proved or _largest(of, 1.0) < 1
 
 
 def _growth(loops: Sequence[Matrix]) -> float:
     """Return what squares of the means grow by in floats."""
-    return max((_size(np.linalg.eigvals(value_of(one))) ** 2 for one in loops), default=0.0)
+    return max((_size(np.linalg.eigvals(value_of(loop))) ** 2 for loop in loops), default=0.0)
 
 
 def _square(loops: Sequence[Matrix]) -> tuple[float, float]:
     """Return bounds on what squares of the means grow by."""
-    found = [enclose_eigenvalues(value_of(one), radius_of(one))[1] for one in loops]
-    low, high = max((one.low for one in found), default=0.0), max((one.high for one in found), default=0.0)
+    bounds = [enclose_eigenvalues(value_of(loop), radius_of(loop))[1] for loop in loops]
+    low, high = max((one.low for one in bounds), default=0.0), max((one.high for one in bounds), default=0.0)
     return low**2 * (1 - 2 * UNIT), high**2 * (1 + 2 * UNIT)
 
 
@@ -461,74 +462,46 @@ def _size(values: NDArray[Any]) -> float:
     return float(np.abs(values).max(initial=0.0))
 
 
-def _bounds(of: Gain, growth: float, numbers: Arithmetic = RADII) -> tuple[float, float] | None:
+def _bounds(of: Moments, growth: float, numbers: Arithmetic = RADII) -> tuple[float, float] | None:
     """Return bounds on the largest eigenvalue of G(λ), None where there are none.
 
     Of G, terms fall as 1/λ or faster: where it is ρ at λ, it is 1 between λ min(ρ, 1) and λ max(ρ, 1).
     """
-    matrix = of(growth, numbers)
+    matrix = gain(of.drives, (of.entries,) * 2, growth, numbers)
     if matrix is None or not np.isfinite(matrix).all():
         return None
     matrix = hull(matrix)
     if matrix.shape[-1] == 1:
         value, off = abs(float(matrix[0, 0, 0])), float(matrix[1, 0, 0])
         return (value - off) * (1 - 4 * UNIT), (value + off) * (1 + 4 * UNIT)  # 1 + UNIT is 1 in floats
-    _, found = enclose_eigenvalues(value_of(matrix), radius_of(matrix))
-    return found.low, found.high
+    _, bounds = enclose_eigenvalues(value_of(matrix), radius_of(matrix))
+    return bounds.low, bounds.high
 
 
-def _largest(of: Gain, growth: float) -> float:
+def _largest(of: Moments, growth: float) -> float:
     """Return the largest eigenvalue of G(λ) in floats, infinite where there is none."""
     with np.errstate(all="ignore"):
-        matrix = of(growth, FLOATS)
+        matrix = gain(of.drives, (of.entries,) * 2, growth, FLOATS)
     if matrix is None or not np.isfinite(matrix).all():
         return np.inf
     return _size(matrix if len(matrix) == 1 else np.linalg.eigvals(matrix))
 
 
-def _radius(of: Gain, least: float) -> tuple[float | None, float]:
+def _radius(of: Moments, least: float) -> tuple[float | None, float]:
     """Return the λ above `least` at which the largest eigenvalue of G is 1 in floats, None if there is none.
 
-    Beside it, how steeply G falls there: d log ρ/d log λ, 1 or more. 1/G − 1 is followed, which is nearly
-    straight from −1 at the means' own growth, where G has its pole: by secants between a point on either
-    side, one that stays twice counting as much less as the other moved (Anderson and Björck, 1973).
+    Beside it, how steeply G falls there: d log ρ/d log λ, 1 or more. The root is that of 1/ρ − 1, which is
+    nearly straight from −1 at the means' own growth, where G has its pole.
     """
 
+    @cache
     def over(growth: float) -> float:
         return 1 / max(_largest(of, growth), TINY) - 1
 
-    low, at_low, known = least, -1.0, False  # of the pole, nothing is known: luck may not reach it
-    high = 1.0 if least < NEAR_ONE else least * (1 + FIRST_GAP)
-    at_high = over(high)
-    while at_high < 0:
-        low, at_low, known = high, at_high, True
-        ahead = (high - least) / max(1 + at_high, 1 / WIDER)
-        high = least + max(ahead, (high - least) * (1 + FIRST_GAP))
-        at_high = over(high)
-    best, off, steep, stayed = high, at_high, 1.0, 0
-    for step in range(STEPS):
-        if step >= BLIND and not known and off > ROUGH:
-            low = least * (1 + NEAR)
-            at_low = over(low)
-            if at_low > 0:
-                return None, 1.0
-            known = True
-        middle = low - at_low * (high - low) / (at_high - at_low)
-        if off <= CLOSE * steep or not low < middle < high:
-            break
-        found = over(middle)
-        if found < 0:
-            slope = (found - at_high) / (middle - high)
-            shrink = 1 - found / at_low
-            at_high *= (shrink if shrink > 0 else 0.5) if stayed == 1 else 1.0
-            low, at_low, known, stayed = middle, found, True, 1
-        else:
-            slope = (found - at_low) / (middle - low)
-            shrink = 1 - found / at_high
-            at_low *= (shrink if shrink > 0 else 0.5) if stayed == -1 else 1.0
-            high, at_high, stayed = middle, found, -1
-        if off > ROUGH:
-            steep = max(1.0, middle * slope)
-        if abs(found) < off:
-            best, off = middle, abs(found)
-    return (best, steep) if known or off <= ROUGH else (None, 1.0)
+    low, gap = least * (1 + NEAR), max(1 - least, 0.1 * least)
+    if over(low) > 0:
+        return None, 1.0
+    while over(high := least + gap) < 0:
+        low, gap = high, WIDER * gap
+    root = float(load_pool("scipy.optimize").brentq(over, low, high, xtol=1e-300, rtol=CLOSE))
+    return root, max(1.0, over(root * (1 + STEP)) / STEP)

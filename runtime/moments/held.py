@@ -1,11 +1,10 @@
 """A loop whose receivers go on with what they heard last: what a frame does where packets get lost.
 
-Takes: a loop of `eigen.modes`, and what its receivers hear apart from the loop's own packets.
-Gives: `Ear`, `HeldLoop`, `held_loop`; `lossy_rows`; `HeldScene`, `held_scene`.
-Guarantees: every matrix comes with the radius of its rounding, those of the sites' frames included; rigid
-motions are taken out, which no loss moves.
-Does not: say which packets get lost (see `worst`, `almost_sure`); serve delays that vary, or receivers that
-take no difference for a lost packet.
+Takes: a scene whose links lose packets, and a loop of its peers.
+Gives: `Ear`, `HeldLoop`, `held_loop`; `lossy_rows`; `HeldScene`, `held_scene`; `Chance`, `every_channel`.
+Guarantees: every matrix comes with the radius of its rounding, those of the sites' frames included.
+Does not: say which packets get lost (see `worst`, `almost_sure`, `patterns`, `bursts`); serve delays that
+vary, or receivers that take no difference for a lost packet.
 
 One packet a frame is sent on each way. What a receiver goes on with once packet k is sent, is either its
 number q or what it went on with before,
@@ -27,23 +26,17 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, lifted_groups, timed
 from apc.compiler.compiled import CompiledSystem, Link
-from apc.eigen.closing import (
-    Feedback,
-    Loop,
-    Packet,
-    StateLayout,
-    bounded_weight,
-    close,
-    feedback_of,
-    lay_out_loop,
-)
+from apc.eigen.closing import Feedback, Loop, bounded_weight, close, feedback_of, lay_out_loop
+from apc.eigen.modes import dense_loop
 from apc.eigen.peer_group import MOST_STATES, PeerGroup
-from apc.eigen.relative import relative_coordinates
-from apc.eigen.rigid import find_rigid_modes
-from apc.frame.exchange import Exchange
+from apc.eigen.relative import Relative, relative_coordinates, relative_rows, with_doubt
 from apc.frame.parameters import resolve
-from apc.frame.radius import RADII, with_radius
+from apc.frame.radius import RADII
 from apc.frame.schedule import Heard, Schedule
+from apc.moments.crowd import Hearing, standing_motions
+from apc.moments.mean_loops import standing_state
+from apc.moments.unserved import UnservedError
+from apc.network.channel import ChannelLaw, channel_law
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -63,15 +56,19 @@ class Ear:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldLoop:
-    """F (2, n, n), G (2, n, ears), S and E (2, ears that have a sender, n) in relative coordinates.
+    """F (2, n, n), G (2, n, ears), S and E (2, ears that have a sender, n).
 
-    The ears that come from outside are the last. `step` is how far what is sent is from what was held, S − E.
+    The ears that come from outside are the last. `at` are coordinates relative to motions that nothing holds
+    back, `offsets` (sites + 1,) say where each site's states start, `places` which ones each ear's are.
     """
 
     f: Matrix
     g: Matrix
     s: Matrix
     e: Matrix
+    at: Relative
+    offsets: tuple[int, ...]
+    places: tuple[range, ...]
 
     @property
     def step(self) -> Matrix:
@@ -83,18 +80,23 @@ class HeldLoop:
         heard = self.e if lost else self.s
         return RADII.add(self.f, RADII.multiply(self.g[..., : heard.shape[-2]], heard))
 
+    def relative(self) -> HeldLoop:
+        """Return the loop over its relative coordinates."""
+        f, g = (relative_rows(matrix, with_doubt(self.at), RADII) for matrix in (self.f, self.g))
+        rest = self.at.rest
+        return replace(self, f=f[..., rest], g=g, s=self.s[..., rest], e=self.e[..., rest])
+
 
 @dataclass(frozen=True, slots=True)
 class HeldScene:
     """A scene whose receivers hold what they heard last; `lossy` are the links that lose packets."""
 
-    groups: tuple[PeerGroup, ...]
-    exchange: Exchange
+    told: Hearing
     lossy: frozenset[str]
 
 
-def held_scene(system: CompiledSystem, prepared: Prepared) -> HeldScene | str:
-    """Return a scene whose receivers hold what they heard last, or say why they don't simply do so.
+def held_scene(system: CompiledSystem, prepared: Prepared) -> HeldScene:
+    """Return a scene whose receivers hold what they heard last.
 
     Parameters
     ----------
@@ -107,10 +109,10 @@ def held_scene(system: CompiledSystem, prepared: Prepared) -> HeldScene | str:
     at = timed(system, prepared, numbers)
     lossy = [link for link in system.links if link.channel is not None]
     if not lossy:
-        return "every link is reliable"
+        raise UnservedError("every link is reliable")
     for link in lossy:
         if why := _unheld(link, at.schedules):
-            return why
+            raise UnservedError(why)
     different = {
         (group.kind, vector.tobytes())
         for group, vectors in zip(system.groups, numbers.parameters, strict=True)
@@ -118,9 +120,12 @@ def held_scene(system: CompiledSystem, prepared: Prepared) -> HeldScene | str:
     }
     states = sum(len(system.kinds[kind].states) for kind, _ in different)
     if states > MOST_STATES:
-        return f"{len(different):,} different peers have {states:,} states, and {MOST_STATES:,} are the most"
+        what = f"{len(different):,} different peers have {states:,} states"
+        raise UnservedError(f"{what}, and {MOST_STATES:,} are the most")
     groups, exchange = lifted_groups(system, prepared=at)
-    return HeldScene(groups, exchange, frozenset(link.name for link in lossy))
+    schedule = at.schedules[0]
+    told = Hearing(groups, exchange, {}, at.timings, schedule.frame_s, schedule.quantum, strictly=False)
+    return HeldScene(told, frozenset(link.name for link in lossy))
 
 
 def _unheld(link: Link, schedules: Sequence[Schedule]) -> str:
@@ -152,8 +157,8 @@ def lossy_rows(group: PeerGroup, lossy: frozenset[str]) -> list[tuple[int, Heard
     ]
 
 
-def held_loop(loop: Loop, ears: Sequence[Ear], lossy: frozenset[str]) -> HeldLoop | None:
-    """Close a loop with what its ears hold, None where a packet depends on another one of its frame.
+def held_loop(loop: Loop, ears: Sequence[Ear], lossy: frozenset[str]) -> HeldLoop:
+    """Close a loop with what its ears hold.
 
     Parameters
     ----------
@@ -169,17 +174,17 @@ def held_loop(loop: Loop, ears: Sequence[Ear], lossy: frozenset[str]) -> HeldLoo
     The state holds the loop's own, without packets of lossy links, and then what each ear went on with, the
     packet before first, for as long as it is heard. Behind the state stand what the ears hear anew.
     """
-    own = _deaf(loop, lossy)
-    layout = lay_out_loop(own)
+    deaf = _deaf(loop, lossy)
+    layout = lay_out_loop(deaf)
     depths = [
         max(1, *(loop.sites[site].schedule.heard[line].lag for site, line in ear.weights)) for ear in ears
     ]
     starts = np.cumsum([len(layout.names), *depths]).tolist()
     states, n = starts[-1], starts[0]
     feedback = []
-    for g, one in enumerate(feedback_of(own, layout)):
-        before = np.zeros((2, one.before.shape[-2], states + len(ears)))
-        before[..., :n] = one.before
+    for g, heard_there in enumerate(feedback_of(deaf, layout)):
+        before = np.zeros((2, heard_there.before.shape[-2], states + len(ears)))
+        before[..., :n] = heard_there.before
         for place, ear in enumerate(ears):
             for (site, line), weight in ear.weights.items():
                 if site == g:
@@ -187,13 +192,13 @@ def held_loop(loop: Loop, ears: Sequence[Ear], lossy: frozenset[str]) -> HeldLoo
                     at = states + place if heard.lag == 0 else starts[place] + heard.lag - 1
                     doubt = 0.0 if ear.sender is None else loop.doubts.get(heard.way, 0.0)
                     before[:, line, at] = bounded_weight(weight, doubt)
-        feedback.append(Feedback(one.now, before))
-    closed = close([group.lifted.bounded for group in own.sites], feedback, layout, numbers=RADII)
-    firsts = np.cumsum([0] + [len(group.schedule.sent) for group in own.sites]).tolist()
+        feedback.append(Feedback(heard_there.now, before))
+    closed = close([group.lifted.bounded for group in deaf.sites], feedback, layout, numbers=RADII)
+    firsts = np.cumsum([0] + [len(group.schedule.sent) for group in deaf.sites]).tolist()
     senders = [(ear.sender, ear.row) for ear in ears if ear.sender is not None]
     sent = closed.sent[:, [firsts[sender] + row for sender, row in senders]]
     if sent[..., states:].any():
-        return None
+        raise UnservedError("a packet follows from another one of its frame")
     f, anew = np.zeros((2, states, states)), np.zeros((2, states, len(ears)))
     f[:, :n], anew[:, :n] = closed.matrix[..., :states], closed.matrix[..., states:]
     for place, (start, depth) in enumerate(zip(starts, depths, strict=False)):
@@ -202,23 +207,26 @@ def held_loop(loop: Loop, ears: Sequence[Ear], lossy: frozenset[str]) -> HeldLoo
             f[0, start + lag, start + lag - 1] = 1.0
     before = np.zeros((2, len(senders), states))
     before[0, np.arange(len(senders)), starts[: len(senders)]] = 1.0
-    at = relative_coordinates(_standing(loop, lossy, layout, senders, starts))
-    weights = with_radius(at.weights, at.doubt)
-
-    def apart(matrix: Matrix) -> Matrix:
-        if not len(at.held):
-            return matrix
-        return RADII.subtract(matrix[:, at.rest], RADII.multiply(weights, matrix[:, at.held]))
-
-    return HeldLoop(apart(f)[..., at.rest], apart(anew), sent[..., at.rest], before[..., at.rest])
+    held = HeldLoop(
+        *(f, anew, sent[..., :states], before, relative_coordinates(np.zeros((states, 0)))),
+        offsets=(*layout.offsets, n),
+        places=tuple(map(range, starts, starts[1:])),
+    )
+    basis = standing_state(held.frame(lost=False), standing_motions(loop), loop, [*layout.offsets, states])
+    return replace(held, at=relative_coordinates(basis))
 
 
 def _deaf(loop: Loop, lossy: frozenset[str]) -> Loop:
-    """Return a loop in which nothing is heard of some links, nor kept of what they carry."""
+    """Return a loop in which nothing is heard of some links, and no packets of theirs are states."""
     nothing = Fraction(0)
+
+    def without(schedule: Schedule) -> Schedule:
+        depths = zip(schedule.sent, schedule.depths, strict=True)
+        return replace(schedule, depths=tuple(0 if sent.link in lossy else depth for sent, depth in depths))
+
     return replace(
         loop,
-        sites=tuple(_kept(site, dict.fromkeys(lossy, (0, 0))) for site in loop.sites),
+        sites=tuple(replace(site, schedule=without(site.schedule)) for site in loop.sites),
         coupling={
             way: tuple((nothing,) * len(row) for row in rows) if way.link in lossy else rows
             for way, rows in loop.coupling.items()
@@ -227,34 +235,55 @@ def _deaf(loop: Loop, lossy: frozenset[str]) -> Loop:
     )
 
 
-def _kept(group: PeerGroup, most: Mapping[str, tuple[int, int]]) -> PeerGroup:
-    """Return a site that keeps packets of some links for at least, and at most, so many frames."""
-    schedule = group.schedule
-    depths = tuple(
-        max(least, min(depth, limit))
-        for sent, depth in zip(schedule.sent, schedule.depths, strict=True)
-        for least, limit in (most.get(sent.link, (0, depth)),)
-    )
-    return replace(group, schedule=replace(schedule, depths=depths))
+@dataclass(frozen=True, slots=True)
+class Chance:
+    """By which `law` the ears `ears` of the way to `receiver` from `sender` lose packets, all together."""
+
+    law: ChannelLaw
+    receiver: int
+    sender: int
+    ears: tuple[int, ...]
 
 
-def _standing(
-    loop: Loop,
-    lossy: frozenset[str],
-    layout: StateLayout,
-    senders: Sequence[tuple[int, int]],
-    starts: Sequence[int],
-) -> Floats:
-    """Return the rigid motions over the state of a held loop: what stands still is held as it was sent."""
-    sites = tuple(_kept(site, dict.fromkeys(lossy, (1, 1))) for site in loop.sites)
-    whole = replace(loop, sites=sites)
-    found, places = find_rigid_modes(whole, with_drifts=False).directions, lay_out_loop(whole)
-    basis = np.zeros((starts[-1], found.shape[1]))
-    for to, from_, group in zip(layout.offsets, places.offsets, sites, strict=True):
-        size = len(group.lifted.z_names)
-        basis[to : to + size] = found[from_ : from_ + size]
-    for packet, place in layout.places.items():
-        basis[place] = found[places.places[packet]]
-    for (sender, row), start, end in zip(senders, starts, starts[1:], strict=False):
-        basis[start:end] = found[places.places[Packet(sender, row, 1)]]
-    return basis
+def every_channel(
+    system: CompiledSystem, scene: HeldScene, most: int | None = None
+) -> tuple[HeldLoop, list[Chance]]:
+    """Put a whole scene in one loop, every peer and every channel by itself.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with the numbers to analyse.
+    scene
+        Its peers.
+    most
+        How many states are the most.
+    """
+    peers = scene.told.exchange.peers
+    if most is not None and peers > most:
+        raise UnservedError(f"{peers:,} peers don't fit in one matrix of {most} states")
+    loop = dense_loop(scene.told.groups, scene.told.exchange)
+    ears: list[Ear] = []
+    of_way: dict[tuple[str, int, int], list[int]] = {}
+    for g, receiver in enumerate(loop.sites):
+        rows = lossy_rows(receiver, scene.lossy)
+        for h, sender in enumerate(loop.sites):
+            for row, sent in enumerate(sender.schedule.sent):
+                weights = {
+                    (g, line): loop.coupling[heard.way][g][h]
+                    for line, heard in rows
+                    if heard.sent == sent and loop.coupling[heard.way][g][h]
+                }
+                if weights:
+                    of_way.setdefault((sent.link, g, h), []).append(len(ears))
+                    ears.append(Ear(weights, h, row))
+    states = sum(len(site.lifted.z_names) for site in loop.sites) + len(ears)
+    if most is not None and states > most:
+        what = f"{peers:,} peers and their channels have {states:,} states"
+        raise UnservedError(f"{what}, and {most} are the most")
+    held = held_loop(loop, ears, scene.lossy)
+    timings = resolve(system).timings
+    laws = {
+        link.name: channel_law(system, link, timings[link.delay]) for link in system.links if link.channel
+    }
+    return held, [Chance(laws[link], g, h, tuple(places)) for (link, g, h), places in of_way.items()]

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.closing import Feedback, Loop, StateLayout, bounded_weight, close
 from apc.eigen.peer_group import PeerGroup
-from apc.eigen.relative import Relative, relative_coordinates
+from apc.eigen.relative import Relative, relative_coordinates, relative_rows, with_doubt
 from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
@@ -42,19 +42,38 @@ Matrix = NDArray[Any]
 # The packets of one link with one delay: what luck is drawn for.
 Route = tuple[str, str]
 
-
 # What stands still is sent as a small fraction of how far it stands aside: a gear's ratio, say.
 FINEST = 10**6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Remembered:
-    """What is remembered of a link's packets with one delay: of each of its `channels` the same."""
+    """What is remembered of a link's packets with one delay: of each of its `channels` the same.
+
+    `after` holds each value once all packets are sent, over [values kept, packets sent, luck]; `misses`, for
+    each slot, how far its uncertain values are before its packet from what that holds.
+    """
 
     route: Route
     memory: Memory
     channels: tuple[str, ...]
-    followed: Followed
+    after: Matrix
+    misses: tuple[Matrix, ...]
+
+    @property
+    def sizes(self) -> list[int]:
+        """How many values each slot's packet may replace by chance."""
+        return [len(self.memory.uncertain(slot)) for slot in range(self.memory.slots)]
+
+    def memorized(self, rows: Matrix) -> Matrix:
+        """Return rows of `after` or `misses` over [values kept, luck], for each of the channels."""
+        count, first = self.memory.count, self.memory.count + self.memory.slots
+        columns = [*range(count), *range(first, first + sum(self.sizes))]
+        inner = rows[..., columns]
+        many = np.kron(np.eye(len(self.channels)), inner)
+        # Each channel's values first, then their luck.
+        place = np.arange(many.shape[-1]).reshape(len(self.channels), -1)
+        return np.asarray(many[..., [*place[:, :count].ravel(), *place[:, count:].ravel()]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,15 +89,14 @@ class Listened:
 class Channel:
     """What the luck of a channel does to a loop.
 
-    `matrix` (2, n + m, n + m) moves the loop's n states and the channel's own m, `driven` (2, n + m, k) is
-    what its luck ξ, slot by slot, does to them. `misses` says how far what is uncertain of each site's
-    packets, by site, route and slot, is from what is sent, over these states and ξ (2, k_slot, n + m + k);
-    `own`, of each slot, what the channel itself adds to that.
+    `matrix` (2, n + m, n + m) moves the loop's n states and the channel's own m, and `into` (2, n + m, k) its
+    luck ξ, which is drawn as a frame begins. `misses` says how far what is uncertain of each site's packets,
+    by site, route and slot, is from what is sent, over these states and ξ; `own`, of each slot, what the
+    channel itself adds to that.
     """
 
-    of: Listened
     matrix: Matrix
-    driven: Matrix
+    into: Matrix
     misses: Mapping[tuple[int, Route, int], Matrix]
     own: tuple[Matrix, ...]
 
@@ -91,26 +109,10 @@ class MeanLoop:
     over the loop's own states (2, k_slot, n).
     """
 
-    name: str
-    multiplicity: int
     matrix: Matrix
     at: Relative
     offsets: tuple[int, ...]
     misses: Mapping[tuple[int, Route, int], Matrix]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Followed:
-    """One number a channel remembers, through a frame: over [kept values, packets sent] and over its luck.
-
-    `whole` and `luck` are each value's once all packets are sent; `before` and `luck_before` those of each
-    slot's uncertain values before its packet.
-    """
-
-    whole: Matrix
-    luck: Matrix
-    before: tuple[Matrix, ...]
-    luck_before: tuple[Matrix, ...]
 
 
 def scaled(matrix: Matrix, by: Matrix, numbers: Arithmetic) -> Matrix:
@@ -127,30 +129,28 @@ def scaled(matrix: Matrix, by: Matrix, numbers: Arithmetic) -> Matrix:
 
 def remember(route: Route, memory: Memory, channels: Sequence[str]) -> Remembered:
     """Follow what is remembered on a route through a frame."""
-    n_e, slots = memory.chances.shape
-    sizes, layers = [len(memory.uncertain(slot)) for slot in range(slots)], 2 + len(memory.moves)
-    known, luck = np.zeros((layers, n_e, memory.count + slots)), np.zeros((layers, n_e, sum(sizes)))
-    known[0, np.arange(n_e), memory.old] = 1.0
-    before, luck_before = [], []
-    first = 0
-    for slot in range(slots):
+    count, slots = memory.count, memory.slots
+    sizes = [len(memory.uncertain(slot)) for slot in range(slots)]
+    after = np.zeros((2 + len(memory.moves), len(memory.old), count + slots + sum(sizes)))
+    after[0, np.arange(len(memory.old)), memory.old] = 1.0
+    misses = []
+    first = count + slots
+    for slot, size in enumerate(sizes):
         uncertain, certain = memory.uncertain(slot), memory.chances[:, slot] == 1
-        before.append(known[:, uncertain])
-        luck_before.append(luck[:, uncertain])
-        known[:, certain], luck[:, certain] = 0.0, 0.0
-        known[0, certain, memory.count + slot] = 1.0
+        misses.append(-after[:, uncertain])
+        misses[slot][0, :, count + slot] = 1.0
+        misses[slot][1] *= -1
+        after[:, certain] = 0.0
+        after[0, certain, count + slot] = 1.0
         chance = memory.chance(slot)
         missed = -chance[..., None]
         missed[0] += 1
         missed[1] = chance[1, :, None] + UNIT
-        known[:, uncertain] = scaled(known[:, uncertain], missed, RADII)
-        luck[:, uncertain] = scaled(luck[:, uncertain], missed, RADII)
-        known[:, uncertain, memory.count + slot] = chance
-        luck[0, uncertain, first + np.arange(len(uncertain))] = 1.0
-        first += len(uncertain)
-    return Remembered(
-        *(route, memory, tuple(channels)), Followed(known, luck, tuple(before), tuple(luck_before))
-    )
+        after[:, uncertain] = scaled(after[:, uncertain], missed, RADII)
+        after[:, uncertain, count + slot] = chance
+        after[0, uncertain, first + np.arange(size)] = 1.0
+        first += size
+    return Remembered(route, memory, tuple(channels), after, tuple(misses))
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,10 +162,14 @@ class Site:
     """
 
     map: FrameMap
-    names: tuple[str, ...]
     values: Mapping[tuple[Route, str, int], int]
     misses: Mapping[tuple[Route, int], slice]
     sent: Mapping[Sent, int]
+
+    @property
+    def states(self) -> int:
+        """How many states it has."""
+        return int(self.map.p.shape[-1])
 
 
 def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: FrameMap | None = None) -> Site:
@@ -204,7 +208,7 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: Frame
     misses: dict[tuple[Route, int], slice] = {}
     count = 0
     for place, (one, channel) in enumerate(numbers):
-        whole = over_all(one.followed.whole, place)
+        whole = over_all(one.after, place)
         values |= {(one.route, channel, value): count + value for value in range(len(one.memory.old))}
         rows.append(whole)
         kept.append(whole[:, one.memory.kept])
@@ -212,14 +216,11 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: Frame
     for one in dict.fromkeys(one for one, _ in numbers):
         for slot in range(one.memory.slots):
             start = count
-            for place, (other, channel) in enumerate(numbers):
+            for place, (other, _) in enumerate(numbers):
                 if other is not one:
                     continue
-                held = over_all(one.followed.before[slot], place)
-                packet = np.zeros_like(held)
-                packet[0, :, n_m + row_of[Sent(one.route[0], channel, slot)]] = 1.0
-                rows.append(arithmetic_of(held).subtract(packet, held))
-                count += held.shape[-2]
+                rows.append(over_all(one.misses[slot], place))
+                count += rows[-1].shape[-2]
             misses[one.route, slot] = slice(start, count)
     plainly = np.zeros((2, n_s, n_m + n_s))
     plainly[0, :, n_m:] = np.eye(n_s)
@@ -235,57 +236,8 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: Frame
     q = np.concatenate([plain.q, multiply(keeping[..., n_m:], plain.d)], axis=-2)
     s = np.concatenate([multiply(listed[..., n_m:], plain.s), listed[..., :n_m]], axis=-1)
     d = multiply(listed[..., n_m:], plain.d)
-    names = [
-        f"{channel} heard" for (_, channel), many in zip(numbers, counts, strict=True) for _ in range(many)
-    ]
     sent: dict[Sent, int] = {one: count + row for one, row in row_of.items()}
-    return Site(FrameMap(p, q, s, d), (*group.lifted.z_names, *names), values, misses, sent)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Apart:
-    """What a channel's memory is apart from its mean, over [δ, ξ].
-
-    `values` are by number and value, `kept` those of the next frame; `misses` are of each slot.
-    """
-
-    values: Matrix
-    kept: Matrix
-    misses: tuple[Matrix, ...]
-
-
-def _apart(one: Remembered) -> _Apart:
-    """Follow what a channel remembers apart from its mean through a frame."""
-    memory, count = one.memory, len(one.channels)
-    sizes = [len(memory.uncertain(slot)) for slot in range(memory.slots)]
-    starts, lucks = np.cumsum([0, *sizes]), np.cumsum([0, *sizes]) * count
-    states = memory.count * count
-
-    def over_all(block: Matrix, luck: Matrix, number: int) -> Matrix:
-        found = np.zeros((len(block), block.shape[-2], states + lucks[-1]))
-        found[..., number * memory.count : (number + 1) * memory.count] = block[..., : memory.count]
-        for slot, size in enumerate(sizes):
-            first = states + lucks[slot] + number * size
-            found[..., first : first + size] = luck[..., starts[slot] : starts[slot + 1]]
-        return found
-
-    followed = one.followed
-    values = [over_all(followed.whole, followed.luck, number) for number in range(count)]
-    misses = [
-        np.concatenate([over_all(before, luck, number) for number in range(count)], axis=-2)
-        for before, luck in zip(followed.before, followed.luck_before, strict=True)
-    ]
-    return _Apart(
-        np.concatenate(values, axis=-2),
-        np.concatenate([own[:, memory.kept] for own in values], axis=-2),
-        tuple(_negative(rows) for rows in misses),
-    )
-
-
-def _negative(rows: Matrix) -> Matrix:
-    found = -rows
-    radius_of(found)[...] = radius_of(rows)
-    return found
+    return Site(FrameMap(p, q, s, d), values, misses, sent)
 
 
 def mean_loop(
@@ -316,11 +268,11 @@ def mean_loop(
     """
     of_route = {one.route: one for one in remembered}
     sites = [with_memory(group, remembered, frames[group.name] if frames else None) for group in loop.sites]
-    offsets = np.cumsum([0] + [len(one.names) for one in sites]).tolist()
+    offsets = np.cumsum([0] + [one.states for one in sites]).tolist()
     starts = np.cumsum([0] + [one.map.s.shape[-2] for one in sites]).tolist()
-    layout = StateLayout(tuple(offsets[:-1]), tuple(name for one in sites for name in one.names), {})
-    apart = [_apart(of_route[one.route]) for one in listened]
-    firsts = np.cumsum([offsets[-1]] + [one.values.shape[-1] for one in apart]).tolist()
+    layout = StateLayout(tuple(offsets[:-1]), ("",) * offsets[-1], {})
+    values = [of_route[one.route].memorized(of_route[one.route].after) for one in listened]
+    firsts = np.cumsum([offsets[-1]] + [one.shape[-1] for one in values]).tolist()
     feedback, like, numbers = list[Feedback](), sites[0].map.p, arithmetic_of(sites[0].map.p)
     for g, rows in enumerate(heard):
         now, before = (np.zeros((len(like), len(rows), many)) for many in (starts[-1], firsts[-1]))
@@ -334,20 +286,16 @@ def mean_loop(
                     place = starts[h] + sites[h].values[one.route, row.channel, value]
                     now[:2, line, place] = bounded_weight(weight, loop.doubts.get(row.way, 0.0))
             place = one.channels.index(row.channel) * len(one.memory.old) + value
-            for channel, own, first in zip(listened, apart, firsts, strict=False):
+            for channel, own, first in zip(listened, values, firsts, strict=False):
                 if channel.site == g and channel.route == one.route and channel.weights.get(row.way):
                     by = np.array(bounded_weight(channel.weights[row.way], 0.0)).reshape(2, 1, 1)
-                    span = slice(first, first + own.values.shape[-1])
-                    weighed = scaled(own.values[:, place, None], by, RADII)
-                    before[:, line, span] = over_as_many(weighed, like)[:, 0]
+                    weighed = scaled(own[:, place, None], by, RADII)
+                    before[:, line, first : first + own.shape[-1]] = over_as_many(weighed, like)[:, 0]
         feedback.append(Feedback(now, before))
     closed = close([one.map for one in sites], feedback, layout, numbers=numbers)
     at = relative_coordinates(standing_state(closed.matrix[..., : offsets[-1]], standing, loop, offsets))
     rest, n = at.rest, len(at.rest)
-    moved = closed.matrix[:, rest]
-    if len(at.held):
-        weights = over_as_many(with_radius(at.weights, at.doubt), like)
-        moved = numbers.subtract(moved, numbers.multiply(weights, closed.matrix[:, at.held]))
+    moved = relative_rows(closed.matrix, with_doubt(at, numbers), numbers)
 
     def missed(columns: NDArray[np.intp]) -> dict[tuple[int, Route, int], Matrix]:
         return {
@@ -356,19 +304,21 @@ def mean_loop(
             for which, rows in site.misses.items()
         }
 
-    found = []
-    for channel, own, first, last in zip(listened, apart, firsts, firsts[1:], strict=False):
-        states, kept = len(own.kept[0]), over_as_many(own.kept, like)
-        matrix = np.zeros((len(like), n + states, n + states))
-        matrix[:, :n, :n], matrix[:, :n, n:] = moved[..., rest], moved[..., first : first + states]
-        matrix[:, n:, n:] = kept[..., :states]
-        driven = np.concatenate([moved[..., first + states : last], kept[..., states:]], axis=-2)
-        misses = missed(np.concatenate([rest, np.arange(first, last)]))
-        within = [over_as_many(rows, like) for rows in own.misses]
-        within = [np.concatenate([np.zeros((*rows.shape[:-1], n)), rows], axis=-1) for rows in within]
-        found.append(Channel(channel, matrix, driven, misses, tuple(within)))
-    mean = MeanLoop(loop.name, loop.multiplicity, moved[..., rest], at, tuple(offsets), missed(rest))
-    return mean, found
+    channels = []
+    for listen, own, first, last in zip(listened, values, firsts, firsts[1:], strict=False):
+        one = of_route[listen.route]
+        kept = [
+            number * len(one.memory.old) + e for number in range(len(one.channels)) for e in one.memory.kept
+        ]
+        columns = np.concatenate([rest, np.arange(first, last)])
+        states = n + len(kept)
+        matrix = np.zeros((len(like), states, len(columns)))
+        matrix[:, :n] = moved[..., columns]
+        matrix[:, n:, n:] = over_as_many(own[:, kept], like)
+        memorized = [over_as_many(one.memorized(miss), like) for miss in one.misses]
+        within = [np.concatenate([np.zeros((*miss.shape[:-1], n)), miss], axis=-1) for miss in memorized]
+        channels.append(Channel(matrix[..., :states], matrix[..., states:], missed(columns), tuple(within)))
+    return MeanLoop(moved[..., rest], at, tuple(offsets), missed(rest)), channels
 
 
 def standing_state(matrix: Matrix, standing: Floats, loop: Loop, offsets: Sequence[int]) -> Floats:

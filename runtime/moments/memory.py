@@ -17,7 +17,6 @@ Ticks of which all packets sent so far are equally likely to be heard, and toget
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -36,9 +35,6 @@ SAME_CHANCE = 1e-15
 
 # Roundings of a probability, relative to 1: those of its law's numbers and of erfc or a power.
 CHANCE_ROUNDINGS = 8
-
-# Descriptions that are remembered.
-LATELY = 64
 
 # Of a quotient of times by a jitter, which is a float: the latest packets of a table arrive all at once.
 ROUNDED = 4e-16
@@ -154,7 +150,7 @@ def memory_of(
     strictly: bool = False,
     lost: tuple[float, ...] = (0.0,),
 ) -> Memory:
-    """Describe what ticks hear of one sender; what was described lately is remembered.
+    """Describe what ticks hear of one sender.
 
     Parameters
     ----------
@@ -171,21 +167,6 @@ def memory_of(
         it changes from the middle to the upper side of each.
     """
     assert law.trace is None, "recorded delays leave nothing to chance"
-    numbers = law.p, law.r, law.one_minus_h, law.one_minus_k, law.delay, law.jitter, law.distribution
-    return _memory_of(numbers, delay, tuple(sent), tuple(ticks.items()), frame, strictly, lost)
-
-
-@functools.lru_cache(maxsize=LATELY)
-def _memory_of(
-    numbers: tuple[float, float, float, float, float, float, str],
-    delay: Fraction,
-    sent: tuple[Fraction, ...],
-    told: tuple[tuple[tuple[str, int], Fraction], ...],
-    frame: Fraction,
-    strictly: bool,
-    lost: tuple[float, ...],
-) -> Memory:
-    law, ticks = ChannelLaw(*numbers, None), dict(told)
     ahead = math.ceil(max(Fraction(law.longest), delay) / frame) + 2
     unit = math.lcm(*(one.denominator for one in (frame, *sent, *ticks.values())))
     length, starts = int(frame * unit), [int(one * unit) for one in reversed(sent)]

@@ -9,9 +9,8 @@ Does not: look at the nominal network (see `analysis`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import partial
 
 import numpy as np
 
@@ -21,15 +20,23 @@ from apc.compiler.multiples import common_multiple
 from apc.finite_equations import finite_equations
 from apc.frame.exchange import arcs
 from apc.frame.parameters import resolve
-from apc.moments.almost_sure import AlmostSure, almost_sure, unplayed
-from apc.moments.bursts import tagged_radius
-from apc.moments.crowd import crowd
-from apc.moments.errors import Told, crowd_error, pattern_error, standing_error, tagged_error
-from apc.moments.gains import gain_of, mean_square_radius, too_much
+from apc.moments.almost_sure import AlmostSure, almost_sure
+from apc.moments.bursts import affine, tagged_error, tagged_radius
+from apc.moments.crowd import Hearing, crowd, hearing, peer_classes
+from apc.moments.errors import forced, moments_error
+from apc.moments.gains import Moments, mean_square_radius
+from apc.moments.held import every_channel, held_scene
 from apc.moments.memory import is_memoryless
-from apc.moments.patterns import MOST_CHANNELS, pattern_radius, patterns
+from apc.moments.patterns import (
+    MOST_CHANNELS,
+    held_patterns,
+    pattern_error,
+    pattern_radius,
+    stand_in_patterns,
+)
 from apc.moments.stand_in import stand_in
 from apc.moments.traces import trace_radius
+from apc.moments.unserved import UnservedError
 from apc.moments.worst import LossesInARow, worst_case
 from apc.network.channel import LATEST, ChannelLaw, channel_law
 from apc.result import Result
@@ -46,6 +53,7 @@ UNPROVED = "not proved: the radius is that of an iteration in floats"
 
 # Peers whose bursts are followed with all tags, and with so many at most; the orders then compared.
 EXACTLY_TAGGED, MOST_TAGGED, ORDERS = 4, 8, (2, 3)
+ESTIMATE = f"an estimate: moments of at most {ORDERS[1]} channels' states together; with {ORDERS[0]}"
 
 # Peers of which any number may be heard, one by one, where values stand in.
 ENUMERATED = 4
@@ -59,6 +67,9 @@ QUICK = 200_000
 
 # How many times what two estimates differ by counts as their error; what bounds may be apart at most.
 DOUBTS, LOOSE = 10, 1e-9
+
+# How near to 1 a growth leaves the digits of a root mean square error to rounding.
+DOUBTFUL = 1e-9
 
 # How much earlier than its nominal delay a jitter of 1 can make a packet.
 EARLIEST = {"uniform": 1.0, "normal": LATEST["normal"], "pareto": 2 / 3}
@@ -109,7 +120,7 @@ class Growth:
     note: str = ""
     proved: bool = False
     quick: bool = False
-    errors: Callable[[], Told] | None = None
+    errors: Callable[[], tuple[float, str]] | None = None
 
     @property
     def stable(self) -> bool | None:
@@ -139,89 +150,120 @@ def growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) 
     bounded
         Whether bounds are asked for; without them, they may be the radius itself.
     """
+    try:
+        return _growth(system, prepared, bounded)
+    except UnservedError as why:
+        return Growth(np.nan, 0.0, np.inf, False, str(why))
+
+
+def _growth(system: CompiledSystem, prepared: Prepared, bounded: bool) -> Growth:
+    """Return `growth`, or raise why there is none."""
     lossy = unreliable(system)
-    why = _unserved(system, lossy)
-    if why:
-        return Growth(np.nan, 0.0, np.inf, False, why)
+    if why := _unserved(system, lossy):
+        raise UnservedError(why)
     if any(law.trace is not None for _, law in lossy):
-        found = trace_radius(system, prepared)
-        if isinstance(found, str):
-            return Growth(np.nan, 0.0, np.inf, False, found)
-        unserved = partial(Told, None, "it is not worked out over recorded delays")
-        low, high = found.low**2 * (1 - ROUNDED), found.high**2 * (1 + ROUNDED)
-        if low > 1 or high < 1 or high - low < LOOSE:
-            return Growth(min(max(found.radius**2, low), high), low, high, True, proved=True, errors=unserved)
-        doubt = max(DOUBTS * 2 * found.radius * found.doubt, LOOSE)
-        note = f"an estimate: bounds on the roundings of {found.frames:,} frames leave it open"
-        radius = found.radius**2
-        return Growth(radius, max(radius - doubt, 0.0), radius + doubt, False, note=note, errors=unserved)
-    holding = {link.channel.on_loss == "hold" for link, _ in lossy if link.channel is not None}
-    if all(is_memoryless(law) for _, law in lossy):
-        if holding == {True} or not any(law.mean_loss for _, law in lossy):
-            of = crowd(system, prepared)
-            entries = sum(len(listed) for one in of.luck for listed in one.entries)
-            states = [channel.matrix.shape[-1] for part in of.parts for channel in part.channels.values()]
-            if why := too_much(entries, max(states, default=0)):
-                return Growth(np.nan, 0.0, np.inf, False, why)
-            inner = mean_square_radius(*of.means, gain_of(of), bounded=bounded)
-            errors = partial(crowd_error, system, prepared)
-            quick = entries * max(states, default=0) ** 3 <= QUICK
-            return Growth(inner.radius, inner.low, inner.high, True, proved=True, quick=quick, errors=errors)
-        first, why = _due(system, lossy)
-        if not why and len(system.links) == 1 and not system.links[0].delays:
-            closed = stand_in(system, prepared, first)
-            if isinstance(closed, str):
-                return Growth(np.nan, 0.0, np.inf, False, closed)
-            means, luck = closed
-            inner = mean_square_radius(means, [], luck, bounded=bounded)
-            errors = partial(standing_error, system, prepared, first)
-            every = system.peers <= ENUMERATED  # of more, a quadrature's nodes are rounded
-            return Growth(inner.radius, inner.low, inner.high, True, proved=every, quick=every, errors=errors)
-    else:
-        first, why = _due(system, lossy)
-    if not why and any(law.jitter for _, law in lossy):
-        why = "jitter of one link beside losses of another that come in bursts or with on_loss: zero"
-    if why:
-        return Growth(np.nan, 0.0, np.inf, False, why)
-    return _by_patterns(system, prepared, first, lossy, holding)
+        return _over_trace(system, prepared)
+    holding = {link.channel.on_loss == "hold" for link, law in lossy if link.channel and law.mean_loss}
+    memoryless = all(is_memoryless(law) for _, law in lossy)
+    if memoryless and holding <= {True}:
+        return _by_gain(system, prepared, bounded, None)
+    if any(law.jitter for _, law in lossy):
+        raise UnservedError("jitter beside losses of another link that come in bursts or with on_loss: zero")
+    if holding == {True}:
+        return _of_held(system, prepared)
+    first = _due(system, lossy)
+    if memoryless:
+        return _by_gain(system, prepared, bounded, first)
+    told = hearing(system, prepared, first=first, stand_in=True)
+    of = stand_in_patterns(system, told)
+
+    def errors() -> tuple[float, str]:
+        pushed = forced(system, told, first)
+        return pattern_error(stand_in_patterns(system, pushed.told), pushed.peer_by_peer()), ""
+
+    return _iterated(pattern_radius(of), errors)
 
 
-def _by_patterns(
-    system: CompiledSystem,
-    prepared: Prepared,
-    first: Fraction,
-    lossy: Sequence[tuple[Link, ChannelLaw]],
-    holding: set[bool],
-) -> Growth:
-    """Return what second moments grow by where losses come in bursts, or links differ."""
-    channels = sum(_channels(link, system.peers) for link, _ in lossy)
-    laws = {(law.p, law.r) for _, law in lossy}
-    sure = all(law.one_minus_h == 1 and law.one_minus_k == 0 for _, law in lossy)
-    alike = len(system.groups) == 1 and not system.groups[0].columns and len(lossy) == 1
+def _over_trace(system: CompiledSystem, prepared: Prepared) -> Growth:
+    """Return what second moments grow by over recorded delays."""
+    found = trace_radius(system, prepared)
+
+    def errors() -> tuple[float, str]:
+        raise UnservedError("it is not worked out over recorded delays")
+
+    radius, low, high = found.radius**2, found.low**2 * (1 - ROUNDED), found.high**2 * (1 + ROUNDED)
+    if low > 1 or high < 1 or high - low < LOOSE:
+        return Growth(min(max(radius, low), high), low, high, True, proved=True, errors=errors)
+    doubt = max(DOUBTS * 2 * found.radius * found.doubt, LOOSE)
+    note = f"an estimate: bounds on the roundings of {found.frames:,} frames leave it open"
+    return Growth(radius, max(radius - doubt, 0.0), radius + doubt, False, note=note, errors=errors)
+
+
+def _by_gain(system: CompiledSystem, prepared: Prepared, bounded: bool, first: Fraction | None) -> Growth:
+    """Return what second moments grow by where packets are lost or late one by one.
+
+    Parameters
+    ----------
+    system, prepared, bounded
+        As for `growth`.
+    first
+        When packets are due, where the receiver's own value stands in for a missing one; None where what was
+        heard last is held.
+    """
+    told = hearing(system, prepared, first=first or Fraction(0), stand_in=first is not None)
+
+    def moments(told: Hearing) -> Moments:
+        return crowd(system, told) if first is None else stand_in(system, told)
+
+    def errors() -> tuple[float, str]:
+        pushed = forced(system, told, first or Fraction(0))
+        classes = pushed.of(peer_classes(pushed.told)[0][0].sites)
+        return moments_error(moments(pushed.told), classes), ""
+
+    of = moments(told)
+    inner = mean_square_radius(of, bounded=bounded)
+    # Of many peers whose values stand in, the nodes of a quadrature are rounded.
+    proved = first is None or system.peers <= ENUMERATED
+    quick = proved if first is not None else of.entries * of.states**3 <= QUICK
+    return Growth(inner.radius, inner.low, inner.high, True, proved=proved, quick=quick, errors=errors)
+
+
+def _of_held(system: CompiledSystem, prepared: Prepared) -> Growth:
+    """Return what second moments grow by where losses come in bursts, and what was heard last is held."""
+    scene = held_scene(system, prepared)
+    links = [link for link in system.links if link.name in scene.lossy]
+    channels = sum(_channels(link, system.peers) for link in links)
     complete = all(link.graph.shape == "complete" for link in system.links)
-    if holding == {True} and sure and len(laws) == 1 and alike and complete and system.peers <= MOST_TAGGED:
-        if system.peers <= EXACTLY_TAGGED:
-            (radius,) = tagged_radius(system, prepared, first, (channels,))
-            errors = partial(tagged_error, system, prepared, first, (channels,))
-            return Growth(radius, radius * (1 - ITERATED), radius * (1 + ITERATED), True, errors=errors)
-        rough, radius = tagged_radius(system, prepared, first, ORDERS)
-        note = (
-            f"an estimate: moments of at most {ORDERS[1]} channels' states together; with {ORDERS[0]} the "
-            f"radius is {rough:.9g}"
-        )
-        low, high = radius - abs(radius - rough), radius + abs(radius - rough)
-        errors = partial(tagged_error, system, prepared, first, ORDERS)
-        return Growth(radius, low, high, False, note=note, errors=errors)
-    if channels > MOST_CHANNELS:
-        bursts = not all(is_memoryless(law) for _, law in lossy)
-        what = "bursts" if bursts else "values that stand in"
-        why = (
-            f"{what} on {channels} ways: followed are {MOST_CHANNELS}, or {MOST_TAGGED} equal peers that "
-            "hold what they miss"
-        )
-        return Growth(np.nan, 0.0, np.inf, False, why)
-    radius = pattern_radius(patterns(system, prepared, first))
-    errors = partial(pattern_error, system, prepared, first)
+    same = len(system.groups) == 1 and not system.groups[0].columns and len(links) == 1 and complete
+    sure = all(law.one_minus_h == 1 and law.one_minus_k == 0 for _, law in unreliable(system))
+    tagged = sure and same and system.peers <= MOST_TAGGED
+    if not tagged and channels > MOST_CHANNELS:
+        what = f"followed are {MOST_CHANNELS}, or {MOST_TAGGED} equal peers that hold what they miss"
+        raise UnservedError(f"bursts on {channels} ways: {what}")
+    orders = ORDERS if system.peers > EXACTLY_TAGGED else (channels,)
+    held, chances = every_channel(system, scene)
+
+    def errors() -> tuple[float, str]:
+        pushed = forced(system, scene.told)
+        whole = every_channel(system, replace(scene, told=pushed.told))
+        if not tagged:
+            return pattern_error(held_patterns(*whole), pushed.peer_by_peer()), ""
+        first, *more = (tagged_error(affine(*whole), order, pushed.peer_by_peer()) for order in orders)
+        return (more[0], f"{ESTIMATE} it is {first:.9g} m") if more else (first, "")
+
+    if not tagged:
+        return _iterated(pattern_radius(held_patterns(held, chances)), errors)
+    frame = affine(held, chances)
+    rough, *more = (tagged_radius(frame, order) for order in orders)
+    if not more:
+        return _iterated(rough, errors)
+    off = abs(more[0] - rough)
+    note = f"{ESTIMATE} the radius is {rough:.9g}"
+    return Growth(more[0], more[0] - off, more[0] + off, False, note=note, errors=errors)
+
+
+def _iterated(radius: float, errors: Callable[[], tuple[float, str]]) -> Growth:
+    """Return a growth that an iteration found."""
     return Growth(radius, radius * (1 - ITERATED), radius * (1 + ITERATED), True, errors=errors)
 
 
@@ -285,22 +327,18 @@ def _overtakes(system: CompiledSystem, link: Link, law: ChannelLaw) -> bool:
     return law.longest - least >= float(period)
 
 
-def _due(system: CompiledSystem, lossy: Sequence[tuple[Link, ChannelLaw]]) -> tuple[Fraction, str]:
-    """Return when in a frame packets are due, or why there is no one instant."""
+def _due(system: CompiledSystem, lossy: Sequence[tuple[Link, ChannelLaw]]) -> Fraction:
+    """Return when in a frame packets are due, or raise why there is no one instant."""
     timings = resolve(system).timings
     clocks = {clock.name: clock for clock in system.clocks}
-    found = set()
-    for link, _ in lossy:
-        clock = clocks[link.clock]
-        for delay in {timings[link.delay], *(timings[one.delay] for one in link.delays)}:
-            found.add((timings[clock.period], (timings[clock.phase] + delay) % timings[clock.period]))
-    if len(found) > 1:
-        return Fraction(0), "packets that are due at different instants of a frame"
-    ((period, first),) = found
+    if len(system.links) > 1 or system.links[0].delays:
+        raise UnservedError("values that stand in beside packets of another link or delay")
+    link = lossy[0][0]
+    period, phase = timings[clocks[link.clock].period], timings[clocks[link.clock].phase]
     frame = common_multiple([timings[clock.period] for clock in system.clocks])
     if frame != period:
-        return first, f"a frame of {float(frame) * 1e3:.6g} ms with several packets of {lossy[0][0].name}"
-    return first, ""
+        raise UnservedError(f"a frame of {float(frame) * 1e3:.6g} ms with several packets of {link.name}")
+    return (phase + timings[link.delay]) % period
 
 
 def judge_network(
@@ -326,7 +364,7 @@ def judge_network(
         followed = lost and not any(_asked_of_packets(system, link) for link in lost)
         worst = worst_case(system, prepared) if followed else None
         surely, unsure = _almost_sure(system, prepared, found)
-        rms = _rms_error(found)
+        metres, unmeasured = _rms_error(found)
         linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     told = bool(np.isfinite(found.radius))
     decided = told and found.stable is not None
@@ -335,7 +373,7 @@ def judge_network(
         UNPROVED if certify and decided and not found.proved else "",
         found.note,
         unsure,
-        rms.why and f"root mean square error of copies: {rms.why}",
+        unmeasured and f"root mean square error of copies: {unmeasured}",
         worst.note if worst is not None else "",
     )
     return NetworkVerdict(
@@ -348,7 +386,7 @@ def judge_network(
         proof=(STABLE_PROVED if found.stable else UNSTABLE_PROVED)
         if certify and decided and found.proved
         else "",
-        rms_error_m=rms.metres,
+        rms_error_m=metres,
         almost_sure=surely,
         losses_in_a_row=worst,
         linearized=not linear,
@@ -356,11 +394,16 @@ def judge_network(
     )
 
 
-def _rms_error(found: Growth) -> Told:
-    """Return the error of copies where second moments die out, or why there is none."""
-    if found.stable and found.errors is not None:
+def _rms_error(found: Growth) -> tuple[float | None, str]:
+    """Return the error of copies where second moments die out, and what there is to say of it."""
+    if not found.stable or found.errors is None:
+        return None, "" if found.why else "only where second moments die out"
+    if found.high > 1 - DOUBTFUL:
+        return None, "rounding leaves its digits in doubt"
+    try:
         return found.errors()
-    return Told(None, "" if found.why else "only where second moments die out")
+    except UnservedError as why:
+        return None, str(why)
 
 
 def verdict_of(found: Growth) -> str:
@@ -375,6 +418,7 @@ def _almost_sure(system: CompiledSystem, prepared: Prepared, found: Growth) -> t
     """Return how a scene settles almost surely where mean squares leave it open, or why that is not told."""
     if found.why or found.stable:  # what settles in mean square settles almost surely
         return None, ""
-    if why := unplayed(system, prepared):
+    try:
+        return almost_sure(system, prepared), ""
+    except UnservedError as why:
         return None, f"almost surely: {why}"
-    return almost_sure(system, prepared), ""

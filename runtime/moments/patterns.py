@@ -1,10 +1,10 @@
 """Second moments of a few peers, pattern by pattern of which packets are lost: bursts, and what stands in.
 
-Takes: a scene of few channels, all of whose packets are due at the same instant of each frame.
-Gives: `Frames`, `frames`; `Patterns`, `patterns`; `every_pattern`, `of_all`; `pattern_radius`,
-`resting_moments`; `largest`, `settled`.
+Takes: a scene of few channels, of each of which one packet a frame may be lost.
+Gives: `Patterns`, `held_patterns`, `stand_in_patterns`; `pattern_radius`, `pattern_error`; `largest`,
+`settled`.
 Guarantees: exact but for rounding: every pattern of lost packets is looked at.
-Does not: bound its rounding; serve jitter, or packets due at different instants.
+Does not: bound its rounding; serve jitter.
 
 Of C channels each is good or bad, 2^C patterns s. What moves in a frame whose packets are lost as b says is
 A_b; second moments X_s, of the frames that begin in pattern s, move by
@@ -14,29 +14,27 @@ A_b; second moments X_s, of the frames that begin in pattern s, move by
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from fractions import Fraction
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Feedback, StateLayout, close
 from apc.eigen.modes import dense_loop
 from apc.eigen.pseudospectrum import balance
 from apc.eigen.relative import Relative, relative, relative_coordinates
-from apc.frame.lift import FrameMap
-from apc.frame.radius import RADII, value_of
-from apc.moments.crowd import Hearing, hearing, own_value, remembered_of, standing_motions
-from apc.moments.mean_loops import standing_state, with_memory
-from apc.network.channel import ChannelLaw, channel_law
+from apc.frame.radius import value_of
+from apc.moments.crowd import Hearing, standing_motions
+from apc.moments.errors import Peer, largest_error
+from apc.moments.held import Chance, HeldLoop
+from apc.moments.mean_loops import standing_state
+from apc.moments.stand_in import receivers_of
+from apc.moments.unserved import UnservedError
+from apc.network.channel import ChannelLaw
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
-Matrix = NDArray[Any]
 
 # Channels whose patterns are all looked at: 64 matrices, of three peers.
 MOST_CHANNELS = 6
@@ -57,151 +55,109 @@ STANDING = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frames:
-    """The whole scene in frames whose packets are lost as patterns say: `matrices` (k, n, n).
-
-    The state holds each peer's own, then what each of the `channels` (link, delay, receiver, sender) holds,
-    from `held` of it on. `basis` (n, d) are the motions that nothing holds back, `laws` those of the
-    channels. `sites` (N + 1,) says where each peer's own starts.
-    """
-
-    matrices: Floats
-    basis: Floats
-    channels: tuple[tuple[str, str, int, int], ...]
-    held: Mapping[int, range]
-    sites: tuple[int, ...]
-    laws: tuple[ChannelLaw, ...]
-
-
-def frames(
-    system: CompiledSystem,
-    prepared: Prepared,
-    first: Fraction,
-    lost: Callable[[int], NDArray[np.int64]],
-    *,
-    told: Hearing | None = None,
-) -> Frames:
-    """Close the whole scene for some patterns of lost packets.
-
-    Parameters
-    ----------
-    system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
-    first
-        When frames begin: all packets that may be lost are due then.
-    lost
-        Gives the patterns (k, C) of C channels: 1 for a packet that is lost.
-    told
-        Its peers, where they are not those of `hearing` with what stands in.
-    """
-    told = told or hearing(system, prepared, first=first, stand_in=True)
-    loop = dense_loop(told.groups, told.exchange)
-    remembered = {one.route: one for one in remembered_of(system, told, loop, perfect=True)}
-    links = {link.name: link for link in system.links}
-    laws = {
-        route: channel_law(system, links[route[0]], told.timings[route[1]])
-        for route in remembered
-        if links[route[0]].channel is not None
-    }
-    channels: list[tuple[str, str, int, int]] = sorted(
-        {
-            (way.link, way.delay, g, h)
-            for way, rows in loop.coupling.items()
-            if (way.link, way.delay) in laws
-            for g, row in enumerate(rows)
-            for h, weight in enumerate(row)
-            if weight
-        }
-    )
-    sites = [with_memory(group, list(remembered.values())) for group in loop.sites]
-    starts = np.cumsum([0] + [one.map.s.shape[-2] for one in sites]).tolist()
-    offsets = np.cumsum([0] + [len(one.names) for one in sites]).tolist()
-    held: dict[int, range] = {}
-    n = offsets[-1]
-    for place, (name, delay, *_) in enumerate(channels):
-        channel = links[name].channel
-        if channel is not None and channel.on_loss == "hold":
-            held[place] = range(n, n + len(remembered[name, delay].channels))
-            n = held[place].stop
-    names = tuple(name for one in sites for name in one.names)
-    layout = StateLayout(tuple(offsets[:-1]), (*names, *["held"] * (n - offsets[-1])), {})
-    number = {which: place for place, which in enumerate(channels)}
-    gone = lost(len(channels))
-    feedback = []
-    for g, rows in enumerate(told.of(loop)):
-        now: Matrix = np.zeros((len(gone), len(rows), starts[-1]))
-        before: Matrix = np.zeros((len(gone), len(rows), n))
-        for line, row in enumerate(rows):
-            route = row.way.link, row.way.delay
-            one = remembered.get(route)
-            if one is None or row.channel not in one.channels:
-                continue
-            for h, weight in enumerate(loop.coupling[row.way][g]):
-                if not weight:
-                    continue
-                value = starts[h] + sites[h].values[route, row.channel, one.memory.heard[row.clock, row.tick]]
-                if route not in laws:
-                    now[:, line, value] = float(weight)
-                    continue
-                place = number[*route, g, h]
-                missed = gone[:, place] * float(weight)
-                if row.gap:
-                    now[:, line, starts[g] + sites[g].sent[own_value(row)]] += missed
-                    continue
-                now[:, line, value] = float(weight) - missed
-                if place in held:
-                    before[:, line, held[place][one.channels.index(row.channel)]] = missed
-        feedback.append(Feedback(now, before))
-    maps = [FrameMap(*(value_of(block) for block in one.map.blocks)) for one in sites]
-    closed = close(maps, feedback, layout)
-    matrix = closed.matrix
-    for place, states in held.items():
-        name, delay, _, h = channels[place]
-        of, lost_now = remembered[name, delay], gone[:, place, None]
-        value = of.memory.heard[min(of.memory.heard)]
-        for state, what in zip(states, of.channels, strict=True):
-            arrived = closed.sent[:, starts[h] + sites[h].values[of.route, what, value]]
-            matrix[:, state] = arrived * (1 - lost_now)
-            matrix[:, state, state] += lost_now[:, 0]
-    known = RADII.exact(matrix[0])
-    known[1] = STANDING
-    basis = standing_state(known, standing_motions(loop), loop, [*offsets[:-1], n])
-    return Frames(
-        matrix, basis, tuple(channels), held, tuple(offsets), tuple(laws[one[0], one[1]] for one in channels)
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Patterns:
     """The frame of each pattern of lost packets, over relative coordinates, and the law of each channel.
 
     `matrices` (2^C, n, n): channel c's packet is lost in those whose bit c is set. `laws` (C,).
-    The coordinates are those of `at`, each divided by its `scale` (n,).
+    The coordinates are those of `at`, each divided by its `scale` (n,), of states that begin at `offsets`,
+    peer by peer.
     """
 
     matrices: Floats
     laws: tuple[ChannelLaw, ...]
     at: Relative
+    offsets: tuple[int, ...]
     scale: Floats
 
 
-def patterns(system: CompiledSystem, prepared: Prepared, first: Fraction) -> Patterns:
-    """Close the whole scene for every pattern of lost packets; parameters as for `frames`."""
-    return of_all(frames(*(system, prepared, first), every_pattern))
+def held_patterns(held: HeldLoop, chances: Sequence[Chance]) -> Patterns:
+    """Return the frames of every pattern where receivers hold what they heard last.
+
+    Parameters
+    ----------
+    held, chances
+        Of `held.every_channel`.
+    """
+    inner = held.relative()
+    f, g, s, e = (value_of(matrix) for matrix in (inner.f, inner.g, inner.s, inner.e))
+    lost = np.zeros((2 ** len(chances), len(s), 1))
+    for gone, bits in zip(lost, _every_pattern(len(chances)), strict=True):
+        for chance, bit in zip(chances, bits, strict=True):
+            gone[list(chance.ears)] = bit
+    laws = tuple(chance.law for chance in chances)
+    return _balanced(f + g @ (s + lost * (e - s)), laws, held.at, held.offsets)
 
 
-def every_pattern(channels: int) -> NDArray[np.int64]:
+def stand_in_patterns(system: CompiledSystem, told: Hearing) -> Patterns:
+    """Return the frames of every pattern where own values stand in for missing ones.
+
+    Parameters
+    ----------
+    system, told
+        As for `stand_in.stand_in`.
+    """
+    loop = dense_loop(told.groups, told.exchange)
+    receivers, offsets, law = receivers_of(system, told, [loop], loop.coupling)
+    channels = [(h, g) for h, one in enumerate(receivers) for g in np.flatnonzero(one.heard.any(axis=0))]
+    if len(channels) > MOST_CHANNELS:
+        what = f"bursts of values that stand in on {len(channels)} ways"
+        raise UnservedError(f"{what}: {MOST_CHANNELS} are the most that are followed")
+    matrices = np.zeros((2 ** len(channels), offsets[-1], offsets[-1]))
+    for matrix, bits in zip(matrices, _every_pattern(len(channels)), strict=True):
+        heard = np.zeros((len(receivers),) * 2)
+        for (h, g), bit in zip(channels, bits, strict=True):
+            heard[h, g] = 1 - bit
+        for h, one in enumerate(receivers):
+            rows = slice(offsets[h], offsets[h + 1])
+            node = int(np.argmin(np.abs(one.heard - heard[h]).sum(axis=1)))
+            varies = one.varies[node, 0]
+            size = len(varies)
+            means = [value_of(share) for share in one.shares]
+            matrix[rows] = np.concatenate(means, axis=-1) + varies[:, size:]
+            matrix[rows, rows] += value_of(one.mean) + varies[:, :size] - means[h]
+    known = np.stack([matrices[0], np.full_like(matrices[0], STANDING)])
+    at = relative_coordinates(standing_state(known, standing_motions(loop), loop, offsets))
+    return _balanced(matrices, (law,) * len(channels), at, tuple(offsets))
+
+
+def _every_pattern(channels: int) -> NDArray[np.int64]:
     """Return all patterns of lost packets (2^C, C)."""
     return (np.arange(2**channels)[:, None] >> np.arange(channels)) & 1
 
 
-def of_all(found: Frames) -> Patterns:
-    """Return the frames of every pattern over relative coordinates."""
-    at = relative_coordinates(found.basis)
-    inner = relative(found.matrices, at)
+def _balanced(
+    matrices: Floats, laws: tuple[ChannelLaw, ...], at: Relative, offsets: tuple[int, ...]
+) -> Patterns:
+    """Return patterns of frames (2^C, n, n), in coordinates of one size."""
+    inner = relative(matrices, at) if len(matrices[0]) > len(at.rest) else matrices
     # Rounding is small beside the largest moment only: of states of one size it is beside all.
     scale = balance(np.abs(inner).max(axis=0))
-    return Patterns(inner / scale[:, None] * scale, found.laws, at, scale)
+    return Patterns(inner / scale[:, None] * scale, laws, at, offsets, scale)
+
+
+def pattern_error(of: Patterns, classes: Sequence[tuple[int, Peer]]) -> float:
+    """Return the largest error of copies in m.
+
+    It is right to what an iteration and rounding leave, of which there is no bound.
+
+    Parameters
+    ----------
+    of
+        The frames of all patterns, stable in mean square.
+    classes
+        What each peer got, as for `errors.moments_error`.
+    """
+    likely: Floats = np.ones(1)
+    for law in of.laws:
+        likely = np.asarray(np.kron([1 - law.bad, law.bad], likely))
+    drawn = np.zeros(len(of.at.held) + len(of.at.rest))
+    for start, (_, peer) in zip(of.offsets, classes, strict=False):
+        drawn[start + np.array(peer.drawn, np.intp)] = 1.0
+    added = np.multiply.outer(likely, np.diag(drawn[of.at.rest] / of.scale**2))
+    step = a_frame_later(of)
+    lasting = settled(step, step(added.reshape(-1)))
+    moments = (added + lasting.reshape(added.shape)).sum(axis=0) * np.outer(of.scale, of.scale)
+    return largest_error(moments, of.at, of.offsets, classes)
 
 
 def pattern_radius(of: Patterns) -> float:
@@ -235,33 +191,6 @@ def a_frame_later(of: Patterns) -> Callable[[Floats], Floats]:
         return _changed(moved.reshape((2,) * len(laws) + (n * n,)), laws).reshape(-1)
 
     return step
-
-
-def resting_moments(of: Patterns, drawn: Floats) -> Floats | None:
-    """Return the second moments (n, n) of a long run in floats, None where they are not found.
-
-    Parameters
-    ----------
-    of
-        The frames of all patterns, stable in mean square.
-    drawn
-        The covariance (n, n) of what is added at the end of each frame, by chance of its own.
-    """
-    likely: Floats = np.ones(1)
-    for law in of.laws:
-        likely = np.asarray(np.kron([1 - law.bad, law.bad], likely))
-    scale = np.outer(of.scale, of.scale)
-    added = np.multiply.outer(likely, drawn / scale)
-    after = a_frame_later(of)(added.reshape(-1)).reshape(added.shape)
-    # What is drawn anew is there for a frame: all that lasts is over the other states.
-    rest = np.flatnonzero(of.matrices.any(axis=(0, 2)))
-    inner = np.ix_(np.arange(len(added)), rest, rest)
-    step = a_frame_later(replace(of, matrices=of.matrices[inner]))
-    found = settled(step, after[inner].reshape(-1))
-    if found is None:
-        return None
-    added[inner] += found.reshape(after[inner].shape)
-    return np.asarray(added.sum(axis=0) * scale)
 
 
 def largest(step: Callable[[Floats], Floats], start: Floats) -> float:
@@ -304,8 +233,8 @@ def largest(step: Callable[[Floats], Floats], start: Floats) -> float:
     return max(found, default=np.nan)
 
 
-def settled(step: Callable[[Floats], Floats], added: Floats) -> Floats | None:
-    """Return the sum of all that `step` makes of what is added once a frame (n,), None where it isn't found.
+def settled(step: Callable[[Floats], Floats], added: Floats) -> Floats:
+    """Return the sum of all that `step` makes of what is added once a frame (n,).
 
     Parameters
     ----------
@@ -317,7 +246,9 @@ def settled(step: Callable[[Floats], Floats], added: Floats) -> Floats | None:
     linalg = load_pool("scipy.sparse.linalg")
     operator = linalg.LinearOperator((added.size,) * 2, matvec=lambda x: x - step(x), dtype=np.float64)
     found, open_end = linalg.gmres(operator, added, rtol=LEFT, atol=0.0, restart=VECTORS, maxiter=RESTARTS)
-    return None if open_end else np.asarray(found)
+    if open_end:
+        raise UnservedError("its iteration did not come to an end")
+    return np.asarray(found)
 
 
 def _changed(moved: Floats, laws: Sequence[ChannelLaw]) -> Floats:

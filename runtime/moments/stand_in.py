@@ -1,7 +1,7 @@
 """Second moments where a receiver puts its own value in the place of a missing one.
 
 Takes: a scene whose packets are due at the same instant of each frame, lost independently of each other.
-Gives: `stand_in`; `Classes`, `standing_in`, `luck_of_luck`, `luck_after`, `entries_of`, `spread_of`.
+Gives: `stand_in`; `Receiver`, `receivers_of`.
 Guarantees: equal peers cost the same, however many they are.
 Does not: serve bursts (see `patterns`), jitter, or several unreliable links.
 
@@ -22,23 +22,22 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Loop
-from apc.eigen.relative import Relative, relative_coordinates
+from apc.eigen.closing import Coupling, Loop
+from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.frame.discretize import UNIT
-from apc.frame.radius import RADII, Arithmetic, with_radius
+from apc.frame.radius import RADII
 from apc.frame.schedule import Selected, Way
-from apc.moments.crowd import Hearing, hearing, own_value, peer_classes, remembered_of, standing_motions
-from apc.moments.gains import Gain, around, number_of, of_kind, stein, too_much
+from apc.moments.crowd import Hearing, own_value, peer_classes, remembered_of, standing_motions
+from apc.moments.gains import Answer, Drive, Moments, Part, number_of, weighted
 from apc.moments.mean_loops import Remembered, Site, scaled, standing_state, with_memory
-from apc.network.channel import channel_law
+from apc.moments.unserved import UnservedError
+from apc.network.channel import ChannelLaw, channel_law
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -51,40 +50,19 @@ NODE_ROUNDINGS = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Receiver:
+class Receiver:
     """How a peer of a class moves by how many it hears: each row of `heard` (m, K) of probability `weight`.
 
     `mean` (2, n, n) is that of P(a), `shares` are k_g, the mean that one peer of each class g takes part with
-    (2, n, n_g). `apart` (m, 2, n, n + Σ n_g) is [P(a) − P, a K_g(a) − n_g k_g], and `per_peer` K_g(a) − k_g.
+    (2, n, n_g). `varies` (m, 2, n, n + Σ n_g) is [P(a) − P, a K_g(a) − n_g k_g], and `per_peer` K_g(a) − k_g.
     """
 
     heard: Floats
     weight: Floats
     mean: Matrix
     shares: tuple[Matrix, ...]
-    apart: Matrix
+    varies: Matrix
     per_peer: tuple[Matrix, ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Classes:
-    """Classes of equal peers: how many, where each one's states start, and how a peer of each moves.
-
-    `parts` are the means' loops in relative coordinates (class or None for all, matrix, coordinates).
-    """
-
-    counts: tuple[int, ...]
-    offsets: tuple[int, ...]
-    receivers: tuple[_Receiver, ...]
-    parts: tuple[tuple[int | None, Matrix, Relative], ...]
-
-    def of(self, place: int) -> slice:
-        """Return the states of a class."""
-        return slice(self.offsets[place], self.offsets[place + 1])
-
-    def size(self, place: int) -> int:
-        """Return how many states a peer of a class has."""
-        return self.offsets[place + 1] - self.offsets[place]
 
 
 def quadrature(n: int, chance: float, most: int) -> tuple[Floats, Floats]:
@@ -112,39 +90,39 @@ def quadrature(n: int, chance: float, most: int) -> tuple[Floats, Floats]:
     return nodes, vectors[0] ** 2
 
 
-def stand_in(system: CompiledSystem, prepared: Prepared, first: Fraction) -> tuple[list[Matrix], Gain] | str:
-    """Return the means' loops and G(λ) of what luck adds, see `gains`; or why not.
+def stand_in(system: CompiledSystem, told: Hearing) -> Moments:
+    """Return the loops and the luck of peers that put their own values in the place of missing ones.
 
     Parameters
     ----------
-    system, prepared, first
-        As for `standing_in`.
-    """
-    found = standing_in(system, prepared, first)
-    if isinstance(found, str):
-        return found
-    why = too_much(sum(map(len, entries_of(found))), found.offsets[-1])
-    return why or ([matrix for _, matrix, _ in found.parts], partial(luck_of_luck, found))
-
-
-def standing_in(
-    system: CompiledSystem, prepared: Prepared, first: Fraction, *, told: Hearing | None = None
-) -> Classes | str:
-    """Return how peers move that put their own values in the place of missing ones; or why not.
-
-    Parameters
-    ----------
-    system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
-    first
-        When frames begin: all packets that may be lost are due then.
+    system
+        The compiled scene.
     told
-        Its peers, where they are not those of `hearing` with what stands in.
+        Its peers, of `crowd.hearing` with what stands in; packets are due as frames begin.
     """
-    told = told or hearing(system, prepared, first=first, stand_in=True)
     loops, weights = peer_classes(told)
+    receivers, offsets, _ = receivers_of(system, told, loops, weights)
+    return _closed(receivers, [site.count for site in loops[0].sites], offsets, loops)
+
+
+def receivers_of(
+    system: CompiledSystem, told: Hearing, loops: Sequence[Loop], weights: Coupling
+) -> tuple[list[Receiver], list[int], ChannelLaw]:
+    """Return how peers of each class move, where their states start, and the law of what they miss.
+
+    Parameters
+    ----------
+    system, told
+        The compiled scene and its peers.
+    loops
+        The loops of classes of peers, that of all first.
+    weights
+        What a peer of one class weighs one of another by.
+    """
     common = loops[0]
     remembered = remembered_of(system, told, common, perfect=True)
+    if len(remembered) != 1:
+        raise UnservedError("values that stand in beside what is heard over other links")
     (one,) = remembered
     link = next(link for link in system.links if link.name == one.route[0])
     law = channel_law(system, link, told.timings[one.route[1]])
@@ -171,7 +149,7 @@ def standing_in(
         ]
         ways = math.prod(len(listed) for listed, _ in nodes)
         if ways > MOST_NODES:
-            return (
+            raise UnservedError(
                 f"values that stand in between different peers: a peer hears others in {ways:,} ways; "
                 f"{MOST_NODES:,} are the most that are followed"
             )
@@ -180,8 +158,8 @@ def standing_in(
             [math.prod(listed) for listed in itertools.product(*(shares for _, shares in nodes))]
         )
         receivers.append(_receiver(sites[h], rows, one, values, own, others, heard, weight))
-    offsets = np.cumsum([0] + [len(site.names) for site in sites]).tolist()
-    return _closed(tuple(receivers), tuple(counts), tuple(offsets), loops)
+    offsets = np.cumsum([0] + [site.states for site in sites]).tolist()
+    return receivers, offsets, law
 
 
 def _receiver(
@@ -193,7 +171,7 @@ def _receiver(
     others: Sequence[int],
     heard: Floats,
     weight: Floats,
-) -> _Receiver:
+) -> Receiver:
     """Close a peer's loop with itself: what stands in for what it misses.
 
     Parameters
@@ -252,200 +230,100 @@ def _receiver(
     alone = RADII.add(
         np.broadcast_to(plain.p, (m, *plain.p.shape)), RADII.multiply(RADII.multiply(reached, gap), own_rows)
     )
-    mean = _mean(weight, alone)
-    apart, shares, per_peer = [RADII.subtract(alone, mean)], [], []
+
+    def averaged(blocks: Matrix) -> Matrix:
+        return np.asarray(weighted(blocks[None], weight, RADII)[0])
+
+    mean = averaged(alone)
+    varies, shares, per_peer = [RADII.subtract(alone, mean)], [], []
     for g, (felt_of, rows_of) in enumerate(zip(from_class, values, strict=True)):
         block = RADII.multiply(RADII.multiply(reached, felt_of), rows_of)
-        alike = _each(block, heard[:, g])
-        shared = _mean(weight, alike)
+        counts = np.stack([heard[:, g], NODE_ROUNDINGS * UNIT * np.abs(heard[:, g])], axis=-1)
+        alike = scaled(block, counts[..., None, None], RADII)
+        shared = averaged(alike)
         shares.append(scaled(shared, number_of(1 / max(others[g], 1), RADII), RADII))
-        apart.append(RADII.subtract(alike, shared))
+        varies.append(RADII.subtract(alike, shared))
         per_peer.append(RADII.subtract(block, shares[g]))
-    return _Receiver(heard, weight, mean, tuple(shares), np.concatenate(apart, axis=-1), tuple(per_peer))
-
-
-def _mean(weight: Floats, blocks: Matrix) -> Matrix:
-    """Return the mean (2, n, n) of matrices (m, 2, n, n), the weights rounded."""
-    value = np.tensordot(weight, blocks[:, 0], 1)
-    size = np.tensordot(np.abs(weight), np.abs(blocks[:, 0]), 1)
-    radius = np.tensordot(np.abs(weight), blocks[:, 1], 1) + NODE_ROUNDINGS * (len(weight) + 4) * UNIT * size
-    return with_radius(value, radius * (1 + 8 * UNIT))
+    return Receiver(heard, weight, mean, tuple(shares), np.concatenate(varies, axis=-1), tuple(per_peer))
 
 
 def _closed(
-    receivers: tuple[_Receiver, ...], counts: tuple[int, ...], offsets: tuple[int, ...], loops: Sequence[Loop]
-) -> Classes:
-    """Close the means' loops, of all peers and of each class's apart."""
+    receivers: Sequence[Receiver], counts: Sequence[int], offsets: Sequence[int], loops: Sequence[Loop]
+) -> Moments:
+    """Close the means' loops, of all peers and of what peers of each class differ by."""
     common, n = loops[0], offsets[-1]
+    states = [slice(*ends) for ends in itertools.pairwise(offsets)]
     whole = np.zeros((2, n, n))
     for h, one in enumerate(receivers):
         for g, count in enumerate(counts):
             block = scaled(one.shares[g], number_of(float(count - (g == h)), RADII), RADII)
-            block = RADII.add(one.mean, block) if h == g else block
-            whole[:, offsets[h] : offsets[h + 1], offsets[g] : offsets[g + 1]] = block
-    at = relative_coordinates(standing_state(whole, standing_motions(common), common, offsets))
-    parts: list[tuple[int | None, Matrix, Relative]] = [(None, _reduced(whole, at), at)]
+            whole[:, states[h], states[g]] = RADII.add(one.mean, block) if h == g else block
+    loops_of: list[tuple[int | None, Matrix]] = [(None, whole)]
+    names = [site.name for site in common.sites]
     for loop in loops[1:]:
-        h = [site.name for site in common.sites].index(loop.sites[0].name)
-        apart = RADII.subtract(receivers[h].mean, receivers[h].shares[h])
-        still = standing_state(apart, standing_motions(loop), loop, [0, offsets[h + 1] - offsets[h]])
-        own = relative_coordinates(still)
-        parts.append((h, _reduced(apart, own), own))
-    return Classes(counts, offsets, receivers, tuple(parts))
-
-
-def _each(blocks: Matrix, by: Floats) -> Matrix:
-    """Return matrices (m, 2, n, n), each times a number of its own (m,)."""
-    factor = by[:, None, None, None]
-    found = blocks * np.abs(factor)
-    found[:, 0] = blocks[:, 0] * by[:, None, None]
-    found[:, 1] += NODE_ROUNDINGS * UNIT * np.abs(found[:, 0])
-    return found
-
-
-def _reduced(matrix: Matrix, at: Relative) -> Matrix:
-    """Return a loop (2, n, n) in relative coordinates."""
-    inner = matrix[:, at.rest[:, None], at.rest]
-    if not len(at.held):
-        return inner
-    weights = with_radius(at.weights, at.doubt)
-    return RADII.subtract(inner, RADII.multiply(weights, matrix[:, at.held[:, None], at.rest]))
-
-
-def luck_of_luck(of: Classes, growth: float, numbers: Arithmetic) -> Matrix | None:
-    """Return G(λ) over the entries of each class's Ω."""
-    listed = [np.array(one, np.intp).T for one in entries_of(of)]
-    firsts = np.cumsum([0] + [one.shape[1] for one in listed]).tolist()
-    found = of_kind(np.zeros((2, firsts[-1], firsts[-1])), numbers)
-    for d, (rows, columns) in enumerate(listed):
-        units, number = np.zeros((len(rows), of.size(d), of.size(d))), np.arange(len(rows))
-        units[number, rows, columns] = units[number, columns, rows] = 1.0
-        after = luck_after(of, d, of_kind(RADII.exact(units), numbers), growth, numbers)
-        if after is None:
-            return None
-        for h, ((a, b), added) in enumerate(zip(listed, after, strict=True)):
-            block = np.moveaxis(added[..., a, b], 0, -1)
-            where = np.s_[..., firsts[h] : firsts[h + 1], firsts[d] : firsts[d + 1]]
-            found[where] = numbers.add(found[where], block)
-    return found
-
-
-def luck_after(of: Classes, d: int, added: Matrix, growth: float, numbers: Arithmetic) -> list[Matrix] | None:
-    """Return what luck adds to peers of each class where those of one got Ω, None where that has no end.
-
-    Parameters
-    ----------
-    of, d, added, growth, numbers
-        As for `spread_of`.
-    """
-    spread = spread_of(of, d, added, growth, numbers)
-    return None if spread is None else [_added(of, h, d, spread, numbers) for h in range(len(of.counts))]
-
-
-def entries_of(of: Classes) -> list[list[tuple[int, int]]]:
-    """Return the entries (a, b) of each class's Ω, a ≤ b."""
-    return [[(a, b) for a in range(n) for b in range(a, n)] for n in np.diff(of.offsets).tolist()]
-
-
-def spread_of(
-    of: Classes, d: int, added: Matrix, growth: float, numbers: Arithmetic
-) -> dict[int | None, Matrix] | None:
-    """Return the moments that peers of a class make who each get Ω more a frame, None where they have no end.
-
-    They are those of all classes' means (None), and those of class d that a peer of n has 1 − 1/n of, apart
-    from its like.
-
-    Parameters
-    ----------
-    of, d
-        The classes, and which of them.
-    added
-        Ω (b, n, n), or several.
-    growth
-        λ, what second moments grow by in a frame.
-    numbers
-        What Ω is of.
-    """
-    root, shrink = number_of(growth**-0.5, numbers), number_of(1 / growth, numbers)
-    spread: dict[int | None, Matrix] = {}
-    for h, matrix, at in of.parts:
-        if h not in (None, d):
-            continue
-        # What luck adds to a peer, in relative coordinates; of all peers' mean, a peer is one in n.
-        place = of.offsets[d] if h is None else 0
-        total = of.offsets[-1] if h is None else of.size(d)
-        into = np.zeros((2, total, of.size(d)))
-        into[0, place : place + of.size(d)] = np.eye(of.size(d))
-        weights = with_radius(at.weights, at.doubt)
-        into = (
-            into[:, at.rest]
-            if not len(at.held)
-            else RADII.subtract(into[:, at.rest], RADII.multiply(weights, into[:, at.held]))
+        h = names.index(loop.sites[0].name)
+        loops_of.append((h, RADII.subtract(receivers[h].mean, receivers[h].shares[h])))
+    listed = [np.array(np.triu_indices(one.stop - one.start)) for one in states]
+    ends = np.cumsum([0, *(entries.shape[1] for entries in listed)]).tolist()
+    places = list(map(slice, ends, ends[1:]))
+    parts, drives = [], []
+    for number, ((only, matrix), loop) in enumerate(zip(loops_of, loops, strict=True)):
+        starts = offsets if only is None else [0, len(matrix[0])]
+        at = relative_coordinates(standing_state(matrix, standing_motions(loop), loop, starts))
+        bounded, inner = with_doubt(at), matrix[..., at.rest]
+        answers = tuple(
+            Answer(places[h], forms[..., at.rest], forms[..., at.rest], weights, listed[h])
+            for h in range(len(counts))
+            for forms, weights in [_forms(receivers, h, only, counts, states)]
+            if len(weights)
         )
-        driven = scaled(around(of_kind(into, numbers), added, numbers), shrink, numbers)
-        if h is None:
-            driven = scaled(driven, number_of(1 / of.counts[d], numbers), numbers)
-        moments = stein(scaled(of_kind(matrix, numbers), root, numbers), driven, numbers)
-        if moments is None:
-            return None
-        whole = np.zeros((*moments.shape[:-2], total, total))
-        whole[..., at.rest[:, None], at.rest] = moments
-        spread[h] = whole
-    return spread
+        part = Part(relative_rows(inner, bounded, RADII), only, at, tuple(starts), answers)
+        parts.append(part)
+        for d in range(len(counts)) if only is None else [only]:
+            # Of a peer in n, the mean of all takes 1/n, and what it differs by from that the rest.
+            share = 1 / counts[d] if only is None else 1 - 1 / counts[d]
+            units = np.zeros((listed[d].shape[1], *[states[d].stop - states[d].start] * 2))
+            a, b = listed[d]
+            units[np.arange(len(a)), a, b] = units[np.arange(len(a)), b, a] = 1.0
+            columns = states[d] if only is None else slice(None)
+            into = relative_rows(RADII.exact(np.eye(matrix.shape[-1])[:, columns]), bounded, RADII)
+            into = scaled(into, number_of(share**0.5, RADII), RADII)
+            drives.append(Drive(part.matrix, into, units, places[d], answers, number, 1.0))
+    return Moments(tuple(parts), tuple(drives), ends[-1])
 
 
-def _added(of: Classes, h: int, d: int, spread: Mapping[int | None, Matrix], numbers: Arithmetic) -> Matrix:
-    """Return Ω of a peer of class h, for moments that class d's luck made (b, n, n)."""
-    classes, one = range(len(of.counts)), of.receivers[h]
+def _forms(
+    receivers: Sequence[Receiver], h: int, only: int | None, counts: Sequence[int], states: Sequence[slice]
+) -> tuple[Matrix, Floats]:
+    """Return by which forms (k, 2, n_h, n) and weights (k,) luck adds to a peer of class h.
 
-    def together(g: int, k: int) -> Matrix:
-        """Return the moments of two peers, of classes g and k, that are not the same."""
-        alike: Matrix = spread[None][..., of.of(g), of.of(k)]
-        if g == k == d and d in spread:
-            return numbers.subtract(alike, scaled(spread[d], number_of(1 / of.counts[d], numbers), numbers))
-        return alike
+    What luck adds is how a peer moves beside the mean of such peers, those it hears taken to be the same; and
+    which of those that differ it hears, a of n.
 
-    def alone(g: int) -> Matrix:
-        """Return the moments of one peer."""
-        if g == d and d in spread:
-            return numbers.add(together(g, g), spread[d])
-        return together(g, g)
-
-    # What luck adds: how a peer moves apart from the mean of such peers, those it hears taken alike; and
-    # which of those that differ it hears, a of n.
-    size = of.size(h)
-    ends = np.cumsum([size] + [of.size(g) for g in classes]).tolist()
-    joint = np.zeros((*alone(h).shape[:-2], ends[-1], ends[-1]))
-    joint[..., :size, :size] = alone(h)
-    for g in classes:
-        rows = slice(ends[g], ends[g + 1])
-        joint[..., :size, rows] = together(h, g)
-        joint[..., rows, :size] = np.swapaxes(together(h, g), -1, -2)
-        for k in classes:
-            joint[..., rows, ends[k] : ends[k + 1]] = together(g, k)
-    total = _mean_of(one.weight, around(_of_nodes(one.apart, numbers), joint[:, None], numbers), numbers)
-    if d in spread and one.heard[:, d].any():
-        others = of.counts[d] - (d == h)
-        here = around(_of_nodes(one.per_peer[d], numbers), spread[d][:, None], numbers)
-        total = numbers.add(total, _mean_of(one.weight * one.heard[:, d], here, numbers))
-        share = of_kind(one.shares[d], numbers)
-        missed = float(one.weight @ (others - one.heard[:, d]))
-        there = scaled(around(share, spread[d], numbers), number_of(missed, numbers), numbers)
-        total = numbers.add(total, there)
-    return total
-
-
-def _of_nodes(blocks: Matrix, numbers: Arithmetic) -> Matrix:
-    """Return matrices (m, 2, …) with their radii as they are, or without them."""
-    return blocks if numbers is RADII else blocks[:, 0]
-
-
-def _mean_of(weight: Floats, blocks: Matrix, numbers: Arithmetic) -> Matrix:
-    """Return the mean (b, …) of matrices (b, m, …)."""
-    if numbers is not RADII:
-        return np.asarray(np.einsum("m,bmij->bij", weight, blocks))
-    value = np.einsum("m,bmij->bij", weight, blocks[:, :, 0])
-    size = np.einsum("m,bmij->bij", np.abs(weight), np.abs(blocks[:, :, 0]))
-    radius = np.einsum("m,bmij->bij", np.abs(weight), blocks[:, :, 1])
-    radius += NODE_ROUNDINGS * (len(weight) + 4) * UNIT * size
-    return with_radius(value, radius * (1 + 8 * UNIT))
+    Parameters
+    ----------
+    receivers, counts, states
+        The classes: how peers of each move, how many there are, and where their states are in the loop of
+        all.
+    h
+        The class that receives.
+    only
+        The class whose peers' differences the loop holds, None for the loop of all.
+    """
+    one = receivers[h]
+    size = one.mean.shape[-1]
+    itself, others = one.varies[..., :size], one.varies[..., size:]
+    if only is None:
+        forms = others.copy()
+        forms[..., states[h]] = RADII.add(others[..., states[h]], itself)
+        return forms, one.weight
+    # Two peers of a class of n differ from its mean by amounts of covariance −1/(n − 1).
+    n = counts[only]
+    forms = others[..., states[only]]
+    listed = [(RADII.add(forms, itself) if h == only else forms, -one.weight / (n - 1))]
+    if h == only:
+        listed.append((itself, one.weight * n / (n - 1)))
+    missed = float(one.weight @ (n - (h == only) - one.heard[:, only]))
+    listed.append((one.per_peer[only], one.weight * one.heard[:, only] * n / (n - 1)))
+    listed.append((one.shares[only][None], np.array([missed * n / (n - 1)])))
+    return np.concatenate([forms for forms, _ in listed]), np.concatenate([weights for _, weights in listed])

@@ -28,11 +28,12 @@ from apc.eigen.closing import Loop, close, feedback_of, lay_out_loop
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.modes import arrange
 from apc.eigen.peer_group import MOST_STATES
-from apc.eigen.relative import Relative, relative, relative_coordinates
+from apc.eigen.relative import Relative, relative, relative_coordinates, with_doubt
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.radius import RADII, radius_of, value_of, with_radius
 from apc.frame.schedule import Heard, Schedule, Selected, Sent
 from apc.moments.crowd import Hearing, hearing, instants
+from apc.moments.unserved import UnservedError
 from apc.network.timetable import instant_of
 
 Floats = NDArray[np.float64]
@@ -53,49 +54,47 @@ class Found:
     frames: int
 
 
-def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found | str:
-    """Return what motions grow by in a frame, on the mean over a period; or why that is not told.
+def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
+    """Return what motions grow by in a frame, on the mean over a period.
 
     Parameters
     ----------
     system, prepared
         The compiled scene, and what `analysis.prepare` made of it.
+
+    Raises
+    ------
+    UnservedError
+        The period or the delays are too long to follow.
     """
     told = hearing(system, prepared)
     links = {link.name: link for link in system.links}
-    clocks = {clock.name: clock for clock in system.clocks}
-    loops = arrange(told.groups, told.exchange).loops
+    times = {clock.name: instants(told, clock) for clock in system.clocks}
     rows = {row: None for listed in told.rows.values() for row in listed}
-    slots = {name: len(instants(told, clocks[link.clock])) for name, link in links.items()}
+    slots = {name: len(times[link.clock]) for name, link in links.items()}
     frames = math.lcm(*(_period_of(links[row.way.link], slots[row.way.link]) for row in rows))
     if frames > MOST_FRAMES:
-        return f"the recorded delays come again after {frames:,} frames, and {MOST_FRAMES:,} are the most"
-    heard: dict[Selected, list[int]] = {}
-    for row in rows:
-        link = links[row.way.link]
-        sent = instants(told, clocks[link.clock])
-        tick = instants(told, clocks[row.clock])[row.tick]
-        heard[row] = _heard(link, told.timings[row.way.delay], sent, tick, told)
+        what = f"the recorded delays come again after {frames:,} frames"
+        raise UnservedError(f"{what}, and {MOST_FRAMES:,} are the most")
+    heard = {
+        row: _heard(link, told.timings[row.way.delay], times[link.clock], times[row.clock][row.tick], told)
+        for row in rows
+        for link in [links[row.way.link]]
+    }
     depth = {
         name: max(
-            (-(number // slots[name]) for row in rows if row.way.link == name for number in heard[row]),
-            default=0,
+            (-(n // slots[name]) for row in rows if row.way.link == name for n in heard[row]), default=0
         )
         for name in links
     }
     found = []
-    for loop in loops:
-        if (
-            sum(
-                len(site.lifted.z_names) + sum(depth[one.link] for one in site.schedule.sent)
-                for site in loop.sites
-            )
-            > MOST_STATES
-        ):
-            return "the recorded delays are longer than can be followed"
+    for loop in arrange(told.groups, told.exchange).loops:
+        packets = sum(depth[sent.link] for site in loop.sites for sent in site.schedule.sent)
+        if packets + sum(len(site.lifted.z_names) for site in loop.sites) > MOST_STATES:
+            raise UnservedError("the recorded delays are longer than can be followed")
         found.append(_period(loop, told, heard, depth, slots, frames))
-    low, high = max(one.low for one in found), max(one.high for one in found)
-    return Found(low, high, max(one.radius for one in found), max(one.doubt for one in found), frames)
+    low, high, radius, doubt = np.array(found).max(axis=0).tolist()
+    return Found(low, high, radius, doubt, frames)
 
 
 def _heard(link: Link, delay: Fraction, sent: Sequence[Fraction], tick: Fraction, told: Hearing) -> list[int]:
@@ -140,11 +139,11 @@ def _period(
     depth: Mapping[str, int],
     slots: Mapping[str, int],
     frames: int,
-) -> Found:
-    """Return what a loop grows by in a frame."""
+) -> tuple[float, float, float, float]:
+    """Return bounds on what a loop grows by in a frame, an estimate, and how far another one is from it."""
     known: dict[tuple[int, ...], Balls] = {}
+    at: Relative | None = None
     rows = [told.rows[id(site.schedule)] for site in loop.sites]
-    coordinates: Relative | None = None
     # The eigenvalues of a product are those of its halves in either order, with other roundings.
     halves: list[Balls] = []
     scale = 0
@@ -153,30 +152,27 @@ def _period(
         if numbers not in known:
             now = _hearing_so(loop, rows, iter(numbers), depth, slots)
             layout = lay_out_loop(now)
-            matrix = close(
-                [site.lifted.bounded for site in now.sites], feedback_of(now, layout), layout, numbers=RADII
-            ).matrix
-            if coordinates is None:
-                at = relative_coordinates(find_rigid_modes(now, with_drifts=False).basis)
-                coordinates = replace(at, weights=with_radius(at.weights, at.doubt))
-            known[numbers] = relative(matrix, coordinates, RADII)
+            maps = [site.lifted.bounded for site in now.sites]
+            matrix = close(maps, feedback_of(now, layout), layout, numbers=RADII).matrix
+            if at is None:
+                at = with_doubt(relative_coordinates(find_rigid_modes(now, with_drifts=False).basis))
+            known[numbers] = relative(matrix, at, RADII)
         if frame in (0, frames // 2):
             halves.append(known[numbers])
         else:
             product = RADII.multiply(known[numbers], halves[-1])
             halves[-1], more = _scaled(product, float(np.abs(value_of(product)).max(initial=0.0)))
             scale += more
-    first, last = halves[0], halves[-1]
+    first, last = (halves * 2)[:2]
     product, turned = last, value_of(last)
-    if len(halves) > 1:
+    if frames > 1:
         product, turned = RADII.multiply(last, first), value_of(first) @ value_of(last)
     # Enclosures are as narrow as asked for where the radius is near 1.
     product, more = _scaled(product, _radius(value_of(product)))
     _, bounds = enclose_eigenvalues(value_of(product), radius_of(product))
-    found = bounds.low, bounds.high, _radius(value_of(product)), _radius(np.ldexp(turned, -more))
-    unit = math.exp2((scale + more) / frames)
-    low, high, radius, other = (one ** (1 / frames) * unit for one in found)
-    return Found(low, high, radius, abs(other - radius), frames)
+    grown = bounds.low, bounds.high, _radius(value_of(product)), _radius(np.ldexp(turned, -more))
+    low, high, radius, other = np.array(grown) ** (1 / frames) * math.exp2((scale + more) / frames)
+    return low, high, radius, abs(other - radius)
 
 
 def _radius(matrix: Floats) -> float:

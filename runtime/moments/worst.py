@@ -20,8 +20,9 @@ d ← r splits into the modes, of which the largest gain counts.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
@@ -42,6 +43,7 @@ from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, value_of
 from apc.frame.schedule import Way
 from apc.moments.held import Ear, HeldLoop, held_loop, held_scene, lossy_rows
+from apc.moments.unserved import UnservedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -126,9 +128,10 @@ def worst_case(system: CompiledSystem, prepared: Prepared) -> LossesInARow:
     prepared
         From `analysis.prepare`, of this system with any numbers.
     """
-    found = held_parts(system, prepared)
-    if isinstance(found, str):
-        return LossesInARow(None, None, None, f"losses in a row are left open: {found}")
+    try:
+        found = held_parts(system, prepared)
+    except UnservedError as why:
+        return LossesInARow(None, None, None, f"losses in a row are left open: {why}")
     certified = harmless(found)
     if certified == MANY:
         return LossesInARow(MANY, None, None, f"{MANY:,} losses in a row are harmless, where counting ends")
@@ -172,8 +175,8 @@ def trace_of_worst(system: CompiledSystem) -> CompiledSystem:
     return replace(system, links=tuple(map(played, system.links)))
 
 
-def held_parts(system: CompiledSystem, prepared: Prepared) -> HeldParts | str:
-    """Make the modes of a scene whose receivers hold what they heard last, or say why not.
+def held_parts(system: CompiledSystem, prepared: Prepared) -> HeldParts:
+    """Make the modes of a scene whose receivers hold what they heard last.
 
     Parameters
     ----------
@@ -181,26 +184,22 @@ def held_parts(system: CompiledSystem, prepared: Prepared) -> HeldParts | str:
         As for `worst_case`.
     """
     scene = held_scene(system, prepared)
-    loops = (
-        scene if isinstance(scene, str) else loops_at_right_angles(scene.groups, scene.exchange, MOST_STATES)
-    )
-    if isinstance(scene, str) or isinstance(loops, str):
-        return str(loops)
+    loops = loops_at_right_angles(scene.told.groups, scene.told.exchange, MOST_STATES)
+    if isinstance(loops, str):
+        raise UnservedError(loops)
     lossy = scene.lossy
     parts, ratios = [], _ratios(loops[0].sites, lossy)
     weight, sizes = _weight(loops, lossy)
     for loop in loops:
         if loop.states > MOST_STATES:
-            return f"peers make one system of {loop.states:,} states, and {MOST_STATES} are the most"
-        part = _part(loop, lossy, ratios, sizes)
-        if part is None:
-            return "a packet follows from another one of its frame"
-        parts.append(part)
+            what = f"peers make one system of {loop.states:,} states"
+            raise UnservedError(f"{what}, and {MOST_STATES} are the most")
+        parts.append(_part(loop, lossy, ratios, sizes))
     return HeldParts(tuple(parts), weight)
 
 
-def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios, sizes: Sizes) -> HeldPart | None:
-    """Make a mode of a scene, None where packets depend on one another within a frame."""
+def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios, sizes: Sizes) -> HeldPart:
+    """Make a mode of a scene."""
 
     def size(site: int, link: str) -> float:
         """Return how far n peers of a site that move alike by 1 move together: √n, or as they are weighed."""
@@ -227,9 +226,7 @@ def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios, sizes: Sizes) -> He
                 places = [line for line, one in rows if (one.way, one.sent) == (way, sent)]
                 outside.append(Ear(dict.fromkeys(((g, line) for line in places), ONE)))
                 shares.append(1 / size(g, sent.link))
-    heard, whole = held_loop(loop, ears, lossy), held_loop(loop, [*ears, *outside], lossy)
-    if heard is None or whole is None:
-        return None
+    heard, whole = (held_loop(loop, some, lossy).relative() for some in (ears, [*ears, *outside]))
     roundings = [8 * UNIT * share if share != 1 else 0.0 for share in shares]
     sums: dict[tuple[int, str, str], Floats] = {}
     for place, ear in enumerate(ears):
@@ -362,70 +359,42 @@ def harmless(of: HeldParts) -> int | None:
 
 
 @cache
-def words(losses: int) -> tuple[tuple[int, ...], ...]:
-    """Return the words of gaps that are tried, whose longest gap loses so many packets, the shortest first.
+def _words() -> dict[int, list[tuple[int, ...]]]:
+    """Return the words of gaps that are tried, by how many losses in a row they have, the shortest first.
 
     A gap is the number of frames from one packet that is heard to the next. Of all words that turn into one
-    another the first is given; none repeats a shorter one.
+    another the first is given.
     """
-    return _all_words().get(losses, ())
-
-
-@cache
-def _all_words() -> dict[int, tuple[tuple[int, ...], ...]]:
-    found: set[tuple[int, ...]] = {(1,)}
-    for pattern in _lyndon_words(2, FRAMES):
-        heard = [place for place, symbol in enumerate(pattern) if symbol]
-        gaps = np.diff([-1, *heard]).tolist()
-        found |= {min((*gaps[k:], *gaps[:k]) for k in range(len(gaps)))} if gaps else set()
-    found |= {tuple(gap + 1 for gap in pattern) for pattern in _lyndon_words(LONGEST, GAPS)}
-    found |= {(*(1,) * short, long) for long in range(2, LONE + 1) for short in range(SHORT)}
+    tried: set[tuple[int, ...]] = set()
+    for frames in range(1, FRAMES + 1):
+        for lost in itertools.product((0, 1), repeat=frames - 1):
+            heard = [place for place, one in enumerate((*lost, 0)) if not one]
+            tried.add(tuple(np.diff([-1, *heard]).tolist()))
+    for count in range(1, GAPS + 1):
+        tried |= set(itertools.product(range(1, LONGEST + 1), repeat=count))
+    tried |= {(*(1,) * short, long) for long in range(2, LONE + 1) for short in range(SHORT)}
+    turned = {min(word[k:] + word[:k] for k in range(len(word))) for word in tried}
     by_losses: dict[int, list[tuple[int, ...]]] = {}
-    for word in sorted(found, key=lambda word: (sum(word), word)):
+    for word in sorted(turned, key=lambda word: (sum(word), word)):
         by_losses.setdefault(max(word) - 1, []).append(word)
-    return {losses: tuple(listed) for losses, listed in by_losses.items()}
+    return by_losses
 
 
-def _lyndon_words(symbols: int, length: int) -> Iterator[tuple[int, ...]]:
-    """Give the words of up to a length that come before all that they turn into (Duval, 1988)."""
-    word = [-1]
-    while word:
-        word[-1] += 1
-        yield tuple(word)
-        own = len(word)
-        while len(word) < length:
-            word.append(word[-own])
-        while word and word[-1] == symbols - 1:
-            word.pop()
-
-
-def growths(part: HeldPart, tried: Sequence[tuple[int, ...]]) -> Floats:
-    """Return what words make of a mode per frame (n,), all channels losing the same packets.
-
-    Parameters
-    ----------
-    part
-        The mode.
-    tried
-        Words of gaps.
-    """
+def _growths(part: HeldPart, words: Sequence[tuple[int, ...]]) -> Floats:
+    """Return what words make of a mode per frame (words,), all channels losing the same packets."""
     heard, lost = (value_of(part.heard.frame(lost=one)) for one in (False, True))
-    found = np.zeros(len(tried))
-    if not len(heard):
-        return found
     gaps = [heard]
-    for _ in range(max(map(max, tried)) - 1):
+    for _ in range(max(map(max, words)) - 1):
         gaps.append(gaps[-1] @ lost)
-    over = np.stack(gaps)
-    for length in sorted({len(word) for word in tried}):
-        places = [place for place, word in enumerate(tried) if len(word) == length]
-        listed = np.array([tried[place] for place in places])
+    over, growths = np.stack(gaps), np.zeros(len(words))
+    for length in {len(word) for word in words} if len(heard) else ():
+        places = [place for place, word in enumerate(words) if len(word) == length]
+        listed = np.array([words[place] for place in places])
         product = over[listed[:, 0] - 1]
         for column in range(1, length):
             product = over[listed[:, column] - 1] @ product
-        size = np.abs(np.linalg.eigvals(product)).max(axis=1)
-        found[places] = size ** (1 / listed.sum(axis=1))
-    return found
+        growths[places] = np.abs(np.linalg.eigvals(product)).max(axis=1) ** (1 / listed.sum(axis=1))
+    return growths
 
 
 def shaking(of: HeldParts, *, known: int = 0) -> tuple[tuple[bool, ...] | None, float | None, str]:
@@ -444,42 +413,31 @@ def shaking(of: HeldParts, *, known: int = 0) -> tuple[tuple[bool, ...] | None, 
         A period of the pattern, its growth per frame, and what else there is to say.
     """
     cost = sum(max(part.heard.f.shape[-1], LEAST_STATES) ** 3 for part in of.parts)
-    most = max(FEWEST, WORK // cost)
-    listed = [losses for losses in range(LONE) if losses == 0 or losses > known]
-    # So few words are left of many losses that they are tried together.
-    batches = [[losses] for losses in listed if losses < LONGEST]
-    batches.append([losses for losses in listed if losses >= LONGEST])
-    for batch in batches:
-        tried = [word for losses in batch for word in words(losses)[:most]]
-        if not tried:
+    for losses, listed in sorted(_words().items()):
+        if 0 < losses <= known:
             continue
-        found = np.stack([growths(part, tried) for part in of.parts])
-        growth, longest = found.max(axis=0), [max(word) for word in tried]
-        for place in np.lexsort((-growth, [sum(word) for word in tried], longest)).tolist():
-            part = of.parts[int(np.argmax(found[:, place]))]
-            if growth[place] > ABOVE and _is_proved(part, tried[place]):
-                note = f"the {part.name} mode grows where all peers lose the same packets"
-                if longest[place] == 1:
-                    note = f"the {part.name} mode grows with no packet lost"
-                alike = np.flatnonzero(np.array(longest) == longest[place])
-                worst = alike[int(np.argmax(growth[alike]))]
-                if growth[worst] > growth[place] * (2 - 1 / ABOVE):
-                    note += (
-                        f"; of at most {longest[place] - 1} losses in a row, the most met is "
-                        f"{growth[worst]:.8g} a frame, by {spelled(pattern_of(tried[worst]))}"
-                    )
-                return pattern_of(tried[place]), float(growth[place]), note
+        words = listed[: max(FEWEST, WORK // cost)]
+        growths = np.stack([_growths(part, words) for part in of.parts])
+        growth = growths.max(axis=0)
+        for place in np.lexsort((-growth, [sum(word) for word in words])).tolist():
+            part = of.parts[int(np.argmax(growths[:, place]))]
+            if growth[place] <= ABOVE or not _is_proved(part, words[place]):
+                continue
+            note = f"the {part.name} mode grows where all peers lose the same packets"
+            if not losses:
+                note = f"the {part.name} mode grows with no packet lost"
+            most = int(np.argmax(growth))
+            if growth[most] > growth[place] * (2 - 1 / ABOVE):
+                spelled = "".join("×" if lost else "·" for lost in pattern_of(words[most]))
+                note += f"; of at most {losses} losses in a row, the most met is "
+                note += f"{growth[most]:.8g} a frame, by {spelled}"
+            return pattern_of(words[place]), float(growth[place]), note
     return None, None, f"no pattern tried of fewer than {LONE} losses in a row shakes the scene"
 
 
 def pattern_of(word: Sequence[int]) -> tuple[bool, ...]:
     """Return a period of a word of gaps, frame by frame: whether packets get lost."""
     return tuple(lost for gap in word for lost in (*(True,) * (gap - 1), False))
-
-
-def spelled(pattern: Sequence[bool]) -> str:
-    """Return a pattern as a row of dots, crosses where packets get lost."""
-    return "".join("×" if lost else "·" for lost in pattern)
 
 
 def _is_proved(part: HeldPart, word: Sequence[int]) -> bool:

@@ -9,15 +9,25 @@ Does not: compute.
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from math import floor, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apc.compiler.words import WIDTH, counted, in_hertz, measured, with_unit, wrapped
-from apc.present.forms import document, note
+from apc.compiler.words import counted, in_hertz, measured, wrapped
+from apc.present.forms import (
+    LINEARIZED,
+    document,
+    labelled,
+    listed,
+    note,
+    notes,
+    picked,
+    quantity,
+    record,
+    table,
+)
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
@@ -38,18 +48,11 @@ DECIMALS = 6  # of a magnitude
 MOST_UNFELT = 4  # names of what is left out beside the translations
 LEAST_MAGNITUDE = 1e-6  # its six digits would show as zero
 LARGE = 1e4  # a larger magnitude needs another notation to fit its column
-MOVES_WIDTH = 30  # columns at most of what a mode moves, at least of what it is cut to
-LEAST_WIDTH = 12
 LEAST_SHARE = 0.005  # shows as zero
 HEADINGS = ("magnitude", "shape", "times", "frequency", "damping", "moves most")
 
-LINEARIZED = ", linearized at its start"
-
-MOST_NAMED = 30  # columns of a contact mode's name; a longer one has a line of its own
 NOT_PLAYED = "not predicted and played: --buzz"
 SHOWN = 1e-9  # digits of a contact mode's spectral radius that its column has room for
-
-_NOUNS = {"determinant": "determinant"}
 
 _WORDS = {
     "stable": "Every motion dies out.",
@@ -84,10 +87,8 @@ def compile_text(system: CompiledSystem, needs: Needs, target: Path) -> str:
         *note(str(replace(needs, pairs=()))),  # they follow, with their reason
         f"  frame {_time(float(needs.frame))}: {ticks or 'no clock is used, any frame will do'}",
     ]
-    lines += warning_lines(system.warnings)
-    for text in (*_pairwise(system), *(f"left out: {name}, as {reason}" for name, reason in system.dropped)):
-        lines += note(text)
-    return "\n".join(lines)
+    dropped = [f"left out: {name}, as {reason}" for name, reason in system.dropped]
+    return "\n".join([*lines, *warning_lines(system.warnings), *notes([*_pairwise(system), *dropped])])
 
 
 def _pairwise(system: CompiledSystem) -> Iterator[str]:
@@ -110,10 +111,6 @@ def _pairwise(system: CompiledSystem) -> Iterator[str]:
 
 def analysis_text(result: Analysis) -> str:
     """Return what `apc analyze` prints: the verdict in words, the numbers, the modes as a table."""
-    lines = [f"{result.topology}: {result.verdict}{LINEARIZED if result.linearized else ''}"]
-    for text in result.left_out:
-        lines += note(text)
-    lines.append("")
     words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
     motions = result.translations + result.rotations
     if motions > 1 and result.verdict.startswith("stable up to"):
@@ -127,43 +124,36 @@ def analysis_text(result: Analysis) -> str:
         words += "\nWhat it does in time is played: apc simulate"
     if not result.states_per_peer:
         words = "Nothing here is free to move."
+    named = (("translation", result.translations), ("rotation", result.rotations))
+    removed = " and ".join(counted(count, noun) for noun, count in named if count)
+    radius = measured(result.spectral_radius, result.spectral_radius_error)
+    facts = (
+        ("spectral radius", f"{radius} per frame of {_time(result.frame_s)}"),
+        ("peers", f"{result.peers}, {result.states_per_peer} states each"),
+        ("method", result.method + (f", {removed} left out" if removed else "")),
+        ("proof", result.proof),
+        (
+            "left out",
+            result.unfelt
+            and f"{listed(result.unfelt, MOST_UNFELT)}, which nothing that moves reads at these values",
+        ),
+    )
+    lines = [f"{result.topology}: {result.verdict}{LINEARIZED if result.linearized else ''}"]
+    lines += [*notes(result.left_out), ""]
     lines += [line for one in words.splitlines() for line in wrapped(one, "  ", "  ")]
-    removed = ""
-    if motions:
-        named = (("translation", result.translations), ("rotation", result.rotations))
-        removed = f", {' and '.join(counted(count, noun) for noun, count in named if count)} left out"
-    lines += [
-        "",
-        f"  spectral radius  {measured(result.spectral_radius, result.spectral_radius_error)}"
-        f" per frame of {_time(result.frame_s)}",
-        f"  peers            {result.peers}, {result.states_per_peer} states each",
-        f"  method           {result.method}{removed}",
-    ]
-    if result.proof:
-        lines.append(f"  proof            {result.proof}")
-    if result.unfelt:
-        names = f"{', '.join(result.unfelt[:MOST_UNFELT])}{', …' if len(result.unfelt) > MOST_UNFELT else ''}"
-        told = f"{names}, which nothing that moves reads at these values"
-        lines += wrapped(told, "  left out         ", " " * 19)
-    lines += ["", _mode_table(result.modes)]
-    for text in result.notes:
-        lines += note(text)
-    return "\n".join(lines)
+    lines += ["", *(line for label, text in facts if text for line in labelled(label, text)), ""]
+    return "\n".join([*lines, *_mode_table(result.modes), *notes(result.notes)])
 
 
 def analysis_document(result: Analysis) -> dict[str, Any]:
     """Return what `apc analyze --json` prints of the analysis itself."""
-    modes = [_mode_document(mode) for mode in result.modes]
-    found: dict[str, Any] = document(result, {"modes": modes})
-    return found
+    return record(result, {"modes": [_mode_document(mode) for mode in result.modes]})
 
 
 def _mode_document(mode: Mode) -> dict[str, Any]:
     (motion,) = mode.motion
-    told: dict[str, Any] = document(mode, {"motion": None})
-    del told["motion"]
     moved: dict[str, Any] = document(motion, {"participation": dict(motion.participation)})
-    return told | moved
+    return record(mode, {"motion": ..., **moved})
 
 
 def analysis_picture(result: Analysis, ax: Any = None) -> Any:
@@ -175,30 +165,27 @@ def analysis_picture(result: Analysis, ax: Any = None) -> Any:
 
 def answer_text(found: Answer) -> str:
     """Return what `apc analyze` prints: the analysis, and what stands beside it."""
-    parts = [analysis_text(found.analysis), str(found.sensitivities), str(found.margins)]
-    if found.network is not None:
-        parts.insert(0, str(found.network))
-    if found.contact_modes is not None:
-        parts.append(str(found.contact_modes))
-    if found.switching is not None:
-        parts.append(str(found.switching))
-    if found.buzz is not None:
-        parts.append(str(found.buzz))
-    if found.no_buzz:
-        parts.append("\n".join(wrapped(f"{found.analysis.topology}: {found.no_buzz}")))
-    if found.detailed:
-        parts.append(str(found.conventions))
-    elif found.conventions.warning:
-        parts.append("\n".join(wrapped(f"Warning: {found.conventions.warning}")))
-    if found.box is not None:  # that was asked for
-        parts.insert(0, str(found.box))
-    first, *rest = "\n\n".join(parts).split("\n")
+    conventions = found.conventions
+    warning = conventions.warning and "\n".join(wrapped(f"Warning: {conventions.warning}"))
+    parts = (
+        found.box,
+        found.network,
+        analysis_text(found.analysis),
+        found.sensitivities,
+        found.margins,
+        found.contact_modes,
+        found.switching,
+        found.buzz,
+        "\n".join(wrapped(f"{found.analysis.topology}: {found.no_buzz}")) if found.no_buzz else "",
+        conventions if found.detailed else warning,
+    )
+    first, *rest = "\n\n".join(str(one) for one in parts if one is not None and one != "").split("\n")
     return "\n".join((first, *warning_lines(found.warnings), *rest))
 
 
 def warning_lines(warnings: Sequence[str]) -> list[str]:
     """Return the warnings of a topology as lines to stand under a sentence."""
-    return [line for text in warnings for line in note(f"Warning: {text}")]
+    return notes(f"Warning: {text}" for text in warnings)
 
 
 def network_answer_text(found: NetworkAnswer) -> str:
@@ -217,14 +204,12 @@ def network_answer_document(found: NetworkAnswer) -> dict[str, Any]:
 
 def answer_document(found: Answer) -> dict[str, Any]:
     """Return what `apc analyze --json` prints: the analysis with more keys."""
-    told = found.analysis.to_dict() | {
-        "network": found.network.to_dict() if found.network else None,
-        "sensitivities": found.sensitivities.to_dict(),
+    parts = ("network", "sensitivities", "contact_modes", "switching", "buzz")
+    told = found.analysis.to_dict()
+    told |= {name: one.to_dict() if (one := getattr(found, name)) else None for name in parts}
+    told |= {
         "margins": document(found.margins.rows),
         "margins_note": found.margins.note,
-        "contact_modes": found.contact_modes.to_dict() if found.contact_modes else None,
-        "switching": found.switching.to_dict() if found.switching else None,
-        "buzz": found.buzz.to_dict() if found.buzz else None,
         "buzz_note": "" if found.buzz else found.no_buzz or NOT_PLAYED,
         "warnings": [*found.warnings, *filter(None, (found.conventions.warning,))],
     }
@@ -235,31 +220,31 @@ def answer_document(found: Answer) -> dict[str, Any]:
     return told
 
 
-def _mode_table(modes: Sequence[Mode]) -> str:
+def _mode_table(modes: Sequence[Mode]) -> list[str]:
     # What can't be told from zero is counted only: its rounding differs from machine to machine.
     alive = [mode for mode in modes if _is_alive(mode)]
     rows = [mode for mode in alive if mode.eigenvalue.imag >= -mode.error]  # a conjugate pair is one row
     shown = rows[:MOST_ROWS]
     dead = [mode for mode in modes if not _is_alive(mode)]
-    rest = [*dead, *rows[MOST_ROWS:]]
+    left = len(dead) + len(rows) - len(shown)
     # A mode not told from zero may be any size up to its error.
     least = max(shown[-1].magnitude if shown else 0.0, 2 * LEAST_MAGNITUDE)
     unsure = sum(not mode.magnitude + mode.error <= least for mode in dead)
-    text = "\n".join(_table_lines([HEADINGS, *(_cells(mode) for mode in shown)])) if shown else ""
-    if not rest:
-        return text or "  nothing moves but that"
+    lines = table([HEADINGS, *map(_cells, shown)], "><>>><") if shown else []
+    if not left:
+        return lines or ["  nothing moves but that"]
     if unsure:
-        many = "all" if unsure == len(rest) > 1 else str(unsure)
-        told = f"{counted(len(rest), 'mode')} {'more' if shown else ''} (--json lists all),"
-        told += (
-            f" {many} of them known too roughly to say how fast {'it dies' if unsure == 1 else 'they die'}"
-        )
+        many = "all" if unsure == left > 1 else str(unsure)
+        ends = "it dies" if unsure == 1 else "they die"
+        told = f"{counted(left, 'mode')} {'more' if shown else ''} (--json lists all),"
+        told += f" {many} of them known too roughly to say how fast {ends}"
     elif shown:
-        told = f"{len(rest)} faster-dying {'one' if len(rest) == 1 else 'ones'} (--json lists all)"
+        told = f"{left} faster-dying {'one' if left == 1 else 'ones'} (--json lists all)"
     else:
-        ends = "dies" if len(rest) == 1 else "die"
-        told = f"{counted(len(rest), 'mode')} {ends} out within a frame (--json lists all)"
-    return "\n".join([*text.splitlines(), *note(f"and {told}" if shown else told)])
+        told = (
+            f"{counted(left, 'mode')} {'dies' if left == 1 else 'die'} out within a frame (--json lists all)"
+        )
+    return [*lines, *note(f"and {told}" if shown else told)]
 
 
 def _is_alive(mode: Mode) -> bool:
@@ -287,22 +272,6 @@ def _magnitude(mode: Mode) -> str:
     return f"{mode.magnitude:.{decimals}f}" + " " * (DECIMALS - decimals)
 
 
-def _table_lines(rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
-    """Yield the lines of a table: numbers to the right, words to the left, the last column wrapped."""
-    widths = [max(len(row[place]) for row in rows) for place in range(len(HEADINGS) - 1)]
-    room = WIDTH - 2 - sum(widths) - 2 * len(widths)
-    last = max(min(MOVES_WIDTH, room), LEAST_WIDTH)
-    for row in rows:
-        cells = [
-            f"{cell:<{width}}" if heading == "shape" else f"{cell:>{width}}"
-            for heading, cell, width in zip(HEADINGS, row, widths, strict=False)
-        ]
-        start = f"  {'  '.join(cells)}  "
-        for line in textwrap.wrap(row[-1], last, break_on_hyphens=False) or [""]:
-            yield f"{start}{line}".rstrip()
-            start = " " * len(start)
-
-
 def _leading(mode: Mode) -> str:
     largest = sorted(mode.participation, key=lambda item: -item[1])[:2]
     return ", ".join(f"{name} {share:.0%}" for name, share in largest if share >= LEAST_SHARE)
@@ -317,7 +286,7 @@ def needs_text(found: Needs) -> str:
     several = len(found.sites) > 1
     sites = "; ".join(f"{one.name}: {_site(one)}" if several else _site(one) for one in found.sites)
     whole = found.peers > 1 and sum(count for count, _ in found.systems) == 1
-    noun = _NOUNS.get(found.method, "system" if whole else "mode")
+    noun = "determinant" if found.method == "determinant" else "system" if whole else "mode"
     systems = " and ".join(f"{counted(count, noun)} of {size}" for count, size in found.systems)
     analysed = f"not analysed: {found.refused}" if found.refused else f"analysed as {systems}"
     pairs = "".join(f"; costs N²: {name} is evaluated once a pair of peers" for name in found.pairs)
@@ -335,29 +304,29 @@ def _site(found: SiteNeeds) -> str:
 
 def box_proof_text(found: BoxProof) -> str:
     """Return what was proved of a box."""
-    lines = [f"  {_range(one)}" for one in found.ranges]
     where = [
-        f"  {one.free.label} = {with_unit(f'{value:.12g}', one.unit)}"
+        f"  {one.free.label} = {quantity(value, one.unit, 12)}"
         for one, value in zip(found.ranges, found.point, strict=False)  # a proved box has no point
     ]
+    cells = counted(found.cells, "cell")
+    more = []
     if found.stable:
-        said = f"proved {found.verdict} for every value in the box ({counted(found.cells, 'cell')})"
+        said = f"proved {found.verdict} for every value in the box ({cells})"
     elif found.stable is False:
         said = "not stable in all of the box"
-        lines += [f"proved {found.verdict} at", *where]
+        more = [f"proved {found.verdict} at", *where]
     else:
-        share = f"{100 * found.open_share:.3g} %"
-        said = f"undecided, {share} of the box is left open ({counted(found.cells, 'cell')})"
+        said = f"undecided, {100 * found.open_share:.3g} % of the box is left open ({cells})"
         if found.point:  # else nothing was looked at, as its notes say
-            lines += ["among others around", *where]
-            lines += wrapped(f"more cells may decide it: --cells {MORE_CELLS * found.cells}")
-    lines += [f"  {text}" for text in found.notes]
-    told = [line for text in found.left_out for line in wrapped(text)]
-    return "\n".join([f"{found.topology}:", *told, *wrapped(said), *lines])
+            more = ["among others around", *where]
+            more += wrapped(f"more cells may decide it: --cells {MORE_CELLS * found.cells}")
+    told = [line for text in (*found.left_out, said) for line in wrapped(text)]
+    ranges = [f"  {_range(one)}" for one in found.ranges]
+    return "\n".join([f"{found.topology}:", *told, *ranges, *more, *(f"  {one}" for one in found.notes)])
 
 
 def _range(found: Range) -> str:
-    low, high = (with_unit(f"{float(one):.9g}", found.unit) for one in (found.low, found.high))
+    low, high = (quantity(float(one), found.unit, 9) for one in (found.low, found.high))
     return f"{found.free.label} from {low} to {high}"
 
 
@@ -369,16 +338,10 @@ def range_document(found: Range) -> dict[str, Any]:
 def box_proof_document(found: BoxProof) -> dict[str, Any]:
     """Return what was proved of a box as plain data."""
     return {
-        "topology": found.topology,
-        "left_out": list(found.left_out),
+        **picked(found, "topology", "left_out", "verdict", "stable", "cells", "open_share", "notes"),
         "box": [range_document(one) for one in found.ranges],
-        "verdict": found.verdict,
-        "stable": found.stable,
-        "cells": found.cells,
-        "open_share": found.open_share,
         "unstable_at": list(found.point) if found.stable is False else None,
         "open_around": list(found.point) if found.stable is None and found.point else None,
-        "notes": list(found.notes),
     }
 
 
@@ -388,33 +351,26 @@ def contact_modes_text(found: ContactModes) -> str:
         return "\n".join([f"{found.topology}: no part switches", *found.notes])
     lines = [*wrapped(f"{found.topology}: {found.summary}"), ""]
     lines += [f"  {name} on: it follows the motion; off: it does not" for name in found.parts]
-    width = min(MOST_NAMED, max(len(mode.name) for mode in found.modes))
-    lines += ["", f"  {'':<{width}}  {'spectral radius':<19}  {'frequency':>9}  verdict"]
+    rows = [("spectral radius", "frequency", "verdict", "")]
     for mode in found.modes:
-        if len(mode.name) > width:
-            lines.append(f"  {mode.name}")
-        head = f"  {mode.name if len(mode.name) <= width else '':<{width}}"
         if mode.refusal:
-            lines += [f"{head}  not analysed:", *wrapped(mode.refusal, "    ", "    ")]
+            rows.append(("–", "–", "not analysed", mode.name))
             continue
         radius = measured(mode.spectral_radius, max(mode.spectral_radius_error, SHOWN))
         frequency = in_hertz(mode.frequency_hz) if mode.frequency_hz else "–"
         verdict = mode.verdict.partition(" up to ")[0].partition(":")[0]
-        lines.append(f"{head}  {radius:<19}  {frequency:>9}  {verdict}{'*' if mode.linearized else ''}")
+        rows.append((radius, frequency, verdict + "*" * mode.linearized, mode.name))
+    lines += ["", *table(rows, "<><<")]
     if any(mode.linearized for mode in found.modes):
         lines += ["", "  * near the start values: this piece is not linear"]
-    return "\n".join([*lines, *(f"  {text}" for text in found.notes)])
+    refused = [f"{mode.name}: not analysed: {mode.refusal}" for mode in found.modes if mode.refusal]
+    return "\n".join([*lines, *notes([*refused, *found.notes])])
 
 
 def contact_modes_document(found: ContactModes) -> dict[str, Any]:
     """Return the modes of contact as plain data."""
-    return {
-        "topology": found.topology,
-        "parts": list(found.parts),
-        "unstable": list(found.unstable),
-        "modes": [_analysed(mode, {"on": dict(mode.on)}, "frequency_hz") for mode in found.modes],
-        "notes": list(found.notes),
-    }
+    modes = [_analysed(mode, {"on": dict(mode.on)}, "frequency_hz") for mode in found.modes]
+    return record(found, {"unstable": found.unstable, "modes": modes})
 
 
 def switching_text(found: Switching) -> str:
@@ -443,8 +399,7 @@ def _analysed(found: ContactMode | Outcome, instead: dict[str, Any], *more: str)
     """Return plain data of what may have been refused: then there are no numbers of an analysis."""
     if not found.verdict:
         instead |= dict.fromkeys(("verdict", "spectral_radius", "spectral_radius_error", *more))
-    told: dict[str, Any] = document(found, instead)
-    return told
+    return record(found, instead)
 
 
 def conventions_text(found: Conventions) -> str:
@@ -477,25 +432,20 @@ def conventions_text(found: Conventions) -> str:
 
 def conventions_document(found: Conventions) -> dict[str, Any]:
     """Return what every convention leads to as plain data."""
-    return {
-        "topology": found.topology,
-        "flips": found.flips,
-        "repeated": found.repeated,
-        "not_repeated": found.not_repeated,
-        "start_matters": found.start_matters,
-        "outcomes": [_analysed(one, {}) for one in found.outcomes],
-    }
+    outcomes = [_analysed(one, {}) for one in found.outcomes]
+    return record(found, {"flips": found.flips, "repeated": found.repeated, "outcomes": outcomes})
 
 
 def paper_route_text(found: PaperRoute) -> str:
     """Return the shapes of the paper's matrices, a line each."""
-    named = (
-        *(("A", found.a), ("B", found.b), ("C", found.c), ("A_D", found.a_d), ("B_D", found.b_d)),
-        *(("C_D", found.c_d), ("D_D", found.d_d), ("A_aug", found.a_aug), ("B_aug", found.b_aug)),
-        *(("C_aug", found.c_aug), ("D_aug", found.d_aug), ("F_D", found.f_d), ("A_cl", found.closed)),
-    )
-    lines = [f"  {name:<6} {len(one.rows):>4} × {len(one.columns)}" for name, one in named]
-    return "\n".join([f"ratio {found.ratio}, frame {found.frame_s * 1e3:.6g} ms", *lines])
+    lines = [f"ratio {found.ratio}, frame {found.frame_s * 1e3:.6g} ms"]
+    for field in fields(found):
+        matrix = getattr(found, field.name)
+        if hasattr(matrix, "columns"):
+            which, mark, of = field.name.partition("_")
+            name = "A_cl" if which == "closed" else f"{which.upper()}{mark}{of.replace('d', 'D')}"
+            lines.append(f"  {name:<6} {len(matrix.rows):>4} × {len(matrix.columns)}")
+    return "\n".join(lines)
 
 
 def matrix_text(found: NamedMatrix) -> str:
@@ -503,6 +453,3 @@ def matrix_text(found: NamedMatrix) -> str:
     rows, columns = found.rows, found.columns
     shown = f"{len(rows)} × {len(columns)}"
     return f"{shown}: {rows[0]} … {rows[-1]} by {columns[0]} … {columns[-1]}" if found.values.size else shown
-
-
-needs_document = paper_route_document = matrix_document = document

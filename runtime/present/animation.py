@@ -18,14 +18,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.files import check_target, write_file
 from apc.compiler.timings import part
 from apc.optional import missing, need
-from apc.present.planar import MM, Actor
-from apc.present.still import draw_actors
+from apc.present.still import MM, draw_actors, keep_in_sight, widen
 
 if TYPE_CHECKING:
     from apc.simulation.trajectory import Trajectory
@@ -67,23 +65,23 @@ def save_animation(system: CompiledSystem, found: Trajectory, path: Path) -> Non
     """
     check_animation(path)
     moving = need("matplotlib.animation", "plot")
-    figure, actors = draw_actors(system, named=False)
+    figure, actors = draw_actors(system)
     columns = {signal.name: place for place, signal in enumerate(found.signals)}
     tracks = [MM * found.values[:, [columns[name] for name in actor.states]] for actor in actors]
-    _keep_in_sight(actors, tracks)
+    for actor, track in zip(actors, tracks, strict=True):
+        widen(actor, track)
+    if actors:
+        keep_in_sight([actor.ax for actor in actors])
     start, end = float(found.time[0]), float(found.time[-1])
     seconds = min(max(end - start, SHORTEST), LONGEST)
     times = np.linspace(start, end, round(RATE * seconds) + 1)
     rows = np.minimum(np.searchsorted(found.time, times), len(found.time) - 1)
-    title = figure.suptitle(" ", fontsize=11)
-    for ax in {id(actor.ax): actor.ax for actor in actors}.values():
-        ax.set_title(ax.get_title().partition(": at the start")[0].replace(system.name, ""), fontsize=9)
     speed = (end - start) / seconds
     told = "" if abs(speed - 1) < 1e-3 else f", {speed:.2g} × as fast as it is"
     pixels = [2 * round(side * DPI / 2) for side in figure.get_size_inches()]  # ffmpeg wants even ones
     figure.set_size_inches(*(side / DPI for side in pixels))
-    shapes = [actor.shape for actor in actors if actor.shape is not None]
-    _paint_what_stands(figure, [title, *shapes, *(actor.dot for actor in actors)])
+    title = figure.suptitle(" ", fontsize=11)
+    _paint_what_stands(figure, [title, *(artist for actor in actors for artist in actor.artists)])
 
     writer = moving.writers["ffmpeg" if path.suffix.lower() == ".mp4" else "pillow"](fps=RATE)
 
@@ -117,20 +115,3 @@ def _paint_what_stands(figure: Any, moving: Sequence[Any]) -> None:
     for one in moving:
         one.set_visible(True)
     figure.figimage(painted, zorder=-1)
-
-
-def _keep_in_sight(actors: Sequence[Actor], tracks: Sequence[NDArray[np.float64]]) -> None:
-    """Widen the axes to all that is ever there: those of planes alike and square, along a line only x."""
-    if not actors:
-        return
-    low = np.min([track.min(axis=0) - one.half for one, track in zip(actors, tracks, strict=True)], axis=0)
-    high = np.max([track.max(axis=0) + one.half for one, track in zip(actors, tracks, strict=True)], axis=0)
-    first = actors[0].ax
-    limits = np.array([first.get_xlim(), first.get_ylim()][: len(low)])
-    low, high = np.minimum(low, limits[:, 0]), np.maximum(high, limits[:, 1])
-    half = (high - low) * (0.5 + ROOM) if len(low) == 1 else (high - low).max() * (0.5 + ROOM) * np.ones(2)
-    middle = (low + high) / 2
-    for actor in actors:
-        actor.ax.set_xlim(middle[0] - half[0], middle[0] + half[0])
-        if len(low) == 2:
-            actor.ax.set_ylim(middle[1] - half[1], middle[1] + half[1])

@@ -7,7 +7,7 @@ Does not: write files.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from itertools import accumulate
 from typing import Any
 
 from apc.compiler.words import counted, wrapped
@@ -15,9 +15,7 @@ from apc.exports.c_text import source
 from apc.exports.code import Code
 from apc.exports.fmu import Unit
 from apc.exports.peer import Line, Peer
-from apc.present.forms import document, note
-
-MOST_NAMED = 6
+from apc.present.forms import document, listed, note, picked
 
 
 def code_text(found: Code) -> str:
@@ -35,19 +33,19 @@ def code_text(found: Code) -> str:
         ("moves itself", inside),
     ]
     lines = [f"{found.topology}: {peer.name} in C99, {name}_tick {every}", ""]
-    for what, listed in rows:
-        lines += wrapped(f"{what} {_named(listed)}", "  ", "    ")
+    for what, names in rows:
+        lines += wrapped(f"{what} {listed(names)}", "  ", "    ")
     return "\n".join([*lines, "", *note(f"method between ticks: {found.method}; all numbers in SI units")])
 
 
 def code_document(found: Code) -> dict[str, Any]:
     """Return a peer's code as plain data."""
     peer = found.code.peer
+    starts = accumulate((peer.moves[one.move].quanta for one in peer.instants), initial=0)
     return {
-        "topology": found.topology,
+        **picked(found, "topology", "method"),
         "peer": peer.name,
         "name": found.code.name,
-        "method": found.method,
         "measured": [peer.kind.states[place].name for place in peer.measured],
         "heard": [
             {"link": line.link, "from": [one.name for one in line.senders], "channels": list(line.channels)}
@@ -55,10 +53,8 @@ def code_document(found: Code) -> dict[str, Any]:
             if line.senders
         ],
         "forces": [one.name for one in peer.forces],
-        "sent": [{"link": line.link, "channels": list(line.channels)} for line in _sending(peer)],
-        "instants_s": [
-            float(sum(_lengths(peer)[:k]) * peer.schedule.quantum) for k in range(len(peer.instants))
-        ],
+        "sent": [picked(line, "link", "channels") for line in _sending(peer)],
+        "instants_s": [float(start * peer.schedule.quantum) for start in [*starts][:-1]],
         "source": source(found.code, f"{found.code.name}.h"),
     }
 
@@ -69,8 +65,8 @@ def unit_text(found: Unit) -> str:
     outputs = [one.name for one in found.scene.variables if not one.given]
     what = found.peer or counted(len(found.scene.peers), "peer")
     lines = [f"{found.system.name}: {what} for co-simulation, FMI 2.0", ""]
-    lines += wrapped(f"{counted(len(inputs), 'input')}: {_named(inputs)}", "  ", "    ")
-    lines += wrapped(f"{counted(len(outputs), 'output')}: {_named(outputs)}", "  ", "    ")
+    lines += wrapped(f"{counted(len(inputs), 'input')}: {listed(inputs)}", "  ", "    ")
+    lines += wrapped(f"{counted(len(outputs), 'output')}: {listed(outputs)}", "  ", "    ")
     told = f"steps of {found.step * 1e3:.6g} ms show every tick of the fastest clock, values before the tick"
     if found.peer:
         told += "; what it hears is set when it has arrived: delays and losses are the network's"
@@ -79,25 +75,15 @@ def unit_text(found: Unit) -> str:
 
 def unit_document(found: Unit) -> dict[str, Any]:
     """Return an FMU as plain data."""
+    variables = [{**picked(one, "name", "unit"), "input": bool(one.given)} for one in found.scene.variables]
     return {
         "topology": found.system.name,
         "peer": found.peer or None,
         "step_s": found.step,
-        "duration_s": found.duration,
-        "variables": [
-            document({"name": one.name, "unit": one.unit, "input": one.given})
-            for one in found.scene.variables
-        ],
+        "duration_s": document(found.duration),
+        "variables": variables,
     }
 
 
 def _sending(peer: Peer) -> list[Line]:
     return [line for line in peer.lines if line.sending >= 0]
-
-
-def _lengths(peer: Peer) -> list[int]:
-    return [peer.moves[one.move].quanta for one in peer.instants]
-
-
-def _named(names: Sequence[str]) -> str:
-    return ", ".join([*names[:MOST_NAMED], "…"] if len(names) > MOST_NAMED else names) or "nothing"

@@ -10,21 +10,19 @@ Does not: compute, or draw itself (see `comparison_picture`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apc.compiler.files import write_text
 from apc.compiler.timings import part
-from apc.compiler.words import WIDTH, counted, known_digits, measured, with_unit, wrapped
-from apc.distribution import program_version
+from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
 from apc.optional import need
 from apc.present.comparison_picture import comparison_picture  # noqa: F401 -- looked up
-from apc.present.forms import MEANT, document, json_text, note
-from apc.present.pictures import FORMATS, check_result_path, write_figure
-from apc.tables import SUFFIXES, Column, Row, blocks_of, write_table
+from apc.present.forms import MEANT, notes, picked, quantity, reached, record, table
+from apc.present.pictures import write_result
+from apc.tables import Column, Row
 
 if TYPE_CHECKING:
     import pandas
@@ -43,65 +41,42 @@ VARIED = (
 )
 
 
-class _Footnotes:
-    """Footnotes as they are asked for, each text once."""
-
-    def __init__(self) -> None:
-        self.texts: dict[str, int] = {}
-
-    def mark(self, texts: Sequence[str]) -> str:
-        """Return what stands in a cell for some footnotes: " [1]"."""
-        marks = [f"[{self.texts.setdefault(text, len(self.texts) + 1)}]" for text in texts if text]
-        return f" {' '.join(marks)}" if marks else ""
-
-
 def comparison_text(found: Comparison) -> str:
     """Return what `apc compare` prints: a table for each question, a line for each scheme."""
     schemes = found.schemes
+    feet: dict[str, int] = {}
     lines = [f"{counted(len(schemes), 'scheme')} side by side"]
-    for text in (*_meant(found), *found.left_out):
-        lines += note(text)
-    for text in found.notes:
-        lines += note(f"note: {text}")
-    feet = _Footnotes()
-    named = [(f"{one.topology}, {counted(one.peers, 'peer', ',d')}",) for one in schemes]
-    lines += _table(("",), named)
-    lines += _table(("verdict", "spectral radius a frame"), [_verdict(one, feet) for one in schemes])
-    if any(one.linearized for one in schemes):
-        lines += _table(("in time", "played"), [_in_time(one, feet) for one in schemes])
-    for key, heading in VARIED:
-        lines += _table((heading, "of"), [_varied(one, key, feet) for one in schemes])
-    headings = ("felt at 1 Hz", "at 10 Hz", "of the hand at")
-    lines += _table(headings, [_felt(one, feet) for one in schemes])
-    costs = [
-        (
-            counted(one.effort.operations, "operation", ",d")
-            + (f" of {one.effort.clock}" if one.effort.clock else ""),
-            f"{one.effort.sent:,.6g} a second",
-            f"{one.effort.sent_by_all:,.6g} a second",
-        )
-        for one in schemes
+    lines += notes([*_meant(found), *found.left_out, *(f"note: {text}" for text in found.notes)])
+    tables: list[tuple[tuple[str, ...], list[tuple[str, ...]]]] = [
+        (("",), [(f"{one.topology}, {counted(one.peers, 'peer', ',d')}",) for one in schemes]),
+        (("verdict", "spectral radius a frame"), [_verdict(one, feet) for one in schemes]),
     ]
-    lines += _table(("work a tick", "a peer sends at most", "all send"), costs)
-    if feet.texts:
-        lines.append("")
-    for text, number in feet.texts.items():
+    if any(one.linearized for one in schemes):
+        tables.append((("in time", "played"), [_in_time(one, feet) for one in schemes]))
+    for key, heading in VARIED:
+        tables.append(((heading, "of"), [_varied(one, key, feet) for one in schemes]))
+    tables.append((("felt at 1 Hz", "at 10 Hz", "of the hand at"), [_felt(one, feet) for one in schemes]))
+    tables.append((("work a tick", "a peer sends at most", "all send"), [_costs(one) for one in schemes]))
+    for headings, cells in tables:
+        rows = [("", *headings), *((str(place), *row) for place, row in enumerate(cells, 1))]
+        lines += ["", *(line for line in table(rows, later=5) if line)]
+    lines += [""] if feet else []
+    for text, number in feet.items():
         lines += wrapped(text, f"  [{number}] ", "      ")
     return "\n".join(lines)
 
 
-def _table(headings: tuple[str, ...], cells: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return a table of numbered schemes; the last column takes as many lines as it needs."""
-    rows = [("", *headings), *((str(place + 1), *row) for place, row in enumerate(cells))]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(headings))]
-    lines = [""]
-    for row in rows:
-        first = "  " + "".join(f"{cell:<{width}}  " for cell, width in zip(row[:-1], widths, strict=True))
-        if row[-1] and len(first) + len(row[-1]) > WIDTH:
-            lines += wrapped(row[-1], first, " " * 5)
-        elif any(row):
-            lines.append(f"{first}{row[-1]}".rstrip())
-    return lines
+def _marked(cell: str, texts: Iterable[str], feet: dict[str, int]) -> str:
+    """Return a cell with the numbers of its footnotes, each text once: "– [1]"."""
+    marks = [f"[{feet.setdefault(text, len(feet) + 1)}]" for text in texts if text]
+    return " ".join([cell, *marks])
+
+
+def _costs(one: Scheme) -> tuple[str, ...]:
+    effort = one.effort
+    clock = f" of {effort.clock}" if effort.clock else ""
+    sent = (f"{number:,.6g} a second" for number in (effort.sent, effort.sent_by_all))
+    return f"{counted(effort.operations, 'operation', ',d')}{clock}", *sent
 
 
 def _meant(found: Comparison) -> Iterator[str]:
@@ -120,9 +95,9 @@ def _why(one: Scheme, key: str) -> tuple[str, ...]:
     return tuple(text for name, text in one.missing if name == key)
 
 
-def _verdict(one: Scheme, feet: _Footnotes) -> tuple[str, str]:
+def _verdict(one: Scheme, feet: dict[str, int]) -> tuple[str, str]:
     if one.analysis is None:
-        return one.verdict, f"{NONE}{feet.mark([one.refused])}"
+        return one.verdict, _marked(NONE, [one.refused], feet)
     told = list(_why(one, "verdict"))
     if one.network is not None and one.network.mean_square_radius is not None:
         root, error = math.sqrt(one.network.mean_square_radius), one.network.error or 0.0
@@ -134,32 +109,32 @@ def _verdict(one: Scheme, feet: _Footnotes) -> tuple[str, str]:
         told.append("the radius is that with free hands")
     verdict = one.verdict + (", linearized" if one.analysis.linearized else "")
     radius = measured(one.analysis.spectral_radius, one.analysis.spectral_radius_error)
-    return verdict, f"{radius}{feet.mark(told)}"
+    return verdict, _marked(radius, told, feet)
 
 
-def _in_time(one: Scheme, feet: _Footnotes) -> tuple[str, str]:
+def _in_time(one: Scheme, feet: dict[str, int]) -> tuple[str, str]:
     """Return the verdict of a simulation, where that of an analysis is of a linearization."""
     if one.analysis is None:
         return NONE, NONE
     if not one.linearized:
         return "as its verdict says: it is linear", ""
     if one.played is None:
-        return f"{NONE}{feet.mark(_why(one, 'played'))}", NONE
+        return _marked(NONE, _why(one, "played"), feet), NONE
     summary = one.played.summary
     at = {"settles": summary.settled, "diverges": summary.stopped_at}.get(summary.verdict)
     return f"{summary.verdict}{'' if at is None else f' at {at:.3g} s'}", f"{summary.end:g} s"
 
 
-def _varied(one: Scheme, key: str, feet: _Footnotes) -> tuple[str, str]:
+def _varied(one: Scheme, key: str, feet: dict[str, int]) -> tuple[str, str]:
     found: Critical | None = getattr(one, key)
     if found is None:
-        return f"{NONE}{feet.mark(_why(one, key))}", NONE
+        return _marked(NONE, _why(one, key), feet), NONE
     told = []
     if len(found.crossings) > 1:
         told.append(f"{counted(len(found.crossings), 'crossing')} in all: apc critical {found.parameter}")
     if found.groups:
         told.append("one value for all groups, which differ in the scene")
-    return f"{_reach(found)}{feet.mark(told)}", found.parameter
+    return _marked(_reach(found), told, feet), found.parameter
 
 
 def _reach(found: Critical) -> str:
@@ -171,15 +146,15 @@ def _reach(found: Critical) -> str:
         if found.verdict.startswith("stable"):
             return f"none up to {with_unit(high, found.unit)}"
         return f"{found.verdict.partition(' ')[0]} from {low} to {with_unit(high, found.unit)}"
-    value = with_unit(f"{found.value:.15g}", found.unit)
+    value = quantity(found.value, found.unit, 15)
     if found.error:
         value = measured(found.value, found.error, found.unit)
     return value if found.stable_side == "below" else f"{value}, stable above it"
 
 
-def _felt(one: Scheme, feet: _Footnotes) -> tuple[str, str, str]:
+def _felt(one: Scheme, feet: dict[str, int]) -> tuple[str, str, str]:
     if one.feel is None:
-        return f"{NONE}{feet.mark(_why(one, 'feel'))}", NONE, NONE
+        return _marked(NONE, _why(one, "feel"), feet), NONE, NONE
     cells = []
     for value, bound in zip(one.feel.impedance.tolist(), one.feel.bound.tolist(), strict=True):
         size = known_digits(abs(value), abs(value) * bound, DIGITS)
@@ -194,115 +169,66 @@ def comparison_document(found: Comparison) -> dict[str, Any]:
 
 def _document(one: Scheme) -> dict[str, Any]:
     parts = ("analysis", "network", "passive", "played", "stiffness", "delay", "loss", "feel")
-    told = {key: None if getattr(one, key) is None else getattr(one, key).to_dict() for key in parts}
-    return {
-        "topology": one.topology,
-        "peers": one.peers,
-        "verdict": one.verdict,
-        "stable": one.stable,
-        "left_out": list(one.left_out),
-        **told,
-        "effort": document(one.effort),
-        "missing": dict(one.missing),
-        "refused": one.refused,
-    }
+    told = {key: None if (had := getattr(one, key)) is None else had.to_dict() for key in parts}
+    return record(one, {**picked(one, "verdict", "stable", "left_out"), **told, "missing": dict(one.missing)})
 
 
 def comparison_table(found: Comparison) -> pandas.DataFrame:
     """Return a pandas table with a row a scheme."""
-    headings = [one.heading for one in _columns()]
+    headings = [column.heading for column, _ in COLUMNS]
     return need("pandas", "data").DataFrame([_row(one) for one in found.schemes], columns=headings)
 
 
 @part("draw")
 def write_comparison(path: Path, found: Comparison) -> None:
     """Write a comparison to a picture, a table or JSON, by the suffix."""
-    suffix = check_result_path(path)
-    if suffix in FORMATS:
-        write_figure(found.plot(), path)
-    elif suffix in SUFFIXES:
-        made = {
-            "apc": program_version(),
-            "left_out": {one.topology: list(one.left_out) for one in found.schemes},
-            "notes": list(found.notes),
-        }
-        write_table(path, _columns(), blocks_of(_row(one) for one in found.schemes), made)
-    else:
-        write_text(path, json_text(found.to_dict()))
+    left_out = {one.topology: list(one.left_out) for one in found.schemes}
+    columns = [column for column, _ in COLUMNS]
+    rows = (_row(one) for one in found.schemes)
+    made = {"left_out": left_out, "notes": list(found.notes)}
+    write_result(path, found, found.plot, (columns, rows, made))
 
 
-def _columns() -> list[Column]:
-    """Return the columns of a table of schemes; of what is varied, how far it was looked as well."""
-    varied = [
-        column
-        for key, unit in (("stiffness", "N/m"), ("delay", "s"), ("loss", ""))
-        for column in (
-            Column(f"{key} parameter", kind="text"),
-            Column(key, unit),
-            Column(f"{key} error", unit),
-            Column(f"{key} stable side", kind="text"),
-            Column(f"{key} scanned to", unit),
-            Column(f"{key} verdict", kind="text"),
-        )
-    ]
-    felt = [
-        Column(f"impedance at {at} Hz {part}", "N*s/m") for at in (1, 10) for part in ("real", "imaginary")
-    ]
-    return [
-        Column("topology", kind="text"),
-        Column("peers", kind="count"),
-        Column("verdict", kind="text"),
-        Column("in time", kind="text"),
-        Column("frame", "s"),
-        Column("spectral radius"),
-        Column("spectral radius error"),
-        Column("mean square radius"),
-        *varied,
-        Column("felt at", kind="text"),
-        *felt,
-        Column("operations a tick", kind="count"),
-        Column("numbers sent", "1/s"),
-        Column("numbers sent by all", "1/s"),
-        Column("missing", kind="text"),
-    ]
+def _varied_columns(key: str, unit: str) -> list[tuple[Column, str]]:
+    """Return the columns of what is varied, and how far it was looked."""
+    words = ("parameter", "stable side", "verdict")
+    numbers = (("", "value"), (" error", "error"), (" scanned to", "scanned.1"))
+    first, *others = (
+        (Column(f"{key} {word}", kind="text"), f"{key}.{word.replace(' ', '_')}") for word in words
+    )
+    value, error, scanned = ((Column(key + name, unit), f"{key}.{place}") for name, place in numbers)
+    return [first, value, error, others[0], scanned, others[1]]
+
+
+# The columns of a table of schemes, and where in a scheme their cells stand.
+COLUMNS: list[tuple[Column, str]] = [
+    (Column("topology", kind="text"), "topology"),
+    (Column("peers", kind="count"), "peers"),
+    (Column("verdict", kind="text"), "verdict"),
+    (Column("in time", kind="text"), "played.summary.verdict"),
+    (Column("frame", "s"), "analysis.frame_s"),
+    (Column("spectral radius"), "analysis.spectral_radius"),
+    (Column("spectral radius error"), "analysis.spectral_radius_error"),
+    (Column("mean square radius"), "network.mean_square_radius"),
+    *_varied_columns("stiffness", "N/m"),
+    *_varied_columns("delay", "s"),
+    *_varied_columns("loss", ""),
+    (Column("felt at", kind="text"), "feel.at"),
+    (Column("impedance at 1 Hz real", "N*s/m"), "feel.impedance.0.real"),
+    (Column("impedance at 1 Hz imaginary", "N*s/m"), "feel.impedance.0.imag"),
+    (Column("impedance at 10 Hz real", "N*s/m"), "feel.impedance.1.real"),
+    (Column("impedance at 10 Hz imaginary", "N*s/m"), "feel.impedance.1.imag"),
+    (Column("operations a tick", kind="count"), "effort.operations"),
+    (Column("numbers sent", "1/s"), "effort.sent"),
+    (Column("numbers sent by all", "1/s"), "effort.sent_by_all"),
+    (Column("missing", kind="text"), ""),
+]
 
 
 def _row(one: Scheme) -> Row:
     """Return a row of the table."""
-    analysis = one.analysis
-    varied = [
-        cell
-        for found in (one.stiffness, one.delay, one.loss)
-        for cell in (
-            (None,) * 6
-            if found is None
-            else (
-                found.parameter,
-                found.value,
-                found.error,
-                found.stable_side,
-                found.scanned[1],
-                found.verdict or None,
-            )
-        )
-    ]
-    felt: list[float | None] = [None] * 4
-    if one.feel is not None:
-        felt = [float(part) for value in one.feel.impedance.tolist() for part in (value.real, value.imag)]
-    return (
-        one.topology,
-        one.peers,
-        one.verdict,
-        None if one.played is None else one.played.summary.verdict,
-        None if analysis is None else analysis.frame_s,
-        None if analysis is None else analysis.spectral_radius,
-        None if analysis is None else analysis.spectral_radius_error,
-        None if one.network is None else one.network.mean_square_radius,
-        *varied,
-        None if one.feel is None else one.feel.at,
-        *felt,
-        one.effort.operations,
-        one.effort.sent,
-        one.effort.sent_by_all,
-        "; ".join(f"{key}: {text}" for key, text in one.missing) or one.refused or None,
-    )
+    missing = "; ".join(f"{key}: {text}" for key, text in one.missing) or one.refused or None
+    cells = (reached(one, path) for _, path in COLUMNS if path)
+    return *(
+        float(cell) if isinstance(cell, float) else None if cell == "" else cell for cell in cells
+    ), missing

@@ -12,9 +12,11 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from apc.optional import need
+from apc.present.forms import reached
 from apc.present.pictures import COLOURS
 
 if TYPE_CHECKING:
@@ -28,10 +30,38 @@ PANEL, BAR = 2.4, 0.28  # inches: the width of a panel, the height of a bar
 FURTHER = 4.0  # times the longest bar that ends, to which one that does not is drawn at most
 LABEL = 24  # letters of a scheme's name in a line
 
-# A bar: its length, and whether it goes on beyond that; or a word where there is none.
-_Bar = tuple[float, bool] | str
+LETTERS: dict[str, Any] = {
+    "textcoords": "offset points",
+    "va": "center",
+    "fontsize": 8,
+    "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 1, "alpha": 0.85},
+}
 NONE = "–"
 BOUNDARY = 1.0  # the spectral radius from which on a motion grows
+
+# The panels: title, where in a scheme the number is, in how many of its units it is drawn.
+NUMBERS = (
+    ("spectral radius a frame", "analysis.spectral_radius", 1.0),
+    ("settles within 2 % in (s)", "analysis.settling_s", 1.0),
+    ("felt at 1 Hz (N·s/m)", "feel.impedance.0", 1.0),
+    ("felt at 10 Hz (N·s/m)", "feel.impedance.1", 1.0),
+    ("operations a tick", "effort.operations", 1.0),
+    ("numbers sent a second", "effort.sent", 1.0),
+)
+REACHES = (
+    ("largest stable stiffness (N/m)", "stiffness", 1.0),
+    ("delay that breaks it (ms)", "delay", 1e3),
+    ("loss that breaks it (%)", "loss", 1e2),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Bar:
+    """A bar with a text at its end; `further` says that it goes on beyond what was looked at."""
+
+    length: float
+    text: str
+    further: bool = False
 
 
 def comparison_picture(found: Comparison) -> Any:
@@ -43,97 +73,68 @@ def comparison_picture(found: Comparison) -> Any:
         E875 matplotlib is not installed.
     """
     figures = need("matplotlib.figure", "plot")
-    panels: list[tuple[str, list[_Bar]]] = [
-        ("spectral radius a frame", [_radius(one) for one in found.schemes]),
-        ("settles within 2 % in (s)", [_settles(one) for one in found.schemes]),
-        ("largest stable stiffness (N/m)", [_reach(one.stiffness, 1.0) for one in found.schemes]),
-        ("delay that breaks it (ms)", [_reach(one.delay, 1e3) for one in found.schemes]),
-        ("loss that breaks it (%)", [_reach(one.loss, 1e2) for one in found.schemes]),
-        ("felt at 1 Hz (N·s/m)", [_felt(one, 0) for one in found.schemes]),
-        ("felt at 10 Hz (N·s/m)", [_felt(one, 1) for one in found.schemes]),
-        ("operations a tick", [(float(one.effort.operations), False) for one in found.schemes]),
-        ("numbers sent a second", [(one.effort.sent, False) for one in found.schemes]),
+    schemes = found.schemes
+    panels = [(title, [_number(one, path, scale) for one in schemes]) for title, path, scale in NUMBERS]
+    reaches = [
+        (title, [_reach(getattr(one, key), scale) for one in schemes]) for title, key, scale in REACHES
     ]
+    panels[2:2] = reaches
     rows = -(-len(panels) // COLUMNS)
-    named = [f"{place + 1}  {one.topology}" for place, one in enumerate(found.schemes)]
-    names = ["\n".join(textwrap.wrap(one, LABEL)) for one in named]
-    tall = 0.9 + BAR * 1.25 * len(names)
-    size = (PANEL * COLUMNS + 1.4, tall * rows + 0.5)
+    names = [
+        "\n".join(textwrap.wrap(f"{place}  {one.topology}", LABEL)) for place, one in enumerate(schemes, 1)
+    ]
+    size = (PANEL * COLUMNS + 1.4, (0.9 + BAR * 1.25 * len(names)) * rows + 0.5)
     figure = figures.Figure(figsize=size, layout="constrained")
     axes = figure.subplots(rows, COLUMNS, squeeze=False, sharey=True).ravel()
-    for place, (ax, (title, bars)) in enumerate(zip(axes, panels, strict=True)):
-        _draw(ax, title, bars, BOUNDARY if place == 0 else 0.0)
+    for ax, (title, bars) in zip(axes, panels, strict=True):
+        _draw(ax, title, bars)
     axes[0].set_yticks(range(len(names)), names, fontsize=8)
     axes[0].invert_yaxis()
-    _judge(axes[0], found.schemes)
+    axes[0].axvline(BOUNDARY, color="0.4", linewidth=0.8, linestyle=(0, (3, 2)))
+    for place, one in enumerate(schemes):
+        axes[0].annotate(_judged(one), (0, place), (4, 0), **LETTERS)
     lines = [line for text in (*found.left_out, *found.notes) for line in textwrap.wrap(text, 110)]
-    if lines:
-        figure.suptitle("\n".join(lines), fontsize=8.5)
+    figure.suptitle("\n".join(lines), fontsize=8.5)
     return figure
 
 
-def _settles(one: Scheme) -> _Bar:
-    seconds = None if one.analysis is None else one.analysis.settling_s
-    return NONE if seconds is None else (seconds, False)
+def _number(one: Scheme, path: str, scale: float) -> _Bar:
+    value = reached(one, path)
+    return _Bar(0.0, NONE) if value is None else _Bar(scale * abs(value), f"{scale * abs(value):.4g}")
 
 
 def _reach(found: Critical | None, scale: float) -> _Bar:
     """Return how far a scheme is stable: up to a crossing, or beyond all that was looked at."""
-    if found is None:
-        return NONE
-    if found.value is not None and found.stable_side == "below":
-        return found.value * scale, False
-    if found.value is None and found.verdict.startswith("stable"):
-        return found.scanned[1] * scale, True
-    return "unstable" if found.verdict.startswith("unstable") else NONE
+    if found is not None and found.value is not None and found.stable_side == "below":
+        return _Bar(scale * found.value, f"{scale * found.value:.4g}")
+    if found is not None and found.value is None and found.verdict.startswith("stable"):
+        return _Bar(scale * found.scanned[1], f"> {scale * found.scanned[1]:.4g}", further=True)
+    return _Bar(0.0, "unstable" if found is not None and found.verdict.startswith("unstable") else NONE)
 
 
-def _radius(one: Scheme) -> _Bar:
-    return one.verdict if one.analysis is None else (one.analysis.spectral_radius, False)
-
-
-def _felt(one: Scheme, place: int) -> _Bar:
-    return NONE if one.feel is None else (float(abs(one.feel.impedance[place])), False)
-
-
-def _draw(ax: Any, title: str, bars: Sequence[_Bar], beyond: float) -> None:
-    """Draw one quantity of all schemes, the numbers behind the bars and behind what is `beyond`."""
+def _draw(ax: Any, title: str, bars: Sequence[_Bar]) -> None:
+    """Draw one quantity of all schemes."""
     ax.set_title(title, fontsize=8.5)
     ax.tick_params(labelsize=8)
-    ax.spines[["top", "right"]].set_visible(False)
     ax.tick_params(axis="y", length=0)
-    known = [bar for bar in bars if not isinstance(bar, str)]
-    ended = max((length for length, on in known if not on), default=0.0)
+    ax.spines[["top", "right"]].set_visible(False)
     # What ends nowhere may be looked at a thousand times as far, and would leave no room for the others.
-    longest = max((min(one, FURTHER * ended or one) if on else one for one, on in known), default=beyond)
-    longest = max(longest, beyond)
-    ax.set_xlim(0, 1.3 * longest if longest else 1.0)
-    ax.set_ylim(-0.6, len(bars) - 0.4)
+    most = FURTHER * max((bar.length for bar in bars if not bar.further), default=0.0)
+    lengths = [min(bar.length, most or bar.length) if bar.further else bar.length for bar in bars]
+    edges = [COLOURS[place % len(COLOURS)] for place in range(len(bars))]
+    hatches = [HATCHES[place % len(HATCHES)] for place in range(len(bars))]
+    faces = ["white" if hatch else edge for hatch, edge in zip(hatches, edges, strict=True)]
+    look = {"color": faces, "edgecolor": edges, "hatch": hatches, "linewidth": 0.8}
+    drawn = ax.barh(range(len(bars)), lengths, height=0.6, **look)
+    ax.bar_label(drawn, [bar.text for bar in bars], padding=4, fontsize=8, bbox=LETTERS["bbox"])
+    ax.set(xlim=(0, 1.3 * max(lengths) or 1.0), ylim=(-0.6, len(bars) - 0.4))
     ax.locator_params(axis="x", nbins=4)
-    for place, bar in enumerate(bars):
-        colour, hatch = COLOURS[place % len(COLOURS)], HATCHES[place % len(HATCHES)]
-        if isinstance(bar, str):
-            _write(ax, bar, 0.0, place)
-            continue
-        length, on = bar
-        face = colour if not hatch else "white"
-        drawn = min(length, longest)
-        ax.barh(place, drawn, height=0.6, facecolor=face, edgecolor=colour, hatch=hatch, linewidth=0.8)
-        _write(ax, f"{'> ' if on else ''}{length:.4g}", max(drawn, beyond), place)
 
 
-def _write(ax: Any, text: str, x: float, y: int) -> None:
-    """Write a word beside where a bar ends, over whatever stands there."""
-    box = {"facecolor": "white", "edgecolor": "none", "pad": 1, "alpha": 0.85}
-    ax.annotate(text, (x, y), (4, 0), textcoords="offset points", va="center", fontsize=8, bbox=box)
-
-
-def _judge(ax: Any, schemes: Sequence[Scheme]) -> None:
-    """Draw where the boundary is; write which scheme is not stable, and what one does that isn't linear."""
-    ax.axvline(BOUNDARY, color="0.4", linewidth=0.8, linestyle=(0, (3, 2)))
-    for place, one in enumerate(schemes):
-        said = [] if one.stable or one.refused else ["unstable" if one.stable is False else "undecided"]
-        if one.played is not None:
-            said.append(f"{one.played.summary.verdict} in time")
-        if said:
-            _write(ax, ", ".join(said), 0.0, place)
+def _judged(one: Scheme) -> str:
+    """Say of a scheme that it is not stable, and what one does that isn't linear."""
+    if one.analysis is None:
+        return one.verdict
+    said = [] if one.stable else ["unstable" if one.stable is False else "undecided"]
+    said += [] if one.played is None else [f"{one.played.summary.verdict} in time"]
+    return ", ".join(said)

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apc.compiler.words import in_hertz, with_unit
+from apc.compiler.words import in_hertz
 from apc.optional import need
+from apc.present.forms import quantity
 from apc.present.pictures import COLOURS, check_format, write_figure
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def eigenvalues_picture(found: Analysis, ax: Any = None) -> Any:
     for place, mode in enumerate(modes[:MOST_NAMED]):
         times = f" × {mode.multiplicity}" if mode.multiplicity > 1 else ""
         label = f"{mode.magnitude:.4f}{times}, {in_hertz(mode.frequency_hz)}, {mode.shape}"
-        _mark(ax, [mode.eigenvalue], MARKS[place % len(MARKS)], COLOURS[1 + place], label)
+        _mark(ax, mode.eigenvalue, MARKS[place % len(MARKS)], COLOURS[1 + place], label)
     _mark(ax, rest, ".", "0.4", f"{len(rest)} that die out faster")
     seconds = found.settling_s
     settles = "" if seconds is None else f"; settles within 2 % in {seconds:.3g} s"
@@ -79,20 +80,19 @@ def locus_picture(found: Locus, ax: Any = None) -> Any:
     ax = _circle(ax)
     of = found.critical
     points = np.concatenate(found.eigenvalues)  # conjugates are among them
-    counts = [len(one) for one in found.eigenvalues]
-    colours = np.repeat(found.values, counts)
+    colours = np.repeat(found.values, [len(one) for one in found.eigenvalues])
     drawn = ax.scatter(points.real, points.imag, c=colours, s=5, linewidths=0, cmap="viridis", zorder=3)
     unit = "" if of.unit == "1" else f" [{of.unit.replace('*', '·')}]"
     ax.figure.colorbar(drawn, ax=ax, label=f"{of.parameter}{unit}")
-    _mark(ax, found.now.tolist(), "x", COLOURS[2], f"now, {with_unit(f'{of.present:.6g}', of.unit)}")
+    _mark(ax, found.now, "x", COLOURS[2], f"now, {quantity(of.present, of.unit)}")
     for place, one in enumerate(of.crossings[:MOST_NAMED]):
         if not found.values.size or not found.values[0] <= one.value <= found.values[-1]:
             continue
         nearest = found.eigenvalues[int(np.abs(found.values - one.value).argmin())]
         at = nearest[np.abs(np.abs(nearest) - 1).argmin()]
         told = "" if np.isnan(one.frequency_hz) else f", {in_hertz(one.frequency_hz)}"
-        label = f"changes at {with_unit(f'{one.value:.6g}', of.unit)}{told}"
-        _mark(ax, [at / abs(at)], MARKS[place], "none", label)
+        label = f"changes at {quantity(one.value, of.unit)}{told}"
+        _mark(ax, at / abs(at), MARKS[place], "none", label)
     _entitle(ax, [f"{of.topology}: eigenvalues of a frame of {1e3 * found.frame_s:g} ms, packets on time"])
     return ax
 
@@ -112,14 +112,14 @@ def _circle(ax: Any) -> Any:
     return ax
 
 
-def _mark(ax: Any, values: Sequence[complex], mark: str, colour: str, label: str) -> None:
-    """Draw eigenvalues and their conjugates."""
-    if not len(values):
+def _mark(ax: Any, values: Any, mark: str, colour: str, label: str) -> None:
+    """Draw eigenvalues (k,) and their conjugates."""
+    points = np.append(values, np.conj(values))
+    if not points.size:
         return
-    points = np.array([(z.real, side * z.imag) for z in values for side in (1, -1)])
     look = {"markerfacecolor": colour, "markeredgecolor": "0.1" if colour == "none" else colour}
     size = {".": 4, "x": 7}.get(mark, 9 if colour == "none" else 6)
-    ax.plot(*points.T, mark, markersize=size, linestyle="none", label=label, zorder=4, **look)
+    ax.plot(points.real, points.imag, mark, markersize=size, label=label, zorder=4, **look)
 
 
 def _entitle(ax: Any, lines: Sequence[str]) -> None:

@@ -1,8 +1,7 @@
 """What an export is, in words and as plain data.
 
 Takes: what `exports` makes.
-Gives: `state_space_text`, `state_space_document`, `state_space_control`; `modelica_text`,
-`modelica_document`.
+Gives: `state_space_text`, `state_space_document`, `state_space_control`; `modelica_text`.
 Guarantees: at most 80 columns.
 Does not: write files.
 """
@@ -10,34 +9,29 @@ Does not: write files.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import counted, wrapped
-from apc.present.forms import document, note
+from apc.present.forms import listed, notes, record
 
 if TYPE_CHECKING:
     from apc.exports.lifted import StateSpace
     from apc.exports.modelica import ModelicaModel
-    from apc.exports.words import Port
-
-MOST_NAMED = 6
 
 
 def state_space_text(found: StateSpace) -> str:
     """Return what a state space has."""
     lines = [f"{found.topology}: {found.what} over one frame of {found.frame_s * 1e3:.6g} ms", ""]
     for word, ports in (("state", found.states), ("input", found.inputs), ("output", found.outputs)):
-        lines += wrapped(f"{counted(len(ports), word)}: {_named(ports)}", "  ", "    ")
+        lines += wrapped(
+            f"{counted(len(ports), word)}: {listed([port.name for port in ports])}", "  ", "    "
+        )
     if found.free:
-        lines += wrapped(f"A, B, C and D are a function of {_named(found.free)}", "  ", "    ")
-    lines += ["", *note(found.meaning), *(line for one in found.notes for line in note(one))]
+        lines += wrapped(
+            f"A, B, C and D are a function of {listed([port.name for port in found.free])}", "  ", "    "
+        )
+    lines += ["", *notes([found.meaning, *found.notes])]
     return "\n".join(lines)
-
-
-def _named(ports: Sequence[Port]) -> str:
-    names = [port.name for port in ports[:MOST_NAMED]]
-    return ", ".join([*names, "…"] if len(ports) > MOST_NAMED else names) or "none"
 
 
 def state_space_control(found: StateSpace) -> Any:
@@ -50,8 +44,8 @@ def state_space_control(found: StateSpace) -> Any:
 def state_space_document(found: StateSpace) -> dict[str, Any]:
     """Return a state space as plain data."""
     function = found.function and found.function.serialize()
-    plain: dict[str, Any] = document(found, {"made_by": json.loads(found.made_by), "function": function})
-    return {**plain, "meaning": found.meaning}
+    instead = {"made_by": json.loads(found.made_by), "function": function, "meaning": found.meaning}
+    return record(found, instead)
 
 
 def modelica_text(found: ModelicaModel) -> str:
@@ -59,9 +53,3 @@ def modelica_text(found: ModelicaModel) -> str:
     has = f"{counted(found.peers, 'peer')}, {counted(found.variables, 'variable')}, one equation each"
     lines = [f"{found.topology}: the model {found.name} of Modelica 3.3", "", f"  {has}"]
     return "\n".join([*lines, *(f"  {clock}" for clock in found.clocks)])
-
-
-def modelica_document(found: ModelicaModel) -> dict[str, Any]:
-    """Return a Modelica model as plain data."""
-    plain: dict[str, Any] = document(found)
-    return plain

@@ -1,21 +1,23 @@
-"""The forms that all results share: plain data, JSON, indented notes.
+"""The forms that all results share: plain data, JSON, notes, labelled lines and tables.
 
-Takes: frozen values, texts. Gives: `document`, `json_text`, `note`; `MEANT`.
-Guarantees: a document is made of what JSON has words for; the same value gives the same text.
+Takes: frozen values, texts.
+Gives: `document`, `record`, `picked`, `reached`, `json_text`; `quantity`, `listed`, `note`, `notes`,
+`labelled`, `table`; `MEANT`.
+Guarantees: a document is made of what JSON has words for; the same value gives the same text; a line is at
+most 80 columns wide where its words allow it.
 Does not: know a result.
 """
 
 from __future__ import annotations
 
-import functools
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from fractions import Fraction
 from typing import Any
 
-from apc.compiler.words import wrapped
+from apc.compiler.words import with_unit, wrapped
 from apc.later import Later
 
 # What stable means by a criterion, where it is not that motions die out.
@@ -24,42 +26,56 @@ MEANT = {
     "passive": "stable with every passive hand at every device",
 }
 
-PLAIN = {str, int, bool, type(None)}
+LINEARIZED = ", linearized at its start"
 
 
 def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
-    """Return a value as plain data: a dataclass by its fields, a complex number as a pair, no NaN.
+    """Return a value as plain data: a dataclass by its shown fields, a complex number as a pair, no NaN.
 
     Parameters
     ----------
     value
         Dataclasses, mappings, sequences and arrays of numbers, texts and None.
     instead
-        What is taken in the place of fields of a dataclass.
+        What is taken in the place of fields of a dataclass, or after them; `...` leaves a field out.
     """
-    if type(value) in PLAIN:
+    if value is None or isinstance(value, str | int):
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if isinstance(value, tuple | list | Later):
-        return [document(one) for one in value]
     if isinstance(value, complex):
         return document((value.real, value.imag))
     if isinstance(value, Fraction):
         return float(value)
     if is_dataclass(value):
-        kind: Any = type(value)
-        own = instead or {}
-        return {name: document(own[name] if name in own else getattr(value, name)) for name in _names(kind)}
+        shown = {one.name: None for one in fields(value) if one.repr}  # there are as many modes as states
+        own = {**shown, **(instead or {})}
+        value = {key: own[key] if key in (instead or {}) else getattr(value, key) for key in own}
     if isinstance(value, Mapping):
-        return {key: document(one) for key, one in value.items()}
+        return {key: document(item) for key, item in value.items() if item is not ...}
+    if isinstance(value, tuple | list | Later):
+        return [document(item) for item in value]
     return document(value.tolist())  # of an array
 
 
-@functools.cache
-def _names(kind: Any) -> tuple[str, ...]:
-    """Return the names of a dataclass's fields that are shown: there are as many modes as states."""
-    return tuple(one.name for one in fields(kind) if one.repr)
+def record(value: Any, instead: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return a dataclass as plain data, see `document`."""
+    plain: dict[str, Any] = document(value, instead)
+    return plain
+
+
+def picked(value: Any, *names: str) -> dict[str, Any]:
+    """Return some fields and properties of a value as plain data."""
+    return {name: document(getattr(value, name)) for name in names}
+
+
+def reached(value: Any, path: str) -> Any:
+    """Return what is at a path of attributes and places, such as "a.b.0"; None beyond a None."""
+    for name in path.split("."):
+        if value is None:
+            return None
+        value = value[int(name)] if name.isdigit() else getattr(value, name)
+    return value
 
 
 def json_text(found: Any, *, indent: int | None = 2) -> str:
@@ -67,12 +83,56 @@ def json_text(found: Any, *, indent: int | None = 2) -> str:
 
     JSON has no word for what is no finite number: null stands in its place, as in `document`.
     """
-    try:
-        return json.dumps(found, ensure_ascii=False, allow_nan=False, indent=indent)
-    except ValueError:
-        return json.dumps(document(found), ensure_ascii=False, allow_nan=False, indent=indent)
+    return json.dumps(document(found), ensure_ascii=False, allow_nan=False, indent=indent)
+
+
+def quantity(value: float, unit: str, digits: int = 6) -> str:
+    """Return a number to so many digits with its unit."""
+    return with_unit(f"{value:.{digits}g}", unit)
+
+
+def listed(names: Sequence[str], most: int = 6) -> str:
+    """Return the first names of several, and "…" for the others; "none" where there are none."""
+    return ", ".join([*names[:most], *["…"][: max(len(names) - most, 0)]]) or "none"
 
 
 def note(text: str) -> list[str]:
     """Return a text as lines that stand a little to the right."""
     return wrapped(text, "  ", "    ")
+
+
+def notes(texts: Iterable[str]) -> list[str]:
+    """Return texts as notes beneath one another."""
+    return [line for text in texts for line in note(text)]
+
+
+def labelled(label: str, text: str, width: int = 17) -> list[str]:
+    """Return a text beside its label, which takes so many columns."""
+    return wrapped(text, f"  {label:<{width}}", " " * (width + 2))
+
+
+def table(rows: Sequence[Sequence[str]], sides: str = "", *, later: int | None = None) -> list[str]:
+    """Return rows of cells as lines, each column as wide as its widest cell.
+
+    Parameters
+    ----------
+    rows
+        The cells, as many in each row; the headings are the first row.
+    sides
+        `<` or `>` for each column, where its cells stand; all to the left if not given.
+    later
+        The column at which the last cell goes on in a second line; beneath its beginning if not given.
+    """
+    if not rows:
+        return []
+    sides = sides or "<" * len(rows[0])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    if sides[-1] == "<":
+        widths[-1] = 0
+    lines = []
+    for row in rows:
+        cells = [f"{cell:{side}{width}}" for cell, side, width in zip(row, sides, widths, strict=True)]
+        first = "  " + "".join(f"{cell}  " for cell in cells[:-1])
+        first += " " * (len(cells[-1]) - len(row[-1]))
+        lines += wrapped(row[-1], first, " " * (len(first) if later is None else later)) or [""]
+    return [line.rstrip() for line in lines]

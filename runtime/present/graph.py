@@ -49,13 +49,15 @@ def graph_picture(diagram: Diagram) -> Any:
     scene, boxes, edges = diagram.scene, diagram.boxes, diagram.edges
     places = _places(boxes, edges)
     title = f"{scene.name}, {one_of(scene)}"
-    below = BESIDE * (len(scene.links) + 2 * bool(scene.clocks))
+    count = len(scene.links) + bool(scene.clocks)
     right = max(left + wide for left, _, wide, _ in places.values())
+    below = BESIDE * (count + bool(scene.clocks))
     width = max(below, max(right, _width(title, TITLE)) + 2 * MARGIN)
     graph = max(top + high for _, top, _, high in places.values()) + BETWEEN
-    small = BELOW if scene.clocks or scene.links else 0.0
+    small = BELOW if count else 0.0
     height = HEAD + graph + small + MARGIN
-    figure = need("matplotlib.figure", "plot").Figure(figsize=(width / 72, height / 72))
+    size = (width / 72, height / 72)
+    figure = need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained" if count else None)
     ax = figure.add_axes((0, (small + MARGIN) / height, 1, (graph + HEAD) / height), xlim=(0, width))
     ax.set_ylim(graph, -HEAD)
     ax.set_axis_off()
@@ -69,7 +71,14 @@ def graph_picture(diagram: Diagram) -> Any:
     colours = _colours(scene)
     for box in boxes:
         _draw(ax, box, places[box.key], colours)
-    _draw_below(figure, scene, small / height, colours)
+    if count:
+        figure.get_layout_engine().set(rect=(0, 0, 1, small / height))
+        shares = [*(1 for _ in scene.links), *([2] if scene.clocks else [])]
+        axes = figure.subplots(1, count, squeeze=False, width_ratios=shares)[0]
+        for small_ax, link in zip(axes, scene.links, strict=False):
+            _draw_peers(small_ax, scene, link, colours)
+        if scene.clocks:
+            _draw_ticks(axes[-1], scene, colours)
     return figure
 
 
@@ -134,37 +143,23 @@ def _colours(scene: Scene) -> dict[str, str]:
     return clocks | groups
 
 
-def _draw_below(figure: Any, scene: Scene, height: float, colours: dict[str, str]) -> None:
-    """Draw who hears whom over each link, and the ticks of each clock along a frame."""
-    owners = [group.name for group in scene.groups for _ in range(min(group.count, MOST_PEERS))][:MOST_PEERS]
-    shares = [*(1 for _ in scene.links), *([2] if scene.clocks else [])]
-    start = 0.02
-    for share, link in zip(shares, [*scene.links, None], strict=False):
-        width = 0.96 * share / sum(shares)
-        if link is None:
-            ax = figure.add_axes((start + 0.35 * width, 0.3 * height, 0.62 * width, 0.5 * height))
-            _draw_ticks(ax, scene, colours)
-        else:
-            ax = figure.add_axes((start, 0.04 * height, width, 0.74 * height), aspect="equal", anchor="S")
-            _draw_peers(ax, scene, link, [colours[f"group {name}"] for name in owners])
-        start += width
-
-
-def _draw_peers(ax: Any, scene: Scene, link: SceneLink, fills: list[str]) -> None:
+def _draw_peers(ax: Any, scene: Scene, link: SceneLink, colours: dict[str, str]) -> None:
+    """Draw who hears whom over a link, in the colours of groups."""
     networkx = need("networkx", "plot")
+    owners = [group.name for group in scene.groups for _ in range(min(group.count, MOST_PEERS))]
+    fills = [colours[f"group {name}"] for name in owners[:MOST_PEERS]]
     number = len(fills)
-    shapes = {
-        "complete": networkx.complete_graph,
-        "ring": networkx.cycle_graph,
-        "star": lambda peers: networkx.star_graph(peers - 1),
-    }
-    if link.graph.shape in shapes:
-        graph = shapes[link.graph.shape](number)
+    star = link.graph.shape == "star"
+    if link.graph.shape == "complete":
+        graph = networkx.complete_graph(number)
+    elif link.graph.shape == "ring":
+        graph = networkx.cycle_graph(number)
+    elif star:
+        graph = networkx.star_graph(number - 1)
     else:
         graph = networkx.DiGraph(pair for pair in link.graph.arcs.tolist() if max(pair) < number)
         graph.add_nodes_from(range(number))
-    inner = [0] if link.graph.shape == "star" else []
-    shells = [one for one in (inner, [peer for peer in range(number) if peer not in inner]) if one]
+    shells = [one for one in ([*range(star)], [*range(star, number)]) if one]
     look = {"node_size": 40, "edge_color": FAINT, "width": 0.7, "with_labels": False}
     places = networkx.shell_layout(graph, shells)
     networkx.draw_networkx(graph, places, ax=ax, nodelist=range(number), node_color=fills, **look)
@@ -172,31 +167,25 @@ def _draw_peers(ax: Any, scene: Scene, link: SceneLink, fills: list[str]) -> Non
     if scene.peers > number:
         told += f"\n{number} drawn, {scene.peers - number:,} left out"
     ax.set_title(told, size=SIZE, color=INK)
-    ax.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2))
+    ax.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2), aspect="equal")
     ax.set_axis_off()
 
 
 def _draw_ticks(ax: Any, scene: Scene, colours: dict[str, str]) -> None:
+    """Draw the ticks of each clock along a frame."""
     frame = common_multiple(clock.period.number for clock in scene.clocks)
     for row, clock in enumerate(scene.clocks):
-        count, colour = int(frame / clock.period.number), colours[f"clock {clock.name}"]
-        times = (clock.phase.number + k * clock.period.number for k in range(count))
-        ticks = [float(time) * 1e3 for time in times] if count <= MOST_TICKS else []
-        ax.eventplot(ticks, lineoffsets=-row, linelengths=0.6, colors=colour)
-        if not ticks:
-            ax.text(
-                float(frame) * 5e2,
-                -row,
-                f"{count:,} ticks",
-                size=SIZE,
-                ha="center",
-                va="center",
-                color=colour,
-            )
+        period, phase = clock.period.number, clock.phase.number
+        count, colour = int(frame / period), colours[f"clock {clock.name}"]
+        if count <= MOST_TICKS:
+            ticks = [float(phase + k * period) * 1e3 for k in range(count)]
+            ax.eventplot(ticks, lineoffsets=-row, linelengths=0.6, colors=colour)
+        else:
+            look = {"size": SIZE, "ha": "center", "va": "center", "color": colour}
+            ax.text(float(frame) * 5e2, -row, f"{count:,} ticks", **look)
     names = [f"{clock.name}: every {seconds(clock.period.number)}" for clock in scene.clocks]
     ax.set_yticks([-row for row in range(len(names))], names, size=SIZE)
-    ax.set_xlim(0, float(frame) * 1e3)
-    ax.set_ylim(0.5 - len(names), 0.5)
+    ax.set(xlim=(0, float(frame) * 1e3), ylim=(0.5 - len(names), 0.5))
     ax.tick_params(labelsize=SIZE, length=2)
     ax.set_xlabel(f"ms of one frame, {seconds(frame)}", size=SIZE, color=FAINT)
     ax.spines[["top", "right", "left"]].set_visible(False)

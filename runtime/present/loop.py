@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from apc.compiler.words import WIDTH, counted, wrapped
+from apc.compiler.words import counted, wrapped
 from apc.loop.packets import DROPPED
-from apc.present.forms import document, note
+from apc.present.forms import document, note, record, table
 from apc.present.recorded_network import recording_document
 
 if TYPE_CHECKING:
@@ -31,9 +31,11 @@ def run_comparison_text(found: RunComparison) -> str:
         lines += [*note(f"not simulated beside it: {found.why_not}"), ""]
     else:
         lines += note("beside simulate with the same packets at each tick, signals differ by at most")
-        for unit, (far, large) in found.apart.items():
-            lines.append(f"    {far:.0e} {unit}".ljust(18) + f" of up to {large:.4g} {unit}")
-        if not any(large for _, large in found.apart.values()):
+        apart = [(far, large, unit) for unit, (far, large) in found.apart.items()]
+        lines += table(
+            [(f"  {far:.0e} {unit}", f"of up to {large:.4g} {unit}") for far, large, unit in apart]
+        )
+        if not any(large for _, large, _ in apart):
             lines += note("nothing moved: start values or a force in the scene would move it")
         lines.append("")
     lines += [*ticks_text(found.ticks), "", *_ways_text(found.ways)]
@@ -47,11 +49,9 @@ def ticks_text(ticks: Iterable[Ticks]) -> list[str]:
     listed = list(ticks)
     lines = []
     for what, shares in (("late by", "late"), ("took", "took")):
-        rows = [(what, f"{'instants':>11}" + "".join(f"{heading:>12}" for heading in HEADINGS))]
-        for one in listed:
-            cells = "".join(f"{f'{1e3 * value:.3f} ms':>12}" for value in getattr(one, shares))
-            rows.append((one.peer, f"{one.ticks:>11,}{cells}"))
-        lines += _rows(rows)
+        rows: list[tuple[str, ...]] = [("instants", *HEADINGS, what)]
+        rows += [(f"{one.ticks:,}", *map(_ms, getattr(one, shares)), one.peer) for one in listed]
+        lines += table(rows, ">>>>><")
     for one in listed:
         said = [f"not given: {why}" for why in one.not_given]
         said += [f"joined at {one.joined:.4g} s"] if one.joined else []
@@ -59,34 +59,22 @@ def ticks_text(ticks: Iterable[Ticks]) -> list[str]:
         said += [
             f"{counted(count, 'datagram', ',')} dropped: {DROPPED[why]}" for why, count in one.dropped.items()
         ]
-        if said:
-            lines += wrapped(f"{one.peer}: {'; '.join(said)}", "  ", "    ")
+        lines += note(f"{one.peer}: {'; '.join(said)}") if said else []
     return lines
 
 
 def _ways_text(ways: Iterable[WayRun]) -> list[str]:
-    listed = [(f"{one.link} {one.sender} to {one.receiver}", one) for one in ways]
-    rows = [("way", f"{'packets':>9}{'lost':>8}{'half within':>13}{'all within':>13}")]
-    for name, one in listed:
+    rows = [("packets", "lost", "half within", "all within", "way")]
+    for one in ways:
         came = one.came
-        middle = f"{1e3 * dict(came.quantiles).get(0.5, came.mean):.3f} ms"
-        cells = f"{came.packets:>9,}{came.lost.count:>8,}{middle:>13}{f'{1e3 * came.longest:.3f} ms':>13}"
-        rows += [(name, cells), (f"  {one.trace}", "")]
-    return _rows(rows)
+        middle = dict(came.quantiles).get(0.5, came.mean)
+        name = f"{one.link} {one.sender} to {one.receiver}: {one.trace}"
+        rows.append((f"{came.packets:,}", f"{came.lost.count:,}", _ms(middle), _ms(came.longest), name))
+    return table(rows, ">>>><")
 
 
-def _rows(rows: Iterable[tuple[str, str]]) -> list[str]:
-    """Return rows of names and equally wide cells; a name that leaves these no room has a line to itself."""
-    listed = list(rows)
-    wide = max(len(cells) for _, cells in listed)
-    width = max([len(name) for name, cells in listed if cells and len(name) + wide + 4 <= WIDTH], default=0)
-    lines = []
-    for name, cells in listed:
-        if cells and len(name) <= width:
-            lines.append(f"  {name:<{width}}  {cells}")
-        else:
-            lines += [f"  {name}", *([f"  {'':<{width}}  {cells}"] if cells else [])]
-    return lines
+def _ms(seconds: float) -> str:
+    return f"{1e3 * seconds:.3f} ms"
 
 
 def _measured_text(one: Measured) -> list[str]:
@@ -104,19 +92,13 @@ def _measured_text(one: Measured) -> list[str]:
 
 def run_comparison_document(found: RunComparison) -> dict[str, Any]:
     """Return a run beside its scene as plain data; times in seconds."""
-    plain: dict[str, Any] = document(found, {"ways": None, "measured": None})
-    plain["ways"] = [
-        {**document(one, {"came": None}), "came": recording_document(one.came)} for one in found.ways
-    ]
-    plain["measured"] = [
+    measured = [
         {
-            "link": one.link,
-            "way": one.way,
-            "delay": one.delay,
+            **document(one, {"analysis": ..., "network": one.network and one.network.verdict}),
             "verdict": one.analysis.verdict,
             "spectral_radius": one.analysis.spectral_radius,
-            "network": None if one.network is None else one.network.verdict,
         }
         for one in found.measured
     ]
-    return plain
+    ways = [document(one, {"came": recording_document(one.came)}) for one in found.ways]
+    return record(found, {"ways": ways, "measured": measured})

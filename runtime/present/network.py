@@ -11,10 +11,11 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import measured, wrapped
-from apc.present.forms import document, note
+from apc.present.forms import LINEARIZED, labelled, notes, record
 
 if TYPE_CHECKING:
     from apc.moments.network import NetworkVerdict
+    from apc.moments.worst import LossesInARow
 
 _WORDS = {
     "stable in mean square": "Over the network as it is, the mean square of every motion dies out.",
@@ -25,62 +26,50 @@ _WORDS = {
 
 def network_text(found: NetworkVerdict) -> str:
     """Return what becomes of a scene over its network, in words and numbers."""
-    judged = found.mean_square_radius is not None
-    where = "" if judged else " over its network"
-    lines = [
-        f"{found.topology}: {found.verdict}{where}{', linearized at its start' if found.linearized else ''}"
-    ]
-    if judged:
-        lines += ["", *wrapped(_WORDS[found.verdict.removeprefix("probably ")], "  ", "  ")]
-    lines.append("")
-    if found.mean_square_radius is not None:
-        error = found.error or 0.0
-        root = math.sqrt(found.mean_square_radius)
-        lines += [
-            f"  mean squares     grow by {measured(found.mean_square_radius, error)} a frame",
-            f"  its root         {measured(root, error / (2 * root) if root else error)}, beside the "
-            "nominal spectral radius",
+    radius = found.mean_square_radius
+    where = " over its network" if radius is None else ""
+    lines = [f"{found.topology}: {found.verdict}{where}{LINEARIZED if found.linearized else ''}", ""]
+    facts = []
+    if radius is not None:
+        lines += [*wrapped(_WORDS[found.verdict.removeprefix("probably ")], "  ", "  "), ""]
+        error, root = found.error or 0.0, math.sqrt(radius)
+        rooted = measured(root, error / (2 * root) if root else error)
+        facts = [
+            ("mean squares", f"grow by {measured(radius, error)} a frame"),
+            ("its root", f"{rooted}, beside the nominal spectral radius"),
         ]
     if found.rms_error_m is not None:
         apart = f"{found.rms_error_m * 1e3:.4g} mm rms, as every hand pushes with 1 N rms, anew each tick"
-        lines += wrapped(apart, "  copies apart     ", " " * 19)
+        facts.append(("copies apart", apart))
     if found.almost_sure is not None:
         low, high = found.almost_sure.interval
-        lines.append(
-            f"  almost surely    growth e^{found.almost_sure.exponent:.4g} a frame ({low:.4g} to {high:.4g})"
-        )
+        exponent = f"growth e^{found.almost_sure.exponent:.4g} a frame ({low:.4g} to {high:.4g})"
+        facts.append(("almost surely", exponent))
     if found.losses_in_a_row is not None:
-        lines += _losses(found)
+        facts += _losses(found.losses_in_a_row)
     if found.proof:
-        lines.append(f"  proof            {found.proof}")
-    for text in found.notes:
-        lines += note(text)
-    while lines[-1] == "":
-        lines.pop()
-    return "\n".join(lines)
+        facts.append(("proof", found.proof))
+    lines += [line for label, text in facts for line in labelled(label, text)]
+    return "\n".join([*lines, *notes(found.notes)]).rstrip()
 
 
-def _losses(found: NetworkVerdict) -> list[str]:
-    row = found.losses_in_a_row
-    assert row is not None
-    lines = []
-    if row.certified is not None:
-        harmless = f"any pattern of at most {row.certified}" if row.certified else "not even one at a time"
-        lines.append(f"  losses in a row  {harmless} is certified harmless")
-    if row.unstable_pattern is not None and not any(row.unstable_pattern):
-        lines.append(f"  losses in a row  with none a motion grows by {row.growth:.6g} a frame")
-    elif row.unstable_pattern is not None and row.growth is not None:
-        pattern = "".join("×" if lost else "·" for lost in row.unstable_pattern)
-        lines += wrapped(
-            f"{pattern} lost again and again (×) makes a motion grow by {row.growth:.6g} a frame",
-            "  worst pattern    ",
-            " " * 19,
+def _losses(found: LossesInARow) -> list[tuple[str, str]]:
+    told = []
+    if found.certified is not None:
+        harmless = (
+            f"any pattern of at most {found.certified}" if found.certified else "not even one at a time"
         )
-    return lines
+        told.append(("losses in a row", f"{harmless} is certified harmless"))
+    pattern = "".join("×" if lost else "·" for lost in found.unstable_pattern or ())
+    grows = f"a motion grows by {found.growth:.6g} a frame" if pattern else ""
+    if "×" in pattern:
+        grows = grows.replace("a motion grows", "makes a motion grow")
+        told.append(("worst pattern", f"{pattern} lost again and again (×) {grows}"))
+    elif pattern:
+        told.append(("losses in a row", f"with none {grows}"))
+    return told
 
 
 def network_document(found: NetworkVerdict) -> dict[str, Any]:
     """Return what becomes of a scene over its network as plain data."""
-    told: dict[str, Any] = document(found)
-    del told["topology"]
-    return told
+    return record(found, {"topology": ...})

@@ -1,16 +1,16 @@
 """What may be set of a scene, as text and as data.
 
-Takes: a `Parameters`. Gives: `parameters_text`, `parameters_document`.
+Takes: a `Parameters`. Gives: `parameters_text`.
 Guarantees: a value stands in the unit that `--set` takes it in.
 Does not: compute.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from apc.compiler.words import beside, with_unit, wrapped
-from apc.present.forms import document
+from apc.compiler.words import with_unit, wrapped
+from apc.present.forms import quantity, table
 
 if TYPE_CHECKING:
     from apc.frame.settable import Parameters, Settable
@@ -22,21 +22,14 @@ HOW = (
 
 def parameters_text(found: Parameters) -> str:
     """Return a line a number: name, value, limits, and what it is."""
-    rows = [
-        ("name", "value", "limits", ""),
-        *((one.name, _value(one), _limits(one), _told(one)) for one in found.rows),
-    ]
-    widths = [max(len(row[column]) for row in rows) for column in range(3)]
-    lines = [f"{found.topology}: what may be set", ""]
-    for *cells, told in rows:
-        shown = "  ".join(f"{cell:<{width}}" for cell, width in zip(cells, widths, strict=True))
-        lines += beside(f"  {shown}", told)
-    return "\n".join([*lines, "", *wrapped(HOW, "  ", "  ")])
+    rows = [(one.name, _value(one), _limits(one), _told(one)) for one in found.rows]
+    lines = table([("name", "value", "limits", ""), *rows], later=6)
+    return "\n".join([f"{found.topology}: what may be set", "", *lines, "", *wrapped(HOW, "  ", "  ")])
 
 
 def _value(one: Settable) -> str:
     if one.low == one.high:
-        return with_unit(f"{one.low:.9g}", one.unit)
+        return quantity(one.low, one.unit, 9)
     return with_unit(f"{one.low:.4g} to {one.high:.4g}", one.unit)
 
 
@@ -50,9 +43,3 @@ def _told(one: Settable) -> str:
     fixed = f"not to be set: {one.fixed}" if one.fixed else ""
     follows = f"follows: {one.follows}" if one.follows else ""
     return "; ".join(part for part in (one.about, follows, fixed) if part)
-
-
-def parameters_document(found: Parameters) -> dict[str, Any]:
-    """Return the same as plain data, in SI."""
-    whole: dict[str, Any] = document(found)
-    return whole

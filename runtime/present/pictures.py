@@ -2,7 +2,7 @@
 
 Takes: a matplotlib Figure and a path.
 Gives: `COLOURS`, `LINES`, `colours_of`; `FORMATS`, `check_format`, `check_result_path`, `write_figure`,
-`svg_text`.
+`write_result`, `svg_text`, `svg_image`.
 Guarantees: the same figure gives the same bytes; a file is there whole or not at all; text in an SVG is text.
 Does not: draw, or need a display.
 
@@ -11,15 +11,23 @@ matplotlib is loaded when something is drawn and not before.
 
 from __future__ import annotations
 
+import base64
 import io
 import re
+from collections.abc import Callable, Iterable, Sequence
+from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from apc.compiler.files import check_target, write_file
+from apc.compiler.files import check_target, write_file, write_text
+from apc.distribution import program_version
 from apc.optional import need
+from apc.present.forms import json_text
 from apc.suffixes import check_suffix
-from apc.tables import SUFFIXES, check_table_path
+from apc.tables import SUFFIXES, Column, Row, blocks_of, check_table_path, write_table
+
+if TYPE_CHECKING:
+    from apc.result import Result
 
 FORMATS = (".png", ".svg", ".pdf")
 DPI = 150
@@ -81,15 +89,54 @@ def svg_text(figure: Any) -> str:
     return re.sub(r"<metadata>.*?</metadata>", "", drawn[drawn.index("<svg") :], flags=re.DOTALL)
 
 
+def svg_image(figure: Any, title: str) -> str:
+    """Return a matplotlib Figure as an image of a page, so that no name in it meets one outside."""
+    image = base64.b64encode(svg_text(figure).encode("utf-8")).decode("ascii")
+    return f'<img alt="{escape(title)}" src="data:image/svg+xml;base64,{image}">'
+
+
 def write_figure(figure: Any, path: Path) -> None:
     """Write a matplotlib Figure, its format chosen by the suffix; the same figure gives the same bytes."""
-    # No date in the file.
     matplotlib = need("matplotlib", "plot")
-    dates: dict[str, dict[str, None]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+    date = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}  # none in the file
     suffix = check_suffix(path, FORMATS, "--plot")
 
     def write(temporary: Path) -> None:
         with matplotlib.rc_context(SVG):
-            figure.savefig(temporary, format=suffix[1:], dpi=DPI, metadata=dates.get(suffix))
+            figure.savefig(temporary, format=suffix[1:], dpi=DPI, metadata=date.get(suffix))
 
     write_file(path, write)
+
+
+def write_result(
+    path: Path,
+    found: Result,
+    draw: Callable[[], Any],
+    rows: tuple[Sequence[Column], Iterable[Row], dict[str, Any]],
+) -> None:
+    """Write a result as a picture, a table or JSON, by the suffix.
+
+    Parameters
+    ----------
+    path
+        The file.
+    found
+        The result.
+    draw
+        Makes its picture, a matplotlib Figure or Axes.
+    rows
+        The columns of its table, the rows, and what the table says of how it was made.
+
+    Raises
+    ------
+    ApcError
+        As `check_result_path`.
+    """
+    suffix = check_result_path(path)
+    if suffix in FORMATS:
+        write_figure(draw().figure, path)
+    elif suffix in SUFFIXES:
+        columns, cells, made = rows
+        write_table(path, columns, blocks_of(cells), {"apc": program_version(), **made})
+    else:
+        write_text(path, json_text(found.to_dict()))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import counted, wrapped
-from apc.present.forms import document, note
+from apc.present.forms import document, labelled, notes, record
 
 if TYPE_CHECKING:
     from apc.network.recorded import NetworkRecording, Share
@@ -21,50 +21,38 @@ if TYPE_CHECKING:
 def recording_text(found: NetworkRecording) -> str:
     """Return what a recording amounts to, in words and numbers, and a link's entry that says so."""
     of = f" by {found.program}" if found.program else ""
-    lines = [f"{Path(found.file).name}: {counted(found.packets, 'packet', ',')} recorded{of}", ""]
-    for told in found.left_out:
-        lines += note(told)
-    lines += [""] if found.left_out else []
-    lines.append(f"  lost             {_share(found.lost)}")
+    file = Path(found.file).name
+    lines = [f"{file}: {counted(found.packets, 'packet', ',')} recorded{of}", ""]
+    if found.left_out:
+        lines += [*notes(found.left_out), ""]
+    facts = [("lost", _share(found.lost))]
     if found.lost.count:
         how = "losses follow losses" if found.bursty else "no more than luck makes of independent losses"
-        average = found.lost.count / found.bursts
-        lines += [
-            f"  bursts           {found.bursts:,}, {average:.3g} packets on average, "
-            f"{found.longest_burst:,} the longest",
-            *wrapped(f"{how} (Fisher's exact test)", " " * 19, " " * 19),
-        ]
+        average = f"{found.lost.count / found.bursts:.3g} packets on average"
+        bursts = f"{found.bursts:,}, {average}, {found.longest_burst:,} the longest"
+        facts += [("bursts", bursts), ("", f"{how} (Fisher's exact test)")]
     if found.law is not None:
-        spread = (
-            f", standard deviation {_ms(found.deviation)}" if found.packets > found.lost.count + 1 else ""
-        )
-        lines += [
-            f"  delay            {_ms(found.shortest)} to {_ms(found.longest)}",
-            f"    mean           {_ms(found.mean)}{spread}",
-            *(
-                f"    {100 * share:g} %".ljust(19) + f"at most {_ms(delay)}"
-                for share, delay in found.quantiles
-            ),
-        ]
+        several = found.packets > found.lost.count + 1
+        spread = f", standard deviation {_ms(found.deviation)}" if several else ""
+        facts += [("delay", f"{_ms(found.shortest)} to {_ms(found.longest)}")]
+        facts += [("  mean", f"{_ms(found.mean)}{spread}")]
+        facts += [(f"  {100 * share:g} %", f"at most {_ms(delay)}") for share, delay in found.quantiles]
     if found.overtaken is not None:
-        lines.append(f"  overtaken        {counted(found.overtaken, 'packet', ',')}")
-    lines += ["", "  as keys of a link"]
-    lines += wrapped(link_entry(found), "    ", "     ")
+        facts.append(("overtaken", counted(found.overtaken, "packet", ",")))
+    lines += [line for label, text in facts for line in labelled(label, text)]
+    lines += ["", "  as keys of a link", *wrapped(link_entry(found), "    ", "     ")]
     if found.law is not None and found.law.jitter:
         away = f"shares of packets below a delay differ by at most {100 * found.law.distance:.2g} %"
         nearest = f"{found.law.distribution} is the nearest of the distributions: {away}"
         lines += wrapped(nearest, "    ", "    ")
-    lines += ["  or packet by packet", f"    lan: {{clock: network, trace: {Path(found.file).name}}}"]
-    return "\n".join(lines)
+    return "\n".join([*lines, "  or packet by packet", f"    lan: {{clock: network, trace: {file}}}"])
 
 
 def recording_document(found: NetworkRecording) -> dict[str, Any]:
     """Return a recording as plain data: seconds, shares from 0 to 1."""
-    plain: dict[str, Any] = document(found, {"delays": None})
-    del plain["delays"]
-    for name in ("lost", "turns_bad", "turns_good"):
-        plain[name] = {**plain[name], "share": getattr(found, name).value}
-    return {**plain, "entry": link_entry(found)}
+    shares = {name: getattr(found, name) for name in ("lost", "turns_bad", "turns_good")}
+    instead = {name: document(share, {"share": share.value}) for name, share in shares.items()}
+    return record(found, {"delays": ..., "entry": link_entry(found), **instead})
 
 
 def recording_table(found: NetworkRecording) -> str:

@@ -10,23 +10,20 @@ Does not: compute, or draw itself (see `region_picture`).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.files import write_text
 from apc.compiler.timings import part
 from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
-from apc.distribution import program_version
 from apc.optional import need
 from apc.present.analysis import range_document
-from apc.present.forms import MEANT, document, json_text, note
-from apc.present.pictures import FORMATS, check_result_path, write_figure
+from apc.present.forms import MEANT, notes, picked, quantity, table
+from apc.present.pictures import write_result
 from apc.present.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up
-from apc.tables import SUFFIXES, Column, Row, blocks_of, write_table
+from apc.tables import Column, Row
 
 if TYPE_CHECKING:
     import pandas
@@ -42,24 +39,19 @@ MOST_CURVES = 12
 
 def region_text(found: Region) -> str:
     """Return what `apc region` prints of one region."""
-    width = max(len(found.x.free.label), len(found.y.free.label))
-    lines = [f"{found.topology}: {_words(found)}"]
-    if found.criterion in MEANT:
-        lines += note(MEANT[found.criterion])
-    for text in found.left_out:
-        lines += note(text)
-    lines.append("")
-    for letter, axis in (("x", found.x), ("y", found.y)):
-        span = with_unit(f"{float(axis.low):.6g} to {float(axis.high):.6g}", axis.unit)
-        lines.append(f"  {letter}  {axis.free.label:<{width}}  {span}")
-    whole = float(found.rectangle.width.prod())
-    share = 100 * found.stable_area / whole
+    axes = [
+        (letter, one.free.label, with_unit(f"{float(one.low):.6g} to {float(one.high):.6g}", one.unit))
+        for letter, one in (("x", found.x), ("y", found.y))
+    ]
+    share = 100 * found.stable_area / float(found.rectangle.width.prod())
     off = found.stable_area_error
     area = measured(found.stable_area, off) if off else f"{found.stable_area:.9g}"
+    meant = [MEANT[found.criterion]] if found.criterion in MEANT else []
+    lines = [f"{found.topology}: {_words(found)}", *notes([*meant, *found.left_out]), "", *table(axes)]
     lines += ["", f"  stable area  {area} in SI, {share:.4g} % of the rectangle"]
     if found.curves:
-        lines += ["", "  boundary     frequency [Hz]   from (x, y)         to (x, y)           error"]
-        lines += [_row(curve) for curve in found.curves[:MOST_CURVES]]
+        rows = [("boundary", "frequency [Hz]", "from (x, y)", "to (x, y)", "error")]
+        lines += ["", *table([*rows, *map(_row, found.curves[:MOST_CURVES])])]
         left = len(found.curves) - MOST_CURVES
         if left > 0:
             lines.append(f"  and {left} more (--json lists all)")
@@ -67,11 +59,10 @@ def region_text(found: Region) -> str:
         most, many = max(one.error for one in coarse), counted(len(coarse), "curve")
         what = f"{many} could not be followed to {found.tolerance:.0e} of a coordinate, but to {most:.0e}"
         lines += ["", *wrapped(what, "  ", "  ")]
-    cell = " × ".join(
-        with_unit(f"{size:.4g}", axis.unit) for size, axis in zip(found.cell, (found.x, found.y), strict=True)
-    )
-    lines += ["", f"  Looked at in cells of {cell}, and finer where the"]
-    lines.append("  eigenvalues hint at more; an island inside one cell could be missed.")
+    sizes = zip(found.cell, (found.x, found.y), strict=True)
+    cell = " × ".join(quantity(size, axis.unit, 4) for size, axis in sizes)
+    looked = f"Looked at in cells of {cell}, and finer where the eigenvalues hint at more; "
+    lines += ["", *wrapped(f"{looked}an island inside one cell could be missed.", "  ", "  ")]
     if found.stepped and found.criterion == "passive":
         lines.append("  Its points are on the boundary; between them it is drawn straight.")
     elif found.stepped:
@@ -87,14 +78,11 @@ def _words(found: Region) -> str:
     return "stable in the whole rectangle" if found.corner else "stable nowhere in the rectangle"
 
 
-def _row(curve: Curve) -> str:
-    low, high = curve.frequency_hz
-    span = (
-        "–" if isnan(low) else f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.4g} to {high:.4g}"
-    )
-    start = _point(curve, 0)
+def _row(curve: Curve) -> tuple[str, ...]:
+    low, high = (f"{one:.4g}" for one in curve.frequency_hz)
+    span = "–" if low == "nan" else low if low == high else f"{low} to {high}"
     end = "closed" if curve.closed else _point(curve, -1)
-    return f"  {curve.mode:<11.11}  {span:<15}  {start:<18}  {end:<18}  {curve.error:.0e}"
+    return f"{curve.mode:.11}", span, _point(curve, 0), end, f"{curve.error:.0e}"
 
 
 def _point(curve: Curve, place: int) -> str:
@@ -104,35 +92,22 @@ def _point(curve: Curve, place: int) -> str:
 
 def region_document(found: Region) -> dict[str, Any]:
     """Return what `apc region --json` prints of one region."""
+    names = ("topology", "tolerance", "stable_area", "stable_area_error", "cell", "criterion", "left_out")
     return {
-        "topology": found.topology,
+        **picked(found, *names),
         "x": range_document(found.x),
         "y": range_document(found.y),
-        "tolerance": found.tolerance,
         "coarse": [number for number, one in enumerate(found.curves) if one in found.coarse],
         "boundary": [_curve_document(curve) for curve in found.curves],
-        "stable_area": found.stable_area,
-        "stable_area_error": found.stable_area_error,
         "area_unit": _product(found.x.unit, found.y.unit),
-        "cell": list(found.cell),
         "finest_cell": found.finest,
-        "criterion": found.criterion,
-        "left_out": list(found.left_out),
         "origin": dict(found.system.origin.digests),
     }
 
 
 def _curve_document(curve: Curve) -> dict[str, Any]:
-    return {
-        "points": curve.points.tolist(),
-        "handles": curve.handles.tolist(),
-        "error": curve.error,
-        "mode": curve.mode,
-        "frequency_hz": document(curve.frequency_hz),
-        "closed": curve.closed,
-        "smooth": curve.smooth,
-        "stable_side": "left",
-    }
+    names = ("points", "handles", "error", "mode", "frequency_hz", "closed", "smooth")
+    return picked(curve, *names) | {"stable_side": "left"}
 
 
 def _product(x: str, y: str) -> str:
@@ -183,25 +158,15 @@ def _panel_document(panel: Panel) -> dict[str, Any]:
 @part("draw")
 def write_panels(path: Path, found: Panels) -> None:
     """Write regions to a file, its format chosen by the suffix. Raises ApcError E601 if it can't."""
-    suffix = check_result_path(path)
-    if suffix in FORMATS:
-        write_figure(found.plot(), path)
-    elif suffix in SUFFIXES:
-        first = found.panels[0].regions[0]
-        rows = (row for panel in found.panels for one in panel.regions for row in _rows(one, panel.title))
-        made = {
-            "axes": [range_document(first.x), range_document(first.y)],
-            "apc": program_version(),
-            "left_out": {one.topology: list(one.left_out) for panel in found.panels for one in panel.regions},
-            "origin": _origins(found),
-        }
-        write_table(path, _columns(first), blocks_of(rows), made)
-    else:
-        write_text(path, json_text(found.to_dict()))
-
-
-def _origins(found: Panels) -> dict[str, Any]:
-    return {one.topology: dict(one.system.origin.digests) for panel in found.panels for one in panel.regions}
+    regions = [(one, panel.title) for panel in found.panels for one in panel.regions]
+    first, _ = regions[0]
+    made = {
+        "axes": [range_document(first.x), range_document(first.y)],
+        "left_out": {one.topology: list(one.left_out) for one, _ in regions},
+        "origin": {one.topology: dict(one.system.origin.digests) for one, _ in regions},
+    }
+    rows = (row for one, title in regions for row in _rows(one, title))
+    write_result(path, found, found.plot, (_columns(first), rows, made))
 
 
 def _columns(found: Region) -> list[Column]:

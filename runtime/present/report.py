@@ -12,36 +12,30 @@ A PDF is printed by Chromium, where there is one.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from html import escape
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypedDict
 
-from apc.analysis.analysis import Analysis
+import msgspec
+
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, check_target, read_file, unwritable, write_file, write_text
 from apc.compiler.timings import part
 from apc.compiler.words import counted, wrapped
-from apc.hands.feel import Feel
 from apc.optional import missing, need
 from apc.present.comparison_picture import comparison_picture
-from apc.present.eigenvalues import eigenvalues_picture, locus_picture
+from apc.present.eigenvalues import locus_picture
 from apc.present.forms import document, json_text
 from apc.present.graph import graph_picture
-from apc.present.hands import feel_picture
-from apc.present.pictures import svg_text
-from apc.present.region_picture import region_picture
-from apc.present.simulation import played_picture
-from apc.regions.region import Region
+from apc.present.pictures import svg_image
 from apc.reports.contents import Cell, Report, SceneReport, Table
-from apc.simulation.trajectory import Trajectory
 from apc.suffixes import check_suffix
 from apc.vary.locus import Locus
 
@@ -75,7 +69,7 @@ a { color: var(--link); } nav a { margin-right: 1rem; white-space: nowrap; }
 .scenes > * { min-width: 0; } .faint { color: var(--faint); }
 figure { margin: .6rem 0; padding: .5rem; background: #fff; border: 1px solid var(--line); border-radius: 4px;
   overflow-x: auto; }
-figure svg { display: block; margin: auto; max-width: 100%; height: auto; }
+figure img { display: block; margin: auto; max-width: 100%; height: auto; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; }
 th, td { text-align: left; padding: .15rem .7rem .15rem 0; border-bottom: 1px solid var(--line);
@@ -102,21 +96,10 @@ def report_text(found: Report) -> str:
 
 def report_document(found: Report) -> dict[str, Any]:
     """Return a report as plain data: what is needed to compute it again, and all of its tables."""
+    sections = [[document(each, {"drawn": ...}) for each in one.sections] for one in found.scenes]
     scenes = [
-        {
-            "name": one.name,
-            "about": one.about,
-            "file": one.path.name,
-            "settings": list(one.settings),
-            "texts": [list(pair) for pair in one.texts],
-            "origin": [list(pair) for pair in one.origin],
-            "sections": [
-                {"key": section.key, "command": section.command, "refused": section.refused}
-                | {"told": list(section.told), "tables": document(section.tables)}
-                for section in one.sections
-            ],
-        }
-        for one in found.scenes
+        document(one, {"path": ..., "file": one.path.name, "sections": kept})
+        for one, kept in zip(found.scenes, sections, strict=True)
     ]
     return {"apc_report": 1, "versions": dict(found.versions), "scenes": scenes}
 
@@ -125,7 +108,6 @@ def report_document(found: Report) -> dict[str, Any]:
 def report_page(found: Report) -> str:
     """Return a report as one HTML document."""
     named = ", ".join(one.name for one in found.scenes)
-    draw = _Pictures()
     kept = json_text(report_document(found), indent=None).replace("<", "\\u003c")
     policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
     parts = [
@@ -137,18 +119,18 @@ def report_page(found: Report) -> str:
         '<p class="faint">Every number here is that of the command beside it; '
         "<code>apc report --check FILE</code> computes this page anew and says what differs.</p>",
         f"<nav>{''.join(_link(key, title) for key, title in _titles(found))}</nav></header><main>",
-        *_row("scene", "The scene", [_scene(one, draw) for one in found.scenes]),
+        *_row("scene", "The scene", map(_scene, found.scenes)),
     ]
     if len(found.scenes) > 1:
         shown = _refused(found.refused)
         if found.comparison is not None:
             files = " ".join(one.path.name for one in found.scenes)
             shown = f"<p>As by {_code(f'apc compare {files} --out compared.svg')}.</p>"
-            shown += draw.of(comparison_picture(found.comparison), "schemes side by side")
+            shown += _picture(comparison_picture(found.comparison), "schemes side by side")
             shown += f"<pre>{escape(str(found.comparison))}</pre>"
         parts += _row("compared", "Side by side", [shown])
     for key, title in TITLES.items():
-        cells = [_section(one, key, draw, len(found.scenes) > 1) for one in found.scenes]
+        cells = [_section(one, key, len(found.scenes) > 1) for one in found.scenes]
         parts += _row(key, title, cells)
     parts += _row("made", "What made it", [_made(one, found) for one in found.scenes])
     parts += [f'</main><script type="application/json" id="apc-report">{kept}</script></body></html>']
@@ -175,13 +157,13 @@ def _refused(why: str) -> str:
     return f'<p class="faint">Not here: {escape(why)}.</p>'
 
 
-def _row(key: str, title: str, cells: Sequence[str]) -> list[str]:
+def _row(key: str, title: str, cells: Iterable[str]) -> list[str]:
     """Return a section of the page: the same of all scenes side by side."""
     inner = "".join(f"<div>{cell}</div>" for cell in cells)
     return [f'<section id="{key}"><h2>{escape(title)}</h2><div class="scenes">{inner}</div></section>']
 
 
-def _scene(one: SceneReport, draw: _Pictures) -> str:
+def _scene(one: SceneReport) -> str:
     from apc.compiler.view.listing import diagram_of  # of the topology as written
 
     diagram = diagram_of(one.path)
@@ -190,16 +172,18 @@ def _scene(one: SceneReport, draw: _Pictures) -> str:
     settings = "".join(f"<li>{_code(text)}</li>" for text in one.settings)
     told = f"<p>{escape(one.about)}</p>" + (f"<p>Set first:</p><ul>{settings}</ul>" if settings else "")
     command = f"<p>As by {_code(f'apc show {one.path.name} --out scene.svg')}.</p>"
-    return f"<h3>{escape(one.name)}</h3>{told}{draw.of(graph_picture(diagram), title)}{command}{texts}"
+    return f"<h3>{escape(one.name)}</h3>{told}{_picture(graph_picture(diagram), title)}{command}{texts}"
 
 
-def _section(one: SceneReport, key: str, draw: _Pictures, several: bool) -> str:
+def _section(one: SceneReport, key: str, several: bool) -> str:
     section = next(each for each in one.sections if each.key == key)
     head = f"<h3>{escape(one.name)}</h3>" if several else ""
     if section.refused:
         return head + _refused(section.refused)
     told = "".join(f"<p>{escape(text)}</p>" for text in section.told)
-    pictures = "".join(draw.result(each, f"{one.name}: {TITLES[key]}") for each in section.drawn)
+    title = f"{one.name}: {TITLES[key]}"
+    figures = (locus_picture(each) if isinstance(each, Locus) else each.plot() for each in section.drawn)
+    pictures = "".join(_picture(drawn.figure, title) for drawn in figures)
     tables = "".join(map(_table, section.tables))
     return f"{head}{told}{pictures}{tables}<p>As by {_code(section.command)}.</p>"
 
@@ -227,32 +211,8 @@ def _made(one: SceneReport, found: Report) -> str:
     return f"<h3>{escape(one.name)}</h3>{_table(versions)}{_table(digests)}"
 
 
-class _Pictures:
-    """Draws figures into a page, each with names of its own inside it."""
-
-    def __init__(self) -> None:
-        self._count = 0
-
-    def result(self, found: Any, title: str) -> str:
-        """Return the picture of a result."""
-        if isinstance(found, Trajectory):
-            return self.of(played_picture(found), title)
-        if isinstance(found, Feel):
-            return self.of(feel_picture(found), title)
-        if isinstance(found, Region):
-            return self.of(region_picture(found).figure, title)
-        if isinstance(found, Locus):
-            return self.of(locus_picture(found).figure, title)
-        assert isinstance(found, Analysis)
-        return self.of(eigenvalues_picture(found).figure, title)
-
-    def of(self, figure: Any, title: str) -> str:
-        """Return a matplotlib Figure as an element of the page."""
-        self._count += 1
-        drawn = svg_text(figure)
-        drawn = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>p{self._count}-", drawn)
-        labelled = f'<svg role="img" aria-label="{escape(title)}"'
-        return f"<figure>{drawn.replace('<svg', labelled, 1)}</figure>"
+def _picture(figure: Any, title: str) -> str:
+    return f"<figure>{svg_image(figure, title)}</figure>"
 
 
 # ---- files ----
@@ -309,7 +269,42 @@ def _print(page: str, target: Path, path: Path) -> None:
             raise unwritable(path, OSError(None, f"{Path(command[0]).name} has not printed it")) from error
 
 
-def kept_report(path: Path) -> dict[str, Any]:
+class KeptTable(TypedDict):
+    """A table that a page keeps."""
+
+    title: str
+    columns: list[str]
+    rows: list[list[Cell]]
+
+
+class KeptSection(TypedDict):
+    """A section that a page keeps."""
+
+    key: str
+    refused: str
+    tables: list[KeptTable]
+
+
+class KeptScene(TypedDict):
+    """A scene that a page keeps: its texts by name, the digests of all it is made of, its sections."""
+
+    name: str
+    about: str
+    file: str
+    settings: list[str]
+    texts: list[tuple[str, str]]
+    origin: list[tuple[str, str]]
+    sections: list[KeptSection]
+
+
+class KeptReport(TypedDict):
+    """What a page keeps of its report, as `report_document` has it."""
+
+    versions: dict[str, str]
+    scenes: list[KeptScene]
+
+
+def kept_report(path: Path) -> KeptReport:
     """Return what a report's page keeps of itself.
 
     Raises
@@ -317,29 +312,18 @@ def kept_report(path: Path) -> dict[str, Any]:
     ApcError
         E990 it is no page that `apc report` wrote, or is damaged.
     """
-    what = "is no report that apc has written, or is damaged"
-    hint = "apc report scene.yaml --out report.html"
-    refusal = ApcError(Mistake("E990", Place(str(path)), what, hint=hint))
     try:
         found = _KEPT.search(read_file(path, LARGEST).decode("utf-8"))
-        kept: dict[str, Any] = json.loads(found[1]) if found else {}
-        for one in kept["scenes"]:
-            assert all(isinstance(one[name], str) for name in ("name", "file"))
-            assert all(isinstance(text, str) for text in one["settings"])
-            assert all(isinstance(text, str) for pair in one["texts"] for text in pair)
-            dict(one["origin"])
-            for section in one["sections"]:
-                for table in section["tables"]:
-                    _ = table["title"], [list(row) for row in table["rows"]], list(table["columns"])
-        dict(kept["versions"])
+        return msgspec.json.decode(found[1] if found else "", type=KeptReport)
     except RefusedError as refused:
         raise ApcError(Mistake("E990", Place(str(path)), refused.words)) from None
-    except (ValueError, KeyError, TypeError, AssertionError, RecursionError):
-        raise refusal from None
-    return kept
+    except (ValueError, RecursionError):
+        what = "is no report that apc has written, or is damaged"
+        hint = "apc report scene.yaml --out report.html"
+        raise ApcError(Mistake("E990", Place(str(path)), what, hint=hint)) from None
 
 
-def scene_again(kept: dict[str, Any], folder: Path) -> Path:
+def scene_again(kept: KeptScene, folder: Path) -> Path:
     """Write the texts of a scene that a report keeps into an empty folder; return the topology.
 
     Raises

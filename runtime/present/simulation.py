@@ -2,9 +2,8 @@
 
 Takes: results of `simulation`. Gives: their texts, documents, tables and pictures; `provenance_json`.
 Guarantees: a text fits 80 columns. In a picture every curve is named, a colour a peer and a dash a part, and
-those that are one are said to be; of more than ten peers each group has a colour, and the extremes are named;
-labels stand beside the panels, over nothing; a long run is drawn by the extremes of its rows, so that no
-swing is lost.
+those that are one are said to be; of more than ten peers each group has a colour;
+labels stand beside the panels, over nothing.
 Does not: compute, or need a display.
 
 matplotlib is loaded when something is drawn and not before.
@@ -20,20 +19,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.language.vectors import entry, whole_and_index
 from apc.compiler.timings import part
-from apc.compiler.words import counted, in_hertz, with_unit, wrapped
+from apc.compiler.words import counted, in_hertz, wrapped
 from apc.optional import need
-from apc.present.forms import document, json_text, note
+from apc.present.forms import document, json_text, labelled, note, notes, quantity, record, table
 from apc.present.pictures import check_format, colours_of, write_figure
-from apc.present.planar import draw_paths, paths_of
 from apc.simulation.settings import EXACT
 
 if TYPE_CHECKING:
     from apc.simulation.accuracy import ErrorEstimate
     from apc.simulation.buzz import Buzz
-    from apc.simulation.ensemble import Ensemble, MeanSquare, Statistics
-    from apc.simulation.limits import Broken
+    from apc.simulation.ensemble import Ensemble, MeanSquare
     from apc.simulation.signals import Signal
+    from apc.simulation.summary import Broken
     from apc.simulation.trajectory import Played, Provenance, Trajectory
 
 Floats = NDArray[np.float64]
@@ -58,7 +57,6 @@ ROUNDING = 1e-9  # of what a panel spans
 LABEL = 36  # letters of a line of a legend
 MOST_LIMITS = 4  # that are told as text; the document has all
 MOST_CURVES = 24  # in a panel: more can't be told apart
-MOST_POINTS = 2000  # of a curve: about one a pixel and a half of a wide picture
 WIDTH, HEIGHT = 9.0, 2.4  # inches: of the figure, of a panel
 PATHS = 2.0  # times as high is a plane
 RECORDED_REST = "No recorded position moves."
@@ -78,8 +76,10 @@ def buzz_text(found: Buzz) -> str:
     known = found.predicted
     settles = "settles" if found.settles else ""
     played = in_hertz(found.lines[0].frequency_hz) if found.lines else settles or "–"
-    title = f"{found.topology}: the buzz of its contacts, predicted beside {found.played_s:g} s played"
-    rows = [("frequency", in_hertz(known.frequency_hz) if known else "–", played)]
+    rows = [
+        ("", "predicted", "played"),
+        ("frequency", in_hertz(known.frequency_hz) if known else "–", played),
+    ]
     share = f"{known.in_contact:.1%}" if known else "–"
     for one in found.contacts:
         depth = "–" if one.predicted_depth_m is None else f"{one.predicted_depth_m * 1e3:.4g} mm"
@@ -87,18 +87,9 @@ def buzz_text(found: Buzz) -> str:
             (f"{one.name}: depth", depth, settles or f"{one.depth_m * 1e3:.4g} mm"),
             (f"{one.name}: in contact", share, f"{one.in_contact:.1%}"),
         ]
-    width = max(len(name) for name, _, _ in rows)
-    lines = [*wrapped(title), "", f"  {'':<{width}}  {'predicted':>10}  {'played':>10}"]
-    lines += [f"  {name:<{width}}  {one:>10}  {other:>10}" for name, one, other in rows]
-    for text in (*((found.reason,) if found.reason else ()), *found.notes):
-        lines += note(text)
-    return "\n".join(lines)
-
-
-def buzz_document(found: Buzz) -> dict[str, Any]:
-    """Return a buzz as plain data."""
-    told: dict[str, Any] = document(found)
-    return told
+    title = f"{found.topology}: the buzz of its contacts, predicted beside {found.played_s:g} s played"
+    told = notes(filter(None, (found.reason, *found.notes)))
+    return "\n".join([*wrapped(title), "", *table(rows, "<>>"), *told])
 
 
 def played_text(found: Played) -> str:
@@ -145,7 +136,7 @@ def played_text(found: Played) -> str:
         rows.append(("error", error_text(found.error)))
     lines.append("")
     for title, text in rows:
-        lines += wrapped(text, f"  {title:<15}", " " * 17)
+        lines += labelled(title, text, 15)
     return "\n".join(lines)
 
 
@@ -163,7 +154,7 @@ def _quantity(value: float, unit: str) -> str:
     """Return a number with its unit, thousandths of it where it is small."""
     if value and abs(value) < 0.1 and unit in ("m", "s", "J", "N"):
         return f"{1e3 * value:.3g} m{unit}" if abs(value) >= 1e-4 else f"{1e6 * value:.3g} µ{unit}"
-    return with_unit(f"{value:.3g}", unit)
+    return quantity(value, unit, 3)
 
 
 def _method(provenance: Provenance) -> str:
@@ -189,68 +180,48 @@ def played_document(found: Played) -> dict[str, Any]:
     """Return what `apc simulate --json` prints."""
     summary = found.summary
 
-    def named(pair: tuple[str, float] | None, key: str) -> dict[str, Any] | None:
-        return None if pair is None else {"signal": pair[0], key: pair[1]}
+    def keyed(values: Sequence[Any] | None, *keys: str) -> dict[str, Any] | None:
+        return None if values is None else dict(zip(keys, values, strict=True))
 
-    force, swing = summary.largest_force, summary.swing
     return {
         "topology": found.topology,
         "verdict": summary.verdict,
         "settled_s": summary.settled,
         "diverged": {"signal": summary.stopped, "time_s": summary.stopped_at} if summary.stopped else None,
         "interrupted": found.interrupted,
-        "swing": None if swing is None else {"signal": swing[0], "size": swing[1], "frequency_hz": swing[2]},
-        "overshoot": named(summary.overshoot, "part"),
-        "limits_broken": [document(one) for one in summary.broken],
-        "largest_force": None if force is None else {"signal": force[0], "N": force[1], "time_s": force[2]},
+        "swing": keyed(summary.swing, "signal", "size", "frequency_hz"),
+        "overshoot": keyed(summary.overshoot, "signal", "part"),
+        "limits_broken": document(summary.broken),
+        "largest_force": keyed(summary.largest_force, "signal", "N", "time_s"),
         "copies_apart": dict(summary.copies),
         "work_J": dict(summary.work),
         "rows": summary.rows,
         "end_s": summary.end,
-        "signals": [
-            {
-                "name": one.name,
-                "unit": one.unit,
-                "first": one.first,
-                "last": one.last,
-                "low": one.low,
-                "high": one.high,
-                "settled_s": one.settled,
-            }
-            for one in summary.extents
-        ],
+        "signals": [document(one, {"settled": ..., "settled_s": one.settled}) for one in summary.extents],
         "error_estimate": None if found.error is None else _error_document(found.error),
         "provenance": provenance_document(found.provenance),
     }
 
 
 def _error_document(found: ErrorEstimate) -> dict[str, Any]:
-    return {
-        "kind": found.kind,
-        "compared_with": found.compared,
-        "signals": [
-            {"name": one.name, "unit": one.unit, "error": one.error, "time_s": one.at, "range": one.span}
-            for one in found.signals
-        ],
-    }
+    signals = [
+        document(one, {"at": ..., "span": ..., "time_s": one.at, "range": one.span}) for one in found.signals
+    ]
+    return {"kind": found.kind, "compared_with": found.compared, "signals": signals}
 
 
 def provenance_document(found: Provenance) -> dict[str, Any]:
     """Return what made a result as plain data."""
-    return {
-        "topology": found.topology,
+    instead = {
+        "texts": ...,
         "sha256": found.texts,
-        "duration_s": found.duration_s,
-        "method": found.method,
-        "tolerances": {
-            one.state: {"relative": one.relative, "absolute": one.absolute, "unit": one.unit}
-            for one in found.tolerances
-        },
-        "seed": found.seed,
+        "tolerances": {one.state: document(one, {"state": ...}) for one in found.tolerances},
         "parameters": {name: {"value": value, "unit": unit} for name, value, unit in found.parameters},
+        "timings": ...,
         "timings_s": dict(found.timings),
         "versions": dict(found.versions),
     }
+    return record(found, instead)
 
 
 def provenance_json(found: Provenance) -> str:
@@ -323,10 +294,7 @@ def played_picture(trajectory: Trajectory, ax: Any = None) -> Any:
         one.tick_params(labelbottom=one is axes[len(panels) - 1])
     axes[len(panels) - 1].set_xlabel("time [s]")
     if paths:
-        styles = [_style(trajectory.signals, [one for one, _ in paths], place) for place, _ in paths]
-        drawn = [(*pair, *style) for pair, style in zip(paths, styles, strict=True)]
-        draw_paths(axes[-1], trajectory.signals, trajectory.values, drawn[:MOST_CURVES])
-        _legend(axes[-1], len(drawn))
+        _draw_paths(axes[-1], trajectory, paths)
     figure.suptitle(f"{trajectory.topology}: {trajectory.summary.verdict}", fontsize=11)
     return figure
 
@@ -340,24 +308,46 @@ def _panels(signals: Sequence[Signal]) -> dict[str, list[int]]:
     return {unit: found[unit] for unit in [*known, *(unit for unit in found if unit not in known)]}
 
 
+def paths_of(signals: Sequence[Signal]) -> list[tuple[int, int]]:
+    """Return which signals are the first two coordinates of one position."""
+    places = {one.name: place for place, one in enumerate(signals) if one.unit == "m"}
+    pairs = [
+        (place, entry(whole_and_index(name)[0], 2)) for name, place in places.items() if name.endswith("[1]")
+    ]
+    return [(place, places[second]) for place, second in pairs if second in places]
+
+
+def _draw_paths(ax: Any, trajectory: Trajectory, paths: Sequence[tuple[int, int]]) -> None:
+    """Draw the paths of positions in their plane, each from its start, a dot."""
+    signals, values = trajectory.signals, 1e3 * trajectory.values
+    for one, two in paths[:MOST_CURVES]:
+        colour, dashes = _style(signals, [first for first, _ in paths], one)
+        label, _ = whole_and_index(signals[one].name)
+        ax.plot(values[:, one], values[:, two], color=colour, linestyle=dashes, linewidth=1.0, label=label)
+        ax.plot(values[:1, one], values[:1, two], "o", color=colour, markersize=4)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set(xlabel="x[1] [mm]", ylabel="path: x[2] [mm]")
+    _finish(ax, len(paths))
+
+
 def _panel(ax: Any, trajectory: Trajectory, unit: str, places: Sequence[int]) -> None:
     title, shown, scale = QUANTITIES.get(unit, ("", unit, 1.0))
-    signals = trajectory.signals
-    drawn = _by_group(trajectory, places) if _are_many(signals) else _one_by_one(trajectory, places)
-    for time, values, label, colour, dashes, high in drawn[:MOST_CURVES]:
-        if high is None:
-            ax.plot(time, scale * values, color=colour, linestyle=dashes, linewidth=1.0, label=label)
-        else:
-            look = {"facecolor": colour, "alpha": 0.2, "linewidth": 0}
-            ax.fill_between(time, scale * values, scale * high, label=label, **look)
+    signals, values = trajectory.signals, scale * trajectory.values
+    many = _are_many(signals)
+    curves = _by_group(signals, places) if many else _identical(values, places)
+    for columns in curves[:MOST_CURVES]:
+        one = signals[columns[0]]
+        names = ", ".join(signals[place].name for place in columns)
+        label = f"{names}: identical" if len(columns) > 1 else names
+        if many:
+            label = f"{one.group}.{one.local}: {counted(len(columns), 'peer')}"
+        colour, dashes = _style(signals, places, columns[0])
+        look = {"color": colour, "linestyle": dashes, "linewidth": 0.4 if many else 1.0}
+        first, *_ = ax.plot(trajectory.time, values[:, columns if many else columns[:1]], **look)
+        first.set_label("\n".join(textwrap.wrap(label, LABEL)))
     ax.set_ylabel(f"{title} [{shown}]" if title else f"[{shown}]")
     ax.margins(x=0)
-    ax.grid(visible=True, linewidth=0.4, alpha=0.5)
-    _legend(ax, len(drawn))
-
-
-# A curve, or with `high` what lies between two: time, values, its name, colour and dashes.
-_Curve = tuple[Floats, Floats, str, Any, Any, Floats | None]
+    _finish(ax, len(curves))
 
 
 def _are_many(signals: Sequence[Signal]) -> bool:
@@ -365,79 +355,42 @@ def _are_many(signals: Sequence[Signal]) -> bool:
     return len({(one.group, one.peer) for one in signals}) > MOST_COLOURS
 
 
-def _one_by_one(trajectory: Trajectory, places: Sequence[int]) -> list[_Curve]:
-    """Return a curve a signal, those that are the same as one: its name names them all."""
-    signals = trajectory.signals
-    found: list[_Curve] = []
-    for alike in _alike(trajectory.values, places):
-        names = ", ".join(signals[place].name for place in alike)
-        label = f"{names}: identical" if len(alike) > 1 else names
-        colour, dashes = _style(signals, places, alike[0])
-        time, values = thinned(trajectory.time, trajectory.values[:, alike[0]])
-        found.append((time, values, "\n".join(textwrap.wrap(label, LABEL)), colour, dashes, None))
-    return found
-
-
-def _alike(values: Floats, places: Sequence[int]) -> list[list[int]]:
+def _identical(values: Floats, places: Sequence[int]) -> list[list[int]]:
     """Return places by curve: in one those that differ by nothing but rounding, of what the panel spans."""
     found: list[list[int]] = []
-    off = ROUNDING * float(np.ptp(values[:, places])) if len(places) else 0.0
+    off = ROUNDING * float(np.ptp(values[:, places]))
     for place in places:
-        for one in found:
-            if np.abs(values[:, place] - values[:, one[0]]).max() <= off:
-                one.append(place)
-                break
-        else:
+        same = (one for one in found if np.abs(values[:, place] - values[:, one[0]]).max() <= off)
+        curve = next(same, None)
+        if curve is None:
             found.append([place])
+        else:
+            curve.append(place)
     return found
 
 
-def _by_group(trajectory: Trajectory, places: Sequence[int]) -> list[_Curve]:
-    """Return of each quantity of a group what lies between all its peers, and the two that go furthest."""
-    signals = trajectory.signals
-    found: list[_Curve] = []
+def _by_group(signals: Sequence[Signal], places: Sequence[int]) -> list[list[int]]:
+    """Return places by group and quantity."""
     members: dict[tuple[str, str], list[int]] = {}
     for place in places:
         members.setdefault((signals[place].group, signals[place].local), []).append(place)
-    for (group, local), own in members.items():
-        values = trajectory.values[:, own]
-        colour, dashes = _style(signals, places, own[0])
-        if len(_alike(trajectory.values, own)) == 1:
-            label = f"{group}.{local}: {counted(len(own), 'peer')}" + (", identical" if len(own) > 1 else "")
-            found.append((*thinned(trajectory.time, values[:, 0]), label, colour, dashes, None))
-            continue
-        width = max(1, -(-len(values) // MOST_POINTS))
-        starts = np.arange(0, len(values), width)
-        low = np.minimum.reduceat(values.min(axis=1), starts)
-        high = np.maximum.reduceat(values.max(axis=1), starts)
-        label = f"{group}.{local}: all {len(own)} peers"
-        found.append((trajectory.time[starts], low, label, colour, dashes, high))
-        extremes = {"highest": int(values.max(axis=0).argmax()), "lowest": int(values.min(axis=0).argmin())}
-        for word, column in extremes.items():
-            label = f"{signals[own[column]].name}: {word}"
-            look = dashes if word == "highest" else DASHES[-1]
-            found.append((*thinned(trajectory.time, values[:, column]), label, colour, look, None))
-    return found
+    return [*members.values()]
 
 
 def _style(signals: Sequence[Signal], places: Sequence[int], place: int) -> tuple[Any, Any]:
     """Return a signal's colour, its peer's or where these are many its group's, and its dashes in a panel."""
-
-    def owner(signal: Signal) -> tuple[str, int]:
-        return (signal.group, 0 if many else signal.peer)
-
     many = _are_many(signals)
-    owners = list(dict.fromkeys(map(owner, signals)))
-    locals_ = list(dict.fromkeys(signals[other].local for other in places))
+    owners = list(dict.fromkeys((one.group, 0 if many else one.peer) for one in signals))
+    quantities = list(dict.fromkeys(signals[other].local for other in places))
     one = signals[place]
-    colour = colours_of(len(owners))[owners.index(owner(one))]
-    return colour, DASHES[locals_.index(one.local) % len(DASHES)]
+    colour = colours_of(len(owners))[owners.index((one.group, 0 if many else one.peer))]
+    return colour, DASHES[quantities.index(one.local) % len(DASHES)]
 
 
-def _legend(ax: Any, curves: int) -> None:
+def _finish(ax: Any, curves: int) -> None:
     """Name the curves beside a panel, and say how many more there are than it shows."""
     drawn = min(curves, MOST_CURVES)
-    left = curves - drawn
+    ax.grid(linewidth=0.4, alpha=0.5)
     ax.legend(
         loc="center left",
         bbox_to_anchor=(1.01, 0.5),
@@ -445,22 +398,9 @@ def _legend(ax: Any, curves: int) -> None:
         ncols=1 if drawn <= 14 else 2,
         frameon=False,
         handlelength=2.6,
-        title=f"and {left} more" if left else None,
+        title=f"and {curves - drawn} more" if curves > drawn else None,
         title_fontsize=7,
     )
-
-
-def thinned(time: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Return a curve in at most some `MOST_POINTS` points: the least and the largest of each stretch."""
-    if len(time) <= MOST_POINTS:
-        return time, values
-    width = -(-2 * len(time) // MOST_POINTS)
-    whole = len(time) // width * width
-    stretches = values[:whole].reshape(-1, width)
-    first = np.arange(0, whole, width)
-    both = np.stack([first + stretches.argmin(axis=1), first + stretches.argmax(axis=1)], axis=1)
-    kept = np.unique(np.concatenate([[0], np.sort(both, axis=1).reshape(-1), [len(time) - 1]]))
-    return time[kept], values[kept]
 
 
 def ensemble_text(ensemble: Ensemble) -> str:
@@ -468,26 +408,25 @@ def ensemble_text(ensemble: Ensemble) -> str:
     from apc.simulation.ensemble import share_interval
 
     n = len(ensemble.runs)
-    lines = [
-        f"{ensemble.topology[:40]}: {counted(n, 'run')} of {float(ensemble.duration):g} s, "
-        f"seed {ensemble.seed}"
-    ]
+    duration = f"{float(ensemble.duration):g} s, seed {ensemble.seed}"
+    lines = [f"{ensemble.topology[:40]}: {counted(n, 'run')} of {duration}"]
+    shares = []
     for verdict, count in ensemble.verdicts:
         low, high = share_interval(count, n)
         told = f"{100 * count / n:.3g} % (95 % sure: {100 * low:.3g} % to {100 * high:.3g} %)"
-        lines.append(f"  {verdict:<10} {count:>8}   {told}")
-    lines.append(f"  {'':<18}{'mean':>10} ±{'error':>8}{'5 %':>10}{'median':>10}{'95 %':>10}{'most':>10}")
+        shares.append((verdict, str(count), told))
+    rows: list[tuple[str, ...]] = [("", "mean", "± error", "5 %", "median", "95 %", "most")]
     for name, label in LABELS.items():
         one = ensemble.statistics(name)
         if one is not None:
-            error = f"{one.standard_error:>8.1g}" if one.count > 1 else f"{'':>8}"
-            numbers = "".join(f"{value:>10.4g}" for value in (*one.quantiles, one.high))
-            lines.append(f"  {label:<18}{one.mean:>10.4g} ±{error}{numbers}")
+            error = f"± {one.standard_error:.1g}" if one.count > 1 else ""
+            rows.append((label, f"{one.mean:.4g}", error, *(f"{v:.4g}" for v in (*one.quantiles, one.high))))
+    lines += [*table(shares, "<><"), "", *table(rows, "<>>>>>>")]
     settled = ensemble.statistics("settled")
     if settled is not None and settled.count < n:
         lines.append(f"  settled at: of the {settled.count} runs that settle")
     if ensemble.mean_square is not None:
-        lines += wrapped(_beside(ensemble, ensemble.mean_square), "  ", "    ")
+        lines += note(_beside(ensemble, ensemble.mean_square))
     if ensemble.interrupted:
         lines.append("  interrupted: there were to be more runs")
     return "\n".join(lines)
@@ -516,35 +455,24 @@ def _beside(ensemble: Ensemble, found: MeanSquare) -> str:
 
 def ensemble_document(found: Ensemble) -> dict[str, Any]:
     """Return what many runs amount to as plain data."""
-    from apc.simulation.ensemble import (  # loaded where there is one, and else not needed
-        QUANTILES,
-        share_interval,
-    )
+    from apc.simulation.ensemble import QUANTILES, share_interval
 
     n, told = len(found.runs), found.mean_square
-    return {
-        "topology": found.topology,
-        "duration_s": float(found.duration),
-        "seed": found.seed,
+    shares = {
+        verdict: {"runs": count, "share": count / n, "share_95": list(share_interval(count, n))}
+        for verdict, count in found.verdicts
+    }
+    instead: dict[str, Any] = {
+        "duration": ...,
+        "duration_s": found.duration,
         "runs": n,
-        "interrupted": found.interrupted,
-        "verdicts": {
-            verdict: {"runs": count, "share": count / n, "share_95": list(share_interval(count, n))}
-            for verdict, count in found.verdicts
-        },
-        **{name: _statistics(found.statistics(name), QUANTILES) for name in LABELS},
         "mean_square": None if told is None else {**document(told), "agrees": found.agrees},
+        "verdicts": shares,
     }
-
-
-def _statistics(found: Statistics | None, quantiles: Sequence[float]) -> dict[str, Any] | None:
-    if found is None:
-        return None
-    return {
-        "runs": found.count,
-        "mean": found.mean,
-        "standard_error": document(found.standard_error),
-        "low": found.low,
-        "high": found.high,
-        "quantiles": dict(zip(map(str, quantiles), found.quantiles, strict=True)),
-    }
+    for name in LABELS:
+        one = found.statistics(name)
+        if one is not None:
+            quantiles = dict(zip(map(str, QUANTILES), one.quantiles, strict=True))
+            one = document(one, {"count": ..., "runs": one.count, "quantiles": quantiles})
+        instead[name] = one
+    return record(found, instead)

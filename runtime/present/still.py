@@ -1,125 +1,58 @@
-"""A picture of how a scene begins: every peer's bodies side by side, and the surfaces between them.
+"""A picture of how a scene begins: the bodies of every peer, and the surfaces between them.
 
-Takes: a `CompiledSystem`. Gives: `Body`, `Wall`, `bodies_of`, `rows_of`, `draw_still`, `save_still`, and
-`draw_actors`, the same picture with what moves in it (see `animation`); of bodies that move in a plane that
-of `planar`.
-Guarantees: everything is found in the equations: a body is a position (a state in metres); where something is
-decided by the distance of two of them, or of one from a fixed place, in metres, there is a surface.
-Does not: play the scene, or know what a part is called.
-
-A decision on x_a − x_b + w, as a contact takes, says that the two touch at the distance w. The body that is
-sent to the others, or else the second, is drawn with a half width of w, the other as a point.
+Takes: a `CompiledSystem`.
+Gives: `draw_still`, `save_still`; `Actor`, `draw_actors` and `keep_in_sight`, the same with what moves in it
+(see `animation`).
+Guarantees: bodies on an axis stand in a row a peer; those of a plane have a plane a peer, all to one scale.
+Of space the first two coordinates are drawn, and beside bodies of a plane none that move along one axis.
+Does not: play the scene, or find what there is to draw (see `bodies`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import CompiledSystem, Kind
-from apc.compiler.interpolation import jacobian
+from apc.compiler.compiled import CompiledSystem
 from apc.compiler.timings import part
-from apc.frame.jacobians import jacobians
-from apc.frame.parameters import resolve
-from apc.frame.start import start_values
 from apc.optional import need
+from apc.present.bodies import Body, Disc, Line, PeerView, moves_in_plane, positions_of, views_of
 from apc.present.pictures import check_format, colours_of, write_figure
-from apc.present.planar import (
-    MM,
-    Actor,
-    deciding,
-    draw_plane,
-    moves_in_plane,
-    name_in_legend,
-    spots_of,
-    write_name,
-)
-from apc.simulation.signals import sent_states
 
-Floats = NDArray[np.float64]
-
-MOST_PEERS = 12  # drawn: more rows can't be told apart
-HEIGHT = 0.36  # half of a body's, of the distance of two rows
-WIDTH, ROW, MARGIN, DPI_POINTS = 7.0, 0.62, 1.1, 7.0  # inches: of the figure, a row, title and axis; points
+MM = 1e3
+COLUMNS, PANEL, MARGIN = 4, 3.2, 1.0  # planes in a row; inches: of a plane, of title and labels
+WIDTH, ROW = 7.0, 0.62  # inches: of a picture of rows, and of a row
+HALF = 0.36  # half of a body's height, of the distance of two rows
+LARGEST = 11  # mark of a body, in points
+ROOM = 0.12  # of what is drawn, around it
 
 
-@dataclass(frozen=True, slots=True)
-class Body:
-    """A position of a peer at the start, in m, half its width, 0 for a point, and the `state` it is."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Actor:
+    """A body in a picture: its signals `states`, half its width in mm, and the `shift` that it is drawn at.
 
-    name: str
-    place: float
-    half_width: float
-    state: str = field(default="", compare=False)
-
-
-@dataclass(frozen=True, slots=True)
-class Wall:
-    """A fixed place, in m, that something is decided by."""
-
-    place: float
-
-
-B = TypeVar("B")  # bodies and surfaces, on a line or in a plane
-S = TypeVar("S")
-
-
-def bodies_of(kind: Kind, vector: Sequence[float], start: Sequence[float]) -> tuple[list[Body], list[Wall]]:
-    """Return what a peer's start looks like.
-
-    Parameters
-    ----------
-    kind
-        The peer's kind.
-    vector
-        Its parameters (n_p,), SI.
-    start
-        Its states at the start (n_x,), SI.
+    `shift` is a matplotlib Affine2D; `artists` are what is drawn.
     """
-    places = [i for i, state in enumerate(kind.states) if state.unit == "m"]
-    widths = dict.fromkeys(places, 0.0)
-    sent = sent_states(kind)
-    walls: dict[float, None] = {}
-    for slopes, offset in _distances(kind, vector):
-        moving = np.flatnonzero(slopes).tolist()
-        if not set(moving) <= set(places) or not (np.abs(slopes[moving]) == 1).all():
-            continue  # decided by something else than a distance
-        if len(moving) == 1:
-            walls[float(-offset / slopes[moving[0]])] = None
-        elif len(moving) == 2 and slopes.sum() == 0:
-            wide = next((i for i in moving if i in sent), moving[1])
-            widths[wide] = max(widths[wide], abs(float(offset)))
-    names = [kind.states[i].name for i in places]
-    bodies = [
-        Body(name.rpartition(".")[0], float(start[i]), widths[i], name)
-        for i, name in zip(places, names, strict=True)
-    ]
-    return bodies, [Wall(place) for place in walls]
 
+    ax: Any
+    states: tuple[str, ...]
+    half: float
+    row: int
+    shift: Any
+    artists: tuple[Any, ...]
 
-def _distances(kind: Kind, vector: Sequence[float]) -> list[tuple[Floats, float]]:
-    """Return the slopes (n_x,) and the value at the origin of what decides, where that is linear."""
-    found = []
-    for x, p, column in deciding(kind):
-        slopes = jacobian(column, x)
-        at = casadi.Function("at", [x, p], [casadi.densify(slopes), column])
-        numbers = [np.asarray(one, dtype=np.float64) for one in at(np.zeros(x.shape), vector)]
-        found += [
-            (numbers[0][row], float(numbers[1][row, 0]))
-            for row in range(column.numel())
-            if not casadi.depends_on(slopes[row, :], x)
-        ]
-    return found
+    def move(self, place: Sequence[float]) -> None:
+        """Put it at (d,), in mm; along an axis it stays in its row."""
+        self.shift.clear().translate(place[0], place[1] if len(place) > 1 else self.row)
 
 
 def draw_still(system: CompiledSystem) -> Any:
-    """Draw how a scene begins, a row a peer; return the matplotlib Figure.
+    """Draw how a scene begins; return the matplotlib Figure.
 
     Parameters
     ----------
@@ -131,82 +64,7 @@ def draw_still(system: CompiledSystem) -> Any:
     ApcError
         E875 matplotlib is not installed.
     """
-    figure, _ = draw_actors(system)
-    return figure
-
-
-def draw_actors(system: CompiledSystem, *, named: bool = True) -> tuple[Any, list[Actor]]:
-    """Draw how a scene begins as `draw_still`; return the Figure and the bodies in it, which can be moved.
-
-    Parameters
-    ----------
-    system
-        The compiled scene.
-    named
-        Whether a body's name stands beside it; else the names stand in a legend.
-    """
-    figures, patches = need("matplotlib.figure", "plot"), need("matplotlib.patches", "plot")
-    if moves_in_plane(system):
-        return draw_plane(system, rows_of(system, spots_of), named=named)
-    rows = rows_of(system, bodies_of)
-    figure = figures.Figure(figsize=(WIDTH, ROW * len(rows) + MARGIN), layout="constrained")
-    ax = figure.subplots()
-    names = list(dict.fromkeys(body.name for _, bodies, _ in rows for body in bodies))
-    actors = []
-    colours = colours_of(len(names))
-    for y, (peer, bodies, walls) in enumerate(rows):
-        for wall in walls:
-            ax.plot([MM * wall.place] * 2, [y - 0.45, y + 0.45], color="0.25", linewidth=3)
-        for body in sorted(bodies, key=lambda one: -one.half_width):
-            colour = colours[names.index(body.name)]
-            shape = None
-            if body.half_width:
-                corner = (MM * (body.place - body.half_width), y - HEIGHT)
-                size = (2 * MM * body.half_width, 2 * HEIGHT)
-                shape = patches.Rectangle(corner, *size, facecolor=colour, alpha=0.35, edgecolor="k")
-                ax.add_patch(shape)
-            marker = "s" if body.half_width else "o"
-            look = {"color": colour, "markersize": DPI_POINTS, "markeredgecolor": "k", "label": body.name}
-            (dot,) = ax.plot(MM * body.place, y, marker, **look)
-            actors.append(Actor(ax, (f"{peer}.{body.state}",), MM * body.half_width, dot, shape))
-            if not named:
-                continue
-            above = HEIGHT if body.half_width else 0.12
-            write_name(ax, body.name, (MM * body.place, y - above), 2)
-    ax.set_ylim(len(rows) - 0.45, -0.55)
-    ax.set_yticks(range(len(rows)), [name for name, _, _ in rows])
-    ax.margins(x=0.08)
-    ax.grid(visible=True, axis="x", linewidth=0.4, alpha=0.5)
-    ax.set_xlabel("position [mm]")
-    left = system.peers - len(rows)
-    ax.set_title(f"{system.name}: at the start" + (f" ({left} more peers)" if left else ""), fontsize=11)
-    if not named:
-        name_in_legend(figure, actors)
-    return figure, actors
-
-
-def rows_of(
-    system: CompiledSystem,
-    seen: Callable[[Kind, Sequence[float], Sequence[float]], tuple[list[B], list[S]]],
-) -> list[tuple[str, list[B], list[S]]]:
-    """Return the peers that are drawn: name, and the bodies and surfaces that are seen of its start.
-
-    Parameters
-    ----------
-    system
-        The compiled scene.
-    seen
-        `bodies_of`, or `planar.spots_of` of what moves in a plane.
-    """
-    numbers = resolve(system)
-    sites = [jacobians(kind) for kind in system.kinds]
-    found: list[tuple[str, list[B], list[S]]] = []
-    for group, one in enumerate(system.groups):
-        for peer in range(min(one.count, MOST_PEERS - len(found))):
-            vector = [float(v) for v in numbers.parameters[group][numbers.rows[group][peer]]]
-            start, _, _ = start_values(sites[one.kind], vector)
-            found.append((f"{one.name}[{peer + 1}]", *seen(system.kinds[one.kind], vector, start)))
-    return found
+    return draw_actors(system)[0]
 
 
 @part("draw")
@@ -220,3 +78,122 @@ def save_still(system: CompiledSystem, path: Path) -> None:
     """
     check_format(path, "--still")
     write_figure(draw_still(system), path)
+
+
+def draw_actors(system: CompiledSystem) -> tuple[Any, list[Actor]]:
+    """Draw how a scene begins; return the matplotlib Figure and the bodies in it, which can be moved."""
+    views, plane = views_of(system), moves_in_plane(system)
+    axes = _planes(views) if plane else _rows(views)
+    names = list(dict.fromkeys(body.name for view in views for body in view.bodies))
+    colours = dict(zip(names, colours_of(len(names)), strict=True))
+    actors = []
+    for row, (ax, view) in enumerate(zip(axes, views, strict=True)):
+        for surface in view.surfaces:
+            _draw_surface(ax, surface, row, view.bodies)
+        bodies = sorted(view.bodies, key=lambda one: -one.radius)
+        for place, body in enumerate(bodies):
+            size = max(LARGEST - 2 * place, 7)  # what is covered is seen around what covers it
+            actors.append(_actor(ax, view.name, body, row, colours[body.name], size))
+    keep_in_sight(axes)
+    figure = axes[0].figure
+    handles = {actor.artists[0].get_label(): actor.artists[0] for actor in actors}
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    left = system.peers - len(views)
+    title = f"{system.name}: at the start" + (f" ({left} more peers)" if left else "")
+    if any(len(body.place) == 3 for view in views for body in view.bodies):
+        title += "\nof three coordinates the first two"
+    if plane and (alone := _on_an_axis(system)):
+        title += f"\nnot drawn, as they move along one axis: {', '.join(alone)}"
+    figure.suptitle(title, fontsize=11)
+    return figure, actors
+
+
+def _planes(views: Sequence[PeerView]) -> list[Any]:
+    """Return an Axes a peer."""
+    columns = min(COLUMNS, len(views))
+    lines = -(-len(views) // columns)
+    size = (PANEL * columns + 1, PANEL * lines + MARGIN)
+    figure = need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained")
+    axes: list[Any] = figure.subplots(lines, columns, squeeze=False).ravel().tolist()
+    for ax in axes[len(views) :]:
+        ax.set_visible(False)
+    for ax, view in zip(axes, views, strict=False):
+        ax.set_title(view.name, fontsize=9)
+        ax.set(aspect="equal", xlabel="x[1] [mm]", ylabel="x[2] [mm]")
+        ax.grid(linewidth=0.4, alpha=0.5)
+    return axes[: len(views)]
+
+
+def _rows(views: Sequence[PeerView]) -> list[Any]:
+    """Return one Axes for all peers, as often as there are peers."""
+    size = (WIDTH, ROW * len(views) + MARGIN + 0.3)
+    ax = need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained").subplots()
+    ax.set(ylim=(len(views) - 0.45, -0.55), xlabel="position [mm]")
+    ax.set_yticks(range(len(views)), [view.name for view in views])
+    ax.grid(axis="x", linewidth=0.4, alpha=0.5)
+    return [ax] * len(views)
+
+
+def _actor(ax: Any, peer: str, body: Body, row: int, colour: Any, size: int) -> Actor:
+    """Draw a body around the origin, shifted to its place; `size` is that of its mark, in points."""
+    patches = need("matplotlib.patches", "plot")
+    shift = need("matplotlib.transforms", "plot").Affine2D()
+    half, flat = MM * body.radius, len(body.place) == 1
+    look = {"markersize": size, "markeredgecolor": "k", "transform": shift + ax.transData}
+    x, y, *_ = (*(MM * value for value in body.place), row)
+    shift.translate(x, y)
+    artists = ax.plot(0, 0, "s" if half else "o", color=colour, label=body.name, **look)
+    if half:
+        look = {"facecolor": colour, "alpha": 0.35, "edgecolor": "k", "transform": look["transform"]}
+        corner, sides = (-half, -HALF), (2 * half, 2 * HALF)
+        shape = patches.Rectangle(corner, *sides, **look) if flat else patches.Circle((0, 0), half, **look)
+        artists.append(ax.add_patch(shape))
+    return Actor(ax, tuple(f"{peer}.{state}" for state in body.states[:2]), half, row, shift, tuple(artists))
+
+
+def _draw_surface(ax: Any, surface: Disc | Line, row: int, bodies: Sequence[Body]) -> None:
+    """Draw a fixed disc, or a line; of a plane in space where it meets that of the first body."""
+    if isinstance(surface, Disc):
+        place = tuple(MM * value for value in surface.centre[:2])
+        look = {"facecolor": "0.8", "edgecolor": "0.25", "linewidth": 2}
+        ax.add_patch(need("matplotlib.patches", "plot").Circle(place, MM * surface.radius, **look))
+        return
+    if len(surface.normal) == 1:
+        if ax.get_aspect() == "auto":
+            ax.plot([MM * surface.offset] * 2, [row - 0.45, row + 0.45], color="0.25", linewidth=3)
+        return
+    normal = np.array(surface.normal[:2])
+    length = float(normal @ normal)
+    if not length:
+        return  # it lies in the plane that is drawn, before or behind it
+    offset = surface.offset - np.dot(surface.normal[2:], bodies[0].place[2:])
+    nearest = [
+        MM * (np.array(body.place[:2]) + (offset - normal @ body.place[:2]) / length * normal)
+        for body in bodies
+    ]
+    ax.axline(nearest[0], nearest[0] + [-normal[1], normal[0]], color="0.25", linewidth=3)
+    ax.update_datalim(nearest)
+
+
+def keep_in_sight(axes: Sequence[Any]) -> None:
+    """Show all that is in the data limits of Axes: of planes the same square of each, else along x."""
+    box = need("matplotlib.transforms", "plot").Bbox.union([ax.dataLim for ax in axes])
+    sides = np.array([box.width, box.height]) * (0.5 + ROOM)
+    plane = axes[0].get_aspect() != "auto"
+    half = (sides.max() if plane else sides[0]) or 0.01 * MM  # all in one point: a centimetre around it
+    for ax in axes:
+        ax.set_xlim((box.x0 + box.x1) / 2 - half, (box.x0 + box.x1) / 2 + half)
+        if plane:
+            ax.set_ylim((box.y0 + box.y1) / 2 - half, (box.y0 + box.y1) / 2 + half)
+
+
+def widen(actor: Actor, track: NDArray[np.float64]) -> None:
+    """Take into an Axes' data limits all places of a body (rows, d), in mm."""
+    for corner in (track.min(axis=0) - actor.half, track.max(axis=0) + actor.half):
+        actor.ax.update_datalim([corner if len(corner) > 1 else (*corner, actor.row)])
+
+
+def _on_an_axis(system: CompiledSystem) -> list[str]:
+    """Return the bodies whose position is a number."""
+    positions = [pair for kind in system.kinds for pair in positions_of(kind).items()]
+    return list(dict.fromkeys(name.rpartition(".")[0] for name, places in positions if len(places) == 1))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.words import counted, in_hertz, known_digits, measured, with_unit, wrapped
 from apc.optional import need
-from apc.present.forms import MEANT, document, note
+from apc.present.forms import MEANT, document, note, notes, quantity, record, table
 
 if TYPE_CHECKING:
     import pandas
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from apc.vary.critical import Critical
     from apc.vary.many import Analyses
     from apc.vary.margins import Margins
-    from apc.vary.sensitivity import Sensitivities, Sensitivity
+    from apc.vary.sensitivity import Sensitivities
 
 SHOWN = 6  # rows of the table of what moves the radius most
 DIGITS = 3  # of a change
@@ -34,73 +34,67 @@ NONE_TOLD = "what moves the radius most: no change of it can be told from roundi
 
 def critical_text(found: Critical) -> str:
     """Return where a scene's verdict changes with a parameter."""
-    low, high = (with_unit(f"{one:.6g}", found.unit) for one in found.scanned)
-    present = with_unit(f"{found.present:.6g}", found.unit)
-    lines = [f"{found.topology}: {found.parameter} is {present}"]
+    unit = found.unit
+    title = [f"{found.topology}: {found.parameter} is {quantity(found.present, unit)}"]
     if found.groups:
-        own = [
-            f"{'several values' if value is None else with_unit(f'{value:.6g}', found.unit)} at {group}"
-            for group, value in found.groups
-        ]
+        values = ["several values" if value is None else quantity(value, unit) for _, value in found.groups]
+        named = [f"{value} at {group}" for value, (group, _) in zip(values, found.groups, strict=True)]
         whom = "groups" if len(found.groups) > 1 else "its peers"
-        lines = [f"{found.topology}: {found.parameter}, one value for all {whom}"]
-        lines += note(f"now {', '.join(own)}")
-    if found.criterion in MEANT:
-        lines += note(MEANT[found.criterion])
-    for text in found.left_out:
-        lines += note(text)
-    lines.append("")
+        title = [f"{found.topology}: {found.parameter}, one value for all {whom}"]
+        title += note(f"now {', '.join(named)}")
+    meant = [MEANT[found.criterion]] if found.criterion in MEANT else []
+    lines = [*title, *notes([*meant, *found.left_out]), ""]
     if found.value is None:
-        verdict = (
-            found.verdict.replace("value scanned", "number looked at") if found.counted else found.verdict
-        )
-        lines += wrapped(verdict, "  ", "  ")
+        wording = ("value scanned", "number looked at") if found.counted else ("", "")
+        lines += wrapped(found.verdict.replace(*wording), "  ", "  ")
     if not found.enters:
         return "\n".join(lines)
     if found.counted:
         return "\n".join([*lines, *_count_lines(found)])
     for one in found.crossings:
-        mark = "→" if one.value == found.value else " "
-        exact = f"{with_unit(f'{one.value:.15g}', found.unit)}, exact"
-        value = measured(one.value, one.error, found.unit) if one.error else exact
-        lines.append(f"{mark} {value}")
+        exact = f"{quantity(one.value, unit, 15)}, exact"
+        value = measured(one.value, one.error, unit) if one.error else exact
+        lines.append(f"{'→' if one.value == found.value else ' '} {value}")
         kind = "jump, " if one.kind == "jump" else ""
-        turns = f", {in_hertz(one.frequency_hz)}" if one.frequency_hz == one.frequency_hz else ""
+        turns = "" if math.isnan(one.frequency_hz) else f", {in_hertz(one.frequency_hz)}"
         lines.append(f"    {kind}stable {one.stable_side} it{turns}, {one.proof}")
-    lines += ["", f"  scanned from {low} to {high}"]
+    lines += ["", f"  scanned {_span(found.scanned, unit)}"]
     lines.append(f"  {counted(found.looked, 'value')} looked at: two crossings near to each other could hide")
     if found.left_open:
-        parts = [" to ".join(with_unit(f"{end:.6g}", found.unit) for end in one) for one in found.left_open]
-        rest = f" and {len(parts) - SHOWN} more" if len(parts) > SHOWN else ""
-        lines += wrapped(f"the verdict is left open from {', '.join(parts[:SHOWN])}{rest}", "  ", "  ")
+        parts = ", ".join(_span(one, unit) for one in found.left_open[:SHOWN])
+        rest = f" and {len(found.left_open) - SHOWN} more" if len(found.left_open) > SHOWN else ""
+        lines += wrapped(f"the verdict is left open {parts}{rest}", "  ", "  ")
     if not found.whole:
         lines.append("  an eigenvalue keeps near to the boundary: more crossings could hide")
     return "\n".join(lines)
 
 
+def _span(ends: tuple[float, float], unit: str) -> str:
+    return f"from {quantity(ends[0], unit)} to {quantity(ends[1], unit)}"
+
+
 def _count_lines(found: Critical) -> list[str]:
     """Return which numbers of peers are stable, and how many were looked at."""
-    first, last = (int(one) for one in found.scanned)
-    ends = [math.floor(one.boundary) for one in found.crossings]
-    stretches = list(zip([first, *(one + 1 for one in ends)], [*ends, last], strict=True))
-    stable = found.crossings[0].stable_side == "below" if found.crossings else False
-    names = [f"{one:,d}" if one == other else f"{one:,d} to {other:,d}" for one, other in stretches]
-    width = max(map(len, names))
+    first, last = map(int, found.scanned)
+    rows, begin = [], first
+    for crossing in found.crossings:
+        end = math.floor(crossing.boundary)
+        rows.append((begin, end, crossing.stable_side == "below"))
+        begin = end + 1
+    if rows:
+        rows.append((begin, last, not rows[-1][-1]))
     lines = []
-    if not found.crossings:
-        names, stretches = [], []
-    for name, stretch in zip(names, stretches, strict=True):
-        mark = "→" if stable and found.value in stretch else " "
-        lines.append(f"{mark} {name:<{width}}  {'stable' if stable else 'unstable'}")
-        stable = not stable
-    lines.append("")
-    if found.looked == last - first + 1:
-        return [*lines, f"  every number from {first:,d} to {last:,d} was looked at"]
-    looked = f"{found.looked} numbers from {first:,d} to {last:,d} were looked at, those on either side of a "
-    return [
-        *lines,
-        *wrapped(f"{looked}change among them; a change and back between two could hide", "  ", "  "),
-    ]
+    for low, high, stable in rows:
+        mark = "→" if stable and found.value in (low, high) else " "
+        name = f"{low:,d}" if low == high else f"{low:,d} to {high:,d}"
+        lines.append((f"{mark} {name}", "stable" if stable else "unstable"))
+    looked = (
+        f"every number from {first:,d} to {last:,d} was looked at"
+        if found.looked == last - first + 1
+        else f"{found.looked} numbers from {first:,d} to {last:,d} were looked at, those on either side of a "
+        "change among them; a change and back between two could hide"
+    )
+    return [*(line[2:] for line in table(lines)), "", *wrapped(looked, "  ", "  ")]
 
 
 def critical_picture(found: Critical, ax: Any) -> Any:
@@ -113,8 +107,7 @@ def critical_picture(found: Critical, ax: Any) -> Any:
 
 def critical_document(found: Critical) -> dict[str, Any]:
     """Return where a scene's verdict changes with a parameter as plain data."""
-    told: dict[str, Any] = document(found, {"groups": dict(found.groups)})
-    return told
+    return record(found, {"groups": dict(found.groups)})
 
 
 def margins_text(found: Margins) -> str:
@@ -124,22 +117,18 @@ def margins_text(found: Margins) -> str:
     width = max(len(one.parameter) for one in found.rows)
     lines = [f"  {'may grow':<{width}}  from           to               times  at"]
     for one in found.rows:
-        name, unit = f"  {one.parameter:<{width}}  ", one.unit
-        start = with_unit(f"{one.present:.5g}", unit)
+        start = f"  {one.parameter:<{width}}  {quantity(one.present, one.unit, 5):<14}"
         if one.note:
-            lines.append(f"{name}{start:<14} not looked for: {one.note}")
-            continue
-        if one.value is None:
-            lines.append(f"{name}{start:<14} none found up to {with_unit(f'{one.scanned:.5g}', unit)}")
-            continue
-        end = with_unit(known_digits(one.value, one.error or 0.0, 7), unit)
-        times = f"{one.factor:.4g}" if one.factor is not None else "–"
-        jump = ", jump" if one.kind == "jump" else ""
-        at = "–" if one.frequency_hz is None else in_hertz(one.frequency_hz)
-        lines.append(f"{name}{start:<14} {end:<16} {times:>5}  {at}{jump}")
-    if found.note:
-        lines += note(found.note)
-    return "\n".join(lines)
+            lines.append(f"{start} not looked for: {one.note}")
+        elif one.value is None:
+            lines.append(f"{start} none found up to {quantity(one.scanned, one.unit, 5)}")
+        else:
+            end = with_unit(known_digits(one.value, one.error or 0.0, 7), one.unit)
+            times = "–" if one.factor is None else f"{one.factor:.4g}"
+            at = in_hertz(math.nan if one.frequency_hz is None else one.frequency_hz)
+            jump = ", jump" if one.kind == "jump" else ""
+            lines.append(f"{start} {end:<16} {times:>5}  {at}{jump}")
+    return "\n".join([*lines, *note(found.note)])
 
 
 def margins_document(found: Margins) -> dict[str, Any]:
@@ -150,24 +139,20 @@ def margins_document(found: Margins) -> dict[str, Any]:
 def sensitivities_text(found: Sensitivities) -> str:
     """Return the table "what moves it most", of at most 80 columns."""
     # Eigenvalues that share the radius often change alike, and then one row tells it.
-    alike: dict[tuple[str, str], list[Sensitivity]] = {}
+    same: dict[tuple[str, str, str], list[str]] = {}
     for row in found.rows:
         if abs(row.derivative) > row.error and row.relative:  # else it can't be told from 0
             change = _change(row.relative / 100, row.error * abs(row.value) / 100)
-            alike.setdefault((row.parameter, change), []).append(row)
-    shown = list(alike.items())[:SHOWN]
-    if not shown:
+            key = (row.parameter, f"{quantity(row.value, row.unit):<15}", change)
+            same.setdefault(key, []).append(str(row.mode + 1))
+    if not same:
         told = found.note if len(found.active) < 2 else ""
         return "\n".join(note(told or NONE_TOLD))
-    width = max(len(name) for (name, _), _ in shown)
-    lines = ["  what moves it most" + " " * max(width - 16, 2) + "value            per percent"]
-    for (name, change), rows in shown:
-        some = ", ".join(str(row.mode + 1) for row in rows) if len(rows) < len(found.active) else ""
-        value = with_unit(f"{rows[0].value:.6g}", rows[0].unit)
-        lines.append(f"  {name:<{width}}  {value:<16} {change}{f'  mode {some}' if some else ''}")
-    if found.note:
-        lines += note(found.note)
-    return "\n".join(lines)
+    rows: list[tuple[str, ...]] = [("what moves it most", f"{'value':<15}", "per percent")]
+    for (*cells, change), modes in list(same.items())[:SHOWN]:
+        which = f"  mode {', '.join(modes)}" if len(modes) < len(found.active) else ""
+        rows.append((*cells, change + which))
+    return "\n".join([*table(rows), *note(found.note)])
 
 
 def _change(value: float, error: float) -> str:
@@ -189,8 +174,7 @@ def sensitivities_document(found: Sensitivities) -> dict[str, Any]:
 def analyses_text(found: Analyses) -> str:
     """Return many analyses in a few lines: what varied, the verdicts."""
     lines = [f"{found.topology}: {found.verdict.size:,} points"]
-    for text in found.left_out:
-        lines += note(text)
+    lines += notes(found.left_out)
     for name, values in zip(found.parameters, found.values, strict=True):
         lines.append(f"  {name}: {values.min():g} … {values.max():g}")
     counts = (Counter(one.ravel().tolist()) for one in (found.verdict, found.message))
@@ -236,8 +220,7 @@ def sweep_text(found: Sweep) -> str:
     """Return a sweep in a few lines: where the rows are, what was swept, the verdicts."""
     where = f" → {found.out}" if found.out else ""
     lines = [f"{found.topology}: {found.points:,} points{where}"]
-    for text in found.made_of["left_out"]:
-        lines += note(text)
+    lines += notes(found.made_of["left_out"])
     for axis in found.grid.axes:
         ends = f"{float(axis.values[0]):g} … {float(axis.values[-1]):g}"
         lines.append(

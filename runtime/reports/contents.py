@@ -14,6 +14,7 @@ import shlex
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from operator import attrgetter
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -29,6 +30,7 @@ from apc.compiler.timings import part
 from apc.compiler.words import counted, with_unit
 from apc.distribution import versions
 from apc.eigen.spectrum import Mode
+from apc.frame.names import parameter_of, unit_of
 from apc.frame.overrides import apply, parse_override
 from apc.hands.asked import read_frequencies
 from apc.hands.feel import feel
@@ -38,7 +40,7 @@ from apc.regions.axes import parse_axes
 from apc.regions.region import region
 from apc.result import Result
 from apc.simulation.trajectory import simulate
-from apc.vary.critical import Critical, critical
+from apc.vary.critical import critical
 from apc.vary.growth import MEAN_SQUARE, NOMINAL
 from apc.vary.locus import root_locus
 from apc.vary.margins import STIFFNESSES, coupler_parameters
@@ -46,7 +48,7 @@ from apc.vary.margins import STIFFNESSES, coupler_parameters
 Cell = str | float | int | None
 
 LIBRARIES = ("casadi", "numpy", "scipy", "sympy", "python-flint", "matplotlib")
-MOVED = ("parameter", "unit", "value", "by a whole of it", "eigenvalue")
+MODES = ("magnitude", "error", "times", "frequency [Hz]", "shape", "moves most")
 MOST_MODES, MOST_SIGNALS, MOST_PLAYED = 12, 40, 60  # rows of a table; peers that are played
 JITTER = "jitter"
 FURTHER = 3  # times the present value a region reaches where the scene says no range
@@ -188,21 +190,20 @@ def _texts(system: CompiledSystem) -> Iterable[tuple[str, str]]:
 
 def _compiled(system: CompiledSystem, call: str) -> Section:
     found = needs(system)
-    rows = [(one.name, one.states, one.motion, one.remembered, one.packets) for one in found.sites]
     told = [f"Warning: {one}" for one in system.warnings]
     told += [f"left out: {name}, as {reason}" for name, reason in system.dropped]
-    table = Table("What a peer keeps", ("kind", "states", "motion", "delayed", "on the network"), tuple(rows))
-    frame = Table(
-        "The scene",
-        ("what", "value"),
-        (
-            ("peers", system.peers),
-            ("frame [s]", float(found.frame)),
-            ("method", found.method),
-            *((f"ticks of {name} in a frame", count) for name, count in found.ticks),
-        ),
+    facts: tuple[tuple[str, Cell], ...] = (
+        ("peers", system.peers),
+        ("frame [s]", float(found.frame)),
+        ("method", found.method),
+        *((f"ticks of {name} in a frame", count) for name, count in found.ticks),
     )
-    return Section("compiled", f"apc compile {call.split(' --set')[0]}", tuple(told), (frame, table))
+    kept = map(attrgetter("name", "states", "motion", "remembered", "packets"), found.sites)
+    tables = (
+        Table("The scene", ("what", "value"), facts),
+        Table("What a peer keeps", ("kind", "states", "motion", "delayed", "on the network"), tuple(kept)),
+    )
+    return Section("compiled", f"apc compile {call.split(' --set')[0]}", tuple(told), tables)
 
 
 def _answered(system: CompiledSystem) -> tuple[Answer, str]:
@@ -215,63 +216,48 @@ def _answered(system: CompiledSystem) -> tuple[Answer, str]:
 
 def _verdict(system: CompiledSystem, call: str) -> Section:
     found, option = _answered(system)
-    one = found.analysis
+    one, network = found.analysis, found.network
     rows: list[tuple[Cell, ...]] = [
         ("verdict", one.verdict, None),
         ("spectral radius a frame", one.spectral_radius, one.spectral_radius_error),
         ("settles within 2 % in [s]", one.settling_s, None),
         ("motions left out", one.rigid_modes, None),
     ]
-    if found.network is not None:
-        judged = found.network.verdict
-        rows += [("over the network as it is", judged.verdict, None)]
+    rows += [] if network is None else [("over the network as it is", network.verdict.verdict, None)]
     told = [f"Proof: {one.proof or 'none; floats with proved bounds decide'}.", *one.notes, *one.left_out]
-    if found.switching is not None:
-        told += [" ".join(str(found.switching).split())]
-    modes = [
-        mode
-        for mode in one.modes
-        if mode.eigenvalue.imag >= -mode.error and mode.magnitude > mode.error + NOTHING
-    ]
-    table = [
-        (
-            mode.magnitude,
-            mode.error,
-            mode.multiplicity,
-            None if math.isnan(mode.frequency_hz) else mode.frequency_hz,
-            mode.shape,
-            ", ".join(f"{name} {share:.0%}" for name, share in _most(mode)),
-        )
-        for mode in modes[:MOST_MODES]
-    ]
-    columns = ("magnitude", "error", "times", "frequency [Hz]", "shape", "moves most")
-    of = found.network or found
+    told += [] if found.switching is None else [" ".join(str(found.switching).split())]
+    of = network or found
     notes = (("Margins", of.margins.note), ("What moves the radius", of.sensitivities.note))
     told += [f"{what}: {note}" for what, note in notes if note]
-    grow = [
-        (one.parameter, one.unit, one.present, one.value, one.error, one.note or None)
-        for one in of.margins.rows
-    ]
-    moved = [
-        (one.parameter, one.unit, one.value, one.relative, one.mode + 1)
-        for one in of.sensitivities.rows
-        if one.relative
-    ]
+    slowest = [mode for mode in one.modes if mode.magnitude > mode.error + NOTHING]
+    slowest = [mode for mode in slowest if mode.eigenvalue.imag >= -mode.error]
+    moved = [row for row in of.sensitivities.rows if row.relative]
+    grow = attrgetter("parameter", "unit", "present", "value", "error", "note")
     tables = (
         Table("Verdict", ("what", "value", "error"), tuple(rows)),
-        Table("Modes, the slowest first", columns, tuple(table)),
-        Table("May grow", ("parameter", "unit", "from", "to", "error", "note"), tuple(grow)),
-        Table("What moves the radius most", MOVED, tuple(moved)),
+        Table("Modes, the slowest first", MODES, tuple(map(_mode, slowest[:MOST_MODES]))),
+        Table(
+            "May grow",
+            ("parameter", "unit", "from", "to", "error", "note"),
+            tuple(map(grow, of.margins.rows)),
+        ),
+        Table(
+            "What moves the radius most",
+            ("parameter", "unit", "value", "by a whole of it", "eigenvalue"),
+            tuple((row.parameter, row.unit, row.value, row.relative, row.mode + 1) for row in moved),
+        ),
     )
-    shown = tuple(one for one in tables if one.rows)
-    return Section(
-        "verdict", f"apc analyze {call}{option} --plot eigenvalues.svg", tuple(told), shown, (one,)
-    )
+    shown = tuple(table for table in tables if table.rows)
+    command = f"apc analyze {call}{option} --plot eigenvalues.svg"
+    return Section("verdict", command, tuple(told), shown, (one,))
 
 
-def _most(mode: Mode) -> list[tuple[str, float]]:
-    """Return the two states that a mode moves most."""
-    return sorted(mode.participation, key=lambda one: -round(one[1], 2))[:2]
+def _mode(mode: Mode) -> tuple[Cell, ...]:
+    """Return a row: the mode, and the two states that it moves most."""
+    most = sorted(mode.participation, key=lambda one: -round(one[1], 2))[:2]
+    moves = ", ".join(f"{name} {share:.0%}" for name, share in most)
+    frequency = None if math.isnan(mode.frequency_hz) else mode.frequency_hz
+    return mode.magnitude, mode.error, mode.multiplicity, frequency, mode.shape, moves
 
 
 def _limits(system: CompiledSystem, call: str) -> Section:
@@ -312,12 +298,11 @@ def _criticals(system: CompiledSystem, call: str, key: str, axes: Sequence[str])
             continue
         plotted = f" --plot {axis}.svg" if axis == STIFFNESS else ""
         commands.append(f"apc critical {name} {call}{plotted}")
-        rows += [
-            (found.parameter, found.unit, one.value, one.error, one.stable_side, one.frequency_hz)
-            for one in found.crossings
-        ]
+        crossings = map(attrgetter("value", "error", "stable_side", "frequency_hz"), found.crossings)
+        rows += [(found.parameter, found.unit, *one) for one in crossings]
         low, high = (with_unit(f"{one:.6g}", found.unit) for one in found.scanned)
-        told.append(f"{found.parameter} is looked at from {low} to {high}{_said(found)}.")
+        said = f": {found.verdict}" if found.verdict else ""
+        told.append(f"{found.parameter} is looked at from {low} to {high}{said}.")
         drawn += [root_locus(system, found)] if axis == STIFFNESS else []
     columns = ("parameter", "unit", "changes at", "error", "stable", "frequency [Hz]")
     tables = (Table("Where the verdict changes", columns, tuple(rows)),) if rows else ()
@@ -325,18 +310,17 @@ def _criticals(system: CompiledSystem, call: str, key: str, axes: Sequence[str])
     return Section(key, " && ".join(commands), tuple(told) if commands else (), tables, tuple(drawn), refused)
 
 
-def _said(found: Critical) -> str:
-    return f": {found.verdict}" if found.verdict else ""
-
-
 def _region(system: CompiledSystem, call: str) -> Section:
     asked: list[str | None] = [None, None]
     if len(system.region) < 2:
-        stiff = [one for one in coupler_parameters(system) if _unit(system, one.name) in STIFFNESSES]
+        stiff = [one for one in coupler_parameters(system) if unit_of(system, one.name) in STIFFNESSES]
         if len(stiff) < 2:
             why = "the scene has fewer than two stiffnesses, and says no studies: region:"
             return Section("region", "", refused=why)
-        asked = [f"{one.label}=0 N/m:{FURTHER * _value(system, one.name) or 1000:g} N/m" for one in stiff[:2]]
+        asked = [
+            f"{one.label}=0 N/m:{FURTHER * parameter_of(system, one).value or 1000:g} N/m"
+            for one in stiff[:2]
+        ]
     unreliable = any(link.channel is not None for link in system.links)
     criterion = NOMINAL if unreliable else None
     found = region(system, parse_axes(system, *asked), criterion=criterion)
@@ -359,14 +343,6 @@ def _region(system: CompiledSystem, call: str) -> Section:
     return Section("region", command, tuple(told), tuple(tables), (found,))
 
 
-def _unit(system: CompiledSystem, name: str) -> str:
-    return next(one.unit for one in system.parameters if one.name == name)
-
-
-def _value(system: CompiledSystem, name: str) -> float:
-    return next(one.value for one in system.parameters if one.name == name)
-
-
 def _response(system: CompiledSystem, call: str) -> Section:
     if system.peers > MOST_PLAYED:
         why = f"{counted(system.peers, 'peer', ',')} are more than the {MOST_PLAYED} that a report plays"
@@ -380,9 +356,7 @@ def _response(system: CompiledSystem, call: str) -> Section:
         pushed = apply(system, [parse_override(system, push)])
         found = simulate(pushed, duration=duration or SECONDS)
     summary = found.summary
-    rows = [
-        (one.name, one.unit, one.first, one.last, one.low, one.high, one.settled) for one in summary.extents
-    ]
+    rows = [*map(attrgetter("name", "unit", "first", "last", "low", "high", "settled"), summary.extents)]
     told.append(f"It {summary.verdict}.")
     if len(rows) > MOST_SIGNALS:
         told.append(f"{MOST_SIGNALS} of {len(rows)} signals are listed.")
@@ -403,29 +377,18 @@ def _feel(system: CompiledSystem, call: str) -> Section:
     low, count = FEEL
     found = feel(system, read_frequencies(system, None, low, None, count))
     places = sorted({round(one) for one in np.linspace(0, len(found.frequency_hz) - 1, SHOWN)})
-    rows = [
-        (
-            float(found.frequency_hz[place]),
-            float(abs(found.impedance[place])),
-            float(abs(found.impedance[place]) * found.bound[place]),
-            float(np.degrees(np.angle(found.impedance[place]))),
-        )
-        for place in places
-    ]
-    columns = ("frequency [Hz]", "impedance [N*s/m]", "error", "phase [°]")
-    tables = [Table(f"Felt at {found.at}", columns, tuple(rows))]
+    size = np.abs(found.impedance)
+    columns = (found.frequency_hz, size, size * found.bound, np.degrees(np.angle(found.impedance)))
+    rows = np.stack(columns, axis=1)[places].tolist()
+    headings = ("frequency [Hz]", "impedance [N*s/m]", "error", "phase [°]")
+    tables = [Table(f"Felt at {found.at}", headings, tuple(map(tuple, rows)))]
     if (slow := found.low_frequency) is not None:
-        values = zip(
-            ("mass [kg]", "damping [N*s/m]", "stiffness [N/m]"), _slow(slow), slow.errors, strict=True
-        )
+        names = ("mass [kg]", "damping [N*s/m]", "stiffness [N/m]")
+        values = zip(names, (slow.mass, slow.damping, slow.stiffness), slow.errors, strict=True)
         tables.append(Table("Of slow motions", ("what", "value", "error"), tuple(values)))
     told = (*found.notes, *found.left_out)
     command = f"apc feel {call} --points {count} --out feel.svg"
     return Section("feel", command, told, tuple(tables), (found,))
-
-
-def _slow(found: Any) -> tuple[float, float, float]:
-    return found.mass, found.damping, found.stiffness
 
 
 # ---- computed anew ----

@@ -14,7 +14,7 @@ difference is what roundings of this size amount to.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -65,21 +65,26 @@ class Comparison:
     def __init__(self, closer: Simulation, kind: str, compared: str, factor: float) -> None:
         self.kind, self.compared, self.factor = kind, compared, factor
         self.signals: tuple[Signal, ...] = closer.signals
-        self.rows = _rows(blocks(closer))
+        self.blocks = blocks(closer)
         n = len(self.signals)
         self.error, self.at = np.zeros(n), np.zeros(n)
         self.low, self.high = np.full(n, np.inf), np.full(n, -np.inf)
 
     def take(self, block: Block) -> None:
         """Compare one block; what only one of the runs reaches is left out."""
-        for time, values in zip(block.time, block.values, strict=True):
-            other = next(self.rows, None)
-            if other is None:
-                return
-            apart = self.factor * np.abs(values - other)
-            self.at = np.where(apart > self.error, time, self.at)
-            self.error = np.maximum(self.error, apart)
-            self.low, self.high = np.minimum(self.low, values), np.maximum(self.high, values)
+        other = next(self.blocks, None)
+        rows = min(len(block.time), len(other.time)) if other else 0
+        if not other or not rows:
+            return
+        values = block.values[:rows]
+        apart = self.factor * np.abs(values - other.values[:rows])
+        larger = apart.max(axis=0) > self.error
+        self.at[larger] = block.time[apart.argmax(axis=0)[larger]]
+        self.error = np.maximum(self.error, apart.max(axis=0))
+        self.low, self.high = (
+            np.minimum(self.low, values.min(axis=0)),
+            np.maximum(self.high, values.max(axis=0)),
+        )
 
     def estimate(self) -> ErrorEstimate:
         """Return what has been seen."""
@@ -109,8 +114,3 @@ def compare_with(simulation: Simulation, *, signals: Sequence[str] = ()) -> Comp
     if method.step is not None:
         return Comparison(closer, "method", f"half the step, {method}", factor)
     return Comparison(closer, "method", f"tolerance {method.tolerance:g}", factor)
-
-
-def _rows(played: Iterator[Block]) -> Iterator[Floats]:
-    for block in played:
-        yield from block.values

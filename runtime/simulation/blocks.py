@@ -61,14 +61,31 @@ def blocks(simulation: Simulation, *, run: int = 0, player: Player | None = None
         was before is yielded first.
     """
     last = int(simulation.settings.duration / simulation.quantum)  # rounds down
-    runner = _Runner(simulation, player or simulation.player(), run)
-    for first in range(0, last // simulation.frame + 1, simulation.length):
-        block = runner.run(first, last)
-        yield block
-        if block.stopped:
+    player, length, marks = player or simulation.player(), simulation.length, len(simulation.marks)
+    done, stopped, stopped_at = np.zeros(len(simulation.population.parts)), "", 0.0
+    player.begin(run)
+    for first in range(0, last // simulation.frame + 1, length):
+        played = player.play(first, length, pushes(simulation, first))
+        instants, kept = instants_of(simulation, first, last)
+        kept &= np.arange(len(kept)) < played.frames * marks
+        values = played.rows[kept][:, simulation.order]
+        time = instants[kept] * simulation.quantum.numerator / simulation.quantum.denominator
+        finite = np.isfinite(values)
+        stop = int(np.argmin(np.append(finite.all(axis=1), False)))  # the first row that is not finite
+        if stop:  # to the last frame that begins by the last row
+            work = played.work[int(np.flatnonzero(kept)[stop - 1]) // marks]
+            if np.isfinite(work).all():  # a product of forces and speeds overflows long before they do
+                done = work.copy()
+        if stop < len(time):
+            name = simulation.signals[int(np.argmin(finite[stop]))].name
+            stopped, stopped_at = name, float(time[stop])
+        elif played.frames == length and instants[-1] <= last and not player.in_range():
+            stopped, stopped_at = "what is not recorded", float(time[-1])
+        yield Block(time[:stop], values[:stop], done, stopped, stopped_at)
+        if stopped:
             return
-        if runner.failed is not None:
-            raise unsolved(simulation, runner.failed)
+        if played.frames < length:
+            raise unsolved(simulation, first + played.frames)
 
 
 def unsolved(simulation: Simulation, frame: int) -> ApcError:
@@ -87,40 +104,6 @@ def unsolved(simulation: Simulation, frame: int) -> ApcError:
     return ApcError(Mistake("E871", place, what, hint=hint))
 
 
-class _Runner:
-    """A player, and what has been done so far."""
-
-    def __init__(self, simulation: Simulation, player: Player, run: int) -> None:
-        self.simulation, self.player = simulation, player
-        self.player.begin(run)
-        self.done = np.zeros(len(simulation.parts))
-        self.failed: int | None = None  # the frame that could not be played
-
-    def run(self, first: int, last: int) -> Block:
-        """Run the frames from `first` on; rows after the quantum `last` are left out."""
-        simulation, length = self.simulation, self.simulation.length
-        played = self.player.play(first, length, pushes(simulation, first))
-        instants, kept = instants_of(simulation, first, last)
-        if played.frames < length:
-            self.failed = first + played.frames
-            kept &= np.arange(len(kept)) < played.frames * len(simulation.marks)
-        values = played.rows[kept][:, simulation.order]
-        time = instants[kept] * simulation.quantum.numerator / simulation.quantum.denominator
-        finite = np.isfinite(values)
-        rows: NDArray[np.bool_] = np.all(finite, axis=1)
-        stop = len(rows) if rows.all() else int(np.argmin(rows))
-        if stop:  # to the last frame that begins by the last row
-            work = played.work[int(np.flatnonzero(kept)[stop - 1]) // len(simulation.marks)]
-            if np.isfinite(work).all():  # a product of forces and speeds overflows long before they do
-                self.done = work
-        if stop < len(rows):
-            name = simulation.signals[int(np.argmin(finite[stop]))].name
-            return Block(time[:stop], values[:stop], self.done, name, float(time[stop]))
-        if self.failed is None and instants[-1] <= last and not self.player.in_range().all():
-            return Block(time, values, self.done, "what is not recorded", float(time[-1]))
-        return Block(time, values, self.done)
-
-
 def pushes(simulation: Simulation, first: int) -> list[Floats | None]:
     """Return the impulses of the frames from `first` on, of each member (frames, rows, sites), if any."""
     found: list[Floats | None] = []
@@ -134,7 +117,9 @@ def pushes(simulation: Simulation, first: int) -> list[Floats | None]:
         which = np.tile(np.array([place for _, place in program.intervals], dtype=np.int64), len(numbers))
         quanta = (numbers[:, None] * simulation.frame + begin).reshape(-1)
         starts = quanta * simulation.quantum.numerator / simulation.quantum.denominator
-        own = [impulses(one, starts, which)[:, program.rates.g].reshape(len(numbers), -1) for one in forces]
+        own = [
+            impulses(one, starts, which)[:, program.rates.pushed].reshape(len(numbers), -1) for one in forces
+        ]
         found.append(np.ascontiguousarray(np.stack(own, axis=-1)))
     return found
 
@@ -142,7 +127,6 @@ def pushes(simulation: Simulation, first: int) -> list[Floats | None]:
 def instants_of(simulation: Simulation, first: int, last: int) -> tuple[Integers, NDArray[np.bool_]]:
     """Return every row's instant in quanta, and which rows are kept: those until the quantum `last`."""
     marks = np.array(simulation.marks, dtype=np.int64)
-    is_tick = np.array([mark in simulation.ticks for mark in simulation.marks])
     instants = (first + np.arange(simulation.length))[:, None] * simulation.frame + marks
-    kept = (is_tick | (instants == 0)) & (instants <= last)
+    kept = ((marks > marks[0]) | simulation.ticks_at_zero | (instants == 0)) & (instants <= last)
     return instants.reshape(-1), kept.reshape(-1)

@@ -18,6 +18,7 @@ from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import find_peaks
 
 from apc.analysis.analysis import Prepared, prepare
 from apc.analysis.contact_modes import EVERYONE, ContactModes, contact_modes
@@ -51,10 +52,9 @@ MOST_PEERS, MOST_PLAYED = 20, 2 * 10**7
 # not come to its end.
 QUIET, SETTLED = 1e-4, 0.02
 
-# Lines looked for, each with so many multiples, and the least beside the largest that is a second one: what a
-# steady swing leaves after its own frequency and its multiples is far less. Of two lines sums and differences
-# of so many times each are no third.
-MOST_LINES, MULTIPLES, SECOND, MIXED = 6, 12, 0.1, 3
+# The least line beside the largest that is a second one: what a steady swing leaves beside its own frequency
+# is far less. Of two lines sums and differences of so many times each, and their multiples, are no third.
+SECOND, MIXED = 0.1, 3
 
 BY_CHANCE = "predicted with every packet on time, played with lost and late ones"
 
@@ -64,7 +64,7 @@ FINER = 8
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A frequency of the depth that swings most, and its amplitude in m, its multiples left out."""
+    """A frequency of the depth that swings most, and its amplitude in m."""
 
     frequency_hz: float
     amplitude_m: float
@@ -283,26 +283,17 @@ def _notes(known: Predicted | None, *, bounded: bool, steady: bool, lines: Seque
 def _lines(time: Floats, values: Floats) -> tuple[Line, ...]:
     """Return the lines of a spectrum, multiples of each and mixtures of two left out."""
     step = float(time[-1] - time[0]) / (len(time) - 1)
-    at, left = time - time[0], values - values.mean()
     window, size = np.hanning(len(time)), FINER * len(time)
+    spectrum = 2 / window.sum() * np.abs(np.fft.rfft((values - values.mean()) * window, size))
     apart = 2 / (step * len(time))  # what a window of this length tells apart
+    places, _ = find_peaks(spectrum, height=SECOND * spectrum[1:-1].max())
     found: list[Line] = []
-    for _ in range(MOST_LINES):
-        spectrum = np.abs(np.fft.rfft(left * window, size))
-        place = int(np.argmax(spectrum[1:-1])) + 1
+    for place in places[np.argsort(-spectrum[places])].tolist():
         near = np.log(spectrum[place - 1 : place + 2])
         aside = 0.5 * (near[0] - near[2]) / (near[0] - 2 * near[1] + near[2])
         frequency = float(place + aside) / (size * step)
-        multiples = np.arange(1, min(MULTIPLES, max(1, math.floor(0.5 / (step * frequency)))) + 1)
-        angles = 2 * np.pi * frequency * np.outer(at, multiples)
-        basis = np.hstack([np.cos(angles), np.sin(angles), np.ones((len(at), 1))])
-        factors = np.linalg.lstsq(basis, left, rcond=None)[0]
-        amplitude = float(np.hypot(factors[0], factors[len(multiples)]))
-        if found and amplitude < SECOND * found[0].amplitude_m:
-            break
         if not _is_mixed(frequency, [line.frequency_hz for line in found], apart):
-            found.append(Line(frequency, amplitude))
-        left = left - basis @ factors
+            found.append(Line(frequency, float(np.exp(near[1] - 0.25 * (near[0] - near[2]) * aside))))
     return tuple(found)
 
 

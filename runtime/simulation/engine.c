@@ -2,30 +2,29 @@
 
 The kernels and `luck.c` stand before this text (see `machine`), which also says what every field is. All fields have 8
 bytes; addresses are those of NumPy's arrays, which outlive a call. A row of a packet, a carry or what is
-heard is contiguous: a number a peer, or of several runs side by side `runs` numbers a peer, one each; what is
-in effect on a way is so too. Counts, columns and widths are of these numbers.
+heard is contiguous: a number a peer; what is in effect is a number a way.
 */
 
-enum { TOTAL, COMPLETE, WEIGHED, DELIVER, ON_WAYS, COPY, COPY_WAYS, LOOK, MOVE, WORK };
+enum { COMPLETE, WEIGHED, DELIVER, LOOK, MOVE, WORK };
 
 typedef struct {
-  whole ways, runs, slots, ticks, phase, period, first_tick, tick_period, kept, buckets, newest, zero, channels;
+  whole ways, slots, ticks, phase, period, first_tick, tick_period, kept, buckets, newest, zero, channels;
   whole distribution, traced, stride;
   double p, r, one_minus_h, one_minus_k, bad_share, jitter, quantum;
   const double *trace, *delays;                   /* (traced,); of each way, in seconds */
   const whole *nominal, *senders, *receivers;     /* of each way: quanta, peers of the scene */
-  const int32_t *columns;                         /* of each way's sender and run */
+  const int32_t *columns;                         /* of each way's sender */
   const whole *keys;                              /* (channels, slots) */
-  double *held;                                   /* (channels, ways · runs): what is in effect */
-  whole *effective, *gap;                         /* (ways · runs,): numbers */
-  int8_t *bad;                                    /* (ways · runs,) */
+  double *held;                                   /* (channels + 1, ways): what is in effect, where it is missing */
+  whole *effective, *gap;                         /* (ways,): numbers */
+  int8_t *bad;                                    /* (ways,) */
   int32_t *heads, *queue;                         /* (buckets,), (kept, stride): packets by their tick, run by run: the
                                                      tick's next run, then its packets as TAG says */
-  int32_t *when, *places;                         /* (ways · runs,), (buckets,) zeros: while packets are drawn */
-  whole *arrived, *waits;                         /* (ways · runs,), (kept, ways · runs), where the order of arrival
+  int32_t *when, *places;                         /* (ways,), (buckets,) zeros: while packets are drawn */
+  whole *arrived, *waits;                         /* (ways,), (kept, ways), where the order of arrival
                                                      matters: the tick that saw what is in effect; from its arrival
                                                      to its tick, in parts of a quantum */
-  uint64_t key[2];                                /* of the first run */
+  uint64_t key[2];
   whole heard;                                    /* ticks so far */
 } Route;
 
@@ -42,12 +41,13 @@ typedef struct {
   double x, y, z;
   const whole *p, *q;
   const double *u;
-  double *v, *w;
+  double *v;
+  const double *r;
 } Operation;
 
 typedef struct {
-  whole runs, frames_kept, keys, peers, operations, routes, marks, width, parts, frame;
-  double *packets, *totals;
+  whole frames_kept, keys, peers, operations, routes, marks, width, parts, frame;
+  double *packets;
   Operation *operation;
   Route *route;
   Member *member;
@@ -60,18 +60,17 @@ static inline whole quotient(whole a, whole b) {
   return (a | b) >> 32 ? a / b : (whole)((uint32_t)a / (uint32_t)b);
 }
 
-enum { LAST = 1, LOST = 2, TAG = 4 }; /* a packet in the queue is TAG · way and run, + LOST, + LAST of its run */
+enum { LAST = 1, LOST = 2, TAG = 4 }; /* a packet in the queue is TAG · way, + LOST, + LAST of its run */
 enum { BLOCK = 256 };                 /* ways whose chances are drawn before they are looked at */
 
-/* Draw the chances of some ways and runs from `begin` on. */
+/* Draw the chances of some ways from `begin` on. */
 static void draw_chances(const Route *r, whole number, whole begin, whole some, double (*u)[4]) {
-  whole way = begin / r->runs, run = begin % r->runs, senders[SIDE], receivers[SIDE];
+  whole senders[SIDE], receivers[SIDE];
   uint64_t keys[SIDE];
   for (whole i = 0; i < some; i += SIDE) {
     for (int k = 0; k < SIDE; k++) {
-      senders[k] = r->senders[way], receivers[k] = r->receivers[way];
-      keys[k] = r->key[1] + ((uint64_t)run << 32); /* as `network.channel.luck_key` */
-      if (i + k + 1 < some && ++run == r->runs) run = 0, way++;
+      whole way = begin + (i + k < some ? i + k : some - 1);
+      senders[k] = r->senders[way], receivers[k] = r->receivers[way], keys[k] = r->key[1];
     }
     chances(SIDE, r->key[0], keys, number, senders, receivers, u + i);
   }
@@ -79,17 +78,17 @@ static void draw_chances(const Route *r, whole number, whole begin, whole some, 
 
 /* Send packet `number` of every way: draw its luck and put it where the tick that first sees it will look. */
 static int draw(Route *r, whole number) {
-  whole slot = number % r->kept, sent = r->phase + r->period * number, all = r->ways * r->runs;
+  whole slot = number % r->kept, sent = r->phase + r->period * number, all = r->ways;
   whole base = sent - r->first_tick - r->heard * r->tick_period, most = r->buckets * r->tick_period;
   whole bucket = r->heard % r->buckets, first = r->buckets, last = -1;
   int chance = !r->traced && (r->jitter > 0 || r->bad_share > 0 || r->one_minus_k > 0 || r->p > 0);
   double u[BLOCK][4];
   const double jitter = r->jitter, quantum = r->quantum, good = r->one_minus_k, ill = r->one_minus_h;
   const double worse = r->p, stays = 1 - r->r, *delays = r->delays;
-  const whole zero = r->zero, buckets = r->buckets, tick = r->tick_period, traced = r->traced, runs = r->runs;
+  const whole zero = r->zero, buckets = r->buckets, tick = r->tick_period, traced = r->traced;
   int32_t *when = r->when, *places = r->places;
   int8_t *is_bad = r->bad; /* what is written there might be any field, as far as a compiler knows: hence all these */
-  for (whole w = 0, way = 0, run = 0; w < all; w++, run = run + 1 < runs ? run + 1 : 0, way += !run) {
+  for (whole w = 0; w < all; w++) {
     const double *own = u[w % BLOCK];
     double late;
     int lost = 0;
@@ -104,7 +103,7 @@ static int draw(Route *r, whole number) {
         }
         if (chance) draw_chances(r, number + 2, w, some, u);
       }
-      late = delays[way];
+      late = delays[w];
       if (chance) {
         int bad = is_bad[w];
         lost = own[1] < (bad ? ill : good);
@@ -118,7 +117,7 @@ static int draw(Route *r, whole number) {
     late /= quantum;
     lost |= !(late < LONGEST);
     if (lost && !zero) continue;
-    whole fine = lost ? r->nominal[way] * ONE : (whole)rint(late * ONE);
+    whole fine = lost ? r->nominal[w] * ONE : (whole)rint(late * ONE);
     whole since = base + (fine + ONE - 1) / ONE; /* since the tick that is heard next */
     whole ticks = since > 0 ? quotient(since + tick - 1, tick) : 0;
     if (since > most || ticks >= buckets) return 1;
@@ -149,14 +148,14 @@ static int draw(Route *r, whole number) {
 
 /* Say whether a packet arrived before the one in effect, or with it but sent before; both since the last tick. */
 static inline int is_before(const Route *r, whole w, whole number) {
-  const whole all = r->ways * r->runs, other = r->effective[w];
+  const whole all = r->ways, other = r->effective[w];
   whole wait = r->waits[number % r->kept * all + w], its = r->waits[other % r->kept * all + w];
   return wait > its || (wait == its && number < other);
 }
 
 /* Bring in effect what a tick is the first to see. `newest` is the number of the packet sent last. */
 static void deliver(const Plan *plan, Route *r, whole tick, whole newest) {
-  whole all = r->ways * r->runs, newest_slot = newest % r->kept, frame = newest / r->slots % plan->frames_kept;
+  whole all = r->ways, newest_slot = newest % r->kept, frame = newest / r->slots % plan->frames_kept;
   for (; r->heard <= tick; r->heard++) {
     int32_t *head = r->heads + r->heard % r->buckets, at = *head;
     *head = -1;
@@ -187,13 +186,18 @@ static void deliver(const Plan *plan, Route *r, whole tick, whole newest) {
       at = next;
     }
   }
+  if (!r->zero) return;
+  for (whole w = 0; w < all; w++) { /* what is missing stays so until a newer packet comes, which is written anew */
+    int gone = r->gap[w] > r->effective[w];
+    r->held[r->channels * all + w] = gone;
+    if (gone)
+      for (whole c = 0; c < r->channels; c++) r->held[c * all + w] = 0;
+  }
 }
 
 static inline const double *packet(const Plan *plan, whole frame, whole key, whole lag) {
   return plan->packets + ((frame + plan->frames_kept - lag) % plan->frames_kept * plan->keys + key) * plan->peers;
 }
-
-static inline int missing(const Route *r, whole w) { return r->zero && r->gap[w] > r->effective[w]; }
 
 /* A sum in four lanes: of many terms the next need not wait for the last. */
 static double sum(const double *values, whole count) {
@@ -205,69 +209,12 @@ static double sum(const double *values, whole count) {
   return (lanes[0] + lanes[1]) + (lanes[2] + lanes[3]);
 }
 
-#define RUNS 8 /* runs that are added up at once */
-
-/* Adds the sums of all runs to what is there. */
-static void add_sums(const double *values, whole count, whole runs, double *to) {
-  if (runs == 1) *to += sum(values, count);
-  else if (count < 4)
-    LANES for (whole run = 0; run < runs; run++) {
-      double total = values[run];
-      if (count > 1) total += values[runs + run];
-      if (count > 2) total += values[2 * runs + run];
-      to[run] += total;
-    }
-  else
-    for (whole run = 0; run < runs; run += RUNS) {
-      double lanes[4][RUNS] = {{0}};
-      whole some = runs - run < RUNS ? runs - run : RUNS;
-      for (whole i = 0; i < count; i++) {
-        const double *from = values + i * runs + run;
-        if (some == RUNS)
-          for (int k = 0; k < RUNS; k++) lanes[i % 4][k] += from[k];
-        else
-          for (int k = 0; k < some; k++) lanes[i % 4][k] += from[k];
-      }
-      for (int k = 0; k < some; k++) to[run + k] += (lanes[0][k] + lanes[1][k]) + (lanes[2][k] + lanes[3][k]);
-    }
-}
-
-INSIDE void complete(whole count, whole runs, const double *total, const double *own, double divisor, double *heard) {
-  for (whole i = 0; i < count; i += runs)
-    LANES for (whole run = 0; run < runs; run++)
-      heard[i + run] = (total[run] - (own ? own[i + run] : 0)) / divisor;
-}
-
-INSIDE void weighed(const Operation *o, whole count, whole runs, const double *row) {
-  for (whole i = 0; i * runs < count; i++)
-    for (whole run = 0; run < runs; run++) {
-      double total = 0;
-      for (whole k = o->p[i]; k < o->p[i + 1]; k++) total += o->u[k] * row[o->q[k] * runs + run];
-      o->v[i * runs + run] = total;
-    }
-}
-
-static void on_ways(const Operation *o, const Route *r, double *heard, whole count) {
-  const double *held = r->held + o->d * r->ways * r->runs;
-  memset(heard, 0, (size_t)count * sizeof(double));
-  for (whole i = 0; i * r->runs < count; i++, heard += r->runs) {
-    whole begin = o->p[i], end = o->p[i + 1];
-    if (!o->e && !r->zero && o->f) { /* equal weights of ways that stand side by side */
-      if (end > begin) add_sums(held + o->q[begin] * r->runs, end - begin, r->runs, heard);
-      for (whole run = 0; run < r->runs; run++) heard[run] *= o->x;
-      continue;
-    }
-    for (whole k = begin; k < end; k++)
-      for (whole run = 0; run < r->runs; run++) {
-        whole w = o->q[k] * r->runs + run;
-        int gone = missing(r, w);
-        heard[run] += o->u[k] * (o->e ? (double)gone : gone ? 0.0 : held[w]);
-      }
-  }
+/* What an operation reads: a packet, or, if its key is -1, what stands at an address. */
+static inline const double *source(const Plan *plan, whole frame, whole key, whole lag, const double *address) {
+  return key < 0 ? address : packet(plan, frame, key, lag);
 }
 
 LIBRARY int play(Plan *plan, whole first, whole count, double *rows, double *work) {
-  const whole runs = plan->runs;
   for (whole n = 0; n < count; n++) {
     whole frame = first + n;
     double *own = rows + n * plan->marks * plan->width;
@@ -276,25 +223,25 @@ LIBRARY int play(Plan *plan, whole first, whole count, double *rows, double *wor
         if (draw(plan->route + i, frame * plan->route[i].slots + slot)) return 1;
     for (const Operation *o = plan->operation; o < plan->operation + plan->operations; o++) {
       switch (o->kind) {
-        case TOTAL: { /* a: place, b: key, c: lag, d: how many ranges p */
-          const double *row = packet(plan, frame, o->b, o->c);
-          double *total = plan->totals + o->a * runs;
-          memset(total, 0, (size_t)runs * sizeof(double));
-          for (whole i = 0; i < o->d; i++) add_sums(row + o->p[2 * i] * runs, o->p[2 * i + 1] - o->p[2 * i], runs, total);
-          break;
-        }
-        case COMPLETE: { /* a: member, b: total, c: key or -1, d: lag, x: divisor, v: to */
+        case COMPLETE: { /* a: member, b: key, c: lag, d: how many ranges p, e: its own is left out, x: divisor, v: to */
           const Member *m = plan->member + o->a;
-          const double *total = plan->totals + o->b * runs;
-          const double *own = o->c < 0 ? 0 : packet(plan, frame, o->c, o->d) + m->column;
-          if (runs == 1) complete(m->count, 1, total, own, o->x, o->v);
-          else complete(m->count, runs, total, own, o->x, o->v);
+          const double *row = packet(plan, frame, o->b, o->c), *own = row + m->column, divisor = o->x;
+          const whole count = m->count;
+          double total = 0, *heard = o->v;
+          for (whole i = 0; i < o->d; i++) total += sum(row + o->p[2 * i], o->p[2 * i + 1] - o->p[2 * i]);
+          if (o->e)
+            LANES for (whole i = 0; i < count; i++) heard[i] = (total - own[i]) / divisor;
+          else
+            LANES for (whole i = 0; i < count; i++) heard[i] = total / divisor;
           break;
         }
-        case WEIGHED: { /* a: member, b: key, c: lag, p: starts, q: columns, u: weights, v: to */
-          const double *row = packet(plan, frame, o->b, o->c);
-          if (runs == 1) weighed(o, plan->member[o->a].count, 1, row);
-          else weighed(o, plan->member[o->a].count, runs, row);
+        case WEIGHED: { /* a: member, b: key, c: lag, r: address, p: starts, q: columns, u: weights, v: to */
+          const double *row = source(plan, frame, o->b, o->c, o->r);
+          for (whole i = 0; i < plan->member[o->a].count; i++) {
+            double total = 0;
+            for (whole k = o->p[i]; k < o->p[i + 1]; k++) total += o->u[k] * row[o->q[k]];
+            o->v[i] = total;
+          }
           break;
         }
         case DELIVER: { /* a: route, b: tick */
@@ -302,28 +249,15 @@ LIBRARY int play(Plan *plan, whole first, whole count, double *rows, double *wor
           deliver(plan, r, frame * r->ticks + o->b, (frame + 1) * r->slots - 1);
           break;
         }
-        case ON_WAYS: /* a: member, b: route, d: channel, e: gap, f: x is every weight; p, q, u, v as above */
-          on_ways(o, plan->route + o->b, o->v, plan->member[o->a].count);
-          break;
-        case COPY: { /* a: key, b: lag, c: from, d: how many, v: to */
-          memcpy(o->v, packet(plan, frame, o->a, o->b) + o->c, (size_t)o->d * sizeof(double));
-          break;
-        }
-        case COPY_WAYS: { /* a: route, b: channel, or -1 for what is missing, v: to */
-          const Route *r = plan->route + o->a;
-          for (whole w = 0; w < r->ways * runs; w++) {
-            int gone = missing(r, w);
-            o->v[w] = o->b < 0 ? (double)gone : gone ? 0.0 : r->held[o->b * r->ways * runs + w];
-          }
-          break;
-        }
-        case LOOK: { /* a: member, b: function, c: arcs, d: operator, e: width, f: rows of what is heard, g: now;
-                        p: senders, q: receivers, then (address, stride) of its own rows; u: weights;
-                        v: what is heard, then what is missing; w: to; y / z: seconds a quantum */
+        case LOOK: { /* a: member, b: function, c: arcs, d: operator, e: first, f: sources, g: now, x: own rows;
+                        p: senders, q: receivers, then (address, stride) of its own rows, then the sources' (key, lag,
+                        address); u: weights; r: what is missing, or 0; v: to; y / z: seconds a quantum */
           double t = ((double)frame * (double)plan->frame + (double)o->g) * o->y / o->z;
-          const Member *m = plan->member + o->a;
-          looks[o->b](o->c, o->p, o->q, o->u, (int)o->d, o->q + o->c, o->w, m->count, o->v,
-                      o->e, o->v + o->f * o->e, t);
+          const whole *own = o->q + o->c, *from = own + 2 * (whole)o->x;
+          const double *sent[o->f + 1];
+          for (whole k = 0; k < o->f; k++)
+            sent[k] = source(plan, frame, from[3 * k], from[3 * k + 1], (const double *)from[3 * k + 2]);
+          looks[o->b](o->c, o->p, o->q, o->u, (int)o->d, (int)o->e, own, o->v, plan->member[o->a].count, sent, o->r, t);
           break;
         }
         case MOVE: { /* a: member, b: kernel, c: first mark, d: first column of rows, e: first impulse, p: keys */

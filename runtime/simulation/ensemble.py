@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis import analysis
-from apc.compiler.compiled import CompiledSystem
+from apc.compiler.compiled import LENGTH, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
@@ -37,11 +37,10 @@ from apc.processes import (
     this_process,
 )
 from apc.result import Result
-from apc.simulation.blocks import blocks, instants_of, pushes
-from apc.simulation.population import Player
+from apc.simulation.blocks import blocks
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
-from apc.simulation.summary import BAND, Watch, is_position
+from apc.simulation.summary import BAND, Watch
 from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
@@ -52,7 +51,6 @@ SURE = 1.959963984540054  # standard deviations of a normal within which 95 % li
 CALM, SHAKEN = ("rests", "settles", "dies away"), ("shakes", "diverges")
 PART = 100  # runs handed to a process at a time: enough to pay for the way, few enough to share out evenly
 RUN = 300  # bytes of a run that is over
-TOGETHER = 2**18  # numbers that runs side by side keep, and that rows of them are played at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +196,7 @@ def play_many(
     done: list[Run] = []
     interrupted = False
     try:
-        with _workers(system, settings, min(runs, PART), min(jobs, len(parts)), place) as workers:
+        with _workers(system, settings, min(jobs, len(parts)), place) as workers:
             for found in results(workers, parts, Patience(), place):
                 done += found
                 if progress is not None:
@@ -230,102 +228,35 @@ def _mean_square(system: CompiledSystem) -> MeanSquare | None:
 
 
 def _workers(
-    system: CompiledSystem, settings: Settings, runs: int, jobs: int, place: Place
+    system: CompiledSystem, settings: Settings, jobs: int, place: Place
 ) -> AbstractContextManager[Workers[range, list[Run]]]:
     """Return who plays: this process, or some that are started afresh."""
     if jobs == 1:
-        return nullcontext(this_process(_runs, _side(prepare(system, settings, runs=runs), runs)))
+        return nullcontext(this_process(_runs, prepare(system, settings)))
     what = "a process that played runs ended without a word: stopped from outside, or out of memory"
     lost = Mistake("E895", place, what, hint="--jobs 1")
-    return local_processes(_part, (model_bytes(system), settings), jobs, lost)
+    return local_processes(_runs_of_model, (model_bytes(system), settings), jobs, lost)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Side:
-    """What plays some runs side by side, and what looks at them: `positions` and `forces` among the signals.
-
-    The signals are counted as a player gives them.
-    """
-
-    simulation: Simulation
-    player: Player
-    watch: Watch
-    positions: tuple[int, ...]
-    forces: tuple[int, ...]
-
-
-def _side(simulation: Simulation, runs: int) -> _Side:
-    """Return what plays runs, as many side by side as stay in the caches with a frame of their rows."""
-    hearing, frame = simulation.population.hearing, len(simulation.marks) * max(len(simulation.signals), 1)
-    ways = zip(simulation.lucks, hearing.routes, strict=True)
-    kept = hearing.start.size * hearing.ring + sum(luck.kept(one) * len(one.pairs) for luck, one in ways)
-    player = simulation.player(min(runs, max(1, TOGETHER // (frame + kept))))
-    length = min(simulation.length, max(1, TOGETHER // (frame * player.runs)))
-    signals = [simulation.signals[i] for i in np.argsort(simulation.order)]
-    positions = tuple(i for i, one in enumerate(signals) if is_position(one))
-    forces = tuple(i for i, one in enumerate(signals) if one.unit == "N")
-    watch = Watch(simulation, [signals[i] for i in positions], player.runs)
-    return _Side(replace(simulation, length=length), player, watch, positions, forces)
-
-
-def _runs(side: _Side, part: range) -> list[Run]:
-    """Play some runs."""
-    parts = (part[first : first + side.player.runs] for first in range(0, len(part), side.player.runs))
-    return [run for some in parts for run in _together(side, some)]
-
-
-def _part(shared: tuple[bytes, Settings], part: range) -> list[Run]:
-    return _runs(_opened(*shared), part)
+def _runs_of_model(shared: tuple[bytes, Settings], numbers: range) -> list[Run]:
+    return _runs(_opened(*shared), numbers)
 
 
 @lru_cache(maxsize=1)
-def _opened(model: bytes, settings: Settings) -> _Side:
-    return _side(prepare(model_of_bytes(model), settings, runs=PART), PART)
+def _opened(model: bytes, settings: Settings) -> Simulation:
+    return prepare(model_of_bytes(model), settings)
 
 
-def _together(side: _Side, runs: range) -> list[Run]:
-    """Play runs side by side; what leaves the range of floats is played again, alone."""
-    simulation, player, watch = side.simulation, side.player, side.watch
-    last = int(simulation.settings.duration / simulation.quantum)
-    largest, finite = np.zeros(player.runs), np.ones(player.runs, np.bool_)
-    player.begin(runs.start)
-    watch.begin()
-    with np.errstate(all="ignore"):  # of what has diverged
-        for first in range(0, last // simulation.frame + 1, simulation.length):
-            played = player.play(first, simulation.length, pushes(simulation, first))
-            if played.frames < simulation.length:
-                return [_alone(simulation, number) for number in runs]
-            instants, kept = instants_of(simulation, first, last)
-            time = instants[kept] * simulation.quantum.numerator / simulation.quantum.denominator
-            rows = played.rows if kept.all() else played.rows[kept]
-            rows = rows.reshape(len(time), len(simulation.signals), player.runs)
-            watch.take(time, rows[:, list(side.positions)].reshape(len(time), watch.signals * player.runs))
-            low, high = rows.min(axis=0, initial=0.0), rows.max(axis=0, initial=0.0)
-            finite &= (np.isfinite(low) & np.isfinite(high)).all(axis=0)
-            size = np.maximum(abs(high), abs(low))[list(side.forces)].max(axis=0, initial=0.0)
-            largest = np.maximum(largest, size)
-        finite &= player.in_range()
-        found = _amounts(watch, runs, largest if side.forces else None)
-    return [found[i] if finite[i] else _alone(simulation, number) for i, number in enumerate(runs)]
-
-
-def _alone(simulation: Simulation, number: int) -> Run:
-    """Play one run block by block."""
-    watch, block = Watch(simulation), None
-    for block in blocks(simulation, run=number):
-        watch.take(block.time, block.values)
-    largest = watch.peak[watch.forces].max(keepdims=True) if watch.forces else None
-    with np.errstate(all="ignore"):
-        return _amounts(watch, range(number, number + 1), largest, stopped=bool(block and block.stopped))[0]
-
-
-def _amounts(watch: Watch, runs: range, forces: Floats | None, *, stopped: bool = False) -> list[Run]:
-    """Return what runs side by side amount to; `forces` (runs,) are the largest of each."""
-    judged = watch.judged(stopped=stopped)
-    apart = [distance for _, unit, distance in watch.copies() if unit == "m"]
-    none = [None] * watch.runs
-    settled = [None if math.isnan(one) else one for one in judged.settled_at.tolist()]
-    largest = none if forces is None else forces.tolist()
-    copies = np.max(apart, axis=0).tolist() if apart else none
-    # Those beyond the last run that was wanted are left out.
-    return [Run(*one) for one in zip(runs, judged.verdict.tolist(), settled, largest, copies, strict=False)]
+def _runs(simulation: Simulation, numbers: range) -> list[Run]:
+    """Play some runs."""
+    player, found = simulation.player(), []
+    lengths = {one.local for one in simulation.signals if one.unit == LENGTH}
+    for number in numbers:
+        watch = Watch(simulation)
+        for block in blocks(simulation, run=number, player=player):
+            watch.take(block.time, block.values)
+        told = watch.summary(block)
+        force = None if told.largest_force is None else told.largest_force[1]
+        copies = max((distance for name, distance in told.copies if name in lengths), default=None)
+        found.append(Run(number, told.verdict, told.settled, force, copies))
+    return found

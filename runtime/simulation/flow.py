@@ -36,7 +36,7 @@ from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.interpolation import jacobian
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.start import start_values
-from apc.simulation.integrate import integrated
+from apc.simulation.integrate import Integrated
 from apc.simulation.propagate import nonlinear_rows
 from apc.simulation.settings import EXACT, RK4, WHERE_NEEDED, Method
 
@@ -77,7 +77,7 @@ class Flow:
             short = self.rate.is_a("SXFunction") and duration <= MOST_UNROLLED * self.method.step
             return move.expand() if short else move
         assert self.method.tolerance is not None
-        return integrated(self.rate, self.scale, self.method.tolerance, duration)
+        return Integrated(self.rate, self.scale, self.method.tolerance, duration)
 
     def tolerances(self, kind: Kind) -> tuple[Tolerance, ...]:
         """Return the tolerances of its states, none if the step is fixed."""
@@ -191,11 +191,14 @@ def integrals(rate: Any) -> tuple[tuple[int, int], ...]:
     type_: Any = casadi.SX if rate.is_a("SXFunction") else casadi.MX
     arguments = [type_.sym(f"a{i}", rate.numel_in(i)) for i in range(4)]
     speed = rate(*arguments)
-    blocks = [jacobian(speed, one) for one in arguments]
-    rows, columns = blocks[0].sparsity().get_triplet()
-    others = {row for block in blocks[1:] for row in block.sparsity().get_triplet()[0]}
-    found = {i: j for i, j in zip(rows, columns, strict=True) if rows.count(i) == 1 and i not in others}
-    found = {i: j for i, j in found.items() if blocks[0][i, j].is_constant() and float(blocks[0][i, j]) == 1}
+    slopes = casadi.horzcat(*(jacobian(speed, one) for one in arguments))
+    found: dict[int, int] = {}
+    for i in range(speed.numel()):
+        columns = slopes[i, :].sparsity().get_triplet()[1]
+        if len(columns) == 1 and columns[0] < speed.numel():
+            slope = slopes[i, columns[0]]
+            if slope.is_constant() and float(slope) == 1:
+                found[i] = columns[0]
     ordered: list[tuple[int, int]] = []
     while found:
         ready = [i for i, j in found.items() if j not in found]

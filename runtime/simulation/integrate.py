@@ -1,6 +1,6 @@
 """What is not linear between two events, by CVODES, restarted where an equation is not smooth.
 
-Takes: the rate of change of a state, tolerances, a duration. Gives: `integrated`.
+Takes: the rate of change of a state, tolerances, a duration. Gives: `Integrated`.
 Guarantees: each step's error is below the tolerance; where something that decides (a comparison, a max, an
 abs) has changed sign between two looks, the instant is found to 1e-10 of the distance of the looks, and the
 integration ends and begins there.
@@ -31,131 +31,111 @@ MOST_CROSSINGS = 4  # between two events that are located; those after are left 
 MOST_STEPS = 20_000  # of CVODES from look to look: what takes more jumps to and fro without end
 
 
-def integrated(function: Any, scale: Floats, tolerance: float, duration: Fraction) -> Any:
-    """Return (x, u, p, t) -> x after `duration`.
+class Integrated(casadi.Callback):
+    """The function (x, u, p, t) -> x after some time, by CVODES.
 
-    Parameters
-    ----------
-    function
-        The rate of change (x, u, p, t) -> dx/dt, a CasADi function.
-    scale
-        How large each state is (n_x,): the error of a step is below `tolerance` times |x| + scale.
-    tolerance
-        Relative to |x| + scale.
-    duration
-        In seconds.
+    CasADi calls it by its address: whoever uses a function made of it keeps it, too.
     """
-    passes = _Passes(function, scale, tolerance, float(duration))
-    x, u, p = (casadi.MX.sym(name, function.numel_in(i)) for i, name in enumerate(("x", "u", "p")))
-    t = casadi.MX.sym("t")
-    after = passes.sweep(MOST_CROSSINGS)(x / passes.scale, casadi.vertcat(u, p, t), 0.0)
-    return casadi.Function("move", [x, u, p, t], [after * passes.scale])
 
+    def __init__(self, function: Any, scale: Floats, tolerance: float, duration: Fraction) -> None:
+        """Build the integrators.
 
-class _Passes:
-    """Functions of y = x/scale, of `fixed` = (u, p, t) and of seconds since t."""
-
-    def __init__(self, function: Any, scale: Floats, tolerance: float, duration: float) -> None:
-        self.function, self.scale, self.duration = function, casadi.DM(scale), duration
-        self.sizes = [function.numel_in(i) for i in range(3)]
-        self.n, self.fixed = self.sizes[0], self.sizes[1] + self.sizes[2] + 1
-        self.tolerance = tolerance
-        self.guards = self._guards()
-        self.looks = self._integrator("looks", [k / LOOKS for k in range(1, LOOKS + 1)])
-        self.once = self._integrator("once", [1.0])
-
-    def _split(self, fixed: Any) -> tuple[Any, Any, Any]:
-        n_u, n_p = self.sizes[1:]
-        return fixed[:n_u], fixed[n_u : n_u + n_p], fixed[n_u + n_p]
-
-    def _integrator(self, name: str, outputs: Sequence[float]) -> Any:
-        """Return CVODES over a time scaled to 1, from `begin` over `length` seconds."""
-        type_: Any = casadi.SX if self.function.is_a("SXFunction") else casadi.MX
-        y, fixed, s = type_.sym("y", self.n), type_.sym("fixed", self.fixed), type_.sym("s")
-        begin, length = type_.sym("begin"), type_.sym("length")
-        u, p, t = self._split(fixed)
-        rate = self.function(y * self.scale, u, p, t + begin + s * length) / self.scale
-        problem = {
-            "x": y,
-            "p": casadi.vertcat(fixed, begin, length),
-            "t": s,
-            "ode": casadi.densify(length * rate),
-        }
+        Parameters
+        ----------
+        function
+            The rate of change (x, u, p, t) -> dx/dt, a CasADi function.
+        scale
+            How large each state is (n_x,): the error of a step is below `tolerance` times |x| + scale.
+        tolerance
+            Relative to |x| + scale.
+        duration
+            In seconds.
+        """
+        casadi.Callback.__init__(self)
+        self.scale, self.duration = scale, float(duration)
+        self.sizes = [function.numel_in(i) for i in range(4)]
+        # In y = x/scale and a time s scaled to 1, from `begin` seconds after t over `length` seconds.
+        type_: Any = casadi.SX if function.is_a("SXFunction") else casadi.MX
+        y, u, p, t = (type_.sym(name, size) for name, size in zip("yupt", self.sizes, strict=True))
+        begin, length, s = type_.sym("begin"), type_.sym("length"), type_.sym("s")
+        rate = function(y * scale, u, p, t + begin + s * length) / scale
+        fixed = casadi.vertcat(u, p, t, begin, length)
+        problem = {"x": y, "p": fixed, "t": s, "ode": casadi.densify(length * rate)}
         options = {
-            "reltol": self.tolerance,
-            "abstol": self.tolerance,
+            "reltol": tolerance,
+            "abstol": tolerance,
             "max_num_steps": MOST_STEPS,
             "disable_internal_warnings": True,
             "show_eval_warnings": False,
         }
-        return casadi.integrator(name, "cvodes", problem, 0.0, list(outputs), options)
+        looks = [k / LOOKS for k in range(1, LOOKS + 1)]
+        self.once = casadi.integrator("once", "cvodes", problem, 0.0, [1.0], options)
+        guards = guards_of(rate, casadi.vertcat(y, begin, t, s)) if type_ is casadi.SX else []
+        self.looks: Any = None
+        self.signs: Any = None
+        if guards:
+            decides = casadi.substitute(casadi.vertcat(*guards), s, 0) >= 0
+            self.signs = casadi.Function("signs", [y, fixed], [casadi.densify(decides)])
+            start, held = casadi.MX.sym("y", self.sizes[0]), casadi.MX.sym("fixed", fixed.numel() - 2)
+            first, last = casadi.MX.sym("first"), casadi.MX.sym("last")
+            looked = casadi.integrator("looks", "cvodes", problem, 0.0, looks, options)
+            ends = looked(x0=start, p=casadi.vertcat(held, first, last - first))["xf"]
+            every = casadi.horzcat(start, ends)
+            at = first + (last - first) * casadi.DM([0.0, *looks]).T
+            places = casadi.vertcat(casadi.repmat(held, 1, LOOKS + 1), at, casadi.MX.zeros(1, LOOKS + 1))
+            signs = self.signs.map(LOOKS + 1)(every, places)
+            crossed = casadi.norm_inf(casadi.vec(signs[:, 1:] - signs[:, :-1]))
+            found = [every[:, -1] * scale, crossed, every, at, signs]
+            self.looks = casadi.Function("looks", [start, held, first, last], found)
+        self.construct("move", {})
 
-    def _guards(self) -> Any:
-        """Return what decides, (y, fixed, seconds since t) -> (n,); None if nothing does."""
-        if not self.function.is_a("SXFunction"):
-            return None
-        y, fixed, at = casadi.SX.sym("y", self.n), casadi.SX.sym("fixed", self.fixed), casadi.SX.sym("at")
-        u, p, t = self._split(fixed)
-        rate = self.function(y * self.scale, u, p, t + at)
-        found = guards_of(rate, casadi.vertcat(y, at, t))
-        return casadi.Function("guards", [y, fixed, at], [casadi.vertcat(*found)]) if found else None
+    def get_n_in(self) -> int:
+        """Return how many arguments there are, for CasADi."""
+        return 4
 
-    def _run(self, integrator: Any, y: Any, fixed: Any, begin: Any, length: Any) -> Any:
-        return integrator(x0=y, p=casadi.vertcat(fixed, begin, length))["xf"]
+    def get_n_out(self) -> int:
+        """Return how many results there are, for CasADi."""
+        return 1
 
-    def sweep(self, crossings: int) -> Any:
-        """Return (y, fixed, begin) -> y at the end, locating so many crossings on the way."""
-        y, fixed, begin = (casadi.MX.sym(n, size) for n, size in (("y", self.n), ("f", self.fixed), ("b", 1)))
-        length = self.duration - begin
-        if self.guards is None or not crossings:
-            end = self._run(self.once, y, fixed, begin, length)
-            return casadi.Function("sweep", [y, fixed, begin], [end])
-        every = casadi.horzcat(y, self._run(self.looks, y, fixed, begin, length))
-        at = begin + length * casadi.DM(np.linspace(0.0, 1.0, LOOKS + 1)).T
-        signs = self.guards.map(LOOKS + 1)(every, casadi.repmat(fixed, 1, LOOKS + 1), at) >= 0
-        changed = casadi.sum1(signs[:, 1:] != signs[:, :-1]) > 0  # (1, LOOKS)
-        first, none_before = [], casadi.MX(1)
-        for k in range(LOOKS):
-            first.append(changed[k] * none_before)
-            none_before = none_before * (1 - changed[k])
-        one = casadi.vertcat(*first)  # 1 where the first change is
-        branches = casadi.Function.if_else("crossed", self._located(crossings), self._smooth())
-        ends = (every[:, :LOOKS] @ one, every[:, 1:] @ one, at[:LOOKS] @ one, at[1:] @ one)
-        end = branches(1 - none_before, *ends, every[:, -1], fixed)
-        return casadi.Function("sweep", [y, fixed, begin], [end])
+    def get_sparsity_in(self, place: int) -> Any:
+        """Return an argument's shape, for CasADi."""
+        return casadi.Sparsity.dense(self.sizes[place], 1)
 
-    def _arguments(self) -> list[Any]:
-        sizes = {"y_low": self.n, "y_high": self.n, "low": 1, "high": 1, "end": self.n, "fixed": self.fixed}
-        return [casadi.MX.sym(name, size) for name, size in sizes.items()]
+    def get_sparsity_out(self, _: int) -> Any:
+        """Return the result's shape, for CasADi."""
+        return casadi.Sparsity.dense(self.sizes[0], 1)
 
-    def _smooth(self) -> Any:
-        arguments = self._arguments()
-        return casadi.Function("smooth", arguments, [arguments[4]])
+    def eval(self, arguments: Sequence[Any]) -> list[Any]:
+        """Return x at the end, locating what decides on the way, for CasADi."""
+        y, held, begin = arguments[0] / casadi.DM(self.scale), casadi.vertcat(*arguments[1:]), 0.0
+        for _ in range(MOST_CROSSINGS if self.looks is not None else 0):
+            end, crossed, *looked = self.looks(y, held, begin, self.duration)
+            if not float(crossed):
+                return [end]
+            every, at, signs = map(np.asarray, looked)
+            changed = (signs[:, 1:] != signs[:, :-1]).any(axis=0)
+            first = int(changed.argmax())
+            ends = every[:, [first]], every[:, [first + 1]]
+            y, begin = self._located(*ends, held, at[0, first], at[0, first + 1])
+        return [self._moved(y, held, begin, self.duration)[:, 0] * self.scale]
 
-    def _located(self, crossings: int) -> Any:
-        """Return what halves the time of a change until it is known, and goes on from there."""
-        arguments = self._arguments()
-        y_low, y_high, low, high, _, fixed = arguments
-        found = self._halving().fold(HALVINGS)(casadi.vertcat(y_low, y_high, low, high, fixed))
-        rest = self.sweep(crossings - 1)
-        end = rest(found[self.n : 2 * self.n], fixed, found[2 * self.n + 1])
-        return casadi.Function("located", arguments, [end])
+    def _moved(self, y: Floats, held: Floats, begin: float, end: float) -> Floats:
+        fixed = np.vstack([np.asarray(held), [[begin], [end - begin]]])
+        return np.asarray(self.once(x0=y, p=fixed)["xf"])
 
-    def _halving(self) -> Any:
-        n = self.n
-        carry = casadi.MX.sym("carry", 2 * n + 2 + self.fixed)
-        y_low, y_high, low, high, fixed = casadi.vertsplit(
-            carry, [0, n, 2 * n, 2 * n + 1, 2 * n + 2, carry.numel()]
-        )
-        middle = (low + high) / 2
-        y_middle = self._run(self.once, y_low, fixed, low, middle - low)
-        before, after = self.guards(y_low, fixed, low) >= 0, self.guards(y_middle, fixed, middle) >= 0
-        changed = casadi.sum1(before != after) > 0
-        result = casadi.vertcat(
-            casadi.if_else(changed, y_low, y_middle),
-            casadi.if_else(changed, y_middle, y_high),
-            casadi.if_else(changed, low, middle),
-            casadi.if_else(changed, middle, high),
-            fixed,
-        )
-        return casadi.Function("halving", [carry], [result])
+    def _signs(self, y: Floats, held: Floats, at: float) -> Floats:
+        return np.asarray(self.signs(y, np.vstack([np.asarray(held), [[at], [0.0]]])))
+
+    def _located(
+        self, low: Floats, high: Floats, held: Floats, begin: float, end: float
+    ) -> tuple[Floats, float]:
+        """Return the state just after the first change between two looks, and when that is."""
+        before = self._signs(low, held, begin)
+        for _ in range(HALVINGS):
+            middle = (begin + end) / 2
+            y = self._moved(low, held, begin, middle)
+            if (self._signs(y, held, middle) != before).any():
+                high, end = y, middle
+            else:
+                low, begin = y, middle
+        return high, end

@@ -1,8 +1,8 @@
 """All peers' frames in machine code: the kernels as loops over peers, and the engine that plays them.
 
 Takes: a `Population`, the laws of its unreliable links.
-Gives: `library_of`, `Library`, `Machine`; `program_text`, the C text; `Kernel`; `straight_lines`,
-`luck_text`, `DISTRIBUTIONS`.
+Gives: `library_of`, `Library`, `Machine`; `program_text`, the C text; `straight_lines`, `luck_text`,
+`DISTRIBUTIONS`.
 Guarantees: the numbers of `stepwise` to a few roundings of the sums, and the same packets; the text depends
 on what a peer does in a frame, not on how many peers there are or on their numbers.
 Does not: compile (see `native`), or play kernels that are not straight code, such as solvers.
@@ -26,19 +26,18 @@ from apc.compiler.interpolation import table_of
 from apc.compiler.plain import PlainFunction, straight
 from apc.network.channel import luck_key
 from apc.network.timetable import START, Luck
-from apc.simulation.hearing import Complete, Deliver, Look, OnWays, Operation, Sparse, Total, Weighed
+from apc.simulation.hearing import Arrived, Complete, Deliver, Look, Operation, Source, Weighed
 from apc.simulation.native import native
 from apc.simulation.population import Played, Population
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 # More operations and rows of tables than this in one kernel: to optimize straight code takes more than linear
 # time.
 MOST_OPERATIONS = 20_000
 MANY = 32  # peers of a member from which on their loop is put into lanes
-KINDS = ("total", "complete", "weighed", "deliver", "on ways", "copy", "copy ways", "look", "move", "work")
+KINDS = ("complete", "weighed", "deliver", "look", "move", "work")
 OPERATORS = {"sum": 0, "mean": 0, "max": 1, "min": 2}
 DISTRIBUTIONS = {"uniform": 0, "normal": 1, "pareto": 2}
 
@@ -76,9 +75,8 @@ whole n, double *carry, const double *heard, const double *constants, {own}const
     whole sites, const whole *site, double frame, double *sent, const whole *keys, whole peers, double *rows,
     whole width"""
 LOOKED = """\
-whole arcs, const whole *senders, const whole *receivers, const double *weights, int mode,
-    const whole *own, double *out, whole n, const double *sent, whole width, const double *missing,
-    double t"""
+whole arcs, const whole *senders, const whole *receivers, const double *weights, int mode, int first,
+    const whole *own, double *out, whole n, const double *const *sent, const double *missing, double t"""
 
 EXPRESSIONS = {
     "neg": "-{0}",
@@ -126,7 +124,7 @@ def _fields(*columns: tuple[str, str]) -> np.dtype[Any]:
 
 WHOLE, NUMBER, ADDRESS = "i8", "f8", "u8"
 ROUTE = _fields(
-    ("ways runs slots ticks phase period first_tick tick_period kept buckets newest zero channels", WHOLE),
+    ("ways slots ticks phase period first_tick tick_period kept buckets newest zero channels", WHOLE),
     ("distribution traced stride", WHOLE),
     ("p r one_minus_h one_minus_k bad_share jitter quantum", NUMBER),
     ("trace delays nominal senders receivers columns keys held effective gap bad", ADDRESS),
@@ -136,34 +134,26 @@ ROUTE = _fields(
 MEMBER = _fields(
     ("count column recorded sites own impulse_rows", WHOLE), ("carry heard constants impulses site", ADDRESS)
 )
-OPERATION = _fields(("kind a b c d e f g", WHOLE), ("x y z", NUMBER), ("p q u v w", ADDRESS))
+OPERATION = _fields(("kind a b c d e f g", WHOLE), ("x y z", NUMBER), ("p q u v r", ADDRESS))
 PLAN = _fields(
-    ("runs frames_kept keys peers operations routes marks width parts frame", WHOLE),
-    ("packets totals operation route member", ADDRESS),
+    ("frames_kept keys peers operations routes marks width parts frame", WHOLE),
+    ("packets operation route member", ADDRESS),
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Kernel:
-    """A segment's function (see `program`) as plain data, and how many signals it records at a mark."""
-
-    function: PlainFunction
-    recorded: int
-
-
-def program_text(kernels: Sequence[Kernel], looks: Sequence[PlainFunction]) -> str:
+def program_text(kernels: Sequence[tuple[PlainFunction, int]], looks: Sequence[PlainFunction]) -> str:
     """Return the C text that plays members whose segments are these kernels, and looks at pairs so.
 
     Parameters
     ----------
     kernels
-        The segments' kernels.
+        The segments' kernels, each with how many signals it records at a mark.
     looks
         The functions of pairs (see `pairs`).
     """
     parts = [HEAD]
-    parts += [_kernel(place, one) for place, one in enumerate(kernels)]
-    parts += [_look(place, one) for place, one in enumerate(looks)]
+    parts += [_kernel(place, *kernel) for place, kernel in enumerate(kernels)]
+    parts += [_look(place, look) for place, look in enumerate(looks)]
     parts.append(_table("kernels", "kernel", PARAMETERS.format(own="int own, "), len(kernels)))
     parts.append(_table("looks", "look", LOOKED, len(looks)))
     parts += [luck_text(), Path(__file__).with_name("engine.c").read_text(encoding="utf-8")]
@@ -180,9 +170,8 @@ def _table(name: str, each: str, parameters: str, count: int) -> str:
     return f"static void (*const {name}[])({parameters}) = {{{listed}}};\n"
 
 
-def _kernel(place: int, kernel: Kernel) -> str:
+def _kernel(place: int, function: PlainFunction, recorded: int) -> str:
     """Return a segment's kernel as a loop over peers."""
-    function, recorded = kernel.function, kernel.recorded
     carry, heard, constants, impulses, _ = (rows for _, rows in function.inputs)
     inputs = [
         *(f"carry[{k} * n + i]" for k in range(carry)),
@@ -193,11 +182,11 @@ def _kernel(place: int, kernel: Kernel) -> str:
     ]
     after, sent, rows = function.results
     values, lines = straight_lines(function, inputs)
-    stores = [f"carry[{k} * n + i] = {values[one]};" for k, one in enumerate(after)]
-    stores += [f"sent[keys[{k}] * peers + i] = {values[one]};" for k, one in enumerate(sent)]
+    stores = [f"carry[{k} * n + i] = {values[value]};" for k, value in enumerate(after) if value != k]
+    stores += [f"sent[keys[{k}] * peers + i] = {values[value]};" for k, value in enumerate(sent)]
     stores += [
-        f"rows[{k // recorded} * width + {k % recorded} * n + i] = {values[one]};"
-        for k, one in enumerate(rows)
+        f"rows[{k // recorded} * width + {k % recorded} * n + i] = {values[value]};"
+        for k, value in enumerate(rows)
     ]
     body = "\n    ".join([*lines, *stores])
     given = "n, carry, heard, constants, {}impulses, sites, site, frame, sent, keys, peers, rows, width"
@@ -224,15 +213,15 @@ def _look(place: int, function: PlainFunction) -> str:
     own, sent, _, _ = (rows for _, rows in function.inputs)
     inputs = [
         *(f"((const double *)own[{2 * k}])[own[{2 * k + 1}] * r]" for k in range(own)),
-        *(f"sent[{k} * width + s]" for k in range(sent)),
-        "missing[s]",
+        *(f"sent[{k}][s]" for k in range(sent)),
+        "(missing ? missing[s] : 0.0)",
         "t",
     ]
     values, lines = straight_lines(function, inputs)
     body = "\n    ".join(lines)
     return f"""\
 static void look{place}({LOOKED}) {{
-  for (whole r = 0; r < n; r++) out[r] = mode == 0 ? 0.0 : mode == 1 ? -INFINITY : INFINITY;
+  if (first) for (whole r = 0; r < n; r++) out[r] = mode == 0 ? 0.0 : mode == 1 ? -INFINITY : INFINITY;
   for (whole a = 0; a < arcs; a++) {{
     const whole s = senders[a], r = receivers[a];
     {body}
@@ -252,7 +241,7 @@ def straight_lines(function: PlainFunction, inputs: Sequence[str]) -> tuple[list
         names.append(f"v{place}")
         if place in used:
             lines.append(f"const double v{place} = {text};")
-    names += [_number(one) for one in function.constants]
+    names += [_number(constant) for constant in function.constants]
     for table in function.tables:
         names.append(f"{len(names)}")
         for what, column in (("times", table.times), ("numbers", table.numbers)):
@@ -289,24 +278,20 @@ class Library:
     kernels: Mapping[int, int]
 
 
-def library_of(population: Population, runs: int = 1) -> Library | None:
-    """Return what plays a population in machine code, None where that can't be had.
-
-    Parameters
-    ----------
-    population
-        All peers.
-    runs
-        How many runs stand side by side.
-    """
-    segments = {id(one): (one, m.program) for m in population.members for one in m.program.segments}
-    functions = [one.kernel for one, _ in segments.values()]
+def library_of(population: Population) -> Library | None:
+    """Return what plays a population in machine code, None where that can't be had."""
+    segments = {
+        id(segment): (segment, m.program) for m in population.members for segment in m.program.segments
+    }
+    functions = [segment.kernel for segment, _ in segments.values()]
     looks = list(population.hearing.functions)
-    if ctypes.sizeof(ctypes.c_void_p) != 8 or not all(_is_worth_it(one) for one in (*functions, *looks)):
+    if ctypes.sizeof(ctypes.c_void_p) != 8 or not all(
+        _is_worth_it(function) for function in (*functions, *looks)
+    ):
         return None
-    kernels = [Kernel(straight(one.kernel), len(own.recorded)) for one, own in segments.values()]
-    many = runs * max(member.count for member in population.members) >= MANY
-    loaded = native(program_text(kernels, [straight(one) for one in looks]), many=many)
+    kernels = [(straight(segment.kernel), len(program.recorded)) for segment, program in segments.values()]
+    many = max(member.count for member in population.members) >= MANY
+    loaded = native(program_text(kernels, [straight(look) for look in looks]), many=many)
     if loaded is None:
         return None
     return Library(loaded, {key: place for place, key in enumerate(segments)})
@@ -315,16 +300,14 @@ def library_of(population: Population, runs: int = 1) -> Library | None:
 def _is_worth_it(function: Any) -> bool:
     if not function.is_a("SXFunction"):
         return False
-    rows = sum(len(table_of(one).times) for one in function.find_functions(0))
+    rows = sum(len(table_of(table).times) for table in function.find_functions(0))
     return bool(function.n_instructions() + rows <= MOST_OPERATIONS)
 
 
 class Machine:
-    """The memory of all peers, once for each of the runs side by side, and the library that plays them."""
+    """The memory of all peers, and the library that plays them."""
 
-    def __init__(
-        self, library: Library, population: Population, lucks: Sequence[Luck], seed: int, runs: int
-    ) -> None:
+    def __init__(self, library: Library, population: Population, lucks: Sequence[Luck], seed: int) -> None:
         """Lay out the memory.
 
         Parameters
@@ -337,56 +320,48 @@ class Machine:
             What chance does on each of its routes.
         seed
             The experiment's.
-        runs
-            How many runs stand side by side.
         """
-        self.runs = runs
-        self.population, self.lucks, self.seed, self.kernels = population, lucks, seed, library.kernels
+        self.population, self.seed = population, seed
         self._play = library.loaded.play
-        self._play.argtypes = [
-            ctypes.c_void_p,
-            ctypes.c_int64,
-            ctypes.c_int64,
-            ctypes.c_void_p,
-            ctypes.c_void_p,
-        ]
+        self._play.argtypes = [ctypes.c_void_p, *[ctypes.c_int64] * 2, *[ctypes.c_void_p] * 2]
         self._kept: list[NDArray[Any]] = []  # arrays whose addresses the library knows
-        self._start: list[tuple[NDArray[Any], NDArray[Any] | float]] = []  # what changes, and its beginning
-        hearing = population.hearing
-        start = np.repeat(hearing.start, runs, axis=1)
-        self.packets = self._changing(np.broadcast_to(start, (hearing.ring, *start.shape)))
-        self.carries = [self._changing(self._carry(g)) for g in range(len(population.members))]
+        self._start: list[tuple[NDArray[Any], NDArray[Any]]] = []  # what changes, and its beginning
+        hearing, members = population.hearing, population.members
+        self.packets = self._changing(np.repeat(hearing.start[None], hearing.ring, axis=0))
+        self.held = [self._changing(start) for start in hearing.held]
+        self.carries = [self._changing(member.each(member.carry).T) for member in members]
+        heights = [max(segment.kernel.numel_in("heard") for segment in m.program.segments) for m in members]
         self.heard = [
-            self._own(
-                np.zeros((max(s.kernel.numel_in("heard") for s in one.program.segments), one.count * runs))
-            )
-            for one in population.members
+            self._own(np.zeros((height, member.count)))
+            for height, member in zip(heights, members, strict=True)
         ]
-        self.members = self._own(np.array([self._member(g) for g in range(len(population.members))], MEMBER))
-        self.routes = self._own(np.array([self._route(i) for i in range(len(lucks))], ROUTE))
-        listed = [one for index, some in enumerate(hearing.segments) for one in self._segment(index, some)]
-        operations = self._own(np.array([*self._work(), *listed], OPERATION))
+        self.members = self._own(np.array([self._member(g) for g in range(len(members))], MEMBER))
+        self.routes = self._own(np.array([self._route(i, luck) for i, luck in enumerate(lucks)], ROUTE))
+        operations = [
+            self._operation("work", g, population.parts.index(part), member.program.layout.work.start + row)
+            for g, member in enumerate(members)
+            for row, part in enumerate(member.program.layout.parts)
+        ]
+        for index, listed in enumerate(hearing.segments):
+            operations += [self._heard(operation) for operation in listed]
+            operations += [self._moved(g, index, library) for g in range(len(members))]
         self.plan = self._own(np.zeros(1, PLAN))
-        totals = self._own(np.zeros(max(hearing.totals, 1) * runs))
-        self._set(
+        _set(
             self.plan[0],
-            runs=runs,
             frames_kept=hearing.ring,
             keys=len(hearing.keys),
-            peers=start.shape[1],
+            peers=hearing.start.shape[1],
             operations=len(operations),
             routes=len(lucks),
             marks=population.marks,
-            width=population.width * runs,
+            width=population.width,
             parts=len(population.parts),
             frame=population.frame,
             packets=self.packets,
-            totals=totals,
-            operation=operations,
+            operation=self._own(np.array(operations, OPERATION)),
             route=self.routes,
             member=self.members,
         )
-        self.address = self.plan.ctypes.data
         self.rows = self.work = np.empty((0, 0))  # of the last call
         self.begin(0)
 
@@ -401,95 +376,67 @@ class Machine:
     def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> Played:
         """Play the frames from number `first` on (see `Player`)."""
         population = self.population
-        for g, one in enumerate(pushes):
-            if one is not None:
-                self.members["impulses"][g] = one.ctypes.data
+        for g, impulses in enumerate(pushes):
+            if impulses is not None:
+                self.members["impulses"][g] = impulses.ctypes.data
         if len(self.work) != count:
-            self.rows = np.empty((count * population.marks, population.width * self.runs))
+            self.rows = np.empty((count * population.marks, population.width))
             self.work = np.empty((count, len(population.parts)))
         self.work[:] = 0.0
-        failed = self._play(self.address, first, count, self.rows.ctypes.data, self.work.ctypes.data)
+        addresses = self.rows.ctypes.data, self.work.ctypes.data
+        failed = self._play(self.plan.ctypes.data, first, count, *addresses)
         assert not failed, "a packet is later than the latest can be"
         return Played(self.rows, self.work, count)
 
-    def in_range(self) -> Flags:
-        """Say of each run whether all that moves is still a number (see `Player`)."""
-        moving = (
-            carry[: member.program.layout.work.start]
-            for carry, member in zip(self.carries, self.population.members, strict=True)
-        )
-        columns = [one.reshape(-1, self.runs) for one in (self.packets, *moving)]
-        found: Flags = np.logical_and.reduce([np.isfinite(one).all(axis=0) for one in columns])
-        return found
+    def in_range(self) -> bool:
+        """Say whether all that moves is still a number (see `Player`)."""
+        members = zip(self.carries, self.population.members, strict=True)
+        moving = (carry[: member.program.layout.work.start] for carry, member in members)
+        return all(bool(np.isfinite(array).all()) for array in (self.packets, *moving))
 
     # ---- the layout
 
-    def _own(self, array: NDArray[Any]) -> NDArray[Any]:
+    def _own(self, array: Any) -> NDArray[Any]:
         """Keep an array, contiguous, as long as the library may look at it."""
         self._kept.append(np.ascontiguousarray(array))
         return self._kept[-1]
 
-    def _changing(self, start: NDArray[Any] | tuple[tuple[int, ...], Any, float]) -> NDArray[Any]:
-        """Return an array that begins every run as it is given: whole, or (shape, type, number)."""
-        if isinstance(start, tuple):
-            shape, type_, value = start
-            array = self._own(np.full(shape, value, type_))
-            self._start.append((array, value))
-            return array
-        array = self._own(np.array(start))
-        self._start.append((array, start))
-        return array
+    def _whole(self, array: Any) -> Integers:
+        """Keep an array of whole numbers."""
+        return self._own(np.asarray(array, np.int64))
 
-    @staticmethod
-    def _set(record: Any, **fields: Any) -> None:
-        for name, value in fields.items():
-            record[name] = value.ctypes.data if isinstance(value, np.ndarray) else value
-
-    def _carry(self, g: int) -> Floats:
-        member = self.population.members[g]
-        height = max(
-            max(one.kernel.numel_in("carry"), one.kernel.numel_out("carry_after"))
-            for one in member.program.segments
-        )
-        start = np.zeros((height, member.count))
-        start[: member.carry.shape[1]] = member.each(member.carry).T
-        return self._side_by_side(start)
-
-    def _side_by_side(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return values (…, peers), or of ways, for every run: (…, peers · runs)."""
-        return np.repeat(values, self.runs, axis=-1)
+    def _changing(self, start: NDArray[Any]) -> NDArray[Any]:
+        """Return an array that begins every run as it is given."""
+        self._start.append((self._own(np.array(start)), start))
+        return self._start[-1][0]
 
     def _member(self, g: int) -> Any:
         member = self.population.members[g]
-        constants, sites = member.constants, len(member.parameters)
-        record = np.zeros(1, MEMBER)[0]
-        self._set(
-            record,
-            count=member.count * self.runs,
-            column=int(self.population.hearing.first[g]) * self.runs,
+        sites = len(member.parameters)
+        return _set(
+            np.zeros(1, MEMBER)[0],
+            count=member.count,
+            column=int(self.population.hearing.first[g]),
             recorded=len(member.program.recorded),
             sites=sites,
             own=int(sites > 1),
             impulse_rows=member.program.impulse_rows,
             carry=self.carries[g],
             heard=self.heard[g],
-            constants=self._own(self._side_by_side(member.each(constants).T) if sites > 1 else constants[0]),
-            site=self._own(self._side_by_side(member.rows)),
+            constants=self._own(member.each(member.constants).T if sites > 1 else member.constants[0]),
+            site=self._whole(member.rows),
         )
-        return record
 
-    def _route(self, place: int) -> Any:
-        hearing, luck = self.population.hearing, self.lucks[place]
-        route, law = hearing.routes[place], luck.law
-        ways = len(route.pairs) * self.runs
+    def _route(self, place: int, luck: Luck) -> Any:
+        hearing, law = self.population.hearing, luck.law
+        route, ways = hearing.routes[place], len(hearing.routes[place].pairs)
         kept, buckets = luck.kept(route), luck.buckets(route)
         stride = ways + min(ways, buckets)  # a packet of each way, and where each run of them begins
         trace = np.zeros(0) if law.trace is None else law.trace
-        record = np.zeros(1, ROUTE)[0]
-        self._set(
-            record,
-            ways=len(route.pairs),
-            runs=self.runs,
+        ordered = 0 if luck.newest else ways  # the order of arrival matters to those
+        return _set(
+            np.zeros(1, ROUTE)[0],
+            ways=ways,
             slots=route.slots,
             ticks=route.ticks,
             phase=luck.phase,
@@ -515,128 +462,87 @@ class Machine:
             nominal=self._own(luck.nominal),
             senders=self._own(route.pairs[:, 0]),
             receivers=self._own(route.pairs[:, 1]),
-            columns=self._own(self._columns(hearing.column_of[route.pairs[:, 0]]).astype(np.int32)),
+            columns=self._own(hearing.column_of[route.pairs[:, 0]].astype(np.int32)),
             keys=self._own(hearing.channels[place]),
-            held=self._changing(self._side_by_side(hearing.held[place])),
-            effective=self._changing(((ways,), np.int64, START)),
-            gap=self._changing(((ways,), np.int64, START)),
-            bad=self._changing(((ways,), np.int8, 0)),
-            heads=self._changing(((buckets,), np.int32, -1)),
+            held=self.held[place],
+            effective=self._changing(np.full(ways, START, np.int64)),
+            gap=self._changing(np.full(ways, START, np.int64)),
+            bad=self._changing(np.zeros(ways, np.int8)),
+            heads=self._changing(np.full(buckets, -1, np.int32)),
             stride=stride,
             queue=self._own(np.empty((kept, stride), np.int32)),
             when=self._own(np.empty(ways, np.int32)),
             places=self._own(np.zeros(buckets, np.int32)),
+            arrived=self._changing(np.full(ordered, -1, np.int64)),
+            waits=self._own(np.empty((kept, ordered), np.int64)),
         )
-        if not luck.newest:
-            record["arrived"] = self._changing(((ways,), np.int64, -1)).ctypes.data
-            record["waits"] = self._own(np.empty((kept, ways), np.int64)).ctypes.data
-        return record
-
-    def _columns(self, places: Integers) -> Integers:
-        """Return where the numbers of some peers or ways stand, run by run."""
-        return (places[:, None] * self.runs + np.arange(self.runs)).reshape(-1)
 
     def _operation(self, kind: str, *whole: int, **fields: Any) -> Any:
         record = np.zeros(1, OPERATION)[0]
-        self._set(record, kind=KINDS.index(kind), **dict(zip("abcdefg", whole, strict=False)), **fields)
-        return record
+        return _set(record, kind=KINDS.index(kind), **dict(zip("abcdefg", whole, strict=False)), **fields)
 
-    def _work(self) -> list[Any]:
-        """Return what adds up the work done until a frame begins."""
-        return [
-            self._operation(
-                "work", g, self.population.parts.index(part), member.program.layout.work.start + row
-            )
-            for g, member in enumerate(self.population.members)
-            for row, part in enumerate(member.program.layout.parts)
-        ]
-
-    def _segment(self, index: int, operations: Sequence[Operation]) -> list[Any]:
-        """Return what is done in a segment of all members."""
-        found = [one for operation in operations for one in self._heard(operation)]
+    def _moved(self, g: int, index: int, library: Library) -> Any:
+        """Return what moves a member over a segment."""
         population = self.population
-        for g, member in enumerate(population.members):
-            program = member.program
-            before = program.segments[:index]
-            recorded = max(len(program.recorded), 1)
-            marks = sum(one.kernel.numel_out("rows") for one in before) // recorded
-            pushed = sum(one.kernel.numel_in("impulses") for one in before)
-            keys = np.array(
-                [population.hearing.sent[g][row] for row in program.segments[index].sent], np.int64
-            )
-            kernel = self.kernels[id(program.segments[index])]
-            where = (g, kernel, marks, population.columns[g] * self.runs, pushed)
-            found.append(self._operation("move", *where, p=self._own(keys)))
-        return found
+        segment = population.members[g].program.segments[index]
+        keys = self._whole([population.hearing.sent[g][row] for row in segment.sent])
+        where = (library.kernels[id(segment)], segment.first_mark, population.columns[g])
+        return self._operation("move", g, *where, segment.first_impulse, p=keys)
 
-    def _heard(self, one: Operation) -> list[Any]:
-        match one:
-            case Total(place, key, lag, ranges):
-                listed = self._own(np.array(ranges, np.int64))
-                return [self._operation("total", place, key, lag, len(ranges), p=listed)]
-            case Complete(g, row, total, key, lag, divisor):
-                return [self._operation("complete", g, total, key, lag, x=divisor, v=self.heard[g][row])]
-            case Weighed(g, row, key, lag, weights):
-                fields = self._weights(weights)
-                return [self._operation("weighed", g, key, lag, v=self.heard[g][row], **fields)]
+    def _read(self, source: Source) -> tuple[int, int, int]:
+        """Return where a source stands: a packet's key and lag, or −1 and an address."""
+        if isinstance(source, Arrived):
+            return -1, 0, self.held[source.route][source.row].ctypes.data
+        return source.key, source.lag, 0
+
+    def _heard(self, operation: Operation) -> Any:
+        match operation:
+            case Complete(g, row, packet, ranges, own, divisor):
+                where = (g, packet.key, packet.lag, len(ranges), int(own))
+                to = self.heard[g][row]
+                return self._operation("complete", *where, x=divisor, p=self._whole(ranges), v=to)
+            case Weighed(g, row, source, weights):
+                fields = {
+                    "p": self._whole(weights.indptr),
+                    "q": self._whole(weights.indices),
+                    "u": self._own(weights.data),
+                }
+                key, lag, address = self._read(source)
+                return self._operation("weighed", g, key, lag, r=address, v=self.heard[g][row], **fields)
             case Deliver(route, tick):
-                return [self._operation("deliver", route, tick)]
-            case OnWays(g, row, route, channel, gap, weights):
-                fields = self._weights(weights)
-                alike = bool(len(weights.weights)) and bool((weights.weights == weights.weights[0]).all())
-                side = bool((np.diff(weights.columns) == 1).all())
-                same = int(alike and side)
-                where = (g, route, 0, channel, int(gap), same)
-                weight = float(weights.weights[0]) if same else 0.0
-                return [self._operation("on ways", *where, x=weight, v=self.heard[g][row], **fields)]
-        return self._look(one)
+                return self._operation("deliver", route, tick)
+        return self._look(operation)
 
-    def _weights(self, weights: Sparse) -> dict[str, NDArray[Any]]:
-        return {
-            "p": self._own(weights.starts),
-            "q": self._own(weights.columns),
-            "u": self._own(weights.weights),
-        }
-
-    def _look(self, one: Look) -> list[Any]:
-        """Return what copies the packets that are looked at side by side, and looks at them."""
-        member, runs = self.population.members[one.member], self.runs
-        count = member.count * runs
-        height = len(one.channels) if one.route >= 0 else len(one.sources)
-        width = one.width * runs
-        inside = self._own(np.zeros((height + 1, width)))  # what is heard, then what is missing
-        found = []
-        for row, source in zip(inside, one.sources, strict=False):
-            to = 0
-            for key, lag, ranges in source:
-                for begin, end in ranges:
-                    size = (end - begin) * runs
-                    found.append(self._operation("copy", key, lag, begin * runs, size, v=row[to:]))
-                    to += size
-        if one.route >= 0:
-            every = [*one.channels, -1] if one.gap else one.channels
-            for row, channel in zip((*inside[: len(one.channels)], inside[-1]), every, strict=False):
-                found.append(self._operation("copy ways", one.route, channel, v=row))
-        carry, constants = self.carries[one.member], int(self.members["constants"][one.member])
+    def _look(self, look: Look) -> Any:
+        """Return what looks at each pair."""
+        member = self.population.members[look.member]
+        carry, constants = self.carries[look.member], int(self.members["constants"][look.member])
         own = len(member.parameters) > 1
-        rows = [(carry[row].ctypes.data, 1) for row in one.pairwise.carry]
-        rows += [(constants + 8 * row * (count if own else 1), int(own)) for row in one.pairwise.constants]
-        listed = np.concatenate([self._columns(one.receivers), np.array(rows, np.int64).reshape(-1)])
-        schedule = member.program.schedule
-        arcs = len(one.senders) * runs
-        where = (one.member, one.function, arcs, OPERATORS[one.operator], width, height)
-        found.append(
-            self._operation(
-                "look",
-                *where,
-                one.pairwise.now,
-                y=float(schedule.quantum.numerator),
-                z=float(schedule.quantum.denominator),
-                p=self._own(self._columns(one.senders)),
-                q=self._own(listed),
-                u=self._own(self._side_by_side(one.weights)),
-                v=inside,
-                w=self.heard[one.member][one.row],
-            )
+        rows = [(carry[row].ctypes.data, 1) for row in look.pairwise.carry]
+        stride = 8 * (member.count if own else 1)
+        rows += [(constants + stride * row, int(own)) for row in look.pairwise.constants]
+        sources = [self._read(source) for source in look.sources]
+        listed = [look.receivers, np.array(rows, np.int64).ravel(), np.array(sources, np.int64).ravel()]
+        quantum = member.program.schedule.quantum
+        where = (look.function, len(look.senders), OPERATORS[look.operator], int(look.first), len(sources))
+        return self._operation(
+            "look",
+            look.member,
+            *where,
+            look.pairwise.now,
+            x=float(len(rows)),
+            y=float(quantum.numerator),
+            z=float(quantum.denominator),
+            p=self._own(look.senders),
+            q=self._own(np.concatenate(listed)),
+            u=self._own(look.weights),
+            r=self._read(look.missing)[2] if look.missing else 0,
+            v=self.heard[look.member][look.row],
         )
-        return found
+
+
+def _set(record: Any, **fields: Any) -> Any:
+    """Fill in a structure: numbers, and the addresses of arrays."""
+    for name, value in fields.items():
+        record[name] = value.ctypes.data if isinstance(value, np.ndarray) else value
+    return record

@@ -25,10 +25,9 @@ from apc.frame.exchange import Exchange
 from apc.frame.schedule import Propagate, Schedule, Tick
 from apc.network.timetable import Route
 from apc.simulation.hearing import Hearing, hearing_of
-from apc.simulation.program import Member
+from apc.simulation.program import Member, timed_events
 
 Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,10 +50,9 @@ class Population:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Played:
-    """Some frames: `rows` (frames · marks, width · runs), `work` (frames, parts) in J until each begins.
+    """Some frames: `rows` (frames · marks, width), `work` (frames, parts) in J until each begins.
 
-    Each number of a row stands there once a run, side by side; the work is that of all runs. Only the first
-    `frames` could be played.
+    Only the first `frames` could be played.
     """
 
     rows: Floats
@@ -63,12 +61,10 @@ class Played:
 
 
 class Player(Protocol):
-    """Plays a population, frame after frame: `runs` runs of one seed, which differ in their packets."""
-
-    runs: int
+    """Plays a population, frame after frame; the runs of one seed differ in their packets."""
 
     def begin(self, run: int) -> None:
-        """Go back to time 0; `run` is the number of the first run, the others follow it."""
+        """Go back to time 0 of the run of a number."""
 
     def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> Played:
         """Play the frames from number `first` on; of the members with impulses `pushes` are these.
@@ -76,8 +72,8 @@ class Player(Protocol):
         They are (frames, rows, sites). What is returned may be written over by the next call.
         """
 
-    def in_range(self) -> Flags:
-        """Say of each run whether all that moves, recorded or not, is still a number; its work may not be."""
+    def in_range(self) -> bool:
+        """Say whether all that moves, recorded or not, is still a number; its work may not be."""
 
 
 def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
@@ -88,40 +84,29 @@ def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
     slots = {one.sent for schedule in schedules for one in schedule.heard if one.lag == 0}
     # Over an unreliable link anything may be heard as soon as it is sent.
     any_time = {one.way.link for schedule in schedules for one in schedule.selected}
-    slots |= {sent for schedule in schedules for sent in schedule.sent if sent.link in any_time}
-    instants = {
-        schedule.sent_times[place]
+    found = {
+        at
         for schedule in schedules
-        for place, sent in enumerate(schedule.sent)
-        if sent in slots
+        for sent, at in zip(schedule.sent, schedule.sent_times, strict=True)
+        if sent in slots or sent.link in any_time
     }
-    return tuple(sorted(instants.union(*(_looks(schedule) for schedule in schedules))))
-
-
-def instants_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
-    """Return the instants, in quanta, at which anything is computed or sent within the frame."""
-    found = set()
     for schedule in schedules:
-        now = 0
-        for event in schedule.events:
-            if isinstance(event, Propagate):
-                now += event.duration
-            else:
+        for now, event in timed_events(schedule):
+            heard = (row for rows in event.heard for row in rows) if isinstance(event, Tick) else ()
+            if any(schedule.received[row].way.edge for row in heard):
                 found.add(now)
     return tuple(sorted(found))
 
 
-def _looks(schedule: Schedule) -> set[int]:
-    """Return the instants, in quanta, of the ticks that look at each sender by itself."""
-    now, found = 0, set()
-    for event in schedule.events:
-        if isinstance(event, Propagate):
-            now += event.duration
-        elif isinstance(event, Tick):
-            rows = [row for one in event.heard for row in one]
-            if any(schedule.received[row].way.edge for row in rows):
-                found.add(now)
-    return found
+def instants_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
+    """Return the instants, in quanta, at which anything is computed or sent within the frame."""
+    found = {
+        now
+        for schedule in schedules
+        for now, event in timed_events(schedule)
+        if not isinstance(event, Propagate)
+    }
+    return tuple(sorted(found))
 
 
 def refuse_unheard_of(system: CompiledSystem) -> None:

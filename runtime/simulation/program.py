@@ -1,8 +1,8 @@
 """One frame of one site as compiled steps, and the peers that take them.
 
-Takes: sites' parameters, what each interval does to them (`Transitions`), their start values; which of a
+Takes: sites' parameters, what each interval does to them, their start values; which of a
 group's different sites each peer is.
-Gives: `Program`, `Segment`, `Layout`; `Member`, `build_member`; `seconds_at`.
+Gives: `Program`, `Segment`, `Layout`; `Member`, `build_member`; `timed_events`, `seconds_at`.
 Guarantees: the carry at time 0 is what was never computed, as zero, and the states where they start; what
 many peers have in common is kept once.
 Does not: write the steps (see `writing`), or know the other members (see `frame_packets`, `population`).
@@ -17,6 +17,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -24,10 +26,10 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.schedule import Schedule, Value
+from apc.frame.schedule import Event, Propagate, Schedule, Value
 from apc.frame.start import start_values
 from apc.simulation.pairs import Pairwise
-from apc.simulation.propagate import Rates, Transitions
+from apc.simulation.propagate import Rates
 from apc.simulation.signals import LocalSignal
 
 Floats = NDArray[np.float64]
@@ -35,41 +37,50 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The rows of the carry at the start of a frame: x, newest outputs, values to act later, work.
+    """The rows of the carry: x, newest outputs, what holds put out, values to act later, work.
 
-    `outputs` are the (clock partition, output) pairs that are computed; `later` are values of earlier frames
-    that a hold puts out in this one or after; `parts` are those whose work is added up.
+    `outputs` are the (clock partition, output) pairs that are remembered or recorded; `later` are values of
+    earlier frames, or of earlier segments, that a hold puts out after; `parts` are those whose work is added
+    up.
     """
 
     states: int
     outputs: tuple[tuple[int, int], ...]
+    holds: int
     later: tuple[Value, ...]
     parts: tuple[str, ...]
 
     @property
-    def size(self) -> int:
-        """The number of rows."""
-        return self.states + len(self.outputs) + len(self.later) + len(self.parts)
+    def ends(self) -> tuple[int, ...]:
+        """Where each of these begins, and the last ends."""
+        sizes = (self.states, len(self.outputs), self.holds, len(self.later), len(self.parts))
+        return tuple(accumulate(sizes, initial=0))
+
+    @property
+    def held(self) -> slice:
+        """The rows that hold what holds put out."""
+        return slice(*self.ends[2:4])
 
     @property
     def work(self) -> slice:
         """The rows that hold the work done so far, in J."""
-        return slice(self.size - len(self.parts), self.size)
+        return slice(*self.ends[4:])
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
     """A stretch of the frame: `kernel` is the function above; `heard`, `sent` are rows of the schedule.
 
-    After those rows the kernel hears what comes of each of `pairs`. `held` are the rows of the carry after it
-    with what each hold puts out then, −1 for what was never computed.
+    After those rows the kernel hears what comes of each of `pairs`. Of a frame's rows and impulses its first
+    are `first_mark` and `first_impulse`.
     """
 
     kernel: Any  # casadi.Function
     heard: tuple[int, ...]
     pairs: tuple[Pairwise, ...]
     sent: tuple[int, ...]
-    held: tuple[int, ...]
+    first_mark: int
+    first_impulse: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +88,8 @@ class Program:
     """A site's frame. `recorded` are the signals of each row; `timed` says that the frame's number matters.
 
     `durations` are the intervals' lengths in quanta, in the order of a site's constants; `intervals` are
-    (start, place in `durations`) of each interval, for the impulses of forces that change with time.
+    (start, place in `durations`) of each interval, for the impulses of forces that change with time; `moves`
+    are what segments integrate by, which has to outlive them.
     """
 
     kind: Kind
@@ -88,42 +100,28 @@ class Program:
     recorded: tuple[LocalSignal, ...]
     durations: tuple[int, ...]
     intervals: tuple[tuple[int, int], ...]
+    moves: tuple[Any, ...]
+
+    @property
+    def seconds(self) -> tuple[Fraction, ...]:
+        """The intervals' lengths in seconds."""
+        return tuple(length * self.schedule.quantum for length in self.durations)
 
     @property
     def impulse_rows(self) -> int:
         """How many numbers the impulses of one frame are."""
-        return int(self.rates.g.sum()) * len(self.intervals) if self.rates.timed else 0
+        return len(self.rates.pushed) * len(self.intervals) if self.rates.timed else 0
 
-    def constants(self, parameters: Floats, transitions: Transitions) -> Floats:
-        """Return a site's constants, of many (sites, rows): parameters, then E, F and c of each duration."""
-        rates, n_x = self.rates, self.layout.states
-        parts = [parameters]
-        for matrix in transitions.matrices:
-            e, f, c = np.split(matrix, [n_x, matrix.shape[-1] - 1], axis=-1)
-            parts += [e[..., rates.e], f[..., rates.f], c[..., rates.g, 0]]
-        return np.concatenate(parts, axis=-1)
+    def constants(self, parameters: Floats, transitions: Sequence[Floats]) -> Floats:
+        """Return sites' constants (sites, rows): parameters, then each duration's [E F c], columns first."""
+        columns = self.rates.pattern.T
+        return np.concatenate([parameters, *(one.swapaxes(1, 2)[:, columns] for one in transitions)], axis=1)
 
-    def start(
-        self, x: Sequence[Floats | float], remembered: Sequence[Sequence[Floats | float]], *, sites: int = 1
-    ) -> Floats:
-        """Return the carry at time 0 (sites, rows), when nothing is computed yet.
 
-        Parameters
-        ----------
-        x
-            The states' start values, each a number or (sites,).
-        remembered
-            Those of the remembered outputs of every clock partition.
-        sites
-            How many.
-        """
-        newest: dict[tuple[int, int], Floats | float] = dict.fromkeys(self.layout.outputs, 0.0)
-        for p, (partition, values) in enumerate(zip(self.kind.clocks, remembered, strict=True)):
-            newest |= {(p, o): one for o, one in zip(partition.memories, values, strict=True)}
-        carry = np.zeros((sites, self.layout.size))
-        for row, one in enumerate([*x, *(newest[one] for one in self.layout.outputs)]):
-            carry[:, row] = one
-        return carry
+def timed_events(schedule: Schedule) -> list[tuple[int, Event]]:
+    """Return what happens in a frame, each with its instant in quanta."""
+    lengths = [event.duration if isinstance(event, Propagate) else 0 for event in schedule.events]
+    return list(zip(accumulate(lengths, initial=0), schedule.events, strict=False))
 
 
 def seconds_at(schedule: Schedule, frame: Any, now: int) -> Any:
@@ -167,7 +165,7 @@ def build_member(
     rows: NDArray[np.int64],
     vectors: Floats,
     program: Program,
-    transitions: Transitions,
+    transitions: Sequence[Floats],
 ) -> Member:
     """Collect what some peers of a group bring to a population.
 
@@ -186,20 +184,26 @@ def build_member(
         What each peer does in a frame.
     """
     used, own = np.unique(rows, return_inverse=True)
-    some = vectors[used]
+    some, kind, layout = vectors[used], site.kind, program.layout
     x, _, remembered = start_values(site, list(some.T))
-    kind, states = site.kind, np.array(x).reshape(len(x), len(some))
-    still = np.zeros((len(kind.holds), len(some)))
+    carry = np.zeros((len(some), layout.ends[-1]))
+    for row, value in enumerate(x):
+        carry[:, row] = value
+    for p, (partition, values) in enumerate(zip(kind.clocks, remembered, strict=True)):
+        for output, value in zip(partition.memories, values, strict=True):
+            if (p, output) in layout.outputs:  # else its clock never ticks
+                carry[:, layout.states + layout.outputs.index((p, output))] = value
+    states, still = carry[:, : layout.states].T, np.zeros((layout.holds, len(some)))
     return Member(
         group=group,
         peers=peers,
         program=program,
         rows=own,
         parameters=some,
-        constants=program.constants(some, transitions.chosen(used)),
+        constants=program.constants(some, [one[used] for one in transitions]),
         sends={
             one.link: np.asarray(one.send.map(len(some))(states, still, some.T, 0.0), np.float64).T
             for one in kind.sends
         },
-        carry=program.start(x, remembered, sites=len(some)),
+        carry=carry,
     )

@@ -1,8 +1,7 @@
 """What a site's continuous states do from event to event: the exact transition of a linear partition.
 
 Takes: a `Kind` and parameter vectors.
-Gives: `Rates`, `rates`, `Transitions`, `transitions`, `transition_rows`, `perturbed`; `exact_rates`;
-`nonlinear_rows`.
+Gives: `Rates`, `rates`, `transition_rows`, `perturbed`; `exact_rates`; `nonlinear_rows`.
 Guarantees: no step size; every entry of a transition is right to the last digit but one, of many different
 sites to some tens of roundings of the largest.
 Does not: integrate what is not linear (see `flow`), or know what changes with time alone (see `forcing`).
@@ -35,6 +34,7 @@ MOST_EXACT = 100
 CLOSE = 1e-14
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 Pattern = NDArray[np.bool_]
 
 
@@ -43,29 +43,21 @@ class Rates:
     """The continuous equations of a kind, linear in x and u.
 
     `matrices(p)` is [A B g] (n_x, n_x + n_u + 1), column-major, with the part of g that does not change;
-    `timed` says that g changes with time: then g is zero there, and `rate(p, t)` gives it. `e`, `f` and `g`
-    are where E, F and c can differ from zero, whatever the numbers. States that are moved otherwise have
-    no entries.
+    `timed` says that g changes with time: then g is zero there, and `rate(p, t)` gives it. `pattern` is where
+    a transition [E F c] can differ from zero, whatever the numbers. States that are moved otherwise have no
+    entries.
     """
 
     kind: Kind
     matrices: Any  # casadi.Function
     rate: Any  # casadi.Function
     timed: bool
-    e: Pattern  # (n_x, n_x)
-    f: Pattern  # (n_x, n_u)
-    g: Pattern  # (n_x,)
+    pattern: Pattern  # (n_x, n_x + n_u + 1)
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Transitions:
-    """[E F c] (n_x, n_x + n_u + 1) of one site for every duration, of many sites (sites, …)."""
-
-    matrices: tuple[Floats, ...]
-
-    def chosen(self, sites: NDArray[np.int64]) -> Transitions:
-        """Return those of some of many sites."""
-        return Transitions(tuple(one[sites] for one in self.matrices))
+    @property
+    def pushed(self) -> Integers:
+        """The states that g can move."""
+        return np.flatnonzero(self.pattern[:, -1])
 
 
 def nonlinear_rows(kind: Kind) -> tuple[int, ...]:
@@ -95,44 +87,38 @@ def rates(kind: Kind, moved: Sequence[int] = ()) -> Rates:
         E870 the others' equations are not linear.
     """
     moving, p, t, speed = _symbols(kind)
-    n_x, rest = len(kind.states), sorted(set(range(len(kind.states))) - set(moved))
-    curved = sorted(set(_curved(speed, moving, t)) & set(rest))
+    n_x, type_ = len(kind.states), type(moving)
+    own: Pattern = ~np.isin(np.arange(n_x), list(moved))
+    curved = [row for row in _curved(speed, moving, t) if own[row]]
     if curved:
         raise _nonlinear(kind, curved, speed, moving, p)
-    slopes = jacobian(speed, moving)
-    type_ = type(moving)
-    at_rest = kind.derivative(type_.zeros(n_x), type_.zeros(len(kind.holds)), p, t)
-    still = type_.zeros(n_x, 1)
-    for row in rest:
-        still[row] = at_rest[row]
-    kept = casadi.diag(casadi.DM([float(row in rest) for row in range(n_x)]))
-    slopes = casadi.sparsify(kept) @ slopes
+    kept = casadi.sparsify(casadi.diag(casadi.DM(own.astype(float))))
+    slopes = kept @ jacobian(speed, moving)
+    still = kept @ kind.derivative(type_.zeros(n_x), type_.zeros(len(kind.holds)), p, t)
     if type_ is casadi.MX:  # the same wherever they are taken, but a loop's solution is of somewhere
         at = casadi.Function("slopes", [moving, p, t], [slopes])
         slopes = at(type_.zeros(moving.numel()), p, 0)
     timed = bool(still.numel() and casadi.depends_on(still, t))
-    constant = type_.zeros(*still.shape) if timed else still
+    constant = type_.zeros(n_x, 1) if timed else casadi.densify(still)
     structure = structural_pattern(slopes)
-    reach = _closure(structure[:, :n_x])
-    pushed = (
-        np.ones(n_x, dtype=bool) if type_ is casadi.MX else structural_pattern(casadi.sparsify(still))[:, 0]
-    )
+    pushed: Pattern = np.ones(n_x, dtype=bool)
+    if type_ is casadi.SX:
+        pushed = structural_pattern(casadi.sparsify(still))[:, 0]
     flat = casadi.vec(casadi.horzcat(casadi.densify(slopes), constant))
     if type_ is casadi.MX:  # which names the symbols of the other rows, even where no value hangs on them
         flat = casadi.substitute([flat], [moving, t], [type_.zeros(*moving.shape), type_(0)])[0]
-    own: Pattern = np.isin(np.arange(n_x), rest)
+    reach = _closure(structure[:, :n_x])
+    inputs = np.hstack([structure[:, n_x:], pushed[:, None]])
     return Rates(
         kind=kind,
         matrices=casadi.Function("matrices", [p], [flat]),
-        rate=casadi.Function("rate", [p, t], [still]),
+        rate=casadi.Function("rate", [p, t], [casadi.densify(still)]),
         timed=timed,
-        e=reach & own[:, None],
-        f=((reach.astype(int) @ structure[:, n_x:].astype(int)) > 0) & own[:, None],
-        g=((reach.astype(int) @ pushed.astype(int)) > 0) & own,
+        pattern=np.hstack([reach, (reach.astype(int) @ inputs.astype(int)) > 0]) & own[:, None],
     )
 
 
-def perturbed(exact: Transitions, seed: int) -> Transitions:
+def perturbed(exact: Sequence[Floats], seed: int) -> tuple[Floats, ...]:
     """Return the same transitions with every number off by one rounding, up or down by chance.
 
     Parameters
@@ -143,35 +129,11 @@ def perturbed(exact: Transitions, seed: int) -> Transitions:
         Of the chance.
     """
     chance = np.random.default_rng(seed)
-
-    def moved(matrix: Floats) -> Floats:
-        towards = np.where(chance.random(matrix.shape) < 0.5, -np.inf, np.inf)
-        return np.where(matrix == 0, 0.0, np.nextafter(matrix, towards))
-
-    return Transitions(tuple(moved(one) for one in exact.matrices))
-
-
-def transitions(rates_of: Rates, parameters: Floats, durations: Sequence[Fraction]) -> Transitions:
-    """Return what a site does in every duration.
-
-    Parameters
-    ----------
-    rates_of
-        The kind's equations.
-    parameters
-        The site's vector (n_p,).
-    durations
-        In seconds.
-
-    Raises
-    ------
-    ApcError
-        E806 something grows beyond the range of floats within a duration.
-    """
-    n_x = len(rates_of.kind.states)
-    whole = exact_rates(rates_of, parameters)
-    steps = discretize(whole[:, :n_x], whole[:, n_x:], durations)
-    return Transitions(tuple(step.matrix for step in steps))
+    ways = (np.where(chance.random(matrix.shape) < 0.5, -np.inf, np.inf) for matrix in exact)
+    return tuple(
+        np.where(matrix == 0, 0.0, np.nextafter(matrix, towards))
+        for matrix, towards in zip(exact, ways, strict=True)
+    )
 
 
 def exact_rates(rates_of: Rates, parameters: Floats) -> NDArray[Any]:
@@ -187,8 +149,8 @@ def exact_rates(rates_of: Rates, parameters: Floats) -> NDArray[Any]:
     return np.array(exact, dtype=object).reshape((n_x, n_x + n_u + 1), order="F")
 
 
-def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fraction]) -> Transitions:
-    """Return what many sites do in every duration, (sites, n_x, n_x + n_u + 1) each.
+def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fraction]) -> tuple[Floats, ...]:
+    """Return what many sites do in every duration, [E F c] (sites, n_x, n_x + n_u + 1) each.
 
     Sites that differ in nothing the continuous equations read share a transition. More than `MOST_EXACT`
     different ones are stepped in floats, all at once, but for those whose bound says that this is less exact
@@ -206,14 +168,12 @@ def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fracti
     Raises
     ------
     ApcError
-        As `transitions`.
+        E806 something grows beyond the range of floats within a duration.
     """
-    n_x, width = len(rates_of.kind.states), len(rates_of.kind.states) + len(rates_of.kind.holds) + 1
+    n_x, width = rates_of.pattern.shape
     flat = np.asarray(rates_of.matrices.map(len(vectors))(vectors.T), np.float64).T
-    # One column at least, and no −0.
-    told = np.ascontiguousarray(np.hstack([flat, np.zeros((len(flat), 1))]) + 0.0)
-    keys = told.view(np.dtype((np.void, told.shape[1] * told.itemsize)))[:, 0]
-    _, first, which = np.unique(keys, return_index=True, return_inverse=True)
+    one_column_at_least = np.hstack([flat, np.zeros((len(flat), 1))])
+    _, first, which = np.unique(one_column_at_least, axis=0, return_index=True, return_inverse=True)
     exactly = np.ones(len(first), np.bool_)
     found = [np.empty((len(first), n_x, width)) for _ in durations]
     if len(first) > MOST_EXACT:
@@ -225,24 +185,19 @@ def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fracti
             error, size = step.roundings * UNIT * step.size, np.abs(matrix)
             exactly |= ~(error <= CLOSE * size.max(axis=(1, 2), keepdims=True)).all(axis=(1, 2))
     for place in np.flatnonzero(exactly).tolist():
-        own = transitions(rates_of, vectors[first[place]], durations)
-        for matrix, one in zip(found, own.matrices, strict=True):
-            matrix[place] = one
-    return Transitions(tuple(matrix[which] for matrix in found))
+        whole = exact_rates(rates_of, vectors[first[place]])
+        for matrix, step in zip(found, discretize(whole[:, :n_x], whole[:, n_x:], durations), strict=True):
+            matrix[place] = step.matrix
+    return tuple(matrix[which.reshape(-1)] for matrix in found)
 
 
 def _symbols(kind: Kind) -> tuple[Any, Any, Any, Any]:
     """Return (x, u), p and t as symbols, and the rates of change."""
     type_: Any = casadi.SX if kind.derivative.is_a("SXFunction") else casadi.MX
-    x, u = type_.sym("x", len(kind.states)), type_.sym("u", len(kind.holds))
-    p, t = type_.sym("p", len(kind.parameters)), type_.sym("t")
-    speed = kind.derivative(x, u, p, t)
-    if type_ is casadi.SX:
-        return casadi.vertcat(x, u), p, t, speed
-    # A derivative is taken with respect to a symbol, which a column of two is not.
-    both = type_.sym("moving", x.numel() + u.numel())
-    speed = kind.derivative(both[: x.numel()], both[x.numel() :], p, t)
-    return both, p, t, speed
+    n_x, n_u = len(kind.states), len(kind.holds)
+    moving, p, t = type_.sym("moving", n_x + n_u), type_.sym("p", len(kind.parameters)), type_.sym("t")
+    x, u = casadi.vertsplit(moving, [0, n_x, n_x + n_u])
+    return moving, p, t, kind.derivative(x, u, p, t)
 
 
 def _curved(speed: Any, moving: Any, t: Any) -> list[int]:

@@ -161,21 +161,15 @@ def choose(
         wanted = np.full((group.count, len(found)), not patterns)
         for pattern, test in tests:
             for place, local in enumerate(found):
-                if test.fullmatch(local.name):
-                    wanted[:, place] = True
-                    used.add(pattern)
-                elif "[" in pattern or pattern.startswith(("*", group.name)):
+                fits = [bool(test.fullmatch(local.name))]
+                if not fits[0] and ("[" in pattern or pattern.startswith(("*", group.name))):
                     names = (f"{group.name}[{i + 1}].{local.name}" for i in range(group.count))
-                    fits = np.fromiter((bool(test.fullmatch(name)) for name in names), bool, group.count)
-                    wanted[:, place] |= fits
-                    used |= {pattern} if fits.any() else set()
-        kept: NDArray[np.bool_] = np.any(wanted, axis=0)
-        choices.append(
-            Choice(
-                tuple(local for local, keep in zip(found, kept.tolist(), strict=True) if keep),
-                np.ascontiguousarray(wanted[:, kept]),
-            )
-        )
+                    fits = [bool(test.fullmatch(name)) for name in names]
+                wanted[:, place] |= fits
+                used |= {pattern} if any(fits) else set()
+        recorded = np.flatnonzero(wanted.any(axis=0))
+        locals_ = tuple(found[place] for place in recorded.tolist())
+        choices.append(Choice(locals_, np.ascontiguousarray(wanted[:, recorded])))
     for pattern in patterns:
         if pattern not in used:
             _refuse(system, available, pattern)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from apc.frame.scheduling import build_schedules
 from apc.memory import refuse_beyond
 from apc.network.timetable import Luck, Route, Timetable, luck_of, routes_of
 from apc.simulation.flow import Flow, Tolerance, flow_of, rows_to_move, state_scales
-from apc.simulation.forcing import SiteForcing, forcing_of
+from apc.simulation.forcing import Kernel, SiteForcing, site_forcing
 from apc.simulation.machine import Library, Machine, library_of
 from apc.simulation.pairs import count_pairs
 from apc.simulation.population import (
@@ -41,12 +42,10 @@ from apc.simulation.population import (
     refuse_unheard_of,
 )
 from apc.simulation.program import Member, Program, build_member
-from apc.simulation.propagate import Transitions, exact_rates, perturbed, rates, transition_rows
-from apc.simulation.quadrature import Kernel, kernel_of
+from apc.simulation.propagate import perturbed, rates, transition_rows
 from apc.simulation.settings import CVODES, EXACT, WHERE_NEEDED, Method, Settings, check_step
 from apc.simulation.signals import (
     Choice,
-    LocalSignal,
     Signal,
     choose,
     local_signals,
@@ -59,8 +58,8 @@ from apc.simulation.writing import build_program
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Numbers that one call of a player gives out, at most, if a frame gives fewer: 4 MiB stay in the machine's
-# caches.
+# Numbers that one call of a player takes and gives out, at most, if a frame has fewer: 4 MiB stay in the
+# machine's caches.
 CHUNK = 2**19
 ROW = Fraction(1, 1000)  # seconds from row to row of a scene in which nothing ticks
 MOST_FRAMES = 2000  # of one chunk: what has left the range of floats is noticed at its end
@@ -83,17 +82,17 @@ class Simulation:
     """A scene ready to be played.
 
     `signals` are the columns of what comes out, the `order` (signals,) of which in a row of the population is
-    another; `marks` the instants of a frame's rows, in quanta, of which those not in `ticks` make a row at
-    time 0 only; `forces` are those that change with time, of each member's different sites. `lucks` are what
-    chance does on the unreliable links, `seed` is what it begins from: that of the settings, or of the
-    experiment. `library` is the machine code, None if there is none. `length` frames are played at a time.
+    another; `marks` the instants of a frame's rows, in quanta, the first of which makes a row at time 0 only
+    unless `ticks_at_zero`; `forces` are those that change with time, of each member's different sites.
+    `lucks` are what chance does on the unreliable links, `seed` is what it begins from: that of the settings,
+    or of the experiment. `library` is the machine code, None if there is none. `length` frames are played at
+    a time.
     `tolerances` are of the states that CVODES moves, `sent` the names of those that peers send as they are.
     """
 
     system: CompiledSystem
     settings: Settings
     population: Population
-    choices: tuple[Choice, ...]
     signals: tuple[Signal, ...]
     order: Integers
     forces: tuple[tuple[SiteForcing, ...], ...]
@@ -104,14 +103,9 @@ class Simulation:
     quantum: Fraction
     frame: int
     marks: tuple[int, ...]
-    ticks: frozenset[int]
+    ticks_at_zero: bool
     library: Library | None
     length: int
-
-    @property
-    def compiled(self) -> bool:
-        """Whether it runs in machine code."""
-        return self.library is not None
 
     @property
     def how(self) -> str:
@@ -126,19 +120,13 @@ class Simulation:
         """How many rows there are at most: those of whole frames."""
         return (int(self.settings.duration / self.quantum) // self.frame + 1) * len(self.marks)
 
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """The parts whose work is added up."""
-        return self.population.parts
-
-    def player(self, runs: int = 1) -> Player:
-        """Return what plays it, with memory of its own, in machine code as many runs side by side."""
+    def player(self) -> Player:
+        """Return what plays it, with memory of its own."""
         if self.library is not None:
-            return Machine(self.library, self.population, self.lucks, self.seed, runs)
-        return Stepwise(self.population, self._timetable if self.lucks else None)
-
-    def _timetable(self, run: int) -> Timetable:
-        return Timetable(self.population.hearing.routes, self.lucks, seed=self.seed, run=run)
+            return Machine(self.library, self.population, self.lucks, self.seed)
+        routes = self.population.hearing.routes
+        timetable = partial(Timetable, routes, self.lucks, seed=self.seed)
+        return Stepwise(self.population, (lambda run: timetable(run=run)) if routes else None)
 
 
 @part("prepare")
@@ -147,7 +135,6 @@ def prepare(
     settings: Settings,
     *,
     signals: Sequence[str] = (),
-    runs: int = 1,
     live: bool = False,
 ) -> Simulation:
     """Do what comes before the first instant.
@@ -160,8 +147,6 @@ def prepare(
         How it is played.
     signals
         Patterns of the signals to record, all if there is none; see `signals.choose`.
-    runs
-        How many runs will stand side by side; it decides how machine code is made, not what comes out.
     live
         Whether it will be played instant by instant, as what is heard at one is known no sooner.
 
@@ -179,16 +164,15 @@ def prepare(
         choices = _choices(plan, signals)
         members = _members(plan, choices, settings.method, live=live)
         population = build_population(plan.exchange, members, plan.routes)
-    schedule = plan.schedules[0]
+    schedule, listed = plan.schedules[0], signals_of(system, choices)
     marks = schedule.marks[:-1]
     timings, quantum = plan.numbers.timings, schedule.quantum
     return Simulation(
         system=system,
         settings=settings,
         population=population,
-        choices=choices,
-        signals=signals_of(system, choices),
-        order=_order(system, population, choices),
+        signals=listed,
+        order=_order(system, population, listed),
         forces=tuple(_forces(member) for member in members),
         lucks=tuple(luck_of(system, timings, plan.exchange, route, quantum) for route in plan.routes),
         seed=system.experiment.seed if settings.seed is None else settings.seed,
@@ -197,8 +181,8 @@ def prepare(
         quantum=quantum,
         frame=schedule.frame,
         marks=marks,
-        ticks=frozenset(marks if _ticks_at_zero(system, plan.numbers) else marks[1:]),
-        library=library_of(population, runs) if settings.jit else None,
+        ticks_at_zero=_ticks_at_zero(system, plan.numbers),
+        library=library_of(population) if settings.jit else None,
         length=_chunk_length(population, settings.duration),
     )
 
@@ -310,13 +294,18 @@ def _members(plan: Plan, choices: Sequence[Choice], method: Method, *, live: boo
     groups = zip(system.groups, plan.schedules, choices, strict=True)
     for group, (one, schedule, choice) in enumerate(groups):
         rows, vectors = numbers.rows[group], numbers.parameters[group]
-        moves: Transitions | None = None
-        for peers, recorded in _recorded_and_not(choice):
+        moves: Sequence[Floats] | None = None
+        is_recorded = choice.wanted.any(axis=1)
+        for which, recorded in ((is_recorded, choice.locals), (~is_recorded, ())):
+            peers = np.flatnonzero(which)
+            if not len(peers):
+                continue
             key = (one.kind, id(schedule), recorded)
             if key not in programs:
                 programs[key] = build_program(linear[one.kind], schedule, recorded, cuts, flows[one.kind])
-            if moves is None:
-                moves = _transitions(programs[key], vectors, method)
+            if moves is None:  # what the different sites of a group do over every interval
+                moves = transition_rows(linear[one.kind], vectors, programs[key].seconds)
+                moves = perturbed(moves, 0) if method.perturbed else moves
             numbered, site = plan.exchange.starts[group] + peers, plan.sites[one.kind]
             members.append(build_member(group, numbered, site, rows[peers], vectors, programs[key], moves))
     return members
@@ -326,24 +315,22 @@ def _chunk_length(population: Population, duration: Fraction) -> int:
     """Return how many frames to play at once: equal chunks, none larger than need be."""
     frames = int(duration / (population.frame * population.quantum)) + 1
     pushed = sum(one.program.impulse_rows * len(one.parameters) for one in population.members)
-    numbers = population.marks * population.width + pushed
+    seen = sum(one.ticks * len(one.pairs) for one in population.hearing.routes)
+    numbers = population.marks * population.width + pushed + seen
     most = max(1, min(MOST_FRAMES, CHUNK // max(1, numbers), frames))
     return -(-frames // -(-frames // most))
 
 
-def _order(system: CompiledSystem, population: Population, choices: Sequence[Choice]) -> Integers:
+def _order(system: CompiledSystem, population: Population, signals: Sequence[Signal]) -> Integers:
     """Return where each signal stands in a row of a population."""
-    first = np.cumsum([0] + [int(choice.wanted.sum()) for choice in choices])
     starts = np.cumsum([0] + [group.count for group in system.groups])
-    order = np.empty(int(first[-1]), np.int64)
-    for member, column in zip(population.members, population.columns, strict=True):
-        if member.program.recorded:
-            wanted = choices[member.group].wanted
-            own = member.peers - starts[member.group]
-            place = first[member.group] + np.cumsum(wanted).reshape(wanted.shape) - 1
-            here = column + np.arange(member.count * wanted.shape[1]).reshape(-1, member.count).T
-            order[place[own][wanted[own]]] = here[wanted[own]]
-    return order
+    column_of = {
+        (system.groups[member.group].name, peer, local.name): column + place * member.count + i
+        for member, column in zip(population.members, population.columns, strict=True)
+        for place, local in enumerate(member.program.recorded)
+        for i, peer in enumerate((member.peers - starts[member.group] + 1).tolist())
+    }
+    return np.array([column_of[one.group, one.peer, one.local] for one in signals], np.int64)
 
 
 def _ticks_at_zero(system: CompiledSystem, numbers: Numbers) -> bool:
@@ -372,13 +359,6 @@ def _check_size(
     refuse_beyond(
         NUMBER * total, "E874", Place(system.origin.topology), what, "fewer peers, or fewer --signals"
     )
-
-
-def _recorded_and_not(choice: Choice) -> list[tuple[Integers, tuple[LocalSignal, ...]]]:
-    """Split a group into the peers that are recorded and the others, neither empty."""
-    recorded = choice.wanted.any(axis=1)
-    split = [(np.flatnonzero(recorded), choice.locals), (np.flatnonzero(~recorded), ())]
-    return [(peers, signals) for peers, signals in split if len(peers)]
 
 
 def _flow(
@@ -421,27 +401,9 @@ def _check_step(
     check_step(system, method, fastest, max(lengths, default=fastest))
 
 
-def _transitions(program: Program, vectors: Floats, method: Method) -> Transitions:
-    """Return what the different sites of a group do over every interval."""
-    seconds = [length * program.schedule.quantum for length in program.durations]
-    found = transition_rows(program.rates, vectors, seconds)
-    return perturbed(found, 0) if method.perturbed else found
-
-
 def _forces(member: Member) -> tuple[SiteForcing, ...]:
     """Return the forces that change with time on each different site of a group; none if none does."""
-    program = member.program
+    program, kernels = member.program, dict[Any, tuple[Kernel, ...]]()
     if not program.impulse_rows:
         return ()
-    seconds = [length * program.schedule.quantum for length in program.durations]
-    forcing, n_x = forcing_of(program.rates), program.layout.states
-    kernels: dict[bytes, tuple[Kernel, ...]] = {}
-    found = []
-    for vector in member.parameters:
-        # Sites that differ in nothing the continuous equations read share a kernel.
-        key = np.asarray(program.rates.matrices(vector)).tobytes()
-        if key not in kernels:
-            a = exact_rates(program.rates, vector)[:, :n_x]
-            kernels[key] = tuple(kernel_of(a, forcing.pushed, length) for length in seconds)
-        found.append(SiteForcing(forcing, vector, kernels[key]))
-    return tuple(found)
+    return tuple(site_forcing(program.rates, one, program.seconds, kernels) for one in member.parameters)

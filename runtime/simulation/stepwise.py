@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.network.timetable import START, Seen
-from apc.simulation.hearing import Complete, Deliver, Look, OnWays, Operation, Sparse, Total, Weighed
+from apc.simulation.hearing import Arrived, Complete, Deliver, Look, Operation, Source, Weighed
 from apc.simulation.population import Played, Population
 from apc.simulation.program import Member, Segment, seconds_at
 
@@ -25,7 +25,6 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-MOST_SEEN = 2**20  # packets that ticks see, drawn at once
 JOINS = {"max": np.fmax, "min": np.fmin}
 
 
@@ -38,8 +37,6 @@ class Told(Protocol):
 
 class Stepwise:
     """The memory of all peers, and what moves them in it, one run at a time."""
-
-    runs = 1
 
     def __init__(
         self,
@@ -60,14 +57,13 @@ class Stepwise:
         """
         self.population, self.timetable = population, timetable
         self.moving = tuple(range(len(population.members)) if moving is None else moving)
-        self.segments = [[_Moving(m, one) for one in m.program.segments] for m in population.members]
+        self.segments = [[_Moving(m, segment) for segment in m.program.segments] for m in population.members]
         # Of each member the rows of its carry that are the work done, and which parts these are.
         layouts = [m.program.layout for m in population.members]
         self.work = [
-            (one.work, np.array([population.parts.index(part) for part in one.parts], np.int64))
-            for one in layouts
+            (layout.work, np.array([population.parts.index(part) for part in layout.parts], np.int64))
+            for layout in layouts
         ]
-        self.looks: dict[tuple[int, int], Callable[..., Any]] = {}
         self.begin(0)
 
     def begin(self, run: int) -> None:
@@ -75,55 +71,40 @@ class Stepwise:
         hearing = self.population.hearing
         self.table = None if self.timetable is None else self.timetable(run)
         self.packets = np.repeat(hearing.start[None], hearing.ring, axis=0)
-        self.totals = np.zeros(hearing.totals)
         self.carries = [member.each(member.carry).T for member in self.population.members]
-        self.held = [one.copy() for one in hearing.held]
-        self.effective = [np.full(len(one.pairs), START, np.int64) for one in hearing.routes]
-        self.missing = [np.zeros(len(one.pairs), np.bool_) for one in hearing.routes]
+        self.held = [start.copy() for start in hearing.held]
+        self.effective = [np.full(len(route.pairs), START, np.int64) for route in hearing.routes]
 
     def play(self, first: int, count: int, pushes: Sequence[Floats | None]) -> Played:
         """Play the frames from number `first` on (see `Player`)."""
         population, marks = self.population, self.population.marks
         rows = np.full((count * marks, population.width), np.nan)
         work = np.zeros((count, len(population.parts)))
-        seen = self._seen(first, count)
+        routes = population.hearing.routes
+        taken = self.table.take((first + count) * population.frame) if self.table else ()
         # Where a solver gives up CasADi prints its arguments, and then the ones that it was called from.
         with contextlib.redirect_stderr(io.StringIO()), np.errstate(all="ignore"):
             for n in range(count):
                 for carry, (done, places) in zip(self.carries, self.work, strict=True):
                     np.add.at(work[n], places, np.add.reduce(carry[done], axis=1))
-                now = [None if one is None else one[n] for one in pushes]
+                now = [None if push is None else push[n] for push in pushes]
+                of_frame = rows[n * marks : (n + 1) * marks]
+                ticks = [slice(n * route.ticks, (n + 1) * route.ticks) for route in routes if taken]
+                seen = tuple(
+                    Seen(packets.packets[at], packets.missing[at])
+                    for packets, at in zip(taken, ticks, strict=True)
+                )
                 try:
-                    self._frame(first + n, rows[n * marks : (n + 1) * marks], next(seen, ()), now)
+                    for index in range(len(population.hearing.segments)):
+                        self._segment(first + n, index, seen, of_frame, now)
                 except RuntimeError:
                     return Played(rows, work, n)
         return Played(rows, work, count)
 
-    def in_range(self) -> Flags:
+    def in_range(self) -> bool:
         """Say whether all that moves is still a number (see `Player`)."""
         moving = (carry[: done.start] for carry, (done, _) in zip(self.carries, self.work, strict=True))
-        return np.array([all(bool(np.isfinite(one).all()) for one in (self.packets, *moving))])
-
-    def _seen(self, first: int, count: int) -> Iterator[tuple[Seen, ...]]:
-        """Yield what the ticks of each frame see on every route."""
-        if self.table is None:
-            return
-        routes = self.population.hearing.routes
-        each = max(1, MOST_SEEN // max(1, sum(one.ticks * len(one.pairs) for one in routes)))
-        for begin in range(first, first + count, each):
-            end = min(begin + each, first + count)
-            whole = self.table.take(end * self.population.frame)
-            for n in range(end - begin):
-                yield tuple(_of_frame(one, n, route.ticks) for one, route in zip(whole, routes, strict=True))
-
-    def _frame(
-        self, number: int, rows: Floats, seen: tuple[Seen, ...], pushes: Sequence[Floats | None]
-    ) -> None:
-        """Play one frame; `rows` (marks, width) are filled in."""
-        population, hearing = self.population, self.population.hearing
-        marks, pushed = [0] * len(population.members), [0] * len(population.members)
-        for index in range(len(hearing.segments)):
-            self._segment(number, index, seen, rows, pushes, marks, pushed)
+        return all(bool(np.isfinite(array).all()) for array in (self.packets, *moving))
 
     def _segment(
         self,
@@ -132,64 +113,52 @@ class Stepwise:
         seen: tuple[Seen, ...],
         rows: Floats,
         pushes: Sequence[Floats | None],
-        marks: list[int],
-        pushed: list[int],
     ) -> None:
-        """Play a segment of a frame; `marks` and `pushed` count each member's rows and impulses so far."""
+        """Play a segment of a frame."""
         population, hearing = self.population, self.population.hearing
-        now = self.packets[number % hearing.ring]
+        packets = self.packets[number % hearing.ring]
         heard = [
-            np.empty((one[index].heard, member.count))
-            for one, member in zip(self.segments, population.members, strict=True)
+            np.empty((moving[index].heard, member.count))
+            for moving, member in zip(self.segments, population.members, strict=True)
         ]
         for operation in hearing.segments[index]:
-            if isinstance(operation, Total | Deliver) or operation.member in self.moving:
+            if isinstance(operation, Deliver) or operation.member in self.moving:
                 self._hear(operation, number, heard, seen)
         for g in self.moving:
-            member = population.members[g]
-            moving, program = self.segments[g][index], member.program
-            push = pushes[g]
-            own = np.empty((0, member.count))
+            member, moving, push = population.members[g], self.segments[g][index], pushes[g]
+            segment, recorded = member.program.segments[index], len(member.program.recorded)
+            impulses = np.empty((0, member.count))
             if push is not None:
-                own = push[pushed[g] : pushed[g] + moving.impulses][:, member.rows]
-            pushed[g] += moving.impulses
-            after, sent, recorded = moving.move(self.carries[g], heard[g], own, number)
-            self.carries[g] = after
+                impulses = push[segment.first_impulse :][: moving.impulses, member.rows]
+            self.carries[g], sent, signals = moving.move(self.carries[g], heard[g], impulses, number)
             columns = slice(int(hearing.first[g]), int(hearing.first[g + 1]))
-            for row, one in zip(program.segments[index].sent, sent, strict=True):
-                now[hearing.sent[g][row], columns] = one
-            if program.recorded:
-                height = len(recorded) // len(program.recorded)
-                to = slice(
-                    population.columns[g], population.columns[g] + len(program.recorded) * member.count
-                )
-                rows[marks[g] : marks[g] + height, to] = recorded.reshape(height, to.stop - to.start)
-                marks[g] += height
+            for row, values in zip(segment.sent, sent, strict=True):
+                packets[hearing.sent[g][row], columns] = values
+            if recorded:
+                height, first = len(signals) // recorded, segment.first_mark
+                to = slice(population.columns[g], population.columns[g] + recorded * member.count)
+                rows[first : first + height, to] = signals.reshape(height, to.stop - to.start)
 
-    def _packet(self, number: int, key: int, lag: int) -> Floats:
-        return np.asarray(self.packets[(number - lag) % self.population.hearing.ring, key])
+    def _row(self, source: Source, number: int) -> Floats:
+        """Return what an operation reads in a frame, a number a peer or a way."""
+        if isinstance(source, Arrived):
+            return np.asarray(self.held[source.route][source.row])
+        return np.asarray(self.packets[(number - source.lag) % self.population.hearing.ring, source.key])
 
-    def _hear(self, one: Operation, number: int, heard: Sequence[Floats], seen: tuple[Seen, ...]) -> None:
-        hearing = self.population.hearing
-        match one:
-            case Total(place, key, lag, ranges):
-                row = self._packet(number, key, lag)
-                self.totals[place] = sum(np.add.reduce(row[begin:end]) for begin, end in ranges)
-            case Complete(g, place, total, key, lag, divisor):
-                own: Floats | float = 0.0
-                if key >= 0:
-                    own = self._packet(number, key, lag)[hearing.first[g] : hearing.first[g + 1]]
-                heard[g][place] = (self.totals[total] - own) / divisor
-            case Weighed(g, place, key, lag, weights):
-                heard[g][place] = _weighed(weights, self._packet(number, key, lag))
+    def _hear(
+        self, operation: Operation, number: int, heard: Sequence[Floats], seen: tuple[Seen, ...]
+    ) -> None:
+        match operation:
+            case Complete(g, place, packet, ranges, own, divisor):
+                row, first = self._row(packet, number), self.population.hearing.first
+                total = sum(np.add.reduce(row[begin:end]) for begin, end in ranges)
+                heard[g][place] = (total - (row[first[g] : first[g + 1]] if own else 0.0)) / divisor
+            case Weighed(g, place, source, weights):
+                heard[g][place] = weights @ self._row(source, number)
             case Deliver(route, tick):
                 self._deliver(route, *self._sees(route, tick, seen))
-            case OnWays(g, place, route, channel, gap, weights):
-                gone = self.missing[route]
-                what = gone.astype(np.float64) if gap else np.where(gone, 0.0, self.held[route][channel])
-                heard[g][place] = _weighed(weights, what)
             case Look():
-                heard[one.member][one.row] = self._look(one, number)
+                self._look(operation, number, heard[operation.member][operation.row])
 
     def _sees(self, place: int, tick: int, seen: tuple[Seen, ...]) -> tuple[Integers, Flags]:
         """Return the packets that a tick sees on a route, and which are missing."""
@@ -197,65 +166,42 @@ class Stepwise:
 
     def _deliver(self, place: int, packets: Integers, missing: Flags) -> None:
         """Bring in effect what a tick sees on a route."""
-        hearing, route = self.population.hearing, self.population.hearing.routes[place]
-        if route.zero:
-            self.missing[place] = missing
+        hearing, route, held = (
+            self.population.hearing,
+            self.population.hearing.routes[place],
+            self.held[place],
+        )
         new = np.flatnonzero(packets != self.effective[place])
         self.effective[place] = packets
         numbers = packets[new]
         keys = hearing.channels[place][:, numbers % route.slots]
         columns = hearing.column_of[route.pairs[new, 0]]
-        self.held[place][:, new] = self.packets[numbers // route.slots % hearing.ring, keys, columns]
+        held[:-1, new] = self.packets[numbers // route.slots % hearing.ring, keys, columns]
+        if route.zero:
+            held[:-1, missing], held[-1] = 0.0, missing
 
-    def _look(self, one: Look, number: int) -> Floats:
-        """Return what a member makes of each pair."""
-        population = self.population
-        member, missing = population.members[one.member], np.zeros(one.width)
-        if one.route >= 0:
-            gone = self.missing[one.route]
-            sent = np.where(gone, 0.0, self.held[one.route][list(one.channels)])
-            missing = gone.astype(np.float64) if one.gap else missing
-        else:
-            sent = np.array([
-                np.concatenate([
-                    self._packet(number, key, lag)[begin:end]
-                    for key, lag, ranges in source for begin, end in ranges
-                ]) for source in one.sources
-            ]).reshape(len(one.sources), one.width)  # fmt: skip
-        result = np.zeros(member.count) if one.operator not in JOINS else np.full(member.count, np.nan)
-        if not len(one.senders):
-            return np.zeros(member.count)
+    def _look(self, look: Look, number: int, result: Floats) -> None:
+        """Join what a member makes of each pair to `result` (peers,)."""
+        member, count = self.population.members[look.member], len(look.senders)
+        joined = JOINS.get(look.operator)
+        if look.first:
+            result[:] = 0.0 if joined is None else np.nan
+        if not count:
+            return
+        sent = np.array([self._row(source, number)[look.senders] for source in look.sources])
+        missing = self._row(look.missing, number)[look.senders] if look.missing else np.zeros(count)
         own = np.concatenate([
-            self.carries[one.member][list(one.pairwise.carry)],
-            member.each(member.constants[:, list(one.pairwise.constants)]).T,
+            self.carries[look.member][list(look.pairwise.carry)],
+            member.each(member.constants[:, list(look.pairwise.constants)]).T,
         ])  # fmt: skip
-        key = (one.function, len(one.senders))
-        if key not in self.looks:
-            function: Any = population.hearing.functions[one.function]
-            self.looks[key] = function.map(len(one.senders))
-        t = seconds_at(member.program.schedule, float(number), one.pairwise.now)
-        values = np.asarray(
-            self.looks[key](own[:, one.receivers], sent[:, one.senders], missing[None, one.senders], t)
-        )[0]
-        if one.operator in JOINS:
-            JOINS[one.operator].at(result, one.receivers, values)
+        function: Any = self.population.hearing.functions[look.function]
+        t = seconds_at(member.program.schedule, float(number), look.pairwise.now)
+        pairs = function.map(count)(own[:, look.receivers], sent.reshape(-1, count), missing[None], t)
+        values = np.asarray(pairs)[0]
+        if joined is None:
+            np.add.at(result, look.receivers, look.weights * values)
         else:
-            np.add.at(result, one.receivers, one.weights * values)
-        return result
-
-
-def _of_frame(seen: Seen, number: int, ticks: int) -> Seen:
-    """Return what the ticks of one of several frames see."""
-    own = slice(number * ticks, (number + 1) * ticks)
-    return Seen(seen.packets[own], seen.missing[own])
-
-
-def _weighed(weights: Sparse, values: Floats) -> Floats:
-    """Return the weighed sum of each receiver."""
-    count = len(weights.starts) - 1
-    receivers = np.repeat(np.arange(count), np.diff(weights.starts))
-    found = np.bincount(receivers, weights.weights * values[weights.columns], minlength=count)
-    return np.asarray(found, np.float64)
+            joined.at(result, look.receivers, values)
 
 
 class _Moving:
@@ -267,14 +213,11 @@ class _Moving:
         self.heard = len(segment.heard) + len(segment.pairs)
         self._function = kernel.map(count)  # the buffer looks at it
         self._buffer, self._call = self._function.buffer()
-        shapes = [(self._function.size1_in(i), self._function.size2_in(i)) for i in range(5)]
-        self._in = [np.zeros(shape, order="F") for shape in shapes]
-        shapes = [(self._function.size1_out(i), self._function.size2_out(i)) for i in range(3)]
-        self._out = [np.zeros(shape, order="F") for shape in shapes]
-        for i, one in enumerate(self._in):
-            self._buffer.set_arg(i, memoryview(one.reshape(-1, order="F").data))
-        for i, one in enumerate(self._out):
-            self._buffer.set_res(i, memoryview(one.reshape(-1, order="F").data))
+        self._in = [np.zeros(self._function.size_in(i), order="F") for i in range(5)]
+        self._out = [np.zeros(self._function.size_out(i), order="F") for i in range(3)]
+        for give, arrays in ((self._buffer.set_arg, self._in), (self._buffer.set_res, self._out)):
+            for i, array in enumerate(arrays):
+                give(i, memoryview(array.reshape(-1, order="F").data))
         self._in[2][:] = member.each(member.constants).T
 
     def move(

@@ -1,6 +1,6 @@
 """What a simulated motion amounts to, in numbers and a word: whether it settles, and how far it goes.
 
-Takes: the rows of a simulation, as they come. Gives: `Watch`, `Summary`, `Extent`, `Judged`.
+Takes: the rows of a simulation, as they come. Gives: `Watch`, `Summary`, `Extent`, `Broken`.
 Guarantees: the memory used does not grow with the duration.
 Does not: prove anything: what it says holds for the time that was simulated (see `analysis` for proof).
 
@@ -12,6 +12,9 @@ changes. Without a position that was recorded it is *not judged*. An angle is a 
 
 The work a coupler does is ∫ −f v dt over the forces it holds, f the flow into the coupler at each of its
 flanges and v that flange's velocity: exact, as f is constant between events. Positive work feeds the motion.
+
+A limit is of a device's force and reach, and of whatever else declares one; it is looked at in every row of
+what is recorded. To keep a motion within it is for equations (`limits: on` of a device).
 """
 
 from __future__ import annotations
@@ -22,9 +25,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import ANGLES, LENGTH, CompiledSystem
+from apc.compiler.compiled import ANGLES, LENGTH, CompiledSystem, Group
 from apc.simulation.blocks import Block
-from apc.simulation.limits import Broken, LimitWatch
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation
 
@@ -39,8 +41,23 @@ NOT_JUDGED = "not judged"
 FEWEST_TURNS = 4  # within the tail: two periods
 SMALLER = 0.9  # a swing of less than this part of that in the time before is dying away
 BUCKETS = 512  # times that extremes are kept for
-PASSED = 32  # of them looked at at once, which stay in the caches
 MOST_EXTREMES = 2**22  # numbers kept for each of three tables: 32 MiB
+
+
+@dataclass(frozen=True, slots=True)
+class Broken:
+    """A limit that was broken: the `signal`, its `limit` by name and `value`, in SI, with its `unit`.
+
+    It is beyond it from `first_s` seconds on; its largest size is `most`, at `at_s` seconds.
+    """
+
+    signal: str
+    limit: str
+    value: float
+    unit: str
+    first_s: float
+    most: float
+    at_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,245 +101,209 @@ class Summary:
     unrecorded: int = 0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Judged:
-    """What several runs of one scene amount to, side by side.
-
-    `verdict` (runs,) are words; `settled` (signals, runs) seconds, NaN where a signal does not settle, and of
-    all positions together (runs,), NaN but for runs that settle; `swing` (signals, runs) is the way to and
-    fro at the end, `rate` how often a second, `restless` (runs,) the signal that swings most, −1 if none
-    does.
-    """
-
-    verdict: NDArray[np.str_]
-    settled: Floats
-    settled_at: Floats
-    swing: Floats
-    rate: Floats
-    restless: NDArray[np.int64]
-
-
 class Watch:
-    """Looks at some runs of a simulation as they pass and keeps extremes, bucket by bucket of rows."""
+    """Looks at a simulation's rows as they pass and keeps extremes, bucket by bucket of rows."""
 
-    def __init__(
-        self, simulation: Simulation, signals: Sequence[Signal] | None = None, runs: int = 1
-    ) -> None:
-        """Begin before the first row.
-
-        Parameters
-        ----------
-        simulation
-            What is played.
-        signals
-            What to look at, all signals of the simulation if not given.
-        runs
-            How many runs stand side by side: the first signal of all is followed by the next of all.
-        """
-        self.simulation, self.runs = simulation, runs
-        self.listed = simulation.signals if signals is None else tuple(signals)
-        self.signals = len(self.listed)
-        self.positions = [i for i, one in enumerate(self.listed) if is_position(one)]
-        self.forces = [i for i, one in enumerate(self.listed) if one.unit == "N" and one.role != "limited"]
-        n = self.signals * runs
-        rows = int(simulation.settings.duration / (simulation.frame * simulation.quantum)) + 1
-        rows *= len(simulation.marks)
-        most = max(16, min(BUCKETS, MOST_EXTREMES // max(len(simulation.signals), 1)))
-        self.width = -(-rows // most)
-        buckets = -(-rows // self.width)
-        self.low, self.high = np.empty((buckets, n)), np.empty((buckets, n))
-        self.turns = np.empty((buckets, len(self.positions) * runs), np.min_scalar_type(self.width))
-        self.begin()
-
-    def begin(self) -> None:
-        """Begin again before the first row: memory that was used once is at hand."""
-        n = self.signals * self.runs
-        self.ends: list[float] = []
-        self.pending, self.times = np.empty((0, n)), np.empty(0)
-        self.before: Floats = np.empty((0, self.turns.shape[1]))  # the last two rows already in a bucket
-        self.first: Floats = np.zeros(n)
-        self.last: Floats = np.zeros(n)
-        self.peak, self.peak_at = np.zeros(n), np.zeros(n)
-        self.limits = LimitWatch(self.simulation.system, self.listed if self.runs == 1 else ())
+    def __init__(self, simulation: Simulation) -> None:
+        """Begin before the first row of what is played."""
+        self.simulation, self.signals = simulation, simulation.signals
+        n = len(self.signals)
+        self.positions = [i for i, signal in enumerate(self.signals) if is_position(signal)]
+        self.forces = [
+            i for i, signal in enumerate(self.signals) if signal.unit == "N" and signal.role != "limited"
+        ]
+        self.limits = _limits(simulation.system, self.signals)
+        self.width = -(-simulation.rows // max(16, min(BUCKETS, MOST_EXTREMES // max(n, 1))))
+        buckets = -(-simulation.rows // self.width)
+        self.low, self.high = np.full((buckets, n), np.inf), np.full((buckets, n), -np.inf)
+        self.turns = np.zeros((buckets, len(self.positions)), np.int64)
+        self.ends = np.zeros(buckets)
+        self.before = np.empty((0, len(self.positions)))  # the last two rows
+        self.first, self.last = np.zeros(n), np.zeros(n)
+        self.peak, self.peak_at = np.full(n, -1.0), np.zeros(n)
+        self.beyond = np.full(len(self.limits), np.nan)
         self.rows = 0
 
     def take(self, time: Floats, values: Floats) -> None:
-        """Look at some rows: `time` (rows,), `values` (rows, signals · runs)."""
+        """Look at some rows: `time` (rows,), `values` (rows, signals)."""
         if not len(time):
             return
         if not self.rows:
             self.first = values[0].copy()
         self.last = values[-1].copy()
+        bucket = (self.rows + np.arange(len(time))) // self.width
         self.rows += len(time)
-        self.limits.take(time, values)
-        for column in self.forces if self.runs == 1 else ():
-            size = np.abs(values[:, column])
-            at = size.argmax()
-            if size[at] > self.peak[column]:
-                self.peak[column], self.peak_at[column] = size[at], time[at]
-        if len(self.times):
-            time, values = np.concatenate([self.times, time]), np.concatenate([self.pending, values])
-        self._fill(time, values)
-
-    def _fill(self, times: Floats, values: Floats, *, all_of_it: bool = False) -> None:
-        whole = len(times) // self.width
-        if whole:
-            cut = whole * self.width
-            self._bucket(times[:cut], values[:cut], whole)
-            times, values = times[cut:], values[cut:]
-        if all_of_it and len(times):
-            self._bucket(times, values, 1)
-        self.times, self.pending = times, values
-
-    def _bucket(self, times: Floats, values: Floats, number: int) -> None:
-        shaped = values.reshape(number, len(values) // number, values.shape[1])
-        here = slice(len(self.ends), len(self.ends) + number)
-        shaped.min(axis=1, out=self.low[here])
-        shaped.max(axis=1, out=self.high[here])
-        self.ends += times.reshape(number, -1)[:, -1].tolist()
-        positions = values
-        if len(self.positions) < self.signals:
-            positions = values.reshape(len(values), -1, self.runs)[:, self.positions]
-        moving = np.concatenate([self.before, positions.reshape(len(values), self.turns.shape[1])])
-        up, down = moving[1:] > moving[:-1], moving[1:] < moving[:-1]
-        found = (up[1:] & down[:-1]) | (down[1:] & up[:-1])
-        turned = np.zeros((len(values), moving.shape[1]), dtype=np.bool_)
-        if len(found):
-            turned[-len(found) :] = found
-        each = turned.view(np.uint8).reshape(*shaped.shape[:2], moving.shape[1])
-        each.sum(axis=1, dtype=self.turns.dtype, out=self.turns[here])
-        self.before = moving[-2:].copy()
-
-    def judged(self, *, stopped: bool = False) -> Judged:
-        """Return what has been seen of every run; `stopped` says that something left the range of floats."""
-        self._fill(self.times, self.pending, all_of_it=True)
-        assert self.rows, "a simulation has a row at time 0"
-        low, high = self._tables()
-        settled = self._settled(low, high)
-        number = len(self.ends)
-        tail = max(1, round(TAIL * number))
-        now, then = slice(number - tail, number), slice(max(0, number - 2 * tail), number - tail)
-        swing = high[now].max(axis=0) - low[now].min(axis=0)
-        span = np.maximum(high.max(axis=0) - low.min(axis=0), np.finfo(float).tiny)
-        turns = np.zeros(swing.shape, np.int64)
-        turns[self.positions] = self.turns[now].sum(axis=0, dtype=np.int64).reshape(-1, self.runs)
-        # Of the positions that turn and don't settle, the one that swings most.
-        restless = np.isnan(settled[self.positions]) & (turns[self.positions] >= FEWEST_TURNS)
-        restless &= number >= 2 * tail
-        for unit in POSITIONS:  # a length and an angle are each compared with their like
-            alike = [place for place in self.positions if self.listed[place].unit == unit]
-            span[alike] = span[alike].max(axis=0, initial=0.0)
-        share = np.where(restless, (swing / span)[self.positions], -1.0)
-        which = np.full(self.runs, -1, np.int64)
-        if self.positions:
-            which = np.where(restless.any(axis=0), np.array(self.positions)[share.argmax(axis=0)], -1)
-        earlier = np.zeros(swing.shape)
-        if then.stop > then.start:
-            earlier = high[then].max(axis=0) - low[then].min(axis=0)
-        smaller = swing < SMALLER * earlier
-        dying = smaller[which, np.arange(self.runs)] if self.positions else np.zeros(self.runs, np.bool_)
-        verdict = np.where(which < 0, "moves on", np.where(dying, "dies away", "shakes"))
-        times = settled[self.positions]
-        calm = ~np.isnan(times).any(axis=0)
-        whole = (high.max(axis=0) - low.min(axis=0))[self.positions]
-        still = calm & ~whole.any(axis=0) & bool(self.positions)
-        verdict = np.where(
-            still, "rests", np.where(calm, "settles" if self.positions else NOT_JUDGED, verdict)
-        )
-        verdict = np.where(stopped, "diverges", verdict)
-        seconds = self.ends[-1] - (self.ends[number - tail - 1] if number > tail else 0.0)
-        return Judged(
-            verdict=verdict,
-            settled=settled,
-            settled_at=np.where(verdict == "settles", times.max(axis=0, initial=0.0), np.nan),
-            swing=swing,
-            rate=turns / 2 / seconds if seconds > 0 else np.zeros(turns.shape),
-            restless=np.where(calm | stopped, -1, which),
-        )
+        touched, starts = np.unique(bucket, return_index=True)
+        self.low[touched] = np.minimum(self.low[touched], np.minimum.reduceat(values, starts))
+        self.high[touched] = np.maximum(self.high[touched], np.maximum.reduceat(values, starts))
+        self.ends[bucket] = time
+        moving = np.concatenate([self.before, values[:, self.positions]])
+        way = np.sign(np.diff(moving, axis=0))
+        turned = np.zeros((len(time), len(self.positions)), np.int64)
+        turned[len(time) - max(len(way) - 1, 0) :] = way[1:] * way[:-1] < 0
+        self.turns[touched] += np.add.reduceat(turned, starts)
+        self.before = moving[-2:]
+        watched = np.array([*self.forces, *(column for column, _, _ in self.limits)], np.int64)
+        size = np.abs(values[:, watched])
+        largest = size.max(axis=0)
+        grown = largest > self.peak[watched]
+        self.peak[watched[grown]] = largest[grown]
+        self.peak_at[watched[grown]] = time[size.argmax(axis=0)[grown]]
+        over = size[:, len(self.forces) :] > [bound for _, _, bound in self.limits]
+        began = over.any(axis=0) & np.isnan(self.beyond)
+        self.beyond[began] = time[over.argmax(axis=0)[began]]
 
     def summary(self, block: Block) -> Summary:
-        """Return what has been seen of the only run; `block` is its last."""
+        """Return what has been seen; `block` is the last."""
+        assert self.rows, "a simulation has a row at time 0"
+        number = (self.rows - 1) // self.width + 1
+        low, high, ends = self.low[:number], self.high[:number], self.ends[:number]
         with np.errstate(over="ignore", invalid="ignore"):  # of what has diverged
-            judged = self.judged(stopped=bool(block.stopped))
-        signals, (low, high) = self.listed, self._tables()
-        listed = [None if np.isnan(one) else float(one) for one in judged.settled[:, 0]]
+            settled = self._settled(low, high, ends)
+            swing = self._swing(low, high, ends, settled)
+        signals, unsettled = self.signals, np.isnan(settled)
+        numbers = np.stack([self.first, self.last, low.min(axis=0), high.max(axis=0)], axis=1).tolist()
         extents = tuple(
-            Extent(one.name, one.unit, float(first), float(last), float(least), float(most), since)
-            for one, first, last, least, most, since in zip(
-                signals,
-                self.first,
-                self.last,
-                low[:, :, 0].min(axis=0),
-                high[:, :, 0].max(axis=0),
-                listed,
-                strict=True,
+            Extent(signal.name, signal.unit, first, last, least, most, None if np.isnan(since) else since)
+            for signal, since, (first, last, least, most) in zip(
+                signals, settled.tolist(), numbers, strict=True
             )
         )
-        verdict, restless = str(judged.verdict[0]), int(judged.restless[0])
-        swing = (
-            (signals[restless].name, float(judged.swing[restless, 0]), float(judged.rate[restless, 0]))
-            if restless >= 0
-            else None
-        )
+        moved = [extents[i] for i in self.positions]
+        if block.stopped:
+            verdict, swing = "diverges", None
+        elif not self.positions:
+            verdict = NOT_JUDGED
+        elif all(extent.low == extent.high for extent in moved):
+            verdict = "rests"
+        elif not unsettled[self.positions].any():
+            verdict = "settles"
+        else:
+            verdict = "moves on" if swing is None else "dies away" if swing[3] else "shakes"
+        settles = verdict == "settles"
         largest = max(self.forces, key=lambda i: float(self.peak[i]), default=-1)
+        work = tuple(zip(self.simulation.population.parts, block.work.tolist(), strict=True))
+        force = None
+        if largest >= 0:
+            force = signals[largest].name, float(self.peak[largest]), float(self.peak_at[largest])
         return Summary(
             verdict=verdict,
-            settled=float(judged.settled_at[0]) if verdict == "settles" else None,
+            settled=float(settled[self.positions].max()) if settles else None,
             stopped=block.stopped,
             stopped_at=block.stopped_at if block.stopped else None,
-            swing=swing,
-            overshoot=_overshoot([extents[i] for i in self.positions]) if verdict == "settles" else None,
-            largest_force=None
-            if largest < 0
-            else (signals[largest].name, float(self.peak[largest]), float(self.peak_at[largest])),
-            copies=tuple((name, float(distance[0])) for name, _, distance in self.copies()),
+            swing=swing[:3] if swing else None,
+            overshoot=_overshoot(moved) if settles else None,
+            largest_force=force,
+            copies=self._copies(),
             # Of a motion without bound the work is as meaningless as it is large.
-            work=() if block.stopped else tuple(zip(self.simulation.parts, block.work.tolist(), strict=True)),
+            work=() if block.stopped else work,
             rows=self.rows,
             signals=len(signals),
-            end=self.ends[-1],
+            end=float(ends[-1]),
             extents=extents,
-            broken=self.limits.broken(),
+            broken=self._broken(),
             unrecorded=_positions(self.simulation.system) - len(self.positions),
         )
 
-    def copies(self) -> list[tuple[str, str, Floats]]:
-        """Return how far apart the peers' copies of each state that is sent as it is are at the end.
-
-        Name, unit, and distances (runs,).
-        """
-        signals = self.listed
-        last = self.last.reshape(-1, self.runs)
-        found = []
-        for name in self.simulation.sent:
-            here = [i for i, one in enumerate(signals) if one.local == name and one.unit in POSITIONS]
-            if len(here) > 1:
-                found.append((name, signals[here[0]].unit, np.ptp(last[here], axis=0)))
-        return found
-
-    def _tables(self) -> tuple[Floats, Floats]:
-        """Return the least and the largest values of every bucket (buckets, signals, runs)."""
-        shape = (len(self.ends), self.signals, self.runs)
-        return self.low[: len(self.ends)].reshape(shape), self.high[: len(self.ends)].reshape(shape)
-
-    def _settled(self, low: Floats, high: Floats) -> Floats:
+    def _settled(self, low: Floats, high: Floats, ends: Floats) -> Floats:
         """Return when each signal is within its band for good; NaN if that is not well before the end."""
-        with np.errstate(over="ignore"):  # of what has diverged
-            own = high.max(axis=0) - low.min(axis=0)
-        span, names = np.empty(own.shape), [one.local for one in self.listed]
-        for name in dict.fromkeys(names):  # the largest range among the peers
-            here = [i for i, one in enumerate(names) if one == name]
-            span[here] = own[here].max(axis=0)
-        last, end = self.last.reshape(self.signals, self.runs), self.ends[-1]
-        ends = np.concatenate([[0.0], self.ends])  # of the last bucket outside the band, 0 if there is none
-        after, band = np.zeros(own.shape, np.int64), BAND * span
-        for begin in range(0, len(low), PASSED):
-            some = slice(begin, begin + PASSED)
-            outside = (high[some] - last > band) | (last - low[some] > band)
-            places = np.arange(1, len(outside) + 1, dtype=np.uint8)[:, None, None]
-            latest = (outside.view(np.uint8) * places).max(axis=0)
-            after = np.where(latest, begin + latest.astype(np.int64), after)
-        return np.where(ends[after] <= LATE * end, ends[after], np.nan)
+        span = high.max(axis=0) - low.min(axis=0)
+        names = np.array([signal.local for signal in self.signals])
+        for name in dict.fromkeys(names.tolist()):  # the largest range among the peers
+            span[names == name] = span[names == name].max()
+        outside = (high - self.last > BAND * span) | (self.last - low > BAND * span)
+        after = np.where(outside.any(axis=0), len(outside) - outside[::-1].argmax(axis=0), 0)
+        since = np.append(0.0, ends)[after]
+        return np.where(since <= LATE * ends[-1], since, np.nan)
+
+    def _swing(
+        self, low: Floats, high: Floats, ends: Floats, settled: Floats
+    ) -> tuple[str, float, float, bool] | None:
+        """Return the position that turns, does not settle and swings most at the end; None if none does.
+
+        That is, its name, the way to and fro, how often a second, and whether it is dying away.
+        """
+        number = len(ends)
+        tail = max(1, round(TAIL * number))
+        if number < 2 * tail:
+            return None
+        now, then = slice(number - tail, number), slice(number - 2 * tail, number - tail)
+        turns = self.turns[:number][now].sum(axis=0)
+        places = [
+            i
+            for i, many in zip(self.positions, turns, strict=True)
+            if np.isnan(settled[i]) and many >= FEWEST_TURNS
+        ]
+        if not places:
+            return None
+        swing = high[now].max(axis=0) - low[now].min(axis=0)
+        ranges = np.maximum(high.max(axis=0) - low.min(axis=0), np.finfo(float).tiny)
+        units = [
+            signal.unit for signal in self.signals
+        ]  # a length and an angle are each compared with their like
+        span = {
+            unit: max(ranges[i] for i in self.positions if units[i] == unit)
+            for unit in {*map(units.__getitem__, places)}
+        }
+        place = max(places, key=lambda i: float(swing[i] / span[units[i]]))
+        seconds = ends[-1] - (ends[number - tail - 1] if number > tail else 0.0)
+        rate = float(turns[self.positions.index(place)] / 2 / seconds) if seconds > 0 else 0.0
+        earlier = high[then, place].max() - low[then, place].min()
+        return self.signals[place].name, float(swing[place]), rate, bool(swing[place] < SMALLER * earlier)
+
+    def _copies(self) -> tuple[tuple[str, float], ...]:
+        """Return how far apart the peers' copies of each state that is sent as it is are at the end."""
+        copies = []
+        for name in self.simulation.sent:
+            places = [
+                i
+                for i, signal in enumerate(self.signals)
+                if signal.local == name and signal.unit in POSITIONS
+            ]
+            if len(places) > 1:
+                copies.append((name, float(np.ptp(self.last[places]))))
+        return tuple(copies)
+
+    def _broken(self) -> tuple[Broken, ...]:
+        """Return the limits that were broken, the first of them first."""
+        broken = [
+            Broken(
+                self.signals[column].name,
+                name,
+                bound,
+                self.signals[column].unit,
+                float(first),
+                float(self.peak[column]),
+                float(self.peak_at[column]),
+            )
+            for (column, name, bound), first in zip(self.limits, self.beyond, strict=True)
+            if not np.isnan(first)
+        ]
+        return tuple(sorted(broken, key=lambda limit: limit.first_s))
+
+
+def _limits(system: CompiledSystem, signals: Sequence[Signal]) -> list[tuple[int, str, float]]:
+    """Return the columns of signals that have a limit, its name and its value, those of each peer its own."""
+    groups = {group.name: group for group in system.groups}
+    common = {parameter.name: parameter.value for parameter in system.parameters}
+    limits = {
+        (group.name, limit.name): limit.limit
+        for group in system.groups
+        for limit in system.kinds[group.kind].limits
+    }
+    return [
+        (column, name, _number(groups[signal.group], signal.peer, name, common))
+        for column, signal in enumerate(signals)
+        if (name := limits.get((signal.group, signal.local))) is not None
+    ]
+
+
+def _number(group: Group, peer: int, name: str, common: dict[str, float]) -> float:
+    """Return a number of one peer, counted from 1: its own, its group's, or that of all."""
+    for column in group.columns:
+        if column.name == name:
+            return float(column.values[peer - 1])
+    return next((value.value for value in group.values if value.name == name), common[name])
 
 
 def is_position(signal: Signal) -> bool:
@@ -338,10 +319,10 @@ def _positions(system: CompiledSystem) -> int:
 
 def _overshoot(extents: Sequence[Extent]) -> tuple[str, float] | None:
     """Return the largest way beyond the last value, as a part of the way from the first."""
-    found = []
-    for one in extents:
-        way = one.last - one.first
-        if abs(way) > LEAST_WAY * (one.high - one.low):
-            beyond = one.high - one.last if way > 0 else one.last - one.low
-            found.append((one.name, beyond / abs(way)))
-    return max(found, key=lambda pair: pair[1], default=None)
+    beyonds = []
+    for extent in extents:
+        way = extent.last - extent.first
+        if abs(way) > LEAST_WAY * (extent.high - extent.low):
+            beyond = extent.high - extent.last if way > 0 else extent.last - extent.low
+            beyonds.append((extent.name, beyond / abs(way)))
+    return max(beyonds, key=lambda pair: pair[1], default=None)

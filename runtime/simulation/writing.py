@@ -9,12 +9,13 @@ Does not: know other peers: what is heard comes in, what is sent goes out (see `
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import casadi
 import numpy as np
 
+from apc.compiler.compiled import Kind
 from apc.frame.jacobians import edge_name
 from apc.frame.schedule import (
     Act,
@@ -30,9 +31,11 @@ from apc.frame.schedule import (
 )
 from apc.simulation.flow import Flow
 from apc.simulation.pairs import Pairwise, pair_function
-from apc.simulation.program import Layout, Program, Segment, seconds_at
+from apc.simulation.program import Layout, Program, Segment, seconds_at, timed_events
 from apc.simulation.propagate import Rates
 from apc.simulation.signals import LocalSignal, ticking_partitions
+
+Timed = Sequence[tuple[int, Event]]  # events, each with its instant in quanta
 
 
 def build_program(
@@ -58,190 +61,177 @@ def build_program(
     flow
         What moves the states that have no exact transition.
     """
-    writer = _Writer(rates, schedule, tuple(recorded), flow)
-    segments = tuple(writer.segment(events, last) for events, last in _cut(schedule.events, cuts))
+    segments = _cut(timed_events(schedule), cuts)
+    writer = _Writer(rates, schedule, recorded, flow, segments)
     return Program(
         kind=rates.kind,
         schedule=schedule,
         rates=rates,
         layout=writer.layout,
-        segments=segments,
+        segments=tuple(writer.segment(events, last=events is segments[-1]) for events in segments),
         recorded=tuple(recorded),
         durations=writer.durations,
         intervals=tuple(writer.intervals),
+        moves=tuple(writer.moves),
     )
 
 
-def _cut(events: Sequence[Event], cuts: Sequence[int]) -> Iterator[tuple[list[tuple[int, Event]], bool]]:
-    """Yield the events of each segment with their instants, and whether it is the last."""
-    now, timed = 0, []
-    for event in events:
-        timed.append((now, event))
-        now += event.duration if isinstance(event, Propagate) else 0
-    begin = 0
-    for cut in sorted(cuts):
-        # Sends come first of what happens at an instant, whatever the group.
-        end = next(
-            (
-                i
-                for i, (at, event) in enumerate(timed)
-                if at > cut or (at == cut and not isinstance(event, Send))
-            ),
-            len(timed),
-        )
-        yield timed[begin:end], False
-        begin = end
-    yield timed[begin:], True
+def _cut(events: Timed, cuts: Sequence[int]) -> list[Timed]:
+    """Return the events of each segment."""
+    # Sends come first of what happens at an instant, whatever the group.
+    ends = [
+        sum(now < cut or (now == cut and isinstance(event, Send)) for now, event in events)
+        for cut in sorted(cuts)
+    ]
+    return [events[begin:end] for begin, end in zip([0, *ends], [*ends, len(events)], strict=True)]
+
+
+def _layout(
+    kind: Kind, schedule: Schedule, segments: Sequence[Timed], recorded: Sequence[LocalSignal]
+) -> Layout:
+    """Return the rows of the carry; it is the same between any two segments."""
+    seen = {signal.place for signal in recorded if signal.role == "output"}
+    before = remembered([event.value for event in schedule.events if isinstance(event, Act)], schedule.ticks)
+    passed = set(before)  # and what is computed in another segment than it is needed in
+    for events in segments:
+        needed = {event.value for _, event in events if isinstance(event, Act)}
+        if events is segments[-1]:
+            needed |= {shifted(value, schedule.ticks) for value in before}
+        computed = {(event.partition, event.index) for _, event in events if isinstance(event, Tick)}
+        passed |= {
+            value for value in needed if value.index >= 0 and (value.partition, value.index) not in computed
+        }
+    return Layout(
+        states=len(kind.states),
+        outputs=tuple(
+            (p, o)
+            for p in ticking_partitions(schedule)
+            for o in range(len(kind.clocks[p].outputs))
+            if o in kind.clocks[p].memories or (p, o) in seen
+        ),
+        holds=len(kind.holds),
+        later=tuple(sorted(passed)),
+        parts=tuple(dict.fromkeys(kind.ports.parts)) if kind.ports else (),
+    )
 
 
 class _Writer:
-    """Writes one segment after the other; what is known at the end of one is the carry into the next."""
+    """Writes one segment after the other; of what is known at the end of one the carry goes into the next."""
 
     def __init__(
-        self, rates: Rates, schedule: Schedule, recorded: tuple[LocalSignal, ...], flow: Flow | None
+        self,
+        rates: Rates,
+        schedule: Schedule,
+        recorded: Sequence[LocalSignal],
+        flow: Flow | None,
+        segments: Sequence[Timed],
     ) -> None:
         self.rates, self.schedule, self.recorded, self.flow = rates, schedule, recorded, flow
         self.kind = kind = rates.kind
-        self.functions = [
-            kind.derivative,
-            *(one.tick for one in kind.clocks),
-            *(one.send for one in kind.sends),
-            *([kind.ports.port] if kind.ports else []),
-        ]
-        lengths = [event.duration for event in schedule.events if isinstance(event, Propagate)]
-        self.durations = tuple(sorted(set(lengths)))
+        lengths = {event.duration for event in schedule.events if isinstance(event, Propagate)}
+        self.durations = tuple(sorted(lengths))
         self.moves = [flow.over(length * schedule.quantum) for length in self.durations] if flow else []
-        plain = all(function.is_a("SXFunction") for function in (*self.functions, *self.moves))
+        functions = [kind.derivative, *(one.tick for one in kind.clocks), *(one.send for one in kind.sends)]
+        functions += [*self.moves, *([kind.ports.port] if kind.ports else [])]
+        plain = all(function.is_a("SXFunction") for function in functions)
         self.type_: Any = casadi.SX if plain else casadi.MX
         self.intervals: list[tuple[int, int]] = []
-        outputs = tuple(
-            (p, o) for p in ticking_partitions(schedule) for o in range(len(kind.clocks[p].outputs))
-        )
-        parts = tuple(dict.fromkeys(kind.ports.parts)) if kind.ports else ()
-        # What holds put out in this frame; `_between` and `_after` pass on what is of earlier ones.
-        read = [one for one in schedule.acting if one is not None]
-        read += [event.value for event in schedule.events if isinstance(event, Act)]
-        self.layout = Layout(len(kind.states), outputs, remembered(read, schedule.ticks), parts)
-        # Keys of the carry: of a segment's first, in its order; of the next, what the last one left.
-        self.keys: list[Any] = [
-            *(("x", i) for i in range(len(kind.states))),
-            *(("newest", one) for one in outputs),
-            *self.layout.later,
-            *(("work", part) for part in parts),
-        ]
-        self.pair_functions: dict[tuple[int, int], tuple[Any, tuple[int, ...]]] = {}
-        self.rest: list[Event] = list(schedule.events)
+        self.layout = _layout(kind, schedule, segments, recorded)
         self.begun = -1  # the instant of the event before
+        self.marks = self.impulses = 0  # written so far
 
-    def segment(self, events: Sequence[tuple[int, Event]], last: bool) -> Segment:
+    def segment(self, events: Timed, *, last: bool) -> Segment:
         """Write the events of one segment."""
-        type_, layout = self.type_, self.layout
-        carry = type_.sym("carry", len(self.keys))
-        constants = type_.sym("constants", self._constant_rows())
-        frame = type_.sym("frame")
-        ticks = [(now, event) for now, event in events if isinstance(event, Tick)]
-        pairs = {key: one for now, tick in ticks for key, one in self._pairs(now, tick).items()}
-        assert all(one.now == events[0][0] for one in pairs.values()), "peers look before anything happens"
-        apart = {row for one in pairs.values() for row in one.heard}
-        heard_rows = sorted({row for _, tick in ticks for rows in tick.heard for row in rows} - apart)
-        heard = type_.sym("heard", len(heard_rows) + len(pairs))
-        lengths = sum(isinstance(event, Propagate) for _, event in events)
-        rows_of_g = int(self.rates.g.sum()) if self.rates.timed else 0
-        impulses = type_.sym("impulses", rows_of_g * lengths)
-        self.known: dict[Any, Any] = {key: carry[i] for i, key in enumerate(self.keys)}
-        if ("u", 0) not in self.known:  # the first segment
-            for h, value in enumerate(self.schedule.acting):
-                self.known["u", h] = type_(0) if value is None else self.known[value]
-        self.inputs = (
-            constants,
-            frame,
-            dict(zip([*heard_rows, *pairs], casadi.vertsplit(heard), strict=True)),
-            impulses,
-        )
+        type_, layout, kind = self.type_, self.layout, self.kind
+        pairs = {
+            key: pair
+            for now, event in events
+            if isinstance(event, Tick)
+            for key, pair in self._pairs(now, event).items()
+        }
+        assert all(pair.now == events[0][0] for pair in pairs.values()), "peers look before anything happens"
+        heard = {
+            row for _, event in events if isinstance(event, Tick) for rows in event.heard for row in rows
+        }
+        heard_rows = sorted(heard - {row for pair in pairs.values() for row in pair.heard})
+        moved = sum(isinstance(event, Propagate) for _, event in events)
+        sizes = {
+            "carry": layout.ends[-1],
+            "heard": len(heard_rows) + len(pairs),
+            "constants": len(kind.parameters) + int(self.rates.pattern.sum()) * len(self.durations),
+            "impulses": len(self.rates.pushed) * moved if self.rates.timed else 0,
+            "frame": 1,
+        }
+        arguments = {name: type_.sym(name, size) for name, size in sizes.items()}
+        self.x, newest, self.u, later, self.work = casadi.vertsplit(arguments["carry"], layout.ends)
+        self.newest = dict(zip(layout.outputs, casadi.vertsplit(newest), strict=True))
+        self.values = dict(zip(layout.later, casadi.vertsplit(later), strict=True))
+        self.heard = dict(zip([*heard_rows, *pairs], casadi.vertsplit(arguments["heard"]), strict=True))
+        self.constants, self.frame = arguments["constants"], arguments["frame"]
+        self.pushes = iter(casadi.vertsplit(arguments["impulses"]))
         self.sent: dict[int, Any] = {}
-        self.rows: list[Any] = []
-        self.taken = 0
+        rows: list[Any] = []
         for now, event in events:
-            if now in self.schedule.marks and self._is_first_at(now, event):
-                self.rows += [self._signal(one, now) for one in self.recorded]
+            first, self.begun = now > self.begun, now
+            if first and now in self.schedule.marks:  # the first event at an instant, which is then over
+                rows += [self._signal(signal, now) for signal in self.recorded]
             self._step(now, event)
-            self.rest.pop(0)
-        keys = self._after() if last else self._between()
-        result = [self.known[source] for source, _ in keys]
-        self.keys = [key for _, key in keys]
+        passed = [
+            self.values[shifted(value, self.schedule.ticks) if last and value.index < 0 else value]
+            for value in layout.later
+        ]
+        newest = [self.newest[key] for key in layout.outputs]
+        after = (self.x, *newest, self.u, *passed, self.work)
         kernel = casadi.Function(
             "segment",
-            [carry, heard, constants, impulses, frame],
+            list(arguments.values()),
             [
-                _column(type_, result),
+                _column(type_, after),
                 _column(type_, [self.sent[row] for row in sorted(self.sent)]),
-                _column(type_, self.rows),
+                _column(type_, rows),
             ],
-            ["carry", "heard", "constants", "impulses", "frame"],
+            list(arguments),
             ["carry_after", "sent", "rows"],
         )
-        assert not last or len(self.keys) == layout.size
-        puts_out = [self.schedule.acting[h] if last else ("u", h) for h in range(len(self.kind.holds))]
-        held = tuple(-1 if one is None else self.keys.index(one) for one in puts_out)
-        return Segment(kernel, tuple(heard_rows), tuple(pairs.values()), tuple(sorted(self.sent)), held)
+        begin = self.marks, self.impulses
+        self.marks += len(rows) // max(len(self.recorded), 1)
+        self.impulses += sizes["impulses"]
+        return Segment(kernel, tuple(heard_rows), tuple(pairs.values()), tuple(sorted(self.sent)), *begin)
 
     def _pairs(self, now: int, tick: Tick) -> dict[Any, Pairwise]:
         """Return what a tick hears pair by pair, by (tick, receive): what matters of x, u, m and p."""
-        computing, found = self.kind.clocks[tick.partition], {}
-        inside = [
-            *(("x", i) for i in range(self.layout.states)),
-            *(("u", h) for h in range(len(self.kind.holds))),
-            *(("newest", (tick.partition, o)) for o in computing.memories),
-        ]
+        computing, pairs, layout = self.kind.clocks[tick.partition], {}, self.layout
+        x, outputs, u, *_ = (range(*ends) for ends in zip(layout.ends, layout.ends[1:], strict=False))
+        memories = [outputs[layout.outputs.index((tick.partition, o))] for o in computing.memories]
+        inside = [*x, *u, *memories]
         for place, (receive, rows) in enumerate(zip(computing.receives, tick.heard, strict=True)):
-            if not rows or not edge_name(computing, receive):
-                continue
-            key = (tick.partition, place)
-            if key not in self.pair_functions:
-                self.pair_functions[key] = pair_function(self.kind, *key)
-            function, own = self.pair_functions[key]
-            found[tick, place] = Pairwise(
-                function,
-                tuple(self.keys.index(inside[row]) for row in own if row < len(inside)),
-                tuple(row - len(inside) for row in own if row >= len(inside)),
-                rows,
-                now,
-            )
-        return found
-
-    def _is_first_at(self, now: int, event: Event) -> bool:
-        """Say whether an event is the first at its instant, which is then over."""
-        first, self.begun = now > self.begun, now
-        return first
-
-    def _constant_rows(self) -> int:
-        rates = self.rates
-        of_step = int(rates.e.sum() + rates.f.sum() + rates.g.sum())
-        return len(self.kind.parameters) + of_step * len(self.durations)
-
-    def _x(self) -> Any:
-        return _column(self.type_, [self.known["x", i] for i in range(self.layout.states)])
-
-    def _u(self) -> Any:
-        return _column(self.type_, [self.known["u", h] for h in range(len(self.kind.holds))])
+            if rows and edge_name(computing, receive):
+                function, matter = pair_function(self.kind, tick.partition, place)
+                carry = tuple(inside[row] for row in matter if row < len(inside))
+                constants = tuple(row - len(inside) for row in matter if row >= len(inside))
+                pairs[tick, place] = Pairwise(function, carry, constants, rows, now)
+        return pairs
 
     def _p(self) -> Any:
-        return self.inputs[0][: len(self.kind.parameters)]
+        return self.constants[: len(self.kind.parameters)]
+
+    def _of_site(self, function: Any, now: int) -> Any:
+        """Return a function of (x, u, p, t) at an instant."""
+        return function(self.x, self.u, self._p(), self._time(now))
 
     def _time(self, now: int) -> Any:
-        return seconds_at(self.schedule, self.inputs[1], now)
+        return seconds_at(self.schedule, self.frame, now)
 
     def _signal(self, signal: LocalSignal, now: int) -> Any:
         match signal.role:
             case "state":
-                return self.known["x", signal.place[0]]
+                return self.x[signal.place[0]]
             case "output":
-                return self.known["newest", signal.place]
+                return self.newest[signal.place[0], signal.place[1]]
             case "limited":
-                limited: Any = self.kind.limits[signal.place[0]].value
-                return limited(self._x(), self._u(), self._p(), self._time(now))
+                return self._of_site(self.kind.limits[signal.place[0]].value, now)
             case _:
-                return self.known["u", signal.place[0]]
+                return self.u[signal.place[0]]
 
     def _step(self, now: int, event: Event) -> None:
         match event:
@@ -249,92 +239,64 @@ class _Writer:
                 self._propagate(now, self.durations.index(duration))
             case Act(hold, value):
                 # What was never computed acts as zero: so the carry begins.
-                self.known["u", hold] = self.known[value]
+                u = casadi.vertsplit(self.u)
+                u[hold] = self.values[value]
+                self.u = _column(self.type_, u)
             case Send(partition, rows):
-                sending = self.kind.sends[partition]
-                everything = sending.send(self._x(), self._u(), self._p(), self._time(now))
+                everything = self._of_site(self.kind.sends[partition].send, now)
                 self.sent |= {row: everything[channel] for channel, row in rows}
             case Tick(partition, index, heard):
                 computing = self.kind.clocks[partition]
-                m = _column(self.type_, [self.known["newest", (partition, o)] for o in computing.memories])
-                values = self.inputs[2]
-                r = _column(
-                    self.type_,
-                    [
-                        values[event, place] if (event, place) in values else self._sum(now, rows)
-                        for place, rows in enumerate(heard)
-                    ],
-                )
-                outputs = computing.tick(self._x(), self._u(), m, r, self._p(), self._time(now))
+                m = _column(self.type_, [self.newest[partition, o] for o in computing.memories])
+                received = [
+                    self.heard[event, place] if (event, place) in self.heard else self._sum(now, rows)
+                    for place, rows in enumerate(heard)
+                ]
+                r = _column(self.type_, received)
+                outputs = computing.tick(self.x, self.u, m, r, self._p(), self._time(now))
                 for o in range(len(computing.outputs)):
-                    self.known["newest", (partition, o)] = outputs[o]
-                    self.known[Value(partition, o, index)] = outputs[o]
+                    self.newest[partition, o] = self.values[Value(partition, o, index)] = outputs[o]
 
     def _sum(self, now: int, rows: Sequence[int]) -> Any:
         total = self.type_(0)
         for row in rows:
             heard = self.schedule.received[row]
-            # What a site would itself send at this moment stands in for what it misses.
-            weight = self._own(now, heard) if isinstance(heard, Selected) and heard.gap else 1
-            total = total + weight * self.inputs[2][row]
+            weight: Any = 1
+            if isinstance(heard, Selected) and heard.gap:
+                # What a site would itself send at this moment stands in for what it misses.
+                sending = next(send for send in self.kind.sends if send.link == heard.way.link)
+                weight = self._of_site(sending.send, now)[sending.channels.index(heard.channel)]
+            total = total + weight * self.heard[row]
         return total
-
-    def _own(self, now: int, heard: Selected) -> Any:
-        sending = next(one for one in self.kind.sends if one.link == heard.way.link)
-        everything = sending.send(self._x(), self._u(), self._p(), self._time(now))
-        return everything[sending.channels.index(heard.channel)]
 
     def _propagate(self, now: int, place: int) -> None:
         """Move x over one interval, and add up the work that held values do meanwhile."""
-        rates, type_ = self.rates, self.type_
-        e_size, f_size, g_size = int(rates.e.sum()), int(rates.f.sum()), int(rates.g.sum())
-        at = len(self.kind.parameters) + place * (e_size + f_size + g_size)
-        constants, _, _, impulses = self.inputs
-        factors = iter(range(at, at + e_size + f_size + g_size))
-        before, u = [self.known["x", i] for i in range(self.layout.states)], self._u()
-        after = [type_(0)] * self.layout.states
-        for pattern, values in ((rates.e, before), (rates.f, [u[h] for h in range(len(self.kind.holds))])):
-            for row, column in zip(*np.nonzero(pattern), strict=True):
-                after[row] = after[row] + constants[next(factors)] * values[column]
-        for row in np.flatnonzero(rates.g):
-            after[row] = after[row] + constants[next(factors)]
-        if rates.timed:
-            for row in np.flatnonzero(rates.g):
-                after[row] = after[row] + impulses[self.taken]
-                self.taken += 1
+        pattern, ports = self.rates.pattern, self.kind.ports
+        size, before = int(pattern.sum()), self.x
+        begin = len(self.kind.parameters) + place * size
+        columns, rows = np.nonzero(pattern.T)
+        shape = pattern.shape[0], pattern.shape[1]
+        sparsity = casadi.Sparsity.triplet(*shape, rows.tolist(), columns.tolist())
+        step = self.type_(sparsity, self.constants[begin : begin + size])
+        after = casadi.vertsplit(casadi.densify(step @ casadi.vertcat(before, self.u, 1)))
+        for row in self.rates.pushed if self.rates.timed else ():
+            after[row] = after[row] + next(self.pushes)
         if self.flow is not None:
-            moved = [before[row] for row in self.flow.rows]
-            moved = self.moves[place](_column(type_, moved), u, self._p(), self._time(now))
+            flowing = before[list(self.flow.rows)]
+            moved = self.moves[place](flowing, self.u, self._p(), self._time(now))
             for i, row in enumerate(self.flow.rows):
                 after[row] = moved[i]
         self.intervals.append((now, place))
-        ports = self.kind.ports
+        old: Any = self._of_site(ports.port, now) if ports else None
+        self.x = _column(self.type_, after)
         if ports:
-            n = len(ports.parts)
-            old = ports.port(_column(type_, before), u, self._p(), self._time(now))
-            new = ports.port(_column(type_, after), u, self._p(), self._time(now))
+            n, new = len(ports.parts), self._of_site(ports.port, now)
+            work = casadi.vertsplit(self.work)
             for i, part in enumerate(ports.parts):
-                self.known["work", part] = self.known["work", part] - old[n + i] * (new[i] - old[i])
-        for i, one in enumerate(after):
-            self.known["x", i] = one
-
-    def _between(self) -> list[tuple[Any, Any]]:
-        """Return what the rest of the frame still needs, as (key, key)."""
-        needed = {event.value for event in self.rest if isinstance(event, Act)}
-        for one in self.layout.later:
-            needed.add(shifted(one, self.schedule.ticks))
-            needed.add(one)
-        return [(key, key) for key in self.known if not isinstance(key, Value) or key in needed]
-
-    def _after(self) -> list[tuple[Any, Any]]:
-        """Return the carry into the next frame, as (key here, key there)."""
-        return [
-            *((("x", i), ("x", i)) for i in range(self.layout.states)),
-            *((("newest", one), ("newest", one)) for one in self.layout.outputs),
-            *((shifted(one, self.schedule.ticks), one) for one in self.layout.later),
-            *((("work", part), ("work", part)) for part in self.layout.parts),
-        ]
+                at = self.layout.parts.index(part)
+                work[at] = work[at] - old[n + i] * (new[i] - old[i])
+            self.work = _column(self.type_, work)
 
 
 def _column(type_: Any, values: Sequence[Any]) -> Any:
-    return casadi.densify(casadi.vertcat(*values)) if values else type_(0, 1)
+    return casadi.densify(casadi.vertcat(type_(0, 1), *values))

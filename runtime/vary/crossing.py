@@ -25,11 +25,11 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from apc.compiler.errors import ApcError
 from apc.compiler.words import counted
 from apc.eigen.spectrum import Mode
+from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -416,6 +416,8 @@ def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float]) -> f
         value = new
     if at(low)[0] * at(high)[0] >= 0:  # an end lies on the circle as far as floats know
         return min(low, high, key=lambda end: abs(at(end)[0]))
+    # Imported where Newton's method fails: it takes as long as an analysis.
+    brentq = load_pool("scipy.optimize").brentq
     return float(brentq(lambda value: at(value)[0], low, high, xtol=5e-324, rtol=1e-15))
 
 

@@ -12,6 +12,7 @@ import pytest
 import apc
 from tests.held_scenes import scene, system_of
 from tests.networks.test_loss import STIFFNESS, judged, radius
+from tests.topologies import replaced
 
 # Two peers: stiffness, share lost, packets a burst, radius under hold and zero.
 PAIR = (
@@ -82,3 +83,20 @@ def test_a_crossing_claims_no_more_than_its_moments_do(loss: str, proof: str) ->
 def test_how_soon_bursts_end_is_scanned_from_where_they_end() -> None:
     found = apc.critical(system_of(scene(2, 500.0, loss="{p: 1 %, r: 10 %}")), "lan.loss.r")
     assert found.verdict.startswith("stable") and found.crossings == ()
+
+
+def over_two_links(loss: str, other: str) -> str:
+    """Return two users who hear each other over a second link too, at other instants."""
+    coupler = "{type: AveragePosition, object: cube, stiffness: 100 N/m, clock: haptic, link: wan}"
+    text = scene(2, 500.0, loss=loss)
+    text = replaced(text, ("  coordination:\n", f"  other: {coupler}\n  coordination:\n"))
+    return f"{text}  wan: {{clock: network, delay: 12 ms, loss: {other}}}\n"
+
+
+def test_links_whose_packets_are_due_at_different_instants_are_judged_together() -> None:
+    """Bursts that end at once are losses one by one, which are judged in another way."""
+    nearly = radius(over_two_links("{p: 10 %, r: 89.999999 %}", "5 %"))
+    assert nearly == pytest.approx(radius(over_two_links("10 %", "5 %")), rel=1e-8)
+    found = judged(over_two_links("10 %, on_loss: zero", "5 %"))
+    assert found.verdict == "not judged"
+    assert "values that stand in beside packets of another link or delay" in found.notes[0]

@@ -56,3 +56,9 @@ def test_many_recorded_delays_are_told_with_how_they_were_found_and_too_many_are
     assert "root mean square error of copies: it is not worked out over recorded delays" in found.notes
     found = judged(tmp_path, "8\n9\n" * 10_001)
     assert found.verdict == "not judged" and "20,002 frames" in found.notes[0]
+
+
+def test_what_is_never_heard_is_not_judged(tmp_path: Path) -> None:
+    found = judged(tmp_path, "lost\nlost\n")
+    assert found.verdict == "not judged"
+    assert found.notes[0].endswith("a trace of losses only: nothing is ever heard")

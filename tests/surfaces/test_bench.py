@@ -123,7 +123,7 @@ def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
     json.dumps(found.to_dict(), allow_nan=False)
     axes = bench_picture(found).axes
     assert [ax.get_title() for ax in axes] == ["apc analyze", "apc simulate"]
-    assert "exact (default)" in [text.get_text() for text in axes[1].texts]
+    assert "exact (default)" in [text.get_text() for text in axes[1].get_legend().get_texts()]
 
 
 # ---- more peers ----

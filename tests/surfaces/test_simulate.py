@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from apc.simulation import blocks, simulation
@@ -86,14 +87,14 @@ def test_a_scene_at_rest_is_said_to_rest_and_an_unstable_one_is_an_answer(cli: C
 
 def test_ctrl_c_keeps_what_is_done(moved: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(simulation, "MOST_FRAMES", 5)
-    step = blocks._Runner.run
+    pushes = blocks.pushes
 
-    def interrupted(self: blocks._Runner, first: int, last: int) -> blocks.Block:
+    def interrupted(played: simulation.Simulation, first: int) -> list[np.ndarray | None]:
         if first >= 10:
             raise KeyboardInterrupt
-        return step(self, first, last)
+        return pushes(played, first)
 
-    monkeypatch.setattr(blocks._Runner, "run", interrupted)
+    monkeypatch.setattr(blocks, "pushes", interrupted)
     ran = moved("simulate --duration 1s --out run.csv")
     assert ran.code == 130 and "run.csv is written" in ran.out
     assert ran.err.startswith("stopped at 0.079 s of 1 s; what was done is kept")

@@ -8,8 +8,7 @@ import pytest
 
 import apc
 from apc.compiler.compiled import CompiledSystem
-from apc.present.planar import paths_of
-from apc.present.simulation import save_picture
+from apc.present.simulation import paths_of, save_picture
 from apc.present.still import draw_still, save_still
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 
@@ -24,8 +23,8 @@ def test_every_peer_has_a_row_and_the_rest_is_counted(tmp_path: Path) -> None:
     drawn = draw_still(scene("experiment-average")).axes[0]
     assert [one.get_text() for one in drawn.get_yticklabels()] == ["right[1]", "left[1]", "left[2]"]
     assert len(drawn.patches) == 3
-    many = draw_still(compiled(replaced(AVERAGE, ("count: 3", "count: 1000")))).axes[0]
-    assert many.get_title() == "three-users-average: at the start (988 more peers)"
+    many = draw_still(compiled(replaced(AVERAGE, ("count: 3", "count: 1000"))))
+    assert many.get_suptitle() == "three-users-average: at the start (988 more peers)"
     save_still(scene("experiment-average"), tmp_path / "still.svg")
     assert (tmp_path / "still.svg").read_text(encoding="utf-8").startswith("<?xml")
 

@@ -211,6 +211,19 @@ def test_two_masses_on_a_spring_are_pushed_as_their_modes_are(what: str, tmp_pat
                 assert found.values[row, place] == pytest.approx(moved, rel=1e-12, abs=1e-15)
 
 
+def test_peers_are_pushed_for_long_each_by_its_own_force_one_of_them_by_none(tmp_path: Path) -> None:
+    """m v' + b v = F sin(ω t + φ): what is left after 10 s is the response to the sine alone."""
+    peers = "count: 3, set: {push.force: [0 N, 2 N, 1 N], push.frequency: [3 Hz, 4 Hz, 500 Hz]}"
+    scene = replaced(SCENE, ("count: 1, set: {device.x: 0.5 m, device.v: 0.125 m/s}", peers))
+    system = pushed("type: SineForce, force: 1 N, frequency: 1 Hz, phase: 0.5 rad", tmp_path, scene)
+    found = simulate(system, duration=Fraction(10), signals=["*.v"], jit=False)
+    for row in (2499, 2500):
+        turn = 2 * np.pi * np.array([3, 4, 500])
+        response = np.array([0, 2, 1]) / (1j * turn * MASS + DAMPING)
+        expected = (response * np.exp(1j * (turn * found.time[row] + 0.5))).imag
+        assert found.values[row] == pytest.approx(expected, rel=1e-9, abs=1e-14)
+
+
 def test_a_force_that_changes_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(forcings, "MOST_HALVED", 1000)
     system = pushed("type: SineForce, force: 1 N, frequency: 1e9 Hz", tmp_path)

@@ -273,6 +273,7 @@ def test_the_verdict_along_a_scan_is_what_analyses_say(name: str) -> None:
 
 def test_how_many_users_is_answered_as_each_scene_alone_would() -> None:
     found = apc.critical(compiled(MESH), "user.count", lower="2", upper="40")
+    assert {one.proof for one in found.crossings} == {"both judged"}
     ends = [int(one.boundary) for one in found.crossings]
     alone = [apc.analyze(compiled(MESH), set={"user.count": str(count)}).stable for count in range(2, 41)]
     expected = [alone[0] is (sum(end < count for end in ends) % 2 == 0) for count in range(2, 41)]

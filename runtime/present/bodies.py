@@ -1,0 +1,209 @@
+"""The bodies of a scene and the surfaces between them, found in its equations.
+
+Takes: a `CompiledSystem`.
+Gives: `Body`, `Disc`, `Line`, `PeerView`, `moves_in_plane`, `bodies_of`, `views_of`.
+Guarantees: a body is a position, a number or a vector of numbers in metres; where something is decided by the
+distance of two of them, or of one from a fixed point, in metres, there is a disc; where by the distance from
+a line or plane, or on an axis from a point, there is a line.
+Does not: play the scene, draw it, or know what a part is called.
+
+A decision on the distance of two bodies less w, as a contact takes, says that the two touch at w. The body
+that is sent to the others, or else the second, is given the radius w, the other is a point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.interpolation import jacobian
+from apc.compiler.language.vectors import whole_and_index
+from apc.frame.jacobians import guards_of, jacobians
+from apc.frame.parameters import resolve
+from apc.frame.start import start_values
+from apc.simulation.signals import sent_states
+
+Floats = NDArray[np.float64]
+
+MOST_PEERS = 12  # in a picture: more can't be told from one another
+PROBES = 4  # states at which a surface is looked at: a disc in space has four unknowns, and each tells three
+SAME = 1e-9  # relative: what is equal but for roundings
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """A body at the start: its place (d,) and its radius, 0 for a point, in m; `states` are its coordinates.
+
+    Of a body on an axis d is 1, and the radius half its width.
+    """
+
+    name: str
+    place: tuple[float, ...]
+    radius: float
+    states: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Disc:
+    """A fixed disc or sphere, in m."""
+
+    centre: tuple[float, ...]
+    radius: float
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """Where normal·x = offset: a point of an axis, a line or a plane; the normal has length 1, m."""
+
+    normal: tuple[float, ...]
+    offset: float
+
+
+@dataclass(frozen=True, slots=True)
+class PeerView:
+    """A peer at the start: its bodies, those of a plane only if there are some, and its fixed surfaces."""
+
+    name: str
+    bodies: tuple[Body, ...]
+    surfaces: tuple[Disc | Line, ...]
+
+
+def positions_of(kind: Kind) -> dict[str, list[int]]:
+    """Return the positions of a kind, each by the places of its coordinates among the states."""
+    found: dict[str, list[int]] = {}
+    for place, state in enumerate(kind.states):
+        if state.unit == "m":
+            found.setdefault(whole_and_index(state.name)[0], []).append(place)
+    return found
+
+
+def moves_in_plane(system: CompiledSystem) -> bool:
+    """Return whether some body's position is a vector."""
+    return any(len(places) > 1 for kind in system.kinds for places in positions_of(kind).values())
+
+
+def views_of(system: CompiledSystem) -> list[PeerView]:
+    """Return the first `MOST_PEERS` peers as they look at the start."""
+    numbers = resolve(system)
+    sites = [jacobians(kind) for kind in system.kinds]
+    plane = moves_in_plane(system)
+    found: list[PeerView] = []
+    for group, members in enumerate(system.groups):
+        for peer in range(min(members.count, MOST_PEERS - len(found))):
+            vector = [float(value) for value in numbers.parameters[group][numbers.rows[group][peer]]]
+            start, _, _ = start_values(sites[members.kind], vector)
+            bodies, surfaces = bodies_of(system.kinds[members.kind], vector, start)
+            shown = tuple(body for body in bodies if not plane or len(body.place) > 1)
+            found.append(PeerView(f"{members.name}[{peer + 1}]", shown, tuple(surfaces)))
+    return found
+
+
+def bodies_of(
+    kind: Kind, vector: Sequence[float], start: Sequence[float]
+) -> tuple[list[Body], list[Disc | Line]]:
+    """Return what a peer's start looks like.
+
+    Parameters
+    ----------
+    kind
+        The peer's kind.
+    vector
+        Its parameters (n_p,), SI.
+    start
+        Its states at the start (n_x,), SI.
+    """
+    positions = positions_of(kind)
+    radii = dict.fromkeys(positions, 0.0)
+    sent = sent_states(kind)
+    fixed: dict[Disc | Line, None] = {}
+    for points, values, slopes in _decisions(kind, vector):
+        moving = set(np.flatnonzero(slopes.any(axis=0)).tolist())
+        names = [name for name, places in positions.items() if moving & set(places)]
+        if not moving <= {place for name in names for place in positions[name]} or len(names) not in (1, 2):
+            continue
+        first, last = (positions[names[end]] for end in (0, -1))
+        at = points[:, first]
+        if len(names) == 2:
+            if len(first) != len(last) or not _equal(slopes[:, first], -slopes[:, last]):
+                continue
+            at = at - points[:, last]
+        surface = _surface(at, values, slopes[:, first])
+        if surface is None:
+            continue
+        if len(names) == 1:
+            fixed[surface] = None
+            continue
+        wide = next((name for name in names if positions[name][0] in sent), names[1])
+        if isinstance(surface, Line) and len(first) == 1:
+            radii[wide] = max(radii[wide], abs(surface.offset))
+        elif isinstance(surface, Disc) and _equal(surface.centre, 0):
+            radii[wide] = max(radii[wide], surface.radius)
+    bodies = [
+        Body(
+            name.rpartition(".")[0],
+            tuple(float(start[place]) for place in places),
+            radii[name],
+            tuple(kind.states[place].name for place in places),
+        )
+        for name, places in positions.items()
+    ]
+    return bodies, list(fixed)
+
+
+def _decisions(kind: Kind, vector: Sequence[float]) -> Iterator[tuple[Floats, Floats, Floats]]:
+    """Yield of all that is decided by states alone: states (k, n_x), its values (k,), slopes (k, n_x)."""
+    points = np.random.default_rng(1).uniform(-1, 1, (PROBES, len(kind.states)))
+    for function in (kind.derivative, *(clock.tick for clock in kind.clocks)):
+        if not function.is_a("SXFunction"):
+            continue
+        inputs: list[Any] = function.sx_in()
+        x, p = inputs[0], inputs[-2]
+        others = casadi.vertcat(*inputs[1:-2], inputs[-1])
+        for guard in guards_of(casadi.densify(function(*inputs)), x):
+            if casadi.depends_on(guard, others):
+                continue
+            at = casadi.Function("at", [x, p], [casadi.densify(casadi.horzcat(guard, jacobian(guard, x)))])
+            rows = np.array([np.asarray(at(point, vector), np.float64)[0] for point in points])
+            if np.isfinite(rows).all():
+                yield points, rows[:, 0], rows[:, 1:]
+
+
+def _equal(values: Any, others: Any, scale: float = 1.0) -> bool:
+    return np.allclose(values, others, rtol=0, atol=SAME * scale)
+
+
+def _surface(at: Floats, values: Floats, slopes: Floats) -> Disc | Line | None:
+    """Return where a function of a point is zero, if it is the distance from a disc or a line, with a sign.
+
+    Parameters
+    ----------
+    at, values, slopes
+        Points (k, d), the function there (k,), and its slopes (k, d).
+    """
+    if not _equal(np.linalg.norm(slopes, axis=1), 1):
+        return None
+    count, size = at.shape
+    if _equal(slopes, slopes[0]):
+        normal = slopes[0] * np.sign(slopes[0][np.abs(slopes[0]).argmax()])
+        offset = normal @ at[0] - (normal @ slopes[0]) * values[0]
+        return Line(tuple(map(_tidy, normal)), _tidy(offset))
+    if size == 1:
+        return None
+    # g = ∓(R − |p − c|) has the slope ±(p − c)/|p − c|: c = p − g·slope ∓ R·slope, the same from every point.
+    system = np.hstack([np.tile(np.eye(size), (count, 1)), slopes.reshape(-1, 1)])
+    right = (at - values[:, None] * slopes).ravel()
+    solution = np.linalg.lstsq(system, right, rcond=None)[0]
+    if not _equal(system @ solution, right, 1 + np.abs(right).max()):
+        return None
+    return Disc(tuple(map(_tidy, solution[:size])), abs(_tidy(solution[size])))
+
+
+def _tidy(number: Any) -> float:
+    """Return a number without its last roundings, so that a surface that is found twice is one."""
+    return float(f"{number:.9g}") if abs(number) > SAME else 0.0
