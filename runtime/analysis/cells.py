@@ -2,7 +2,7 @@
 
 Takes: a `ClosedSystem`, its sites over `Fraction` and `Ratio`, its rigid motions; cells.
 Gives: `OpenFrames`, `open_frames`, `frames_over`; `OpenLoop`, `open_loop`, `closed_over`; `OpenSystem`,
-`open_system`; `Cell`; `Looked`, `look`, `contracted`; `change_of_basis`.
+`open_system`; `Cell`; `Looked`, `look`, `contracted`.
 Guarantees: a cell that is said to be stable is proved so, at every point of it; rounding is charged.
 Does not: divide cells, or decide what floats leave open (see `box_proof`).
 
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.closing import ClosedSystem, Feedback, bounded_weight, close, feedback_of
-from apc.eigen.pseudospectrum import balance
+from apc.eigen.pseudospectrum import balance, norms
 from apc.eigen.ratios import Ratio
 from apc.eigen.relative import Relative, relative, relative_coordinates, with_doubt
 from apc.eigen.rigid import RigidModes
@@ -197,7 +197,7 @@ def contracted(matrix: Matrix) -> Looked:
     if not n:
         return Looked(proved, inside, reach)
     value, off, slopes = value_of(matrix), radius_of(matrix), matrix[:, 2:]
-    basis = change_of_basis(value)
+    basis = _change_of_basis(value)
     known = np.isfinite(basis).all(axis=(1, 2)) & np.isfinite(matrix).all(axis=(1, 2, 3))
     reach[~known] = np.nan
     if known.any():
@@ -214,13 +214,9 @@ def _contracted(basis: Floats, value: Floats, off: Floats, slopes: Floats) -> Lo
     With Y about R⁻¹, ‖R M R⁻¹‖ ≤ ‖R M Y‖ / (1 − ‖1 − R Y‖). What the radii, and rounding, leave of R M Y is
     less in norm than |R| E |Y|.
     """
-    k, count, n = slopes.shape[:3]
+    count, n = slopes.shape[1:3]
     charge = (n + 4) * UNIT
-    try:
-        inverse = np.linalg.inv(basis)
-    except np.linalg.LinAlgError:
-        nothing = np.zeros(k, dtype=np.bool_)
-        return Looked(nothing, nothing, np.full((k, count), np.nan))
+    inverse = np.linalg.inv(basis)
     size, weight = np.abs(basis), np.abs(inverse)
     wrong = norms(np.eye(n) - basis @ inverse) + charge * (norms(size @ weight) + np.sqrt(n))
     moved = basis @ value @ inverse
@@ -232,22 +228,10 @@ def _contracted(basis: Floats, value: Floats, off: Floats, slopes: Floats) -> Lo
     inside = limit > 0
     inside[inside] = _norm_below(moved[inside], limit[inside])
     proved = inside.copy()
-    for signs in itertools.product((1.0, -1.0), repeat=count) if count else ():
-        some = np.flatnonzero(proved)
-        if not len(some):
-            break
-        corner = moved[some]
-        for by, sign in enumerate(signs):
-            corner = corner + sign * turned[some, by]
-        proved[some] = _norm_below(corner, limit[some])
+    for signs in itertools.product((1.0, -1.0), repeat=count):
+        corner = moved + np.tensordot(turned, np.array(signs), (1, 0))
+        proved[proved] = _norm_below(corner[proved], limit[proved])
     return Looked(proved, inside, norms(turned))
-
-
-def norms(matrix: Floats) -> Floats:
-    """Return upper bounds on the 2-norms of matrices (…, n, m), those of Frobenius."""
-    entries = matrix.shape[-2] * matrix.shape[-1]
-    total = np.square(matrix).sum(axis=(-2, -1))
-    return np.asarray(np.sqrt(total) * (1 + (entries + 4) * UNIT) + np.finfo(np.float64).tiny ** 0.5)
 
 
 def _norm_below(matrix: Floats, limit: Floats) -> Truths:
@@ -275,7 +259,7 @@ def _cholesky(matrix: Floats) -> Floats:
     return found
 
 
-def change_of_basis(matrix: Floats) -> Floats:
+def _change_of_basis(matrix: Floats) -> Floats:
     """Return R (k, n, n) with ‖R M R⁻¹‖₂ < 1 of matrices (k, n, n), NaN where rounding finds none.
 
     Notes

@@ -359,11 +359,8 @@ def _lift(loop: _OpenLoop) -> FrameMap:
 
 def _feedback(loop: _OpenLoop) -> Floats:
     """Return F_D: the forces of each tick of the samples there, and those of what is heard."""
-    n, n_c, ratio = len(loop.states), len(loop.fast), loop.ratio
-    f = np.zeros((ratio * n_c + len(loop.slow), ratio * n + len(loop.heard)))
-    f[: ratio * n_c, : ratio * n] = np.kron(np.eye(ratio), _floats(loop.fast, n))
-    f[ratio * n_c :, ratio * n :] = _floats(loop.slow, len(loop.heard))
-    return f
+    own = np.kron(np.eye(loop.ratio), _floats(loop.fast, len(loop.states)))
+    return np.asarray(block_diag(own, _floats(loop.slow, len(loop.heard))))
 
 
 def _close(delayed: FrameMap, f: Floats) -> Matrix:
