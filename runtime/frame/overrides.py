@@ -203,7 +203,19 @@ def _check_bounds(system: CompiledSystem) -> None:
 def check_bounds(
     parameter: Parameter, name: str, mistakes: Mistakes, code: str = "E624", place: Place = OVERRIDE
 ) -> None:
-    """Record a value below the minimum or above the maximum of a parameter, in words of that name."""
+    """Record a value below the minimum or above the maximum of a parameter.
+
+    Parameters
+    ----------
+    parameter
+        The parameter, with its value.
+    name
+        What it is called in the message.
+    mistakes
+        Where a mistake is recorded.
+    code, place
+        Those of the mistake.
+    """
     low, high, value = parameter.minimum, parameter.maximum, parameter.value
 
     def told(number: float) -> str:
