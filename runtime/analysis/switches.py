@@ -188,7 +188,9 @@ def find_switches(kind: Kind) -> SwitchedKind:
         for one in opened:
             if casadi.depends_on(one.output, symbol):
                 changed |= dict.fromkeys(_changed(kind, one, symbol, opening.operands[number]))
-        decisions.append(Decision(symbol, tuple(changed), _guard(opening.operands[number])))
+        first, *others = opening.operands[number]
+        # Of a sign there is one operand.
+        decisions.append(Decision(symbol, tuple(changed), first - others[0] if others else first))
     return SwitchedKind(kind, tuple(decisions), opened, walkable=True)
 
 
@@ -253,11 +255,6 @@ def bind(switched: SwitchedKind, base: SiteJacobians, settings: Mapping[int, boo
         By the place of the decision; what is left out is off.
     """
     return replace(jacobians(_bound(switched, settings)), kind=base.kind, pattern=base.pattern)
-
-
-def _guard(operands: Sequence[Any]) -> Any:
-    """Return what is zero where a decision between two operands, or on the sign of one, is taken."""
-    return operands[0] - operands[1] if len(operands) > 1 else operands[0]
 
 
 def _functions(kind: Kind) -> list[tuple[tuple[str, int, int], Any, tuple[str, ...], tuple[str, ...]]]:

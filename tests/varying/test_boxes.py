@@ -133,7 +133,7 @@ def test_a_box_stands_before_the_answer_and_says_that_more_cells_may_decide_it(
     words = ["analyze", str(tmp_path / "scene.yaml"), "--box", "coordination.stiffness=100 N/m:1 N/mm"]
     assert run([*words, "--cells", "1"]) == 0
     text = capsys.readouterr().out
-    assert text.startswith("three-users-average:\nundecided, 100 % of the box is left open (1 cells)")
+    assert text.startswith("three-users-average:\nundecided, 100 % of the box is left open (1 cell)")
     assert "--cells 10\n" in text
     assert run(words) == 0
     assert capsys.readouterr().out.startswith("three-users-average:\nproved stable")
