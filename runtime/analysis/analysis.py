@@ -121,18 +121,16 @@ class Analysis(Result):
         )
 
 
-def prepare(system: CompiledSystem, *, order: Sequence[str] = ORDER) -> Prepared:
+def prepare(system: CompiledSystem) -> Prepared:
     """Do what analyses with different numbers can share.
 
     Parameters
     ----------
     system
         The compiled scene.
-    order
-        The order of coincident events, see `schedule.ORDER`.
     """
     timings = {timing.name: timing.value for timing in system.timings}
-    return _scheduled(system, linear_sites(system, timings, order), timings, tuple(order))
+    return _scheduled(system, linear_sites(system, timings, ORDER), timings, ORDER)
 
 
 def prepare_at_start(system: CompiledSystem, prepared: Prepared) -> Prepared | None:
@@ -226,10 +224,9 @@ def analyze(
             spectrum, notes = _solve_populations(system, prepared, numbers, exchange)
         elif plan.method == "determinant":
             spectrum, notes = _solve_determinant(plan.loops), ()
+            small = all(one.states <= MOST_STATES for one in plan.loops)
             if (
-                method == "auto"
-                and spectrum.stable is None
-                and all(one.states <= MOST_STATES for one in plan.loops)
+                method == "auto" and spectrum.stable is None and small
             ):  # matrices bound what the determinant leaves open
                 arranged = arrange(plan.groups, exchange)
                 plan = replace(plan, method=arranged.method, notes=arranged.notes)
@@ -241,9 +238,7 @@ def analyze(
         if certify and (not plan.groups or plan.method == "determinant"):
             notes = (*notes, f"not proved, as method {plan.method} has no matrix of balls")
         linearized = not all(prepared.jacobians[group.kind].affine for group in system.groups)
-        population = (
-            () if plan.loops else plan.groups or _representatives(system, prepared, numbers, exchange)
-        )
+        population = () if plan.loops else _representatives(system, prepared, numbers, exchange)
         stands = _what_stands(spectrum, plan.loops, population)
         verdict, stable = spectrum.verdict, spectrum.stable
         if verdict in (STABLE_TRANSLATING, DRIFTS):

@@ -1,7 +1,7 @@
 """Which parameters a box leaves open, and how far: `contact.stiffness=±1%`.
 
 Takes: a `CompiledSystem` and ranges as text.
-Gives: `parse_range`; `Box`, `open_box`; `OpenSites`, `open_sites`.
+Gives: `parse_range`; `open_systems`; `OpenSites`, `open_sites`.
 Guarantees: a site's matrices are exact quotients of polynomials in the open parameters, and what depends on
 these by an expression follows.
 Does not: prove anything (see `box_proof`).
@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups, prepare
+from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem, Formula, Group, Parameter
 from apc.compiler.digits import plain_float
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.language.evaluation import FaultError, exactly
 from apc.compiler.plain import RULES
 from apc.compiler.words import with_unit
@@ -31,7 +31,7 @@ from apc.eigen.peer_group import PeerGroup, Runs
 from apc.eigen.ratios import NotRational, Ratio, Ratios, open_site
 from apc.frame.exchange import Exchange
 from apc.frame.names import Free, Range, find
-from apc.frame.overrides import Override, apply
+from apc.frame.overrides import Override, apply, check_bounds
 from apc.frame.parameters import exact_numbers, scope_of
 from apc.frame.site import LinearSite
 from apc.network.nominal import refuse_channel_number
@@ -40,21 +40,8 @@ _PLACE = Place("box")
 
 # Where in the box the peers are sorted into groups: a place that no two given values share, so that peers are
 # alike there only if they are alike all over the box: of each range another power of it, as two groups may
-# have the same ranges. Three, in case one of them is met by chance.
-GENERIC = (Fraction(6180339887, 10**10), Fraction(4142135623, 10**10), Fraction(7320508075, 10**10))
-
-
-@dataclass(frozen=True, slots=True)
-class Box:
-    """A scene with parameters left open.
-
-    `systems` are its closed systems (at some point of the box); `sites[s][g]` are the matrices of site g of
-    system s, over `Fraction` and `Ratio` in the order of `ranges`.
-    """
-
-    ranges: tuple[Range, ...]
-    systems: tuple[ClosedSystem, ...]
-    sites: tuple[tuple[LinearSite, ...], ...]
+# have the same ranges.
+GENERIC = Fraction(6180339887, 10**10)
 
 
 def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Range:
@@ -145,23 +132,28 @@ def _parameter(system: CompiledSystem, free: Free, place: Place) -> Parameter:
 
 def _check_limits(parameter: Parameter, low: Fraction, high: Fraction, name: str, place: Place) -> None:
     """Refuse an empty range, and one beyond the parameter's bounds."""
-    low_text, high_text = (with_unit(f"{float(one):g}", parameter.unit) for one in (low, high))
+    what, mistakes = f"the box of {name}", Mistakes()
     if not low < high:
-        raise ApcError(
-            Mistake("E833", place, f"the box of {name}", "a low below the high", f"{low_text} to {high_text}")
-        )
-    least, most = parameter.minimum, parameter.maximum
-    if least is not None and (low < Fraction(least) or (parameter.open_minimum and low == Fraction(least))):
-        end = with_unit(f"{least:g}", parameter.unit)
-        wanted = f"{'more than' if parameter.open_minimum else 'at least'} {end}"
-        raise ApcError(Mistake("E833", place, f"the box of {name}", wanted, low_text))
-    if most is not None and high > Fraction(most):
-        wanted = f"at most {with_unit(f'{most:g}', parameter.unit)}"
-        raise ApcError(Mistake("E833", place, f"the box of {name}", wanted, high_text))
+        ends = " to ".join(with_unit(f"{float(end):g}", parameter.unit) for end in (low, high))
+        mistakes.add("E833", place, what, expected="a low below the high", got=ends)
+    for end in (low, high):
+        check_bounds(replace(parameter, value=float(end), exact=None), what, mistakes, "E833", place)
+    mistakes.raise_if_any()
 
 
-def open_box(system: CompiledSystem, ranges: Sequence[Range]) -> Box:
-    """Return a scene with parameters left open, as closed systems over these.
+def open_systems(
+    system: CompiledSystem, ranges: Sequence[Range], prepared: Prepared
+) -> list[tuple[ClosedSystem, tuple[LinearSite, ...]]]:
+    """Return the closed systems of a scene with parameters left open, at some point of the box.
+
+    With each come the matrices of its sites, over `Fraction` and `Ratio` in the order of `ranges`.
+
+    Parameters
+    ----------
+    system, ranges
+        The compiled scene and what is left open.
+    prepared
+        From `analysis.prepare`.
 
     Raises
     ------
@@ -172,12 +164,12 @@ def open_box(system: CompiledSystem, ranges: Sequence[Range]) -> Box:
         raise ApcError(Mistake("E830", _PLACE, "no parameter is left open", hint="contact.stiffness=±1%"))
     for one in ranges:
         refuse_channel_number(system, one.free, _PLACE)
-    prepared = prepare(system)
     found = open_sites(system, ranges, prepared, lambda changed: lifted_groups(changed, prepared=prepared))
-    systems = split(found.groups, found.exchange).systems
     by_site = {id(group.site): found.sites[group.name] for group in found.groups}
-    sites = tuple(tuple(by_site[id(group.site)] for group in one.sites) for one in systems)
-    return Box(tuple(ranges), systems, sites)
+    return [
+        (one, tuple(by_site[id(group.site)] for group in one.sites))
+        for one in split(found.groups, found.exchange).systems
+    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,18 +217,15 @@ def open_sites(
         raise ApcError(Mistake("E832", Place(system.origin.topology), what))
     field = Ratios.of(len(ranges))
     opened = [_opened(system, group, ranges, field) for group in system.groups]
-    for share in GENERIC:
-        point = [
-            Override(one.free, one.low + share**place * (one.high - one.low))
-            for place, one in enumerate(ranges, 1)
-        ]
-        at = apply(system, point)
-        groups, exchange = lifted(at)
-        members = [_members(group, exchange.starts) for group in groups]
-        if all(len({_reach(opened[place]) for place in own}) == 1 for own in members):
-            break
-    else:
-        raise AssertionError("peers of different groups are alike at three places of the box")
+    point = [
+        Override(one.free, one.low + GENERIC**place * (one.high - one.low))
+        for place, one in enumerate(ranges, 1)
+    ]
+    at = apply(system, point)
+    groups, exchange = lifted(at)
+    members = [_members(group, exchange.starts) for group in groups]
+    apart = all(len({_reach(opened[place]) for place in own}) == 1 for own in members)
+    assert apart, "peers of different groups are alike at a generic place of the box"
     vectors = {
         group.name: _open_vector(group, opened[own[0]]) for group, own in zip(groups, members, strict=True)
     }

@@ -2,7 +2,7 @@
 
 Takes: a `ClosedSystem`, its sites over `Fraction` and `Ratio`, its rigid motions; cells.
 Gives: `OpenFrames`, `open_frames`, `frames_over`; `OpenLoop`, `open_loop`, `closed_over`; `OpenSystem`,
-`open_system`; `Cell`; `Looked`, `look`, `contracted`; `change_of_basis`.
+`open_system`; `Cell`; `Looked`, `look`, `contracted`.
 Guarantees: a cell that is said to be stable is proved so, at every point of it; rounding is charged.
 Does not: divide cells, or decide what floats leave open (see `box_proof`).
 
@@ -14,6 +14,7 @@ eigenvalues inside the circle. A norm is convex: it is largest at a corner of th
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,13 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.closing import ClosedSystem, Feedback, bounded_weight, close, feedback_of
-from apc.eigen.pseudospectrum import balance
+from apc.eigen.pseudospectrum import balance, norms
 from apc.eigen.ratios import Ratio
 from apc.eigen.relative import Relative, relative, relative_coordinates, with_doubt
 from apc.eigen.rigid import RigidModes
-from apc.frame.discretize import UNIT, discretize
+from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap, compose, step_durations
-from apc.frame.radius import Arithmetic, radius_of, value_of, with_radius
+from apc.frame.radius import Arithmetic, radius_of, value_of
 from apc.frame.schedule import Schedule
 from apc.frame.site import LinearSite, every_matrix
 from apc.frame.taylor import reciprocal, step_over, taylor, within
@@ -65,15 +66,13 @@ class OpenFrames:
     """Sites over the open parameters of a box, ready to be lifted over cells.
 
     `written` are the sites in floats, `beside` another matrix that is wanted, `quotients` the numerators and
-    denominators in these, none where this is 1; `steps` are [F G] by duration in quanta of the sites whose A
-    and B stay.
+    denominators in these, none where this is 1.
     """
 
     sites: tuple[LinearSite, ...]
     schedules: tuple[Schedule, ...]
     written: tuple[LinearSite, ...]
     beside: Matrix
-    steps: tuple[Mapping[int, Matrix], ...]
     quotients: tuple[tuple[Polynomial, Polynomial | None], ...]
 
 
@@ -85,18 +84,12 @@ class OpenLoop:
     frames: OpenFrames
     feedback: tuple[Feedback, ...]
 
-    @property
-    def sites(self) -> tuple[LinearSite, ...]:
-        """Its sites' matrices, over `Fraction` and `Ratio`."""
-        return self.frames.sites
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenSystem:
-    """A closed system over a box, and its rigid motions, which are so all over it."""
+    """A closed system over a box, and its relative coordinates, which serve all over it."""
 
     loop: OpenLoop
-    rigid: RigidModes
     relative: Relative
 
 
@@ -122,7 +115,7 @@ def open_system(system: ClosedSystem, sites: Sequence[LinearSite], rigid: RigidM
     rigid
         Its rigid motions, which are so all over the box.
     """
-    return OpenSystem(open_loop(system, sites), rigid, with_doubt(relative_coordinates(rigid.basis)))
+    return OpenSystem(open_loop(system, sites), with_doubt(relative_coordinates(rigid.basis)))
 
 
 def open_loop(system: ClosedSystem, sites: Sequence[LinearSite], beside: Matrix | None = None) -> OpenLoop:
@@ -179,7 +172,6 @@ def open_frames(
         schedules=tuple(schedules),
         written=tuple(alike[id(site)] for site in sites),
         beside=wanted,
-        steps=tuple(_steps(site, schedule) for site, schedule in zip(sites, schedules, strict=True)),
         quotients=tuple(quotients),
     )
 
@@ -205,7 +197,7 @@ def contracted(matrix: Matrix) -> Looked:
     if not n:
         return Looked(proved, inside, reach)
     value, off, slopes = value_of(matrix), radius_of(matrix), matrix[:, 2:]
-    basis = change_of_basis(value)
+    basis = _change_of_basis(value)
     known = np.isfinite(basis).all(axis=(1, 2)) & np.isfinite(matrix).all(axis=(1, 2, 3))
     reach[~known] = np.nan
     if known.any():
@@ -222,13 +214,9 @@ def _contracted(basis: Floats, value: Floats, off: Floats, slopes: Floats) -> Lo
     With Y about R⁻¹, ‖R M R⁻¹‖ ≤ ‖R M Y‖ / (1 − ‖1 − R Y‖). What the radii, and rounding, leave of R M Y is
     less in norm than |R| E |Y|.
     """
-    k, count, n = slopes.shape[:3]
+    count, n = slopes.shape[1:3]
     charge = (n + 4) * UNIT
-    try:
-        inverse = np.linalg.inv(basis)
-    except np.linalg.LinAlgError:
-        nothing = np.zeros(k, dtype=np.bool_)
-        return Looked(nothing, nothing, np.full((k, count), np.nan))
+    inverse = np.linalg.inv(basis)
     size, weight = np.abs(basis), np.abs(inverse)
     wrong = norms(np.eye(n) - basis @ inverse) + charge * (norms(size @ weight) + np.sqrt(n))
     moved = basis @ value @ inverse
@@ -240,22 +228,10 @@ def _contracted(basis: Floats, value: Floats, off: Floats, slopes: Floats) -> Lo
     inside = limit > 0
     inside[inside] = _norm_below(moved[inside], limit[inside])
     proved = inside.copy()
-    for signs in itertools.product((1.0, -1.0), repeat=count) if count else ():
-        some = np.flatnonzero(proved)
-        if not len(some):
-            break
-        corner = moved[some]
-        for by, sign in enumerate(signs):
-            corner = corner + sign * turned[some, by]
-        proved[some] = _norm_below(corner, limit[some])
+    for signs in itertools.product((1.0, -1.0), repeat=count):
+        corner = moved + np.tensordot(turned, np.array(signs), (1, 0))
+        proved[proved] = _norm_below(corner[proved], limit[proved])
     return Looked(proved, inside, norms(turned))
-
-
-def norms(matrix: Floats) -> Floats:
-    """Return upper bounds on the 2-norms of matrices (…, n, m), those of Frobenius."""
-    entries = matrix.shape[-2] * matrix.shape[-1]
-    total = np.square(matrix).sum(axis=(-2, -1))
-    return np.asarray(np.sqrt(total) * (1 + (entries + 4) * UNIT) + np.finfo(np.float64).tiny ** 0.5)
 
 
 def _norm_below(matrix: Floats, limit: Floats) -> Truths:
@@ -267,21 +243,23 @@ def _norm_below(matrix: Floats, limit: Floats) -> Truths:
     less than it by more than that rounds, γ_{n+1} tr / (1 − γ_{n+1}) (Rump, Verification of positive
     definiteness, 2006), and by what N ᵀN rounds.
     """
-    # Column by column for all at once: NumPy's own decomposition refuses a whole stack where it refuses one.
     n = matrix.shape[-1]
     rounded = (n + 2) * UNIT * (np.square(matrix).sum(axis=(1, 2)) + n) * 2
     left = -(matrix.swapaxes(1, 2) @ matrix)
     np.einsum("kii->ki", left)[:] += (np.square(limit) * (1 - 4 * UNIT) - rounded)[:, None]
-    below = np.ones(len(matrix), dtype=np.bool_)
-    for column in range(n):
-        pivot = left[:, column, column]
-        below &= pivot > 0
-        under = left[:, column + 1 :, column] / np.sqrt(np.where(below, pivot, 1.0))[:, None]
-        left[:, column + 1 :, column + 1 :] -= under[:, :, None] * under[:, None]
-    return below
+    return np.asarray(np.isfinite(_cholesky(left)).all(axis=(1, 2)))
 
 
-def change_of_basis(matrix: Floats) -> Floats:
+def _cholesky(matrix: Floats) -> Floats:
+    """Return the lower triangular L (k, n, n) of matrices L Lᵀ, NaN where there is none."""
+    found = np.full(matrix.shape, np.nan)
+    for place, one in enumerate(matrix):  # NumPy refuses a whole stack where it refuses one of it
+        with contextlib.suppress(np.linalg.LinAlgError):
+            found[place] = np.linalg.cholesky(one)
+    return found
+
+
+def _change_of_basis(matrix: Floats) -> Floats:
     """Return R (k, n, n) with ‖R M R⁻¹‖₂ < 1 of matrices (k, n, n), NaN where rounding finds none.
 
     Notes
@@ -308,18 +286,8 @@ def change_of_basis(matrix: Floats) -> Floats:
         power_of = power_of @ power_of
         if not np.abs(power_of).max() > np.finfo(np.float64).tiny:
             break
-    found[some] = _roots((total + total.swapaxes(1, 2)) / 2) / scale
+    found[some] = _cholesky((total + total.swapaxes(1, 2)) / 2).swapaxes(1, 2) / scale
     return found
-
-
-def _roots(matrix: Floats) -> Floats:
-    """Return R (k, n, n) of matrices RᵀR, NaN where there is none."""
-    try:
-        return np.asarray(np.linalg.cholesky(matrix)).swapaxes(1, 2)
-    except np.linalg.LinAlgError:
-        if len(matrix) == 1:
-            return np.full(matrix.shape, np.nan)
-        return np.concatenate([_roots(one[None]) for one in matrix])
 
 
 def _matrices(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:
@@ -373,16 +341,15 @@ def frames_over(asked: OpenFrames, cells: Sequence[Cell]) -> tuple[list[FrameMap
 
     known: dict[tuple[int, int], FrameMap] = {}
     maps = []
-    for site, steps, schedule in zip(asked.written, asked.steps, asked.schedules, strict=True):
+    for site, schedule in zip(asked.written, asked.schedules, strict=True):
         key = id(site), id(schedule)
         if key not in known:
             here = every_matrix(site, over)
-            durations = {one: float(one * schedule.quantum) for one in step_durations(schedule)}
-            own = {
-                duration: within(steps[duration], count) if steps else step_over(here.a, here.b, seconds)
-                for duration, seconds in durations.items()
+            steps = {
+                one: step_over(here.a, here.b, float(one * schedule.quantum))
+                for one in step_durations(schedule)
             }
-            known[key] = compose(here, schedule, own, numbers=numbers)
+            known[key] = compose(here, schedule, steps, numbers=numbers)
         maps.append(known[key])
     return maps, over(asked.beside)
 
@@ -440,19 +407,6 @@ def _polynomial(terms: Polynomial, parameters: Sequence[Matrix], numbers: Arithm
         radius_of(term)[...] = off
         for number, power in zip(parameters, powers, strict=True):
             for _ in range(power):
-                one = coefficient == 1 and not off and term.ndim == 3
-                term = number if one else numbers.multiply(term, number)
+                term = numbers.multiply(term, number)
         total = numbers.add(total, term) if place else term
     return total
-
-
-def _steps(site: LinearSite, schedule: Schedule) -> Mapping[int, Matrix]:
-    """Return [F G] with its radii by duration in quanta, as an analysis has it; none if A or B moves."""
-    if any(isinstance(entry, Ratio) for block in (site.a, site.b) for entry in block.ravel()):
-        return {}
-    durations = step_durations(schedule)
-    steps = discretize(site.a, site.b, [duration * schedule.quantum for duration in durations])
-    return {
-        duration: with_radius(step.matrix, step.roundings * UNIT * step.size)[None]
-        for duration, step in zip(durations, steps, strict=True)
-    }

@@ -13,7 +13,7 @@ Closed again, f = φ(y) with f (y − f) ≥ 0 at each tick. With w = y − f an
 
 What can drift with all contacts open is a pole of H at z = 1, R/(z − 1). Where it is one motion, y follows it
 alike at all ticks, R = −s m, and with Λ s = −mᵀ the rest is free of it: He(−ΛR/(z − 1)) = mᵀm/2 on the
-circle, of either sign of θ, is taken off. Where a frame has one tick only, that can be had in several modes.
+circle, of either sign of θ, is taken off. That can be had in one mode.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from apc.analysis.opened import Matrix, OpenLoop
 from apc.eigen.dissipation import least_real, proves_positive
 from apc.frame.discretize import UNIT
-from apc.frame.radius import RADII, radius_of, value_of, with_radius
+from apc.frame.radius import RADII, radius_of, value_of
 
 Floats = NDArray[np.float64]
 
@@ -43,20 +43,20 @@ def weights_of(loops: Sequence[OpenLoop]) -> Weights | str:
         All loops of a scene.
     """
     drifting = [one for one in loops if one.seen]
-    if len(drifting) > 1 and any(len(one.ports) > 1 for one in drifting):
+    if len(drifting) > 1:
         names = " and ".join(one.name for one in drifting)
         return f"with all contacts open, what may drift is of several modes: {names}"
     weights: dict[tuple[str, str, int], tuple[float, float]] = {}
     for one in drifting:
-        for k, (site, name, tick) in enumerate(one.ports):
-            if not one.seen[k]:
-                return f"{name} does not hold what may drift with all contacts open"
-            by = -1 / (float(one.seen[k]) * one.counts[k])
-            moved, off = (float(one.moved[which, 0, k]) for which in (0, 1))
-            found = by * moved, abs(by) * (off + 8 * UNIT * abs(moved))
-            if not found[0] > found[1]:
-                return f"{name} drives away what may drift with all contacts open"
-            weights.setdefault((site, name, tick), found)
+        moved, off = value_of(one.moved)[0], radius_of(one.moved)[0]
+        for port, share, count, m, doubt in zip(one.ports, one.seen, one.counts, moved, off, strict=True):
+            if not share:
+                return f"{port[1]} does not hold what may drift with all contacts open"
+            by = -1 / (float(share) * count)
+            weight, radius = by * m, abs(by) * (doubt + 8 * UNIT * abs(m))
+            if not weight > radius:
+                return f"{port[1]} drives away what may drift with all contacts open"
+            weights[port] = weight, radius
     return weights
 
 
@@ -89,10 +89,6 @@ def _posed(one: OpenLoop, weights: Weights) -> tuple[Matrix, Matrix, Matrix, Mat
     """Return A, B, C, D and W of a loop whose He(C (e^{jθ} − A)⁻¹ B + D) + W is to be positive."""
     weigh = _weigh(one, weights)
     half = RADII.multiply(np.swapaxes(one.moved / 2, -1, -2), one.moved)
-    if one.seen and len(one.ports) == 1:  # Λ s = −p m for some p, which is 1 in the mode that Λ is of
-        share = np.abs(value_of(weigh) / value_of(one.moved))
-        own, doubt = (radius_of(each) / np.abs(value_of(each)) for each in (weigh, one.moved))
-        half = RADII.multiply(half, with_radius(share, share * (own + doubt + 4 * UNIT) / (1 - doubt)))
     c, d = (RADII.multiply(weigh, block) for block in (one.c, one.d))
     weight = RADII.subtract(weigh, half)
     return one.a, one.b, c, d, weight

@@ -12,10 +12,10 @@ several parts switch, each part alone on at every peer.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
+from apc.analysis.analysis import Prepared, analyze, prepare
 from apc.analysis.switches import SwitchedKind, SwitchingPart, bind, find_switches, switching_parts
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
@@ -113,9 +113,50 @@ def contact_modes(system: CompiledSystem, *, prepared: Prepared | None = None) -
     parts = parts_of_kinds(system, switched, resolve(system))
     names = tuple(dict.fromkeys(part.name for listed in parts for part in listed))
     has = [frozenset(part.name for part in parts[group.kind]) for group in system.groups]
-    scene = _Scene(system, prepared, switched, parts)
-    modes = [scene.analyze(name, setting) for name, setting in _settings(system, names, has)] if names else []
-    return ContactModes(system.name, names, tuple(modes), notes)
+
+    def site(kind: int, on: frozenset[str]) -> SiteJacobians:
+        """Return the Jacobians of a kind with these parts on and all others off."""
+        if not switched[kind].decisions:
+            return prepared.jacobians[kind]
+        setting = settings((one for one in parts[kind] if one.name in on), on=True)
+        setting |= settings((one for one in parts[kind] if one.name not in on), on=False)
+        return bind(switched[kind], prepared.jacobians[kind], setting)
+
+    def mode(name: str, setting: _Setting) -> ContactMode:
+        """Analyse the scene with these parts on."""
+        # Groups of one kind with other parts on are of two kinds now.
+        numbers: dict[tuple[int, frozenset[str]], int] = {}
+        groups = tuple(
+            replace(group, kind=numbers.setdefault((group.kind, own), len(numbers)))
+            for group, own in zip(system.groups, setting, strict=True)
+        )
+        sites = tuple(site(*number) for number in numbers)
+        kinds = tuple(system.kinds[kind] for kind, _ in numbers)
+        changed = replace(system, kinds=kinds, groups=groups)
+        on = tuple((group.name, tuple(sorted(own))) for group, own in zip(groups, setting, strict=True))
+        found, refusal = None, _no_slope(changed, sites)
+        if not refusal:
+            try:
+                found = analyze(changed, prepared=replace(prepared, jacobians=sites))
+            except ApcError as error:
+                refusal = error.mistakes[0].sentence
+        if found is None:
+            nan = float("nan")
+            return ContactMode(name, on, "", None, nan, nan, 0.0, linearized=False, refusal=refusal)
+        return ContactMode(
+            name=name,
+            on=on,
+            verdict=found.verdict,
+            stable=found.stable,
+            spectral_radius=found.spectral_radius,
+            spectral_radius_error=found.spectral_radius_error,
+            frequency_hz=found.modes[0].frequency_hz if found.modes else 0.0,
+            linearized=found.linearized,
+            refusal="",
+        )
+
+    modes = tuple(mode(name, setting) for setting, name in _settings(system, names, has).items())
+    return ContactModes(system.name, names, modes, notes)
 
 
 def parts_of_kinds(
@@ -135,7 +176,7 @@ def parts_of_kinds(
     return parts
 
 
-def settings(parts: Sequence[SwitchingPart], *, on: bool) -> dict[int, bool]:
+def settings(parts: Iterable[SwitchingPart], *, on: bool) -> dict[int, bool]:
     """Return the settings of all decisions of some parts, each wholly on or wholly off."""
     return {
         place: value
@@ -146,64 +187,16 @@ def settings(parts: Sequence[SwitchingPart], *, on: bool) -> dict[int, bool]:
 
 def _settings(
     system: CompiledSystem, names: Sequence[str], has: Sequence[frozenset[str]]
-) -> Iterator[tuple[str, _Setting]]:
-    """Yield the modes of a scene, each once."""
+) -> dict[_Setting, str]:
+    """Return the modes of a scene with their names, each once; none where nothing switches."""
     nothing: frozenset[str] = frozenset()
-    listed = [(EVERYONE, tuple(has)), (NOBODY, tuple(nothing for _ in has))]
-    if len(system.groups) > 1:
-        listed += [
-            (f"on at {group.name} alone", tuple(own if g == place else nothing for g, own in enumerate(has)))
-            for place, group in enumerate(system.groups)
-        ]
-    if len(names) > 1:
-        listed += [(f"{name} on alone", tuple(own & {name} for own in has)) for name in names]
-    known: set[_Setting] = set()
-    for name, setting in listed:
-        if setting not in known:
-            known.add(setting)
-            yield name, setting
-
-
-@dataclass(frozen=True, slots=True)
-class _Scene:
-    """A scene with its switches; one and the same piece of a kind is built once."""
-
-    system: CompiledSystem
-    prepared: Prepared
-    switched: Sequence[SwitchedKind]
-    parts: Sequence[tuple[SwitchingPart, ...]]
-
-    def analyze(self, name: str, setting: _Setting) -> ContactMode:
-        """Analyse the scene with these parts on."""
-        on = tuple(
-            (group.name, tuple(sorted(own))) for group, own in zip(self.system.groups, setting, strict=True)
-        )
-        # Groups of one kind with other parts on are of two kinds now.
-        numbers: dict[tuple[int, frozenset[str]], int] = {}
-        groups = tuple(
-            replace(group, kind=numbers.setdefault((group.kind, own), len(numbers)))
-            for group, own in zip(self.system.groups, setting, strict=True)
-        )
-        sites = tuple(self.site(kind, own) for kind, own in numbers)
-        kinds = tuple(self.system.kinds[kind] for kind, _ in numbers)
-        system = replace(self.system, kinds=kinds, groups=groups)
-        if refusal := _no_slope(system, sites):
-            return _refused(name, on, refusal)
-        prepared = replace(self.prepared, jacobians=sites)
-        try:
-            return _mode(name, on, analyze(system, prepared=prepared))
-        except ApcError as error:
-            return _refused(name, on, error.mistakes[0].sentence)
-
-    def site(self, kind: int, on: frozenset[str]) -> SiteJacobians:
-        """Return the Jacobians of a kind with these parts on and all others off."""
-        base = self.prepared.jacobians[kind]
-        settings: Mapping[int, bool] = {
-            place: value
-            for part in self.parts[kind]
-            for place, value in zip(part.decisions, part.on if part.name in on else part.off, strict=True)
-        }
-        return bind(self.switched[kind], base, settings) if self.switched[kind].decisions else base
+    found = {tuple(has): EVERYONE, tuple(nothing for _ in has): NOBODY} if names else {}
+    for place, group in enumerate(system.groups if names else ()):
+        alone = tuple(own if g == place else nothing for g, own in enumerate(has))
+        found.setdefault(alone, f"on at {group.name} alone")
+    for name in names:
+        found.setdefault(tuple(own & {name} for own in has), f"{name} on alone")
+    return found
 
 
 def _no_slope(system: CompiledSystem, sites: Sequence[SiteJacobians]) -> str:
@@ -218,22 +211,3 @@ def _no_slope(system: CompiledSystem, sites: Sequence[SiteJacobians]) -> str:
         except ApcError:
             return f"this piece of {group.name} is not linear and has no slope at the start values"
     return ""
-
-
-def _mode(name: str, on: tuple[tuple[str, tuple[str, ...]], ...], found: Analysis) -> ContactMode:
-    return ContactMode(
-        name=name,
-        on=on,
-        verdict=found.verdict,
-        stable=found.stable,
-        spectral_radius=found.spectral_radius,
-        spectral_radius_error=found.spectral_radius_error,
-        frequency_hz=found.modes[0].frequency_hz if found.modes else 0.0,
-        linearized=found.linearized,
-        refusal="",
-    )
-
-
-def _refused(name: str, on: tuple[tuple[str, tuple[str, ...]], ...], refusal: str) -> ContactMode:
-    nan = float("nan")
-    return ContactMode(name, on, "", None, nan, nan, 0.0, linearized=False, refusal=refusal)

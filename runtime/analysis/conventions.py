@@ -16,7 +16,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,7 +24,7 @@ import casadi
 import numpy as np
 
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
-from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
 from apc.frame.ages import at_timings
@@ -33,6 +33,8 @@ from apc.frame.schedule import ORDER, Act, Propagate, Schedule, Send, Tick, Valu
 from apc.frame.scheduling import build_schedules
 from apc.frame.site import LinearSite
 from apc.result import Result
+
+Order = tuple[str, ...]
 
 # The pairs of events whose order at one instant can change the frame, and what each order other than the
 # default means. Sending and ticking read the same instant and write different things: their order can't.
@@ -65,7 +67,7 @@ class Outcome:
     Where the analysis refuses this reading, `verdict` is "" and `refusal` says why.
     """
 
-    orders: tuple[tuple[str, ...], ...]
+    orders: tuple[Order, ...]
     departures: tuple[str, ...]
     start: str
     verdict: str
@@ -145,59 +147,59 @@ def conventions(
     """
     prepared = prepared or prepare(system)
     default = default or analyze(system, prepared=prepared)
-    used = [prepared.jacobians[group.kind] for group in system.groups]
-    matters = any(_hearing_matters(site) for site in used)
-    carried = any(send.u.any() for site in used for send in site.pattern.sends)
+    sites = [prepared.jacobians[group.kind] for group in system.groups]
+    matters = any(map(_hearing_matters, sites))
+    carried = any(send.u.any() for site in sites for send in site.pattern.sends)
     pairs = {pair: words for pair, words in DEPARTURES.items() if pair != ("act", "send") or carried}
-    first = _outcome(default, (ORDER,), {}, SENDER if matters else "")
-    if quick and (why := _too_much(prepared, default, 1)):
-        return Conventions(system.name, (first,), matters, why)
-    classes = _classes(system, prepared, pairs)
     readings = [SENDER, NOTHING] if matters else [""]
-    if quick and (why := _too_much(prepared, default, len(classes) * len(readings) - 1)):
+
+    def outcome(orders: Sequence[Order], start: str, found: Analysis | ApcError, frame_s: float) -> Outcome:
+        departures = tuple(
+            words
+            for (a, b), words in pairs.items()
+            if all(order.index(a) < order.index(b) for order in orders)
+        )
+        if isinstance(found, ApcError):
+            nan, refusal = float("nan"), found.mistakes[0].sentence
+            return Outcome(tuple(orders), departures, start, "", None, nan, nan, frame_s, refusal)
+        radius, error = found.spectral_radius, found.spectral_radius_error
+        answer = found.verdict, found.stable, radius, error, found.frame_s
+        return Outcome(tuple(orders), departures, start, *answer, refusal="")
+
+    def only(why: str) -> Conventions:
+        first = replace(outcome([ORDER], readings[0], default, default.frame_s), departures=())
         return Conventions(system.name, (first,), matters, why)
+
+    if quick and (why := _too_much(prepared, default, 1)):
+        return only(why)
+    classes: dict[Hashable, list[Order]] = {}
+    patterns = [site.pattern for site in prepared.jacobians]
+    for order in sorted(itertools.permutations(ORDER), key=lambda order: order != ORDER):
+        schedules = build_schedules(system, prepared.timings, patterns, order=order)
+        meaning = tuple(
+            _meaning(schedule, site.pattern) for schedule, site in zip(schedules, sites, strict=True)
+        )
+        classes.setdefault(meaning, []).append(order)
+    if quick and (why := _too_much(prepared, default, len(classes) * len(readings) - 1)):
+        return only(why)
     outcomes = []
-    for orders, schedules in classes:
-        for start in readings:
-            if ORDER in orders and start != NOTHING:
-                outcomes.append(_outcome(default, orders, pairs, start))
-                continue
-            sites = at_timings(system, prepared.jacobians, prepared.timings, orders[0])
-            if sites is not prepared.jacobians:  # the ages of this order
-                patterns = [site.pattern for site in sites]
-                schedules = build_schedules(system, prepared.timings, patterns, order=orders[0])
-            heard = tuple(map(_silent, sites)) if start == NOTHING else sites
-            changed = Prepared(heard, schedules, prepared.timings, orders[0])
+    for orders, start in itertools.product(classes.values(), readings):
+        found: Analysis | ApcError = default
+        if ORDER not in orders or start == NOTHING:
+            changed = _prepared(system, prepared, orders[0], silent=start == NOTHING)
             try:
                 found = analyze(system, prepared=changed)
             except ApcError as refused:
-                outcomes.append(_refused(refused, orders, pairs, start, float(schedules[0].frame_s)))
-            else:
-                outcomes.append(_outcome(found, orders, pairs, start))
+                found = refused
+        outcomes.append(outcome(orders, start, found, default.frame_s))
     return Conventions(system.name, tuple(outcomes), matters, "")
 
 
-def _classes(
-    system: CompiledSystem, prepared: Prepared, pairs: _Pairs
-) -> list[tuple[tuple[tuple[str, ...], ...], tuple[Schedule, ...]]]:
-    """Return the orders that mean the same frame, with their schedules; the default's first.
-
-    `pairs` are those whose order can matter here at all.
-    """
-    patterns = [site.pattern for site in prepared.jacobians]
-    built: dict[tuple[bool, ...], tuple[Hashable, tuple[Schedule, ...]]] = {}
-    found: dict[Hashable, list[tuple[str, ...]]] = {}
-    schedules: dict[Hashable, tuple[Schedule, ...]] = {}
-    for order in [ORDER, *(one for one in itertools.permutations(ORDER) if one != ORDER)]:
-        key = tuple(order.index(a) < order.index(b) for a, b in pairs)
-        if key not in built:
-            made = build_schedules(system, prepared.timings, patterns, order=order)
-            kinds = [patterns[group.kind] for group in system.groups]
-            built[key] = tuple(_meaning(*pair) for pair in zip(made, kinds, strict=True)), made
-        meaning, made = built[key]
-        found.setdefault(meaning, []).append(order)
-        schedules.setdefault(meaning, made)
-    return [(tuple(orders), schedules[meaning]) for meaning, orders in found.items()]
+def _prepared(system: CompiledSystem, prepared: Prepared, order: Order, *, silent: bool) -> Prepared:
+    """Return what was prepared for another order of events, `silent` with nothing heard at the start."""
+    sites = at_timings(system, prepared.jacobians, prepared.timings, order)
+    schedules = build_schedules(system, prepared.timings, [site.pattern for site in sites], order=order)
+    return Prepared(tuple(map(_silent, sites)) if silent else sites, schedules, prepared.timings, order)
 
 
 def _meaning(schedule: Schedule, pattern: LinearSite) -> Hashable:
@@ -246,16 +248,12 @@ def _hearing_matters(site: SiteJacobians) -> bool:
 
 def _silent(site: SiteJacobians) -> SiteJacobians:
     """Return a site whose start value of everything it sends is zero; how it sends is not changed."""
-    return replace(site, kind=replace(site.kind, sends=tuple(_no_sends(site.kind))))
-
-
-def _no_sends(kind: Kind) -> list[Any]:
-    found = []
-    for sending in kind.sends:
-        symbols = [casadi.SX.sym(f"i{i}", sending.send.sparsity_in(i)) for i in range(sending.send.n_in())]
-        nothing = casadi.Function("nothing", symbols, [casadi.SX.zeros(len(sending.channels))])
-        found.append(replace(sending, send=nothing))
-    return found
+    sends = []
+    for sending in site.kind.sends:
+        inputs = sending.send.sx_in()
+        nothing = casadi.Function("nothing", inputs, [casadi.SX.zeros(len(sending.channels))])
+        sends.append(replace(sending, send=nothing))
+    return replace(site, kind=replace(site.kind, sends=tuple(sends)))
 
 
 def _too_much(prepared: Prepared, default: Analysis, times: int) -> str:
@@ -267,35 +265,3 @@ def _too_much(prepared: Prepared, default: Analysis, times: int) -> str:
     if times * sum(size**3 for size in sizes.values()) > QUICK_CUBES or times * events > QUICK_EVENTS:
         return "not repeated under other conventions: too large to do in passing"
     return ""
-
-
-_Pairs = Mapping[tuple[str, str], str]
-
-
-def _outcome(found: Analysis, orders: Sequence[tuple[str, ...]], pairs: _Pairs, start: str) -> Outcome:
-    return Outcome(
-        orders=tuple(orders),
-        departures=_departures(orders, pairs),
-        start=start,
-        verdict=found.verdict,
-        stable=found.stable,
-        spectral_radius=found.spectral_radius,
-        spectral_radius_error=found.spectral_radius_error,
-        frame_s=found.frame_s,
-        refusal="",
-    )
-
-
-def _refused(
-    error: ApcError, orders: Sequence[tuple[str, ...]], pairs: _Pairs, start: str, frame_s: float
-) -> Outcome:
-    nan = float("nan")
-    sentence = error.mistakes[0].sentence
-    return Outcome(tuple(orders), _departures(orders, pairs), start, "", None, nan, nan, frame_s, sentence)
-
-
-def _departures(orders: Sequence[tuple[str, ...]], pairs: _Pairs) -> tuple[str, ...]:
-    """Return what all of these orders do other than the default one, in words."""
-    return tuple(
-        words for (a, b), words in pairs.items() if all(order.index(a) < order.index(b) for order in orders)
-    )

@@ -21,6 +21,8 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 
+from scipy.optimize import brentq
+
 from apc.analysis.opened import with_gain
 from apc.analysis.pushes import Push
 from apc.compiler.compiled import CompiledSystem
@@ -31,8 +33,8 @@ from apc.eigen.spectrum import Spectrum, solve_spectrum
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.parameters import resolve
 
-# Gains tried between 0 and 1 on the way from 1 down, and halvings of the cell where the radius crosses 1.
-CELLS, HALVINGS = 32, 50
+# Gains tried between 0 and 1 on the way from 1 down, and how near the root of an equation is to be had.
+CELLS, NEAR = 32, 1e-15
 
 # How near 1 the magnitude of a mode is that is marginal.
 MARGINAL = 1e-6
@@ -84,43 +86,27 @@ def predict(system: CompiledSystem, groups: list[tuple[PeerGroup, tuple[Push, ..
     def at(gain: float) -> Spectrum:
         return _spectrum(groups, exchange, gain)
 
-    closed = at(1.0).spectral_radius
-    above = 1.0
-    for cell in range(CELLS - 1, 0, -1):
-        below = cell / CELLS
-        if (at(below).spectral_radius > 1) != (closed > 1):
-            break
-        above = below
-    else:
-        word = "unstable" if closed > 1 else "stable"
+    def excess(gain: float) -> float:
+        return at(gain).spectral_radius - 1
+
+    gains = [cell / CELLS for cell in range(CELLS, 0, -1)]
+    unstable = excess(1.0) > 0
+    below = next((gain for gain in gains if (excess(gain) > 0) != unstable), None)
+    if below is None:
+        word = "unstable" if unstable else "stable"
         return f"no buzz: with contacts of any part of their stiffness it is {word}"
-    for _ in range(HALVINGS):
-        middle = (below + above) / 2
-        if not below < middle < above:
-            break
-        if (at(middle).spectral_radius > 1) == (closed > 1):
-            above = middle
-        else:
-            below = middle
-    found = at(above)
+    gain = brentq(excess, below, below + 1 / CELLS, xtol=NEAR)
+    found = at(gain)
     frequency = max(
         (mode.frequency_hz for mode in found.modes if abs(mode.magnitude - 1) < MARGINAL), default=0.0
     )
     if not frequency:
-        return f"no buzz: with contacts of {above:.6g} of their stiffness it drifts away without swinging"
-    bias = _bias(above)
-    return Predicted(frequency, above, bias, 0.5 + math.asin(bias) / math.pi, closed > 1)
+        return f"no buzz: with contacts of {gain:.6g} of their stiffness it drifts away without swinging"
+    bias = brentq(lambda one: gain_of(one) - gain, -1, 1, xtol=NEAR)
+    return Predicted(frequency, gain, bias, 0.5 + math.asin(bias) / math.pi, unstable)
 
 
 def _spectrum(groups: list[tuple[PeerGroup, tuple[Push, ...]]], exchange: Exchange, gain: float) -> Spectrum:
     """Solve the scene with linear contacts of a part of their stiffness."""
     weaker = [with_gain(group, pushes, Fraction(gain)) for group, pushes in groups]
     return solve_spectrum([close_loop(loop) for loop in arrange(weaker, exchange).loops])
-
-
-def _bias(gain: float) -> float:
-    """Return the β of a gain, which grows with it."""
-    low, high = -1.0, 1.0
-    while low < (middle := (low + high) / 2) < high:
-        low, high = (middle, high) if gain_of(middle) < gain else (low, middle)
-    return high

@@ -6,12 +6,13 @@ Guarantees: every matrix comes with its radii; what may drift with all contacts 
 The cost grows with the different peers, not with their number.
 Does not: judge anything (see `switching`).
 
-From the forces f to the numbers y they follow (see `pushes`), tick by tick over a frame, in relative
-coordinates ξ:
+From the forces f to the numbers y they follow (see `pushes`), tick by tick over a frame:
 
     ξ⁺ = A ξ + B f      −y = C ξ + D f − s η      η⁺ = η + m f
 
-η is the one motion that may drift, y follows it alike at all ticks of a contact.
+η is the one motion that may drift, y follows it alike at all ticks of a contact. The loop as it is has M and
+C₀; M V = V is what stands with all contacts open. With L M = L, L V = 1, the state is V (L x) and a part that
+follows from ξ, the relative coordinates: C ξ = (C₀ − C₀ V L) x.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from apc.analysis.contact_modes import parts_of_kinds, settings
 from apc.analysis.pushes import Push, push_of
 from apc.analysis.switches import bind, find_switches
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Loop, StateLayout, close_loop, close_outside, lay_out
+from apc.eigen.closing import Loop, close_loop, close_outside, lay_out
 from apc.eigen.modes import loops_at_right_angles
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.peers import peer_groups
@@ -40,7 +41,7 @@ from apc.frame.exchange import build_exchange
 from apc.frame.lift import FrameMap, compose, step_durations, with_roundings
 from apc.frame.parameters import resolve
 from apc.frame.ports import with_cuts
-from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
+from apc.frame.radius import RADII, radius_of, rounded, solve, value_of, with_radius
 from apc.frame.site import LinearSite
 
 Floats = NDArray[np.float64]
@@ -48,6 +49,9 @@ Matrix = NDArray[Any]
 
 # States and ticks of contacts of one loop worth a proof: a Riccati equation of so many takes a second.
 MOST_STATES = 150
+
+_MORE = "what a contact follows is more than positions, and something may drift with all contacts open"
+_APART = "with all contacts open, several things may drift apart, and one is moved by another's contact"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +66,7 @@ class Opened:
     map: FrameMap
     states: int
     ticks: tuple[tuple[str, int], ...]
-    slopes: tuple[tuple[Fraction, ...], ...]
+    slopes: Matrix  # (ticks, n_x), of `Fraction`
     plain: bool
     jumps: str
 
@@ -114,20 +118,21 @@ def contact_groups(
         for one, site, listed in zip(switched, prepared.jacobians, parts, strict=True)
     )
     for place, group in enumerate(system.groups):
-        kind, vector = group.kind, numbers.parameters[place][0]
-        told = [push_of(switched[kind], one, prepared.jacobians[kind], vector) for one in parts[kind]]
-        for one in told:
-            if isinstance(one, str):
-                return one
-        if not on[kind].parameters_suffice:
+        vector = numbers.parameters[place][0]
+        for one in parts[group.kind]:
+            push = push_of(switched[group.kind], one, prepared.jacobians[group.kind], vector)
+            if isinstance(push, str):
+                return push
+        if not on[group.kind].parameters_suffice:
             return f"some force at {group.name} is not linear, or looks at each of the others by itself"
     exchange = build_exchange(system, numbers.timings)
     kinds = {id(one): kind for kind, one in enumerate(on)}
     found = []
     for peers in peer_groups(system, on, prepared.schedules, numbers, exchange):
         kind = kinds[id(peers.jacobians)]
-        site = prepared.jacobians[kind]
-        pushes = [push_of(switched[kind], one, site, peers.parameters) for one in parts[kind]]
+        pushes = (
+            push_of(switched[kind], one, prepared.jacobians[kind], peers.parameters) for one in parts[kind]
+        )
         found.append((peers, tuple(one for one in pushes if isinstance(one, Push))))
     return found
 
@@ -151,7 +156,7 @@ def _pushing(site: LinearSite, pushes: Sequence[Push], gain: Fraction) -> Linear
     ticks = list(site.ticks)
     for one in pushes:
         tick = ticks[one.partition]
-        blocks = [np.array(block) for block in (tick.x, tick.u, tick.m, tick.r)]
+        blocks = [block.copy() for block in (tick.x, tick.u, tick.m, tick.r)]
         for block in blocks:
             block[one.output] *= gain if block.dtype == object else float(gain)
         x, u, m, r = blocks
@@ -202,12 +207,13 @@ def _cut_open(group: PeerGroup, pushes: Sequence[Push]) -> Opened:
     for one in pushes:
         count = schedule.ticks[one.partition]
         ticks += [(one.part, index) for index in range(count)]
-        slopes += [tuple(map(Fraction, group.exact.ticks[one.partition].x[one.output]))] * count
+        slopes += [group.exact.ticks[one.partition].x[one.output]] * count
     wide, whole = with_cuts(group.site, schedule, [(one.partition, one.output) for one in pushes])
     wide_map = compose(with_roundings(wide), whole, off, numbers=RADII)
+    followed = np.array(slopes, dtype=object).reshape(len(ticks), len(bare.exact.a))
     plain = not any(one.slopes[one.states :].any() for one in pushes)
     jumps = next((one.part for one in pushes if one.sector), "")
-    return Opened(bare, wide_map, len(bare.lifted.z_names), tuple(ticks), tuple(slopes), plain, jumps)
+    return Opened(bare, wide_map, len(bare.lifted.z_names), tuple(ticks), followed, plain, jumps)
 
 
 def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
@@ -220,79 +226,77 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
     closed = close_outside(
         loop, [one.map for one in opened], [len(one.ticks) for one in opened], layout, numbers=RADII
     )
-    outside = np.concatenate(
-        [
-            offset + one.states + np.arange(len(one.ticks))
-            for offset, one in zip(layout.offsets, opened, strict=True)
-        ]
-    )
-    n = len(layout.names)
+    n, listed = len(layout.names), list(zip(loop.sites, opened, layout.offsets, strict=True))
+    outside = np.concatenate([offset + one.states + np.arange(len(one.ticks)) for _, one, offset in listed])
     own = np.delete(np.arange(n), outside)
+    a, b = (closed[:, own][..., which] for which in (own, slice(n, None)))
+    c, d = (closed[:, outside][..., which] for which in (own, slice(n, None)))
+    ports = tuple((site.name, *tick) for site, one, _ in listed for tick in one.ticks)
     at = with_doubt(relative_coordinates(free.basis))
-    rest, held = own[at.rest], own[at.held]
-    taken = relative_rows(closed[:, own], at, RADII)
-    a, b = taken[..., rest], taken[..., n:]
-    c, d = closed[:, outside][..., rest], closed[:, outside][..., n:]
-    each = list(zip(loop.sites, opened, strict=True))
-    ports = tuple((site.name, *tick) for site, one in each for tick in one.ticks)
-    counts = np.array([float(site.count) for site, one in each for _ in one.ticks])
-    still, jumps = np.zeros((2, 1, len(ports))), next((one.jumps for one in opened if one.jumps), "")
-    plain = OpenLoop(loop.name, a, b, negated(c), negated(d), ports, counts, (), still, jumps)
-    if free.exact and not all(one.plain for one in opened):
-        return "what a contact follows is more than positions, and something may drift with all contacts open"
-    seen = _seen(opened, free.exact, layout, n, outside)
-    if isinstance(seen, str) or not any(seen):
-        return seen if isinstance(seen, str) else plain
-    # What y follows, over the coordinates held, is that of the first y that does times `seen`.
-    first = next(place for place, one in enumerate(seen) if one)
-    factors = RADII.add(
-        closed[:, outside[first : first + 1]][..., held], RADII.multiply(c[:, first : first + 1], at.weights)
+    shares, moved = np.zeros(0, dtype=object), np.zeros((2, 1, len(ports)))
+    if free.exact:
+        if not all(one.plain for one in opened):
+            return _MORE
+        motions = np.array(free.exact, dtype=object).T
+        left = _left_vectors(a, motions, at.held)
+        if left is None:
+            return "what moves with all contacts open can't be told from what drifts"
+        rows = [(one.slopes, np.searchsorted(own, offset)) for _, one, offset in listed]
+        followed = np.concatenate(
+            [slopes @ motions[start : start + slopes.shape[1]] for slopes, start in rows], axis=0
+        )
+        along = rounded(followed.astype(np.float64))
+        c = RADII.subtract(c, RADII.multiply(along, left))
+        if followed.any():
+            first = followed[followed.any(axis=1).argmax()]
+            pivot = int((first != 0).argmax())
+            shares = followed[:, pivot] / first[pivot]
+            if (followed != np.outer(shares, first)).any():
+                return _APART
+            drift = rounded(first[None].astype(np.float64))
+            moved = RADII.multiply(drift, RADII.multiply(left, b))
+    return OpenLoop(
+        name=loop.name,
+        a=relative_rows(a[..., at.rest], at, RADII),
+        b=relative_rows(b, at, RADII),
+        c=negated(c[..., at.rest]),
+        d=negated(d),
+        ports=ports,
+        counts=np.array([float(site.count) for site, one, _ in listed for _ in one.ticks]),
+        seen=tuple(shares),
+        moved=moved,
+        jumps=next((one.jumps for one in opened if one.jumps), ""),
     )
-    pushed = RADII.multiply(factors, closed[:, held][..., rest])
-    # k (1 − A) = what is pushed.
-    left = RADII.subtract(RADII.exact(np.eye(a.shape[-1])), a)
-    solved = solve(np.swapaxes(left, -1, -2), np.swapaxes(pushed, -1, -2))
-    if solved is None:
-        return "what moves with all contacts open can't be told from what drifts"
-    along = np.swapaxes(solved, -1, -2)
-    share = [one / seen[first] for one in seen]
-    column = np.array([[(float(one),) for one in share], [(UNIT * abs(float(one)),) for one in share]])
-    moved = RADII.add(RADII.multiply(factors, closed[:, held][..., n:]), RADII.multiply(along, b))
-    return replace(
-        plain, c=negated(RADII.subtract(c, RADII.multiply(column, along))), seen=tuple(share), moved=moved
-    )
+
+
+def _left_vectors(matrix: Matrix, motions: Matrix, held: NDArray[np.intp]) -> Matrix | None:
+    """Return L (2, k, n) with L M = L and L V = 1, None where rounding hides it.
+
+    Parameters
+    ----------
+    matrix
+        M (2, n, n), with its radii.
+    motions
+        V (n, k), exactly: M V = V, and nothing else stands.
+    held
+        Places p (k,) at which V_p can be inverted.
+
+    Notes
+    -----
+    Lᵀ solves (1 − M)ᵀ Lᵀ + 1_p Z = 0, Vᵀ Lᵀ = 1: Vᵀ times the first
+    is V_pᵀ Z = 0.
+    """
+    n, k = motions.shape
+    v = rounded(motions.astype(np.float64))
+    bordered, right = np.zeros((2, n + k, n + k)), np.zeros((2, n + k, k))
+    bordered[:, :n, :n] = np.swapaxes(RADII.subtract(RADII.exact(np.eye(n)), matrix), -1, -2)
+    bordered[:, n:, :n] = np.swapaxes(v, -1, -2)
+    bordered[0, held, n + np.arange(k)] = 1.0
+    right[0, n:] = np.eye(k)
+    solved = solve(bordered, right)
+    return None if solved is None else np.swapaxes(solved[:, :n], -1, -2)
 
 
 def negated(matrix: Matrix) -> Matrix:
     """Return a matrix with its radii times −1."""
     return with_radius(-value_of(matrix), radius_of(matrix))
-
-
-def _seen(
-    opened: Sequence[Opened],
-    motions: Sequence[Sequence[Fraction]],
-    layout: StateLayout,
-    n: int,
-    outside: NDArray[np.intp],
-) -> tuple[Fraction, ...] | str:
-    """Return how far each y follows the one motion that may drift, exactly, 0 where none does."""
-    if not motions:
-        return ()
-    place_of = {int(place): k for k, place in enumerate(np.delete(np.arange(n), outside))}
-    rows = []
-    for offset, one in zip(layout.offsets, opened, strict=True):
-        start = place_of[offset] if one.states else 0
-        rows += [[_along(slopes, motion[start:]) for motion in motions] for slopes in one.slopes]
-    first = next((row for row in rows if any(row)), None)
-    if first is None:
-        return ()
-    pivot = next(place for place, one in enumerate(first) if one)
-    shares = [row[pivot] / first[pivot] for row in rows]
-    if any(row != [share * one for one in first] for row, share in zip(rows, shares, strict=True)):
-        return "with all contacts open, several things may drift apart, and one is moved by another's contact"
-    return tuple(shares)
-
-
-def _along(slopes: Sequence[Fraction], motion: Sequence[Fraction]) -> Fraction:
-    """Return how far a y follows a motion of the continuous states that come first."""
-    return sum((s * x for s, x in zip(slopes, motion, strict=False)), Fraction(0))

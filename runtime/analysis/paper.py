@@ -1,13 +1,20 @@
 """The analysis as the paper writes it: cut at every force, lifted over a frame, delayed, closed again.
 
-Takes: a `CompiledSystem` of the paper's form (see `openloop`).
+Takes: a `CompiledSystem` of the paper's form: linear, at rest or translating, with one clock of forces and
+one network clock at a whole multiple of its period.
 Gives: `NamedMatrix`, `PaperRoute`, `paper_route`, `analyze_paper`.
-Guarantees: every matrix names its rows and columns; the nonzero eigenvalues are those of the direct route.
+Guarantees: every matrix names its rows and columns; the nonzero eigenvalues are those of the direct route. A
+scene of another form is refused with what it lacks.
 Does not: split equal peers into modes, so it costs (4nR)³ for n peers at ratio R.
 
-Rakhsha and Constantinescu, eqs. (18) to (20), after Araki and Yamamoto (IEEE Trans. Automatic Control 31,
-1986) and Fotoohi et al. (Int. J. Robotics Research 26, 2007). The blocks are not printed; these have the
-printed shapes. With R force ticks a frame:
+Rakhsha and Constantinescu, eqs. (7) to (20), after Araki and Yamamoto (IEEE Trans. Automatic Control 31,
+1986) and Fotoohi et al. (Int. J. Robotics Research 26, 2007). With x of all peers, u_c what a force makes of
+its own peer's samples, u_n what it makes of the others' packets, and y_n what is heard:
+
+    dx/dt = A x + B (u_c, u_n),   y = (x, y_n) = C x                                           (18)
+
+A force that has both parts counts as two inputs, through one column of B each. The blocks that follow are not
+printed; these have the printed shapes. With R force ticks a frame:
 
     x_D = (x at the R force ticks up to the frame's start, the newest last)
     u_D = (u_c at the R force ticks of the frame, u_n),   y_D = (x at these ticks, y_n)
@@ -15,37 +22,48 @@ printed shapes. With R force ticks a frame:
     u_D = F_D y_D,   A_cl = A_aug + B_aug F_D (I − D_aug F_D)⁻¹ C_aug                          (20)
 
 The augmented state holds, after x_D, the forces still to act and the y_n still to arrive. D_aug F_D is
-nilpotent: a force moves later samples only.
+nilpotent: a force moves later samples only. All matrices are computed with their radii (see `frame.radius`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
-from apc.analysis.analysis import Analysis
+from apc.analysis.analysis import Analysis, lifted_groups
 from apc.analysis.methods import PAPER
-from apc.analysis.openloop import Input, OpenLoop, open_loop, over, whole_system
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import ClosedSystem, Feedback, StateLayout, close
-from apc.eigen.relative import Relative, independent_places, relative_bounded
+from apc.eigen.modes import dense
+from apc.eigen.peer_group import PeerGroup
+from apc.eigen.relative import relative_bounded, relative_coordinates, relative_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes
-from apc.eigen.spectrum import DRIFTS, STABLE, STABLE_TRANSLATING, Spectrum, solve_spectrum
+from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, Spectrum, solve_spectrum
 from apc.finite_equations import finite_equations
-from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT
+from apc.frame.discretize import UNIT, discretize
 from apc.frame.lift import FrameMap
+from apc.frame.radius import RADII, radius_of, rounded, value_of, with_radius
+from apc.frame.schedule import Way
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
+Matrix = NDArray[Any]
 
-# Rounding of a standing state from exact numbers, of its pivots' inverse and of the product of both, in units
-# of UNIT: a few operations an entry, of as many terms as there are rigid motions.
-RIGID_ROUNDINGS = 16
+# More rows than this of y_D are refused: four dense matrices of that size already fill 100 MB.
+MOST_ROWS = 1800
+
+# What a scene of another form can do instead.
+_INSTEAD = "--method modes, which asks for none of it"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +126,7 @@ def paper_route(system: CompiledSystem) -> PaperRoute:
         has, but the matrices would be too large. And whatever the analysis of the scene raises.
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        return _route(open_loop(system, whole_system(system)))
+        return _named(_open_loop(system, dense(*lifted_groups(system))))
 
 
 def analyze_paper(system: CompiledSystem) -> Analysis:
@@ -125,187 +143,272 @@ def analyze_paper(system: CompiledSystem) -> Analysis:
     Raises
     ------
     ApcError
-        As `paper_route`.
+        As `paper_route`; E861 also a scene that drifts.
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        whole = whole_system(system)
-        loop = open_loop(system, whole)
+        whole = dense(*lifted_groups(system))
+        loop = _open_loop(system, whole)
         rigid = find_rigid_modes(whole)
-        closed, dead = _without_rigid(loop, whole, rigid)
-        spectrum = _with_rigid(_with_turns(solve_spectrum([closed]), solve_spectrum([whole])), rigid)
-    size = dead + len(closed.names) + rigid.basis.shape[1]
+        if rigid.drifts:
+            raise _not_of_the_form(system, ["a scene in which nothing drifts"])
+        spectrum = _with_turns(solve_spectrum([_without_rigid(loop, whole, rigid)]), solve_spectrum([whole]))
+    translations = len(rigid.names)
+    translates = bool(translations) and spectrum.verdict == STABLE
+    zero, size = (loop.ratio - 1) * len(loop.states), loop.starts[-1]
     return Analysis(
         topology=system.name,
         peers=system.peers,
-        frame_s=closed.frame_s,
-        states_per_peer=-(-(size - dead) // system.peers),
+        frame_s=loop.frame_s,
+        states_per_peer=-(-(size - zero) // system.peers),
         method=PAPER,
-        verdict=spectrum.verdict,
+        verdict=STABLE_TRANSLATING if translates else spectrum.verdict,
         stable=spectrum.stable,
         spectral_radius=spectrum.spectral_radius,
         spectral_radius_error=spectrum.spectral_radius_error,
-        rigid_modes=spectrum.rigid_modes,
-        translations=spectrum.rigid_modes,
+        rigid_modes=translations,
+        translations=translations,
         modes=spectrum.modes,
         linearized=False,
         notes=(
-            f"A_cl is {size} × {size}; {dead} of its columns are zero and as many eigenvalues with them",
+            f"A_cl is {size} × {size}; {zero} of its columns are zero and as many eigenvalues with them",
             *spectrum.notes,
         ),
         left_out=left_out(system),
     )
 
 
-def _sizes(loop: OpenLoop) -> tuple[int, int, int, int, int]:
-    """Return the numbers of states, fast inputs, slow inputs and rows of y_n, and the ratio."""
-    return len(loop.states), len(loop.fast), len(loop.slow), len(loop.heard), loop.ratio
+# ---- eq. (18): the loop cut open ----
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Signal:
+    """An input, over x or over y_n, or a row of y_n, over x: its exact weights, and how late it is.
+
+    An input is late by force ticks, a row of y_n by frames.
+    """
+
+    name: str
+    delay: int
+    weights: Matrix  # of `Fraction`
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _OpenLoop:
+    """Eq. (18) with what the delays and the feedback need; `step` is [F G_c G_n] of one force period."""
+
+    ratio: int
+    period: Fraction  # s
+    states: tuple[str, ...]
+    fast: tuple[_Signal, ...]  # u_c, over x
+    slow: tuple[_Signal, ...]  # u_n, over y_n
+    heard: tuple[_Signal, ...]  # y_n, over x
+    ab: Floats  # [A B] (n, n + n_u)
+    step: Matrix  # (2, n, n + n_u), with its radii
+
+    @property
+    def frame_s(self) -> float:
+        """The length of a frame in seconds."""
+        return float(self.ratio * self.period)
+
+    @property
+    def depths(self) -> list[int]:
+        """How many values of each input, and of each row of y_n, are on their way at a frame's start."""
+        frames = [-(-one.delay // self.ratio) for one in self.slow]
+        return [one.delay for one in self.fast] + frames + [one.delay for one in self.heard]
+
+    @property
+    def starts(self) -> list[int]:
+        """Where these stand in the augmented state, and how large that is."""
+        first = self.ratio * len(self.states)
+        return list(itertools.accumulate(self.depths, initial=first))
+
+
+def _weights(signals: Sequence[_Signal], width: int) -> Matrix:
+    """Return the exact weights of signals (len(signals), width)."""
+    return np.array([one.weights for one in signals], dtype=object).reshape(len(signals), width)
+
+
+def _floats(signals: Sequence[_Signal], width: int) -> Floats:
+    """Return the weights of signals (len(signals), width), each rounded once."""
+    return _weights(signals, width).astype(np.float64)
+
+
+def _open_loop(system: CompiledSystem, whole: ClosedSystem) -> _OpenLoop:
+    """Cut the loop of all peers at every force."""
+    sites = whole.sites
+    period, frame = _periods(system, sites)
+    ratio = int(frame / period)
+    timings = {timing.name: timing.value for timing in system.timings}
+    starts = [0, *itertools.accumulate(len(group.jacobians.kind.states) for group in sites)]
+    n = starts[-1]
+    if (n + 2 * len(sites)) * ratio > MOST_ROWS:
+        what = (
+            f"the paper's matrices for {len(sites)} peers at {ratio} force ticks a frame have more than "
+            f"{MOST_ROWS:,} rows"
+        )
+        raise ApcError(Mistake("E862", Place(system.origin.topology), what, hint=_INSTEAD))
+    sent = [
+        {
+            (sending.link, channel): row
+            for sending, send in zip(group.jacobians.kind.sends, group.exact.sends, strict=True)
+            for channel, row in zip(sending.channels, send.x, strict=True)
+        }
+        for group in sites
+    ]
+    heard: dict[tuple[int, Way, str], _Signal] = {}
+    for i, group in enumerate(sites):
+        several = len({one.way.delay for one in group.schedule.heard}) > 1
+        places = (
+            (p, k) for p, one in enumerate(group.jacobians.kind.clocks) for k in range(len(one.receives))
+        )
+        for way, channel in (pair for place in places for pair in group.schedule.ways(*place)):
+            row = np.full(n, Fraction(0), dtype=object)
+            for j, weight in enumerate(whole.coupling[way][i]):
+                row[starts[j] : starts[j + 1]] += weight * sent[j].get((way.link, channel), 0)
+            delay = int(timings[way.delay] / frame)
+            late = f" {delay} frames late" if several else ""
+            name = f"{group.name}.{way.operator}(others.{channel}){late}"
+            heard[i, way, channel] = _Signal(name, delay, row)
+    place_of = {key: place for place, key in enumerate(heard)}
+    fast: list[_Signal] = []
+    slow: list[_Signal] = []
+    columns: tuple[list[int], list[int]] = [], []  # of the holds of all sites, side by side
+    first = 0
+    for i, group in enumerate(sites):
+        kind, own = group.jacobians.kind, slice(starts[i], starts[i + 1])
+        clocks = [partition.clock for partition in kind.clocks]
+        for column, hold in enumerate(kind.holds, first):
+            if group.schedule.acting[column - first] is None:
+                continue
+            p, name = clocks.index(hold.clock), f"{group.name}.{hold.name}"
+            delay = int(timings[hold.delay] / period)
+            pattern, tick = group.jacobians.pattern.ticks[p], group.exact.ticks[p]
+            received = pattern.r[hold.output].any()
+            if pattern.x[hold.output].any() or not received:
+                row = np.full(n, Fraction(0), dtype=object)
+                row[own] += tick.x[hold.output]
+                fast.append(_Signal(f"{name} own" if received else name, delay, row))
+                columns[0].append(column)
+            if received:
+                row = np.full(len(heard), Fraction(0), dtype=object)
+                for k, weight in enumerate(tick.r[hold.output]):
+                    row[[place_of[i, *pair] for pair in group.schedule.ways(p, k)]] += weight
+                slow.append(_Signal(f"{name} received", delay, row))
+                columns[1].append(column)
+        first += len(kind.holds)
+
+    def side_by_side(blocks: Iterable[Floats]) -> Floats:
+        """Return the blocks [A B] (n_x, n_x + n_u) of the sites as one of all states and inputs."""
+        split = [np.split(block, [len(block)], axis=1) for block in blocks]
+        a, b = (block_diag(*listed) for listed in zip(*split, strict=True))
+        return np.hstack([a, b[:, columns[0]], b[:, columns[1]]])
+
+    known = {id(one.site): discretize(one.exact.a, one.exact.b, [period])[0] for one in sites}
+    steps = [known[id(one.site)] for one in sites]
+    return _OpenLoop(
+        ratio=ratio,
+        period=period,
+        states=tuple(f"{group.name}.{one.name}" for group in sites for one in group.jacobians.kind.states),
+        fast=tuple(fast),
+        slow=tuple(slow),
+        heard=tuple(heard.values()),
+        ab=side_by_side(np.hstack([one.site.a, one.site.b]) for one in sites),
+        step=with_radius(
+            side_by_side(one.matrix for one in steps),
+            side_by_side(one.roundings * UNIT * one.size for one in steps),
+        ),
+    )
 
 
 # ---- eqs. (19) and (20): lifted, delayed, closed ----
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Lifted:
-    """Eq. (19), and the same with delays; `terms` is the most terms of any sum in their products."""
+def _lift(loop: _OpenLoop) -> FrameMap:
+    """Return A_aug, B_aug, C_aug and D_aug with their radii: a frame of force ticks, one after the other."""
+    n, n_c, ratio, starts = len(loop.states), len(loop.fast), loop.ratio, loop.starts
+    inputs = (*loop.fast, *loop.slow)
+    size, forces = starts[-1], ratio * n_c + len(loop.slow)
+    # Rows over the augmented state and u_D.
+    unit = RADII.exact(np.eye(size + forces))
 
-    plain: tuple[Floats, Floats, Floats, Floats]
-    delayed: tuple[Floats, Floats, Floats, Floats]
-    f: Floats
-    terms: int
+    def value(i: int, number: int) -> int:
+        """Return the column of an input's value of that number in the frame, of earlier ones below 0."""
+        if number < 0:
+            return starts[i] - number - 1
+        return size + (number * n_c + i if i < n_c else ratio * n_c + i - n_c)
 
-
-def _lift(loop: OpenLoop, step: Floats, absolute: bool = False) -> _Lifted:
-    """Stack the open loop over a frame, delay it, and write its feedback; or all of it in magnitudes."""
-    n, n_c, n_s, n_h, ratio = _sizes(loop)
-    size = np.abs if absolute else (lambda values: values)
-    advance, force = step[:, :n], step[:, n:]
-    # Rows: x at ticks 0 … R of the frame. Columns: x at its start, then what acts tick by tick (fast, slow).
-    course = np.zeros(((ratio + 1) * n, n + ratio * (n_c + n_s)))
-    course[:n, :n] = np.eye(n)
-    for j in range(ratio):
-        now, following = slice(j * n, (j + 1) * n), slice((j + 1) * n, (j + 2) * n)
-        course[following] = advance @ course[now]
-        at = n + j * (n_c + n_s)
-        course[following, at : at + n_c + n_s] = force
-    newest = np.zeros((n, ratio * n))
-    newest[:, -n:] = np.eye(n)
-    c_n = size(loop.c_n)
-    a_d, b_all = course[n:, :n] @ newest, course[n:, n:]
-    c_d = np.vstack([course[:-n, :n] @ newest, c_n @ newest])
-    d_all = np.vstack([course[:-n, n:], np.zeros((n_h, ratio * (n_c + n_s)))])
-
-    at_once, _, _ = _acting(replace(loop, fast=_undelayed(loop.fast), slow=_undelayed(loop.slow)))
-    from_inputs, from_state, shift = _acting(loop)
-    waiting = sum(one.delay for one in loop.heard)
-    a_aug = np.zeros((ratio * n + len(shift[0]) + waiting,) * 2)
-    forces = slice(ratio * n, ratio * n + len(shift[0]))
-    a_aug[: ratio * n, : ratio * n] = a_d
-    a_aug[: ratio * n, forces] = b_all @ from_state
-    a_aug[forces, forces] = shift[0]
-    c_aug = np.zeros((len(c_d), len(a_aug)))
-    c_aug[:, : ratio * n] = c_d
-    c_aug[:, forces] = d_all @ from_state
-    at = forces.stop
-    for row, one in enumerate(loop.heard):
-        line = ratio * n + row
-        for age in range(one.delay):
-            if age == 0:
-                a_aug[at] = c_aug[line]
-            else:
-                a_aug[at + age, at + age - 1] = 1.0
-        if one.delay:
-            c_aug[line] = 0.0
-            c_aug[line, at + one.delay - 1] = 1.0
-        at += one.delay
-    b_aug = np.vstack([b_all @ from_inputs, shift[1], np.zeros((waiting, ratio * n_c + n_s))])
-    f = np.zeros((ratio * n_c + n_s, ratio * n + n_h))
-    own = size(over([one.terms for one in loop.fast], n))
-    for j in range(ratio):
-        f[j * n_c : (j + 1) * n_c, j * n : (j + 1) * n] = own
-    f[ratio * n_c :, ratio * n :] = size(over([one.terms for one in loop.slow], n_h))
-    delayed = (a_aug, b_aug, c_aug, d_all @ from_inputs)
-    terms = max(int(np.count_nonzero(one, axis=1).max(initial=0)) for one in (*delayed, f, step))
-    return _Lifted((a_d, b_all @ at_once, c_d, d_all @ at_once), delayed, f, terms)
+    course = [unit[:, (ratio - 1) * n : ratio * n]]
+    for tick in range(ratio):
+        late = [tick - one.delay for one in inputs]
+        acting = [value(i, by if i < n_c else by // ratio) for i, by in enumerate(late)]
+        course.append(RADII.multiply(loop.step, np.concatenate([course[-1], unit[:, acting]], axis=1)))
+    waiting, outputs = [], []
+    for i in range(len(inputs)):
+        newest = ratio if i < n_c else 1
+        columns = [value(i, newest - age) for age in range(1, loop.depths[i] + 1)]
+        waiting.append(unit[:, np.array(columns, dtype=np.intp)])
+    heard = RADII.multiply(rounded(_floats(loop.heard, n)), course[0])
+    for row, (one, start) in enumerate(zip(loop.heard, starts[len(inputs) :], strict=False)):
+        line = np.concatenate([heard[:, row : row + 1], unit[:, start : start + one.delay]], axis=1)
+        waiting.append(line[:, : one.delay])
+        outputs.append(line[:, one.delay :])
+    moved = np.concatenate([*course[1:], *waiting], axis=1)
+    seen = np.concatenate([*course[:-1], *outputs], axis=1)
+    return FrameMap(moved[..., :size], moved[..., size:], seen[..., :size], seen[..., size:])
 
 
-def _close(lifted: _Lifted) -> Floats:
-    """Return A_cl of eq. (20): the loop u_D = F_D y_D closed; what is on its way is in the state."""
-    one = FrameMap(*lifted.delayed)
-    names = ("",) * len(one.p)
-    feedback = Feedback(lifted.f, np.zeros((len(lifted.f), len(one.p))))
-    return close([one], [feedback], StateLayout((0,), names, {})).matrix
+def _feedback(loop: _OpenLoop) -> Floats:
+    """Return F_D: the forces of each tick of the samples there, and those of what is heard."""
+    own = np.kron(np.eye(loop.ratio), _floats(loop.fast, len(loop.states)))
+    return np.asarray(block_diag(own, _floats(loop.slow, len(loop.heard))))
 
 
-def _acting(loop: OpenLoop) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
-    """Return what acts tick by tick over (u_D) and over the waiting forces, and how these move on.
-
-    The waiting forces are, input by input, the newest first: of a fast one its values at the last ticks
-    before the frame, of a slow one those of the last frames.
-    """
-    n_c, n_s, ratio = len(loop.fast), len(loop.slow), loop.ratio
-    depths = [one.delay for one in loop.fast] + [-(-one.delay // ratio) for one in loop.slow]
-    starts = np.cumsum([0, *depths]).tolist()
-    from_inputs = np.zeros((ratio * (n_c + n_s), ratio * n_c + n_s))
-    from_state = np.zeros((len(from_inputs), starts[-1]))
-    kept = np.zeros((starts[-1], starts[-1])), np.zeros((starts[-1], ratio * n_c + n_s))
-    for i, one in enumerate((*loop.fast, *loop.slow)):
-        fast = i < n_c
-        per_frame = ratio if fast else 1  # how often it is computed in a frame
-        for j in range(ratio):
-            number = j - one.delay if fast else (j - one.delay) // ratio
-            row = j * (n_c + n_s) + i
-            if number >= 0:
-                from_inputs[row, number * n_c + i if fast else ratio * n_c + i - n_c] = 1.0
-            else:
-                from_state[row, starts[i] - number - 1] = 1.0
-        for age in range(1, depths[i] + 1):  # at the next frame's start
-            number = per_frame - age
-            if number >= 0:
-                kept[1][starts[i] + age - 1, number * n_c + i if fast else ratio * n_c + i - n_c] = 1.0
-            else:
-                kept[0][starts[i] + age - 1, starts[i] - number - 1] = 1.0
-    return from_inputs, from_state, kept
+def _close(delayed: FrameMap, f: Floats) -> Matrix:
+    """Return A_cl of eq. (20) with its radii."""
+    size = delayed.p.shape[-1]
+    feedback = Feedback(rounded(f), np.zeros((2, len(f), size)))
+    return close([delayed], [feedback], StateLayout((0,), ("",) * size, {}), numbers=RADII).matrix
 
 
-def _undelayed(inputs: Sequence[Input]) -> tuple[Input, ...]:
-    return tuple(replace(one, delay=0) for one in inputs)
-
-
-def _route(loop: OpenLoop) -> PaperRoute:
-    """Name every matrix."""
-    n, _, _, _, ratio = _sizes(loop)
-    lifted = _lift(loop, loop.step)
-    closed = _close(lifted)
-    times = [float(j * loop.period * 1000) for j in range(-ratio, ratio)]
-    fast, slow = [one.name for one in loop.fast], [one.name for one in loop.slow]
-    heard = [one.name for one in loop.heard]
-    stacked = _timed(loop.states, times[1 : ratio + 1])
-    inputs, outputs = (*_timed(fast, times[ratio:]), *slow), (*_timed(loop.states, times[ratio:]), *heard)
-    waiting = _waiting_names(loop)
-    augmented = (*stacked, *waiting)
-    a_d, b_d, c_d, d_d = lifted.plain
-    a_aug, b_aug, c_aug, d_aug = lifted.delayed
+def _named(loop: _OpenLoop) -> PaperRoute:
+    """Return every matrix with the names of its rows and columns."""
+    n, ratio = len(loop.states), loop.ratio
+    fast, slow = (tuple(replace(one, delay=0) for one in signals) for signals in (loop.fast, loop.slow))
+    at_once = replace(loop, fast=fast, slow=slow, heard=tuple(replace(one, delay=0) for one in loop.heard))
+    f, lifted, delayed = _feedback(loop), _lift(at_once), _lift(loop)
+    closed = value_of(_close(delayed, f))
+    ticks = [float(j * loop.period * 1000) for j in range(1 - ratio, ratio)]
+    forces, received, heard = ([one.name for one in signals] for signals in (fast, slow, loop.heard))
+    stacked = _timed(loop.states, ticks[:ratio])
+    augmented = (*stacked, *_waiting_names(loop))
+    inputs = (*_timed(forces, ticks[ratio - 1 :]), *received)
+    outputs = (*_timed(loop.states, ticks[ratio - 1 :]), *heard)
     values = np.zeros(len(closed), dtype=np.complex128)
     alive = slice((ratio - 1) * n, None)  # the columns before are zero, and so are as many eigenvalues
     values[alive] = np.linalg.eigvals(closed[alive, alive])
     return PaperRoute(
         ratio=ratio,
-        frame_s=float(ratio * loop.period),
-        a=NamedMatrix(loop.a, loop.states, loop.states),
-        b=NamedMatrix(loop.b, loop.states, (*fast, *slow)),
-        c=NamedMatrix(np.vstack([np.eye(n), loop.c_n]), (*loop.states, *heard), loop.states),
-        a_d=NamedMatrix(a_d, stacked, stacked),
-        b_d=NamedMatrix(b_d, stacked, inputs),
-        c_d=NamedMatrix(c_d, outputs, stacked),
-        d_d=NamedMatrix(d_d, outputs, inputs),
-        a_aug=NamedMatrix(a_aug, augmented, augmented),
-        b_aug=NamedMatrix(b_aug, augmented, inputs),
-        c_aug=NamedMatrix(c_aug, outputs, augmented),
-        d_aug=NamedMatrix(d_aug, outputs, inputs),
-        f_d=NamedMatrix(lifted.f, inputs, outputs),
+        frame_s=loop.frame_s,
+        a=NamedMatrix(loop.ab[:, :n], loop.states, loop.states),
+        b=NamedMatrix(loop.ab[:, n:], loop.states, (*forces, *received)),
+        c=NamedMatrix(np.vstack([np.eye(n), _floats(loop.heard, n)]), (*loop.states, *heard), loop.states),
+        **_blocks("d", lifted, stacked, inputs, outputs),
+        **_blocks("aug", delayed, augmented, inputs, outputs),
+        f_d=NamedMatrix(f, inputs, outputs),
         closed=NamedMatrix(closed, augmented, augmented),
         eigenvalues=values[np.lexsort((-values.imag, values.real, -np.abs(values)))],
     )
+
+
+def _blocks(
+    suffix: str, lifted: FrameMap, states: tuple[str, ...], inputs: tuple[str, ...], outputs: tuple[str, ...]
+) -> dict[str, NamedMatrix]:
+    """Return A, B, C and D of a lifted system by their names in `PaperRoute`."""
+    shapes = ((states, states), (states, inputs), (outputs, states), (outputs, inputs))
+    return {
+        f"{letter}_{suffix}": NamedMatrix(value_of(block), *shape)
+        for letter, block, shape in zip("abcd", lifted.blocks, shapes, strict=True)
+    }
 
 
 def _timed(names: Sequence[str], times: Sequence[float]) -> tuple[str, ...]:
@@ -313,108 +416,52 @@ def _timed(names: Sequence[str], times: Sequence[float]) -> tuple[str, ...]:
     return tuple(f"{name}({time:.6g} ms)" for time in times for name in names)
 
 
-def _waiting_names(loop: OpenLoop) -> tuple[str, ...]:
-    """Return the names of the augmented states: forces still to act, and what is still to be heard."""
-    period, frame = float(loop.period * 1000), float(loop.ratio * loop.period * 1000)
-    names = [f"{one.name}({-age * period:.6g} ms)" for one in loop.fast for age in range(1, one.delay + 1)]
-    for one in loop.slow:
-        names += [f"{one.name}({-age * frame:.6g} ms)" for age in range(1, -(-one.delay // loop.ratio) + 1)]
-    for row in loop.heard:
-        names += [f"{row.name}({-age * frame:.6g} ms)" for age in range(1, row.delay + 1)]
-    return tuple(names)
+def _waiting_names(loop: _OpenLoop) -> tuple[str, ...]:
+    """Return the names of the augmented states behind x_D: forces still to act, and y_n still to arrive."""
+    frame = loop.ratio * loop.period
+    signals = (*loop.fast, *loop.slow, *loop.heard)
+    return tuple(
+        f"{one.name}({-age * float((loop.period if i < len(loop.fast) else frame) * 1000):.6g} ms)"
+        for i, (one, depth) in enumerate(zip(signals, loop.depths, strict=True))
+        for age in range(1, depth + 1)
+    )
 
 
 # ---- the analysis: rigid motions out, then eigenvalues ----
 
 
-def _without_rigid(loop: OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> tuple[ClosedSystem, int]:
-    """Return A_cl in relative coordinates, its error and its motion; and how many zero columns were left out.
+def _without_rigid(loop: _OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> ClosedSystem:
+    """Return A_cl in relative coordinates, without its zero columns.
 
-    As many positions are given up as there are rigid motions.
+    As many positions are given up as there are rigid motions. Where x stands, so does all that is a form in
+    it: what is still to act, and to be heard.
     """
-    n, _, _, _, ratio = _sizes(loop)
-    lifted, large = _lift(loop, loop.step), _lift(loop, loop.step_size, absolute=True)
-    dead = (ratio - 1) * n
-    closed, size = _close(lifted), _close(large)
-    # A path through a frame passes at most so many sums and coefficients (see `lift.lift`).
-    roundings = (3 * ratio + 4) * (lifted.terms + 2 + COEFFICIENT_ROUNDINGS)
-    charge = roundings * UNIT / (1 - roundings * UNIT)
-    matrix, size = closed[dead:, dead:], size[dead:, dead:]
+    n, zero = len(loop.states), (loop.ratio - 1) * len(loop.states)
+    closed = _close(_lift(loop), _feedback(loop))[..., zero:, zero:]
+    motions = []
+    for motion in rigid.exact:
+        x = np.array([motion[place] for place in whole.motion], dtype=object)
+        heard = _weights(loop.heard, n) @ x
+        signals = [*(_weights(loop.fast, n) @ x), *(_weights(loop.slow, len(heard)) @ heard), *heard]
+        motions.append([*x, *np.repeat(np.array(signals, dtype=object), loop.depths)])
+    basis = np.array(motions, dtype=np.float64).reshape(len(motions), closed.shape[-1]).T
+    held, _ = relative_places(basis[:n])
+    rest = np.delete(np.arange(len(basis)), held)
+    at = relative_coordinates(basis, (held, rest))
+    matrix, error = relative_bounded(value_of(closed), radius_of(closed), at)
     names = (*loop.states, *_waiting_names(loop))
-    error = charge * size
-    rest = np.arange(len(matrix))
-    basis, doubt = _rigid_basis(loop, whole, rigid)
-    moving = rest[:n]
-    if basis.shape[1]:
-        held = independent_places(basis[:n].T)
-        rest = np.delete(rest, held)
-        moving = rest[rest < n]
-        inverse = np.linalg.inv(basis[held])
-        weights = basis[rest] @ inverse
-        # W off: by V_r's error, by V_p's through W, by the rounding of the inverse and of the product.
-        wrong = RIGID_ROUNDINGS * basis.shape[1] * UNIT
-        wide = np.abs(basis[rest]) @ np.abs(inverse)
-        off = doubt[rest] @ np.abs(inverse)
-        off += wide @ (doubt[held] + wrong * np.abs(basis[held])) @ np.abs(inverse) + wrong * wide
-        at = Relative(held, rest, weights, 2 * off + wrong * np.abs(weights))
-        matrix, error = relative_bounded(matrix, error, at)
-    system = ClosedSystem(
+    return ClosedSystem(
         name=PAPER,
         multiplicity=1,
         sites=(),  # a matrix by itself, its rigid motions already out
         coupling={},
-        frame_s=float(ratio * loop.period),
+        frame_s=loop.frame_s,
         layout=StateLayout((0,), tuple(names[place] for place in rest), {}),
         matrix=matrix,
         error=error,
         heard=(),
-        motion=tuple(range(len(moving))),
+        motion=tuple(range(n - len(held))),
     )
-    return system, dead
-
-
-def _rigid_basis(loop: OpenLoop, whole: ClosedSystem, rigid: RigidModes) -> tuple[Floats, Floats]:
-    """Return the rigid motions over the augmented state, and bounds on their errors.
-
-    Everything in the state is a form in x, each of its terms at some time, so a motion of x is one of the
-    state: standing, x = x₀; drifting, x(t) = x₁ + t x₀.
-    """
-    n, _, _, _, ratio = _sizes(loop)
-    frame = float(ratio * loop.period)
-    fast = over([one.terms for one in loop.fast], n)
-    heard_at = np.array([-one.delay * frame for one in loop.heard])
-    forms, timed = [np.eye(n)], [np.zeros((n, n))]  # a form, and the same with each term times its time
-    for one, form in zip(loop.fast, fast, strict=True):
-        for age in range(1, one.delay + 1):
-            forms.append(form[None, :])
-            timed.append(-age * float(loop.period) * form[None, :])
-    for one, weights in zip(loop.slow, over([one.terms for one in loop.slow], len(heard_at)), strict=True):
-        for age in range(1, -(-one.delay // ratio) + 1):
-            forms.append(weights[None, :] @ loop.c_n)
-            timed.append((weights * (heard_at - age * frame))[None, :] @ loop.c_n)
-    for row, one_heard in enumerate(loop.heard):
-        for age in range(1, one_heard.delay + 1):
-            forms.append(loop.c_n[[row]])
-            timed.append(-age * frame * loop.c_n[[row]])
-    form, late = np.vstack(forms), np.vstack(timed)
-    motion = list(whole.motion)
-    standing, second = rigid.directions[motion], rigid.generalized[motion]
-    # What a drift gains in a frame is a standing motion: M x₁ = x₁ + T x₀.
-    inverse = np.linalg.pinv(standing)
-    gained = (whole.matrix @ rigid.generalized - rigid.generalized)[motion] / frame
-    shares = inverse @ gained
-    size = (whole.error + RIGID_ROUNDINGS * UNIT * np.abs(whole.matrix)) @ np.abs(rigid.generalized)
-    unsure = 2 * np.abs(inverse) @ size[motion] / frame
-    basis = np.hstack([form @ standing, form @ second + late @ (standing @ shares)])
-    terms = RIGID_ROUNDINGS + n
-    doubt = np.hstack(
-        [
-            terms * UNIT * (np.abs(form) @ np.abs(standing)),
-            terms * UNIT * (np.abs(form) @ np.abs(second))
-            + np.abs(late) @ np.abs(standing) @ (unsure + terms * UNIT * np.abs(shares)),
-        ]
-    )
-    return basis, doubt
 
 
 def _with_turns(spectrum: Spectrum, whole: Spectrum) -> Spectrum:
@@ -425,20 +472,80 @@ def _with_turns(spectrum: Spectrum, whole: Spectrum) -> Spectrum:
     values = np.array([mode.eigenvalue for mode in whole.modes])
     modes = []
     for mode in spectrum.modes:
-        near = int(np.argmin(np.abs(values - mode.eigenvalue))) if np.isnan(mode.frequency_hz) else -1
-        same = whole.modes[near] if near >= 0 else mode
-        if same is mode or abs(same.eigenvalue - mode.eigenvalue) <= same.error + mode.error:
-            (own,), (other,) = mode.motion, same.motion
-            own = replace(own, frequency_hz=other.frequency_hz, damping_ratio=other.damping_ratio)
-            mode = replace(mode, motion=(own,))
+        if np.isnan(mode.frequency_hz):
+            near = whole.modes[int(np.argmin(np.abs(values - mode.eigenvalue)))]
+            if abs(near.eigenvalue - mode.eigenvalue) <= near.error + mode.error:
+                same = replace(near.motion[0], participation=mode.participation)
+                mode = replace(mode, motion=(same,))
         modes.append(mode)
     return replace(spectrum, modes=tuple(modes))
 
 
-def _with_rigid(spectrum: Spectrum, rigid: RigidModes) -> Spectrum:
-    """Return the spectrum of the rest with what the rigid motions add to the verdict."""
-    count, drifts = rigid.directions.shape[1], rigid.drifts
-    verdict, stable = spectrum.verdict, spectrum.stable
-    if verdict == STABLE and count:
-        verdict, stable = (DRIFTS, False) if drifts else (STABLE_TRANSLATING, True)
-    return replace(spectrum, verdict=verdict, stable=stable, rigid_modes=count, drifts=drifts)
+# ---- the paper's form ----
+
+
+def _periods(system: CompiledSystem, sites: Sequence[PeerGroup]) -> tuple[Fraction, Fraction]:
+    """Return T_c and T_n, or say everything that keeps a scene from having the paper's form."""
+    timings = {timing.name: timing.value for timing in system.timings}
+    link_clock = {link.name: link.clock for link in system.links}
+    holds = [
+        hold
+        for group in sites
+        for hold, acting in zip(group.jacobians.kind.holds, group.schedule.acting, strict=True)
+        if acting is not None
+    ]
+    ways = [one.way for group in sites for one in group.schedule.heard]
+    forces = dict.fromkeys(hold.clock for hold in holds)
+    networks = dict.fromkeys(link_clock[way.link] for way in ways)
+    missing = [text for group in {id(one.site): one for one in sites}.values() for text in _misfits(group)]
+    for what, found in (("clock of forces", forces), ("network clock", networks)):
+        if len(found) != 1:
+            listed = f"here are {' and '.join(found)}" if found else "here is none"
+            missing.append(f"one {what} ({listed})")
+    if missing:
+        raise _not_of_the_form(system, missing)
+    fast, slow = (
+        next(clock for clock in system.clocks if clock.name in names) for names in (forces, networks)
+    )
+    period, frame = timings[fast.period], timings[slow.period]
+    apart = timings[slow.phase] - timings[fast.phase]
+    whole = [
+        (frame / period, f"a network period that is a whole multiple of that of {fast.name}"),
+        (apart / period, f"ticks of {slow.name} that fall on ticks of {fast.name}"),
+    ]
+    whole += [
+        (timings[one.delay] / period, f"a computational delay of {one.name} of whole ticks of {fast.name}")
+        for one in holds
+    ]
+    whole += [
+        (timings[way.delay] / frame, f"a delay of {way.link} of whole ticks of {slow.name}") for way in ways
+    ]
+    if missing := [wanted for number, wanted in whole if number.denominator != 1]:
+        raise _not_of_the_form(system, missing)
+    return period, frame
+
+
+def _misfits(group: PeerGroup) -> Iterator[str]:
+    """Yield what a peer's own equations lack."""
+    kind, pattern = group.jacobians.kind, group.jacobians.pattern
+    if not group.site.affine:
+        yield f"linear equations ({kind.name} is not linear)"
+    for partition, tick in zip(kind.clocks, pattern.ticks, strict=True):
+        if partition.variants:
+            yield "forces that are the same at every tick (they follow the age of what is heard)"
+        if any(receive.before for receive in partition.receives):
+            yield "forces of what is heard now (what the tick before heard counts as well)"
+        if tick.m.any():
+            names = [partition.outputs[partition.memories[m]] for m in np.flatnonzero(tick.m.any(axis=0))]
+            yield f"forces of the samples alone ({', '.join(names)} is remembered from tick to tick)"
+        if tick.u.any():
+            yield f"forces of the samples alone (on {partition.clock}, a held force is read)"
+    if any(send.u.any() for send in pattern.sends):
+        yield "packets of the motion alone (a held force is sent)"
+
+
+def _not_of_the_form(system: CompiledSystem, missing: Iterable[str]) -> ApcError:
+    what = "the paper's route is written for another form of scene; missing: " + "; ".join(
+        dict.fromkeys(missing)
+    )
+    return ApcError(Mistake("E861", Place(system.origin.topology), what, hint=_INSTEAD))

@@ -8,6 +8,7 @@ Does not: analyse (see `analysis`).
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -171,12 +172,11 @@ def cannot_serve(system: CompiledSystem, method: str, reason: str) -> ApcError:
 
 def _sizes(loops: Sequence[Loop], method: str) -> tuple[tuple[int, int], ...]:
     """Return how many loops there are of which size."""
-    found: dict[int, int] = {}
-    for loop in loops:
-        rows = sum(len(group.schedule.sent) for group in loop.sites)
-        size = rows if method == "determinant" else loop.states
-        found[size] = found.get(size, 0) + 1
-    return tuple((count, size) for size, count in found.items())
+    sizes = Counter(
+        sum(len(group.schedule.sent) for group in loop.sites) if method == "determinant" else loop.states
+        for loop in loops
+    )
+    return tuple((count, size) for size, count in sizes.items())
 
 
 def _determinant_bytes(loop: Loop) -> int:

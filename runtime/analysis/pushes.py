@@ -154,14 +154,12 @@ def _sector(force_at: Callable[[float], float], breaks: Sequence[float], size: f
     `size` is that of the numbers y is made of.
     """
     ends = [one for k, one in enumerate(breaks) if not k or one - breaks[k - 1] > ROUNDED * size]
-    lines = []
-    for low, high in itertools.pairwise([ends[0] - FAR * size, *ends, ends[-1] + FAR * size]):
-        one, other = low + (high - low) / 3, high - (high - low) / 3
-        slope = (force_at(other) - force_at(one)) / (other - one)
-        lines.append((slope, force_at(one) - slope * one))
-    if any(not -ROUNDED <= slope <= 1 + ROUNDED for slope, _ in lines):
+    knots = np.array([ends[0] - FAR * size, *ends, ends[-1] + FAR * size])
+    at_knots = np.array([force_at(y) for y in knots])
+    amid = np.array([force_at(y) for y in (knots[1:] + knots[:-1]) / 2])
+    if np.abs(amid - (at_knots[1:] + at_knots[:-1]) / 2).max() > ROUNDED * size:
+        return "jumps"
+    slopes = np.diff(at_knots) / np.diff(knots)
+    if slopes.min() < -ROUNDED or slopes.max() > 1 + ROUNDED:
         return "falls, or grows faster in some piece than where it is on"
-    for at, (before, after) in zip(ends, itertools.pairwise(lines), strict=True):
-        if abs((before[0] - after[0]) * at + before[1] - after[1]) > ROUNDED * size:
-            return "jumps"
     return ""

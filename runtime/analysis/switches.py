@@ -25,6 +25,7 @@ from typing import Any
 import casadi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -51,11 +52,20 @@ class Decision:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Opened:
-    """A function with its decisions as symbols: `where` it stands, its inputs, its output column."""
+    """A function with its decisions as symbols: `where` it stands, its inputs, its output column.
+
+    `rows` name what its rows compute; a function of many variants computes them again and again.
+    """
 
     where: tuple[str, int, int]  # ("derivative" | "tick" | "send" | "edge", partition, receive)
     inputs: tuple[Any, ...]  # casadi.SX
     output: Any  # casadi.SX
+    rows: tuple[str, ...]
+
+    def names(self, expression: Any, symbol: Any) -> list[str]:
+        """Return the names of the rows of an expression of them that depend on a symbol, each once."""
+        rows = [row for row in range(expression.size1()) if casadi.depends_on(expression[row, :], symbol)]
+        return list(dict.fromkeys(self.rows[row % len(self.rows)] for row in rows))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,17 +176,21 @@ class _Walk:
 def find_switches(kind: Kind) -> SwitchedKind:
     """Lay a kind's decisions open."""
     functions = _functions(kind)
-    if not all(function.is_a("SXFunction") for _, function, _ in functions):
+    if not all(function.is_a("SXFunction") for _, function, _, _ in functions):
         return SwitchedKind(kind, (), (), walkable=False)
     opening = _Walk()
-    opened = tuple(_Opened(where, *opening.open(function, names)) for where, function, names in functions)
+    opened = tuple(
+        _Opened(where, *opening.open(function, names), rows) for where, function, names, rows in functions
+    )
     decisions = []
     for number, symbol in opening.symbols.items():
         changed: dict[str, None] = {}
         for one in opened:
             if casadi.depends_on(one.output, symbol):
                 changed |= dict.fromkeys(_changed(kind, one, symbol, opening.operands[number]))
-        decisions.append(Decision(symbol, tuple(changed), _guard(opening.operands[number])))
+        first, *others = opening.operands[number]
+        # Of a sign there is one operand.
+        decisions.append(Decision(symbol, tuple(changed), first - others[0] if others else first))
     return SwitchedKind(kind, tuple(decisions), opened, walkable=True)
 
 
@@ -187,22 +201,11 @@ def varying_slopes(site: SiteJacobians) -> tuple[str, ...]:
     """
     if not site.timed:
         return ()
-    kind = site.kind
     found: dict[str, None] = {}
-    for one in find_switches(kind).functions:
+    for one in find_switches(site.kind).functions:
         *moving, _, t = one.inputs
         slopes = jacobian(one.output, casadi.vertcat(*moving))
-        rows = [row for row in range(slopes.size1()) if casadi.depends_on(slopes[row, :], t)]
-        what, p, place = one.where
-        if what == "edge" and rows:
-            found[kind.clocks[p].receives[place].name] = None
-            continue
-        names = {
-            "derivative": [state.name for state in kind.states],
-            "tick": kind.clocks[p].outputs if what == "tick" else (),
-            "send": kind.sends[p].channels if what == "send" else (),
-        }.get(what, ())
-        found |= dict.fromkeys(names[row % len(names)] for row in rows)
+        found |= dict.fromkeys(one.names(slopes, t))
     return tuple(found)
 
 
@@ -254,73 +257,57 @@ def bind(switched: SwitchedKind, base: SiteJacobians, settings: Mapping[int, boo
     return replace(jacobians(_bound(switched, settings)), kind=base.kind, pattern=base.pattern)
 
 
-def _guard(operands: Sequence[Any]) -> Any:
-    """Return what is zero where a decision between two operands, or on the sign of one, is taken."""
-    return operands[0] - operands[1] if len(operands) > 1 else operands[0]
-
-
-def _functions(kind: Kind) -> list[tuple[tuple[str, int, int], Any, tuple[str, ...]]]:
-    """Return a kind's functions: where each stands, itself, and its arguments' names."""
-    listed: list[tuple[tuple[str, int, int], Any, tuple[str, ...]]] = [
-        (("derivative", 0, 0), kind.derivative, ("x", "u", "p", "t"))
+def _functions(kind: Kind) -> list[tuple[tuple[str, int, int], Any, tuple[str, ...], tuple[str, ...]]]:
+    """Return a kind's functions: where each stands, itself, its arguments' names, and those of its rows."""
+    states = tuple(state.name for state in kind.states)
+    listed: list[tuple[tuple[str, int, int], Any, tuple[str, ...], tuple[str, ...]]] = [
+        (("derivative", 0, 0), kind.derivative, ("x", "u", "p", "t"), states)
     ]
     for p, partition in enumerate(kind.clocks):
         names = ("x", "u", f"m{p}", f"r{p}", "p", "t")
-        listed.append((("tick", p, 0), partition.tick, names))
+        listed.append((("tick", p, 0), partition.tick, names, partition.outputs))
         for place, receive in enumerate(partition.receives):
             if receive.edge is not None:
                 edge = ("x", "u", f"m{p}", f"s {receive.link}", "p", "t")
-                listed.append((("edge", p, place), receive.edge, edge))
-    listed += [(("send", p, 0), one.send, ("x", "u", "p", "t")) for p, one in enumerate(kind.sends)]
+                listed.append((("edge", p, place), receive.edge, edge, (receive.name,)))
+    listed += [
+        (("send", p, 0), one.send, ("x", "u", "p", "t"), one.channels) for p, one in enumerate(kind.sends)
+    ]
     return listed
 
 
 def _changed(kind: Kind, one: _Opened, symbol: Any, operands: Sequence[Any]) -> list[str]:
     """Return the names of what a decision changes in a function."""
     what, p, place = one.where
-    rows = [row for row in range(one.output.numel()) if casadi.depends_on(one.output[row], symbol)]
-    if what == "tick":
-        outputs = kind.clocks[p].outputs
-        return list(dict.fromkeys(outputs[row % len(outputs)] for row in rows))  # of all variants
-    if what == "send":
-        return [kind.sends[p].channels[row] for row in rows]
-    if what == "edge":
+    changed = one.names(one.output, symbol)
+    if what == "edge":  # what is computed of what is heard
         partition = kind.clocks[p]
         inputs = partition.tick.sx_in()
         computed = partition.tick(*inputs)
-        every = partition.outputs * (computed.numel() // len(partition.outputs))  # of all variants
-        heard = inputs[3][place]
-        found = (name for row, name in enumerate(every) if casadi.depends_on(computed[row], heard))
-        return list(dict.fromkeys(found))
+        tick = _Opened(("tick", p, 0), tuple(inputs), computed, partition.outputs)
+        return tick.names(computed, inputs[3][place])
+    if what != "derivative":
+        return changed
     # A continuous force has no name in the equations of motion; the part whose parameters decide has.
     symbols = casadi.vertsplit(one.inputs[2]) if kind.parameters else []
-    used = [
-        name
+    moving = {state.name.rpartition(".")[0] for state in kind.states}
+    owners = dict.fromkeys(
+        name.rpartition(".")[0]
         for name, parameter in zip(kind.parameters, symbols, strict=True)
         if any(casadi.depends_on(operand, parameter) for operand in operands)
-    ]
-    moving = {state.name.rpartition(".")[0] for state in kind.states}
-    owners = dict.fromkeys(name.rpartition(".")[0] for name in used)
-    named = [owner for owner in owners if owner and owner not in moving]
-    return named or [kind.states[row].name for row in rows]
+    )
+    return [owner for owner in owners if owner and owner not in moving] or changed
 
 
 def _together(decisions: Sequence[Decision]) -> list[tuple[int, ...]]:
-    """Return the places of decisions that change something in common."""
-    groups: list[tuple[set[str], list[int]]] = []
-    for place, decision in enumerate(decisions):
-        names, places = set(decision.changes), [place]
-        if not names:  # nobody reads what it decides
-            continue
-        apart = []
-        for others, theirs in groups:
-            if names & others:
-                names |= others
-                places = theirs + places
-            else:
-                apart.append((others, theirs))
-        groups = [*apart, (names, places)]
-    return sorted(tuple(sorted(places)) for _, places in groups)
+    """Return the places of decisions that change something in common; not of those nobody reads."""
+    read = [place for place, decision in enumerate(decisions) if decision.changes]
+    shared = [[not set(decisions[a].changes).isdisjoint(decisions[b].changes) for b in read] for a in read]
+    count, labels = connected_components(np.array(shared).reshape(len(read), len(read)), directed=False)
+    return sorted(
+        tuple(place for place, own in zip(read, labels, strict=True) if own == label)
+        for label in range(count)
+    )
 
 
 def _extremes(

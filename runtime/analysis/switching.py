@@ -17,12 +17,12 @@ is proved at will holds of what is linear about it, and loads of constant size l
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from apc.analysis.analysis import Prepared, prepare
-from apc.analysis.circle_criterion import Weights, is_proved, least_of, weights_of
+from apc.analysis.circle_criterion import is_proved, least_of, weights_of
 from apc.analysis.contact_modes import ContactModes
 from apc.analysis.opened import OpenLoop, open_loops
 from apc.compiler.compiled import CompiledSystem
@@ -88,16 +88,11 @@ def switching(system: CompiledSystem, modes: ContactModes, *, prepared: Prepared
 
 
 def _judge(topology: str, loops: Sequence[OpenLoop]) -> Switching:
-    """Prove that contacts may switch at will, or say what is open."""
+    """Prove the circle criterion of all loops, or say which fails."""
     weights = weights_of(loops)
     jumps = next((one.jumps for one in loops if one.jumps), "")
-    return replace(_circle(topology, loops, weights), jumps=jumps)
-
-
-def _circle(topology: str, loops: Sequence[OpenLoop], weights: Weights | str) -> Switching:
-    """Prove the circle criterion of all loops, or say which fails."""
     if isinstance(weights, str):
-        return Switching(topology, OPEN, weights)
+        return Switching(topology, OPEN, weights, jumps=jumps)
     least, worst = min(((least_of(one, weights), one.name) for one in loops), default=(np.inf, ""))
     reach = float("inf") if least >= 0 else float(-1 / least)
     if not reach > 1:
@@ -105,5 +100,5 @@ def _circle(topology: str, loops: Sequence[OpenLoop], weights: Weights | str) ->
     elif fails := [one.name for one in loops if not is_proved(one, weights)]:
         reason = f"the circle criterion holds too narrowly to be proved in the {fails[0]} mode"
     else:
-        return Switching(topology, STABLE, "", reach, worst)
-    return Switching(topology, OPEN, reason, reach, worst)
+        return Switching(topology, STABLE, "", reach, worst, jumps)
+    return Switching(topology, OPEN, reason, reach, worst, jumps)

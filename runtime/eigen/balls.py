@@ -2,9 +2,9 @@
 
 Takes: a `ClosedSystem`; its sites' matrices as exact rationals.
 Gives: `precision`, `unprovable`, `rational_ball`, `site_balls`, `frame_steps`, `closed_frame`, `frame_balls`,
-`reduced_balls`, `square`; `weight_balls`; `Dual`, `slope_of`, `step_duals`: balls with a slope.
+`reduced_balls`, `square`; `weight_balls`.
 Guarantees: the true matrix, of the numbers the sites hold, lies in the balls, whatever the number of bits;
-more bits make them smaller. Where a parameter is a ball, value and slope hold those of every parameter in it.
+more bits make them smaller.
 Does not: decide anything (see `certify`).
 
 The frame is followed event by event over the state of the closed system itself (`lift.follow`), all sites
@@ -16,7 +16,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -283,68 +282,3 @@ def reduced_balls(matrix: Balls, vectors: Sequence[Sequence[Fraction]], held: ND
     weights[:] = [rational_ball(Fraction(int(e.p), int(e.q))) for e in quotient.entries()]
     weights = weights.reshape(len(rest), count)
     return relative(matrix, Relative(held, rest, weights, np.zeros(weights.shape)), BALLS)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Dual:
-    """`value` and its derivative `slope`; adds and multiplies with whole numbers and balls, too."""
-
-    value: Any
-    slope: Any
-
-    def __add__(self, other: Any) -> Dual:
-        if isinstance(other, Dual):
-            return Dual(self.value + other.value, self.slope + other.slope)
-        return Dual(self.value + other, self.slope)
-
-    def __mul__(self, other: Any) -> Dual:
-        if isinstance(other, Dual):
-            return Dual(self.value * other.value, self.value * other.slope + self.slope * other.value)
-        return Dual(self.value * other, self.slope * other)
-
-    def __neg__(self) -> Dual:
-        return Dual(-self.value, -self.slope)
-
-    __radd__ = __add__
-    __rmul__ = __mul__
-
-
-def value_of(entry: Any) -> Any:
-    """Return the value of a number with or without a slope."""
-    return entry.value if isinstance(entry, Dual) else entry
-
-
-def slope_of(entry: Any) -> Any:
-    """Return the slope of a number, 0 for one that has none."""
-    return entry.slope if isinstance(entry, Dual) else 0
-
-
-def mapped(change: Any, numbers: Balls) -> Balls:
-    """Return an array of changed numbers."""
-    entries = np.empty(numbers.size, dtype=object)
-    entries[:] = [change(entry) for entry in numbers.ravel()]
-    return entries.reshape(numbers.shape)
-
-
-def step_duals(a: Balls, b: Balls, duration: Fraction) -> Balls:
-    """Return [F G] (n_x, n_x + n_u) of one duration with its slope; see `discretize.step_balls`.
-
-    Notes
-    -----
-    y = ∂x/∂p moves by dy/dt = A y + A′ x + B′ u beside dx/dt = A x + B u, so that the rows of y in the step
-    of both are the slope.
-    """
-    steady_a, steady_b, slope_a, slope_b = (
-        mapped(part, matrix) for part in (value_of, slope_of) for matrix in (a, b)
-    )
-    n = len(a)
-    if all(isinstance(entry, int) for entry in (*slope_a.ravel(), *slope_b.ravel())):
-        return step_balls(steady_a, steady_b, duration)
-    nothing = np.zeros((n, n), dtype=object)
-    both = step_balls(
-        np.block([[steady_a, slope_a], [nothing, steady_a]]), np.vstack([slope_b, steady_b]), duration
-    )
-    values, slopes = both[n:, n:], both[:n, n:]
-    entries = np.empty(values.size, dtype=object)
-    entries[:] = [Dual(value, slope) for value, slope in zip(values.ravel(), slopes.ravel(), strict=True)]
-    return entries.reshape(values.shape)

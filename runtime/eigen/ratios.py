@@ -146,15 +146,6 @@ class Ratio:
     def __float__(self) -> float:
         return float(self.constant())
 
-    def slope(self, place: int) -> Ratio:
-        """Return the derivative by a parameter."""
-        top = self.top.derivative(place) * self.bottom - self.top * self.bottom.derivative(place)
-        return self._reduced(top, self.bottom * self.bottom)
-
-    def at(self, point: Sequence[Any]) -> Any:
-        """Return the value at parameters that are balls, as a ball."""
-        return _value(self.top, point) / _value(self.bottom, point)
-
 
 def open_site(built: SiteJacobians, vector: Sequence[Any]) -> LinearSite:
     """Return the matrices of a site that follow from its parameters (n_p,), some of them open.
@@ -171,14 +162,3 @@ def open_site(built: SiteJacobians, vector: Sequence[Any]) -> LinearSite:
 
     flat = evaluate_exact(built.function, [*zeros, list(vector), [Fraction(0)]], rounded=refuse)[0]
     return site_of_entries(built, flat, Fraction(0))
-
-
-def _value(polynomial: Any, point: Sequence[Any]) -> Any:
-    total = flint.arb(0)
-    for exponents, coefficient in polynomial.to_dict().items():
-        term = flint.arb(coefficient)
-        for one, exponent in zip(point, exponents, strict=True):
-            if exponent:
-                term *= one ** int(exponent)
-        total += term
-    return total

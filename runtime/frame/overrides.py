@@ -1,7 +1,7 @@
 """Changing the numbers of a compiled system without compiling again.
 
 Takes: a `CompiledSystem` and overrides such as `contact.stiffness=800 N/m`.
-Gives: `Override`, `parse_override`, `apply`.
+Gives: `Override`, `parse_override`, `apply`; `check_bounds`.
 Guarantees: what depends on a changed parameter by a formula changes with it, in exact rationals; the rest
 keeps the very numbers it was compiled with. Every value out of what its component allows is told, all
 together; of a parameter that differs from peer to peer, the first peer's.
@@ -180,10 +180,10 @@ def _check_bounds(system: CompiledSystem) -> None:
     """Raise the mistakes of every value that is out of its bounds."""
     mistakes = Mistakes()
     for parameter in system.parameters:
-        _check_parameter(parameter, parameter.name, mistakes)
+        check_bounds(parameter, parameter.name, mistakes)
     for group in system.groups:
         for parameter in group.values:
-            _check_parameter(parameter, f"{group.name}.{parameter.name}", mistakes)
+            check_bounds(parameter, f"{group.name}.{parameter.name}", mistakes)
         _check_columns(system, group, mistakes)
     periods = {clock.period for clock in system.clocks}
     for timing in system.timings:
@@ -200,15 +200,29 @@ def _check_bounds(system: CompiledSystem) -> None:
     mistakes.raise_if_any()
 
 
-def _check_parameter(parameter: Parameter, name: str, mistakes: Mistakes) -> None:
-    """Record a value below the minimum or above the maximum."""
+def check_bounds(
+    parameter: Parameter, name: str, mistakes: Mistakes, code: str = "E624", place: Place = OVERRIDE
+) -> None:
+    """Record a value below the minimum or above the maximum of a parameter.
+
+    Parameters
+    ----------
+    parameter
+        The parameter, with its value.
+    name
+        What it is called in the message.
+    mistakes
+        Where a mistake is recorded.
+    code, place
+        Those of the mistake.
+    """
     low, high, value = parameter.minimum, parameter.maximum, parameter.value
 
     def told(number: float) -> str:
         return with_unit(f"{number:g}", parameter.unit)
 
     def out(expected: str, number: float) -> None:
-        mistakes.add("E624", OVERRIDE, name, expected=f"{expected} {told(number)}", got=told(value))
+        mistakes.add(code, place, name, expected=f"{expected} {told(number)}", got=told(value))
 
     if low is not None and parameter.open_minimum and value <= low:
         out("more than", low)
@@ -232,4 +246,4 @@ def _check_columns(system: CompiledSystem, group: Group, mistakes: Mistakes) -> 
         wrong = np.flatnonzero(below | (values > high))
         if len(wrong):
             peer, value = f"{group.name}[{int(wrong[0]) + 1}]", float(values[wrong[0]])
-            _check_parameter(replace(parameter, value=value, exact=None), f"{peer}.{name}", mistakes)
+            check_bounds(replace(parameter, value=value, exact=None), f"{peer}.{name}", mistakes)

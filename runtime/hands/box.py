@@ -24,13 +24,12 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, lifted_groups, prepare
 from apc.analysis.box import open_sites
-from apc.analysis.box_proof import BITS, TOGETHER, BoxProof, Looked, middle, search_box
+from apc.analysis.box_proof import TOGETHER, BoxProof, Looked, middle, search_box
 from apc.analysis.cells import Cell, OpenLoop, closed_over, open_loop
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.compiler.words import with_unit
-from apc.eigen.balls import precision
 from apc.eigen.closing import ClosedSystem, close_loop
 from apc.eigen.dissipation import is_positive, least_real, proves_positive_between
 from apc.eigen.modes import split
@@ -109,7 +108,7 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range], *, cells: int | N
         low, high = (with_unit(f"{float(end):g}", one.unit) for end in (one.low, one.high))
         hint = f'apc analyze --box "{one.free.label}={low}:{high}"'
         refuse_channel_number(system, one.free, PLACE, instead=hint)
-    with single_threaded(), np.errstate(all="ignore"), precision(BITS):
+    with single_threaded(), np.errstate(all="ignore"):
         asked = _question(system, ranges)
         if isinstance(asked, str):
             inner = tuple(map(float, middle(tuple((one.low, one.high) for one in ranges))))

@@ -27,12 +27,11 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared, prepare
 from apc.analysis.box import open_sites
-from apc.analysis.box_proof import BITS, TOGETHER, UNDECIDED, BoxProof, Looked, middle, search_box
+from apc.analysis.box_proof import TOGETHER, UNDECIDED, BoxProof, Looked, middle, search_box
 from apc.analysis.cells import Cell, OpenFrames, contracted, frames_over, open_frames
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
-from apc.eigen.balls import precision
 from apc.eigen.closing import Loop, without_packets
 from apc.eigen.rigid import stays_rigid
 from apc.frame.discretize import UNIT
@@ -93,7 +92,7 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range], *, cells: int | N
     ApcError
         E898 the network can't be judged all over a box, by name; E831 and E832 as `box.open_sites`.
     """
-    with single_threaded(), np.errstate(all="ignore"), precision(BITS):
+    with single_threaded(), np.errstate(all="ignore"):
         asked = _question(system, ranges)
         for loop in asked.classes.loops:
             bare = without_packets(loop)

@@ -108,7 +108,7 @@ def test_cells_as_small_as_their_distance_from_the_limit_are_never_wrong(
         assert found.stable is not False
     else:
         assert found.stable is not True or high < LIMIT
-    assert found.stable is not None or low < LIMIT < high or abs(centre) < 1e-8
+    assert found.stable is not None or low < LIMIT < high or abs(centre) < 1e-7
 
 
 def test_what_can_not_be_proved_is_left_open_and_says_where() -> None:
@@ -133,8 +133,8 @@ def test_a_box_stands_before_the_answer_and_says_that_more_cells_may_decide_it(
     words = ["analyze", str(tmp_path / "scene.yaml"), "--box", "coordination.stiffness=100 N/m:1 N/mm"]
     assert run([*words, "--cells", "1"]) == 0
     text = capsys.readouterr().out
-    assert text.startswith("three-users-average:\nundecided, 100 % of the box is left open (2 cells)")
-    assert "--cells 20\n" in text
+    assert text.startswith("three-users-average:\nundecided, 100 % of the box is left open (1 cell)")
+    assert "--cells 10\n" in text
     assert run(words) == 0
     assert capsys.readouterr().out.startswith("three-users-average:\nproved stable")
 
