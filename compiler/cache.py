@@ -16,7 +16,8 @@ A text has the name by which the topology gives it:
     Mass               a definition of the built-in library
 
 The file is four lines: `apc`, the format and whether the model is as its texts compile ("compiled") or may
-have been changed since ("saved"); the seal of all else; the origin as JSON; the model.
+have been changed since ("saved"); the seal of all else and, against damage on the way to somebody else, its
+SHA-256; the origin as JSON; the model.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, files_below, read_file
 from apc.compiler.seal import is_sealed, seal
 
-FORMAT = 14  # of NAME.apc
+FORMAT = 15  # of NAME.apc
 LARGEST = 256 * 2**20  # bytes of the file
 LARGEST_ORIGIN = 64 * 2**20  # bytes of its third line, each of which takes up to ten of memory
 SUFFIX = ".yaml"  # of the files in a folder of components
@@ -84,7 +85,9 @@ def packed(origin: Origin, model: bytes, *, compiled: bool) -> bytes:
     """Return the content of a model's file, under this user's seal."""
     head = f"apc {FORMAT} {'compiled' if compiled else 'saved'}".encode()
     body = msgspec.json.encode(origin) + b"\n" + model
-    return b"\n".join((head, seal(head + b"\n" + body).encode(), body))
+    whole = head + b"\n" + body
+    mark = f"{seal(whole)} {hashlib.sha256(whole).hexdigest()}"
+    return b"\n".join((head, mark.encode(), body))
 
 
 def read_archive(path: Path) -> Archive:
@@ -101,14 +104,17 @@ def read_archive(path: Path) -> Archive:
         hint = "apc compile" if refused.why == "missing" else ""
         other = ", not a compiled model" if refused.why in ("folder", "special") else ""
         raise ApcError(Mistake("E602", Place(str(path)), f"{refused.words}{other}", hint=hint)) from None
-    hint = f"apc compile {path.with_suffix(SUFFIX)}"
+    topology = path.with_suffix(SUFFIX)
+    hint = f"apc compile {topology}" if topology.exists() else "the file once more, from whoever made it"
     head, mark, origin, model = (*data.split(b"\n", 3), b"", b"", b"")[:4]
     form = re.fullmatch(rb"apc ([0-9]{1,6}) (compiled|saved)", head)
     if form and int(form[1]) != FORMAT:
         what = f"has format version {int(form[1])}, this program reads version {FORMAT}"
         raise ApcError(Mistake("E603", Place(str(path)), what, hint=hint))
+    whole = b"\n".join((head, origin, model))
+    sealed, _, checksum = mark.decode("latin-1").partition(" ")
     try:
-        if form is None or len(origin) > LARGEST_ORIGIN:
+        if form is None or len(origin) > LARGEST_ORIGIN or checksum != hashlib.sha256(whole).hexdigest():
             raise ValueError
         made_from = msgspec.json.decode(origin, type=Origin)
         name = made_from.topology
@@ -119,8 +125,7 @@ def read_archive(path: Path) -> Archive:
             raise ValueError
     except (ValueError, RecursionError):  # what is nested too deeply
         raise ApcError(Mistake("E604", Place(str(path)), FOREIGN, hint=hint)) from None
-    whole = b"\n".join((head, origin, model))
-    return Archive(made_from, model, is_sealed(whole, mark.decode("latin-1")), form[2] == b"compiled")
+    return Archive(made_from, model, is_sealed(whole, sealed), form[2] == b"compiled")
 
 
 def changed(archive: Archive, folder: Path) -> str:

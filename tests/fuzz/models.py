@@ -10,6 +10,7 @@ Does not: watch over what it runs (see `running`).
 from __future__ import annotations
 
 import functools
+import hashlib
 import io
 import json
 import random
@@ -162,7 +163,9 @@ def bases() -> tuple[tuple[Origin, bytes], ...]:
 
 def unsealed(origin: bytes, model: bytes) -> bytes:
     """Return the file of a model that nobody has sealed."""
-    return b"\n".join((f"apc {FORMAT} compiled".encode(), b"0" * 64, origin, model))
+    head = f"apc {FORMAT} compiled".encode()
+    checksum = hashlib.sha256(b"\n".join((head, origin, model))).hexdigest()
+    return b"\n".join((head, b"0" * 64 + b" " + checksum.encode(), origin, model))
 
 
 def _forge_model(seed: str) -> Input:
