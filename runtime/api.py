@@ -103,10 +103,14 @@ def with_hands(model: CompiledSystem | str | Path, hands: str) -> CompiledSystem
     Raises
     ------
     ApcError
-        No such hands, a peer without a device, or with a hand already.
+        No such hands, a peer without a device, or with a hand already. E930 "passive", which are all
+        hands there are: `passive_hands`, `critical` and `region` judge them.
     """
     from apc.frame import devices
 
+    if hands == devices.PASSIVE:
+        what = "passive hands are all that draw no energy, and a model has one hand a device"
+        raise ApcError(Mistake("E930", Place("with_hands"), what, hint="apc.passive_hands(model)"))
     return devices.with_hands(_model(model, None), hands)
 
 

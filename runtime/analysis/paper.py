@@ -35,7 +35,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from apc.analysis.analysis import Analysis, lifted_groups
 from apc.analysis.methods import PAPER
@@ -54,7 +53,7 @@ from apc.frame.radius import RADII, radius_of, rounded, value_of, with_radius
 from apc.frame.schedule import Way
 from apc.network.nominal import left_out
 from apc.result import Result
-from apc.threads import single_threaded
+from apc.threads import load_pool, single_threaded
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -300,6 +299,7 @@ def _open_loop(system: CompiledSystem, whole: ClosedSystem) -> _OpenLoop:
     def side_by_side(blocks: Iterable[Floats]) -> Floats:
         """Return the blocks [A B] (n_x, n_x + n_u) of the sites as one of all states and inputs."""
         split = [np.split(block, [len(block)], axis=1) for block in blocks]
+        block_diag = load_pool("scipy.linalg").block_diag
         a, b = (block_diag(*listed) for listed in zip(*split, strict=True))
         return np.hstack([a, b[:, columns[0]], b[:, columns[1]]])
 
@@ -360,7 +360,7 @@ def _lift(loop: _OpenLoop) -> FrameMap:
 def _feedback(loop: _OpenLoop) -> Floats:
     """Return F_D: the forces of each tick of the samples there, and those of what is heard."""
     own = np.kron(np.eye(loop.ratio), _floats(loop.fast, len(loop.states)))
-    return np.asarray(block_diag(own, _floats(loop.slow, len(loop.heard))))
+    return np.asarray(load_pool("scipy.linalg").block_diag(own, _floats(loop.slow, len(loop.heard))))
 
 
 def _close(delayed: FrameMap, f: Floats) -> Matrix:

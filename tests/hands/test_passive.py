@@ -349,3 +349,10 @@ def test_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert usual in said(*asked, "StylusArmForward") and usual not in said(*asked, "clamped")
     found = apc.critical(scene, PULL, lower="600 N/m", criterion="passive")
     assert (found.value, found.verdict) == (None, "unstable at every value scanned")
+
+
+def test_no_model_has_every_passive_hand() -> None:
+    with pytest.raises(
+        apc.ApcError, match=r"E930 passive hands are all .*Write: apc\.passive_hands\(model\)"
+    ):
+        apc.with_hands(three(), "passive")
