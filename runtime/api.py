@@ -108,10 +108,11 @@ def with_hands(model: CompiledSystem | str | Path, hands: str) -> CompiledSystem
     """
     from apc.frame import devices
 
+    changed = devices.with_hands(_model(model, None), hands)
     if hands == devices.PASSIVE:
         what = "passive hands are all that draw no energy, and a model has one hand a device"
         raise ApcError(Mistake("E930", Place("with_hands"), what, hint="apc.passive_hands(model)"))
-    return devices.with_hands(_model(model, None), hands)
+    return changed
 
 
 @checked
