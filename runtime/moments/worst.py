@@ -393,7 +393,9 @@ def _growths(part: HeldPart, words: Sequence[tuple[int, ...]]) -> Floats:
         product = over[listed[:, 0] - 1]
         for column in range(1, length):
             product = over[listed[:, column] - 1] @ product
-        growths[places] = np.abs(np.linalg.eigvals(product)).max(axis=1) ** (1 / listed.sum(axis=1))
+        finite = np.isfinite(product).all(axis=(1, 2))  # the others, beyond all floats, are not tried
+        largest = np.abs(np.linalg.eigvals(product[finite])).max(axis=1, initial=0.0)
+        growths[np.array(places)[finite]] = largest ** (1 / listed[finite].sum(axis=1))
     return growths
 
 
