@@ -137,6 +137,8 @@ def _root_discs(polynomial: Any) -> tuple[Complexes, Floats]:
     """
     coefficients = polynomial.coeffs()
     n = len(coefficients) - 1
+    if not all(one.is_finite() for one in coefficients):
+        return np.zeros(n, dtype=np.complex128), np.full(n, np.inf)
     zeros = next(place for place, one in enumerate(coefficients) if not bool(one == 0))
     middle = [
         (one.mid() + one.rad() * (GOLDEN * place % 1 - 0.5)).mid().man_exp()
