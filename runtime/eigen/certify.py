@@ -137,7 +137,7 @@ def _root_discs(polynomial: Any) -> tuple[Complexes, Floats]:
     """
     coefficients = polynomial.coeffs()
     n = len(coefficients) - 1
-    if not all(one.is_finite() for one in coefficients):
+    if not all(math.isfinite(float(one.abs_upper())) for one in coefficients):  # more bits may tell
         return np.zeros(n, dtype=np.complex128), np.full(n, np.inf)
     zeros = next(place for place, one in enumerate(coefficients) if not bool(one == 0))
     middle = [
