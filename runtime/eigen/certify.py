@@ -28,7 +28,7 @@ from apc.eigen.eigenpairs import components
 from apc.eigen.enclosure import discs
 from apc.eigen.relative import independent_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes
-from apc.frame.discretize import UNIT
+from apc.eigen.roots import approach_roots, root_discs
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -50,9 +50,6 @@ SHARP = 2.0**-50
 
 # A verdict that is proved isn't followed by more than so many times its bits, for a sharper radius.
 SHARPENING = 4
-
-# Multiples of it, whole numbers left out, are spread evenly and favour no symmetry (Weyl).
-GOLDEN = (5**0.5 - 1) / 2
 
 # What the characteristic polynomial at 1 is known to before its vanishing is taken for a drift to look for.
 SETTLED = 2.0**-40
@@ -127,35 +124,14 @@ def _root_discs(polynomial: Any) -> tuple[Complexes, Floats]:
     """Enclose the roots of a monic polynomial of degree n in discs: centres and radii (n,) in floats.
 
     All roots are in the discs; k discs that hang together hold k of them.
-
-    Notes
-    -----
-    |z − z_i| ≤ n |p(z_i)| / Π_{j≠i} |z_i − z_j| (Smith, Error bounds for zeros of a polynomial based upon
-    Gerschgorin's theorems, J. ACM 17, 1970), for any n different z_i. These are the roots of one of the
-    polynomials within the balls: where several are one within the precision, they come as far apart as the
-    others' may be, which is where the discs are about the smallest.
     """
     coefficients = polynomial.coeffs()
-    n = len(coefficients) - 1
     if not all(math.isfinite(float(one.abs_upper())) for one in coefficients):  # more bits may tell
+        n = len(coefficients) - 1
         return np.zeros(n, dtype=np.complex128), np.full(n, np.inf)
-    zeros = next(place for place, one in enumerate(coefficients) if not bool(one == 0))
-    middle = [
-        (one.mid() + one.rad() * (GOLDEN * place % 1 - 0.5)).mid().man_exp()
-        for place, one in enumerate(coefficients[zeros:])
-    ]
-    least = min(int(exponent) for mantissa, exponent in middle if mantissa)
-    whole = flint.fmpz_poly([int(m) << int(e) - least if m else 0 for m, e in middle])
-    found: Any = whole.complex_roots()  # with multiplicities; python-flint's types say otherwise
-    points = [root.mid() for root, times in found for _ in range(times)]
-    reduced = flint.acb_poly(coefficients[zeros:])
-    radii = np.zeros(n)
-    for i, point in enumerate(points):
-        apart = math.prod((point - other for j, other in enumerate(points) if j != i), start=flint.acb(1))
-        radius = abs(reduced(point) / apart) * len(points)
-        radii[i] = float(radius.upper()) * (1 + 4 * UNIT) if radius.is_finite() else np.inf
-    centres = np.array([complex(point) for point in points] + [0j] * zeros, dtype=np.complex128)
-    return centres, radii + 4 * UNIT * np.abs(centres)
+    guesses = np.roots([float(one.mid()) for one in reversed(coefficients)]).astype(np.complex128)
+    bits = flint.ctx.prec
+    return root_discs(polynomial, approach_roots(polynomial, guesses, bits), bits)
 
 
 def _inside(polynomials: Sequence[Any], values: Complexes, radii: Floats) -> bool | None:
