@@ -200,6 +200,6 @@ def test_the_wheel_brings_one_name_to_site_packages_and_every_model(tmp_path: Pa
         names = archive.namelist()
     tops = {name.split("/")[0] for name in names}
     assert {top for top in tops if not re.fullmatch(r"apc_haptics-[\d.]+\.dist-info", top)} == {"apc"}
-    packed = {name.removeprefix("apc/models/") for name in names if name.endswith(".yaml")}
+    packed = {name.removeprefix("apc/models/") for name in names if re.match(r"apc/models/.*\.yaml$", name)}
     assert packed == {str(path.relative_to(ROOT / "models")) for path in (ROOT / "models").rglob("*.yaml")}
     assert "apc/py.typed" in names

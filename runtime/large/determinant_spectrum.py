@@ -136,7 +136,7 @@ def _solve_loop(loop: Loop) -> _Solved:
         rigid
         and np.isfinite(zeros.high)
         and not zeros.rigid_counted
-        and (drifts := find_rigid_modes(prompt).drifts)
+        and (drifts := find_rigid_modes(loop).drifts)
     ):
         zeros = find_zeros(function, starts, rigid=rigid + drifts, listed=LISTED, near=0)
     modes = _with_conjugates(_loop_mode(function, loop, zero) for zero in zeros.found)

@@ -420,7 +420,7 @@ def ensemble_text(ensemble: Ensemble) -> str:
         one = ensemble.statistics(name)
         if one is not None:
             error = f"± {one.standard_error:.1g}" if one.count > 1 else ""
-            rows.append((label, f"{one.mean:.4g}", error, *(f"{v:.4g}" for v in (*one.quantiles, one.high))))
+            rows.append((label, f"{one.mean:.3g}", error, *(f"{v:.3g}" for v in (*one.quantiles, one.high))))
     lines += [*table(shares, "<><"), "", *table(rows, "<>>>>>>")]
     settled = ensemble.statistics("settled")
     if settled is not None and settled.count < n:
