@@ -101,7 +101,7 @@ SCENES: dict[str, tuple[Scene, str, float]] = {
 }
 
 
-SCATTERED = pytest.mark.xfail(strict=True, reason="packets' cluster at 0 comes as 0.04, within its bound of 0.2")
+SCATTERED = pytest.mark.xfail(strict=True, reason="packets' cluster at 0 comes as 0.04, within its bound")
 
 
 @pytest.mark.few(10)
