@@ -61,14 +61,16 @@ class Proof:
 
     `inside` says whether all eigenvalues but the rigid ones lie inside the unit circle, None if that is left
     open; `bits` with how many bits it was decided, or left open. `free` are the rigid modes, drifts included
-    if there are any. Of the matrix in relative coordinates, `values` (m,) are eigenvalues, and `radii` (m,)
-    those of discs about them: k discs that hang together hold k eigenvalues.
+    if there are any. Of the matrix in relative coordinates, `values` (m,) estimate the eigenvalues, and
+    discs about `centres` (m,) with `radii` (m,) hold them: k discs that hang together hold k eigenvalues. The
+    centres of roots that are one within the precision are spread, the estimates are not.
     """
 
     inside: bool | None
     bits: int
     free: RigidModes
     values: Complexes
+    centres: Complexes
     radii: Floats
 
 
@@ -91,13 +93,12 @@ def prove(system: ClosedSystem, free: RigidModes) -> Proof:
             if not searched and any(map(_may_vanish_at_one, polynomials)):
                 free, searched = find_rigid_modes(system), True
                 polynomials = _polynomials(matrix, free)
-            enclosed = [_root_discs(one) for one in polynomials]
-            values = np.concatenate([centres for centres, _ in enclosed] or [np.empty(0, np.complex128)])
-            radii = np.concatenate([radius for _, radius in enclosed] or [np.empty(0)])
-            inside = _inside(polynomials, values, radii) if _stands_still(matrix, free) else None
+            values, centres, wide = np.concatenate([np.empty((3, 0)), *map(_root_discs, polynomials)], axis=1)
+            radii = wide.real
+            inside = _inside(polynomials, centres, radii) if _stands_still(matrix, free) else None
         settled = settled or (bits if inside is not None else 0)
         if best is None or inside is not None or bits == PRECISIONS[-1]:
-            best = Proof(inside, settled or bits, free, values, radii)
+            best = Proof(inside, settled or bits, free, values, centres, radii)
         if inside is not None and (_sharp(best) or bits >= SHARPENING * settled):
             break
         if any(doubt for way, doubt in system.doubts.items() if way not in system.surds) and bits >= DOUBTFUL:
@@ -120,27 +121,32 @@ def _may_vanish_at_one(polynomial: Any) -> bool:
     return bool(at_one.contains(0)) and float(at_one.rad()) < SETTLED
 
 
-def _root_discs(polynomial: Any) -> tuple[Complexes, Floats]:
-    """Enclose the roots of a monic polynomial of degree n in discs: centres and radii (n,) in floats.
+def _root_discs(polynomial: Any) -> Complexes:
+    """Estimate and enclose the roots of a monic polynomial of degree n.
 
-    All roots are in the discs; k discs that hang together hold k of them.
+    Returns
+    -------
+    The estimates, then the centres and the radii of discs (3, n). All roots are in the discs; k discs that hang
+    together hold k of them.
     """
     coefficients = polynomial.coeffs()
     if not all(math.isfinite(float(one.abs_upper())) for one in coefficients):  # more bits may tell
-        n = len(coefficients) - 1
-        return np.zeros(n, dtype=np.complex128), np.full(n, np.inf)
+        nothing = np.zeros(len(coefficients) - 1, dtype=np.complex128)
+        return np.stack([nothing, nothing, nothing + np.inf])
     guesses = np.roots([float(one.mid()) for one in reversed(coefficients)]).astype(np.complex128)
     bits = flint.ctx.prec
-    return root_discs(polynomial, approach_roots(polynomial, guesses, bits), bits)
+    roots = approach_roots(polynomial, guesses, bits)
+    centres, radii = root_discs(polynomial, roots, bits)
+    return np.stack([np.array([complex(root) for root in roots], dtype=np.complex128), centres, radii])
 
 
-def _inside(polynomials: Sequence[Any], values: Complexes, radii: Floats) -> bool | None:
+def _inside(polynomials: Sequence[Any], centres: Complexes, radii: Floats) -> bool | None:
     """Say whether all eigenvalues of all parts lie inside the unit circle, None if that is open.
 
     The discs tell, unless one reaches over the circle; then Schur and Cohn, who need more bits where there
     are many eigenvalues, but come as near to the circle as the balls allow.
     """
-    found = discs(values, values, radii)
+    found = discs(centres, centres, radii)
     if found.high < 1:
         return True
     if found.low > 1:
@@ -192,7 +198,7 @@ def schur_cohn(coefficients: Sequence[Any]) -> bool | None:
 
 def _sharp(proof: Proof) -> bool:
     """Say whether the largest eigenvalues are known as well as floats can tell."""
-    sizes = np.abs(proof.values)
+    sizes = np.abs(proof.centres)
     largest = sizes.max(initial=0.0)
     reaching = sizes + proof.radii >= largest - proof.radii.min(initial=np.inf)
     return bool(np.all(proof.radii[reaching] <= SHARP * max(largest, 1.0)))

@@ -101,13 +101,8 @@ SCENES: dict[str, tuple[Scene, str, float]] = {
 }
 
 
-SCATTERED = pytest.mark.xfail(strict=True, reason="packets' cluster at 0 comes as 0.04, within its bound")
-
-
 @pytest.mark.few(10)
-@pytest.mark.parametrize(
-    "name", [pytest.param(one, marks=[SCATTERED] if one == "pairs of delays" else []) for one in SCENES]
-)
+@pytest.mark.parametrize("name", SCENES)
 def test_the_modes_are_the_whole_spectrum_of_all_peers(name: str) -> None:
     scene, method, off = SCENES[name]
     expected = np.linalg.eigvals(np.array(frame_matrix(scene)))
