@@ -126,8 +126,8 @@ def _root_discs(polynomial: Any) -> Complexes:
 
     Returns
     -------
-    The estimates, then the centres and the radii of discs (3, n). All roots are in the discs; k discs that hang
-    together hold k of them.
+    The estimates, then the centres and the radii of discs (3, n). All roots are in the discs; k discs
+    that hang together hold k of them.
     """
     coefficients = polynomial.coeffs()
     if not all(math.isfinite(float(one.abs_upper())) for one in coefficients):  # more bits may tell
