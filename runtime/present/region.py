@@ -64,7 +64,8 @@ def region_text(found: Region) -> str:
     looked = f"Looked at in cells of {cell}, and finer where the eigenvalues hint at more; "
     lines += ["", *wrapped(f"{looked}an island inside one cell could be missed.", "  ", "  ")]
     if found.stepped and found.criterion == "passive":
-        lines.append("  Its points are on the boundary; between them it is drawn straight.")
+        lines.append("  Its points are on the boundary, with straight lines between; the error is an")
+        lines.append("  estimate by how far the middles of these were off, no bound.")
     elif found.stepped:
         lines.append("  Along these times the boundary has steps: it is right to a cell only.")
     return "\n".join(lines)

@@ -262,7 +262,7 @@ def region(
     Where one axis is a delay, the rectangle is cut where events coincide (see `strips`). Where both axes are
     times, or the scene is linearized at its start, each point is analysed by itself, and the boundary is a
     line from cell edge to cell edge, its error the size of a cell. With passive hands there are no steps: its
-    points are on the boundary, and it goes straight between.
+    points are on the boundary, straight lines between, and its error is an estimate by their middles.
     """
     free = tuple(axis.free for axis in axes)
     meant = criterion_of(system, criterion, PLACE, free)
