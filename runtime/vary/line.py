@@ -200,16 +200,12 @@ def _one_by_one(judge: Callable[[Fraction], Verdict], values: Floats) -> tuple[C
 
 
 @dataclass(frozen=True, eq=False)
-class AnalysedLine:
-    """A parameter of a scene whose matrices are too large for many of them: each value is analysed."""
+class _JudgedLine:
+    """A line of which each value is analysed by itself, once."""
 
     system: CompiledSystem
     free: Free
-    prepared: Prepared
-    bottom: float
-    top: float
-    scale: float
-    known: dict[Fraction, Verdict] = field(default_factory=dict)
+    known: dict[Fraction, Verdict] = field(default_factory=dict, kw_only=True)
 
     @property
     def label(self) -> str:
@@ -219,9 +215,24 @@ class AnalysedLine:
     def judge(self, value: Fraction) -> Verdict:
         """Return the verdict at a value."""
         if value not in self.known:
-            changed = apply(self.system, [Override(self.free, value)])
-            self.known[value] = analysed(changed, self.prepared)
+            self.known[value] = self._verdict(value)
         return self.known[value]
+
+    def _verdict(self, value: Fraction) -> Verdict:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class AnalysedLine(_JudgedLine):
+    """A parameter of a scene whose matrices are too large for many of them: each value is analysed."""
+
+    prepared: Prepared
+    bottom: float
+    top: float
+    scale: float
+
+    def _verdict(self, value: Fraction) -> Verdict:
+        return analysed(apply(self.system, [Override(self.free, value)]), self.prepared)
 
     def stretches(self) -> Iterator[Stretch]:
         """Yield the one stretch."""
@@ -238,31 +249,19 @@ class AnalysedLine:
 
 
 @dataclass(frozen=True, eq=False)
-class DelayLine:
+class DelayLine(_JudgedLine):
     """A delay from `low` to `high`: between two coincidences of events what decides is continuous.
 
     What happens exactly at `low` is a stretch of its own: events may coincide there.
     """
 
-    system: CompiledSystem
-    free: Free
     prepared: Prepared
     low: Fraction
     high: Fraction
     told: Callable[[Fraction], None] | None = None
-    known: dict[Fraction, Verdict] = field(default_factory=dict)
 
-    @property
-    def label(self) -> str:
-        """The delay that varies."""
-        return self.free.label
-
-    def judge(self, value: Fraction) -> Verdict:
-        """Return the verdict at a delay."""
-        if value not in self.known:
-            changed = system_with_delay(self.system, self.free, value)
-            self.known[value] = analysed(changed, self.prepared)
-        return self.known[value]
+    def _verdict(self, value: Fraction) -> Verdict:
+        return analysed(system_with_delay(self.system, self.free, value), self.prepared)
 
     def _judge_within(self, value: Fraction) -> Verdict:
         """Return the verdict at a delay that moves events, of all systems without anything beside."""
@@ -359,27 +358,15 @@ def delay_reach(
 
 
 @dataclass(frozen=True, eq=False)
-class CountLine:
+class CountLine(_JudgedLine):
     """A number of peers from `first` to `last`: a stretch each, the larger ones looked at less densely."""
 
-    system: CompiledSystem
-    free: Free
     verdict_of: Callable[[CompiledSystem], bool | None]
     first: int
     last: int
-    known: dict[Fraction, Verdict] = field(default_factory=dict)
 
-    @property
-    def label(self) -> str:
-        """The count that varies."""
-        return self.free.label
-
-    def judge(self, value: Fraction) -> Verdict:
-        """Return the verdict of so many peers."""
-        if value not in self.known:
-            stable = self.verdict_of(apply(self.system, [Override(self.free, value)]))
-            self.known[value] = sided(stable)
-        return self.known[value]
+    def _verdict(self, value: Fraction) -> Verdict:
+        return sided(self.verdict_of(apply(self.system, [Override(self.free, value)])))
 
     def stretches(self) -> Iterator[Stretch]:
         """Yield the counts that are looked at to begin with, in order."""
