@@ -29,15 +29,15 @@ RESERVED = frozenset(
     {"peers", "others", "time", "pi", "ground", "type", "at", "shared", "set", *FUNCTIONS, *KEYWORDS}
 )
 # A parameter of one of these roles isn't a number: it names, or describes, something of the scene.
-ROLES = {
-    "clock": "a clock",
-    "link": "a link",
-    "graph": "who hears whom",
-    "delays": "other delays: sending group, hearing group",
-    "loss": "how packets get lost",
-    "trace": "a CSV file of recorded delays, one a packet",
-    "table": "a CSV file of numbers over time",
-}
+ROLES = (
+    "clock",
+    "link",
+    "graph",
+    "delays",
+    "loss",
+    "trace",
+    "table",
+)
 
 
 @dataclass(frozen=True, slots=True)

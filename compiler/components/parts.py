@@ -45,11 +45,11 @@ LARGEST_ARRAY = 500
 # Of one peer, those inside parts included: half a minute and 1 GB of compiling.
 MOST_PARTS = 1000
 # The keys of every part of a topology beside its type.
-PART_KEYS = {
-    "at": "only at these groups",
-    "shared": "a copy at each peer of one object",
-    "count": "an array",
-}
+PART_KEYS = (
+    "at",
+    "shared",
+    "count",
+)
 # By section, an entry without its name; and a type to show for an entry that has none.
 EXAMPLES = {
     "masses": ("device", "{mass: 0.1 kg}", "Mass"),

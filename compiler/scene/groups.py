@@ -48,11 +48,11 @@ from apc.compiler.source.reading import (
 )
 
 MOST_FAULTS = 5  # of a column, that are told
-GROUP = {
-    "count": "how many",
-    "set": "this group's own settings; a list has a value a peer",
-    "table": "a CSV file with a row a peer",
-}
+GROUP = (
+    "count",
+    "set",
+    "table",
+)
 # How a count begins that is no number, word of YAML or quantity: with a name, or a parenthesis before one.
 _IN_NAMES = re.compile(
     r"\(*\s*(?!(true|false|null)\Z)[A-Za-z]\w*|[0-9]+\s*[-+*/]\s*\(*\s*[A-Za-z]\w*", re.ASCII

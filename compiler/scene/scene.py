@@ -36,21 +36,21 @@ from apc.compiler.source.reading import Body, brief, fault, mapping_of, text_of
 from apc.compiler.source.source import Source
 
 SECTIONS = ("masses", "couplers", "links", "hands")  # those of parts
-# The sections of a topology, and what each is.
-TOPOLOGY = {
-    "topology": "the scene's name",
-    "about": "one sentence",
-    "library": "folders of components of one's own, from this file's folder",
-    "clocks": "what ticks, and how often",
-    "parameters": "named quantities, for use in expressions",
-    "peers": "who is there: groups of peers",
-    "masses": "what each peer has",
-    "couplers": "what pulls at masses",
-    "links": "what carries samples to the other peers",
-    "hands": "what moves a device",
-    "experiment": "what a simulation runs for",
-    "studies": "which parameters a study varies",
-}
+# The sections of a topology; what each is stands in view/schema.yaml.
+TOPOLOGY = (
+    "topology",
+    "about",
+    "library",
+    "clocks",
+    "parameters",
+    "peers",
+    "masses",
+    "couplers",
+    "links",
+    "hands",
+    "experiment",
+    "studies",
+)
 # Those that it must have, and what to write.
 REQUIRED = {
     "topology": "my-scene",

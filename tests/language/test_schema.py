@@ -16,7 +16,9 @@ from apc.__main__ import run
 from apc.compiler.compiled import LARGEST_COUNT
 from apc.compiler.components.parts import DEFAULT_TYPES, LARGEST_ARRAY
 from apc.compiler.scene.graphs import SHAPES
+from apc.compiler.scene.groups import GROUP
 from apc.compiler.scene.links import PROBABILITIES
+from apc.compiler.scene.scene import TOPOLOGY
 from apc.compiler.source.reading import IDENTIFIER
 from tests.topologies import AVERAGE, ROOT, SCENES, replaced
 
@@ -193,5 +195,6 @@ def test_what_is_written_by_hand_agrees_with_the_compiler() -> None:
     assert definitions["graph"]["anyOf"][0]["enum"] == list(SHAPES)
     channels = definitions["loss"]["anyOf"][1]["properties"]
     assert {name: one["description"] for name, one in channels.items()} == PROBABILITIES
+    assert (tuple(sections), tuple(definitions["group"]["properties"])) == (TOPOLOGY, GROUP)
     for section, default in DEFAULT_TYPES.items():
         assert sections[section]["additionalProperties"]["properties"]["type"]["default"] == default
