@@ -14,7 +14,7 @@ from typing import TypeVar
 
 from apc.compiler.errors import Place
 from apc.compiler.language.dimensions import Dimension
-from apc.compiler.language.expression import FUNCTIONS, KEYWORDS, Compare, Equation, Expr, Name, walk
+from apc.compiler.language.expression import FUNCTIONS, KEYWORDS, Call, Equation, Expr, Name, walk
 from apc.compiler.language.units import Unit
 from apc.compiler.language.values import Binding, Bounds
 from apc.compiler.source.nodes import Node
@@ -222,14 +222,8 @@ Settable = Number | Option | Reference | Variable  # what a group of peers can s
 
 def option_test(node: Expr, options: dict[str, Option]) -> tuple[Option, str] | None:
     """Return the option and the word that a comparison such as `delays == all` is about."""
-    if (
-        isinstance(node, Compare)
-        and node.operator in ("==", "!=")
-        and isinstance(node.left, Name)
-        and isinstance(node.right, Name)
-        and len(node.left.parts) == len(node.right.parts) == 1
-    ):
-        option = options.get(node.left.parts[0])
-        if option is not None and node.right.parts[0] in option.words:
-            return option, node.right.parts[0]
+    match node:
+        case Call("==" | "!=", (Name((name,)), Name((word,)))):
+            if (option := options.get(name)) is not None and word in option.words:
+                return option, word
     return None

@@ -23,8 +23,8 @@ from apc.compiler.components.declarations import Written
 from apc.compiler.errors import ApcError, Mistakes, Place, place_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import (
+    FUNCTIONS,
     Call,
-    Compare,
     Equation,
     Expr,
     Name,
@@ -48,7 +48,7 @@ from apc.compiler.language.vectors import (
 from apc.compiler.source.reading import brief, fault, unknown
 from apc.compiler.words import counted
 
-_TRUE = Compare("==", Literal(Fraction(1)), Literal(Fraction(1)))
+_TRUE = Call("==", (Literal(Fraction(1)), Literal(Fraction(1))))
 
 Path = tuple[str, ...]  # a name in an equation, between its dots
 T = TypeVar("T")
@@ -180,7 +180,7 @@ class ComponentNames:
     def _check_reductions(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> None:
         """Record a reduction that doesn't run over the other peers, and an age of what is not heard."""
         for node in walk(expression):
-            if not isinstance(node, Call):
+            if not isinstance(node, Call) or node.function not in FUNCTIONS:
                 continue
             function, others = node.function, [name for name in names(node) if name.parts[0] == OTHERS]
             hint = "count(others)" if function == "count" else f"{function}(others.x)"
@@ -242,13 +242,14 @@ class ComponentNames:
         """Record names that nothing of the component has, and words that an option hasn't got."""
         told = set[int]()
         for node in walk(expression):
-            if isinstance(node, Compare) and isinstance(node.left, Name) and isinstance(node.right, Name):
-                option, word = self.options.get(".".join(node.left.parts)), ".".join(node.right.parts)
-                if option is not None and node.operator in ("==", "!="):  # else it was decided
-                    told |= {node.left.start, node.right.start}
-                    what = f"{option.name} has no option {brief(word)}"
-                    at = place_in(place, text, node.right.start)
-                    mistakes.take(unknown("E206", at, what, word, option.words))
+            match node:
+                case Call("==" | "!=", (Name(left), Name(right) as second)):
+                    option, word = self.options.get(".".join(left)), ".".join(right)
+                    if option is not None:  # else it was decided
+                        told |= {part.start for part in node.arguments}
+                        what = f"{option.name} has no option {brief(word)}"
+                        at = place_in(place, text, second.start)
+                        mistakes.take(unknown("E206", at, what, word, option.words))
             if isinstance(node, Name) and node.parts not in self.dimensions and node.start not in told:
                 mistakes.take(self._unknown(node.parts, place_in(place, text, node.start)))
 

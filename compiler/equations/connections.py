@@ -13,7 +13,7 @@ from fractions import Fraction
 
 from apc.compiler.components.parts import GROUND
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.language.expression import Binary, Expr, Name, Number
+from apc.compiler.language.expression import Call, Expr, Name, Number
 from apc.compiler.scene.instances import Part
 
 Terminal = tuple[str, str]  # (part, connector)
@@ -74,4 +74,4 @@ def _sum(terms: Sequence[Expr]) -> Expr:
     if len(terms) == 1:
         return terms[0]
     half = len(terms) // 2 if len(terms) > 16 else -1  # few read best as they are written
-    return Binary("+", _sum(terms[:half]), _sum(terms[half:]))
+    return Call("+", (_sum(terms[:half]), _sum(terms[half:])))

@@ -29,11 +29,11 @@ from apc.compiler.equations.connections import ZERO, connection_equations
 from apc.compiler.errors import Mistakes, Place, place_in
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import (
+    FUNCTIONS,
     INTERVAL,
+    LEVELS,
     SMOOTH,
-    Binary,
     Call,
-    Conditional,
     Equation,
     Expr,
     Name,
@@ -52,8 +52,8 @@ from apc.compiler.scene.scene import Scene
 HEARD_AGE = f"{OTHERS}.age"  # in what a reduction runs over; no send has this name, as a part's stands before
 CONNECTION = "connection"  # where an equation comes from that is no part's
 
-# The functions whose value hangs on those of their arguments at the same moment, and on nothing else.
-POINTWISE = frozenset(("max", "min", "abs", "sign", "sqrt", "floor", "atan2", *SMOOTH))
+# What hangs on the values of its arguments at the same moment, and on nothing else.
+POINTWISE = frozenset(("max", "min", "abs", "sign", "sqrt", "floor", "atan2", *SMOOTH, *LEVELS))
 REDUCTIONS = ("mean", "sum", "max", "min", "count")
 
 
@@ -335,17 +335,17 @@ class _PartWriter:
         options = {p.name: p for p in self.part.component.parameters if isinstance(p, Option)}
 
         def decided(node: Expr) -> Expr | None:
-            test = option_test(node.condition, options) if isinstance(node, Conditional) else None
-            if test is None or not isinstance(node, Conditional):
-                return None
-            holds = dict(self.part.options)[test[0].name] == test[1]
-            equal = getattr(node.condition, "operator", "==") == "=="
-            return transform(node.then if holds == equal else node.otherwise, decided)
+            match node:
+                case Call("if", (Call(relation) as condition, then, otherwise)):
+                    if test := option_test(condition, options):
+                        holds = dict(self.part.options)[test[0].name] == test[1]
+                        return transform(then if holds == (relation == "==") else otherwise, decided)
+            return None
 
         def whole(node: Expr) -> Expr | None:
             if isinstance(node, Name):
                 return self._name(node) if heard or node.parts[0] != OTHERS else self._each(node, where)
-            if not isinstance(node, Call):
+            if not isinstance(node, Call) or node.function not in FUNCTIONS:
                 return None
             of = node.arguments[0]
             reads = any(name.parts[0] == OTHERS for name in names(node))
@@ -483,4 +483,4 @@ class _PartWriter:
             return Number(words[head])
         whole = Name((*part, head))
         divided = self.part.shared and any(one.divided for one in component.numbers if one.name == head)
-        return Binary("/", whole, Name(("peers",))) if divided else whole
+        return Call("/", (whole, Name(("peers",)))) if divided else whole

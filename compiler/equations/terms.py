@@ -25,15 +25,9 @@ import sympy
 from apc.compiler.language.expression import (
     COMPARISONS,
     SMOOTH,
-    Binary,
     Call,
-    Compare,
-    Conditional,
     Expr,
-    Logic,
     Name,
-    Negate,
-    Not,
     Number,
     fold,
     format_expression,
@@ -124,6 +118,7 @@ FUNCTIONS: dict[str, Any] = {
     "*": operator.mul,
     "/": operator.truediv,
     "^": operator.pow,
+    "neg": operator.neg,
     "if": If,
     "max": Max,
     "min": Min,
@@ -165,18 +160,13 @@ def to_term(expression: Expr, differentiate: Callable[[Term], Term] | None = Non
             return symbol(".".join(node.parts))
         return sympy.Rational(node.value.numerator, node.value.denominator)
 
-    def operation(node: Expr, *operands: Term) -> Term:
-        match node:
-            case Call("der"):
-                assert differentiate is not None, node
-                return differentiate(*operands)
-            case Negate():
-                return -operands[0]
-            case Call(function=name) | Binary(operator=name) | Compare(operator=name) | Logic(operator=name):
-                return FUNCTIONS[name](*operands)
-        return FUNCTIONS["if" if isinstance(node, Conditional) else "not"](*operands)
+    def apply(word: str, *operands: Term) -> Term:
+        if word == "der":
+            assert differentiate is not None, operands
+            return differentiate(*operands)
+        return FUNCTIONS[word](*operands)
 
-    return fold(expression, leaf, operation)
+    return fold(expression, leaf, apply)
 
 
 # ---- what is asked of terms ----
@@ -253,25 +243,17 @@ def _written(term: Term) -> Expr:
         total = _written(first)
         for part in others:
             minus = _is_negative(part)
-            total = Binary("-" if minus else "+", total, _written(-part if minus else part))
+            total = Call("-" if minus else "+", (total, _written(-part if minus else part)))
         return total
     if term.is_Mul and _is_negative(term):
-        return Negate(_written(-term))
+        return Call("neg", (_written(-term),))
     if term.is_Mul or (term.is_Pow and term.exp.is_negative):
         return _written_product(term)
     if term.is_Pow and term.exp != HALF:
-        return Binary("^", *map(_written, term.args))
+        return Call("^", tuple(map(_written, term.args)))
     if term.is_Pow:
         return Call("sqrt", (_written(term.base),))
-    arguments = tuple(map(_written, term.args))
-    name = NAMES.get(term.func, term.func.__name__)
-    if name == "if":
-        return Conditional(*arguments)
-    if name in COMPARISONS:
-        return Compare(name, *arguments)
-    if name in ("and", "or"):
-        return Logic(name, *arguments)
-    return Not(*arguments) if name == "not" else Call(name, arguments)
+    return Call(NAMES.get(term.func, term.func.__name__), tuple(map(_written, term.args)))
 
 
 def _written_product(term: Term) -> Expr:
@@ -280,8 +262,9 @@ def _written_product(term: Term) -> Expr:
     factors = sympy.Mul.make_args(rest)
     below = [factor for factor in factors if factor.is_Pow and factor.exp.is_negative]
     above = [*([number] if number != 1 else []), *(one for one in factors if one not in below)]
-    times = functools.partial(Binary, "*")
-    whole = functools.reduce(times, map(_written, above or [ONE]))
-    if not below:
-        return whole
-    return Binary("/", whole, functools.reduce(times, (_written(1 / factor) for factor in below)))
+    whole = _times(above or [ONE])
+    return Call("/", (whole, _times(1 / factor for factor in below))) if below else whole
+
+
+def _times(factors: Iterable[Term]) -> Expr:
+    return functools.reduce(lambda one, other: Call("*", (one, other)), map(_written, factors))

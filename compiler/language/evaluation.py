@@ -19,19 +19,16 @@ from typing import Any, NoReturn
 from apc.compiler.compiled import Formula
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.language.expression import (
+    FUNCTIONS,
     SMOOTH,
     Call,
-    Compare,
-    Conditional,
     Expr,
-    Logic,
     Name,
     Number,
     children,
     fold,
     format_expression,
     names,
-    operation,
     walk,
 )
 from apc.compiler.language.grammar import parse_expression
@@ -58,12 +55,10 @@ _OPERATIONS = {
     "!=": "ne",
     "and": "and",
     "or": "or",
-    "Negate": "neg",
-    "Not": "not",
     "abs": "fabs",
     "max": "fmax",
     "min": "fmin",
-    **{name: name for name in ("sign", "floor", "sqrt", "atan2", *SMOOTH)},
+    **{name: name for name in ("neg", "not", "sign", "floor", "sqrt", "atan2", *SMOOTH)},
 }
 
 
@@ -184,51 +179,48 @@ def computed(formula: Formula, values: Sequence[Any], rule: Rule) -> Any:
     def leaf(expr: Name | Number) -> Any:
         return float(expr.value) if isinstance(expr, Number) else by_name[".".join(expr.parts)]
 
-    def node(expr: Expr, *operands: Any) -> Any:
-        if not isinstance(expr, Conditional):
-            return _operation(expr, operands, rule)
+    def apply(word: str, *operands: Any) -> Any:
+        if word != "if":
+            return _apply(word, operands, rule)
         holds, then, otherwise = operands
         branches = (holds, then), (rule("not")(holds), otherwise)
         return rule("add")(*(rule("if_else_zero")(*branch) for branch in branches))
 
-    return fold(_tree(formula.text), leaf, node)
+    return fold(_tree(formula.text), leaf, apply)
 
 
 def _exactly(expr: Expr, values: dict[str, Any], rule: Rule) -> Any:
     """Return the value of an expression, evaluated only as far as it is needed. Raises FaultError."""
 
     def value(expr: Expr) -> Any:
-        if isinstance(expr, Conditional):
-            return value(expr.then if value(expr.condition) != 0 else expr.otherwise)
-        if isinstance(expr, Logic) and ((left := value(expr.left)) != 0) == (expr.operator == "or"):
-            return left
-        parts = [value(part) for part in children(expr)]
+        match expr:
+            case Call("if", (condition, then, otherwise)):
+                return value(then if value(condition) != 0 else otherwise)
+            case Call("and" | "or" as word, (left, right)):
+                first = value(left)
+                return first if (first != 0) == (word == "or") else value(right)
+        operands = [value(part) for part in children(expr)]
         try:
-            match expr:
-                case Number():
-                    return _finite(expr.value)
-                case Name():
-                    return _finite(values[".".join(expr.parts)])
-            return _operation(expr, parts, rule)
+            if isinstance(expr, Call):
+                return _apply(expr.function, operands, rule)
+            return _finite(expr.value if isinstance(expr, Number) else values[".".join(expr.parts)])
         except (ArithmeticError, ValueError) as cause:
             raise FaultError(expr, cause) from None
 
     return value(expr)
 
 
-def _operation(expr: Expr, operands: Sequence[Any], rule: Rule) -> Any:
-    """Return what a node comes to, from what its sub-expressions come to."""
-    match expr:
-        case Compare(">" | ">="):
-            operands = operands[::-1]
-        case Call("max" | "min"):
-            return reduce(rule(_OPERATIONS[expr.function]), operands)
-    return rule(_OPERATIONS[operation(expr)])(*operands)
+def _apply(word: str, operands: Sequence[Any], rule: Rule) -> Any:
+    """Return what an operator or function comes to."""
+    operation = rule(_OPERATIONS[word])
+    if word in ("max", "min"):
+        return reduce(operation, operands)
+    return operation(*(operands[::-1] if word in (">", ">=") else operands))
 
 
 def _check_functions(expr: Expr, place: Place) -> None:
     for node in walk(expr):
-        if isinstance(node, Call) and node.function not in _OPERATIONS:
+        if isinstance(node, Call) and node.function in FUNCTIONS.keys() - _OPERATIONS.keys():
             what = f"{node.function}(…) changes with time or with the peers: a parameter cannot hold it"
             _fail(place, node, "E332", what)
 

@@ -1,20 +1,20 @@
 """The nodes of an expression's tree, walking and changing them, and their text.
 
 Takes: `Expr` trees.
-Gives: the node types, `Equation`, `format_expression`, `interval_of`, `operation`, `children`, `rebuild`,
-`walk`, `names`, `transform`, `fold`.
+Gives: the node types, `Equation`, `format_expression`, `interval_of`, `children`, `walk`, `names`,
+`transform`, `fold`.
 Guarantees: plain frozen data; the text has no more parentheses than the tree needs.
 Does not: read text (see `grammar`), or know what a name means, or its unit.
 """
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from decimal import Context, Decimal, Inexact
-from enum import IntEnum
 from fractions import Fraction
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from apc.compiler.errors import Place
 
@@ -42,68 +42,16 @@ class Name(Spanned):
 
 
 @dataclass(frozen=True, slots=True)
-class Negate(Spanned):
-    """−operand."""
-
-    operand: Expr
-
-
-@dataclass(frozen=True, slots=True)
-class Binary(Spanned):
-    """`operator` is one of + - * / ^; the right side of ^ is a `Number`, maybe negative or a fraction."""
-
-    operator: str
-    left: Expr
-    right: Expr
-
-
-@dataclass(frozen=True, slots=True)
-class Compare(Spanned):
-    """A condition; `operator` is one of < <= > >= == !=."""
-
-    operator: str
-    left: Expr
-    right: Expr
-
-
-@dataclass(frozen=True, slots=True)
-class Logic(Spanned):
-    """A condition of two conditions; `operator` is `and` or `or`."""
-
-    operator: str
-    left: Expr
-    right: Expr
-
-
-@dataclass(frozen=True, slots=True)
-class Not(Spanned):
-    """The opposite of a condition."""
-
-    operand: Expr
-
-
-@dataclass(frozen=True, slots=True)
 class Call(Spanned):
-    """A function of `FUNCTIONS` and its arguments."""
+    """An operator or a function, and what it is applied to.
+
+    `function` is one of `FUNCTIONS` or an operator: `neg` of -x; ^, whose right side is a `Number`, maybe
+    negative or a fraction; `if` of a condition, a value and another, where an `elseif` is an `if` in its
+    place; `{` of the entries of a vector, of which none is left behind `vectors`.
+    """
 
     function: str
     arguments: tuple[Expr, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Conditional(Spanned):
-    """`if condition then then else otherwise`; an `elseif` is a `Conditional` in `otherwise`."""
-
-    condition: Expr
-    then: Expr
-    otherwise: Expr
-
-
-@dataclass(frozen=True, slots=True)
-class Vector(Spanned):
-    """`{a, b}`: a vector by its entries; none is left behind `vectors`."""
-
-    entries: tuple[Expr, ...]
 
 
 _EXACT = Context(prec=5000, traps=[Inexact])  # of more digits than any number in a text has
@@ -112,7 +60,7 @@ V = TypeVar("V")
 
 PI = Fraction("3.1415926535897932384626433832795028841971693993751")  # OEIS A000796; the name `pi`
 
-Expr = Number | Name | Negate | Binary | Compare | Logic | Not | Call | Conditional | Vector
+Expr = Number | Name | Call
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,29 +93,14 @@ KEYWORDS = frozenset(("if", "then", "elseif", "else", "and", "or", "not"))
 
 
 COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
+CONDITIONS = (*COMPARISONS, "and", "or", "not")
 
-
-class Level(IntEnum):
-    """How tightly an operator binds; an operand must bind tighter than what it stands in."""
-
-    OR = 1
-    AND = 2
-    NOT = 3
-    COMPARE = 4
-    SUM = 5
-    PRODUCT = 6
-    SIGN = 7
-    POWER = 8
-    ATOM = 9
-
-
-LEVELS = {
-    "or": Level.OR,
-    "and": Level.AND,
-    **dict.fromkeys(COMPARISONS, Level.COMPARE),
-    **dict.fromkeys("+-", Level.SUM),
-    **dict.fromkeys("*/", Level.PRODUCT),
-    "^": Level.POWER,
+# Operators by how tightly they bind: an operand must bind tighter than what it stands in.
+_BINDING = (("if",), ("or",), ("and",), ("not",), COMPARISONS, ("+", "-"), ("*", "/"), ("neg",), ("^",))
+LEVELS = {word: level for level, words in enumerate(_BINDING) for word in words}
+PRODUCT, SIGN, ATOM = LEVELS["*"], LEVELS["neg"], len(_BINDING)
+_FORMS = {"if": "if {} then {} else {}", "neg": "-{}", "not": "not {}"} | {
+    word: f"{{}}{word}{{}}" for word in "*/^"
 }
 
 
@@ -181,48 +114,30 @@ def format_expression(expr: Expr) -> str:
 
 def _format(expr: Expr) -> tuple[str, int]:
     """Return a text and how tightly it binds."""
-    match expr:
-        case Number():
-            return _format_number(expr.value)
-        case Name():
-            return ".".join(expr.parts), Level.ATOM
-        case Negate():
-            return "-" + _inside(expr.operand, Level.SIGN), Level.SIGN
-        case Binary("^", base, exponent):
-            return f"{_inside(base, Level.ATOM)}^{_inside(exponent, Level.ATOM)}", Level.POWER
-        case Binary() | Logic() | Compare():
-            level = LEVELS[expr.operator]
-            # Both sides of a comparison bind tighter than it: a < b < c is not in the language.
-            left = _inside(expr.left, level + isinstance(expr, Compare))
-            right = _inside(expr.right, level + 1)
-            space = "" if level == Level.PRODUCT else " "
-            return f"{left}{space}{expr.operator}{space}{right}", level
-        case Not():
-            return "not " + _inside(expr.operand, Level.NOT), Level.NOT
-        case Call():
-            arguments = ", ".join(_format(argument)[0] for argument in expr.arguments)
-            return f"{expr.function}({arguments})", Level.ATOM
-        case Conditional():
-            parts = f"if {_format(expr.condition)[0]} then {_format(expr.then)[0]}"
-            return f"{parts} else {_format(expr.otherwise)[0]}", 0
-        case Vector():
-            return f"{{{', '.join(_format(entry)[0] for entry in expr.entries)}}}", Level.ATOM
-
-
-def _inside(expr: Expr, level: int) -> str:
-    text, binds = _format(expr)
-    return text if binds >= level else f"({text})"
+    if isinstance(expr, Number):
+        return _format_number(expr.value)
+    if isinstance(expr, Name):
+        return ".".join(expr.parts), ATOM
+    word, parts = expr.function, [_format(argument) for argument in expr.arguments]
+    if word not in LEVELS:
+        arguments = ", ".join(text for text, _ in parts)
+        return f"{{{arguments}}}" if word == "{" else f"{word}({arguments})", ATOM
+    level = LEVELS[word]
+    # Both sides of a comparison bind tighter than it: a < b < c is not in the language.
+    least = {"if": (0, 0, 0), "^": (ATOM, ATOM)}.get(word, (level + (word in COMPARISONS), level + 1))
+    texts = [text if binds >= due else f"({text})" for (text, binds), due in zip(parts, least, strict=False)]
+    return _FORMS.get(word, f"{{}} {word} {{}}").format(*texts), level
 
 
 def _format_number(value: Fraction) -> tuple[str, int]:
     """Return the shortest exact decimal, or a quotient when there is none."""
     if value == PI:
-        return "pi", Level.ATOM
-    sign, level = ("-", Level.SIGN) if value < 0 else ("", Level.ATOM)
+        return "pi", ATOM
+    sign, level = ("-", SIGN) if value < 0 else ("", ATOM)
     try:
         number = _EXACT.divide(Decimal(abs(value.numerator)), Decimal(value.denominator)).normalize(_EXACT)
     except Inexact:
-        return f"{sign}{abs(value.numerator)}/{value.denominator}", Level.PRODUCT
+        return f"{sign}{abs(value.numerator)}/{value.denominator}", PRODUCT
     _, digits, exponent = number.as_tuple()
     assert isinstance(exponent, int)
     # An exponent stands for more than four zeros behind the point, and in a number of more than 16 digits.
@@ -231,38 +146,9 @@ def _format_number(value: Fraction) -> tuple[str, int]:
     return f"{sign}{number:f}", level
 
 
-_PARTS: dict[type[Spanned], tuple[str, ...]] = {
-    Negate: ("operand",),
-    Not: ("operand",),
-    **dict.fromkeys((Binary, Compare, Logic), ("left", "right")),
-    Call: ("arguments",),
-    Conditional: ("condition", "then", "otherwise"),
-    Vector: ("entries",),
-}
-
-
-def operation(expr: Expr) -> str:
-    """Return what a node does: its operator, its function, or else the name of its type."""
-    match expr:
-        case Binary() | Compare() | Logic():
-            return expr.operator
-        case Call():
-            return expr.function
-    return type(expr).__name__
-
-
 def children(expr: Expr) -> tuple[Expr, ...]:
     """Return the sub-expressions of a node, left to right."""
-    parts = [getattr(expr, name) for name in _PARTS.get(type(expr), ())]
-    several: tuple[Expr, ...] = parts[0] if isinstance(expr, Call | Vector) else tuple(parts)
-    return several
-
-
-def rebuild(expr: Expr, parts: tuple[Expr, ...]) -> Expr:
-    """Return the node with other sub-expressions, in the order of `children`."""
-    values: tuple[Any, ...] = (parts,) if isinstance(expr, Call | Vector) else parts
-    changed: dict[str, Any] = dict(zip(_PARTS.get(type(expr), ()), values, strict=True))
-    return replace(expr, **changed)
+    return expr.arguments if isinstance(expr, Call) else ()
 
 
 def interval_of(clock: str) -> str:
@@ -295,15 +181,14 @@ def transform(expr: Expr, function: Callable[[Expr], Expr | None]) -> Expr:
         Gives a node's replacement, into which nothing descends, or None to go on with its sub-expressions.
     """
     replacement = function(expr)
-    if replacement is not None:
-        return replacement
-    parts = children(expr)
-    changed = tuple(transform(part, function) for part in parts)
-    same = all(new is old for new, old in zip(changed, parts, strict=True))
-    return expr if same else rebuild(expr, changed)
+    if replacement is not None or not isinstance(expr, Call):
+        return replacement or expr
+    changed = tuple(transform(part, function) for part in expr.arguments)
+    same = all(map(operator.is_, changed, expr.arguments))
+    return expr if same else replace(expr, arguments=changed)
 
 
-def fold(expr: Expr, leaf: Callable[[Name | Number], V], operation: Callable[..., V]) -> V:
+def fold(expr: Expr, leaf: Callable[[Name | Number], V], apply: Callable[..., V]) -> V:
     """Return what a tree comes to.
 
     Parameters
@@ -312,9 +197,9 @@ def fold(expr: Expr, leaf: Callable[[Name | Number], V], operation: Callable[...
         The tree.
     leaf
         Gives what a name or a number comes to.
-    operation
-        Gives what any other node comes to, from the node and what its sub-expressions come to.
+    apply
+        Gives what an operator or function comes to, from its word and what it is applied to.
     """
-    if isinstance(expr, Name | Number):
+    if not isinstance(expr, Call):
         return leaf(expr)
-    return operation(expr, *(fold(part, leaf, operation) for part in children(expr)))
+    return apply(expr.function, *(fold(part, leaf, apply) for part in expr.arguments))

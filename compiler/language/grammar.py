@@ -23,21 +23,15 @@ from lark.exceptions import UnexpectedCharacters, UnexpectedToken
 
 from apc.compiler.errors import Place, nearest
 from apc.compiler.language.expression import (
+    CONDITIONS,
     FUNCTIONS,
     KEYWORDS,
     PI,
-    Binary,
     Call,
-    Compare,
-    Conditional,
     Equation,
     Expr,
-    Logic,
     Name,
-    Negate,
-    Not,
     Number,
-    Vector,
     children,
     format_expression,
     interval_of,
@@ -104,9 +98,9 @@ def parse_equation(text: str, place: Place) -> Equation:
     """Return both sides of `left = right`: as `parse_expression`, and E329 unless there is just one `=`."""
     with placing(text, place):
         left, *others = _parsed(text, "equation")
-        if isinstance(left, Compare) and left.operator == "==" and not others:
+        if isinstance(left, Call) and left.function == "==" and not others:
             # The usual slip: `a == b` for `a = b`.
-            hint = f"{format_expression(left.left)} = {format_expression(left.right)}"
+            hint = " = ".join(map(format_expression, left.arguments))
             raise FaultError("E329", len(text), "an equation", "one =", "==, which compares", hint=hint)
         if not others:
             raise FaultError("E329", len(text), "an equation", "one =, as in a = b", "none")
@@ -200,7 +194,8 @@ def _check(expr: Expr, text: str, depth: int = 1, *, conditional: bool = False) 
     """Raise E328 if a tree is too deep, E327 for a condition where a number is due or the reverse."""
     if depth > MAX_DEPTH:
         raise FaultError("E328", expr.start, TOO_DEEP)
-    condition = isinstance(expr, Compare | Logic | Not)
+    word = expr.function if isinstance(expr, Call) else ""
+    condition = word in CONDITIONS
     # A name may stand for a condition; what it is, only its declaration can tell.
     if condition != conditional and not isinstance(expr, Name):
         kinds = "a condition, and a number" if condition else "a number, and a condition"
@@ -208,7 +203,7 @@ def _check(expr: Expr, text: str, depth: int = 1, *, conditional: bool = False) 
         raise FaultError("E327", expr.start, what)
     parts = children(expr)
     for place, part in enumerate(parts):
-        due = isinstance(expr, Logic) or (place == 0 and isinstance(expr, Not | Conditional))
+        due = word in ("and", "or", "not") or (place == 0 and word == "if")
         # A first operand that is a leaf is read at the level of its operator.
         deeper = bool(place or len(parts) == 1 or children(part))
         _check(part, text, depth + deeper, conditional=due)
@@ -279,17 +274,17 @@ class _Trees(TREE):
 
     def binary(self, parts: list[Any]) -> Any:
         left, operator, right = parts
-        kinds = {"COMPARISON": Compare, "AND": Logic, "OR": Logic}
         word = "^" if operator.type == "POWER" else str(operator)
-        return kinds.get(operator.type, Binary)(word, left, right, **_span(left, right))
+        return Call(word, (left, right), **_span(left, right))
 
     def unary(self, parts: list[Any]) -> Any:
-        if parts[0] == "+":
-            if isinstance(parts[1], Compare | Logic | Not):
-                what = f"{cut(format_expression(parts[1]))} is a condition, and a number is due here"
-                raise FaultError("E327", parts[1].start, what)
-            return parts[1]
-        return (Negate if parts[0] == "-" else Not)(parts[1], **_span(*parts))
+        sign, operand = parts
+        if sign != "+":
+            return Call("neg" if sign == "-" else "not", (operand,), **_span(*parts))
+        if isinstance(operand, Call) and operand.function in CONDITIONS:
+            what = f"{cut(format_expression(operand))} is a condition, and a number is due here"
+            raise FaultError("E327", operand.start, what)
+        return operand
 
     def parenthesis(self, parts: list[Any]) -> Any:
         return replace(parts[1], **_span(*parts))
@@ -298,7 +293,7 @@ class _Trees(TREE):
         if len(parts) == 2:
             what = "a vector has entries; one of zeros is {0, 0}"
             raise FaultError("E322", parts[0], what)
-        return Vector(tuple(parts[1:-1]), **_span(*parts))
+        return Call("{", tuple(parts[1:-1]), **_span(*parts))
 
     def call(self, parts: list[Any]) -> Expr:
         function, _, *arguments, _ = parts
@@ -319,7 +314,7 @@ class _Trees(TREE):
         otherwise = parts[-1]
         for at in reversed(range(0, len(parts) - 2, 4)):
             condition, then = parts[at + 1], parts[at + 3]
-            otherwise = Conditional(condition, then, otherwise, **_span(parts[at], parts[-1]))
+            otherwise = Call("if", (condition, then, otherwise), **_span(parts[at], parts[-1]))
         return otherwise
 
 

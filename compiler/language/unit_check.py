@@ -9,31 +9,28 @@ Does not: know scales (all is SI by now), or look names up.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 
 from apc.compiler.errors import Mistakes, Place, place_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import (
+    CONDITIONS,
+    FUNCTIONS,
     SMOOTH,
-    Binary,
     Call,
-    Compare,
     Equation,
     Expr,
-    Logic,
     Name,
-    Negate,
-    Not,
     Number,
-    children,
     format_expression,
-    operation,
 )
 from apc.compiler.language.unit_text import format_dimension
 
 ANY = Dimension((("any", 1),))
 """The dimension of the literal 0, which fits every other."""
+
+_HALF = Number(Fraction(1, 2))
 
 # What the arguments behind the first have to be.
 _TIMES = {"hold": "s, as a delay", "interpolate": "s, as tables are over time"}
@@ -89,12 +86,9 @@ def check_equation(equation: Equation, lookup: Lookup) -> None:
 def _terms(expr: Expr) -> list[Expr]:
     """Return what a sum adds up, signs and parentheses taken apart."""
     match expr:
-        case Binary("+" | "-", left, right):
-            return [*_terms(left), *_terms(right)]
-        case Negate(operand):
-            return _terms(operand)
-        case _:
-            return [expr]
+        case Call("+" | "-" | "neg", parts):
+            return [term for part in parts for term in _terms(part)]
+    return [expr]
 
 
 def _said(dimension: Dimension) -> str:
@@ -117,7 +111,7 @@ class _Checker:
         place = place_in(self.place, self.text, expr.start)
         self.mistakes.add(code, place, self.said(expr), expected=expected, got=_said(got))
 
-    def agree(self, code: str, parts: list[Expr]) -> Dimension | None:
+    def agree(self, code: str, parts: Sequence[Expr]) -> Dimension | None:
         """Return the dimension most parts have, the first of them in a tie; report the others."""
         found = [(part, self.dimension(part)) for part in parts]
         known = [(part, dimension) for part, dimension in found if dimension not in (None, ANY)]
@@ -142,37 +136,35 @@ class _Checker:
         return DIMENSIONLESS if dimension == ANY else dimension
 
     def dimension(self, expr: Expr) -> Dimension | None:
-        word, parts = operation(expr), children(expr)
         if isinstance(expr, Number):
             return DIMENSIONLESS if expr.value else ANY
         if isinstance(expr, Name):
             return self.lookup(expr)
-        if word in ("+", "-", "Negate"):
+        word, parts = expr.function, expr.arguments
+        if word in ("+", "-", "neg"):
             return self.agree("E402", _terms(expr))
         if word in ("*", "/", "dot", "cross", "^"):
             return self.product(word, *parts)
+        if word == "sqrt":
+            return self.product("^", *parts, _HALF)
         if word in ("floor", *SMOOTH):
             self.fits(parts[0], DIMENSIONLESS, "E403", "a plain number")
             return DIMENSIONLESS
-        if word in ("and", "or", "Not", "Conditional"):
-            conditions, parts = (parts[:1], parts[1:]) if word == "Conditional" else (parts, ())
+        if word in ("and", "or", "not", "if"):
+            conditions, parts = (parts[:1], parts[1:]) if word == "if" else (parts, ())
             for condition in conditions:
                 self.dimension(condition)
         # Of the branches, sides or entries of one; atan2: of the sides of a triangle, whatever their unit.
-        equal = not isinstance(expr, Call) or word in ("max", "min", "atan2")
-        found = self.agree("E404", list(parts)) if equal else self.dimension(parts[0])
+        equal = word not in FUNCTIONS or word in ("max", "min", "atan2")
+        found = self.agree("E404", parts) if equal else self.dimension(parts[0])
         for time in parts[1:] if word in _TIMES else ():
             self.fits(time, SECOND, "E405", _TIMES[word])
-        if isinstance(expr, Compare | Logic | Not) or word in ("atan2", "sign", "count"):
+        if word in ("atan2", "sign", "count", *CONDITIONS):
             return DIMENSIONLESS
-        match word:
-            case "age":
-                return SECOND
-            case "sqrt":
-                return DIMENSIONLESS if found == ANY else found and found.power(Fraction(1, 2))
-            case "der":
-                return found if found == ANY else found and found.divide(SECOND)
-        return found  # of max, min, hold, interpolate, sample, previous, initial, mean, sum, abs and norm
+        if word == "der" and found != ANY:
+            return found and found.divide(SECOND)
+        # Else of if, {, max, min, hold, interpolate, sample, previous, initial, mean, sum, abs and norm.
+        return SECOND if word == "age" else found
 
     def product(self, word: str, left: Expr, right: Expr) -> Dimension | None:
         base = self.factor(left)

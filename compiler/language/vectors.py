@@ -24,32 +24,27 @@ from typing import NoReturn, TypeVar
 
 from apc.compiler.errors import ApcError, Mistake, Place, place_in
 from apc.compiler.language.expression import (
-    COMPARISONS,
-    Binary,
+    CONDITIONS,
+    FUNCTIONS,
     Call,
     Equation,
     Expr,
     Name,
     Number,
-    Vector,
-    children,
     format_expression,
-    operation,
-    rebuild,
     walk,
 )
 from apc.compiler.language.grammar import MAX_LENGTH
 
 T = TypeVar("T")
 SIZES = (2, 3)
-VECTOR_WORDS = ("{", "dot", "norm", "cross")  # what makes or takes vectors is written with one of these
 LONGEST_REPEATED = 20  # characters of a number that a message writes once for each entry
 
 # Which parts of an operation are numbers, never vectors, and which are left as they are.
 NUMBERS: dict[str, tuple[int, ...]] = {
-    **dict.fromkeys((*COMPARISONS, "and", "or", "Not"), (0, 1)),
+    **dict.fromkeys(CONDITIONS, (0, 1)),
     **dict.fromkeys(("/", "hold", "interpolate"), (1,)),
-    "Conditional": (0,),
+    "if": (0,),
 }
 AS_THEY_ARE: dict[str, tuple[int, ...]] = {"sample": (1,), "interpolate": (0,)}
 
@@ -164,18 +159,18 @@ class _Writer:
                     return None
                 names = (replace(expr, parts=(*path[:-1], name)) for name in entries(path[-1], size))
                 return tuple(names) if size else expr
-            case Vector():
-                if len(expr.entries) not in SIZES:
-                    got = f"{len(expr.entries)}"
-                    self.fail("E406", expr, self.source(expr), f"{_or(SIZES)} entries", got)
-                return tuple(map(self.number, expr.entries))
-            case Call("dot" | "cross" | "norm"):
-                return self.product(expr)
-            case Binary("^"):
-                inner, power = format_expression(expr.left), format_expression(expr.right)
-                hint = f"dot({inner}, {inner})" if power == "2" else f"norm({inner})^{power}"
-                return self.each(expr, [self.number(expr.left, hint), expr.right])
-        parts, word = children(expr), operation(expr)
+        word, parts = expr.function, expr.arguments
+        if word == "{":
+            if len(parts) not in SIZES:
+                expected = f"{' or '.join(map(str, SIZES))} entries"
+                self.fail("E406", expr, self.source(expr), expected, f"{len(parts)}")
+            return tuple(map(self.number, parts))
+        if word in ("dot", "cross", "norm"):
+            return self.product(expr)
+        if word == "^":
+            inner, power = map(format_expression, parts)
+            hint = f"dot({inner}, {inner})" if power == "2" else f"norm({inner})^{power}"
+            return self.each(expr, [self.number(parts[0], hint), parts[1]])
         numbers, skipped = NUMBERS.get(word, ()), AS_THEY_ARE.get(word, ())
         written = [
             part if k in skipped else self.number(part) if k in numbers else self.written(part)
@@ -183,14 +178,14 @@ class _Writer:
         ]
         is_vector = [isinstance(part, tuple) for part in written]
         if word == "age":  # of a vector, which travels in one packet
-            return rebuild(expr, written[0][:1]) if isinstance(written[0], tuple) else expr
+            return replace(expr, arguments=written[0][:1]) if isinstance(written[0], tuple) else expr
         if word == "*" and all(is_vector):
             hint = f"dot({', '.join(map(format_expression, parts))})"
             self.fail("E407", expr, self.source(expr), "one vector at most in a product", "two", hint)
         if word != "*":
             # A function takes numbers beside vectors.
             equal = [k for k in range(len(parts)) if k not in (*numbers, *skipped)]
-            equal = [k for k in equal if is_vector[k] or not isinstance(expr, Call)]
+            equal = [k for k in equal if is_vector[k] or word not in FUNCTIONS]
             self.agree([parts[k] for k in equal], [written[k] for k in equal])
         return self.each(expr, written)
 
@@ -216,7 +211,7 @@ class _Writer:
         self.agree(expr.arguments, vectors)
 
         def binary(operator: str, left: Expr, right: Expr) -> Expr:
-            return Binary(operator, left, right, start=expr.start, end=expr.end)
+            return replace(expr, function=operator, arguments=(left, right))
 
         a, b = vectors[0], vectors[-1]
         if expr.function == "cross":
@@ -251,17 +246,15 @@ class _Writer:
             expected = f"{_size(first)} like {self.source(model)}"
             self.fail("E406", part, self.source(part), expected, _size(other), hint)
 
-    def each(self, node: Expr, parts: Sequence[Written]) -> Written:
-        """Return a node of other parts: one for each entry, where one of them is a vector."""
-        size = max(map(_length, parts), default=0)
+    def each(self, call: Call, parts: Sequence[Written]) -> Written:
+        """Return a call of other arguments: one for each entry, where one of them is a vector."""
+        size = max(map(_length, parts))
         if None in parts and not size:
             return None
-        known = (before if part is None else part for part, before in zip(parts, children(node), strict=True))
-        rows = zip(
-            *(part if isinstance(part, tuple) else (part,) * (size or 1) for part in known), strict=True
-        )
-        nodes = tuple(rebuild(node, row) for row in rows)
-        return nodes if size else nodes[0]
+        known = (before if part is None else part for part, before in zip(parts, call.arguments, strict=True))
+        columns = (part if isinstance(part, tuple) else (part,) * (size or 1) for part in known)
+        calls = tuple(replace(call, arguments=row) for row in zip(*columns, strict=True))
+        return calls if size else calls[0]
 
     def of_vector(self, expr: Expr) -> str:
         """Return numbers that somebody may have meant who wrote a vector."""
@@ -275,7 +268,3 @@ def _length(written: Written) -> int:
 
 def _size(written: Written) -> str:
     return f"a vector of {len(written)}" if isinstance(written, tuple) else "a number"
-
-
-def _or(numbers: Iterable[int]) -> str:
-    return " or ".join(map(str, numbers))

@@ -28,7 +28,7 @@ from apc.compiler.components.component import Number as Parameter
 from apc.compiler.components.parts import PartEntry
 from apc.compiler.errors import Place
 from apc.compiler.language.dimensions import DIMENSIONLESS
-from apc.compiler.language.expression import Binary, Name, Number
+from apc.compiler.language.expression import Call, Name, Number
 from apc.compiler.language.recordings import read_trace
 from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.units import Unit
@@ -235,7 +235,7 @@ def _loss(link: str, node: Node, numbers: NamedNumbers) -> dict[str, Value]:
 def _completed(name: str, name_p: str, given: Mapping[str, Value]) -> dict[str, Value]:
     """Return all four probabilities by their whole names."""
     p = given["p"]
-    rest = Binary("-", Number(Fraction(1)), Name(tuple(name_p.split("."))))
+    rest = Call("-", (Number(Fraction(1)), Name(tuple(name_p.split(".")))))
     known = {
         "r": Value(1 - p.number, DIMENSIONLESS, rest, p.place),
         "1-h": Value(Fraction(1), DIMENSIONLESS, None, p.place),
