@@ -313,10 +313,11 @@ class _EntryReader:
     def _binding(
         self, key: str, node: Node | None, unit: Unit, words: Collection[tuple[str, Fraction]] = ()
     ) -> Binding | None:
-        if node is _FAULTY:
-            return None
-        known, names = self.scope.dimension, self.scope.names
-        return read_binding(node, key, unit.dimension, unit.text, known, names, self.mistakes, words=words)
+        if node is not None and node is not _FAULTY:
+            known, names = self.scope.dimension, self.scope.names
+            with self.mistakes:
+                return read_binding(node, key, unit.dimension, unit.text, known, names, words)
+        return None
 
     def _number(self, parameter: Number, node: Node | None) -> Binding | None:
         if node is None and parameter.default is not None:

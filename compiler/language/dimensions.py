@@ -1,6 +1,6 @@
 """Physical dimensions: products of powers of SI base units.
 
-Takes: nothing (a data type). Gives: `Dimension` and its arithmetic, `product`; `DIMENSIONLESS`, `SECOND`.
+Takes: nothing (a data type). Gives: `Dimension` and its arithmetic; `DIMENSIONLESS`, `SECOND`.
 Guarantees: equal dimensions compare equal, however they came about; exponents are exact.
 Does not: know units, which have a scale as well (see `units`), or their text (see `unit_text`).
 """
@@ -26,26 +26,20 @@ class Dimension:
         """Say whether one counts cycles and the other radians."""
         return {self.turning, other.turning} == {"Hz", "rad"}
 
-    def multiply(self, other: Dimension) -> Dimension:
-        """Return the dimension of a product."""
-        return product((*self.exponents, *other.exponents))
+    def multiply(self, other: Dimension, times: Fraction | int = 1) -> Dimension:
+        """Return the dimension of a product with another one's power."""
+        total: dict[str, Fraction | int] = dict(self.exponents)
+        for base, power in other.exponents:
+            total[base] = total.get(base, 0) + power * times
+        return Dimension(tuple(sorted((base, power) for base, power in total.items() if power)))
 
     def divide(self, other: Dimension) -> Dimension:
         """Return the dimension of a quotient."""
-        return self.multiply(other.power(-1))
+        return self.multiply(other, -1)
 
     def power(self, exponent: Fraction | int) -> Dimension:
         """Return the dimension of a power."""
-        return product(tuple((base, power * exponent) for base, power in self.exponents))
-
-
-def product(factors: tuple[tuple[str, Fraction | int], ...]) -> Dimension:
-    """Return the product of powers of base units, each of which may come several times."""
-    total: dict[str, Fraction | int] = {}
-    for base, power in factors:
-        total[base] = total.get(base, 0) + power
-    whole = ((base, int(power) if power.denominator == 1 else power) for base, power in total.items())
-    return Dimension(tuple(sorted((base, power) for base, power in whole if power)))
+        return DIMENSIONLESS.multiply(self, exponent)
 
 
 DIMENSIONLESS = Dimension(())

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache, lru_cache
 from pathlib import Path
@@ -25,7 +25,7 @@ from lark import Token
 from lark.exceptions import UnexpectedCharacters, UnexpectedToken
 
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
-from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension, product
+from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.expression import PI
 from apc.compiler.language.parsing import TREE, FaultError, exponent_of, kind_of, parser, placing, unclosed
 from apc.compiler.words import cut
@@ -299,8 +299,8 @@ def _unit(text: str) -> Unit:
     if isinstance(square, float) or scale**2 != square:
         expected = "a root whose scale is a rational number"
         raise FaultError("E222", len(text.rstrip()), "a unit", expected, "its end")
-    dimension = product(tuple((_BASES[base], power) for base, power in dimensions.items()))
-    return Unit(text.strip(), scale, replace(dimension, turning=_turning(text)))
+    exponents = tuple(sorted((_BASES[base], power) for base, power in dimensions.items()))
+    return Unit(text.strip(), scale, Dimension(exponents, _turning(text)))
 
 
 def _refuse(text: str, fault: UnexpectedToken) -> NoReturn:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from graphlib import CycleError, TopologicalSorter
 
-from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, place_in
+from apc.compiler.errors import ApcError, Mistakes, Place, place_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.evaluation import evaluate
 from apc.compiler.language.expression import Expr, Name, format_expression, names, transform
@@ -23,7 +23,7 @@ from apc.compiler.language.unit_text import format_dimension, format_si
 from apc.compiler.language.units import parse_quantity, parse_unit, quantity
 from apc.compiler.language.vectors import number_of
 from apc.compiler.source.nodes import Node, Scalar
-from apc.compiler.source.reading import add_unknown, brief, either_comma, read_text
+from apc.compiler.source.reading import brief, either_comma, fault, text_of, unknown
 
 PEERS = ("peers",)
 
@@ -38,6 +38,7 @@ _QUANTITY = re.compile(
 _SPACED = re.compile(r"[+-]?[0-9]{1,3}([ _'\u00a0\u2009][0-9]{3})+(?![0-9])")
 _COMMA = re.compile(r"([+-]?[0-9]+),([0-9]+)([^0-9,].*)?", re.DOTALL)
 _COMPUTED = re.compile(r"(?P<numbers>[-+*/^().\d\s]*(?:pi[-+*/^().\d\s]*)*)(?P<unit>[^\W\d_°%µΩ].*)")
+_NO_UNITS = "a number with its unit, or an expression without units"
 _WORD_NUMBER = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
 
 
@@ -95,8 +96,7 @@ class Bounds:
 
     def check(self, value: Value, what: str, mistakes: Mistakes) -> None:
         """Record a number that breaks the bounds."""
-        expected = self.fault(value.number)
-        if expected:
+        if expected := self.fault(value.number):
             got = f"{self._shown(value.number)} {self.unit}"
             mistakes.add("E207", value.place, what, expected=expected, got=got)
 
@@ -116,22 +116,20 @@ def text_place(node: Node) -> Place:
 
 
 def read_binding(
-    node: Node | None,
+    node: Node,
     what: str,
     dimension: Dimension,
     unit: str,
     known: Callable[[tuple[str, ...]], Dimension | None],
     names_known: Collection[str],
-    mistakes: Mistakes,
-    *,
     words: Collection[tuple[str, Fraction]] = (),
-) -> Binding | None:
+) -> Binding:
     """Read a number: a quantity, a word that stands for one, or an expression.
 
     Parameters
     ----------
     node
-        Where it stands; None if it isn't there.
+        Where it stands.
     what
         What it is, for messages.
     dimension, unit
@@ -140,44 +138,42 @@ def read_binding(
         The dimension of a name an expression may use, or None.
     names_known
         All these names, for messages.
-    mistakes
-        Where faults go.
     words
         Words that stand for numbers.
+
+    Raises
+    ------
+    ApcError
+        E203 no single value, E204 a unit that does not fit, E206 for every name that isn't known; and those
+        of `quantity`, `parse_expression` and `dimension_of`.
     """
-    text = read_text(node, what, mistakes, hint=f"{what}: 1 {unit}")
-    if node is None or text is None:
-        return None
-    named = dict(words)
-    if text in named:
-        return Binding(named[text], None, dimension, node.place)
-    try:
-        _refuse_marks(text, node.place, what)
-        _refuse_computed(text, node.place, what, unit)
-        if is_quantity(text):
-            _refuse_mixture(text, node.place, what, names_known)
-            number = quantity(text, node.place, what=what, unit=unit).value
-            return Binding(number, None, dimension, node.place)
-        return Binding(
-            None,
-            _expression(text, text_place(node), what, dimension, unit, known, names_known),
-            dimension,
-            text_place(node),
-        )
-    except ApcError as error:
-        mistakes.take(error)
-        return None
+    text, place = text_of(node, what, f"{what}: 1 {unit}"), node.place
+    number = dict(words).get(text)
+    if number is None:
+        _refuse_marks(text, place, what)
+        _refuse_computed(text, place, what, unit)
+        if not is_quantity(text):
+            place = text_place(node)
+            tree = _tree(text, place)
+            actual = _dimension(tree, text, place, what, known, names_known)
+            if actual is not None and actual != ANY and (actual != dimension or actual.clashes(dimension)):
+                told, hint = _misfit(tree, actual, dimension, unit)
+                raise fault("E204", place, what, unit, f"{brief(text)}, which {told}", f"{what}: {hint}")
+            return Binding(None, tree, dimension, place)
+        _refuse_mixture(text, place, what, names_known)
+        number = quantity(text, place, what=what, unit=unit).value
+    return Binding(number, None, dimension, place)
 
 
 def _refuse_marks(text: str, place: Place, what: str) -> None:
     """Raise ApcError for a number with a decimal comma, or whose thousands are set apart."""
-    if (match := _COMMA.fullmatch(text.strip())) is not None:
-        hint = either_comma(what, match[1], match[2], match[3])
-        raise ApcError(Mistake("E221", place, what, "a decimal point", brief(text), hint))
-    if (match := _SPACED.match(text.strip())) is not None:
-        joined = re.sub(r"[^0-9+-]", "", match[0]) + text.strip()[match.end() :]
+    bare = text.strip()
+    if (match := _COMMA.fullmatch(bare)) is not None:
+        raise fault("E221", place, what, "a decimal point", brief(text), either_comma(what, *match.groups()))
+    if (match := _SPACED.match(bare)) is not None:
+        joined = re.sub(r"[^0-9+-]", "", match[0]) + bare[match.end() :]
         expected = "a number without spaces or marks inside"
-        raise ApcError(Mistake("E221", place, what, expected, brief(text), f"{what}: {joined}"))
+        raise fault("E221", place, what, expected, brief(text), f"{what}: {joined}")
 
 
 def _refuse_computed(text: str, place: Place, what: str, unit: str) -> None:
@@ -185,16 +181,13 @@ def _refuse_computed(text: str, place: Place, what: str, unit: str) -> None:
     match = _COMPUTED.fullmatch(text.strip())
     if match is None or is_quantity(text) or not match["numbers"].strip():
         return
-    none: dict[tuple[str, ...], Fraction] = {}  # a name has no value here
-    try:
-        number = evaluate(parse_expression(match["numbers"], place), none.__getitem__)
-        if parse_unit(match["unit"], place).dimension != parse_unit(unit, place).dimension:
-            return
-    except ApcError:
-        return
-    expected = "a number with its unit, or an expression without units"
-    hint = f"{what}: {float(number):.9g} {match['unit']}"
-    raise ApcError(Mistake("E204", place, what, expected, brief(text), hint))
+    hint = ""
+    with Mistakes():
+        number = evaluate(parse_expression(match["numbers"], place), lambda _: 0)
+        if parse_unit(match["unit"], place).dimension == parse_unit(unit, place).dimension:
+            hint = f"{what}: {float(number):.9g} {match['unit']}"
+    if hint:
+        raise fault("E204", place, what, _NO_UNITS, brief(text), hint)
 
 
 def _refuse_mixture(text: str, place: Place, what: str, names_known: Collection[str]) -> None:
@@ -202,74 +195,47 @@ def _refuse_mixture(text: str, place: Place, what: str, names_known: Collection[
     for word in re.finditer(r"[A-Za-z]\w*", text):
         before = text[: word.start()].rstrip(" (")
         if word.group() in names_known and before[-1:] in ("*", "/", "+", "-"):
-            number, rest = before[:-1].strip(), text[len(before) - 1 :].strip()
-            try:
+            with Mistakes():
                 parse_unit(word.group(), place)
-            except ApcError:
-                pass
-            else:
                 return
+            number, rest = before[:-1].strip(), text[len(before) - 1 :].strip()
             hint = f"{what}: total{rest}, with parameters: {{total: {number}}}"
-            expected = "a number with its unit, or an expression without units"
-            raise ApcError(Mistake("E204", place, what, expected, brief(text), hint))
+            raise fault("E204", place, what, _NO_UNITS, brief(text), hint)
 
 
-def _expression(
-    text: str,
-    place: Place,
-    what: str,
-    dimension: Dimension,
-    unit: str,
-    known: Callable[[tuple[str, ...]], Dimension | None],
-    names_known: Collection[str],
-) -> Expr:
-    tree = number_of(parse_expression(text, place), text, place)
-    check_names(tree, text, place, what, known, names_known)
-    actual = dimension_of(tree, lambda name: known(name.parts), text, place)
-    if actual is None or actual == ANY or (actual == dimension and not actual.clashes(dimension)):
-        return tree
-    fault, hint = f"is in {format_dimension(actual)}", f"1 {unit}"
-    if actual == DIMENSIONLESS != dimension:
-        fault = "has no unit"
-    elif actual == dimension:  # of a name, a sum or a choice: no product counts cycles or radians
-        whole = format_expression(tree) if isinstance(tree, Name) else f"({format_expression(tree)})"
-        hint = f"2*pi*{whole}" if dimension.turning == "rad" else f"{whole}/(2*pi)"
-    raise ApcError(Mistake("E204", place, what, unit, f"{brief(text)}, which {fault}", f"{what}: {hint}"))
+def _misfit(tree: Expr, actual: Dimension, due: Dimension, unit: str) -> tuple[str, str]:
+    """Return what is wrong with an expression of another dimension than is due, and what to write."""
+    if actual != due:
+        told = "has no unit" if actual == DIMENSIONLESS else f"is in {format_dimension(actual)}"
+        return told, f"1 {unit}"
+    # Of a name, a sum or a choice: no product counts cycles or radians.
+    text = format_expression(tree)
+    whole = text if isinstance(tree, Name) else f"({text})"
+    hint = f"2*pi*{whole}" if due.turning == "rad" else f"{whole}/(2*pi)"
+    return f"is in {format_dimension(actual)}", hint
 
 
-def check_names(
+def _tree(text: str, place: Place) -> Expr:
+    return number_of(parse_expression(text, place), text, place)
+
+
+def _dimension(
     tree: Expr,
     text: str,
     place: Place,
     what: str,
     known: Callable[[tuple[str, ...]], Dimension | None],
     names_known: Collection[str],
-) -> None:
-    """Refuse the names of an expression that aren't known.
-
-    Parameters
-    ----------
-    tree, text, place
-        The expression, as it was written, and where.
-    what
-        What it is the value of, for a message.
-    known
-        Gives a name's dimension, None if there is no such name.
-    names_known
-        The names there are, to find the nearest.
-
-    Raises
-    ------
-    ApcError
-        E206 for every name that isn't known.
-    """
+) -> Dimension | None:
+    """Return an expression's dimension. Raises E206 for every name that isn't known, or as `dimension_of`."""
     mistakes = Mistakes()
     for node in names(tree):
         if known(node.parts) is None:
             shown = ".".join(node.parts)
-            fault = f"{what} names {brief(shown)}, which is no parameter here"
-            add_unknown("E206", place_in(place, text, node.start), fault, shown, names_known, mistakes)
+            told = f"{what} names {brief(shown)}, which is no parameter here"
+            mistakes.take(unknown("E206", place_in(place, text, node.start), told, shown, names_known))
     mistakes.raise_if_any()
+    return dimension_of(tree, lambda name: known(name.parts), text, place)
 
 
 def settle(binding: Binding, number_of: Callable[[tuple[str, ...]], Fraction]) -> Value:
@@ -281,25 +247,16 @@ def settle(binding: Binding, number_of: Callable[[tuple[str, ...]], Fraction]) -
     return Value(number, binding.dimension, binding.expression, binding.place)
 
 
-def read_free(node: Node | None, what: str, mistakes: Mistakes) -> Binding | None:
+def read_free(node: Node, what: str) -> Binding:
     """Read a number of any unit: a quantity, or an expression whose names are checked later."""
-    text = read_text(node, what, mistakes, hint=f"{what}: 2000 N/m")
-    if node is None or text is None:
-        return None
-    try:
-        if is_quantity(text):
-            parsed = parse_quantity(text, node.place)
-            return Binding(parsed.value, None, parsed.unit.dimension, node.place)
-        place = text_place(node)
-        return Binding(None, number_of(parse_expression(text, place), text, place), DIMENSIONLESS, place)
-    except ApcError as error:
-        mistakes.take(error)
-        return None
+    text, place = text_of(node, what, f"{what}: 2000 N/m"), text_place(node)
+    if not is_quantity(text):
+        return Binding(None, _tree(text, place), DIMENSIONLESS, place)
+    parsed = parse_quantity(text, node.place)
+    return Binding(parsed.value, None, parsed.unit.dimension, node.place)
 
 
-def resolve_in_order(
-    waiting: Mapping[str, Binding], peers: int, mistakes: Mistakes
-) -> tuple[dict[str, Value], set[str]]:
+def resolve_in_order(waiting: Mapping[str, Binding], peers: int, mistakes: Mistakes) -> dict[str, Value]:
     """Settle named numbers that depend on each other, in the order in which they can be known.
 
     Parameters
@@ -313,10 +270,7 @@ def resolve_in_order(
 
     Returns
     -------
-    settled
-        The values, in the order of `waiting`.
-    faulty
-        The names without one; each fault was reported once, where it is.
+    The values, in the order of `waiting`; the fault of one that isn't there was reported once, where it is.
     """
     needs = {
         name: {".".join(node.parts) for node in names(binding.expression)} if binding.expression else set()
@@ -329,32 +283,22 @@ def resolve_in_order(
         first = min(range(len(chain)), key=lambda k: [*waiting].index(chain[k]))
         chain = [*chain[first:], *chain[:first], chain[first]]
         mistakes.add("E209", waiting[chain[0]].place, f"parameters depend in a circle: {' → '.join(chain)}")
-        return {}, set(waiting)
+        return {}
     settled = {"peers": Value(Fraction(peers), DIMENSIONLESS, None, Place(""))}
-    faulty: set[str] = set()
     for name in order:
-        if name not in waiting or needs[name] & faulty:
-            faulty |= {name} & waiting.keys()
-            continue
-        try:
-            settled[name] = _settled(name, waiting[name], settled)
-        except ApcError as error:
-            faulty.add(name)
-            mistakes.take(error)
-    return {name: settled[name] for name in waiting if name in settled}, faulty
+        if name in waiting and needs[name] & waiting.keys() <= settled.keys():
+            with mistakes:
+                settled[name] = _settled(name, waiting[name], settled)
+    return {name: settled[name] for name in waiting if name in settled}
 
 
 def _settled(name: str, binding: Binding, settled: Mapping[str, Value]) -> Value:
-    tree, place = binding.expression, binding.place
-
     def dimension(parts: tuple[str, ...]) -> Dimension | None:
         value = settled.get(".".join(parts))
-        return None if value is None else value.dimension
+        return value and value.dimension
 
-    if tree is not None:
-        text = format_expression(tree)
-        check_names(tree, text, place, name, dimension, settled)
-        actual = dimension_of(tree, lambda node: dimension(node.parts), text, place)
+    if (tree := binding.expression) is not None:
+        actual = _dimension(tree, format_expression(tree), binding.place, name, dimension, settled)
         binding = replace(binding, dimension=DIMENSIONLESS if actual in (None, ANY) else actual)
     return settle(binding, lambda parts: settled[".".join(parts)].number)
 

@@ -41,11 +41,9 @@ def read_named_numbers(root: Body, peers: int, mistakes: Mistakes) -> NamedNumbe
     for key, value in section:
         with mistakes:
             name = name_of(key, "a parameter", words=RESERVED)
-            if (binding := read_free(value, name, mistakes)) is not None:
-                waiting[name] = binding
-    faulty = {key.text for key, _ in section} - waiting.keys()
-    values, unresolved = resolve_in_order(waiting, peers, mistakes)
-    return NamedNumbers(values, frozenset(faulty | unresolved), peers, mistakes)
+            waiting[name] = read_free(value, name)
+    values = resolve_in_order(waiting, peers, mistakes)
+    return NamedNumbers(values, frozenset(key.text for key, _ in section) - values.keys(), peers, mistakes)
 
 
 def read_count_by_names(node: Scalar, root: Body) -> Value:
@@ -136,11 +134,7 @@ class NamedNumbers:
         ApcError
             What is at fault.
         """
-        mistakes = Mistakes()
-        binding = read_binding(node, what, dimension, unit, self.dimension, self.names, mistakes, words=words)
-        mistakes.raise_if_any()
-        if binding is None:
-            raise AlreadyReportedError
+        binding = read_binding(node, what, dimension, unit, self.dimension, self.names, words)
         return settle(binding, self.number)
 
     def read_time(self, node: Node, what: str, unit: str = "ms") -> Value:

@@ -199,17 +199,3 @@ def among(name: str, known: Collection[str], place: Place, what: str, code: str 
     if name in known:
         return name
     raise unknown(code, place, what.replace("{}", brief(name)), name, known)
-
-
-def read_text(node: Node | None, what: str, mistakes: Mistakes, *, hint: str = "") -> str | None:
-    """Return the text of a scalar as `text_of`; None without one, whose fault is recorded."""
-    with mistakes:
-        return None if node is None else text_of(node, what, hint)
-    return None
-
-
-def add_unknown(
-    code: str, place: Place, what: str, name: str, known: Collection[str], mistakes: Mistakes
-) -> None:
-    """Record an unknown name; the arguments are those of `unknown`."""
-    mistakes.take(unknown(code, place, what, name, known))
