@@ -135,7 +135,7 @@ class ComponentNames:
         """Return the size of an expression; 0 of one at fault, which `_checked` reports."""
         with Mistakes():
             found = written_out(expression, self.size_of, text, place)
-            return len(found) if isinstance(found, tuple) else None if found is None else 0
+            return found and (len(found) if len(found) > 1 else 0)
         return 0
 
     def _inferred(self, expression: Expr, text: str, place: Place) -> Dimension | None:
@@ -153,8 +153,8 @@ class ComponentNames:
             with mistakes:
                 self._check_sent(send)
                 found = written_out(send.expression, self.size_of, send.text, send.place)
-                each = found if isinstance(found, tuple) else (found or send.expression,)
-                named = entries(send.name, len(each) if each is found else 0)
+                each = found or (send.expression,)
+                named = entries(send.name, len(each) if len(each) > 1 else 0)
                 sends += [replace(send, name=n, expression=one) for n, one in zip(named, each, strict=True)]
         for equation in component.equations:
             with mistakes:

@@ -267,7 +267,7 @@ class _EntryReader:
             sizes = sizes_of(tuple(known.split(".")) for known in self.scope.names)
             tree = parse_expression(node.text, place)
             found = written_out(tree, lambda parts: sizes.get(parts, 0), node.text, place)
-            if isinstance(found, tuple) and len(found) == size:
+            if found is not None and len(found) == size:
                 return tuple(replace(node, text=format_expression(one)) for one in found)
         return list_of(node, name, size, _one(self.units[f"{name}[1]"]))
 

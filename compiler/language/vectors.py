@@ -48,8 +48,8 @@ NUMBERS: dict[str, tuple[int, ...]] = {
 }
 AS_THEY_ARE: dict[str, tuple[int, ...]] = {"sample": (1,), "interpolate": (0,)}
 
-# An expression written out: a number, a vector's entries, or None where a name's size isn't known yet.
-Written = Expr | tuple[Expr, ...] | None
+# An expression written out: the entries of a vector, one of a number; None where a size isn't known yet.
+Written = tuple[Expr, ...] | None
 SizeOf = Callable[[tuple[str, ...]], int | None]
 
 
@@ -88,7 +88,7 @@ def sizes_of(names: Iterable[tuple[str, ...]]) -> dict[tuple[str, ...], int]:
 
 
 def written_out(expr: Expr, size_of: SizeOf, text: str, place: Place) -> Written:
-    """Return an expression for each entry of a vector, one for a number.
+    """Return an expression for each entry of a vector, one for a number; None if its size isn't known yet.
 
     Parameters
     ----------
@@ -99,21 +99,16 @@ def written_out(expr: Expr, size_of: SizeOf, text: str, place: Place) -> Written
     text, place
         The text, and where it starts.
 
-    Returns
-    -------
-    The entries of a vector, or the tree of a number; None when its size hangs on names without one.
-
     Raises
     ------
     ApcError
         E328 it gets too long, E406 sizes that differ, E407 a vector where a number is due or the reverse.
     """
-    writer = _Writer(size_of, text, place)
-    written = writer.written(expr)
-    for tree in written if isinstance(written, tuple) else (written or expr,):
+    written = _Writer(size_of, text, place).written(expr)
+    for tree in written or (expr,):
         if len(list(islice(walk(tree), MAX_LENGTH + 1))) > MAX_LENGTH:
             what = f"entry by entry this has more than {MAX_LENGTH} terms: give a part of it a name"
-            writer.fail("E328", expr, what)
+            raise ApcError(Mistake("E328", place_in(place, text, expr.start), what))
     return written
 
 
@@ -121,12 +116,9 @@ def written_equation(equation: Equation, size_of: SizeOf) -> tuple[Equation, ...
     """Return an equation for each entry; raises as `written_out`, also where its sides differ in size."""
     writer = _Writer(size_of, equation.text, equation.place)
     sides = (equation.left, equation.right)
-    left, right = (written_out(side, size_of, equation.text, equation.place) for side in sides)
-    writer.agree(sides, (left, right))
-    if not isinstance(left, tuple) or not isinstance(right, tuple):
-        assert isinstance(left, Expr) and isinstance(right, Expr)
-        return (replace(equation, left=left, right=right),)
-    return tuple(replace(equation, left=lhs, right=rhs) for lhs, rhs in zip(left, right, strict=True))
+    written = [written_out(side, size_of, equation.text, equation.place) or (side,) for side in sides]
+    writer.agree(sides, written)
+    return tuple(replace(equation, left=lhs, right=rhs) for lhs, rhs in zip(*written, strict=True))
 
 
 def number_of(expr: Expr, text: str, place: Place) -> Expr:
@@ -145,116 +137,101 @@ class _Writer:
         return self.text[expr.start : expr.end] or format_expression(expr)
 
     def fail(
-        self, code: str, at: Expr, what: str, expected: str = "", got: str = "", hint: str = ""
+        self, code: str, at: Expr, expected: str, got: str = "", hint: str = "", within: str = ""
     ) -> NoReturn:
-        raise ApcError(Mistake(code, place_in(self.place, self.text, at.start), what, expected, got, hint))
+        what, place = self.source(at) + within, place_in(self.place, self.text, at.start)
+        raise ApcError(Mistake(code, place, what, expected, got, hint))
 
     def written(self, expr: Expr) -> Written:
         match expr:
             case Number() | Call("count"):  # peers are counted, whatever they send
-                return expr
+                return (expr,)
             case Name(path):
                 size = self.size_of(path)
-                if size is None:
-                    return None
-                names = (replace(expr, parts=(*path[:-1], name)) for name in entries(path[-1], size))
-                return tuple(names) if size else expr
+                named = () if size is None else entries(path[-1], size)
+                return tuple(replace(expr, parts=(*path[:-1], name)) for name in named) or None
         word, parts = expr.function, expr.arguments
         if word == "{":
             if len(parts) not in SIZES:
                 expected = f"{' or '.join(map(str, SIZES))} entries"
-                self.fail("E406", expr, self.source(expr), expected, f"{len(parts)}")
+                self.fail("E406", expr, expected, f"{len(parts)}")
             return tuple(map(self.number, parts))
         if word in ("dot", "cross", "norm"):
             return self.product(expr)
         if word == "^":
             inner, power = map(format_expression, parts)
             hint = f"dot({inner}, {inner})" if power == "2" else f"norm({inner})^{power}"
-            return self.each(expr, [self.number(parts[0], hint), parts[1]])
+            return self.each(expr, [(self.number(parts[0], hint),), parts[1:]])
         numbers, skipped = NUMBERS.get(word, ()), AS_THEY_ARE.get(word, ())
         written = [
-            part if k in skipped else self.number(part) if k in numbers else self.written(part)
+            (part,) if k in skipped else (self.number(part),) if k in numbers else self.written(part)
             for k, part in enumerate(parts)
         ]
-        is_vector = [isinstance(part, tuple) for part in written]
         if word == "age":  # of a vector, which travels in one packet
-            return replace(expr, arguments=written[0][:1]) if isinstance(written[0], tuple) else expr
-        if word == "*" and all(is_vector):
-            hint = f"dot({', '.join(map(format_expression, parts))})"
-            self.fail("E407", expr, self.source(expr), "one vector at most in a product", "two", hint)
+            return (replace(expr, arguments=(written[0] or parts)[:1]),)
+        is_vector = [_is_vector(part) for part in written]
         if word != "*":
             # A function takes numbers beside vectors.
             equal = [k for k in range(len(parts)) if k not in (*numbers, *skipped)]
             equal = [k for k in equal if is_vector[k] or word not in FUNCTIONS]
             self.agree([parts[k] for k in equal], [written[k] for k in equal])
+        elif all(is_vector):
+            hint = f"dot({', '.join(map(format_expression, parts))})"
+            self.fail("E407", expr, "one vector at most in a product", "two", hint)
         return self.each(expr, written)
 
     def product(self, expr: Call) -> Written:
         """Write out `dot`, `cross` and `norm`, each piece of which stands where the whole does."""
-        vectors: list[tuple[Expr, ...]] = []
+        word, vectors = expr.function, list[tuple[Expr, ...]]()
         for argument in expr.arguments:
-            written = self.written(argument)
-            if written is None:
-                return None if expr.function == "cross" else Number(Fraction(0))
-            if not isinstance(written, tuple):
+            if (written := self.written(argument)) is None:
+                return None if word == "cross" else (Number(Fraction(0)),)
+            if not _is_vector(written):
                 shown = [format_expression(part) for part in expr.arguments]
-                hint = {"norm": f"abs({shown[0]})", "dot": "*".join(shown)}.get(expr.function, "")
-                self.fail(
-                    "E407",
-                    argument,
-                    f"{self.source(argument)} in {expr.function}",
-                    "a vector",
-                    "a number",
-                    hint,
-                )
+                hint = {"norm": f"abs({shown[0]})", "dot": "*".join(shown)}.get(word, "")
+                self.fail("E407", argument, "a vector", "a number", hint, f" in {word}")
             vectors.append(written)
         self.agree(expr.arguments, vectors)
 
-        def binary(operator: str, left: Expr, right: Expr) -> Expr:
-            return replace(expr, function=operator, arguments=(left, right))
+        def call(word: str, *parts: Expr) -> Expr:
+            return replace(expr, function=word, arguments=parts)
 
         a, b = vectors[0], vectors[-1]
-        if expr.function == "cross":
+        if word == "cross":
             pairs = ((0, 1),) if len(a) == 2 else ((1, 2), (2, 0), (0, 1))
-            turned = [binary("-", binary("*", a[i], b[j]), binary("*", a[j], b[i])) for i, j in pairs]
-            return tuple(turned) if len(a) > 2 else turned[0]
-        norm, two = expr.function == "norm", Number(Fraction(2))
-        terms = (binary("^", x, two) if norm else binary("*", x, y) for x, y in zip(a, b, strict=True))
-        total = reduce(partial(binary, "+"), terms)
-        return replace(expr, function="sqrt", arguments=(total,)) if norm else total
+            return tuple(call("-", call("*", a[i], b[j]), call("*", a[j], b[i])) for i, j in pairs)
+        if word == "dot":
+            return (reduce(partial(call, "+"), map(partial(call, "*"), a, b)),)
+        squares = (call("^", x, Number(Fraction(2))) for x in a)
+        return (call("sqrt", reduce(partial(call, "+"), squares)),)
 
     def number(self, expr: Expr, hint: str = "") -> Expr:
         """Return an expression that has to be a number."""
-        written = self.written(expr)
-        if isinstance(written, tuple):
-            self.fail(
-                "E407", expr, self.source(expr), "a number", _size(written), hint or self.of_vector(expr)
-            )
-        return expr if written is None else written
+        written = self.written(expr) or (expr,)
+        if _is_vector(written):
+            self.fail("E407", expr, "a number", _size(written), hint or self.of_vector(expr))
+        return written[0]
 
     def agree(self, parts: Sequence[Expr], written: Sequence[Written]) -> None:
         """Refuse parts that are not of one size."""
         known = [(part, other) for part, other in zip(parts, written, strict=True) if other is not None]
         for part, other in known[1:]:
             model, first = known[0]
-            size, length = _length(first), _length(other)
-            if length == size:
+            if len(first) == len(other):
                 continue
-            text, hint = format_expression(part), "" if size else self.of_vector(part)
-            if not length and len(text) <= LONGEST_REPEATED:
-                hint = "{" + ", ".join([text] * size) + "}"
-            expected = f"{_size(first)} like {self.source(model)}"
-            self.fail("E406", part, self.source(part), expected, _size(other), hint)
+            text, hint = format_expression(part), "" if _is_vector(first) else self.of_vector(part)
+            if not _is_vector(other) and len(text) <= LONGEST_REPEATED:
+                hint = "{" + ", ".join([text] * len(first)) + "}"
+            self.fail("E406", part, f"{_size(first)} like {self.source(model)}", _size(other), hint)
 
     def each(self, call: Call, parts: Sequence[Written]) -> Written:
         """Return a call of other arguments: one for each entry, where one of them is a vector."""
-        size = max(map(_length, parts))
-        if None in parts and not size:
+        size = max(len(part or ()) for part in parts)
+        if None in parts and size < 2:
             return None
-        known = (before if part is None else part for part, before in zip(parts, call.arguments, strict=True))
-        columns = (part if isinstance(part, tuple) else (part,) * (size or 1) for part in known)
-        calls = tuple(replace(call, arguments=row) for row in zip(*columns, strict=True))
-        return calls if size else calls[0]
+        known = (part or (before,) for part, before in zip(parts, call.arguments, strict=True))
+        rows = zip(*(part if _is_vector(part) else part * size for part in known), strict=True)
+        return tuple(replace(call, arguments=row) for row in rows)
 
     def of_vector(self, expr: Expr) -> str:
         """Return numbers that somebody may have meant who wrote a vector."""
@@ -262,9 +239,9 @@ class _Writer:
         return f"{entry(of, 1)}, or norm({of})" if isinstance(expr, Name) else f"norm({of})"
 
 
-def _length(written: Written) -> int:
-    return len(written) if isinstance(written, tuple) else 0
+def _is_vector(written: Written) -> bool:
+    return written is not None and len(written) > 1
 
 
-def _size(written: Written) -> str:
-    return f"a vector of {len(written)}" if isinstance(written, tuple) else "a number"
+def _size(written: tuple[Expr, ...]) -> str:
+    return f"a vector of {len(written)}" if _is_vector(written) else "a number"
