@@ -36,7 +36,16 @@ from apc.compiler.language.expression import (
     format_expression,
     interval_of,
 )
-from apc.compiler.language.parsing import TREE, FaultError, exponent_of, kind_of, parser, placing, unclosed
+from apc.compiler.language.parsing import (
+    TREE,
+    FaultError,
+    check_size,
+    exponent_of,
+    kind_of,
+    parser,
+    placing,
+    unclosed,
+)
 from apc.compiler.words import cut
 
 ALIKE = 0.8  # of the letters of a function's name, for another to be the one that was meant
@@ -44,7 +53,6 @@ MAX_LENGTH = 10_000  # characters of an expression
 MAX_DEPTH = 100  # levels of the tree; Python's own stack allows about 300
 TOO_DEEP = f"this is nested or chained more than {MAX_DEPTH} deep: give a part of it a name"
 MAX_DIGITS = 1000  # characters of a number: Python refuses an integer of 4300 digits
-MAX_NUMBER_EXPONENT = 300  # of 1e300: still a float
 MAX_POWER = 100  # of x^100
 
 _LOOKALIKES = {"−": "-", "–": "-", "×": "*", "·": "*", "⋅": "*", "÷": "/", "²": "^2", "³": "^3"} | {
@@ -228,10 +236,7 @@ class _Trees(TREE):
         if len(token) > MAX_DIGITS:
             expected = f"at most {MAX_DIGITS} characters"
             raise FaultError("E323", token, "a number", expected, f"{len(token)}")
-        exponent = token.lower().partition("e")[2]
-        if abs(int(exponent or 0)) > MAX_NUMBER_EXPONENT:
-            limit = f"an exponent from -{MAX_NUMBER_EXPONENT} to {MAX_NUMBER_EXPONENT}"
-            raise FaultError("E323", token, "a number", limit, cut(exponent))
+        check_size(token, token, "E323")
         return token
 
     def NAME(self, token: Token) -> Token:
@@ -310,12 +315,9 @@ class _Trees(TREE):
             raise FaultError("E325", clock.start, function, "the name of a clock", got)
         return Name((interval_of(clock.parts[0]),), **_span(*parts))
 
-    def conditional(self, parts: list[Any]) -> Any:
-        otherwise = parts[-1]
-        for at in reversed(range(0, len(parts) - 2, 4)):
-            condition, then = parts[at + 1], parts[at + 3]
-            otherwise = Call("if", (condition, then, otherwise), **_span(parts[at], parts[-1]))
-        return otherwise
+    def conditional(self, parts: list[Any]) -> Expr:
+        _, condition, _, then, *_, otherwise = parts
+        return Call("if", (condition, then, otherwise), **_span(*parts))
 
 
 def _span(*parts: Any) -> dict[str, int]:

@@ -1,13 +1,14 @@
 """The grammars of the language, read by Lark.
 
 Takes: a grammar beside this module, and what its rules build.
-Gives: `parser`, `FaultError`, `placing`, `TREE`, `kind_of`, `unclosed`, `exponent_of`.
+Gives: `parser`, `FaultError`, `placing`, `TREE`, `kind_of`, `unclosed`, `exponent_of`, `check_size`.
 Guarantees: a mistake knows the offset in its text, and its place once it is placed.
 Does not: bound a text: whoever parses it does, before.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,7 +19,9 @@ from typing import Any
 from lark import Lark, Token, Transformer
 
 from apc.compiler.errors import ApcError, Mistake, Place, place_in
+from apc.compiler.words import cut
 
+MAX_NUMBER_EXPONENT = 300  # of 1e300: still a float
 TREE = Transformer[Token, Any]
 _OPENED_BY = {"RPAR": "LPAR", "RBRACE": "LBRACE", "ELSE": "IF"}
 _OPENERS = ("LPAR", "LBRACE", "IF", "THEN", "ELSEIF")
@@ -57,6 +60,14 @@ def parser(grammar: str, starts: list[str], builder: TREE) -> Callable[[str, str
 def kind_of(value: object) -> str:
     """Return the kind of a token on the parser's stack, an empty text for what is built already."""
     return value.type if isinstance(value, Token) else ""
+
+
+def check_size(number: str, at: int | Token, code: str) -> None:
+    """Raise FaultError for a number, or a quotient of two, whose exponent no float has."""
+    for exponent in re.findall(r"[eE]([+-]?[0-9]+)", number):
+        if abs(int(exponent)) > MAX_NUMBER_EXPONENT:
+            limit = f"an exponent from -{MAX_NUMBER_EXPONENT} to {MAX_NUMBER_EXPONENT}"
+            raise FaultError(code, at, "a number", limit, cut(exponent))
 
 
 def unclosed(stack: Sequence[object]) -> int:

@@ -27,12 +27,20 @@ from lark.exceptions import UnexpectedCharacters, UnexpectedToken
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.expression import PI
-from apc.compiler.language.parsing import TREE, FaultError, exponent_of, kind_of, parser, placing, unclosed
+from apc.compiler.language.parsing import (
+    TREE,
+    FaultError,
+    check_size,
+    exponent_of,
+    kind_of,
+    parser,
+    placing,
+    unclosed,
+)
 from apc.compiler.words import cut
 
 TURN = 2 * PI  # a cycle in radians
 MAX_LENGTH = 200  # characters of a quantity
-MAX_NUMBER_EXPONENT = 300  # of 1e300: still a float
 MAX_EXPONENT = 9  # of a unit: m^9
 
 # What a scene is likely to use: proposed for a misspelt name, and told apart by case.
@@ -264,10 +272,7 @@ def _quantity(text: str) -> Quantity:
 
 def _number(text: str, offset: int) -> Fraction:
     """Return the exact value of a number or of a quotient of two."""
-    for exponent in re.findall(r"[eE]([+-]?[0-9]+)", text):
-        if abs(int(exponent)) > MAX_NUMBER_EXPONENT:
-            limit = f"an exponent from -{MAX_NUMBER_EXPONENT} to {MAX_NUMBER_EXPONENT}"
-            raise FaultError("E226", offset, "a number", limit, cut(exponent))
+    check_size(text, offset, "E226")
     above, _, below = text.partition("/")
     try:
         return Fraction(above) / Fraction(below or "1")
