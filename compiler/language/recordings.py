@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.digits import plain_float
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.errors import Place
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.probes import read_probe
 from apc.compiler.language.tables import Headings, open_table, read_bytes, read_table
 from apc.compiler.language.units import NO_UNIT, Unit
-from apc.compiler.source.reading import brief
+from apc.compiler.source.reading import brief, fault
 
 DELAY = "delay"  # the column of a trace that is read
 TABLE_SUFFIX = ".csv"  # a file of another suffix may be what ping or irtt wrote
@@ -60,13 +60,13 @@ def read_time_table(path: Path, name: str, unit: Unit, named_at: Place) -> TimeT
     first = table.columns[0]
     if len(table.columns) != 2 or first.unit.dimension != SECOND:
         expected = f"two columns, time [s] and {name} [{unit.text}]"
-        raise ApcError(Mistake("E702", first.place, "a table over time", expected))
+        raise fault("E702", first.place, "a table over time", expected)
     times, numbers = table.columns
     if numbers.unit.dimension != unit.dimension:
-        raise ApcError(Mistake("E702", numbers.place, brief(numbers.name), unit.text, numbers.unit.text))
+        raise fault("E702", numbers.place, brief(numbers.name), unit.text, numbers.unit.text)
     if table.rows < 2 or not (np.diff(times.numbers) > 0).all():
         expected = "two or more rows of rising time"
-        raise ApcError(Mistake("E703", times.place, "a table over time", expected))
+        raise fault("E703", times.place, "a table over time", expected)
     return TimeTable(name, times.numbers, numbers.numbers)
 
 
@@ -107,7 +107,7 @@ def read_trace(path: Path, named_at: Place) -> Trace:
         if (probe := read_probe(text)) is not None:
             return Trace(probe.delays, probe.program, probe.interval)
         if DELAY not in text.partition("\n")[0]:
-            raise ApcError(Mistake("E702", Place(str(path), 1, 1), "a recording", RECORDINGS))
+            raise fault("E702", Place(str(path), 1, 1), "a recording", RECORDINGS)
     with open_table(path, named_at, known=(DELAY,)) as opened:
         column = _delay_column(opened.headings)
         scale = float(opened.headings[column][1].scale)
@@ -134,4 +134,4 @@ def _delay_column(names: Headings) -> int:
                 return column
             got, place = f"delay {'without a unit' if unit == NO_UNIT else f'in {unit.text}'}", at
     expected = "a column delay in a unit of time"
-    raise ApcError(Mistake("E702", place, "a trace", expected, brief(got), "delay [ms]"))
+    raise fault("E702", place, "a trace", expected, brief(got), "delay [ms]")

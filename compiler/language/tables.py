@@ -25,15 +25,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.digits import plain_float
-from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
+from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.files import RefusedError, read_file
 from apc.compiler.language.units import NO_UNIT, Unit, parse_unit
-from apc.compiler.source.reading import brief
+from apc.compiler.source.reading import brief, fault
 
 MAX_BYTES = 1 << 26  # 64 MiB: some eight million numbers, read in a few seconds
 PACKED = ".gz"  # the suffix of what gzip packed
 MOST_COLUMNS = 1000  # more than a scene has parameters that differ from peer to peer
 MOST_MISTAKES = 20  # of one table; a wrong column has as many as rows
+_EXAMPLE = "device.mass [kg]"
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.\[\]]*\Z")
 # The last bracket holds the unit; those before it, the index of an entry or of an element.
 _HEADING = re.compile(r"(?P<name>[^\[\]]*(\[[0-9]+\][^\[\]]*)*?)(\[(?P<unit>[^\[\]]*)\])?\Z")
@@ -54,13 +55,11 @@ class NamedFiles:
 
     def read(self, name: str, reader: Callable[[Path], F]) -> F | None:
         """Return what a reader finds in a file; None, and its mistakes are taken, if that is at fault."""
-        try:
+        with self.mistakes:
             found = reader(self.folder / name)
-        except ApcError as error:
-            self.mistakes.take(error)
-            return None
-        self.names.add(name)
-        return found
+            self.names.add(name)
+            return found
+        return None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,7 +147,7 @@ class Opened:
         ApcError
             E703 a row or cell is at fault, or there is none.
         """
-        mistakes, numbers, lines, faults = Mistakes(), array("d"), array("q"), 0
+        mistakes, numbers, lines, faulty = Mistakes(), array("d"), array("q"), set[int]()
         begin = self.rows.line_num + 1
         for cells in self.rows:
             # A cell in quotes may go over several lines.
@@ -157,27 +156,24 @@ class Opened:
             if not (filled if empty_too else any(map(str.strip, cells))):
                 continue
             lines.append(place.line)
-            try:
-                if len(cells) != len(self.headings):
-                    reason = f"the row has {len(cells)} cells and there are {len(self.headings)} headings"
-                    mistakes.add("E703", place, reason)
-                    faults += 1
-                else:
-                    numbers.extend([number(cells[column]) for column in columns])
-            except ValueError:
+            if len(cells) != len(self.headings):
+                reason = f"the row has {len(cells)} cells and there are {len(self.headings)} headings"
+                mistakes.add("E703", place, reason)
+                faulty.add(place.line)
+            else:
                 for column in columns:
                     try:
-                        number(cells[column])
+                        numbers.append(number(cells[column]))
                     except ValueError:
                         at = place.shifted(sum(len(cell) + 1 for cell in cells[:column]))
                         got = brief(cells[column]) or "nothing"
                         mistakes.add("E703", at, what, expected=expected, got=got)
-                faults += 1
-            if faults >= MOST_MISTAKES:
+                        faulty.add(place.line)
+            if len(faulty) >= MOST_MISTAKES:
                 break
         mistakes.raise_if_any()
         if not lines:
-            raise ApcError(Mistake("E703", Place(self.file, 2, 1), "the table has headings but no rows"))
+            raise fault("E703", Place(self.file, 2, 1), "the table has headings but no rows")
         return np.frombuffer(numbers, dtype=np.float64), tuple(lines)
 
 
@@ -206,14 +202,12 @@ def open_table(path: Path, named_at: Place, known: Collection[str] = ()) -> Iter
         first = next(rows, [])
         yield Opened(file, _headings(first, file), rows)
     except csv.Error as error:
-        raise ApcError(Mistake("E703", Place(file, rows.line_num or 1, 1), f"is no CSV: {error}")) from None
+        raise fault("E703", Place(file, rows.line_num or 1, 1), f"is no CSV: {error}") from None
     except ApcError:
         if not any(map(str.strip, first)) or _is_table(first, known):
             raise
         expected = "a name and its unit in each heading"
-        raise ApcError(
-            Mistake("E702", Place(file, 1, 1), "a table", expected, hint="device.mass [kg]")
-        ) from None
+        raise fault("E702", Place(file, 1, 1), "a table", expected, hint=_EXAMPLE) from None
 
 
 def _is_table(headings: list[str], known: Collection[str]) -> bool:
@@ -237,29 +231,26 @@ def read_bytes(path: Path, named_at: Place) -> bytes:
         if path.suffix.lower() == PACKED:
             with gzip.open(io.BytesIO(data)) as packed:
                 data = packed.read(MAX_BYTES + 1)
-            if len(data) > MAX_BYTES:
-                raise ApcError(
-                    Mistake("E701", named_at, f"{path.name} unpacks to more than {MAX_BYTES >> 20} MiB")
-                )
-        data.decode("utf-8-sig")  # all of it: what decodes piece by piece counts from where it is
+        if len(data) <= MAX_BYTES:
+            data.decode("utf-8-sig")  # all of it: what decodes piece by piece counts from where it is
+            return data
+        what = f"{path.name} unpacks to more than {MAX_BYTES >> 20} MiB"
     except RefusedError as refused:
-        raise ApcError(Mistake("E701", named_at, f"the table {path} {refused.words}")) from None
+        what = f"the table {path} {refused.words}"
     except UnicodeDecodeError as error:
-        raise ApcError(
-            Mistake("E701", named_at, f"{path.name} is not UTF-8 text (byte {error.start})")
-        ) from None
+        what = f"{path.name} is not UTF-8 text (byte {error.start})"
     except (OSError, EOFError, zlib.error):
-        raise ApcError(Mistake("E701", named_at, f"{path.name} is no whole gzip file")) from None
-    return data
+        what = f"{path.name} is no whole gzip file"
+    raise fault("E701", named_at, what)
 
 
 def _headings(texts: list[str], file: str) -> Headings:
     place = Place(file, 1, 1)
     if not any(text.strip() for text in texts):
-        raise ApcError(Mistake("E702", place, "the table has no headings", hint="device.mass [kg]"))
+        raise fault("E702", place, "the table has no headings", hint=_EXAMPLE)
     if len(texts) > MOST_COLUMNS:
         what = f"the table has {len(texts)} columns, and {MOST_COLUMNS} are the most"
-        raise ApcError(Mistake("E702", place, what, hint="several groups, each with a table"))
+        raise fault("E702", place, what, hint="several groups, each with a table")
     mistakes = Mistakes()
     found: dict[str, tuple[str, Unit, Place]] = {}
     for text in texts:
@@ -267,7 +258,7 @@ def _headings(texts: list[str], file: str) -> Headings:
         unit = NO_UNIT
         if not name:
             expected, got = "a name and its unit", brief(text) or "nothing"
-            mistakes.add("E702", place, "a heading", expected=expected, got=got, hint="device.mass [kg]")
+            mistakes.add("E702", place, "a heading", expected=expected, got=got, hint=_EXAMPLE)
         try:
             unit = parse_unit(written, place) if written else NO_UNIT
         except ApcError as error:

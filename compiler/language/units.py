@@ -187,11 +187,11 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
         [mistake] = error.mistakes
         if mistake.code != "E221" or mistake.hint:
             raise
-        example = f"{what}: 1" if unit == "1" else f"{what}: 1 {unit}"
+        example = f"{what}: 1 {unit}".removesuffix(" 1")
         raise ApcError(Mistake("E221", place, what, named, cut(text) or "nothing", example)) from None
     actual, due = parsed.unit.dimension, wanted.dimension
     got, right = cut(text.strip()), unit
-    if actual == due and (parsed.unit != NO_UNIT or due == DIMENSIONLESS):
+    if actual == due:
         if not actual.clashes(due):
             return parsed
         # 20 Hz are 125.66 rad/s.
