@@ -14,9 +14,9 @@ from typing import Any, NoReturn
 
 import yaml
 
-from apc.compiler.errors import ApcError, Mistake, Mistakes, Place, nearest
+from apc.compiler.errors import ApcError, Mistakes, Place, nearest
 from apc.compiler.source.nodes import Lines, Mapping, Node, Scalar, Sequence
-from apc.compiler.source.reading import either_comma
+from apc.compiler.source.reading import either_comma, fault
 from apc.compiler.source.yaml_faults import NO_COLON, not_yaml, with_colon
 from apc.compiler.words import cut
 
@@ -73,7 +73,7 @@ def compose(text: str, lines: Lines) -> Node:
         composer.mistakes.add("E109", Place(lines.file), f"this is not YAML: {error}")
     composer.mistakes.raise_if_any()
     if root is None or (isinstance(root, Scalar) and root.plain and not root.text):
-        raise ApcError(Mistake("E108", Place(lines.file), "this file is empty"))
+        raise fault("E108", Place(lines.file), "this file is empty")
     return root
 
 

@@ -40,8 +40,6 @@ _PROBLEMS: tuple[tuple[str, str, str], ...] = (
     ),
     ("node content", "a value or a closing bracket is missing here", ""),
     ("could not find expected ':'", NO_COLON, ""),
-    ("expected ',' or '}'", "this { is never closed, or a comma is missing behind it", ""),
-    ("expected ',' or ']'", "this [ is never closed, or a comma is missing behind it", ""),
     ("flow mapping", "this { is never closed, or a comma is missing behind it", ""),
     ("flow sequence", "this [ is never closed, or a comma is missing behind it", ""),
     ("block mapping", "this line is indented differently from the keys it belongs to", ""),
@@ -97,8 +95,7 @@ def _code(line: int, lines: Lines) -> tuple[str, Place]:
 def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Mistake:
     """Rewrite PyYAML's error as one sentence at the place that has to change."""
     mark = error.problem_mark or error.context_mark
-    if mark is None:
-        return Mistake("E109", Place(lines.file), f"this is not YAML: {error.problem}")
+    assert mark is not None, error
     place = lines.of(mark)
     rest = place.source_line[place.column - 1 :]
     indent = place.source_line[: len(place.source_line) - len(place.source_line.lstrip())]
@@ -114,22 +111,19 @@ def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Mistake:
         text = before[0] + bracket[0].rstrip()
         where = place.shifted(-len(before[0]))
         return Mistake("E109", where, f"a text with {rest[0]} in it needs quotes here", hint=f'"{text}"')
-    if "mapping values" in told:
-        for line in (mark.line, _line_above(mark.line, lines)):
-            if (found := _without_colon(line, lines)) is not None:
+    opening, above = (error.context_mark or mark).line, _line_above(mark.line, lines)
+    slips = {
+        "mapping values": ((_without_colon, mark.line), (_without_colon, above)),
+        "could not find expected ':'": ((_without_colon, opening),),
+        "block": ((_item_among_keys, mark.line), (_item_among_keys, opening), (_without_colon, above)),
+    }
+    for part in slips:
+        for slip, line in slips[part] if part in told else ():
+            if (found := slip(line, lines)) is not None:
                 return found
-    opening = error.context_mark.line if error.context_mark is not None else mark.line
-    if "could not find expected ':'" in told and (found := _without_colon(opening, lines)):
-        return found
-    if "block" in told:
-        for line in (mark.line, opening):
-            if (found := _item_among_keys(line, lines)) is not None:
-                return found
-        if (found := _without_colon(_line_above(mark.line, lines), lines)) is not None:
-            return found
     for part, sentence, hint in _PROBLEMS:
         if part in told:
-            opened = sentence.startswith("this ") and error.context_mark is not None
-            where = lines.of(error.context_mark) if opened and "indented" not in sentence else place
-            return Mistake("E109", where, sentence, hint=hint)
+            if error.context_mark and sentence.startswith("this ") and "indented" not in sentence:
+                place = lines.of(error.context_mark)
+            return Mistake("E109", place, sentence, hint=hint)
     return Mistake("E109", place, f"this is not YAML: {error.problem}")
