@@ -90,7 +90,7 @@ class Timings:
         tree = transform(hold.delay, register)
         if isinstance(tree, Name):
             return ".".join(tree.parts)
-        value = Fraction(evaluate(tree, number, place=Place(self.scene.name)))
+        value = Fraction(evaluate(tree, number, Place(self.scene.name)))
         name = f"delay of {hold.variable}" + (f" at {kind.name}" if kind.delays else "")
         return self.use(name, Value(value, SECOND, tree, hold.place))
 

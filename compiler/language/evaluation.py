@@ -36,6 +36,7 @@ from apc.compiler.plain import ROUNDED, RULES
 from apc.compiler.words import cut
 
 Value = Fraction | float
+Lookup = Callable[[tuple[str, ...]], Any]  # of the parts of a name
 Rule = Callable[[str], Callable[..., Any]]
 
 MAX_BITS = 4096  # of an exact numerator or denominator; beyond it a float takes over
@@ -75,21 +76,13 @@ class FaultError(Exception):
 
 
 def formula_of(expr: Expr) -> Formula:
-    """Return an expression as a formula.
-
-    Raises
-    ------
-    ApcError
-        E332 a function that has no value in a parameter.
-    """
-    text = format_expression(expr)
-    _check_functions(expr, Place("an expression", 1, 1, text))
-    return Formula(text, tuple(dict.fromkeys(".".join(name.parts) for name in names(expr))))
+    """Return an expression of parameters, which has a value, as a formula."""
+    return Formula(
+        format_expression(expr), tuple(dict.fromkeys(".".join(name.parts) for name in names(expr)))
+    )
 
 
-def evaluate(
-    expr: Expr, lookup: Callable[[tuple[str, ...]], Value | int], place: Place | None = None
-) -> Value:
+def evaluate(expr: Expr, lookup: Lookup, place: Place) -> Value:
     """Return the value of an expression of parameters.
 
     Parameters
@@ -97,7 +90,7 @@ def evaluate(
     expr
         The tree.
     lookup
-        Gives the value of a name's parts; a `KeyError` from it becomes a mistake.
+        Gives the value of a name's parts.
     place
         Where the text of `expr` starts, for messages.
 
@@ -110,20 +103,16 @@ def evaluate(
     Raises
     ------
     ApcError
-        E330 a name without a value, E331 no finite real value, E332 a function that has none in a parameter.
+        E331 no finite real value, E332 a function that has none in a parameter.
     """
-    start = place or Place("an expression")
-    _check_functions(expr, start)
-    values: dict[str, Any] = {}
-    for name in names(expr):
-        try:
-            values[".".join(name.parts)] = lookup(name.parts)
-        except KeyError:
-            _fail(start, name, "E330", f"{'.'.join(name.parts)} has no value here")
+    for node in walk(expr):
+        if isinstance(node, Call) and node.function in FUNCTIONS.keys() - _OPERATIONS.keys():
+            what = f"{node.function}(…) changes with time or with the peers: a parameter cannot hold it"
+            _fail(place, node, "E332", what)
     try:
-        value: Value = _exactly(expr, values, EXACT.__getitem__)
+        value: Value = _exactly(expr, lookup, EXACT.__getitem__)
     except FaultError as fault:
-        _fail(start, fault.node, "E331", f"{cut(format_expression(fault.node))} {fault.words}")
+        _fail(place, fault.node, "E331", f"{cut(format_expression(fault.node))} {fault.words}")
     return value
 
 
@@ -142,8 +131,8 @@ def exact_value(name: str, formula: Formula, values: Sequence[Fraction]) -> Frac
     ApcError
         E331 it has no finite real value.
     """
-    by_parts = {tuple(key.split(".")): value for key, value in zip(formula.names, values, strict=True)}
-    return Fraction(evaluate(_tree(formula.text), by_parts.__getitem__, Place(name, 1, 1, formula.text)))
+    text, lookup = formula.text, _lookup(formula, values)
+    return Fraction(evaluate(_tree(text), lookup, Place(name, 1, 1, text)))
 
 
 def exactly(formula: Formula, values: Sequence[Any], rule: Rule) -> Any:
@@ -161,7 +150,7 @@ def exactly(formula: Formula, values: Sequence[Any], rule: Rule) -> Any:
     FaultError
         It has none.
     """
-    return _exactly(_tree(formula.text), dict(zip(formula.names, values, strict=True)), rule)
+    return _exactly(_tree(formula.text), _lookup(formula, values), rule)
 
 
 def computed(formula: Formula, values: Sequence[Any], rule: Rule) -> Any:
@@ -174,10 +163,10 @@ def computed(formula: Formula, values: Sequence[Any], rule: Rule) -> Any:
     rule
         What an operation of `plain` is in this kind of number.
     """
-    by_name = dict(zip(formula.names, values, strict=True))
+    lookup = _lookup(formula, values)
 
     def leaf(expr: Name | Number) -> Any:
-        return float(expr.value) if isinstance(expr, Number) else by_name[".".join(expr.parts)]
+        return float(expr.value) if isinstance(expr, Number) else lookup(expr.parts)
 
     def apply(word: str, *operands: Any) -> Any:
         if word != "if":
@@ -189,7 +178,12 @@ def computed(formula: Formula, values: Sequence[Any], rule: Rule) -> Any:
     return fold(_tree(formula.text), leaf, apply)
 
 
-def _exactly(expr: Expr, values: dict[str, Any], rule: Rule) -> Any:
+def _lookup(formula: Formula, values: Sequence[Any]) -> Lookup:
+    by_name = dict(zip(formula.names, values, strict=True))
+    return lambda parts: by_name[".".join(parts)]
+
+
+def _exactly(expr: Expr, lookup: Lookup, rule: Rule) -> Any:
     """Return the value of an expression, evaluated only as far as it is needed. Raises FaultError."""
 
     def value(expr: Expr) -> Any:
@@ -203,7 +197,7 @@ def _exactly(expr: Expr, values: dict[str, Any], rule: Rule) -> Any:
         try:
             if isinstance(expr, Call):
                 return _apply(expr.function, operands, rule)
-            return _finite(expr.value if isinstance(expr, Number) else values[".".join(expr.parts)])
+            return _finite(expr.value if isinstance(expr, Number) else lookup(expr.parts))
         except (ArithmeticError, ValueError) as cause:
             raise FaultError(expr, cause) from None
 
@@ -216,13 +210,6 @@ def _apply(word: str, operands: Sequence[Any], rule: Rule) -> Any:
     if word in ("max", "min"):
         return reduce(operation, operands)
     return operation(*(operands[::-1] if word in (">", ">=") else operands))
-
-
-def _check_functions(expr: Expr, place: Place) -> None:
-    for node in walk(expr):
-        if isinstance(node, Call) and node.function in FUNCTIONS.keys() - _OPERATIONS.keys():
-            what = f"{node.function}(…) changes with time or with the peers: a parameter cannot hold it"
-            _fail(place, node, "E332", what)
 
 
 def _fail(place: Place, node: Expr, code: str, what: str) -> NoReturn:

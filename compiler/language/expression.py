@@ -1,8 +1,8 @@
 """The nodes of an expression's tree, walking and changing them, and their text.
 
 Takes: `Expr` trees.
-Gives: the node types, `Equation`, `format_expression`, `interval_of`, `children`, `walk`, `names`,
-`transform`, `fold`.
+Gives: the node types, `Equation`, `format_expression`, `as_written`, `interval_of`, `children`, `walk`,
+`names`, `transform`, `fold`.
 Guarantees: plain frozen data; the text has no more parentheses than the tree needs.
 Does not: read text (see `grammar`), or know what a name means, or its unit.
 """
@@ -110,6 +110,11 @@ def format_expression(expr: Expr) -> str:
     A `Number` no parsed text can hold (1/3, −2) prints as the operation that gives it.
     """
     return _format(expr)[0]
+
+
+def as_written(expr: Expr, text: str) -> str:
+    """Return a part as it is written in a text, or as it would be when it comes from somewhere else."""
+    return text[expr.start : expr.end] or format_expression(expr)
 
 
 def _format(expr: Expr) -> tuple[str, int]:

@@ -23,7 +23,7 @@ from apc.compiler.language.expression import (
     Expr,
     Name,
     Number,
-    format_expression,
+    as_written,
 )
 from apc.compiler.language.unit_text import format_dimension
 
@@ -103,8 +103,7 @@ class _Checker:
         self.mistakes = Mistakes()
 
     def said(self, expr: Expr) -> str:
-        """Return a part as it is written, or as it would be when it comes from somewhere else."""
-        written = self.text[expr.start : expr.end] or format_expression(expr)
+        written = as_written(expr, self.text)
         return written if len(written) <= 60 else written[:57] + "…"
 
     def add(self, code: str, expr: Expr, expected: str, got: Dimension) -> None:

@@ -183,7 +183,7 @@ def _refuse_computed(text: str, place: Place, what: str, unit: str) -> None:
         return
     hint = ""
     with Mistakes():
-        number = evaluate(parse_expression(match["numbers"], place), lambda _: 0)
+        number = evaluate(parse_expression(match["numbers"], place), lambda _: 0, place)
         if parse_unit(match["unit"], place).dimension == parse_unit(unit, place).dimension:
             hint = f"{what}: {float(number):.9g} {match['unit']}"
     if hint:
@@ -243,7 +243,7 @@ def settle(binding: Binding, number_of: Callable[[tuple[str, ...]], Fraction]) -
     if binding.expression is None:
         assert binding.number is not None
         return Value(binding.number, binding.dimension, None, binding.place)
-    number = Fraction(evaluate(binding.expression, number_of, place=binding.place))
+    number = Fraction(evaluate(binding.expression, number_of, binding.place))
     return Value(number, binding.dimension, binding.expression, binding.place)
 
 

@@ -31,6 +31,7 @@ from apc.compiler.language.expression import (
     Expr,
     Name,
     Number,
+    as_written,
     format_expression,
     walk,
 )
@@ -132,14 +133,10 @@ class _Writer:
     def __init__(self, size_of: SizeOf, text: str, place: Place) -> None:
         self.size_of, self.text, self.place = size_of, text, place
 
-    def source(self, expr: Expr) -> str:
-        """Return a part as it is written, or as it would be when it comes from somewhere else."""
-        return self.text[expr.start : expr.end] or format_expression(expr)
-
     def fail(
         self, code: str, at: Expr, expected: str, got: str = "", hint: str = "", within: str = ""
     ) -> NoReturn:
-        what, place = self.source(at) + within, place_in(self.place, self.text, at.start)
+        what, place = as_written(at, self.text) + within, place_in(self.place, self.text, at.start)
         raise ApcError(Mistake(code, place, what, expected, got, hint))
 
     def written(self, expr: Expr) -> Written:
@@ -222,7 +219,7 @@ class _Writer:
             text, hint = format_expression(part), "" if _is_vector(first) else self.of_vector(part)
             if not _is_vector(other) and len(text) <= LONGEST_REPEATED:
                 hint = "{" + ", ".join([text] * len(first)) + "}"
-            self.fail("E406", part, f"{_size(first)} like {self.source(model)}", _size(other), hint)
+            self.fail("E406", part, f"{_size(first)} like {as_written(model, self.text)}", _size(other), hint)
 
     def each(self, call: Call, parts: Sequence[Written]) -> Written:
         """Return a call of other arguments: one for each entry, where one of them is a vector."""
