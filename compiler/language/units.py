@@ -118,18 +118,11 @@ class Unit:
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """`value` in SI; `unit` as written, `NO_UNIT` when there was none; `text` as written."""
+    """`value` in SI; `unit` as written, `NO_UNIT` when there was none; `number` as written, without it."""
 
     value: Fraction
     unit: Unit
-    text: str
-
-    @property
-    def number(self) -> str:
-        """The number as written, without its unit."""
-        match = _QUANTITY_START.match(self.text)
-        assert match is not None
-        return match.group().strip()
+    number: str
 
 
 NO_UNIT = Unit("1", Fraction(1), DIMENSIONLESS)
@@ -216,19 +209,12 @@ def _meant(unit: Unit, wanted: Unit) -> tuple[str, str]:
     exponents, or with a letter more; or failing that the one that is wanted, if a value in it is as large:
     5 N/mm^2 are not proposed as 5 N/m, a millionth of it.
     """
-    others = [(name, other) for name in NAME.findall(unit.text) for other in COMMON if other != name]
-    texts = [
-        *((unit.text.replace(name, other), name) for name, other in others if other.lower() == name.lower()),
-        *(
-            (unit.text[: match.start()] + unit.text[match.end() :], "")
-            for match in _EXPONENT.finditer(unit.text)
-        ),
-        *(
-            (re.sub(rf"\b{re.escape(name)}\b", other, unit.text), "")
-            for name, other in others
-            if other[:-1] == name
-        ),
-    ]
+    text = unit.text
+    others = [(name, other) for name in NAME.findall(text) for other in COMMON if other != name]
+    texts = [(text.replace(name, other), name) for name, other in others if other.lower() == name.lower()]
+    texts += [(text[: match.start()] + text[match.end() :], "") for match in _EXPONENT.finditer(text)]
+    longer = ((name, other) for name, other in others if other[:-1] == name)
+    texts += [(re.sub(rf"\b{re.escape(name)}\b", other, text), "") for name, other in longer]
     fitting = (candidate for candidate in texts if _is_of(candidate[0], wanted.dimension))
     return next(fitting, (wanted.text if unit.scale == wanted.scale else "", ""))
 
@@ -267,7 +253,7 @@ def _quantity(text: str) -> Quantity:
         raise
     except OverflowError:
         raise FaultError("E226", 0, "this quantity is too large for a number") from None
-    return Quantity(value * unit.scale, unit, text)
+    return Quantity(value * unit.scale, unit, number)
 
 
 def _number(text: str, offset: int) -> Fraction:
