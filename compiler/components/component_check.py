@@ -135,7 +135,7 @@ class ComponentNames:
         """Return the size of an expression; 0 of one at fault, which `_checked` reports."""
         with Mistakes():
             found = written_out(expression, self.size_of, text, place)
-            return found and (len(found) if len(found) > 1 else 0)
+            return None if found is None else len(found) if len(found) > 1 else 0
         return 0
 
     def _inferred(self, expression: Expr, text: str, place: Place) -> Dimension | None:

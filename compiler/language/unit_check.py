@@ -145,7 +145,7 @@ class _Checker:
         if word in ("*", "/", "dot", "cross", "^"):
             return self.product(word, *parts)
         if word == "sqrt":
-            return self.product("^", *parts, _HALF)
+            return self.product("^", parts[0], _HALF)
         if word in ("floor", *SMOOTH):
             self.fits(parts[0], DIMENSIONLESS, "E403", "a plain number")
             return DIMENSIONLESS

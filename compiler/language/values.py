@@ -295,7 +295,7 @@ def resolve_in_order(waiting: Mapping[str, Binding], peers: int, mistakes: Mista
 def _settled(name: str, binding: Binding, settled: Mapping[str, Value]) -> Value:
     def dimension(parts: tuple[str, ...]) -> Dimension | None:
         value = settled.get(".".join(parts))
-        return value and value.dimension
+        return None if value is None else value.dimension
 
     if (tree := binding.expression) is not None:
         actual = _dimension(tree, format_expression(tree), binding.place, name, dimension, settled)
