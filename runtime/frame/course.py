@@ -25,7 +25,7 @@ from apc.frame.discretize import exponential_values
 from apc.frame.lift import Seen, follow
 from apc.frame.radius import FLOATS
 from apc.frame.schedule import Propagate, Schedule
-from apc.frame.site import LinearSite, every_matrix
+from apc.frame.site import LinearSite, every_matrix, matrices_of
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -81,7 +81,7 @@ def turns(
         Which continuous state is followed (k,), and the eigenvalues (k,).
     """
     found = np.full(len(values), np.nan)
-    one_site = len(site.a) == 1
+    one_site = _of_one(site)
     swing = _fastest(site.a)
     durations = [event.duration for event in schedule.events if isinstance(event, Propagate)]
     height = sum(site.b.shape[-2:])
@@ -105,6 +105,11 @@ def turns(
             agreed[first : first + chunk] = known
         left = left[~agreed]
     return found
+
+
+def _of_one(site: LinearSite) -> bool:
+    """Say whether matrices (1, …) or (k, …) are those of one site."""
+    return max(map(len, matrices_of(site))) == 1
 
 
 def _fastest(a: Floats) -> float:
@@ -136,7 +141,7 @@ def _courses(
         step = exponential_values(site.a, site.b, float(duration * schedule.quantum) / number)
         power = np.concatenate([step, np.broadcast_to(below, (len(step), *below.shape))], axis=1)
         fine[duration], steps[duration] = _followed(power, states, number)
-    one_site = len(site.a) == 1
+    one_site = _of_one(site)
     if one_site:
         site = every_matrix(site, lambda matrix: matrix[0])
         steps = {duration: step[0] for duration, step in steps.items()}
@@ -146,8 +151,8 @@ def _courses(
         return np.concatenate([numbers.real.T, numbers.imag.T], axis=1)
 
     def multiply(matrix: Floats, rows: Floats) -> Floats:
-        if matrix.ndim == 2:
-            return np.asarray(matrix @ rows)
+        if matrix.ndim == 2 or len(matrix) == 1:
+            return np.asarray(matrix.reshape(matrix.shape[-2:]) @ rows)
         halves = rows.reshape(len(rows), 2, count)
         return np.asarray(np.einsum("khn,nck->hck", matrix, halves).reshape(-1, 2 * count))
 
