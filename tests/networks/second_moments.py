@@ -144,7 +144,7 @@ def second_moment_radius(scene: Scene, law: Law) -> float:
 
     operator = scipy.sparse.linalg.LinearOperator((start.size,) * 2, matvec=step, dtype=np.float64)
     # Moments map a cone into itself, so the largest value is real; a small Krylov space may miss it.
-    options = {"ncv": min(start.size, 300), "tol": 1e-12, "return_eigenvectors": False}
+    options = {"ncv": min(start.size, 144), "tol": 1e-12, "return_eigenvectors": False}
     values = scipy.sparse.linalg.eigs(operator, 2, v0=step(start.ravel()), which="LR", **options)
     return float(np.abs(values).max())
 
