@@ -7,9 +7,11 @@ Does not: look into equations, or decide what was meant.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
-from apc.compiler.components.parts import GROUND, PartEntry
+from scipy.cluster.hierarchy import DisjointSet
+
+from apc.compiler.components.parts import PartEntry
 from apc.compiler.errors import Mistake, Place
 from apc.compiler.scene.instances import Part
 
@@ -44,12 +46,12 @@ def oddities(
     hearing = {part.name: part for part in outer if part.component.hears_others}
     masses = [part for part in outer if part.section == "masses"]
     for part in masses:
-        alone = [group for group in part.groups if len(joined[group][part.name]) == 1]
+        alone = [group for group in part.groups if len(joined[group].subset(part.name)) == 1]
         if alone and part.component.connectors and not part.connections:
             where = "" if len(alone) == len(part.groups) else f" of {' and '.join(alone)}"
             what = f"{part.name}{where} is joined to nothing: no coupler, no hand and no other mass"
             found.append(Mistake("W272", part.place, what))
-        near = {name for group in part.groups for name in joined[group][part.name]}
+        near = {name for group in part.groups for name in joined[group].subset(part.name)}
         if sum(counts[group] for group in part.groups) < 2:
             continue
         if part.shared and not near & hearing.keys():
@@ -73,14 +75,13 @@ def oddities(
     return tuple(sorted(dict.fromkeys(found), key=lambda one: (one.place, one.code)))
 
 
-def _joined(parts: Iterable[Part]) -> dict[str, set[str]]:
-    """Return what is joined to each part of one group, directly or by others; the ground joins nothing."""
-    found = {part.name: {part.name} for part in parts}
+def _joined(parts: Sequence[Part]) -> DisjointSet:
+    """Return the parts of one group, in sets of those joined directly or by others; the ground joins nothing."""
+    found = DisjointSet(part.name for part in parts)
     for part in parts:
         for _, other, _ in part.connections:
-            if other != GROUND and other in found:
-                found[part.name] |= found[other]
-                found |= dict.fromkeys(found[part.name], found[part.name])
+            if other in found:
+                found.merge(part.name, other)
     return found
 
 

@@ -132,7 +132,7 @@ def build_scene(source: Source, library: Library) -> Scene:
     bodies = read_counts(root, files)
     counts = {name: group.count for name, group in bodies.items()}
     mistakes.names = tuple(counts)
-    numbers = read_named_numbers(root, sum(counts.values()), mistakes)
+    numbers = read_named_numbers(root, counts, files)
     clocks = read_clocks(root, numbers, {*numbers.values, *counts})
     sections = Parts(library, mistakes, {*numbers.values, *counts, *clocks})
     for section in SECTIONS:
@@ -140,13 +140,15 @@ def build_scene(source: Source, library: Library) -> Scene:
     names = _Names(root, sections, clocks, tuple(counts))
     entries = sections.entries
     scope = Scope(numbers.dimension, numbers.names, names.of_role, sections, "this topology", names.complete)
-    reader = PartReader(scope, numbers, counts, files)
-    parts = [part for entry in entries.values() for part in reader.read(entry)]
+    reader = PartReader(scope, numbers)
+    for entry in entries.values():
+        reader.read(entry)
+    parts = reader.parts
     links: list[SceneLink | None] = []
     for part in parts:
         if part.section == "links" and "." not in part.name:
             with mistakes:
-                links.append(read_link(part, entries[part.name], counts, numbers, files))
+                links.append(read_link(part, entries[part.name], numbers))
     read_links = tuple(link for link in links if link is not None)
     settable = settable_names(parts)
     of_groups = {name: items for name, items in settable.items() if not names.is_of_link(name)}
