@@ -151,8 +151,7 @@ class Mistakes:
 
     def take(self, error: ApcError) -> None:
         """Record every mistake of an error raised further down."""
-        for mistake in error.mistakes:
-            self._found[mistake] = None
+        self._found |= dict.fromkeys(error.mistakes)
 
     def __enter__(self) -> None:
         """Take what is raised within: `with mistakes:`."""
@@ -168,16 +167,20 @@ class Mistakes:
 
     def pass_on(self, other: Mistakes) -> None:
         """Record all of these with others."""
-        if self._found:
-            other.take(ApcError(list(self._found)))
+        other._found |= self._found
+
+    @property
+    def found(self) -> tuple[Mistake, ...]:
+        """All mistakes in file order."""
+        any_name = "|".join(map(re.escape, self.names)) or "(?!)"  # without names, nothing
+        named = re.compile(rf"(?<!\w)({any_name})(?!\w)")
+        once = {(one.place, one.code, named.sub("…", one.sentence)): one for one in reversed(self._found)}
+        return tuple(sorted(once.values(), key=lambda mistake: (mistake.place, mistake.code)))
 
     def raise_if_any(self) -> None:
-        """Raise `ApcError` with all mistakes in file order, if there is one."""
+        """Raise `ApcError` with all mistakes, if there is one."""
         if self._found:
-            any_name = "|".join(map(re.escape, self.names)) or "(?!)"  # without names, nothing
-            named = re.compile(rf"(?<!\w)({any_name})(?!\w)")
-            once = {(one.place, one.code, named.sub("…", one.sentence)): one for one in reversed(self._found)}
-            raise ApcError(sorted(once.values(), key=lambda mistake: (mistake.place, mistake.code)))
+            raise ApcError(self.found)
 
 
 def nearest(name: str, known: Iterable[str], *, alike: float = 0.6) -> str:

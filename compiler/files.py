@@ -1,9 +1,9 @@
 """What is read from disk and written to it, whoever named the file.
 
-Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `same_file`; `recorded`,
-`replayed`; `write_file`, `write_bytes`, `write_text`, `write_texts`, `check_target`, `unwritable`,
-`is_special`, `is_stdout`, and for what is written piece by piece `begin_file`, `finish_file`, `drop_file`,
-`partial_name`; `unlink_link`.
+Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `listing`, `same_file`;
+`recorded`, `replayed`; `write_file`, `write_bytes`, `write_text`, `write_texts`, `check_target`,
+`unwritable`, `is_special`, `is_stdout`, and for what is written piece by piece `begin_file`, `finish_file`,
+`drop_file`, `partial_name`; `unlink_link`.
 Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
 waited for. What is written is there whole or not at all, and what a writer left that was killed goes with the
 next: a file is replaced by one of its mode and owner unless it is read-only, a link stays and its file is
@@ -20,10 +20,11 @@ import stat
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from contextvars import ContextVar
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 from apc.compiler.errors import ApcError, Mistake, Place
 
@@ -36,6 +37,7 @@ KERNELS_OWN = "is an answer of the system's kernel"
 
 UNFINISHED = ".unfinished"  # how the name of a temporary file ends that goes with the next writer
 
+T = TypeVar("T")
 Why = Literal["missing", "folder", "special", "large", "forbidden", "unreadable"]
 
 
@@ -53,26 +55,25 @@ _replay: ContextVar[Mapping[str, bytes] | None] = ContextVar("replay", default=N
 
 
 @contextmanager
-def recorded(texts: dict[str, bytes]) -> Iterator[None]:
+def _during(variable: ContextVar[T], value: T) -> Iterator[None]:
+    token = variable.set(value)
+    try:
+        yield
+    finally:
+        variable.reset(token)
+
+
+def recorded(texts: dict[str, bytes]) -> AbstractContextManager[None]:
     """Put the bytes of every file that is read meanwhile into `texts`, by its path.
 
     Of a folder, by its path and a slash, these are the files that were listed of it, a line each.
     """
-    token = _record.set(texts)
-    try:
-        yield
-    finally:
-        _record.reset(token)
+    return _during(_record, texts)
 
 
-@contextmanager
-def replayed(texts: Mapping[str, bytes]) -> Iterator[None]:
+def replayed(texts: Mapping[str, bytes]) -> AbstractContextManager[None]:
     """Read meanwhile what was recorded, by absolute path, instead of any file or folder."""
-    token = _replay.set(texts)
-    try:
-        yield
-    finally:
-        _replay.reset(token)
+    return _during(_replay, texts)
 
 
 def _replayed(path: str, texts: Mapping[str, bytes]) -> bytes:
@@ -114,12 +115,8 @@ def read_file(path: Path, most: int) -> bytes:
 def _read(path: Path, most: int) -> bytes:
     check_file(path, most)  # first, as opening a device can already do something
     with _refusing(), open(path, "rb", opener=_without_waiting) as stream:
-        found = os.fstat(stream.fileno())
-        _check(found, most)  # of what was opened
-        data = stream.read(found.st_size + 1)  # as many bytes are set aside
-        if len(data) > found.st_size:
-            data += stream.read(most + 1 - len(data))
-    return data
+        _check(os.fstat(stream.fileno()), most)  # of what was opened
+        return stream.read(most + 1)
 
 
 def check_file(path: Path, most: int) -> None:
@@ -182,29 +179,27 @@ def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
         more than `MOST_DEPTH` folders deep.
     """
     texts = _replay.get()
-    if texts is None:
-        names = "\n".join(str(path.relative_to(folder)) for path in _walked(folder, suffix))
-    else:
-        names = os.fsdecode(_replayed(f"{folder}/", texts))
-    _note(f"{folder}/", os.fsencode(names))
-    return tuple(folder / name for name in names.split("\n") if name)
+    names = listing(folder, suffix) if texts is None else _replayed(f"{folder}/", texts)
+    _note(f"{folder}/", names)
+    return tuple(folder / name for name in os.fsdecode(names).split("\n") if name)
 
 
-def _walked(folder: Path, suffix: str) -> tuple[Path, ...]:
+def listing(folder: Path, suffix: str) -> bytes:
+    """Return the names, from the folder, of the files that `files_below` gives, a line each."""
     found: list[Path] = []
     kernels, entries = _kernels_devices(), 0
     with _refusing():
         for name, folders, files in os.walk(folder, onerror=_raise):
-            path = Path(name)
-            if len(path.relative_to(folder).parts) >= MOST_DEPTH:
+            below = Path(name).relative_to(folder)
+            if len(below.parts) >= MOST_DEPTH:
                 raise RefusedError("large", f"is more than {MOST_DEPTH} folders deep")
-            if path.stat().st_dev in kernels:
+            if Path(name).stat().st_dev in kernels:
                 raise RefusedError("special", KERNELS_OWN)
             entries += len(folders) + len(files)
             if entries > MOST_ENTRIES:
                 raise RefusedError("large", f"holds more than {MOST_ENTRIES} files and folders")
-            found += [path / file for file in files if file.endswith(suffix)]
-    return tuple(sorted(found))
+            found += [below / file for file in files if file.endswith(suffix)]
+    return os.fsencode("\n".join(map(str, sorted(found))))
 
 
 def _raise(error: OSError) -> None:
@@ -234,24 +229,33 @@ def write_file(path: Path, write: Callable[[Path], object]) -> None:
     ApcError
         E601 it can't be written; then what was there before is as it was.
     """
-    with _writing(path):
-        temporary = begin_file(path)
+    _write_all({path: write})
+
+
+def _write_all(writers: Mapping[Path, Callable[[Path], object]]) -> None:
+    """Fill a temporary file for each path, then put all where they belong, or none. Raises ApcError E601."""
+    ready: dict[Path, Path] = {}
     try:
-        write(temporary)
-        finish_file(temporary, path)
-    except BaseException as error:
-        drop_file(temporary)
-        if isinstance(error, OSError):
-            raise unwritable(path, error) from error
-        raise
+        for path, write in writers.items():
+            with _writing(path, ValueError):  # of a name that can't be one
+                ready[path] = begin_file(path)
+            with _writing(path):
+                write(ready[path])
+        for path in writers:
+            with _writing(path):
+                finish_file(ready[path], path)
+                del ready[path]
+    finally:
+        for temporary in ready.values():
+            drop_file(temporary)
 
 
 @contextmanager
-def _writing(path: Path) -> Iterator[None]:
+def _writing(path: Path, *others: type[ValueError]) -> Iterator[None]:
     """Turn what the system says of a file that is to be written into ApcError (E601)."""
     try:
         yield
-    except (OSError, ValueError) as error:
+    except (OSError, *others) as error:
         raise unwritable(path, error) from error
 
 
@@ -267,24 +271,16 @@ def write_text(path: Path, text: str) -> None:
 
 def write_texts(texts: Mapping[Path, str]) -> None:
     """Write texts that belong together, all or none. Raises ApcError (E601) if one can't be written."""
-    ready: dict[Path, Path] = {}
-    try:
-        for path, text in texts.items():
-            with _writing(path):
-                ready[path] = begin_file(path)
-                ready[path].write_bytes(text.encode())
-        for path in texts:
-            with _writing(path):
-                finish_file(ready[path], path)
-                del ready[path]
-    finally:
-        for temporary in ready.values():
-            drop_file(temporary)
+    _write_all({path: partial(_fill, text.encode()) for path, text in texts.items()})
+
+
+def _fill(content: bytes, temporary: Path) -> None:
+    temporary.write_bytes(content)
 
 
 def check_target(path: Path) -> None:
     """Refuse a place where nothing can be written, before anything is computed: ApcError E601."""
-    with _writing(path):
+    with _writing(path, ValueError):
         drop_file(begin_file(path))
 
 
@@ -310,18 +306,17 @@ def begin_file(path: Path) -> Path:
     target = _target(path)
     if target.is_dir():
         raise IsADirectoryError(None, "it is a folder")
+    folder = target.parent
     if is_special(path):
-        handle, name = tempfile.mkstemp(prefix=f".{target.name[:24]}.")
-        os.close(handle)
-        return Path(name)
-    if target.exists() and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)):
+        folder = Path(tempfile.gettempdir())
+    elif target.exists() and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)):
         raise PermissionError(None, "it is read-only")
     # The name of the target need not fit: a temporary's is longer.
     prefix = f".{target.name[:24]}.{platform.node()}."
-    handle, name = tempfile.mkstemp(UNFINISHED, f"{prefix}{os.getpid()}.", target.parent)
+    handle, name = tempfile.mkstemp(UNFINISHED, f"{prefix}{os.getpid()}.", folder)
     os.close(handle)
     with suppress(OSError):  # a folder may be written to and not be read
-        for left in target.parent.iterdir():
+        for left in folder.iterdir():
             if left.name.startswith(prefix) and left.name.endswith(UNFINISHED):
                 _remove_left(left, left.name.removeprefix(prefix).partition(".")[0])
     return Path(name)
@@ -362,9 +357,8 @@ def finish_file(temporary: Path, path: Path) -> None:
         os.umask(mask)
         temporary.chmod(0o666 & ~mask)
     else:
-        made = temporary.stat()
-        if (made.st_uid, made.st_gid) != (before.st_uid, before.st_gid):
-            _give(temporary, before)
+        with suppress(OSError, AttributeError):  # only root may give it away; and not on Windows
+            os.chown(temporary, before.st_uid, before.st_gid)
         temporary.chmod(stat.S_IMODE(before.st_mode))
     temporary.replace(target)
 
@@ -414,14 +408,6 @@ def is_stdout(path: Path) -> bool:
         return os.path.samestat(path.stat(), os.fstat(STDOUT))
     except (OSError, ValueError):
         return False
-
-
-def _give(temporary: Path, before: os.stat_result) -> None:
-    """Give a file to the owner of the one it replaces, where that is allowed."""
-    try:
-        os.chown(temporary, before.st_uid, before.st_gid)
-    except (OSError, AttributeError):  # only root may; and not on Windows
-        return
 
 
 def _drain(path: Path) -> int:

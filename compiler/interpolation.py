@@ -39,8 +39,7 @@ class Interpolation:
     def value(self, at: Any, number: Callable[[float], Any]) -> Any:
         """Return what the table says at a number of some kind, which a float is turned into by `number`."""
         place = bisect.bisect_right(self.times, float(at))
-        last = max(place - 1, 0)
-        low, start = number(float(self.numbers[last])), number(float(self.times[last]))
+        low, start = (number(float(one[max(place - 1, 0)])) for one in (self.numbers, self.times))
         return low + self.slope(at, number) * (at - start) if 0 < place < len(self.times) else low
 
     def slope(self, at: Any, number: Callable[[float], Any]) -> Any:
@@ -48,17 +47,14 @@ class Interpolation:
         place = bisect.bisect_right(self.times, float(at))
         if place in (0, len(self.times)):
             return number(0.0)
-        rows = (self.times[place - 1 : place + 1], self.numbers[place - 1 : place + 1])
-        (start, end), (low, high) = (map(number, map(float, row)) for row in rows)
+        columns = self.times, self.numbers
+        (start, end), (low, high) = (map(number, one[place - 1 : place + 1].tolist()) for one in columns)
         return (high - low) / (end - start)
 
     def values(self, at: Any) -> Any:
         """Return what the table says at floats, or at complex steps from them."""
-        real = np.real(at)
-        place = np.searchsorted(self.times, real, side="right")
-        last = np.maximum(place - 1, 0)
-        found = self.numbers[last] + self.rates[place] * (real - self.times[last])
-        return found + 1j * self.rates[place] * np.imag(at) if np.iscomplexobj(at) else found
+        found = np.interp(np.real(at), self.times, self.numbers)
+        return found + 1j * self.slopes(at) * np.imag(at) if np.iscomplexobj(at) else found
 
     def slopes(self, at: Any) -> Any:
         """Return how fast that changes with them."""
@@ -69,7 +65,7 @@ class Interpolation:
         gaps = np.diff(self.times)[[0, -1]]
         times = np.concatenate([self.times[:1] - gaps[:1], self.times, self.times[-1:] + gaps[1:]])
         count = len(self.times)
-        return Interpolation(times, np.concatenate([[-0.5], np.arange(count), [count - 0.5]]))
+        return Interpolation(times, np.clip(np.arange(-1, count + 1), -0.5, count - 0.5))
 
 
 def function_of(table: Interpolation) -> Any:

@@ -7,9 +7,9 @@ Does not: save anything.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, get_args
 
 from apc.compiler.cache import Origin, origin_of, replayable
 from apc.compiler.compiled import CompiledSystem
@@ -25,7 +25,7 @@ from apc.compiler.source.source import Source, read_source
 from apc.compiler.timings import part
 
 Stage = Literal["source", "scene", "flat", "clocked", "sorted", "compiled"]
-STAGES: tuple[Stage, ...] = ("source", "scene", "flat", "clocked", "sorted", "compiled")
+STAGES: tuple[Stage, ...] = get_args(Stage)
 StageValue = Source | Scene | FlatSystem | ClockedSystem | SortedSystem | CompiledSystem
 
 
@@ -118,15 +118,14 @@ def stages_of(source: Source, texts: dict[str, bytes] | None = None) -> Iterator
         library = Library(library_folders(source))
         scene = build_scene(source, library)
     yield "scene", scene
-    with part("flat"):
-        flat = flatten(scene)
-    yield "flat", flat
-    with part("clocked"):
-        clocked = partition(flat)
-    yield "clocked", clocked
-    with part("sorted"):
-        sorted_system = sort(clocked)
-    yield "sorted", sorted_system
-    with part("compiled"):
-        system = build_functions(sorted_system, origin_of(path, texts))
-    yield "compiled", system
+    value: Any = scene
+    later: tuple[tuple[Stage, Callable[[Any], StageValue]], ...] = (
+        ("flat", flatten),
+        ("clocked", partition),
+        ("sorted", sort),
+        ("compiled", lambda ordered: build_functions(ordered, origin_of(path, texts))),
+    )
+    for stage, run in later:
+        with part(stage):
+            value = run(value)
+        yield stage, value

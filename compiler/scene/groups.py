@@ -178,41 +178,42 @@ class GroupReader:
         for key, node in self._entry_by_entry(group):
             with mistakes:
                 what = f"set names {brief(key.text)}, which is no parameter or variable of a part"
-                for whole, item in self._items(key.text, key.place, group.name, "E206", what):
-                    if isinstance(item, Option | Reference):
-                        words[whole] = self._word(node, key.text, item)
-                    elif isinstance(node, Sequence):
-                        columns[whole] = self._listed(node, key.text, item, group.count)
-                    else:
-                        values[whole] = self.numbers.read_for(node, key.text, item)
+                item, wholes = self._settable(key.text, key.place, group.name, "E206", what)
+                if isinstance(item, Option | Reference):
+                    words |= dict.fromkeys(wholes, self._word(node, key.text, item))
+                elif isinstance(node, Sequence):
+                    columns |= dict.fromkeys(wholes, self._listed(node, key.text, item, group.count))
+                else:
+                    values |= dict.fromkeys(wholes, self.numbers.read_for(node, key.text, item))
         for column in () if table is None else table.columns:
             with mistakes:
                 what = f"a heading names {brief(column.name)}, which is no number of a part"
-                for whole, item in self._items(column.name, column.place, group.name, "E702", what):
-                    if whole in columns or whole in values:
-                        told = f"{whole} is given by set and by the table"
-                        mistakes.add("E702", column.place, told)
-                    columns[whole] = column.numbers
-                    assert table is not None and isinstance(item, Number | Variable)
-                    _check_column(column, table.lines, item, mistakes)
+                item, wholes = self._settable(column.name, column.place, group.name, "E702", what)
+                for whole in columns.keys() & wholes | values.keys() & wholes:
+                    mistakes.add("E702", column.place, f"{whole} is given by set and by the table")
+                columns |= dict.fromkeys(wholes, column.numbers)
+                assert table is not None and isinstance(item, Number | Variable)
+                _check_column(column, table.lines, item, mistakes)
         self._add_followers(values, words, columns, group.body.place)
         settings = tuple(values.items()), tuple(words.items()), tuple(columns.items())
         return SceneGroup(group.name, group.count, *settings, group.body.place, group.counted)
 
-    def _items(self, name: str, place: Place, group: str, code: str, what: str) -> list[tuple[str, Settable]]:
-        """Return the whole names that a name stands for; in a heading, which is told by E702, of numbers."""
+    def _settable(
+        self, name: str, place: Place, group: str, code: str, what: str
+    ) -> tuple[Settable, list[str]]:
+        """Return what a name stands for, with its whole names; in a heading, told by E702, only a number."""
         kinds = (Number, Variable) if code == "E702" else (Number, Variable, Option, Reference)
-        items = self.settable.get(name)
-        if items is None or not isinstance(items[0][1], kinds):
+        item, wholes = self.settable.get(name, (None, []))
+        if not isinstance(item, kinds):
             self.explain(name, place)
-            known = [known for known, found in self.settable.items() if isinstance(found[0][1], kinds)]
+            known = [known for known, (other, _) in self.settable.items() if isinstance(other, kinds)]
             raise unknown(code, place, what, name, known)
-        part = items[0][0].rpartition(".")[0]
+        part = wholes[0].rpartition(".")[0]
         at = next(one.groups for one in self.parts if one.name == part)
         if at and group not in at:
             what = f"{group} sets {name} and has no {part}, which is at {', '.join(at)}"
             raise fault("E211", place, what, hint=f"at: [{', '.join((*at, group))}]")
-        return items
+        return item, wholes
 
     def _entry_by_entry(self, group: GroupBody) -> Iterator[tuple[Scalar, Node]]:
         """Yield what a group sets, a vector as its entries.
@@ -224,7 +225,7 @@ class GroupReader:
             if not size:
                 yield key, node
                 continue
-            _, item = self.settable[entry(key.text, 1)][0]
+            item, _ = self.settable[entry(key.text, 1)]
             assert isinstance(item, Number | Variable)
             one = f"1 {item.unit.text}".removesuffix(" 1")
             nested = isinstance(node, Sequence) and any(isinstance(item, Sequence) for item in node.items)
@@ -274,9 +275,8 @@ class GroupReader:
                 with self.numbers.mistakes:
                     follows = Fraction(evaluate(tree, number, place))
                     values[whole] = replace(value, number=follows, place=place)
-                    for _, item in self.settable.get(whole, ()):
-                        if isinstance(item, Number):
-                            item.bounds.check(values[whole], whole, self.numbers.mistakes)
+                    if isinstance(item := self.settable[whole][0], Number):
+                        item.bounds.check(values[whole], whole, self.numbers.mistakes)
 
 
 def _check_column(

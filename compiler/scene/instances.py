@@ -9,7 +9,7 @@ Does not: read a section (see `scene`), or look into equations.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -28,8 +28,8 @@ from apc.compiler.source.reading import among, fault, form, text_of
 
 LINK_ROLES = ("graph", "delays", "loss", "trace")
 
-# What can be set: by the name a person writes, the whole names it stands for.
-SettableNames = Mapping[str, list[tuple[str, Settable]]]
+# What can be set: by the name a person writes, what that is and the whole names it stands for.
+SettableNames = Mapping[str, tuple[Settable, list[str]]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,12 +206,12 @@ def _inside(part: Part, inner: Inner, peers: int) -> Part:
     )
 
 
-def settable_names(parts: Collection[Part]) -> dict[str, list[tuple[str, Settable]]]:
-    """Return what a group can set: by the name a person writes, the whole names it stands for.
+def settable_names(parts: Iterable[Part]) -> dict[str, tuple[Settable, list[str]]]:
+    """Return what a group can set: by the name a person writes, what it is and its whole names.
 
     The name of an array stands for all its elements: `a[1].b[2]` is one of `a.b[2]`, `a[1].b` and `a.b`.
     """
-    found: dict[str, list[tuple[str, Settable]]] = {}
+    found: dict[str, tuple[Settable, list[str]]] = {}
     for part in parts:
         items: list[Settable] = [
             p for p in part.component.parameters if not isinstance(p, Reference) or p.role == "clock"
@@ -222,5 +222,6 @@ def settable_names(parts: Collection[Part]) -> dict[str, list[tuple[str, Settabl
         )
         for name in map(".".join, elements):
             for item in items:
-                found.setdefault(f"{name}.{item.name}", []).append((f"{part.name}.{item.name}", item))
+                _, wholes = found.setdefault(f"{name}.{item.name}", (item, []))
+                wholes.append(f"{part.name}.{item.name}")
     return found

@@ -28,10 +28,10 @@ from apc.compiler.components.component import Number as Parameter
 from apc.compiler.components.parts import PartEntry
 from apc.compiler.errors import Place
 from apc.compiler.language.dimensions import DIMENSIONLESS
-from apc.compiler.language.expression import Binary, Name, Number
+from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.recordings import read_trace
 from apc.compiler.language.units import Unit
-from apc.compiler.language.values import Value
+from apc.compiler.language.values import AlreadyReportedError, Value
 from apc.compiler.scene.graphs import COMPLETE, SceneDelay, read_delays, read_graph
 from apc.compiler.scene.instances import Part
 from apc.compiler.scene.named_numbers import NamedNumbers
@@ -115,7 +115,7 @@ class SceneLink:
     place: Place
 
 
-def read_link(part: Part, entry: PartEntry, numbers: NamedNumbers) -> SceneLink | None:
+def read_link(part: Part, entry: PartEntry, numbers: NamedNumbers) -> SceneLink:
     """Read what a link's entry says beyond numbers and words.
 
     Parameters
@@ -125,14 +125,10 @@ def read_link(part: Part, entry: PartEntry, numbers: NamedNumbers) -> SceneLink 
     numbers
         Reads delays, probabilities and files.
 
-    Returns
-    -------
-    None if its clock or delay is at fault, which was reported.
-
     Raises
     ------
     ApcError
-        E210 it is no link.
+        E210 it is no link; none if its clock or delay is at fault, which was reported.
     """
     component, clock, delay = part.component, part.reference("clock"), dict(part.values).get("delay")
     roles = {p.name: p.role for p in component.parameters if isinstance(p, Reference)}
@@ -157,7 +153,7 @@ def read_link(part: Part, entry: PartEntry, numbers: NamedNumbers) -> SceneLink 
         raise fault("E210", part.place, f"{told} a link has no {idle[0]}", hint="type: Link")
     channel = _read_channel(part, nodes, numbers)
     if clock is None or delay is None:
-        return None
+        raise AlreadyReportedError
     return SceneLink(part.name, clock, delay, graph, delays, channel, part.place)
 
 
@@ -218,7 +214,7 @@ def _loss(link: str, node: Node, numbers: NamedNumbers) -> Named[Value]:
         given["p"] = _probability(node, "loss", numbers)
     if (p := given["p"]) is None:
         return ()
-    rest = Binary("-", Number(Fraction(1)), Name(tuple(name_p.split("."))))
+    rest = parse_expression(f"1 - {name_p}", p.place)
     usual = {"r": (1 - p.number, rest), "1-h": (Fraction(1), None), "1-k": (Fraction(0), None)}
     others = (
         (f"{name}.{key}", given.get(key) or Value(number, DIMENSIONLESS, expression, p.place))

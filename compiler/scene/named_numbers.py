@@ -10,12 +10,12 @@ Does not: know what a number is for, but for the bounds of a component's paramet
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
-from apc.compiler.components.component import RESERVED, Named, Number, Settable, Variable
+from apc.compiler.components.component import RESERVED, Number, Settable, Variable
 from apc.compiler.errors import Mistakes
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import names

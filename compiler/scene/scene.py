@@ -17,7 +17,7 @@ from pathlib import Path
 
 from apc.compiler.cache import SUFFIX
 from apc.compiler.compiled import Axis, Experiment
-from apc.compiler.components.component import Named, Settable
+from apc.compiler.components.component import Named
 from apc.compiler.components.library import Library, definition_of
 from apc.compiler.components.parts import Parts, Scope
 from apc.compiler.errors import Mistake, Mistakes, Place, visible
@@ -144,39 +144,34 @@ def build_scene(source: Source, library: Library) -> Scene:
     for entry in entries.values():
         reader.read(entry)
     parts = reader.parts
-    links: list[SceneLink | None] = []
+    links: list[SceneLink] = []
     for part in parts:
         if part.section == "links" and "." not in part.name:
             with mistakes:
                 links.append(read_link(part, entries[part.name], numbers))
-    read_links = tuple(link for link in links if link is not None)
-    settable = settable_names(parts)
-    of_groups = {name: items for name, items in settable.items() if not names.is_of_link(name)}
-    group_reader = GroupReader(of_groups, parts, clocks, numbers, names.explain)
+    others = tuple(part for part in parts if part.section != "links")
+    group_reader = GroupReader(settable_names(others), others, clocks, numbers, names.explain)
     groups = tuple(group_reader.read(group) for group in bodies.values())
-    # What a link loses by can vary where it follows from no other number.
-    losses: dict[str, list[tuple[str, Settable]]] = {
-        name: [(name, PROBABILITY)]
-        for link in read_links
-        for name, value in (link.channel.loss if link.channel is not None else ())
-        if value.expression is None
-    }
-    set_by_groups = {name for group in groups for name, _ in (*group.values, *group.words, *group.columns)}
+    settable = settable_names(parts)
+    for link in links:  # what one loses by can vary where it follows from no other number
+        for name, value in link.channel.loss if link.channel is not None else ():
+            if value.expression is None:
+                settable[name] = PROBABILITY, [name]
     scene = Scene(
         visible(root.text("topology")),
         visible(root.text("about")),
         tuple(clocks.values()),
         tuple(numbers.values.items()),
         groups,
-        tuple(part for part in parts if part.section != "links"),
-        read_links,
+        others,
+        tuple(links),
         read_experiment(root, numbers),
-        read_region(root, settable | losses, numbers, names.is_reported),
+        read_region(root, settable, numbers, names.is_reported),
         tuple(sorted(files.names)),
         root.place,
     )
     mistakes.raise_if_any()  # before warnings, which would tell a second time what is missing for a mistake
-    return replace(scene, warnings=oddities(parts, entries, counts, set_by_groups))
+    return replace(scene, warnings=oddities(parts, entries, groups))
 
 
 @dataclass(frozen=True, slots=True)
