@@ -122,8 +122,8 @@ def read_archive(path: Path) -> Archive:
         name = made_from.topology
         if name in ("", "..") or PurePath(name).name != name or name not in dict(made_from.texts):
             raise ValueError
-        numbers = (one for change in made_from.changes for one in change if one[0] != HANDS_CHANGE)
-        if not all(_RATIONAL.fullmatch(value) for _, value in numbers):
+        numbers = (one for change in made_from.changes for one in change)
+        if not all(name == HANDS_CHANGE or _RATIONAL.fullmatch(value) for name, value in numbers):
             raise ValueError
     except (ValueError, RecursionError):  # what is nested too deeply
         raise fault("E604", place, FOREIGN, hint=hint) from None
@@ -169,17 +169,17 @@ def origin_of(topology: Path, read: Mapping[str, bytes]) -> Origin:
     read
         What `files.recorded` noted.
     """
-    builtin = {str(path): name for name, path in builtin_files().items()}
-    texts = {builtin.get(path) or _name(path, topology): text for path, text in read.items()}
+    names = {str(path): name for name, path in builtin_files().items()} | {str(topology): topology.name}
+    texts = {names.get(path) or _name(path, topology.parent): text for path, text in read.items()}
     return Origin(topology.name, tuple(sorted(texts.items())), program_digest())
 
 
-def _name(path: str, topology: Path) -> str:
+def _name(path: str, folder: Path) -> str:
     """Return a file's name from the topology's folder, with a slash at its end for a folder."""
     plain = PurePath(path)
-    if plain == topology or not plain.is_relative_to(topology.parent):
-        return topology.name if plain == topology else path
-    return f"./{plain.relative_to(topology.parent).as_posix()}{'/' * path.endswith('/')}"
+    if not plain.is_relative_to(folder):
+        return path
+    return f"./{plain.relative_to(folder).as_posix()}{'/' * path.endswith('/')}"
 
 
 def replayable(origin: Origin, folder: Path) -> dict[str, bytes]:

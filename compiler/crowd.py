@@ -8,9 +8,11 @@ Does not: change who is in a group of peers that differ, or a graph that names i
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +32,7 @@ from apc.compiler.compiled import (
 )
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.source.reading import fault
-from apc.compiler.weights import Sums, sum_weights
+from apc.compiler.weights import sum_weights
 
 COUNT_ABOUT = "peers heard over the link, counted with their weights"
 
@@ -45,55 +47,44 @@ def with_heard(groups: Sequence[Group], kinds: Sequence[Kind], links: Sequence[L
     groups, kinds, links
         Of the model; on a graph that isn't complete, every peer sends.
     """
-    peers = sum(group.count for group in groups)
-    counted = {count_of(link.name): link for link in links}
-    sums = {link.name: heard_sums(link, peers) for link in links if link.graph.shape == "arcs"}
-    sending = {
-        link.name: [any(one.link == link.name for one in kinds[group.kind].sends) for group in groups]
-        for link in links
-    }
-    total = {
-        name: sum(group.count for group, sends in zip(groups, which, strict=True) if sends)
-        for name, which in sending.items()
-    }
-    found, start = [], 0
+    heard = {count_of(link.name): _heard(link, groups, kinds) for link in links}
+    found = []
     for place, group in enumerate(groups):
-        values = [one for one in group.values if one.name not in counted]
-        columns = [one for one in group.columns if one.name not in counted]
-        for name, link in counted.items():
+        values = [one for one in group.values if one.name not in heard]
+        columns = [one for one in group.columns if one.name not in heard]
+        for name, by_group in heard.items():
             if name in kinds[group.kind].parameters:
-                heard: Fraction | NDArray[np.float64] = Fraction(total[link.name] - sending[link.name][place])
-                if link.graph.shape != "complete":
-                    heard = _on_graph(link, group.count, start, peers, sums.get(link.name))
-                if isinstance(heard, Fraction):
-                    values.append(Parameter(name, "1", float(heard), about=COUNT_ABOUT, exact=heard))
+                number = by_group[place]
+                if isinstance(number, Fraction):
+                    values.append(Parameter(name, "1", float(number), about=COUNT_ABOUT, exact=number))
                 else:
-                    columns.append(Column(name, heard))
+                    columns.append(Column(name, number))
         found.append(replace(group, values=tuple(values), columns=tuple(columns)))
-        start += group.count
     return tuple(found)
 
 
-def heard_sums(link: Link, peers: int) -> Sums:
-    """Return what every peer of a scene hears in all over a link of arcs."""
+def heard_sums(link: Link, peers: int) -> NDArray[Any]:
+    """Return what every peer of a scene hears in all over a link of arcs, as `sum_weights` does."""
     return sum_weights(link.graph.arcs[:, 1], link.graph.weights, peers)
 
 
-def _on_graph(
-    link: Link, count: int, start: int, peers: int, sums: Sums | None
-) -> Fraction | NDArray[np.float64]:
-    """Return the summed weights of what each of `count` peers from `start` on hears: one number if alike."""
-    if link.graph.shape == "ring":
-        return Fraction(min(2, peers - 1))
-    if link.graph.shape == "star":
-        if start or peers == 2:
-            return Fraction(1)
-        counts = np.ones(count)
-        counts[0] = peers - 1
-        return counts if count > 1 else Fraction(peers - 1)
-    end = start + count
-    assert sums is not None, link.graph.shape
-    return sums.of(start) if sums.alike(start, end) else sums.floats[start:end]
+def _heard(
+    link: Link, groups: Sequence[Group], kinds: Sequence[Kind]
+) -> list[Fraction | NDArray[np.float64]]:
+    """Return, by group, the summed weights of what its peers hear over a link: one number if alike."""
+    counts = [group.count for group in groups]
+    peers, shape = sum(counts), link.graph.shape
+    if shape == "complete":
+        sends = [any(one.link == link.name for one in kinds[group.kind].sends) for group in groups]
+        total = sum(itertools.compress(counts, sends))
+        return [Fraction(total - does) for does in sends]
+    heard = np.full(peers, min(2, peers - 1) if shape == "ring" else 1, dtype=object)
+    if shape == "star":
+        heard[0] = peers - 1
+    if shape == "arcs":
+        heard = heard_sums(link, peers)
+    parts = np.split(heard, np.cumsum(counts)[:-1])
+    return [Fraction(one[0]) if np.all(one == one[0]) else one.astype(np.float64) for one in parts]
 
 
 def recounted(system: CompiledSystem, counts: Mapping[str, Fraction], place: Place) -> CompiledSystem:

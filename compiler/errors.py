@@ -32,7 +32,7 @@ class Place:
 
     def shifted(self, columns: int) -> Place:
         """Return the place `columns` further right on the same line."""
-        return Place(self.file, self.line, self.column + columns, self.source_line)
+        return replace(self, column=self.column + columns)
 
 
 def visible(text: str) -> str:
@@ -40,8 +40,6 @@ def visible(text: str) -> str:
 
     Line breaks, tabs and spaces stay. So a JSON document stays one.
     """
-    if text.isascii() and text.isprintable():
-        return text
     return "".join(
         c if c.isprintable() or c in "\n\t" or unicodedata.category(c) == "Zs" else _escaped(c) for c in text
     )
@@ -86,8 +84,7 @@ class Mistake:
         if not (self.place.line and line.strip()):
             return text
         # A long line is shown around its fault only; a tab or control character would move the caret.
-        start = max(0, self.place.column - 1 - SHOWN // 2) if len(line) > SHOWN else 0
-        start = min(start, max(0, len(line) - SHOWN))
+        start = max(0, min(self.place.column - 1 - SHOWN // 2, len(line) - SHOWN))
         shown = "".join(c if c.isprintable() else " " for c in line[start : start + SHOWN])
         return f"{text}\n    {shown}\n    {' ' * (self.place.column - 1 - start)}^"
 
@@ -113,7 +110,7 @@ class Mistake:
 
 def _in_one_line(text: str) -> str:
     """Return a text in one line, whatever it quotes."""
-    return visible("".join(" " if c.isspace() else c for c in text))
+    return visible(re.sub(r"\s", " ", text))
 
 
 class ApcError(Exception):

@@ -106,8 +106,7 @@ def read_file(path: Path, most: int) -> bytes:
     """
     texts = _replay.get()
     data = _read(path, most) if texts is None else _replayed(str(path), texts)
-    if len(data) > most:  # it grew meanwhile
-        raise _too_large(most)
+    _check_size(len(data), most)  # it may have grown meanwhile
     _note(str(path), data)
     return data
 
@@ -145,13 +144,13 @@ def _check(found: os.stat_result, most: int) -> None:
         raise RefusedError("special", "is a device, pipe or socket")
     if found.st_dev in _kernels_devices():
         raise RefusedError("special", KERNELS_OWN)
-    if found.st_size > most:
-        raise _too_large(most)
+    _check_size(found.st_size, most)
 
 
-def _too_large(most: int) -> RefusedError:
-    size = f"{most >> 20} MiB" if most % (1 << 20) == 0 else f"{most:,} bytes"
-    return RefusedError("large", f"is larger than {size}, the most it may have")
+def _check_size(size: int, most: int) -> None:
+    if size > most:
+        limit = f"{most >> 20} MiB" if most % (1 << 20) == 0 else f"{most:,} bytes"
+        raise RefusedError("large", f"is larger than {limit}, the most it may have")
 
 
 def _kernels_devices() -> set[int]:
@@ -208,10 +207,9 @@ def _raise(error: OSError) -> None:
 
 def same_file(one: Path, other: Path) -> bool:
     """Return whether two paths lead to one file that exists."""
-    try:
+    with suppress(OSError, ValueError):
         return one.samefile(other)
-    except (OSError, ValueError):
-        return False
+    return False
 
 
 def write_file(path: Path, write: Callable[[Path], object]) -> None:
@@ -261,7 +259,7 @@ def _writing(path: Path, *others: type[ValueError]) -> Iterator[None]:
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file, whole or not at all. Raises ApcError (E601) if it can't be written."""
-    write_file(path, lambda temporary: temporary.write_bytes(content))
+    write_file(path, partial(Path.write_bytes, data=content))
 
 
 def write_text(path: Path, text: str) -> None:
@@ -271,11 +269,7 @@ def write_text(path: Path, text: str) -> None:
 
 def write_texts(texts: Mapping[Path, str]) -> None:
     """Write texts that belong together, all or none. Raises ApcError (E601) if one can't be written."""
-    _write_all({path: partial(_fill, text.encode()) for path, text in texts.items()})
-
-
-def _fill(content: bytes, temporary: Path) -> None:
-    temporary.write_bytes(content)
+    _write_all({path: partial(Path.write_bytes, data=text.encode()) for path, text in texts.items()})
 
 
 def check_target(path: Path) -> None:
@@ -395,19 +389,17 @@ def _target(path: Path) -> Path:
 
 def is_special(path: Path) -> bool:
     """Return whether a path leads to what is written to in place: a device, a pipe, our standard output."""
-    try:
+    with suppress(OSError, ValueError):
         mode = path.stat().st_mode
-    except (OSError, ValueError):
-        return False
-    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)) or is_stdout(path)
+        return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)) or is_stdout(path)
+    return False
 
 
 def is_stdout(path: Path) -> bool:
     """Return whether a path leads to where our standard output goes, by whatever name, a file included."""
-    try:
+    with suppress(OSError, ValueError):
         return os.path.samestat(path.stat(), os.fstat(STDOUT))
-    except (OSError, ValueError):
-        return False
+    return False
 
 
 def _drain(path: Path) -> int:

@@ -36,13 +36,13 @@ class Interpolation:
         """The slopes of its lines, 0 before the first row and after the last (n + 1,)."""
         return np.pad(np.diff(self.numbers) / np.diff(self.times), 1)
 
-    def value(self, at: Any, number: Callable[[float], Any]) -> Any:
+    def value(self, at: Any, number: Callable[[float], Any] = float) -> Any:
         """Return what the table says at a number of some kind, which a float is turned into by `number`."""
         place = bisect.bisect_right(self.times, float(at))
         low, start = (number(float(one[max(place - 1, 0)])) for one in (self.numbers, self.times))
         return low + self.slope(at, number) * (at - start) if 0 < place < len(self.times) else low
 
-    def slope(self, at: Any, number: Callable[[float], Any]) -> Any:
+    def slope(self, at: Any, number: Callable[[float], Any] = float) -> Any:
         """Return how fast that changes with it."""
         place = bisect.bisect_right(self.times, float(at))
         if place in (0, len(self.times)):
@@ -81,18 +81,13 @@ def function_of(table: Interpolation) -> Any:
 
 def table_of(function: Any) -> Interpolation:
     """Return the table that a function of CasADi's looks up: one of `function_of`, or a derivative of it."""
-    work = [function]
-    while work:
-        one = work.pop()
+    for one in (function, *function.find_functions()):
         for k in range(one.n_instructions()):
-            code = one.instruction_id(k)
-            if code == casadi.OP_CONST:
+            if one.instruction_id(k) == casadi.OP_CONST:
                 constant = one.instruction_MX(k).to_DM()
                 if constant.size1() == 2:
                     times, numbers = np.asarray(constant)
                     return Interpolation(times, numbers)
-            elif code == casadi.OP_CALL:
-                work.append(one.instruction_MX(k).which_function())
     raise ValueError(f"{function.name()} is no table of ours")
 
 

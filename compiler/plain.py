@@ -67,17 +67,28 @@ RULES: dict[str, Callable[..., Any]] = {
     "or": lambda a, b: int(a != 0 or b != 0),
     # The product with a condition: zero whatever b is, when the condition is false.
     "if_else_zero": lambda a, b: b if a != 0 else 0 * b,
-    LOOK: lambda table, at: table.value(at, float),
-    SLOPE: lambda table, at: table.slope(at, float),
+    LOOK: Interpolation.value,
+    SLOPE: Interpolation.slope,
 }
 
 # Those that have no rational value of a rational number.
 ROUNDED: dict[str, Callable[..., float]] = {
     name: getattr(math, name)
-    for name in (
-        *("sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
+    for name in [
+        "sqrt",
+        "exp",
+        "log",
+        "sin",
+        "cos",
+        "tan",
+        "asin",
+        "acos",
+        "atan",
+        "sinh",
+        "cosh",
+        "tanh",
         "atan2",
-    )
+    ]
 }
 _CODES = {
     word: getattr(casadi, f"OP_{word.upper()}")

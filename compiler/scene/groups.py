@@ -189,8 +189,9 @@ class GroupReader:
             with mistakes:
                 what = f"a heading names {brief(column.name)}, which is no number of a part"
                 item, wholes = self._settable(column.name, column.place, group.name, "E702", what)
-                for whole in columns.keys() & wholes | values.keys() & wholes:
-                    mistakes.add("E702", column.place, f"{whole} is given by set and by the table")
+                for whole in wholes:
+                    if whole in columns or whole in values:
+                        mistakes.add("E702", column.place, f"{whole} is given by set and by the table")
                 columns |= dict.fromkeys(wholes, column.numbers)
                 assert table is not None and isinstance(item, Number | Variable)
                 _check_column(column, table.lines, item, mistakes)

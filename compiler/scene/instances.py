@@ -220,8 +220,7 @@ def settable_names(parts: Iterable[Part]) -> dict[str, tuple[Settable, list[str]
         elements = product(
             *(dict.fromkeys((name, whole_and_index(name)[0])) for name in part.name.split("."))
         )
-        for name in map(".".join, elements):
-            for item in items:
-                _, wholes = found.setdefault(f"{name}.{item.name}", (item, []))
-                wholes.append(f"{part.name}.{item.name}")
+        for name, item in product(map(".".join, elements), items):
+            _, wholes = found.setdefault(f"{name}.{item.name}", (item, []))
+            wholes.append(f"{part.name}.{item.name}")
     return found

@@ -91,8 +91,9 @@ class SceneChannel:
         """What it is, in words."""
         lines = []
         if self.loss:
-            p, r, one_minus_h, one_minus_k = (float(100 * value.number) for _, value in self.loss)
-            lines.append(f"loss: p {p:.6g} %, r {r:.6g} %, 1-h {one_minus_h:.6g} %, 1-k {one_minus_k:.6g} %")
+            four = zip(PROBABILITIES, self.loss, strict=True)
+            shares = (f"{key} {float(100 * value.number):.6g} %" for key, (_, value) in four)
+            lines.append(f"loss: {', '.join(shares)}")
         if self.jitter is not None:
             lines.append(f"jitter {float(1000 * self.jitter.number):.6g} ms, {self.distribution}")
         if self.trace is not None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from apc.compiler.cache import SUFFIX
@@ -74,7 +74,7 @@ class Scene:
     region: tuple[Axis, ...]
     texts: tuple[str, ...]
     place: Place
-    warnings: tuple[Mistake, ...] = ()
+    warnings: tuple[Mistake, ...]
 
     @property
     def peers(self) -> int:
@@ -157,21 +157,26 @@ def build_scene(source: Source, library: Library) -> Scene:
         for name, value in link.channel.loss if link.channel is not None else ():
             if value.expression is None:
                 settable[name] = PROBABILITY, [name]
-    scene = Scene(
-        visible(root.text("topology")),
-        visible(root.text("about")),
+    experiment, region = (
+        read_experiment(root, numbers),
+        read_region(root, settable, numbers, names.is_reported),
+    )
+    name, about = (visible(root.text(key)) for key in ("topology", "about"))
+    mistakes.raise_if_any()  # before warnings, which would tell a second time what is missing for a mistake
+    return Scene(
+        name,
+        about,
         tuple(clocks.values()),
         tuple(numbers.values.items()),
         groups,
         others,
         tuple(links),
-        read_experiment(root, numbers),
-        read_region(root, settable, numbers, names.is_reported),
+        experiment,
+        region,
         tuple(sorted(files.names)),
         root.place,
+        oddities(parts, entries, groups),
     )
-    mistakes.raise_if_any()  # before warnings, which would tell a second time what is missing for a mistake
-    return replace(scene, warnings=oddities(parts, entries, groups))
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,18 +194,22 @@ class _Names:
         nodes = self.root.nodes
         return "masses" in nodes and all(isinstance(nodes.get(key), Mapping | None) for key in SECTIONS)
 
+    @property
+    def links(self) -> list[str]:
+        """The names of the links."""
+        return [name for name, entry in self.sections.entries.items() if entry.section == "links"]
+
     def of_role(self, role: str, word: str) -> Collection[str]:
         """Return the clocks or links, unused ones first. Raises what is wrong with their section."""
         section = f"{role}s"
-        node, entries = self.root.nodes.get(section), self.sections.entries
+        node = self.root.nodes.get(section)
         if word and node is None:
             example = "clocks: {haptic: 1 ms}" if role == "clock" else "links: {lan: {clock: network}}"
             raise fault("E201", self.root.place, f"the topology has no {section} section", hint=example)
-        links = [name for name, entry in entries.items() if entry.section == "links"]
-        known = self.clocks if role == "clock" else links
+        known = self.clocks if role == "clock" else self.links
         if word and word not in known and not (isinstance(node, Mapping) and node.get(word) is None):
             raise AlreadyReportedError
-        said = set[str]().union(*(entry.words for entry in entries.values())) if not word else set()
+        said = () if word else {one for entry in self.sections.entries.values() for one in entry.words}
         return sorted(known, key=lambda name: name in said)
 
     def is_reported(self, name: str) -> bool:
@@ -208,15 +217,10 @@ class _Names:
         part = re.split(r"[.\[]", name)[0]
         return part in self.sections.faulty or (not self.complete and part not in self.sections.entries)
 
-    def is_of_link(self, name: str) -> bool:
-        """Return whether `part.parameter` is of a link."""
-        entry = self.sections.entries.get(name.partition(".")[0])
-        return entry is not None and entry.section == "links"
-
     def explain(self, name: str, place: Place) -> None:
         """Raise why a group can't set `part.parameter`, if that is known or was reported."""
-        if self.is_of_link(name):
-            link, _, parameter = name.partition(".")
+        link, _, parameter = name.partition(".")
+        if link in self.links:
             example = f"{link}: {{delays: {{{self.groups[0]}: {{{self.groups[-1]}: 12 ms}}}}}}"
             what = f"{name} is of a link, the same for all peers: a group can't set it"
             raise fault("E211", place, what, hint=example if parameter == "delay" else "")
