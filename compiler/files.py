@@ -31,6 +31,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 # Of a folder of a user's components: the largest library we know of has a hundred files, three deep.
 MOST_ENTRIES = 10_000
 MOST_DEPTH = 8
+NO_NAME = OSError, ValueError  # what the system and Python say of a name that can't be one
 STDOUT = 1  # the descriptor of standard output
 KERNELS = ("/proc", "/sys")  # file systems whose files are answers of the kernel
 KERNELS_OWN = "is an answer of the system's kernel"
@@ -235,7 +236,7 @@ def _write_all(writers: Mapping[Path, Callable[[Path], object]]) -> None:
     ready: dict[Path, Path] = {}
     try:
         for path, write in writers.items():
-            with _writing(path, ValueError):  # of a name that can't be one
+            with _writing(path, NO_NAME):
                 ready[path] = begin_file(path)
             with _writing(path):
                 write(ready[path])
@@ -249,11 +250,13 @@ def _write_all(writers: Mapping[Path, Callable[[Path], object]]) -> None:
 
 
 @contextmanager
-def _writing(path: Path, *others: type[ValueError]) -> Iterator[None]:
+def _writing(
+    path: Path, kinds: type[OSError] | tuple[type[OSError], type[ValueError]] = OSError
+) -> Iterator[None]:
     """Turn what the system says of a file that is to be written into ApcError (E601)."""
     try:
         yield
-    except (OSError, *others) as error:
+    except kinds as error:
         raise unwritable(path, error) from error
 
 
@@ -274,7 +277,7 @@ def write_texts(texts: Mapping[Path, str]) -> None:
 
 def check_target(path: Path) -> None:
     """Refuse a place where nothing can be written, before anything is computed: ApcError E601."""
-    with _writing(path, ValueError):
+    with _writing(path, NO_NAME):
         drop_file(begin_file(path))
 
 

@@ -74,21 +74,10 @@ RULES: dict[str, Callable[..., Any]] = {
 # Those that have no rational value of a rational number.
 ROUNDED: dict[str, Callable[..., float]] = {
     name: getattr(math, name)
-    for name in [
-        "sqrt",
-        "exp",
-        "log",
-        "sin",
-        "cos",
-        "tan",
-        "asin",
-        "acos",
-        "atan",
-        "sinh",
-        "cosh",
-        "tanh",
+    for name in (
+        *("sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
         "atan2",
-    ]
+    )
 }
 _CODES = {
     word: getattr(casadi, f"OP_{word.upper()}")

@@ -89,7 +89,7 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
     return Graph("arcs", np.array([*found], np.int64).reshape(-1, 2), np.array([*found.values()]))
 
 
-def _pairs_of(table: Table) -> tuple[Sequence, ...]:
+def _pairs_of(table: Table) -> tuple[Node, ...]:
     """Return the rows of a table with the columns from, to and weight or none as pairs."""
     names, place = [column.name for column in table.columns], table.columns[0].place
     if names not in (["from", "to"], ["from", "to", "weight"]):
@@ -119,8 +119,9 @@ def _arc(pair: Node, what: str, numbered: Mapping[str, int], mistakes: Mistakes)
     ends: list[int] = []
     for node in pair.items[:2]:
         with mistakes:
-            text = node.text if isinstance(node, Scalar) else ""
-            if text not in numbered or (text.isdigit() and not node.plain):
+            quoted = isinstance(node, Scalar) and node.text.isdigit() and not node.plain
+            text = node.text if isinstance(node, Scalar) and not quoted else ""
+            if text not in numbered:
                 first = next((name for name in numbered if name.endswith("]")), "user[1]")
                 numbers = f'a number from 1 to {len(numbered) // 2}, or a name in quotes such as "{first}"'
                 raise fault("E213", node.place, "a peer", numbers, form(node))

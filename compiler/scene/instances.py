@@ -173,7 +173,8 @@ def _inside(part: Part, inner: Inner, peers: int) -> Part:
     """Return a part inside a part; its numbers are expressions over the outer one's, in whole names."""
     entry, references = inner.entry, dict(part.references)
     tables = {table.name: table for table in part.tables}
-    numbers = {PEERS: Fraction(peers)} | {(name,): value.number for name, value in part.values}
+    numbers: dict[tuple[str, ...], Fraction] = {(name,): value.number for name, value in part.values}
+    numbers[PEERS] = Fraction(peers)
 
     def whole(parts: tuple[str, ...]) -> tuple[str, ...]:
         return parts if parts == PEERS else (*part.name.split("."), *parts)
