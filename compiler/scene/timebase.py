@@ -53,17 +53,16 @@ def read_clocks(root: Body, numbers: NamedNumbers, taken: Container[str]) -> dic
 
 def _read_clock(name: str, node: Node, numbers: NamedNumbers, root: Body) -> SceneClock:
     """Read a period, or a mapping of a period and a phase."""
-    period: Value | None
-    phase: Value | None = Value(Fraction(0), SECOND, None, node.place)
+    phase = Value(Fraction(0), SECOND, None, node.place)
     if isinstance(node, Mapping):
         body = Body(node, CLOCK, f"clock {name}", root.mistakes)
         if "period" not in body.nodes:
             raise fault("E201", node.place, f"clock {name} has no period", hint="period: 1 ms")
-        period = body.read("period", numbers.read_time, None)
-        if "phase" in body.nodes:
-            phase = body.read("phase", numbers.read_time, None)
-        if period is None or phase is None:
+        given = body.read("period", numbers.read_time, None)
+        shift = body.read("phase", numbers.read_time, None if "phase" in body.nodes else phase)
+        if given is None or shift is None:
             raise AlreadyReportedError
+        period, phase = given, shift
     elif isinstance(node, Scalar) and type(node.value) in (int, float) and node.plain:
         rates = f"{name}: {node.text} Hz", f"{name}: {node.text} ms"
         hint = ", or ".join(rates if abs(float(node.text)) > LIKE_A_RATE else reversed(rates))
