@@ -41,13 +41,11 @@ def visible(text: str) -> str:
     Line breaks, tabs and spaces stay. So a JSON document stays one.
     """
     return "".join(
-        c if c.isprintable() or c in "\n\t" or unicodedata.category(c) == "Zs" else _escaped(c) for c in text
+        c
+        if c.isprintable() or c in "\n\t" or unicodedata.category(c) == "Zs"
+        else re.sub("(....)", r"\\u\1", c.encode("utf-16-be", "surrogatepass").hex())
+        for c in text
     )
-
-
-def _escaped(character: str) -> str:
-    digits = character.encode("utf-16-be", "surrogatepass").hex()
-    return "".join(f"\\u{digits[at : at + 4]}" for at in range(0, len(digits), 4))
 
 
 def place_in(place: Place, text: str, offset: int) -> Place:

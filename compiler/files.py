@@ -13,6 +13,7 @@ Does not: know a format, or say at which line a file was named.
 
 from __future__ import annotations
 
+import glob
 import os
 import platform
 import shutil
@@ -163,7 +164,7 @@ def _without_waiting(name: str, flags: int) -> int:
     return os.open(name, flags | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0))
 
 
-def _reason(error: OSError | ValueError) -> str:
+def _reason(error: Exception) -> str:
     return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
 
 
@@ -236,12 +237,12 @@ def _write_all(writers: Mapping[Path, Callable[[Path], object]]) -> None:
     ready: dict[Path, Path] = {}
     try:
         for path, write in writers.items():
-            with _writing(path, NO_NAME):
+            with _writing(path, *NO_NAME):
                 ready[path] = begin_file(path)
-            with _writing(path):
+            with _writing(path, OSError):
                 write(ready[path])
         for path in writers:
-            with _writing(path):
+            with _writing(path, OSError):
                 finish_file(ready[path], path)
                 del ready[path]
     finally:
@@ -250,10 +251,8 @@ def _write_all(writers: Mapping[Path, Callable[[Path], object]]) -> None:
 
 
 @contextmanager
-def _writing(
-    path: Path, kinds: type[OSError] | tuple[type[OSError], type[ValueError]] = OSError
-) -> Iterator[None]:
-    """Turn what the system says of a file that is to be written into ApcError (E601)."""
+def _writing(path: Path, *kinds: type[Exception]) -> Iterator[None]:
+    """Turn what is said of a file that is to be written, if of such a kind, into ApcError (E601)."""
     try:
         yield
     except kinds as error:
@@ -277,11 +276,11 @@ def write_texts(texts: Mapping[Path, str]) -> None:
 
 def check_target(path: Path) -> None:
     """Refuse a place where nothing can be written, before anything is computed: ApcError E601."""
-    with _writing(path, NO_NAME):
+    with _writing(path, *NO_NAME):
         drop_file(begin_file(path))
 
 
-def unwritable(path: Path, error: OSError | ValueError) -> ApcError:
+def unwritable(path: Path, error: Exception) -> ApcError:
     """Return the message (E601) of a file or folder that can't be written."""
     return ApcError(Mistake("E601", Place(str(path)), f"can't be written: {_reason(error)}"))
 
@@ -313,9 +312,8 @@ def begin_file(path: Path) -> Path:
     handle, name = tempfile.mkstemp(UNFINISHED, f"{prefix}{os.getpid()}.", folder)
     os.close(handle)
     with suppress(OSError):  # a folder may be written to and not be read
-        for left in folder.iterdir():
-            if left.name.startswith(prefix) and left.name.endswith(UNFINISHED):
-                _remove_left(left, left.name.removeprefix(prefix).partition(".")[0])
+        for left in folder.glob(f"{glob.escape(prefix)}*{UNFINISHED}"):
+            _remove_left(left, left.name.removeprefix(prefix).partition(".")[0])
     return Path(name)
 
 
@@ -349,14 +347,14 @@ def finish_file(temporary: Path, path: Path) -> None:
     target = _target(path)
     try:
         before = target.stat()
+        mode = stat.S_IMODE(before.st_mode)
+        with suppress(OSError, AttributeError):  # only root may give it away; and not on Windows
+            os.chown(temporary, before.st_uid, before.st_gid)
     except FileNotFoundError:
         mask = os.umask(0)
         os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
-    else:
-        with suppress(OSError, AttributeError):  # only root may give it away; and not on Windows
-            os.chown(temporary, before.st_uid, before.st_gid)
-        temporary.chmod(stat.S_IMODE(before.st_mode))
+        mode = 0o666 & ~mask
+    temporary.chmod(mode)
     temporary.replace(target)
 
 
@@ -372,7 +370,7 @@ def unlink_link(path: Path) -> None:
 
     Raises ApcError (E601) if it can't be removed.
     """
-    with _writing(path):
+    with _writing(path, OSError):
         if path.is_symlink():
             path.unlink()
 

@@ -8,11 +8,12 @@ Does not: look into equations, or decide what was meant.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 from scipy.cluster.hierarchy import DisjointSet
 
 from apc.compiler.components.parts import PartEntry
-from apc.compiler.errors import Mistake, Mistakes, Place
+from apc.compiler.errors import Mistake, Mistakes
 from apc.compiler.scene.groups import SceneGroup
 from apc.compiler.scene.instances import Part
 
@@ -85,7 +86,6 @@ def _joined(parts: Sequence[Part]) -> DisjointSet:
 def warning_texts(warnings: Collection[Mistake]) -> tuple[str, ...]:
     """Return warnings as texts, each with its place in the topology, whose folder is left out."""
     return tuple(
-        f"{Place(one.place.file.rpartition('/')[2], one.place.line, one.place.column)}: "
-        f"{one.code} {one.sentence}"
+        f"{replace(one.place, file=one.place.file.rpartition('/')[2])}: {one.code} {one.sentence}"
         for one in warnings
     )
