@@ -285,7 +285,7 @@ def with_rounded(scene: Scene, kind: Kind, links: Sequence[Link]) -> Kind:
     rounded = []
     for link in links:
         if count_of(link.name) in kind.parameters and link.graph.shape == "arcs":
-            values = heard_sums(link, scene.peers).values
+            values = set(heard_sums(link, scene.peers).tolist())
             if len(set(map(float, values))) < len(values):
                 what = f"what two peers hear over {link.name} adds up to sums that doubles can't tell apart"
                 raise ApcError(Mistake("E217", places[link.name], what, hint="weights of at most 15 digits"))

@@ -59,7 +59,7 @@ def _read_clock(name: str, node: Node, numbers: NamedNumbers, root: Body) -> Sce
         if "period" not in body.nodes:
             raise fault("E201", node.place, f"clock {name} has no period", hint="period: 1 ms")
         given = body.read("period", numbers.read_time, None)
-        shift = body.read("phase", numbers.read_time, phase if "phase" not in body.nodes else None)
+        shift = body.read("phase", numbers.read_time, None if "phase" in body.nodes else phase)
         if given is None or shift is None:
             raise AlreadyReportedError
         period, phase = given, shift
