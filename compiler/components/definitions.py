@@ -102,7 +102,7 @@ def _read_declarations(root: Body, library: Definitions, mistakes: Mistakes) -> 
         name = name_of(title, "a component") if isinstance(title, Scalar) else name
     place = title.place
     about, cited = root.text("about"), root.text("source")
-    base = Component("", "", "", (), (), (), (), (), (), (), (), place)
+    base = Component("", "", "", place)
     base = root.read("extends", lambda node, key: _base(node, key, library), base)
     connectors, grips = _connectors(root, library, mistakes)
     parameters, variables = read_parameters(root), read_variables(root)
