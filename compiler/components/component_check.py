@@ -19,7 +19,6 @@ from itertools import count
 from typing import TypeVar
 
 from apc.compiler.components.component import OTHERS, Component, Option, Send, option_test
-from apc.compiler.components.declarations import Written
 from apc.compiler.errors import ApcError, Mistakes, Place, place_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import (
@@ -51,6 +50,8 @@ from apc.compiler.words import counted
 _TRUE = Compare("==", Literal(Fraction(1)), Literal(Fraction(1)))
 
 Path = tuple[str, ...]  # a name in an equation, between its dots
+Where = Equation | Send  # what an expression stands in
+Written = tuple[Expr, Where]
 T = TypeVar("T")
 
 
@@ -88,21 +89,25 @@ class ComponentNames:
         """Return the size of a name: 0 for a number, None for what is to be inferred."""
         return self.sizes.get(parts, 0)
 
-    def completed(self, sends: Mapping[str, Written], mistakes: Mistakes) -> Component:
-        """Return the component with its locals and what it sends, checked, its vectors entry by entry."""
+    def completed(self, sends: Collection[Send], mistakes: Mistakes) -> Component:
+        """Return the component with its locals and what it sends, checked, its vectors entry by entry.
+
+        The dimensions of `sends` are found here.
+        """
         locals_, sent, equations = self._infer_locals(sends), list[Send](), list[Equation]()
-        for name, (expression, text, place) in sends.items():
+        for send in sends:
             with mistakes:
-                written = written_out(expression, self.size_of, text, place)  # or its sizes do not fit
-                dimension = _known(self._dimension(expression, text, place))
-                each = written if isinstance(written, tuple) else (written or expression,)
-                named = entries(name, len(each) if each is written else 0)
-                sent += [Send(n, one, text, place, dimension) for n, one in zip(named, each, strict=True)]
+                written = written_out(send.expression, self.size_of, send.text, send.place)
+                dimension = _known(self._dimension(send.expression, send))
+                each = written if isinstance(written, tuple) else (written or send.expression,)
+                named = entries(send.name, len(each) if each is written else 0)
+                pairs = zip(named, each, strict=True)
+                sent += [replace(send, name=n, expression=one, dimension=dimension) for n, one in pairs]
         own = self.component
         if not mistakes:
-            for name, it in sends.items():
+            for send in sends:
                 with mistakes:
-                    self._check_sent(name, *it)
+                    self._check_sent(send)
             for equation in own.equations:
                 with mistakes:
                     equations += self._checked(equation, mistakes)
@@ -110,20 +115,21 @@ class ComponentNames:
             own, locals=(*own.locals, *locals_), sends=(*own.sends, *sent), equations=tuple(equations)
         )
 
-    def _infer_locals(self, sends: Mapping[str, Written]) -> list[tuple[str, Dimension]]:
+    def _infer_locals(self, sends: Collection[Send]) -> list[tuple[str, Dimension]]:
         """Return the undeclared names that stand alone on the left of an equation, a vector's entry by entry.
 
         What one is may hang on another, on itself, or on what is sent. An unknown name on the right is
         reported once, by `_checked`.
         """
-        undeclared: dict[Path, Written] = {
-            equation.left.parts: (equation.right, equation.text, equation.place)
+        undeclared = {
+            equation.left.parts: (equation.right, equation)
             for equation in reversed(self.component.equations)
             if isinstance(equation.left, Name)
             and ".".join(equation.left.parts).isidentifier()
             and equation.left.parts not in self.dimensions
         }
-        waiting = {(OTHERS, name): written for name, written in sends.items()} | undeclared
+        waiting: dict[Path, Written] = {(OTHERS, send.name): (send.expression, send) for send in sends}
+        waiting |= undeclared
         self.dimensions |= dict.fromkeys(waiting)
         self.sizes |= dict.fromkeys(waiting)
         _settle(waiting, self._size, self.sizes)
@@ -140,30 +146,30 @@ class ComponentNames:
         """Return the paths of a vector's entries, or that of a number."""
         return [(*path[:-1], one) for one in entries(path[-1], self.size_of(path) or 0)]
 
-    def _size(self, expression: Expr, text: str, place: Place) -> int | None:
+    def _size(self, expression: Expr, where: Where) -> int | None:
         """Return the size of an expression; 0 of one at fault, which `_checked` reports."""
         with Mistakes():
-            found = written_out(expression, self.size_of, text, place)
+            found = written_out(expression, self.size_of, where.text, where.place)
             return len(found) if isinstance(found, tuple) else None if found is None else 0
         return 0
 
-    def _inferred(self, expression: Expr, text: str, place: Place) -> Dimension | None:
+    def _inferred(self, expression: Expr, where: Where) -> Dimension | None:
         with Mistakes():
-            return self._dimension(expression, text, place)
+            return self._dimension(expression, where)
         return None
 
     def _checked(self, equation: Equation, mistakes: Mistakes) -> tuple[Equation, ...]:
         """Return an equation for each entry of it. Raises ApcError for names and sizes; records units."""
         sides, wrong = [self._decided(side) for side in (equation.left, equation.right)], Mistakes()
         for side in sides:
-            self._check_names(side, equation.text, equation.place, wrong)
-            self._check_reductions(side, equation.text, equation.place, wrong)
+            self._check_names(side, equation, wrong)
+            self._check_reductions(side, equation, wrong)
         wrong.raise_if_any()
         with mistakes:
             check_equation(replace(equation, left=sides[0], right=sides[1]), self._lookup)
         return written_equation(equation, self.size_of)
 
-    def _check_reductions(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> None:
+    def _check_reductions(self, expression: Expr, where: Where, mistakes: Mistakes) -> None:
         """Record a reduction that doesn't run over the other peers, and an age of what is not heard."""
         for node in walk(expression):
             if not isinstance(node, Call):
@@ -186,18 +192,18 @@ class ComponentNames:
                 what, expected = function, "two values, or one of the other peers"
             else:
                 continue
-            where, got = place_in(place, text, node.start), format_expression(node)
-            mistakes.add("E506", where, what, expected=expected, got=got, hint=hint)
+            got = format_expression(node)
+            mistakes.add("E506", _place(where, node), what, expected=expected, got=got, hint=hint)
 
-    def _check_sent(self, sent: str, expression: Expr, text: str, place: Place) -> None:
+    def _check_sent(self, send: Send) -> None:
         """Refuse a send of what is heard: that is known at ticks of the clock, not of the link."""
-        for heard in names(expression):
+        for heard in names(send.expression):
             if heard.parts[0] == OTHERS:
                 name = next(one for n in count(1) if (one := f"sent{n}",) not in self.dimensions)
-                what = f"{sent} is sent at ticks of the link, and {format_expression(heard)} is heard at"
-                hint = f"{name} = {text} among the equations, and sends: {{{sent}: sample(hold({name}))}}"
-                where = place_in(place, text, heard.start)
-                raise fault("E505", where, f"{what} those of the clock", hint=hint)
+                what = f"{send.name} is sent at ticks of the link, and {format_expression(heard)} is heard at"
+                sample = f"{{{send.name}: sample(hold({name}))}}"
+                hint = f"{name} = {send.text} among the equations, and sends: {sample}"
+                raise fault("E505", _place(send, heard), f"{what} those of the clock", hint=hint)
 
     def _decided(self, expression: Expr) -> Expr:
         """Return the expression without what has no dimension: words of options, and clocks to sample at.
@@ -217,19 +223,19 @@ class ComponentNames:
         """Return the dimension of a checked expression, or None if it is a variable, which has its own."""
         if isinstance(expression, Name) and expression.parts in self.variables:
             return None
-        return _known(self._dimension(expression, text, place))
+        return _known(self._dimension(expression, Equation(expression, expression, text, place)))
 
-    def _dimension(self, expression: Expr, text: str, place: Place) -> Dimension | None:
+    def _dimension(self, expression: Expr, where: Where) -> Dimension | None:
         """Return the dimension of an expression. Raises ApcError for its names and units."""
         expression, wrong = self._decided(expression), Mistakes()
-        self._check_names(expression, text, place, wrong)
+        self._check_names(expression, where, wrong)
         wrong.raise_if_any()
-        return dimension_of(expression, self._lookup, text, place)
+        return dimension_of(expression, self._lookup, where.text, where.place)
 
     def _lookup(self, name: Name) -> Dimension | None:
         return self.dimensions.get(name.parts)
 
-    def _check_names(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> None:
+    def _check_names(self, expression: Expr, where: Where, mistakes: Mistakes) -> None:
         """Record names that nothing of the component has, and words that an option hasn't got."""
         told = set[int]()
         for node in walk(expression):
@@ -238,10 +244,10 @@ class ComponentNames:
                     # Else it was decided.
                     told |= {node.left.start, right.start}
                     word, words = format_expression(right), self.options[name].words
-                    what, at = f"{name} has no option {brief(word)}", place_in(place, text, right.start)
+                    what, at = f"{name} has no option {brief(word)}", _place(where, right)
                     mistakes.take(unknown("E206", at, what, word, words))
-                case Name(parts, start=start) if parts not in self.dimensions and start not in told:
-                    mistakes.take(self._unknown(parts, place_in(place, text, start)))
+                case Name(parts) if parts not in self.dimensions and node.start not in told:
+                    mistakes.take(self._unknown(parts, _place(where, node)))
 
     def _unknown(self, parts: Path, place: Place) -> ApcError:
         """Return the mistake of a name there isn't, of an entry that a vector hasn't got among them."""
@@ -262,9 +268,13 @@ class ComponentNames:
         return unknown("E303", place, f"{self.component.name} has no {brief(shown)}", shown, known)
 
 
+def _place(where: Where, node: Expr) -> Place:
+    return place_in(where.place, where.text, node.start)
+
+
 def _settle(
     waiting: Mapping[Path, Written],
-    infer: Callable[[Expr, str, Place], T | None],
+    infer: Callable[[Expr, Where], T | None],
     known: dict[Path, T | None],
 ) -> None:
     """Infer something of each name, which may hang on others: each round settles some, while any can be."""
