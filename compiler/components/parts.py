@@ -264,7 +264,7 @@ class _EntryReader:
                 with self.mistakes:
                     values = self._vector(nodes[name], name, len(one))
                 nodes.update(zip(one, values, strict=True))
-        for name, parameters in by_vector(component.parameters, lambda one: one.name).items():
+        for name, parameters in by_vector(component.parameters).items():
             due = [self._due(one) for one in parameters if one.name not in nodes]
             if any(due):
                 missing[name] = due[0] if len(due) == 1 else f"[{', '.join(due)}]"

@@ -97,7 +97,7 @@ def component_document(name: str) -> dict[str, Any]:
     kind, whole = "component", found
     if isinstance(whole, Connector):  # it has no parts of its own to tell of
         kind, whole = "connector", Component(name, found.about, "", Place(""))
-    vectors = by_vector(whole.parameters, lambda parameter: parameter.name)
+    vectors = by_vector(whole.parameters)
     return {
         "name": name,
         "kind": kind,

@@ -114,7 +114,7 @@ def _part(component: Component, quantities: dict[str, Schema]) -> Schema:
         about = f"the part, or its connector, that this {connector.name} is joined to"
         properties[name] = {"$ref": "#/$defs/joined", "description": about}
     starts = (variable for variable in component.variables if variable.start is not None)
-    for name, items in by_vector((*component.parameters, *starts), lambda one: one.name).items():
+    for name, items in by_vector((*component.parameters, *starts)).items():
         schemas = [_settable(name, one, quantities) for one in items]
         size, about = len(schemas), schemas[0].get("description", "")
         vector = {"type": "array", "description": about, "prefixItems": schemas}
