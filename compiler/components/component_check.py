@@ -171,25 +171,20 @@ class ComponentNames:
 
     def _check_reductions(self, expression: Expr, where: Where, mistakes: Mistakes) -> None:
         """Record a reduction that doesn't run over the other peers, and an age of what is not heard."""
-        for node in walk(expression):
-            if not isinstance(node, Call):
-                continue
+        for node in (node for node in walk(expression) if isinstance(node, Call)):
             function, others = node.function, [name for name in names(node) if name.parts[0] == OTHERS]
+            heard = [name for name in others if len(name.parts) > 1]
+            what, expected = function, "others.x in it"
             hint = "count(others)" if function == "count" else f"{function}(others.x)"
-            if function == "age":
-                heard = [name for name in others if len(name.parts) > 1]
-                if node.arguments[0] in heard:
-                    continue
+            if function == "age" and node.arguments[0] not in heard:
                 sent = next((send.name for send in self.component.sends), "x")
                 shown = format_expression(heard[0]) if heard else f"{OTHERS}.{sent}"
                 what, expected = "age is of one value that is heard of the others, and", f"{shown} in it"
                 hint = f"age({shown})"
-            elif others:
-                continue
-            elif function in ("mean", "sum", "count"):
-                what, expected = f"{function} runs over the other peers and", "others.x in it"
-            elif function in ("max", "min") and len(node.arguments) == 1:
-                what, expected = function, "two values, or one of the other peers"
+            elif function in ("mean", "sum", "count") and not others:
+                what = f"{function} runs over the other peers and"
+            elif function in ("max", "min") and len(node.arguments) == 1 and not others:
+                expected = "two values, or one of the other peers"
             else:
                 continue
             got = format_expression(node)

@@ -30,6 +30,7 @@ from apc.compiler.language.vectors import entries as names_of
 from apc.compiler.source.nodes import Node, Scalar, Sequence
 from apc.compiler.source.reading import (
     Body,
+    among,
     brief,
     fault,
     form,
@@ -37,7 +38,6 @@ from apc.compiler.source.reading import (
     mapping_of,
     name_of,
     text_of,
-    unknown,
     whole_number,
 )
 
@@ -143,11 +143,11 @@ def _option(name: str, options: Sequence, body: Body) -> Option:
     for item in options.items:
         with body.mistakes:
             words.append(text_of(item, "an option"))
-    default = body.text("default")
-    if default and default not in words:
-        what = f"{name} has no option {brief(default)}"
-        body.mistakes.take(unknown("E206", body.nodes["default"].place, what, default, words))
-    return Option(name, tuple(words), default or None, body.text("about"), options.place)
+
+    def known(node: Node, key: str) -> str:
+        return among(text_of(node, key), words, node.place, f"{name} has no option {{}}")
+
+    return Option(name, tuple(words), body.read("default", known, None), body.text("about"), options.place)
 
 
 def _numbers(name: str, body: Body) -> list[Number]:

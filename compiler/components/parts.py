@@ -10,7 +10,7 @@ Does not: know the sections of a topology.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Protocol, TypeVar
@@ -75,8 +75,9 @@ EXAMPLES = {
 }
 _FAULTY = MappingNode((), Place(""))  # stands for an entry of a vector whose fault was reported
 DEFAULT_TYPES = {"masses": "Mass", "links": "Link"}
+# A part, the first and last elements of an array, a connector.
 _TARGET = re.compile(
-    r"(?P<part>[A-Za-z]\w*)(\[(?P<first>\d{1,6})(:(?P<last>\d{1,6}))?\])?(\.(?P<connector>[A-Za-z]\w*))?\Z",
+    r"([A-Za-z]\w*)(?:\[(\d{1,6})(?::(\d{1,6}))?\])?(?:\.([A-Za-z]\w*))?\Z",
     re.ASCII,
 )
 
@@ -124,6 +125,10 @@ class PartEntry:
     def words(self) -> set[str]:
         """What its keys say in a word."""
         return {value.text for _, value in self.body.entries if isinstance(value, Scalar)}
+
+    def connectors(self, kind: str) -> list[str]:
+        """Return its connectors of a type."""
+        return [name for name, its in self.component.connectors if its.name == kind]
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,214 +232,195 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
     index
         Which element of an array this is.
     """
-    component = entry.component
+    component, within, naming = entry.component, scope.outer, ("clock", "link")
+    if within is not None:
+        naming += ("table",)  # one of the outer component's
     starts = [variable for variable in component.variables if variable.start is not None]
-    units = {one.name: one.unit for one in (*component.numbers, *starts)}
     named = (whole_and_index(one.name)[0] for one in (*component.parameters, *starts))
-    common = PART_KEYS if scope.outer is None else ("count",)
+    common = PART_KEYS if within is None else ("count",)
     keys = dict.fromkeys(("type", *common, *dict(component.connectors), *named))
-    body = Body(entry.body, keys, f"{entry.name} ({component.name})", mistakes)
-    found = _EntryReader(entry, body.nodes, scope, mistakes, index, units).read(starts)
-    targets = [(part, its) for _, part, its in found.connections if part != GROUND]
-    if len(targets) > 1 and len(set(targets)) == 1:
-        mistakes.add("E210", entry.place, f"{entry.name} joins {targets[0][0]} to itself")
-    return found
+    nodes = Body(entry.body, keys, f"{entry.name} ({component.name})", mistakes).nodes
+    for name, vector in by_vector((*component.numbers, *starts)).items():
+        if len(vector) > 1 and name in nodes:  # a key for each entry, x[1], in the place of x: [1 m, 0 m]
+            values: tuple[Node, ...] = (_FAULTY,) * len(vector)
+            with mistakes:
+                values = _vector(nodes[name], name, vector, scope)
+            nodes.update(zip((one.name for one in vector), values, strict=True))
 
-
-@dataclass(frozen=True, slots=True)
-class _EntryReader:
-    """Reads one entry, value by value; what is missing or at fault is reported and left out.
-
-    `units` are those of the numbers, and entries of vectors, that it may give.
-    """
-
-    entry: PartEntry
-    nodes: dict[str, Node]
-    scope: Scope
-    mistakes: Mistakes
-    index: int
-    units: Mapping[str, Unit]
-
-    def read(self, starts: Collection[Variable]) -> Entry:
-        """Read the component's parameters, the start values it may have, and its connectors."""
-        component, nodes, missing = self.entry.component, self.nodes, dict[str, str]()
-        for name, one in by_vector(self.units, str).items():
-            if len(one) > 1 and name in nodes:  # a key for each entry, x[1], in the place of x: [1 m, 0 m]
-                values: tuple[Node, ...] = (_FAULTY,) * len(one)
-                with self.mistakes:
-                    values = self._vector(nodes[name], name, len(one))
-                nodes.update(zip(one, values, strict=True))
-        for name, parameters in by_vector(component.parameters).items():
-            due = [self._due(one) for one in parameters if one.name not in nodes]
-            if any(due):
-                missing[name] = due[0] if len(due) == 1 else f"[{', '.join(due)}]"
-        if missing:
-            hint = ", ".join(f"{key}: {value}" for key, value in missing.items())
-            what = f"{self.entry.name} has no {enumerated(tuple(missing))}"
-            self.mistakes.add("E201", self.entry.place, what, hint=hint)
-        references = [one for one in component.parameters if isinstance(one, Reference)]
-        connections = []
-        for name, kind in component.connectors:
-            with self.mistakes:
-                if (joined := self._connection(name, kind.name)) is not None:
-                    connections.append((name, *joined))
-        return Entry(
-            self._each(component.numbers, self._number),
-            self._each((one for one in component.parameters if isinstance(one, Option)), self._option),
-            self._each((one for one in references if one.role in self._named), self._reference),
-            tuple(
-                (one.name, nodes[one.name])
-                for one in references
-                if one.role not in self._named and one.name in nodes
-            ),
-            self._each(starts, self._number),
-            tuple(connections),
-        )
-
-    def _vector(self, node: Node, name: str, size: int) -> tuple[Node, ...]:
-        """Return a node for each entry of a vector, which inside a component may be an expression."""
-        if isinstance(node, Scalar) and self.scope.outer is not None and not is_quantity(node.text):
-            place = text_place(node)
-            sizes = sizes_of(tuple(known.split(".")) for known in self.scope.names)
-            tree = parse_expression(node.text, place)
-            found = written_out(tree, lambda parts: sizes.get(parts, 0), node.text, place)
-            if isinstance(found, tuple) and len(found) == size:
-                return tuple(replace(node, text=format_expression(one)) for one in found)
-        return list_of(node, name, size, _one(self.units[f"{name}[1]"]))
-
-    @property
-    def _named(self) -> tuple[str, ...]:
-        """The roles of what names something; inside a component, a table is one of the outer's."""
-        return ("clock", "link") if self.scope.outer is None else ("clock", "link", "table")
-
-    def _each(self, items: Iterable[Item], read: Callable[[Item], T | None]) -> Named[T]:
-        """Return what is read of items by their names, those at fault left out."""
-        found = []
-        for item in items:
-            with self.mistakes:
-                if (value := read(item)) is not None:
-                    found.append((item.name, value))
-        return tuple(found)
-
-    def _due(self, parameter: Parameter) -> str:
+    def due(parameter: Parameter) -> str:
         """Return what to write for a parameter that must be given; nothing of one that may be left out."""
         if isinstance(parameter, Reference):
-            named = parameter.role in self._named
-            return next(iter(self.scope.references(parameter.role, "")), "name") if named else ""
+            known = scope.references(parameter.role, "") if parameter.role in naming else [""]
+            return next(iter(known), "name")
         if parameter.default is not None:
             return ""
         return parameter.words[0] if isinstance(parameter, Option) else _one(parameter.unit)
 
-    def _number(self, item: Number | Variable) -> Binding | None:
+    def number(item: Number | Variable) -> Binding | None:
         """Return a parameter's number, the default of one that isn't given, or a variable's start value."""
-        node, unit, words = self.nodes.get(item.name), item.unit, Named[Fraction]()
+        node, unit, words = nodes.get(item.name), item.unit, Named[Fraction]()
         if isinstance(item, Number):
             words = item.words
             if node is None and item.default is not None:
-                return Binding(item.default, None, unit.dimension, self.entry.place)
+                return Binding(item.default, None, unit.dimension, entry.place)
         if node is _FAULTY:
             return None
-        what, known, names = item.name, self.scope.dimension, self.scope.names
-        return read_binding(node, what, unit.dimension, unit.text, known, names, self.mistakes, words=words)
+        what, known = (item.name, unit.dimension, unit.text), (scope.dimension, scope.names)
+        return read_binding(node, *what, *known, mistakes, words=words)
 
-    def _option(self, option: Option) -> str | None:
-        name, words, node = option.name, option.words, self.nodes.get(option.name)
+    def option(item: Option) -> str | None:
+        name, words, node = item.name, item.words, nodes.get(item.name)
         if node is None:
-            return option.default
+            return item.default
         word = text_of(node, name, f"{name}: {words[0]}")
         if word in words:
             return word
-        hint = f"{name}: {option.default or words[0]}"
+        hint = f"{name}: {item.default or words[0]}"
         raise fault("E206", node.place, name, " or ".join(words), brief(word), hint)
 
-    def _reference(self, parameter: Reference) -> str | None:
-        role, within, node = parameter.role, self.scope.outer, self.nodes.get(parameter.name)
-        if node is None:
+    def reference(item: Reference) -> str | None:
+        name, role, node = item.name, item.role, nodes.get(item.name)
+        if node is None or role not in naming:
             return None
-        word = text_of(node, parameter.name)
+        word = text_of(node, name)
         outer = None if within is None else within.parameter(word)
-        if isinstance(outer, Reference) and parameter.unit is not None and outer.unit is not None:
+        if isinstance(outer, Reference) and item.unit is not None and outer.unit is not None:
             # A table handed on to a part inside: only here do the two units meet.
-            if outer.unit.dimension != parameter.unit.dimension:
-                raise fault("E204", node.place, parameter.name, parameter.unit.text, outer.unit.text)
+            if outer.unit.dimension != item.unit.dimension:
+                raise fault("E204", node.place, name, item.unit.text, outer.unit.text)
             return word
-        known = self.scope.references(role, word)
         missing = f"isn't in {role}s" if within is None else f"is no {role} of {within.name}"
-        return among(word, known, node.place, f"{self.entry.name} names {role} {{}}, which {missing}")
+        what = f"{entry.name} names {role} {{}}, which {missing}"
+        return among(word, scope.references(role, word), node.place, what)
 
-    def _connection(self, connector: str, kind: str) -> tuple[str, str] | None:
-        """Return the part and the connector of it that a connector is joined to."""
-        node, name, outer = self.nodes.get(connector), self.entry.name, self.scope.outer
-        parts = self.scope.parts.entries
-        if node is None:
-            # A mass need not be joined, nor what another entry is joined to.
-            if self.entry.section in ("masses", "parts") or any(
-                f"{name}.{connector}" in other.words for other in parts.values()
-            ):
-                return None
-            free = (part for part in parts.values() if part.name not in {name, *self.entry.words})
-            fitting = (part.name for part in free if _fitting(part.component, kind))
-            what = f"{name} does not say what its {connector} is joined to"
-            raise fault("E210", self.entry.place, what, hint=f"{connector}: {next(fitting, GROUND)}")
-        text = text_of(node, connector, f"{connector}: device")
-        if text == GROUND:
-            return GROUND, ""
-        if outer is not None and text in dict(outer.connectors):
-            return "", text
-        if (found := _TARGET.match(text)) is None:
-            expected = "a part, such as device, device.flange or chain[2]"
-            raise fault("E210", node.place, connector, expected, brief(text))
-        part = parts.get(other := found["part"])
-        if other in self.scope.parts.faulty or (part is None and not self.scope.complete):
-            raise AlreadyReportedError
-        if part is None:
-            what = f"{name} joins its {connector} to {brief(other)}, which is no part of {self.scope.whole}"
-            raise unknown("E206", node.place, what, other, [*(one for one in parts if one != name), GROUND])
-        element = self._element(found, part.count, connector, node)
-        return element, self._its_connector(part, found["connector"], connector, kind, node)
+    def each(items: Iterable[Item], read: Callable[[Item], T | None]) -> Named[T]:
+        """Return what is read of items by their names, those at fault left out."""
+        found = []
+        for item in items:
+            with mistakes:
+                if (value := read(item)) is not None:
+                    found.append((item.name, value))
+        return tuple(found)
 
-    def _element(self, found: re.Match[str], size: int | None, connector: str, node: Node) -> str:
-        """Return the part, or the element of an array of `size`, that this element is joined to."""
-        other, count = str(found["part"]), self.entry.count
-        if size is None:
-            if found["first"] is not None:
-                what = f"{other} is one part, not an array"
-                raise fault("E210", node.place, what, hint=f"{connector}: {other}")
-            return other
-        first = int(found["first"] or 1)
-        last = int(found["last"] or found["first"] or size)
-        if not 1 <= first <= last <= size:
-            what = f"{other} is an array of {size}: its elements are {other}[1] to {other}[{size}]"
-            raise fault("E210", node.place, what)
-        if first == last and found["first"]:
-            return f"{other}[{first}]"
-        if count != last - first + 1:
-            mine = "one part" if count is None else f"an array of {count}"
-            what = f"{self.entry.name} is {mine} and {other}[{first}:{last}] has {last - first + 1} elements"
-            raise fault("E210", node.place, what, hint=f'{connector}: "{other}[1]"')
-        return f"{other}[{first + self.index - 1}]"
-
-    def _its_connector(
-        self, part: PartEntry, named: str | None, connector: str, kind: str, node: Node
-    ) -> str:
-        """Return the connector of another part that is named, or meant where none is."""
-        shown, hand = f"{part.name} ({part.component.name})", self.entry.section == "hands"
-        fitting = _fitting(part.component, kind)
-        meant = [name for name in fitting if (name in part.component.grips) == hand] or fitting
-        if named is not None:
-            return among(named, fitting, node.place, f"{shown} has no {kind} called {{}}")
-        if len(meant) == 1:
-            return meant[0]
-        what, hint = f"{shown} has no connector of type {kind} to join {connector} to", ""
-        if fitting:
-            what = f"{shown} has {len(fitting)} connectors of type {kind}"
-            hint = f"{connector}: {part.name}.{fitting[0]}"
-        raise fault("E210", node.place, what, hint=hint)
+    missing = dict[str, str]()
+    for name, parameters in by_vector(component.parameters).items():
+        wanted = [due(one) for one in parameters if one.name not in nodes]
+        if any(wanted):
+            missing[name] = wanted[0] if len(wanted) == 1 else f"[{', '.join(wanted)}]"
+    if missing:
+        hint = ", ".join(f"{key}: {value}" for key, value in missing.items())
+        what = f"{entry.name} has no {enumerated(tuple(missing))}"
+        mistakes.add("E201", entry.place, what, hint=hint)
+    references = [one for one in component.parameters if isinstance(one, Reference)]
+    described = (one.name for one in references if one.role not in naming)
+    connections = []
+    for name, kind in component.connectors:
+        with mistakes:
+            if joined := _joined(name, kind.name, nodes.get(name), entry, scope, index):
+                connections.append((name, *joined))
+    targets = [(part, its) for _, part, its in connections if part != GROUND]
+    if len(targets) > 1 and len(set(targets)) == 1:
+        mistakes.add("E210", entry.place, f"{entry.name} joins {targets[0][0]} to itself")
+    return Entry(
+        each(component.numbers, number),
+        each((one for one in component.parameters if isinstance(one, Option)), option),
+        each(references, reference),
+        tuple((name, nodes[name]) for name in described if name in nodes),
+        each(starts, number),
+        tuple(connections),
+    )
 
 
-def _fitting(component: Component, kind: str) -> list[str]:
-    """Return the connectors of a component that are of a type."""
-    return [name for name, its in component.connectors if its.name == kind]
+def _vector(node: Node, name: str, vector: Sequence[Number | Variable], scope: Scope) -> tuple[Node, ...]:
+    """Return a node for each entry of a vector, which inside a component may be an expression."""
+    if isinstance(node, Scalar) and scope.outer is not None and not is_quantity(node.text):
+        place = text_place(node)
+        sizes = sizes_of(tuple(known.split(".")) for known in scope.names)
+        tree = parse_expression(node.text, place)
+        found = written_out(tree, lambda parts: sizes.get(parts, 0), node.text, place)
+        if isinstance(found, tuple) and len(found) == len(vector):
+            return tuple(replace(node, text=format_expression(one)) for one in found)
+    return list_of(node, name, len(vector), _one(vector[0].unit))
+
+
+def _joined(
+    connector: str, kind: str, node: Node | None, entry: PartEntry, scope: Scope, index: int
+) -> tuple[str, str] | None:
+    """Return the part and the connector of it that a connector, of a type, of an entry is joined to."""
+    name, outer, parts = entry.name, scope.outer, scope.parts.entries
+    if node is None:
+        # A mass need not be joined, nor what another entry is joined to.
+        if entry.section in ("masses", "parts") or any(
+            f"{name}.{connector}" in other.words for other in parts.values()
+        ):
+            return None
+        free = (part for part in parts.values() if part.name not in {name, *entry.words})
+        fitting = (part.name for part in free if part.connectors(kind))
+        what = f"{name} does not say what its {connector} is joined to"
+        raise fault("E210", entry.place, what, hint=f"{connector}: {next(fitting, GROUND)}")
+    text = text_of(node, connector, f"{connector}: device")
+    if text == GROUND:
+        return GROUND, ""
+    if outer is not None and text in dict(outer.connectors):
+        return "", text
+    if (found := _TARGET.match(text)) is None:
+        expected = "a part, such as device, device.flange or chain[2]"
+        raise fault("E210", node.place, connector, expected, brief(text))
+    other, first, last, named = found.groups()
+    part = parts.get(other)
+    if other in scope.parts.faulty or (part is None and not scope.complete):
+        raise AlreadyReportedError
+    if part is None:
+        what = f"{name} joins its {connector} to {brief(other)}, which is no part of {scope.whole}"
+        raise unknown("E206", node.place, what, other, [*(one for one in parts if one != name), GROUND])
+    element = _element(part, first, last, entry, index, connector, node.place)
+    return element, _its_connector(part, named, connector, kind, entry.section == "hands", node.place)
+
+
+def _element(
+    part: PartEntry,
+    first: str | None,
+    last: str | None,
+    entry: PartEntry,
+    index: int,
+    connector: str,
+    at: Place,
+) -> str:
+    """Return the part that an entry is joined to; of an array from `first` to `last`, the element."""
+    other, size, what, hint = part.name, part.count, "", ""
+    if size is None and first is None:
+        return other
+    low, high = int(first or 1), int(last or first or size or 0)
+    if size is None:
+        what, hint = f"{other} is one part, not an array", f"{connector}: {other}"
+    elif not 1 <= low <= high <= size:
+        what = f"{other} is an array of {size}: its elements are {other}[1] to {other}[{size}]"
+    elif low == high and first:
+        return f"{other}[{low}]"
+    elif entry.count == high - low + 1:
+        return f"{other}[{low + index - 1}]"
+    else:
+        mine = "one part" if entry.count is None else f"an array of {entry.count}"
+        what = f"{entry.name} is {mine} and {other}[{low}:{high}] has {high - low + 1} elements"
+        hint = f'{connector}: "{other}[1]"'
+    raise fault("E210", at, what, hint=hint)
+
+
+def _its_connector(
+    part: PartEntry, named: str | None, connector: str, kind: str, by_hand: bool, at: Place
+) -> str:
+    """Return the connector of another part that is named, or meant where none is."""
+    shown, fitting = f"{part.name} ({part.component.name})", part.connectors(kind)
+    meant = [name for name in fitting if (name in part.component.grips) == by_hand] or fitting
+    if named is not None:
+        return among(named, fitting, at, f"{shown} has no {kind} called {{}}")
+    if len(meant) == 1:
+        return meant[0]
+    what, hint = f"{shown} has no connector of type {kind} to join {connector} to", ""
+    if fitting:
+        what = f"{shown} has {len(fitting)} connectors of type {kind}"
+        hint = f"{connector}: {part.name}.{fitting[0]}"
+    raise fault("E210", at, what, hint=hint)
 
 
 def _one(unit: Unit) -> str:
