@@ -1,7 +1,7 @@
 """The declarations of a component: equations, what it sends, variables and parameters; YAML to typed data.
 
 Takes: the body of a definition.
-Gives: `read_equations`, `read_sends`, `read_variables`, `read_parameters`, `declared_once`.
+Gives: `read_equations`, `read_sends`, `read_variables`, `read_parameters`.
 Guarantees: a number is in SI and of its declared unit's dimension; a fault is reported and its item left out;
 a vector is declared as its entries, `x[1]`, `x[2]`.
 Does not: look at how the declarations fit together (see `definitions`).
@@ -103,7 +103,7 @@ def read_variables(root: Body, section: str = "variables") -> tuple[Variable, ..
         starts = _entry_by_entry(body, "start", name, *_unit_and_size(body, name))
         return [Variable(*start, about, key.place, limit) for start in starts]
 
-    return (*chain(*root.each(section, "{x: {unit: m}}", read)),)
+    return tuple(chain(*root.each(section, "{x: {unit: m}}", read)))
 
 
 def _is_unit(text: str) -> bool:
@@ -121,11 +121,9 @@ def read_parameters(root: Body) -> tuple[Parameter, ...]:
         if isinstance(value, Scalar):
             if value.text in ROLES:
                 return [Reference(name, value.text, "", value.place)]
-            expected, hint = (
-                f"{', '.join(ROLES)}, or a mapping with its unit",
-                f"{name}: {{unit: N/m, min: 0}}",
-            )
-            raise fault("E203", value.place, what, expected, brief(value.text) or "nothing", hint)
+            expected, hint = f"{', '.join(ROLES)}, or a mapping with its unit", "{unit: N/m, min: 0}"
+            got = brief(value.text) or "nothing"
+            raise fault("E203", value.place, what, expected, got, f"{name}: {hint}")
         node = mapping_of(value, what, f"{name}: {{unit: N/m}}")
         if (table := node.get("table")) is not None:
             unit = _unit(table, "table", "table: N")
@@ -135,7 +133,7 @@ def read_parameters(root: Body) -> tuple[Parameter, ...]:
             return [_option(name, options, Body(node, OPTION, what, root.mistakes))]
         return _numbers(name, Body(node, NUMBER, what, root.mistakes))
 
-    return (*chain(*root.each("parameters", "{stiffness: {unit: N/m, min: 0}}", read)),)
+    return tuple(chain(*root.each("parameters", "{stiffness: {unit: N/m, min: 0}}", read)))
 
 
 def _option(name: str, options: Sequence, body: Body) -> Option:
@@ -177,7 +175,7 @@ def _numbers(name: str, body: Body) -> list[Number]:
 
     check(most, nodes.get("max"), f"the max of {first}")
     words: dict[str, Fraction] = {}
-    for key, node in body.section("options", "{left: -1, right: 1}"):
+    for key, node in mapping_of(nodes["options"], "options").entries if "options" in nodes else ():
         with mistakes:
             words[key.text] = _number(node, key.text, unit)
             check(words[key.text], node, f"{key.text} of {first}")
