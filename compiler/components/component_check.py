@@ -19,7 +19,7 @@ from itertools import count
 from typing import TypeVar
 
 from apc.compiler.components.component import OTHERS, Component, Option, Send, option_test
-from apc.compiler.errors import ApcError, Mistakes, Place, place_in
+from apc.compiler.errors import Mistakes, Place, place_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import (
     Call,
@@ -58,9 +58,9 @@ T = TypeVar("T")
 class ComponentNames:
     """Resolves a component's names to dimensions, and finds the locals on the way.
 
-    `dimensions` are those of all names, of a vector and of each of its entries; `sizes` those of the vectors
-    among them and of what is being inferred; None is one that isn't known. `variables` are the names whose
-    values are computed.
+    `dimensions` are those of all names, one for a vector and its entries; `sizes` those of the vectors among
+    them and of what is being inferred; None is one that isn't known. `variables` are the names whose values
+    are computed, a vector's entry by entry.
     """
 
     def __init__(self, component: Component, undefined: Collection[str] = ()) -> None:
@@ -71,19 +71,19 @@ class ComponentNames:
         computed |= dict(_visible_names(component))
         computed |= {(name, flow.name): flow.unit.dimension for name, flow in component.flows}
         self.variables = frozenset(computed)
-        self.dimensions = {(word,): p.unit.dimension for p in component.numbers for word, _ in p.words}
+        known: dict[Path, Dimension | None] = {
+            (word,): p.unit.dimension for p in component.numbers for word, _ in p.words
+        }
         # `others` alone stands for count(others).
-        self.dimensions |= computed | {PEERS: DIMENSIONLESS, ("time",): SECOND, (OTHERS,): DIMENSIONLESS}
+        known |= computed | {PEERS: DIMENSIONLESS, ("time",): SECOND, (OTHERS,): DIMENSIONLESS}
         for one in component.parameters:
             if not isinstance(one, Option) and one.unit is not None:  # a number or a table
-                self.dimensions[(one.name,)] = one.unit.dimension
+                known[(one.name,)] = one.unit.dimension
             elif getattr(one, "role", "") == "clock":
-                self.dimensions[(interval_of(one.name),)] = SECOND
-        self.dimensions |= {(OTHERS, send.name): send.dimension for send in component.sends}
-        self.sizes: dict[Path, int | None] = {**sizes_of(self.dimensions)}
-        self.dimensions |= {
-            (*path, name): self.dimensions[*path, entry(name, 1)] for *path, name in self.sizes
-        }
+                known[(interval_of(one.name),)] = SECOND
+        known |= {(OTHERS, send.name): send.dimension for send in component.sends}
+        self.dimensions = {_whole(path): dimension for path, dimension in known.items()}
+        self.sizes: dict[Path, int | None] = {**sizes_of(known)}
 
     def size_of(self, parts: Path) -> int | None:
         """Return the size of a name: 0 for a number, None for what is to be inferred."""
@@ -135,16 +135,12 @@ class ComponentNames:
         _settle(waiting, self._size, self.sizes)
         # A size that contradicts itself, or hangs on itself alone, is none.
         self.sizes |= {name: self._size(*written) or 0 for name, written in waiting.items()}
-        entry_by_entry = {name: self._entries(name) for name in waiting}
-        waiting |= {one: waiting[name] for name, all_ in entry_by_entry.items() for one in all_}
-        self.dimensions |= dict.fromkeys(waiting)
         _settle(waiting, self._inferred, self.dimensions)
-        found = (one for name in reversed(undeclared) for one in entry_by_entry[name])
-        return [(one[0], _known(self.dimensions[one])) for one in found]
-
-    def _entries(self, path: Path) -> list[Path]:
-        """Return the paths of a vector's entries, or that of a number."""
-        return [(*path[:-1], one) for one in entries(path[-1], self.size_of(path) or 0)]
+        return [
+            (one, _known(self.dimensions[name]))
+            for name in reversed(undeclared)
+            for one in entries(name[0], self.sizes[name] or 0)
+        ]
 
     def _size(self, expression: Expr, where: Where) -> int | None:
         """Return the size of an expression; 0 of one at fault, which `_checked` reports."""
@@ -228,7 +224,7 @@ class ComponentNames:
         return dimension_of(expression, self._lookup, where.text, where.place)
 
     def _lookup(self, name: Name) -> Dimension | None:
-        return self.dimensions.get(name.parts)
+        return self.dimensions.get(_whole(name.parts))
 
     def _check_names(self, expression: Expr, where: Where, mistakes: Mistakes) -> None:
         """Record names that nothing of the component has, and words that an option hasn't got."""
@@ -241,26 +237,31 @@ class ComponentNames:
                     word, words = format_expression(right), self.options[name].words
                     what, at = f"{name} has no option {brief(word)}", _place(where, right)
                     mistakes.take(unknown("E206", at, what, word, words))
-                case Name(parts) if parts not in self.dimensions and node.start not in told:
-                    mistakes.take(self._unknown(parts, _place(where, node)))
+                case Name(parts) if node.start not in told:
+                    self._check_name(parts, _place(where, node), mistakes)
 
-    def _unknown(self, parts: Path, place: Place) -> ApcError:
-        """Return the mistake of a name there isn't, of an entry that a vector hasn't got among them."""
-        name, index = whole_and_index(parts[-1])
-        whole = (*parts[:-1], name)
-        shown, size = ".".join(whole), self.size_of(whole)
+    def _check_name(self, parts: Path, place: Place, mistakes: Mistakes) -> None:
+        """Record a name there isn't, or an entry that a vector hasn't got."""
+        whole, index = _whole(parts), whole_and_index(parts[-1])[1]
+        shown, size = ".".join(whole), self.size_of(whole) or 0
+        if whole in self.dimensions and index <= size:
+            return
         if parts[0] == OTHERS:
             what = f"{self.component.name} sends nothing called {brief('.'.join(parts[1:]))}"
-            return fault("E303", place, what, hint="sends: {x: sample(object.x)}")
-        if index and whole in self.dimensions:
-            told = entry(shown, index)
+            mistakes.add("E303", place, what, hint="sends: {x: sample(object.x)}")
+        elif whole in self.dimensions:
+            expected, got, hint = "a vector before the index", f"{shown}, which is a number", shown
             if size:
-                expected, hint = f"an index from 1 to {size}", entry(shown, size)
-                return fault("E408", place, told, expected, f"{index}", hint)
-            got = f"{shown}, which is a number"
-            return fault("E408", place, told, "a vector before the index", got, shown)
-        known = sorted(".".join(one) for one in self.dimensions if not one[-1].endswith("]"))
-        return unknown("E303", place, f"{self.component.name} has no {brief(shown)}", shown, known)
+                expected, got, hint = f"an index from 1 to {size}", f"{index}", entry(shown, size)
+            mistakes.add("E408", place, entry(shown, index), expected=expected, got=got, hint=hint)
+        else:
+            what, known = f"{self.component.name} has no {brief(shown)}", map(".".join, self.dimensions)
+            mistakes.take(unknown("E303", place, what, shown, sorted(known)))
+
+
+def _whole(path: Path) -> Path:
+    """Return the vector that an entry is of; of a number its own path."""
+    return (*path[:-1], whole_and_index(path[-1])[0])
 
 
 def _place(where: Where, node: Expr) -> Place:

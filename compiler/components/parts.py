@@ -232,15 +232,15 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
     index
         Which element of an array this is.
     """
-    component, within, naming = entry.component, scope.outer, ("clock", "link")
-    if within is not None:
-        naming += ("table",)  # one of the outer component's
+    component, within = entry.component, scope.outer
+    naming = ("clock", "link", "" if within is None else "table")  # a table is one of the outer component's
     starts = [variable for variable in component.variables if variable.start is not None]
     named = (whole_and_index(one.name)[0] for one in (*component.parameters, *starts))
     common = PART_KEYS if within is None else ("count",)
     keys = dict.fromkeys(("type", *common, *dict(component.connectors), *named))
     nodes = Body(entry.body, keys, f"{entry.name} ({component.name})", mistakes).nodes
-    for name, vector in by_vector((*component.numbers, *starts)).items():
+    numbers: tuple[Number | Variable, ...] = (*component.numbers, *starts)
+    for name, vector in by_vector(numbers).items():
         if len(vector) > 1 and name in nodes:  # a key for each entry, x[1], in the place of x: [1 m, 0 m]
             values: tuple[Node, ...] = (_FAULTY,) * len(vector)
             with mistakes:
