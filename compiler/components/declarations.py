@@ -18,7 +18,16 @@ from fractions import Fraction
 from functools import partial
 from itertools import chain
 
-from apc.compiler.components.component import ROLES, Number, Option, Parameter, Reference, Send, Variable
+from apc.compiler.components.component import (
+    ROLES,
+    Named,
+    Number,
+    Option,
+    Parameter,
+    Reference,
+    Send,
+    Variable,
+)
 from apc.compiler.errors import ApcError, Mistakes, Place
 from apc.compiler.language.dimensions import DIMENSIONLESS
 from apc.compiler.language.expression import Equation
@@ -100,8 +109,9 @@ def read_variables(root: Body, section: str = "variables") -> tuple[Variable, ..
         node = mapping_of(value, name, f"{name}: {{unit: {meant}}}")
         body = Body(node, VARIABLE, f"variable {name}", root.mistakes)
         about, limit = body.text("about"), body.text("limit", "limit: force_limit")
-        starts = _entry_by_entry(body, "start", name, *_unit_and_size(body, name))
-        return [Variable(*start, about, key.place, limit) for start in starts]
+        unit, size = _unit_and_size(body, name)
+        starts = _entry_by_entry(body, "start", name, unit, size)
+        return [Variable(one, unit, start, about, key.place, limit) for one, start in starts]
 
     return tuple(chain(*root.each(section, "{x: {unit: m}}", read)))
 
@@ -126,9 +136,9 @@ def read_parameters(root: Body) -> tuple[Parameter, ...]:
             raise fault("E203", value.place, what, expected, got, f"{name}: {hint}")
         node = mapping_of(value, what, f"{name}: {{unit: N/m}}")
         if (table := node.get("table")) is not None:
+            body = Body(node, TABLE, what, root.mistakes)
             unit = _unit(table, "table", "table: N")
-            about = Body(node, TABLE, what, root.mistakes).text("about")
-            return [Reference(name, "table", about, node.place, unit)]
+            return [Reference(name, "table", body.text("about"), node.place, unit)]
         if isinstance(options := node.get("options"), Sequence):
             return [_option(name, options, Body(node, OPTION, what, root.mistakes))]
         return _numbers(name, Body(node, NUMBER, what, root.mistakes))
@@ -180,10 +190,10 @@ def _numbers(name: str, body: Body) -> list[Number]:
             words[key.text] = _number(node, key.text, unit)
             check(words[key.text], node, f"{key.text} of {first}")
     defaults = _entry_by_entry(body, "default", name, unit, size, words)
-    for one, _, default in defaults:
+    for one, default in defaults:
         check(default, nodes.get("default"), f"the default of {one}")
     named = tuple(words.items())
-    return [replace(model, name=one, default=default, words=named) for one, _, default in defaults]
+    return [replace(model, name=one, default=default, words=named) for one, default in defaults]
 
 
 def _unit_and_size(body: Body, name: str) -> tuple[Unit, int]:
@@ -212,11 +222,8 @@ def _size(node: Node, what: str, name: str) -> int:
 
 def _entry_by_entry(
     body: Body, key: str, name: str, unit: Unit, size: int, words: Mapping[str, Fraction] | None = None
-) -> list[tuple[str, Unit, Fraction | None]]:
-    """Read the default or start of a number, or the list of a vector's.
-
-    Return its name, or that of each entry, with the unit and what was read; None of one that isn't given.
-    """
+) -> Named[Fraction | None]:
+    """Read the default or start of a number, or the list of a vector's, by names; None of one not given."""
 
     def read(node: Node, _: str) -> list[Fraction | None]:
         nodes = list_of(node, key, size, "0") if size else (node,)
@@ -224,7 +231,7 @@ def _entry_by_entry(
 
     named = names_of(name, size)
     values = body.read(key, read, [None] * len(named))
-    return [(one, unit, value) for one, value in zip(named, values, strict=True)]
+    return tuple(zip(named, values, strict=True))
 
 
 def _number(node: Node, what: str, unit: Unit, words: Mapping[str, Fraction] | None = None) -> Fraction:

@@ -95,15 +95,15 @@ def read_component(source: Source, library: Definitions) -> Component:
 
 def _read_declarations(root: Body, library: Definitions, mistakes: Mistakes) -> Component:
     """Read everything but equations and sends; what the component extends comes first."""
-    title, name = root.nodes["component"], "?"
+    title = root.nodes["component"]
+    assert isinstance(title, Scalar)  # or the library would not know it
     with mistakes:
-        name = name_of(title, "a component") if isinstance(title, Scalar) else name
-    place = title.place
+        name_of(title, "a component")
     about, cited, hint = root.text("about"), root.text("source"), "extends: Mass"
     base = root.read(
         "extends",
         lambda node, key: component_named(text_of(node, key, hint), node.place, library, hint),
-        Component("", "", "", place),
+        Component("", "", "", title.place),
     )
     connectors = _connectors(root, library)
     parameters, variables = read_parameters(root), read_variables(root)
@@ -117,13 +117,13 @@ def _read_declarations(root: Body, library: Definitions, mistakes: Mistakes) -> 
             seen.add(own)
     draft = replace(
         base,
-        name=name,
+        name=title.text,
         about=about,
         source=cited,
         connectors=(*base.connectors, *((own, kind) for own, kind, _ in connectors)),
         parameters=_overridden(base.parameters, parameters, mistakes),
         variables=_overridden(base.variables, variables, mistakes),
-        place=place,
+        place=title.place,
         grips=(*base.grips, *(own for own, _, for_hands in connectors if for_hands)),
         peers=root.read("peers", _peers, base.peers),
     )

@@ -233,7 +233,8 @@ def read_entry(entry: PartEntry, scope: Scope, mistakes: Mistakes, index: int = 
         Which element of an array this is.
     """
     component, within = entry.component, scope.outer
-    naming = ("clock", "link", "" if within is None else "table")  # a table is one of the outer component's
+    # What names something; inside a component, a table is one of the outer's.
+    naming = ("clock", "link") if within is None else ("clock", "link", "table")
     starts = [variable for variable in component.variables if variable.start is not None]
     named = (whole_and_index(one.name)[0] for one in (*component.parameters, *starts))
     common = PART_KEYS if within is None else ("count",)
