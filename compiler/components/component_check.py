@@ -214,7 +214,7 @@ class ComponentNames:
         """Return the dimension of a checked expression, or None if it is a variable, which has its own."""
         if isinstance(expression, Name) and expression.parts in self.variables:
             return None
-        return _known(self._dimension(expression, Equation(expression, expression, text, place)))
+        return _known(dimension_of(self._decided(expression), self._lookup, text, place))
 
     def _dimension(self, expression: Expr, where: Where) -> Dimension | None:
         """Return the dimension of an expression. Raises ApcError for its names and units."""
