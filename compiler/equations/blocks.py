@@ -13,14 +13,15 @@ for tearing systems of equations in object-oriented modeling, 1994).
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
-from math import prod
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from typing import Any
 
 import sympy
 from sympy.matrices import dotprodsimp
 
 from apc.compiler.equations.elimination import eliminate
-from apc.compiler.equations.matching import Incidence, alternating, match_columns, strong_components
+from apc.compiler.equations.matching import Block, match
 from apc.compiler.equations.solution import (
     MOST_LISTED,
     Assignment,
@@ -31,9 +32,8 @@ from apc.compiler.equations.solution import (
     listed,
 )
 from apc.compiler.equations.terms import (
-    Abs,
+    ONE,
     If,
-    Max,
     NoDerivativeError,
     Symbol,
     Term,
@@ -47,7 +47,6 @@ from apc.compiler.words import counted
 
 # A loop of more guesses isn't asked whether it has one solution, nor more pieces of it between its corners.
 MOST_GUESSES, MOST_PIECES = 3, 64
-BENT = (If, Max, Abs, sympy.Abs, sympy.sign, sympy.floor)
 
 
 def solve_blocks(
@@ -63,19 +62,16 @@ def solve_blocks(
         Takes E502 equations or unknowns left over, E503 a loop without an unknown to solve for, E511 linear
         equations that depend on each other, E512 what is no number.
     """
-    columns = {unknown: j for j, unknown in enumerate(unknowns)}
-    incidence = [sorted(columns[s] for s in r.expression.free_symbols & columns.keys()) for r in residuals]
-    match = match_columns(incidence, len(unknowns))
-    if not len(residuals) == len(unknowns) == len(match):
-        report_singular(residuals, [unknown.name for unknown in unknowns], incidence, match, problem)
+    known = frozenset(unknowns)
+    held = [one.expression.free_symbols & known for one in residuals]
+    left_over, over, under, blocks = match(held, unknowns)
+    if left_over or under[1]:
+        report_singular(residuals, left_over, over, under, problem)
         return ()
-    column_of = {row: column for column, row in match.items()}
-    # Row i needs the rows that compute its other unknowns.
-    needs = [[match[j] for j in held if match[j] != i] for i, held in enumerate(incidence)]
     steps: list[Step] = []
-    for rows in strong_components(needs):
+    for rows, own in blocks:
         block = [residuals[row] for row in rows]
-        solved = _solved(block, [unknowns[j] for j in sorted(column_of[row] for row in rows)], problem)
+        solved = _solved(block, own, problem)
         parts = [one.expressions if isinstance(one, ImplicitBlock) else one[1:] for one in solved]
         if any(is_no_number(expression) for part in parts for expression in part):
             problem.report_no_number(block)  # what was divided may cancel
@@ -86,42 +82,35 @@ def solve_blocks(
 
 def report_singular(
     residuals: Sequence[Residual],
-    unknowns: Sequence[str],
-    incidence: Incidence,
-    match: Mapping[int, int],
+    left_over: Sequence[int],
+    over: Block[Any],
+    under: Block[Any],
     problem: Problem,
 ) -> None:
     """Add the mistake E502: which equations and which unknowns are too many.
 
     Parameters
     ----------
-    residuals, unknowns
-        The equations, and the names of what they are to give.
-    incidence
-        For each equation the places of its unknowns.
-    match
-        The unknowns that are given, each with its equation.
+    residuals
+        The equations.
+    left_over, over, under
+        As `match` gives them, of unknowns that are shown by their text.
     problem
         Takes the mistake.
     """
-    columns = {row: column for column, row in match.items()}
-    holders = [[i for i, held in enumerate(incidence) if j in held] for j in range(len(unknowns))]
-    unmatched = [i for i in range(len(residuals)) if i not in columns]
-    over, over_columns = alternating(unmatched, incidence, match)
-    free = [j for j in range(len(unknowns)) if j not in match]
-    under_columns, under = alternating(free, holders, columns)
     parts = []
-    if over:
-        names = [unknowns[j] for j in over_columns]
-        only = f"only {counted(len(names), 'unknown')} ({listed(names)})" if names else "no unknown"
-        parts.append(f"{counted(len(over), 'equation')} hold {only}: {listed([residuals[i] for i in over])}")
-    if under_columns:
-        names = [unknowns[j] for j in under_columns]
-        by = f"only {counted(len(under), 'equation')}, {listed([residuals[i] for i in under])}"
-        has = f"{'has' if len(names) == 1 else 'have'} {by if under else 'no equation'}"
-        parts.append(f"{counted(len(names), 'unknown')} ({listed(names)}) {has}")
-    first = [residuals[i] for i in unmatched] or residuals
-    problem.report("E502", first, f"{problem.where} can't be solved: {'; and '.join(parts)}")
+    (too_many, held), (holding, open_) = (
+        ([residuals[i] for i in rows], [str(one) for one in unknowns]) for rows, unknowns in (over, under)
+    )
+    if too_many:
+        only = f"only {counted(len(held), 'unknown')} ({listed(held)})" if held else "no unknown"
+        parts.append(f"{counted(len(too_many), 'equation')} hold {only}: {listed(too_many)}")
+    if open_:
+        by = f"only {counted(len(holding), 'equation')}, {listed(holding)}" if holding else "no equation"
+        has = "has" if len(open_) == 1 else "have"
+        parts.append(f"{counted(len(open_), 'unknown')} ({listed(open_)}) {has} {by}")
+    what = f"{problem.where} can't be solved: {'; and '.join(parts)}"
+    problem.report("E502", [residuals[i] for i in left_over] or residuals, what)
 
 
 def _solved(block: Sequence[Residual], unknowns: Sequence[Symbol], problem: Problem) -> Sequence[Step]:
@@ -190,39 +179,22 @@ def _torn(block: Sequence[Residual], unknowns: Sequence[Symbol], divisors: Divis
 
 def _is_open(residuals: Sequence[Term], guesses: Sequence[Symbol], divisors: Divisors) -> bool:
     """Return whether between corners the residuals don't depend on the guesses, or only on some."""
-    bent = {node for one in residuals for node in one.atoms(*BENT)}
-    pieces = min(MOST_PIECES, prod(len(_branches(node)) for node in bent))
-    for number in range(pieces if len(guesses) <= MOST_GUESSES else 0):
-        piece = _piece(residuals, number)
-        try:
-            slopes = sympy.Matrix([[slope(one, guess) for guess in guesses] for one in piece])
-        except NoDerivativeError:
-            continue
-        with dotprodsimp(False):  # which would expand it
-            determinant = slopes.det(method="laplace")
-        if divisors.is_zero(determinant) or divisors.vanishes(determinant):
-            return True
-    return False
+    if len(guesses) > MOST_GUESSES:
+        return False
+    try:
+        slopes = sympy.Matrix([[slope(one, guess) for guess in guesses] for one in residuals])
+    except NoDerivativeError:
+        return False
+    with dotprodsimp(False):  # which would expand it
+        pieces = islice(_pieces(slopes.det(method="laplace")), MOST_PIECES)
+    return any(divisors.is_zero(piece) or divisors.vanishes(piece) for piece in pieces)
 
 
-def _piece(residuals: Sequence[Term], number: int) -> list[Term]:
-    """Return what residuals are between their corners and jumps, by the number of a choice of branches."""
-    chosen: dict[Term, Term] = {}
-
-    def choose(node: Term) -> Term:
-        nonlocal number
-        if node not in chosen:
-            branches = _branches(node)
-            number, digit = divmod(number, len(branches))
-            chosen[node] = branches[digit]
-        return chosen[node]
-
-    return [one.replace(lambda node: isinstance(node, BENT), choose) for one in residuals]
-
-
-def _branches(node: Term) -> tuple[Term, ...]:
-    """Return what a node is on either side of its corners; what jumps is constant between jumps."""
-    if isinstance(node, If | Max):
-        return tuple(node.args[isinstance(node, If) :])
-    is_size = isinstance(node, Abs | sympy.Abs)
-    return (node.args[0], -node.args[0]) if is_size else (symbol(f"constant {node}"),)
+def _pieces(term: Term) -> Iterator[Term]:
+    """Yield what a term is between its corners, each choice of branches and signs by itself."""
+    node = next((one for one in sympy.preorder_traversal(term) if isinstance(one, If | sympy.sign)), None)
+    if node is None:
+        yield term
+    else:
+        for branch in node.args[1:] if isinstance(node, If) else (ONE, -ONE):
+            yield from _pieces(term.xreplace({node: branch}))

@@ -18,14 +18,13 @@ start value of a chosen state counts; the variables that depend on it follow, wh
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass
 
 import sympy
 
 from apc.compiler.equations.blocks import report_singular
 from apc.compiler.equations.derivatives import TIME, Derivative, Moving
 from apc.compiler.equations.elimination import Elimination
-from apc.compiler.equations.matching import alternating, match_columns
+from apc.compiler.equations.matching import match
 from apc.compiler.equations.solution import Problem, Residual
 from apc.compiler.equations.terms import (
     NoDerivativeError,
@@ -45,13 +44,8 @@ HIGHEST_ORDER = 8
 LARGEST = 100_000
 
 
-@dataclass(frozen=True, slots=True)
-class Reduced:
-    """Equations to solve for the unknowns. `states` are x, and der(x) where der(der(x)) is solved."""
-
-    residuals: tuple[Residual, ...]
-    unknowns: tuple[Symbol, ...]
-    states: tuple[Symbol, ...]
+# Equations to solve, their unknowns, and the states: x, and der(x) where der(der(x)) is solved.
+Reduced = tuple[list[Residual], list[Symbol], list[Symbol]]
 
 
 class IndexReduction:
@@ -82,21 +76,17 @@ class IndexReduction:
         self.integral: dict[int, int] = {}  # of each derivative, the equation it is of
         for residual in residuals:
             self._add(residual)
-            for name, order in self.held[-1].items():
-                self.order[name] = max(self.order[name], order)
 
     def reduced(self, started: Set[Symbol]) -> Reduced | None:
         """Differentiate what must be and choose the states; None if the equations can't be solved.
 
         `started` are the variables and derivatives with a declared start value.
         """
-        column = {name: j for j, name in enumerate(self.order)}
-        incidence = [sorted(column[name] for name in held) for held in self.held]
-        match = match_columns(incidence, len(column))
-        if not len(self.residuals) == len(column) == len(match):
-            report_singular(self.residuals, list(column), incidence, match, self.problem)
+        left_over, over, under, _ = match(self.held, list(self.order))
+        if left_over or under[1]:
+            report_singular(self.residuals, left_over, over, under, self.problem)
             return None
-        dummies = self._choose_dummies(started) if self._differentiate_constraints(column) else None
+        dummies = self._choose_dummies(started) if self._differentiate_constraints() else None
         if dummies is None:
             return None
         states: list[Symbol] = []
@@ -107,35 +97,23 @@ class IndexReduction:
             split = max(first - 1, 0)
             states += [derivative(name, k) for k in range(split)]
             unknowns += [derivative(name, k) for k in range(split, top + 1)]
-        return Reduced(tuple(self.residuals), tuple(unknowns), tuple(states))
+        return self.residuals, unknowns, states
 
     def _add(self, residual: Residual) -> None:
         self.residuals.append(residual)
-        self.held.append({})
-        for name, order in self.moving.derivatives(residual.expression).values():
-            self.held[-1][name] = max(self.held[-1].get(name, 0), order)
+        self.held.append(dict(sorted(self.moving.derivatives(residual.expression).values())))
+        self.order |= {name: max(self.order[name], order) for name, order in self.held[-1].items()}
 
     # ---- Pantelides ----
 
-    def _differentiate_constraints(self, column: Mapping[str, int]) -> bool:
+    def _differentiate_constraints(self) -> bool:
         """Match every equation to a highest derivative, differentiating those that hold none of their own."""
-        names = list(column)
         while True:
             newest = sorted({*range(len(self.residuals))} - {*self.integral.values()})
-            incidence = [
-                [column[name] for name, order in self.held[row].items() if order == self.order[name]]
-                for row in newest
-            ]
-            partner = match_columns(incidence, len(names))
-            passed: set[int] = set()
-            for start in sorted({*range(len(newest))} - {*partner.values()}):
-                rows, columns = alternating([start], incidence, partner)
-                if passed.isdisjoint(columns):
-                    passed.update(columns)
-                    if not self._pass_on([newest[i] for i in rows], [names[j] for j in columns]):
-                        return False
-            if len(partner) == len(newest):
-                return True
+            held = [[x for x, order in self.held[i].items() if order == self.order[x]] for i in newest]
+            left_over, (rows, names), *_ = match(held, list(self.order))
+            if not left_over or not self._pass_on([newest[i] for i in rows], names):
+                return not left_over
 
     def _pass_on(self, rows: Sequence[int], names: Sequence[str]) -> bool:
         """Differentiate equations that block one another, and with them the order of what they hold."""
@@ -152,8 +130,8 @@ class IndexReduction:
         for name in names:
             self.order[name] += 1
         # Each factor of a product stands beside the slopes of all the others.
-        sizes = (size(term) for one in blocking for term in sympy.Add.make_args(one.expression))
-        if any(self.order[name] > HIGHEST_ORDER for name in names) or sum(n * n for n in sizes) > LARGEST:
+        grown = (sum(size(term) ** 2 for term in sympy.Add.make_args(one.expression)) for one in blocking)
+        if any(self.order[name] > HIGHEST_ORDER for name in names) or max(grown) > LARGEST:
             shown = ", ".join(dict.fromkeys(one.shown for one in blocking))
             what = f"no number of derivatives of these equations determines what they hold: {shown}"
             self.problem.report("E509", blocking, what)

@@ -196,7 +196,8 @@ def _sorted_continuous(
     reduced = reduction.reduced({aliases.value(name) for name in started})
     if reduced is None:
         return None
-    states = tuple(aliases.shown(s).name for s in reduced.states)
+    solving, unknowns, states_ = reduced
+    states = tuple(aliases.shown(s).name for s in states_)
     for state in (state for state in states if state not in started):
         holder = next((one for one in equations if f"der({state})" in one.text), equations[0])
         what = f"{state} is a state, by `{holder.text}` ({holder.origin}), and has no start value"
@@ -204,8 +205,8 @@ def _sorted_continuous(
         if state.startswith("der("):
             hint = f"{state} = v, with a start value for v"
         problem.mistakes.add("E510", holder.place, what, hint=hint)
-    shown = [Residual(aliases.shown(one.expression), one.equation) for one in reduced.residuals]
-    steps = solve_blocks(shown, [aliases.shown(s) for s in reduced.unknowns], problem)
+    shown = [Residual(aliases.shown(one.expression), one.equation) for one in solving]
+    steps = solve_blocks(shown, [aliases.shown(s) for s in unknowns], problem)
     below = {v: aliases.shown(derivative(x, order - 1)).name for (x, order), v in aliases.velocities.items()}
     rates = [(f"der({x})", symbol(v)) for v, x in below.items() if x in states]
     known = [rate for rate in rates if rate[1].name in states]
