@@ -313,7 +313,7 @@ class _PartWriter:
         return self._whole(expression)
 
     def _whole(self, expression: Expr, *, heard: bool = False) -> Expr:
-        """Return an expression in whole names; `heard` in a reduction, where alone the others can be named."""
+        """Return an expression in whole names; `heard` in a reduction, where alone others can be named."""
 
         def whole(node: Expr) -> Expr | None:
             reads = any(name.parts[0] == OTHERS for name in names(node))

@@ -86,6 +86,7 @@ class ImplicitBlock:
 
 
 Step = Assignment | ImplicitBlock
+Definition = Term | ImplicitBlock  # what gives an unknown its value
 
 
 def listed(texts: Sequence[str | Residual]) -> str:

@@ -23,7 +23,7 @@ from apc.compiler.equations.derivatives import Moving
 from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.index import IndexReduction, report_no_derivative
 from apc.compiler.equations.reductions import Heard, taken_apart
-from apc.compiler.equations.solution import Assignment, ImplicitBlock, Problem, Residual, Step
+from apc.compiler.equations.solution import Assignment, Definition, ImplicitBlock, Problem, Residual, Step
 from apc.compiler.equations.terms import (
     ZERO,
     NoDerivativeError,
@@ -51,17 +51,6 @@ class SortedPartition:
     clock: str
     assignments: tuple[Step, ...]
 
-    @property
-    def definitions(self) -> dict[Symbol, Term | ImplicitBlock]:
-        """What gives each unknown its value."""
-        found: dict[Symbol, Term | ImplicitBlock] = {}
-        for step in self.assignments:
-            if isinstance(step, ImplicitBlock):
-                found |= dict.fromkeys(map(symbol, step.unknowns), step)
-            else:
-                found[symbol(step[0])] = step[1]
-        return found
-
 
 @dataclass(frozen=True, slots=True)
 class SortedSend:
@@ -84,6 +73,14 @@ class SortedKind:
     samples: tuple[Assignment, ...]
     receives: tuple[Heard, ...]
     sends: tuple[SortedSend, ...]
+
+    @property
+    def definitions(self) -> dict[Symbol, Definition]:
+        """What gives each unknown and each sample its value."""
+        found: dict[str, Definition] = {}
+        for step in (step for part in self.partitions for step in part.assignments):
+            found |= dict.fromkeys(step.unknowns, step) if isinstance(step, ImplicitBlock) else dict([step])
+        return {symbol(name): one for name, one in (found | dict((*self.aliases, *self.samples))).items()}
 
 
 @dataclass(frozen=True, slots=True)
