@@ -38,8 +38,7 @@ from apc.compiler.functions.casadi_writer import Writer
 from apc.compiler.functions.exchange import (
     Timings,
     all_parameters,
-    check_channels,
-    check_heard,
+    check_links,
     compiled_groups,
     followers_of,
     used_clocks,
@@ -68,13 +67,13 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
         unread = (one.variable for one in kind.clocked.holds if symbol(one.symbol) not in writer.known)
         dropped += [(name, "nobody reads this held value") for name in unread]
         dropped += [(send.name, "nobody hears it") for send in kind.sends if send.name not in heard]
-    check_channels(scene, kinds)
     numbers = {group: i for i, kind in enumerate(system.kinds) for group in kind.clocked.flat.groups}
-    check_heard(scene, {group: kinds[place] for group, place in numbers.items()})
+    places = [numbers[group.name] for group in scene.groups]
+    check_links(scene, kinds, places)
     links, unheard = used_links(scene, kinds, timings)
     clocks, silent = used_clocks(scene, kinds, links, timings)
     parameters = all_parameters(scene, kinds, links)
-    groups = compiled_groups(scene, kinds, numbers, links, timings)
+    groups = compiled_groups(scene, kinds, places, links, timings)
     return CompiledSystem(
         scene.name,
         scene.about,
@@ -96,7 +95,7 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
 def _write(kinds: Sequence[SortedKind], writers: Sequence[Writer]) -> list[str]:
     """Write what the motion of any state follows from, and what has a limit; return the sends that are heard.
 
-    What a crossing that was read stands for is written too, and what that reads in turn, until nothing is new.
+    What a crossing stands for that was read is written too, and what that reads, until nothing is new.
     """
     before, heard = -1, list[str]()
     while before < (before := sum(len(writer.known) for writer in writers)):
