@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from operator import itemgetter
 
 from apc.compiler.equations.aliases import Aliases
 from apc.compiler.equations.blocks import solve_blocks
@@ -36,7 +37,7 @@ from apc.compiler.equations.terms import (
 )
 from apc.compiler.equations.zero_test import Divisors, Given
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.language.expression import Name, names
+from apc.compiler.language.expression import Name, format_expression, names
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.scene.scene import Scene
 
@@ -111,16 +112,15 @@ def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[Symbol, Given]]:
     common = {f"{part.name}.{name}": value for part in scene.parts for name, value in part.values}
     found = []
     for group in (group for group in scene.groups if group.name in kind.flat.groups):
-        columns: dict[str, Given] = dict(group.columns)
+        varying: dict[str, Given] = dict(group.columns)
         numbers: dict[str, Given] = {"peers": Fraction(scene.peers)}
         for name, value in (common | dict(group.values)).items():
             numbers[name] = value.number
             # Inside a part, what depends on a number that differs from peer to peer does so too.
-            used = () if value.expression is None or name in columns else names(value.expression)
-            if any(".".join(node.parts) in columns for node in used):
-                assert value.expression is not None
-                columns[name] = to_term(value.expression)
-        found.append({symbol(name): number for name, number in (numbers | columns).items()})
+            used = () if value.expression is None else map(format_expression, names(value.expression))
+            if value.expression is not None and not varying.keys().isdisjoint(used):
+                varying.setdefault(name, to_term(value.expression))
+        found.append({symbol(name): number for name, number in (numbers | varying).items()})
     return found
 
 
@@ -139,9 +139,8 @@ def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> Sorted
     partitions = []
     for part in kind.partitions[1:]:
         its = problem(f"the equations of clock {part.clock}", part)
-        if (sides := _sides(part.equations, None, its)) is not None:
-            equal = zip(part.equations, sides, strict=True)
-            residuals = [Residual((left - right).xreplace(reductions), one) for one, (left, right) in equal]
+        if (equations := _residuals(part.equations, None, its)) is not None:
+            residuals = [Residual(one.expression.xreplace(reductions), one.equation) for one in equations]
             steps = solve_blocks(residuals, [symbol(name) for name in part.variables], its)
             partitions.append(SortedPartition(part.clock, steps))
     continuous = _sorted_continuous(kind, problem("the continuous equations", kind.partitions[0]))
@@ -172,29 +171,26 @@ def _sorted_continuous(
     where = problem.place
     reads = [FlatEquation(Name((s.symbol,)), s.expression, s.clock, s.clock, where) for s in kind.samples]
     reads += [FlatEquation(Name((s.name,)), s.expression, s.link, None, s.place) for s in kind.flat.sends]
-    sides = _sides((*equations, *reads), moving.differentiate, problem)
-    if sides is None:
+    written = _residuals(equations, moving.differentiate, problem)
+    values = _residuals(reads, moving.differentiate, problem, value=True)
+    if written is None or values is None:
         return None
     aliases = Aliases(moving, variables, started)
-    pairs = list(zip((*equations, *reads), sides, strict=True))
-    residuals = aliases.remove(
-        [Residual(left - right, one) for one, (left, right) in pairs[: len(equations)]]
-    )
-    read = [Residual(aliases.substitute(value), one) for one, (_, value) in pairs[len(equations) :]]
+    residuals = aliases.remove(written)
+    read = [Residual(aliases.substitute(one.expression), one.equation) for one in values]
     if none := [one for one in (*residuals, *read) if is_no_number(one.expression)]:
         problem.report_no_number(none)
         return None
     # A derivative that has a name of its own, or that is read, is asked for, even if no equation holds it.
     asked = [*aliases.velocities, *(it for one in read for it in moving.derivatives(one.expression).values())]
-    orders = dict.fromkeys((name for name in variables if name not in aliases.stands), 0)
-    for name, order in asked:
-        orders[name] = max(orders[name], order)
-    reduction = IndexReduction(residuals, orders, moving, problem)
-    reduced = reduction.reduced({aliases.value(name) for name in started})
+    orders = {name: 0 for name in variables if name not in aliases.stands} | dict(
+        sorted(asked, key=itemgetter(1))
+    )
+    reduced = IndexReduction(residuals, orders, moving, problem).reduced({*map(aliases.value, started)})
     if reduced is None:
         return None
-    solving, unknowns, states_ = reduced
-    states = tuple(aliases.shown(s).name for s in states_)
+    solving, unknowns, differentiated = reduced
+    states = tuple(aliases.shown(s).name for s in differentiated)
     for state in (state for state in states if state not in started):
         holder = next((one for one in equations if f"der({state})" in one.text), equations[0])
         what = f"{state} is a state, by `{holder.text}` ({holder.origin}), and has no start value"
@@ -211,10 +207,17 @@ def _sorted_continuous(
     return states, aliases.assignments(), steps, [aliases.shown(one.expression) for one in read]
 
 
-def _sides(
-    equations: Sequence[FlatEquation], differentiate: Callable[[Term], Term] | None, problem: Problem
-) -> list[tuple[Term, Term]] | None:
-    """Return both sides of equations; None where a derivative doesn't exist, or a constant is no number."""
+def _residuals(
+    equations: Sequence[FlatEquation],
+    differentiate: Callable[[Term], Term] | None,
+    problem: Problem,
+    *,
+    value: bool = False,
+) -> list[Residual] | None:
+    """Return left − right of equations, or the right side, their `value`.
+
+    None where a derivative doesn't exist, or a constant is no number.
+    """
     found = []
     for equation in equations:
         try:
@@ -225,5 +228,5 @@ def _sides(
         if any(map(is_no_number, sides)):
             problem.report_no_number([Residual(ZERO, equation)])
         else:
-            found.append(sides)
+            found.append(Residual(sides[1] if value else sides[0] - sides[1], equation))
     return found if len(found) == len(equations) else None
