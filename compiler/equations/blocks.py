@@ -33,6 +33,7 @@ from apc.compiler.equations.solution import (
 )
 from apc.compiler.equations.terms import (
     ONE,
+    ZERO,
     If,
     NoDerivativeError,
     Symbol,
@@ -116,9 +117,8 @@ def report_singular(
 def _solved(block: Sequence[Residual], unknowns: Sequence[Symbol], problem: Problem) -> Sequence[Step]:
     """Return what gives the unknowns of one block, explicit where it is linear in them."""
     known = frozenset(unknowns)
-    forms = [linear_form(residual.expression, known) for residual in block]
-    linear = [form for form in forms if form is not None]
-    if len(linear) == len(forms):
+    linear = [form for one in block if (form := linear_form(one.expression, known)) is not None]
+    if len(linear) == len(block):
         steps, free = eliminate(linear, unknowns, problem.divisors)
         if free:
             what = f"depend on each other and don't determine {listed([one.name for one in free])}"
@@ -151,9 +151,9 @@ def _torn(block: Sequence[Residual], unknowns: Sequence[Symbol], divisors: Divis
     @functools.cache
     def solved(i: int, unknown: Symbol) -> Term | None:
         """Return an unknown by an equation, None where it can't be told from that."""
-        form = linear_form(block[i].expression, frozenset((unknown,)))
-        factor = form and form[0].get(unknown)
-        if not form or factor is None or factor.free_symbols & members or divisors.is_zero(factor):
+        form = linear_form(block[i].expression, {unknown})
+        factor = form[0].get(unknown, ZERO) if form else ZERO
+        if form is None or factor.free_symbols & members or divisors.is_zero(factor):
             return None
         return -form[1] / factor
 
@@ -166,7 +166,7 @@ def _torn(block: Sequence[Residual], unknowns: Sequence[Symbol], divisors: Divis
     torn: list[Symbol] = []
     while remaining:
         single = ((i, *still) for i in left if len(still := holds[i] & remaining.keys()) == 1)
-        ready = next(((i, unknown) for i, unknown in single if solved(i, unknown) is not None), None)
+        ready = next((pair for pair in single if solved(*pair) is not None), None)
         if ready is None:
             torn.append(max(remaining, key=gain))
             del remaining[torn[-1]]

@@ -143,7 +143,9 @@ class _Clocks:
         self.given: dict[str, FlatEquation] = {}
         self._crossings = {one.symbol: one for one in kind.crossings}
         self._sets = DisjointSet()
-        self._clocks: dict[str, str] = {}  # of each set that has one, by its root
+        crossed = (one.clock for one in kind.crossings if isinstance(one, SampleCrossing))
+        named = {CONTINUOUS, *crossed, *(one.clock for one in kind.equations if one.clock is not None)}
+        self._clocks = {clock: clock for clock in named}  # of each set that has one, by its root
         self._reported: set[str] = set()  # parts whose clocked flow was reported
         hearing: dict[str, FlatEquation] = {}
         for index, equation in enumerate(kind.equations):
@@ -181,7 +183,7 @@ class _Clocks:
         """Join what stands in an expression with its domain: its equation, or the inside of a sample."""
         for node in walk(expression):
             if isinstance(node, Call) and node.function == "der":
-                self._pin(domain, CONTINUOUS, format_expression(node), equation)
+                self._join(domain, CONTINUOUS, format_expression(node), equation)
             if not isinstance(node, Name):
                 continue
             name = ".".join(node.parts)
@@ -189,29 +191,23 @@ class _Clocks:
             crossing = self._crossings.get(name)
             if name in self.variables:
                 self._join(domain, name, name, equation)
+            if isinstance(crossing, PreviousCrossing | ReceiveCrossing) and equation.clock is not None:
+                self._join(domain, equation.clock, name, equation)
             match crossing:
                 case SampleCrossing():
-                    self._pin(domain, crossing.clock, name, equation)
+                    self._join(domain, crossing.clock, name, equation)
                     inside = f"inside {name} of {equation.origin}"
-                    self._pin(inside, CONTINUOUS, name, equation)
+                    self._join(inside, CONTINUOUS, name, equation)
                     self._visit(crossing.expression, inside, equation, hearing)
                 case HoldCrossing():
-                    self._pin(domain, CONTINUOUS, name, equation)
+                    self._join(domain, CONTINUOUS, name, equation)
                 case PreviousCrossing():
-                    if equation.clock is not None:
-                        self._pin(domain, equation.clock, name, equation)
                     self._join(domain, crossing.variable, crossing.variable, equation)
                 case ReceiveCrossing():
                     self._visit(crossing.argument, domain, equation, hearing)
                     self._join(domain, name, name, equation)
                     if equation.clock is None:
                         hearing.setdefault(domain, equation)
-                    else:
-                        self._pin(domain, equation.clock, name, equation)
-
-    def _pin(self, domain: str, clock: str, because: str, equation: FlatEquation) -> None:
-        self._clocks[self._root(clock)] = clock
-        self._join(domain, clock, because, equation)
 
     def _join(self, domain: str, name: str, shown: str, equation: FlatEquation) -> None:
         """Merge the sets of a domain and of a name in it, unless they have different clocks."""

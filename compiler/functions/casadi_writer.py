@@ -42,7 +42,7 @@ _CASADI: dict[str, Callable[..., Any]] = {
     **{name: getattr(casadi, name) for name in ("atan2", *SMOOTH)},
     "and": casadi.logic_and,
     "or": casadi.logic_or,
-    "not": casadi.logic_not,
+    "Not": casadi.logic_not,
     "<": operator.lt,
     "<=": operator.le,
     ">": operator.gt,
@@ -168,7 +168,7 @@ class Writer:
         if name == "interpolate":  # a table's value, linear between its rows and constant beyond its ends
             rows = self.tables[expression.args[0].name]
             return function_of(Interpolation(rows.times, rows.numbers))(self._build(expression.args[1]))
-        if name == "if":
+        if name == "Conditional":
             holds = self._build(expression.args[0], taken)
             within = [holds, casadi.logic_not(holds)]
             if taken is not None:
