@@ -46,6 +46,13 @@ class Heard:
     before: bool = False
     edge: Term | None = None
 
+    @property
+    def sends(self) -> list[str]:
+        """The names of what is read of each other peer."""
+        symbols = () if self.edge is None else self.edge.free_symbols - {AGE}
+        others = sorted(s.name.removeprefix(f"{OTHERS}.") for s in symbols if s.name.startswith(f"{OTHERS}."))
+        return list(dict.fromkeys([self.send, *others]))
+
 
 def taken_apart(crossing: ReceiveCrossing, mistakes: Mistakes) -> tuple[Term, list[Heard]]:
     """Return a reduction as a term, and what it holds that is heard; an edge where it is not linear.

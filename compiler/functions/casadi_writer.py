@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, TypeVar
 
 import casadi
@@ -61,6 +61,7 @@ class Writer:
 
     def __init__(self, kind: SortedKind) -> None:
         flat = kind.clocked.flat
+        self.kind = kind
         self.definitions = kind.definitions
         self.tables = {f"{part.name}.{table.name}": table for part in flat.parts for table in part.tables}
         self.started = {one.name for one in flat.variables if one.start}
@@ -70,10 +71,25 @@ class Writer:
         self.parameters: dict[str, Any] = {}
         self.loops: list[tuple[Any, Any, Any]] = []  # unknowns (n,), where they begin, what is to be zero
 
-    def column(self, values: Iterable[Any]) -> Any:
-        """Return a dense column of scalars, (0, 1) when there are none."""
-        listed = list(values)
-        return casadi.densify(casadi.vertcat(*listed)) if listed else casadi.SX(0, 1)
+    def follow(self, heard: Collection[str]) -> None:
+        """Write what the motion of any state follows from, what has a limit, and the sends that are heard.
+
+        What a crossing that was read stands for is written too; what that reads, when this is called again.
+        """
+        clocked = self.kind.clocked
+        remembered = [one.variable for one in self.read(clocked.previous)]
+        for name in (*self.kind.states, *remembered):
+            self.parameter(name)
+        limited = [one.name for one in clocked.flat.variables if one.limit]
+        held = [one.variable for one in self.read(clocked.holds)]
+        self.column([*map("der({})".format, self.kind.states), *limited, *held, *remembered])
+        edges = [one.edge for one in self.read(self.kind.receives) if one.edge is not None]
+        for expression in (*edges, *(one.expression for one in self.kind.sends if one.name in heard)):
+            self.write(expression)
+
+    def column(self, names: Iterable[str]) -> Any:
+        """Return the values of some names as a dense column, (0, 1) when there are none."""
+        return casadi.densify(casadi.vertcat(casadi.SX(0, 1), *(self.write(symbol(name)) for name in names)))
 
     def parameter(self, name: str) -> Any:
         """Return the symbol of a parameter; a start value has the name of its variable."""
@@ -142,10 +158,10 @@ class Writer:
     def _tear(self, loop: ImplicitBlock) -> None:
         """Make known the unknowns of a loop that are torn; the others follow from them."""
         z = casadi.SX.sym("z", len(loop.tearing))
-        begin = self.column(self.parameter(x) if x in self.started else casadi.SX(0) for x in loop.tearing)
+        begin = casadi.vertcat(*(self.parameter(x) if x in self.started else 0 for x in loop.tearing))
         self.known |= {symbol(name): z[i] for i, name in enumerate(loop.tearing)}
         self.definitions |= {symbol(name): expression for name, expression in loop.inner}
-        self.loops.append((z, begin, self.column(map(self.write, loop.residuals))))
+        self.loops.append((z, begin, casadi.densify(casadi.vertcat(*map(self.write, loop.residuals)))))
 
     def _build(self, expression: Term, taken: Any = None) -> Any:
         """Return the value of an expression whose symbols are known.

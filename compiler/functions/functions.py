@@ -28,6 +28,7 @@ from apc.compiler.compiled import (
 )
 from apc.compiler.components.component import OTHERS
 from apc.compiler.components.parts import GROUND
+from apc.compiler.equations.derivatives import TIME
 from apc.compiler.equations.flatten import HEARD_AGE, FlatVariable
 from apc.compiler.equations.reductions import Heard
 from apc.compiler.equations.solution import Definition, ImplicitBlock
@@ -60,8 +61,13 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     scene = system.scene
     timings = Timings(scene)
     writers = [Writer(kind) for kind in system.kinds]
-    heard = _write(system.kinds, writers)
-    kinds = [_kind(kind, writer, heard, timings) for kind, writer in zip(system.kinds, writers, strict=True)]
+    before, heard = -1, list[str]()
+    while before < (before := sum(len(writer.known) for writer in writers)):  # until nothing new is read
+        for writer in writers:
+            writer.follow(heard)
+        receives = (one for writer in writers for one in writer.read(writer.kind.receives))
+        heard = list(dict.fromkeys(name for one in receives for name in one.sends))
+    kinds = [_kind(writer, heard, timings) for writer in writers]
     dropped = []
     for kind, writer in zip(system.kinds, writers, strict=True):
         unread = (one.variable for one in kind.clocked.holds if symbol(one.symbol) not in writer.known)
@@ -92,46 +98,10 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     )
 
 
-def _write(kinds: Sequence[SortedKind], writers: Sequence[Writer]) -> list[str]:
-    """Write what the motion of any state follows from, and what has a limit; return the sends that are heard.
-
-    What a crossing stands for that was read is written too, and what that reads, until nothing is new.
-    """
-    before, heard = -1, list[str]()
-    while before < (before := sum(len(writer.known) for writer in writers)):
-        for kind, writer in zip(kinds, writers, strict=True):
-            limited = [one.name for one in kind.clocked.flat.variables if one.limit]
-            previous = writer.read(kind.clocked.previous)
-            crossing = [one.variable for one in (*writer.read(kind.clocked.holds), *previous)]
-            for name in (*kind.states, *(one.variable for one in previous)):
-                writer.parameter(name)
-            for name in (*(f"der({state})" for state in kind.states), *limited, *crossing):
-                writer.write(symbol(name))
-            for edge in (one.edge for one in writer.read(kind.receives) if one.edge is not None):
-                writer.write(edge)
-            for send in (one for one in kind.sends if one.name in heard):
-                writer.write(send.expression)
-        read = (
-            one for kind, writer in zip(kinds, writers, strict=True) for one in writer.read(kind.receives)
-        )
-        heard = list(dict.fromkeys(name for one in read for name in sends_of(one)))
-    return heard
-
-
-def sends_of(heard: Heard) -> list[str]:
-    """Return the names of what is read of each other peer."""
-    symbols = () if heard.edge is None else heard.edge.free_symbols - {symbol(HEARD_AGE)}
-    others = sorted(s.name.removeprefix(f"{OTHERS}.") for s in symbols if s.name.startswith(f"{OTHERS}."))
-    return list(dict.fromkeys([heard.send, *others]))
-
-
-def _kind(kind: SortedKind, writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
+def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
     """Write a kind's functions; `heard` are the names of the sends that any kind hears."""
-    flat, holds, previous = (
-        kind.clocked.flat,
-        writer.read(kind.clocked.holds),
-        writer.read(kind.clocked.previous),
-    )
+    kind, flat = writer.kind, writer.kind.clocked.flat
+    holds, previous = writer.read(kind.clocked.holds), writer.read(kind.clocked.previous)
     sends = {send.name: send for send in kind.sends}
     units = {one.name: format_dimension(one.dimension) for one in flat.variables}
     channels: dict[str, list[str]] = {}  # over each link, what is heard of this kind
@@ -142,12 +112,9 @@ def _kind(kind: SortedKind, writer: Writer, heard: Iterable[str], timings: Timin
         outputs[one.clock][one.variable] = None
     parameters = tuple(sorted(writer.parameters))
 
-    def column(names: Iterable[str]) -> Any:
-        return writer.column(writer.write(symbol(name)) for name in names)
-
     around = (
-        {"x": column(kind.states), "u": column(one.symbol for one in holds)},
-        {"p": writer.column(map(writer.parameter, parameters)), "t": column(["time"])},
+        {"x": writer.column(kind.states), "u": writer.column(one.symbol for one in holds)},
+        {"p": casadi.vertcat(casadi.SX(0, 1), *map(writer.parameter, parameters)), "t": writer.known[TIME]},
     )
 
     def function(name: str, output: str, value: Any, between: Mapping[str, Any]) -> Any:
@@ -158,7 +125,7 @@ def _kind(kind: SortedKind, writer: Writer, heard: Iterable[str], timings: Timin
         if one.edge is None:
             return None
         theirs = [f"{OTHERS}.{name}" for name in channels[one.link]]
-        sent = column([*theirs, HEARD_AGE] if one.age == "edge" else theirs)
+        sent = writer.column([*theirs, HEARD_AGE] if one.age == "edge" else theirs)
         value = writer.write(one.edge)
         if casadi.depends_on(value, r):
             what = f"{one.symbol} asks of each other peer what depends on all that are heard"
@@ -170,7 +137,7 @@ def _kind(kind: SortedKind, writer: Writer, heard: Iterable[str], timings: Timin
         """Write what one clock's tick computes, from what is remembered and heard as well."""
         received = [one for one in writer.read(kind.receives) if one.clock == name]
         remembered = [one for one in previous if one.clock == name]
-        m, r = (column(one.symbol for one in some) for some in (remembered, received))
+        m, r = (writer.column(one.symbol for one in some) for some in (remembered, received))
         return ClockPartition(
             name,
             tuple(computed),
@@ -184,12 +151,12 @@ def _kind(kind: SortedKind, writer: Writer, heard: Iterable[str], timings: Timin
                 )
                 for one in received
             ),
-            function(f"tick_{name}", "y", column(computed), {"m": m, "r": r}),
+            function(f"tick_{name}", "y", writer.column(computed), {"m": m, "r": r}),
         )
 
     def send(link: str, names: Sequence[str]) -> SendPartition:
-        values = writer.column(writer.write(sends[name].expression) for name in names)
-        written = function(f"send_{link}", "s", values, {})
+        values = [writer.write(sends[name].expression) for name in names]
+        written = function(f"send_{link}", "s", casadi.densify(casadi.vertcat(*values)), {})
         return SendPartition(link, tuple(names), tuple(sends[name].unit for name in names), written)
 
     def limit(variable: FlatVariable) -> Limit:
@@ -200,14 +167,14 @@ def _kind(kind: SortedKind, writer: Writer, heard: Iterable[str], timings: Timin
             what = f"{name} has a limit and is computed at ticks; a limit is of what holds at every moment"
             hint = f"acting = hold({whole_and_index(own)[0]}), with the limit of acting"
             raise ApcError(Mistake("E513", variable.declared.place, what, hint=hint))
-        value = None if name in kind.states else function("limited", "value", column([name]), {})
+        value = None if name in kind.states else function("limited", "value", writer.column([name]), {})
         return Limit(name, units[name], f"{part}.{variable.limit}", value)
 
     held = [hold.variable for hold in holds]
     hands = [part for part in flat.parts if part.section == "hands"]
-    rates = column(f"der({name})" for name in kind.states)
+    rates = writer.column(f"der({name})" for name in kind.states)
     ports = [port for port in _held_ports(kind) if port[3] <= writer.known.keys()]
-    acting = column(port[row] for row in (1, 2) for port in ports)
+    acting = writer.column(port[row] for row in (1, 2) for port in ports)
     port = function("port", "potentials_flows", acting, {})
     return Kind(
         flat.name,
@@ -242,7 +209,7 @@ def _held_ports(kind: SortedKind) -> Iterable[tuple[str, str, str, set[Symbol]]]
     """
     definitions = kind.definitions
     held = {symbol(hold.symbol): hold.variable.rpartition(".")[0] for hold in kind.clocked.holds}
-    moving = {symbol(name) for name in (*kind.states, "time")}
+    moving = {*map(symbol, kind.states), TIME}
     for part in kind.clocked.flat.parts:
         passed = {outer for outer, _, _ in part.component.passed}
         for name, connector in part.component.connectors if part.name in held.values() else ():
