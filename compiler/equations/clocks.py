@@ -100,7 +100,7 @@ def _partitioned(kind: FlatKind, mistakes: Mistakes) -> ClockedKind:
     crossings = [
         one
         if isinstance(one, SampleCrossing)
-        else replace(one, clock=clocks.of(one.symbol if isinstance(one, ReceiveCrossing) else one.variable))
+        else replace(one, clock=clocks.of(getattr(one, "variable", one.symbol)))
         for one in kind.crossings
     ]
     samples = tuple(one for one in crossings if isinstance(one, SampleCrossing))
@@ -114,7 +114,7 @@ def _partitioned(kind: FlatKind, mistakes: Mistakes) -> ClockedKind:
     for one in (one for one in previous if one.clock == CONTINUOUS):
         mistakes.add("E505", one.place, one.symbol, expected="a variable that belongs to a clock")
     for send in kind.sends:
-        for variable in (".".join(name.parts) for name in names(send.expression)):
+        for variable in map(format_expression, names(send.expression)):
             clocks.check_start(variable, send.place)
             if variable in clocks.variables and (clock := clocks.of(variable)) != CONTINUOUS:
                 what = f"{send.name} is sent at ticks of {send.link}, and {variable} is on clock {clock}"
@@ -125,8 +125,7 @@ def _partitioned(kind: FlatKind, mistakes: Mistakes) -> ClockedKind:
         members.setdefault(clocks.of(f"equation {index}"), ([], []))[1].append(equation)
     for variable in clocks.variables:
         members.setdefault(clocks.of(variable), ([], []))[0].append(variable)
-    listed = ((clock, tuple(its), tuple(of)) for clock, (its, of) in members.items())
-    partitions = tuple(Partition(*one) for one in listed)
+    partitions = tuple(Partition(clock, tuple(its), tuple(of)) for clock, (its, of) in members.items())
     return ClockedKind(kind, partitions, samples, holds, previous, receives)
 
 

@@ -170,7 +170,7 @@ class FlatKind:
 
     name: str
     groups: tuple[str, ...]
-    delays: tuple[tuple[str, Value], ...]
+    delays: Named[Value]
     parts: tuple[Part, ...]
     variables: tuple[FlatVariable, ...]
     equations: tuple[FlatEquation, ...]
@@ -202,18 +202,16 @@ def flatten(scene: Scene) -> FlatSystem:
         equations = (FlatEquation(left, right, CONNECTION, None, place) for left, right, place in joints)
         kind = replace(kind, equations=(*kind.equations, *equations))
         delays = _delay_names(kind)
-        sharing: dict[str, list[SceneGroup]] = {}
+        # The schedule is a kind's: a group that sets a delay can have it changed without the others'.
+        sharing: dict[str, tuple[list[str], Named[Value]]] = {}
         for group in groups:
             for name in delays.intersection(name for name, _ in group.columns):
                 what = f"{name} can't differ from peer to peer within a group"
                 mistakes.add("E211", group.place, what, hint="a group of its own for each delay")
-            # The schedule is a kind's: a group that sets a delay can have it changed without the others'.
-            alone = any(name in delays for name, _ in group.values)
-            sharing.setdefault(group.name if alone else "", []).append(group)
-        for sharers in sharing.values():
-            members = tuple(group.name for group in sharers)
-            settings = tuple((name, value) for name, value in sharers[0].values if name in delays)
-            kinds.append(replace(kind, name=" and ".join(members), groups=members, delays=settings))
+            own = tuple(setting for setting in group.values if setting[0] in delays)
+            sharing.setdefault(group.name if own else "", ([], own))[0].append(group.name)
+        for members, own in sharing.values():
+            kinds.append(replace(kind, name=" and ".join(members), groups=tuple(members), delays=own))
     mistakes.raise_if_any()
     return FlatSystem(scene, tuple(kinds))
 
@@ -221,11 +219,11 @@ def flatten(scene: Scene) -> FlatSystem:
 def _delay_names(kind: FlatKind) -> set[str]:
     """Return the numbers of parts that a hold's delay is or depends on: of the schedule, not of equations."""
     delays = [one.delay for one in kind.crossings if isinstance(one, HoldCrossing)]
-    found = {".".join(name.parts) for delay in delays for name in names(delay)}
+    found = {format_expression(name) for delay in delays for name in names(delay)}
     for part in reversed(kind.parts):  # what an inner part's number depends on is a number of an outer part
         for name, value in part.values:
             if f"{part.name}.{name}" in found and value.expression is not None:
-                found |= {".".join(node.parts) for node in names(value.expression)}
+                found.update(map(format_expression, names(value.expression)))
     return found
 
 
@@ -267,7 +265,7 @@ def _flat_kind(name: str, parts: Sequence[Part], mistakes: Mistakes) -> FlatKind
                 for one in (*type_.potentials, *type_.flows)
             ),
         ]
-        variables += [FlatVariable(f"{part.name}.{own_name}", *its) for own_name, *its in own]
+        variables += [FlatVariable(f"{part.name}.{its}", unit, one) for its, unit, one in own]
         for equation in component.equations:
             left, right = (writer.written(one, equation) for one in (equation.left, equation.right))
             equations.append(FlatEquation(left, right, part.name, writer.clock, equation.place, equation))
@@ -287,9 +285,12 @@ def _flat_kind(name: str, parts: Sequence[Part], mistakes: Mistakes) -> FlatKind
 
 def _unsampled(node: Expr) -> Expr | None:
     """Take the samples off what is sent: it is evaluated at the link's tick as a whole."""
-    if isinstance(node, Call) and node.function == "sample":
-        return transform(node.arguments[0], _unsampled)
-    return node if isinstance(node, Call) and node.function == "hold" else None
+    match node:
+        case Call("sample", (argument, *_)):
+            return transform(argument, _unsampled)
+        case Call("hold"):
+            return node
+    return None
 
 
 class _PartWriter:

@@ -31,6 +31,7 @@ from apc.compiler.equations.terms import (
     Symbol,
     Term,
     derivative,
+    in_order,
     linear_form,
     size,
     text_of,
@@ -212,9 +213,8 @@ class IndexReduction:
             what = f"the constraint {constraints[i].shown} says what other constraints say already"
             code, hint = "E502", ""
             if not all(divisors.vanishes(factor) for factor in entries.values()):
-                held = self.moving.derivatives(sum(entries))
                 factors = ", ".join(
-                    f"{x} (by the factor {text_of(entries[s])})" for s, (x, _) in held.items()
+                    f"{symbols[s][0]} (by the factor {text_of(entries[s])})" for s in in_order(entries)
                 )
                 what = f"no variable follows from the constraint {constraints[i].shown} in every position"
                 what, code = f"{what}, since the factor moves and may vanish: {factors}", "E509"

@@ -117,7 +117,8 @@ def _power(base: int, exponent: int, inverse_of_zero: int) -> int:
 
 
 # Of one number, or of each in an array.
-_MODULAR, _POWER = np.frompyfunc(_modular, 1, 1), np.frompyfunc(_power, 3, 1)
+_MODULAR: Any = np.frompyfunc(_modular, 1, 1)
+_POWER: Any = np.frompyfunc(_power, 3, 1)
 
 
 def _is_identity(expression: Term) -> bool:

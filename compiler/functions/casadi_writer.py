@@ -66,8 +66,7 @@ class Writer:
         self.tables = {f"{part.name}.{table.name}": table for part in flat.parts for table in part.tables}
         self.started = {one.name for one in flat.variables if one.start}
         self.known: dict[Symbol, Any] = {symbol(name): casadi.SX.sym(name) for name in ("time", *kind.states)}
-        crossings = (*kind.clocked.holds, *kind.clocked.previous, *kind.receives)
-        self.crossing = {one.symbol for one in crossings}
+        self.crossing = {one.symbol for one in flat.crossings} | {one.symbol for one in kind.receives}
         self.parameters: dict[str, Any] = {}
         self.loops: list[tuple[Any, Any, Any]] = []  # unknowns (n,), where they begin, what is to be zero
 

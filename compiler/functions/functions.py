@@ -29,7 +29,7 @@ from apc.compiler.compiled import (
 from apc.compiler.components.component import OTHERS
 from apc.compiler.components.parts import GROUND
 from apc.compiler.equations.derivatives import TIME
-from apc.compiler.equations.flatten import HEARD_AGE, FlatVariable
+from apc.compiler.equations.flatten import HEARD_AGE, FlatVariable, HoldCrossing, PreviousCrossing
 from apc.compiler.equations.reductions import Heard
 from apc.compiler.equations.solution import Definition, ImplicitBlock
 from apc.compiler.equations.structure import SortedKind, SortedSystem
@@ -108,7 +108,8 @@ def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
     for name in (name for name in heard if name in sends):
         channels.setdefault(sends[name].link, []).append(name)
     outputs: dict[str, dict[str, None]] = {part.clock: {} for part in kind.partitions[1:]}
-    for one in (*holds, *previous):
+    switched: list[HoldCrossing | PreviousCrossing] = [*holds, *previous]
+    for one in switched:
         outputs[one.clock][one.variable] = None
     parameters = tuple(sorted(writer.parameters))
 
@@ -174,7 +175,7 @@ def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
     hands = [part for part in flat.parts if part.section == "hands"]
     rates = writer.column(f"der({name})" for name in kind.states)
     ports = [port for port in _held_ports(kind) if port[3] <= writer.known.keys()]
-    acting = writer.column(port[row] for row in (1, 2) for port in ports)
+    acting = writer.column([*(port[1] for port in ports), *(port[2] for port in ports)])
     port = function("port", "potentials_flows", acting, {})
     return Kind(
         flat.name,
