@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from graphlib import TopologicalSorter
+from itertools import islice
 
 import numpy as np
 
@@ -48,7 +49,6 @@ from apc.compiler.words import enumerated
 
 NO_DELAY = "no delay"
 Path = tuple[str, ...]  # a name, between its dots
-Left = list[tuple[str, str]]  # what the scene names and nothing needs, with the reason
 
 
 class Timings:
@@ -100,8 +100,8 @@ class Timings:
         return tuple(self.use(f"{kind.groups[0]}.{name}", replace(own[name], expression=tree)).split("."))
 
 
-def used_links(scene: Scene, kinds: Sequence[Kind], timings: Timings) -> tuple[list[Link], Left]:
-    """Return the links over which something is heard, and those left out with the reason.
+def used_links(scene: Scene, kinds: Sequence[Kind], timings: Timings) -> tuple[Link, ...]:
+    """Return the links over which something is heard.
 
     Parameters
     ----------
@@ -113,13 +113,9 @@ def used_links(scene: Scene, kinds: Sequence[Kind], timings: Timings) -> tuple[l
     heard = {receive.link for kind in kinds for clock in kind.clocks for receive in clock.receives}
     links = []
     for link in (link for link in scene.links if link.name in heard):
+        pairs = ((one, f"{link.name}.delays.{one.sender}.{one.receiver}") for one in link.delays)
         delays = tuple(
-            PairDelay(
-                one.sender,
-                one.receiver,
-                timings.use(f"{link.name}.delays.{one.sender}.{one.receiver}", one.delay),
-            )
-            for one in link.delays
+            PairDelay(one.sender, one.receiver, timings.use(name, one.delay)) for one, name in pairs
         )
         delay, channel, its = timings.use(f"{link.name}.delay", link.delay), None, link.channel
         if its is not None:
@@ -127,15 +123,13 @@ def used_links(scene: Scene, kinds: Sequence[Kind], timings: Timings) -> tuple[l
             jitter = None if its.jitter is None else timings.use(f"{link.name}.jitter", its.jitter)
             channel = Channel(loss, jitter, its.distribution, its.reorder, its.on_loss, its.trace)
         links.append(Link(link.name, link.clock, delay, link.graph, delays, channel))
-    return links, [
-        (one.name, "nobody hears what it would carry") for one in scene.links if one.name not in heard
-    ]
+    return tuple(links)
 
 
 def used_clocks(
     scene: Scene, kinds: Sequence[Kind], links: Sequence[Link], timings: Timings
-) -> tuple[list[Clock], Left]:
-    """Return the clocks that something ticks with, and those left out with the reason.
+) -> tuple[Clock, ...]:
+    """Return the clocks that something ticks with.
 
     Parameters
     ----------
@@ -147,12 +141,17 @@ def used_clocks(
         Takes the periods and phases that are used.
     """
     used = {link.clock for link in links} | {clock.clock for kind in kinds for clock in kind.clocks}
-    clocks = []
-    for clock in (clock for clock in scene.clocks if clock.name in used):
-        period = timings.use(f"{clock.name}.period", clock.period)
-        phase, place = timings.use(f"{clock.name}.phase", clock.phase), clock.period.place
-        clocks.append(Clock(clock.name, period, phase, place.line, place.column))
-    return clocks, [(one.name, "nothing ticks with it") for one in scene.clocks if one.name not in used]
+    return tuple(
+        Clock(
+            clock.name,
+            timings.use(f"{clock.name}.period", clock.period),
+            timings.use(f"{clock.name}.phase", clock.phase),
+            clock.period.place.line,
+            clock.period.place.column,
+        )
+        for clock in scene.clocks
+        if clock.name in used
+    )
 
 
 def check_links(scene: Scene, kinds: Sequence[Kind], places: Sequence[int]) -> None:
@@ -173,10 +172,10 @@ def check_links(scene: Scene, kinds: Sequence[Kind], places: Sequence[int]) -> N
     """
     mistakes = Mistakes()
     for link in scene.links:
-        sent = {kind.name: one.channels for kind in kinds for one in kind.sends if one.link == link.name}
-        every = dict.fromkeys(channel for channels in sent.values() for channel in channels)
-        missing = [(name, one) for one in every for name, channels in sent.items() if one not in channels]
-        for name, channel in missing[:1]:
+        sent = [(kind.name, one.channels) for kind in kinds for one in kind.sends if one.link == link.name]
+        every = [channel for _, channels in sent for channel in channels]
+        missing = ((name, one) for one in every for name, channels in sent if one not in channels)
+        for name, channel in islice(missing, 1):
             what = f"{channel} travels over {link.name}, and those of {name} send other values over it"
             hint = "a link of its own for what only some groups send"
             mistakes.add("E215", link.place, what, hint=hint)
@@ -363,12 +362,13 @@ def followers_of(
     parameters: Sequence[Parameter], timings: Sequence[Timing], groups: Sequence[Group]
 ) -> tuple[str, ...]:
     """Return the names of all numbers that follow from others, each behind what it follows from."""
-    found: dict[str, dict[str, None]] = {}
     numbers: list[Parameter | Timing] = [*parameters, *timings]
+    followed, names = TopologicalSorter[str](), set[str]()
     for one in (*numbers, *(value for group in groups for value in group.values)):
         if one.formula is not None:
-            found.setdefault(one.name, {}).update(dict.fromkeys(one.formula.names))
-    return tuple(name for name in TopologicalSorter(found).static_order() if name in found)
+            followed.add(one.name, *one.formula.names)
+            names.add(one.name)
+    return tuple(name for name in followed.static_order() if name in names)
 
 
 def _formula(expression: Expr | None) -> Formula | None:

@@ -76,20 +76,23 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     numbers = {group: i for i, kind in enumerate(system.kinds) for group in kind.clocked.flat.groups}
     places = [numbers[group.name] for group in scene.groups]
     check_links(scene, kinds, places)
-    links, unheard = used_links(scene, kinds, timings)
-    clocks, silent = used_clocks(scene, kinds, links, timings)
+    links = used_links(scene, kinds, timings)
+    clocks = used_clocks(scene, kinds, links, timings)
+    used = {one.name for one in (*links, *clocks)}  # no link has the name of a clock
+    dropped += [(one.name, "nobody hears what it would carry") for one in scene.links if one.name not in used]
+    dropped += [(one.name, "nothing ticks with it") for one in scene.clocks if one.name not in used]
     parameters = all_parameters(scene, kinds, links)
     groups = compiled_groups(scene, kinds, places, links, timings)
     return CompiledSystem(
         scene.name,
         scene.about,
-        tuple(clocks),
-        tuple(links),
+        clocks,
+        links,
         timings.found,
         parameters,
         tuple(with_rounded(scene, kind, links) for kind in kinds),
         groups,
-        tuple(dict.fromkeys([*dropped, *unheard, *silent])),
+        tuple(dict.fromkeys(dropped)),
         origin,
         scene.experiment,
         scene.region,
