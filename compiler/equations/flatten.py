@@ -317,7 +317,7 @@ class _PartWriter:
         """Return an expression in whole names; `heard` in a reduction, where alone others can be named."""
 
         def whole(node: Expr) -> Expr | None:
-            reads = any(name.parts[0] == OTHERS for name in names(node))
+            reads = isinstance(node, Name | Call) and any(one.parts[0] == OTHERS for one in names(node))
             match node:
                 case Name():
                     return self._name(node) if heard or not reads else self._each(node)
