@@ -44,6 +44,7 @@ from apc.compiler.equations.terms import (
     symbol,
 )
 from apc.compiler.equations.zero_test import Divisors
+from apc.compiler.errors import ApcError
 from apc.compiler.words import counted
 
 # A loop of more guesses isn't asked whether it has one solution, nor more pieces of it between its corners.
@@ -58,37 +59,41 @@ def solve_blocks(
     Parameters
     ----------
     residuals, unknowns
-        As many equations as unknowns; a mistake if not.
+        As many equations as unknowns.
     problem
-        Takes E502 equations or unknowns left over, E503 a loop without an unknown to solve for, E511 linear
+        Takes E503 a loop without an unknown to solve for, E511 linear
         equations that depend on each other, E512 what is no number.
+
+    Raises
+    ------
+    ApcError
+        E502 equations or unknowns left over.
     """
     known = frozenset(unknowns)
     held = [one.expression.free_symbols & known for one in residuals]
     left_over, over, under, blocks = match(held, unknowns)
     if left_over or under[1]:
-        report_singular(residuals, left_over, over, under, problem)
-        return ()
+        raise singular(residuals, left_over, over, under, problem)
     steps: list[Step] = []
     for rows, own in blocks:
         block = [residuals[row] for row in rows]
-        solved = _solved(block, own, problem)
-        parts = [one.expressions if isinstance(one, ImplicitBlock) else one[1:] for one in solved]
-        if any(is_no_number(expression) for part in parts for expression in part):
-            problem.report_no_number(block)  # what was divided may cancel
-        else:
+        with problem.mistakes:
+            solved = _solved(block, own, problem)
+            parts = [one.expressions if isinstance(one, ImplicitBlock) else one[1:] for one in solved]
+            if any(is_no_number(expression) for part in parts for expression in part):
+                raise problem.no_number(block)  # what was divided may cancel
             steps += solved
     return tuple(steps)
 
 
-def report_singular(
+def singular(
     residuals: Sequence[Residual],
     left_over: Sequence[int],
     over: Block[Any],
     under: Block[Any],
     problem: Problem,
-) -> None:
-    """Add the mistake E502: which equations and which unknowns are too many.
+) -> ApcError:
+    """Return the mistake E502: which equations and which unknowns are too many.
 
     Parameters
     ----------
@@ -97,7 +102,7 @@ def report_singular(
     left_over, over, under
         As `match` gives them, of unknowns that are shown by their text.
     problem
-        Takes the mistake.
+        What they are called.
     """
     parts = []
     (too_many, held), (holding, open_) = (
@@ -111,7 +116,7 @@ def report_singular(
         has = "has" if len(open_) == 1 else "have"
         parts.append(f"{counted(len(open_), 'unknown')} ({listed(open_)}) {has} {by}")
     what = f"{problem.where} can't be solved: {'; and '.join(parts)}"
-    problem.report("E502", [residuals[i] for i in left_over] or residuals, what)
+    return problem.fault("E502", [residuals[i] for i in left_over] or residuals, what)
 
 
 def _solved(block: Sequence[Residual], unknowns: Sequence[Symbol], problem: Problem) -> Sequence[Step]:
@@ -122,7 +127,7 @@ def _solved(block: Sequence[Residual], unknowns: Sequence[Symbol], problem: Prob
         steps, free = eliminate(linear, unknowns, problem.divisors)
         if free:
             what = f"depend on each other and don't determine {listed([one.name for one in free])}"
-            problem.report("E511", block, f"{problem.where} {what}: {listed(block)}")
+            raise problem.fault("E511", block, f"{problem.where} {what}: {listed(block)}")
         return steps
     loop = _torn(block, unknowns, problem.divisors)
     residuals = loop.residuals
@@ -134,8 +139,9 @@ def _solved(block: Sequence[Residual], unknowns: Sequence[Symbol], problem: Prob
     elif _is_open(residuals, [symbol(name) for name in loop.tearing], problem.divisors):
         fault = "hold a loop that many values solve, or none"
     if fault:
-        problem.report("E503", block, f"{problem.where} {fault}: {loop.chain}, by {listed(block)}")
-    return () if fault else (loop,)
+        what = f"{problem.where} {fault}: {loop.chain}, by {listed(block)}"
+        raise problem.fault("E503", block, what)
+    return (loop,)
 
 
 def _torn(block: Sequence[Residual], unknowns: Sequence[Symbol], divisors: Divisors) -> ImplicitBlock:

@@ -107,12 +107,14 @@ def _partitioned(kind: FlatKind, mistakes: Mistakes) -> ClockedKind:
     holds = tuple(one for one in crossings if isinstance(one, HoldCrossing))
     previous = tuple(one for one in crossings if isinstance(one, PreviousCrossing))
     receives = tuple(one for one in crossings if isinstance(one, ReceiveCrossing))
-    for hold in (hold for hold in holds if hold.clock == CONTINUOUS):
-        call = format_expression(Call("hold", (Name((hold.shown,)), hold.delay)))
-        what = f"{call} holds {hold.shown}, which is continuous already"
-        mistakes.add("E505", hold.place, what, hint=hold.shown)
-    for one in (one for one in previous if one.clock == CONTINUOUS):
-        mistakes.add("E505", one.place, one.symbol, expected="a variable that belongs to a clock")
+    for hold in holds:
+        if hold.clock == CONTINUOUS:
+            call = format_expression(Call("hold", (Name((hold.shown,)), hold.delay)))
+            what = f"{call} holds {hold.shown}, which is continuous already"
+            mistakes.add("E505", hold.place, what, hint=hold.shown)
+    for one in previous:
+        if one.clock == CONTINUOUS:
+            mistakes.add("E505", one.place, one.symbol, expected="a variable that belongs to a clock")
     for send in kind.sends:
         for variable in map(format_expression, names(send.expression)):
             clocks.check_start(variable, send.place)

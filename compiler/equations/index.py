@@ -21,7 +21,7 @@ from collections.abc import Iterable, Mapping, Sequence, Set
 
 import sympy
 
-from apc.compiler.equations.blocks import report_singular
+from apc.compiler.equations.blocks import singular
 from apc.compiler.equations.derivatives import TIME, Derivative, Moving
 from apc.compiler.equations.elimination import Elimination
 from apc.compiler.equations.matching import match
@@ -36,6 +36,7 @@ from apc.compiler.equations.terms import (
     size,
     text_of,
 )
+from apc.compiler.language.values import AlreadyReportedError
 
 # More derivatives than this of one variable: no mechanical model needs them (a constraint on a position
 # needs two), so the equations do not end.
@@ -62,8 +63,8 @@ class IndexReduction:
     moving
         Knows the derivatives of the variables.
     problem
-        Takes E502 equations or unknowns left over or constraints that say the same, E508 the derivative of a
-        value that jumps, E509 states that can't be chosen once and for all.
+        What they are called. Raised are E502 equations or unknowns left over or constraints that say the
+        same, E508 the derivative of a value that jumps, E509 states that can't be chosen once and for all.
     """
 
     def __init__(
@@ -78,18 +79,16 @@ class IndexReduction:
         for residual in residuals:
             self._add(residual)
 
-    def reduced(self, started: Set[Symbol]) -> Reduced | None:
-        """Differentiate what must be and choose the states; None if the equations can't be solved.
+    def reduced(self, started: Set[Symbol]) -> Reduced:
+        """Differentiate what must be and choose the states.
 
         `started` are the variables and derivatives with a declared start value.
         """
         left_over, over, under, _ = match(self.held, list(self.order))
         if left_over or under[1]:
-            report_singular(self.residuals, left_over, over, under, self.problem)
-            return None
-        dummies = self._choose_dummies(started) if self._differentiate_constraints() else None
-        if dummies is None:
-            return None
+            raise singular(self.residuals, left_over, over, under, self.problem)
+        self._differentiate_constraints()
+        dummies = self._choose_dummies(started)
         states: list[Symbol] = []
         unknowns: list[Symbol] = []
         for name, top in self.order.items():
@@ -107,27 +106,26 @@ class IndexReduction:
 
     # ---- Pantelides ----
 
-    def _differentiate_constraints(self) -> bool:
+    def _differentiate_constraints(self) -> None:
         """Match every equation to a highest derivative, differentiating those that hold none of their own."""
         while True:
             newest = sorted({*range(len(self.residuals))} - {*self.integral.values()})
             held = [[x for x, order in self.held[i].items() if order == self.order[x]] for i in newest]
             left_over, (rows, names), *_ = match(held, list(self.order))
-            if not left_over or not self._pass_on([newest[i] for i in rows], names):
-                return not left_over
+            if not left_over:
+                return
+            self._pass_on([newest[i] for i in rows], names)
 
-    def _pass_on(self, rows: Sequence[int], names: Sequence[str]) -> bool:
+    def _pass_on(self, rows: Sequence[int], names: Sequence[str]) -> None:
         """Differentiate equations that block one another, and with them the order of what they hold."""
         blocking = [self.residuals[row] for row in rows]
-        for row in rows:
+        for row, residual in zip(rows, blocking, strict=True):
             if not self._moves_on(row):
                 what = (
                     "holds no unknown once what the connections and other equations say is put in: "
                     "it says what they say already, or contradicts them"
                 )
-                at_fault = self.residuals[row]
-                self.problem.report("E502", [at_fault], f"{at_fault.shown} {what}")
-                return False
+                raise self.problem.fault("E502", [residual], f"{residual.shown} {what}")
         for name in names:
             self.order[name] += 1
         # Each factor of a product stands beside the slopes of all the others.
@@ -135,17 +133,14 @@ class IndexReduction:
         if any(self.order[name] > HIGHEST_ORDER for name in names) or max(grown) > LARGEST:
             shown = ", ".join(dict.fromkeys(one.shown for one in blocking))
             what = f"no number of derivatives of these equations determines what they hold: {shown}"
-            self.problem.report("E509", blocking, what)
-            return False
+            raise self.problem.fault("E509", blocking, what)
         for row, residual in zip(rows, blocking, strict=True):
             try:
                 expression = self.moving.differentiate(residual.expression)
             except NoDerivativeError as missing:
-                report_no_derivative(residual, missing, self.problem)
-                return False
+                raise self.problem.no_derivative(residual, missing) from missing
             self.integral[len(self.residuals)] = row
             self._add(Residual(expression, residual.equation))
-        return True
 
     def _moves_on(self, row: int) -> bool:
         """Return whether an equation holds what a derivative of it may determine.
@@ -160,7 +155,7 @@ class IndexReduction:
 
     # ---- dummy derivatives ----
 
-    def _choose_dummies(self, started: Set[Symbol]) -> set[Derivative] | None:
+    def _choose_dummies(self, started: Set[Symbol]) -> set[Derivative]:
         """Return the derivatives that become unknowns, level by level from the highest order down.
 
         At each level as many as there are constraints, so that the constraints' Jacobian in them is regular.
@@ -172,16 +167,12 @@ class IndexReduction:
         while rows:
             candidates.sort(key=lambda it: (derivative(it[0], it[1] - 1) in started, -it[1], -rank[it[0]]))
             level = self._regular_columns(rows, candidates)
-            if level is None:
-                return None
             chosen |= set(level)
             rows = [self.integral[row] for row in rows if self.integral[row] in self.integral]
             candidates = [(name, order - 1) for name, order in level if order > 1]
         return chosen
 
-    def _regular_columns(
-        self, rows: Sequence[int], candidates: Sequence[Derivative]
-    ) -> list[Derivative] | None:
+    def _regular_columns(self, rows: Sequence[int], candidates: Sequence[Derivative]) -> list[Derivative]:
         """Return the first columns, in the order given, in which the rows' Jacobian is regular.
 
         Elimination column by column; a factor that moves, such as 2·x, may vanish and is no pivot.
@@ -195,8 +186,7 @@ class IndexReduction:
             if form is None:  # else a derivative is linear in the highest derivatives
                 what = f"in the constraint {one.shown} a condition hangs on a derivative that it ties down"
                 hint = "a condition on positions, parameters or time"
-                self.problem.report("E509", [one], f"{where}: {what}", hint)
-                return None
+                raise self.problem.fault("E509", [one], f"{where}: {what}", hint)
             linear.append(form[0])
         system = Elimination(linear, divisors, "", LARGEST)
         chosen = []
@@ -219,14 +209,10 @@ class IndexReduction:
                 what = f"no variable follows from the constraint {constraints[i].shown} in every position"
                 what, code = f"{what}, since the factor moves and may vanish: {factors}", "E509"
                 hint = "the constraint with an angle or another coordinate that gives every position"
-            self.problem.report(code, [constraints[i]], f"{where}: {what}", hint)
-        return None if system.rows else chosen
+            self.problem.mistakes.take(self.problem.fault(code, [constraints[i]], f"{where}: {what}", hint))
+        if system.rows:
+            raise AlreadyReportedError
+        return chosen
 
     def _moves(self, factor: Term) -> bool:
         return TIME in factor.free_symbols or bool(self.moving.derivatives(factor))
-
-
-def report_no_derivative(residual: Residual, missing: NoDerivativeError, problem: Problem) -> None:
-    """Add the mistake E508: an equation's derivative is needed, and what it holds has none."""
-    what = f"{residual.shown} needs the derivative of {missing}"
-    problem.report("E508", [residual], f"{what}; a position follows such a force only through a mass")

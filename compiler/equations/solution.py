@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from apc.compiler.equations.flatten import FlatEquation
-from apc.compiler.equations.terms import Symbol, Term, symbol
+from apc.compiler.equations.terms import NoDerivativeError, Symbol, Term, symbol
 from apc.compiler.equations.zero_test import Divisors
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 
 Assignment = tuple[str, Term]  # an unknown, and the expression that gives it
 MOST_LISTED = 8  # equations or unknowns in one message
@@ -44,15 +44,20 @@ class Problem:
     divisors: Divisors
     mistakes: Mistakes
 
-    def report(self, code: str, residuals: Sequence[Residual], what: str, hint: str = "") -> None:
-        """Add a mistake where the first of some equations stands."""
+    def fault(self, code: str, residuals: Sequence[Residual], what: str, hint: str = "") -> ApcError:
+        """Return a mistake where the first of some equations stands."""
         place = residuals[0].equation.place if residuals else self.place
-        self.mistakes.add(code, place, what, hint=hint)
+        return ApcError(Mistake(code, place, what, hint=hint))
 
-    def report_no_number(self, residuals: Sequence[Residual]) -> None:
-        """Add the mistake E512: equations in which a constant is none, maybe after others are put in."""
+    def no_number(self, residuals: Sequence[Residual]) -> ApcError:
+        """Return the mistake E512: equations in which a constant is none, maybe after others are put in."""
         holds = f"{listed(residuals)} hold{'s' if len(residuals) == 1 else ''}"
-        self.report("E512", residuals, f"{holds} a constant that is no number, such as 1/0 or sqrt(-1)")
+        return self.fault("E512", residuals, f"{holds} a constant that is no number, such as 1/0 or sqrt(-1)")
+
+    def no_derivative(self, residual: Residual, missing: NoDerivativeError) -> ApcError:
+        """Return the mistake E508: an equation's derivative is needed, and what it holds has none."""
+        what = f"{residual.shown} needs the derivative of {missing}"
+        return self.fault("E508", [residual], f"{what}; a position follows such a force only through a mass")
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ from apc.compiler.equations.blocks import solve_blocks
 from apc.compiler.equations.clocks import CONTINUOUS, ClockedKind, ClockedSystem, Partition
 from apc.compiler.equations.derivatives import Moving
 from apc.compiler.equations.flatten import FlatEquation
-from apc.compiler.equations.index import IndexReduction, report_no_derivative
+from apc.compiler.equations.index import IndexReduction
 from apc.compiler.equations.reductions import Heard, taken_apart
 from apc.compiler.equations.solution import Assignment, Definition, ImplicitBlock, Problem, Residual, Step
 from apc.compiler.equations.terms import (
@@ -39,6 +39,7 @@ from apc.compiler.equations.zero_test import Divisors, Given
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.language.expression import Name, format_expression, names
 from apc.compiler.language.unit_text import format_dimension
+from apc.compiler.language.values import AlreadyReportedError
 from apc.compiler.scene.scene import Scene
 
 
@@ -102,9 +103,12 @@ def sort(clocked: ClockedSystem) -> SortedSystem:
         for declared in part.component.numbers
         if declared.open_minimum and declared.minimum == 0
     }
-    kinds = [_sorted(kind, Divisors(nonzero, _numbers(scene, kind)), mistakes) for kind in clocked.kinds]
+    kinds = []
+    for kind in clocked.kinds:
+        with mistakes:
+            kinds.append(_sorted(kind, Divisors(nonzero, _numbers(scene, kind)), mistakes))
     mistakes.raise_if_any()
-    return SortedSystem(scene, tuple(kind for kind in kinds if kind is not None))
+    return SortedSystem(scene, tuple(kinds))
 
 
 def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[Symbol, Given]]:
@@ -124,8 +128,8 @@ def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[Symbol, Given]]:
     return found
 
 
-def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> SortedKind | None:
-    """Sort and solve a kind; None where there are mistakes."""
+def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> SortedKind:
+    """Sort and solve a kind. Raises ApcError with what stands in the way of the continuous equations."""
 
     def problem(where: str, part: Partition) -> Problem:
         place = next((one.place for one in (*part.equations, *kind.flat.equations)), Place("topology"))
@@ -139,14 +143,14 @@ def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> Sorted
     partitions = []
     for part in kind.partitions[1:]:
         its = problem(f"the equations of clock {part.clock}", part)
-        if (equations := _residuals(part.equations, None, its)) is not None:
-            residuals = [Residual(one.expression.xreplace(reductions), one.equation) for one in equations]
+        with mistakes:
+            equal = zip(part.equations, _sides(part.equations, None, its), strict=True)
+            residuals = [Residual((left - right).xreplace(reductions), one) for one, (left, right) in equal]
             steps = solve_blocks(residuals, [symbol(name) for name in part.variables], its)
             partitions.append(SortedPartition(part.clock, steps))
-    continuous = _sorted_continuous(kind, problem("the continuous equations", kind.partitions[0]))
-    if continuous is None or mistakes:
-        return None
-    states, aliases, steps, read = continuous
+    states, aliases, steps, read = _sorted_continuous(
+        kind, problem("the continuous equations", kind.partitions[0])
+    )
     samples = zip((one.symbol for one in kind.samples), read, strict=False)
     sends = zip(kind.flat.sends, read[len(kind.samples) :], strict=True)
     return SortedKind(
@@ -162,8 +166,8 @@ def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> Sorted
 
 def _sorted_continuous(
     kind: ClockedKind, problem: Problem
-) -> tuple[tuple[str, ...], tuple[Assignment, ...], tuple[Step, ...], list[Term]] | None:
-    """Return states, aliases, steps, and what is sampled and sent; None where there are mistakes."""
+) -> tuple[tuple[str, ...], tuple[Assignment, ...], tuple[Step, ...], list[Term]]:
+    """Return states, aliases, steps, and what is sampled and sent. Raises ApcError where there is no way."""
     variables, equations = kind.partitions[0].variables, kind.partitions[0].equations
     started = {variable.name for variable in kind.flat.variables if variable.start}
     moving = Moving(dict.fromkeys(variables), {hold.symbol for hold in kind.holds})
@@ -171,25 +175,22 @@ def _sorted_continuous(
     where = problem.place
     reads = [FlatEquation(Name((s.symbol,)), s.expression, s.clock, s.clock, where) for s in kind.samples]
     reads += [FlatEquation(Name((s.name,)), s.expression, s.link, None, s.place) for s in kind.flat.sends]
-    written = _residuals(equations, moving.differentiate, problem)
-    values = _residuals(reads, moving.differentiate, problem, value=True)
-    if written is None or values is None:
-        return None
+    sides = _sides((*equations, *reads), moving.differentiate, problem)
     aliases = Aliases(moving, variables, started)
-    residuals = aliases.remove(written)
-    read = [Residual(aliases.substitute(one.expression), one.equation) for one in values]
+    residuals = aliases.remove(
+        [Residual(left - right, one) for one, (left, right) in zip(equations, sides, strict=False)]
+    )
+    values = zip(reads, sides[len(equations) :], strict=True)
+    read = [Residual(aliases.substitute(value), one) for one, (_, value) in values]
     if none := [one for one in (*residuals, *read) if is_no_number(one.expression)]:
-        problem.report_no_number(none)
-        return None
+        raise problem.no_number(none)
     # A derivative that has a name of its own, or that is read, is asked for, even if no equation holds it.
     asked = [*aliases.velocities, *(it for one in read for it in moving.derivatives(one.expression).values())]
     orders = {name: 0 for name in variables if name not in aliases.stands} | dict(
         sorted(asked, key=itemgetter(1))
     )
-    reduced = IndexReduction(residuals, orders, moving, problem).reduced({*map(aliases.value, started)})
-    if reduced is None:
-        return None
-    solving, unknowns, differentiated = reduced
+    reduction = IndexReduction(residuals, orders, moving, problem)
+    solving, unknowns, differentiated = reduction.reduced({*map(aliases.value, started)})
     states = tuple(aliases.shown(s).name for s in differentiated)
     for state in (state for state in states if state not in started):
         holder = next((one for one in equations if f"der({state})" in one.text), equations[0])
@@ -207,26 +208,20 @@ def _sorted_continuous(
     return states, aliases.assignments(), steps, [aliases.shown(one.expression) for one in read]
 
 
-def _residuals(
-    equations: Sequence[FlatEquation],
-    differentiate: Callable[[Term], Term] | None,
-    problem: Problem,
-    *,
-    value: bool = False,
-) -> list[Residual] | None:
-    """Return left − right of equations, or the right side, their `value`.
-
-    None where a derivative doesn't exist, or a constant is no number.
-    """
+def _sides(
+    equations: Sequence[FlatEquation], differentiate: Callable[[Term], Term] | None, problem: Problem
+) -> list[tuple[Term, Term]]:
+    """Return both sides of equations. Raises ApcError for derivatives and constants that do not exist."""
     found = []
     for equation in equations:
-        try:
-            sides = (to_term(equation.left, differentiate), to_term(equation.right, differentiate))
-        except NoDerivativeError as missing:
-            report_no_derivative(Residual(ZERO, equation), missing, problem)
-            continue
-        if any(map(is_no_number, sides)):
-            problem.report_no_number([Residual(ZERO, equation)])
-        else:
-            found.append(Residual(sides[1] if value else sides[0] - sides[1], equation))
-    return found if len(found) == len(equations) else None
+        with problem.mistakes:
+            try:
+                sides = (to_term(equation.left, differentiate), to_term(equation.right, differentiate))
+            except NoDerivativeError as missing:
+                raise problem.no_derivative(Residual(ZERO, equation), missing) from missing
+            if any(map(is_no_number, sides)):
+                raise problem.no_number([Residual(ZERO, equation)])
+            found.append(sides)
+    if len(found) < len(equations):
+        raise AlreadyReportedError
+    return found
