@@ -13,9 +13,9 @@ for tearing systems of equations in object-oriented modeling, 1994).
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import islice
-from typing import Any
+from typing import TypeVar
 
 import sympy
 from sympy.matrices import dotprodsimp
@@ -44,11 +44,11 @@ from apc.compiler.equations.terms import (
     symbol,
 )
 from apc.compiler.equations.zero_test import Divisors
-from apc.compiler.errors import ApcError
 from apc.compiler.words import counted
 
 # A loop of more guesses isn't asked whether it has one solution, nor more pieces of it between its corners.
 MOST_GUESSES, MOST_PIECES = 3, 64
+T = TypeVar("T")
 
 
 def solve_blocks(
@@ -61,8 +61,8 @@ def solve_blocks(
     residuals, unknowns
         As many equations as unknowns.
     problem
-        Takes E503 a loop without an unknown to solve for, E511 linear
-        equations that depend on each other, E512 what is no number.
+        Takes E503 a loop without an unknown to solve for, E511 linear equations that depend on each other,
+        E512 what is no number.
 
     Raises
     ------
@@ -71,11 +71,8 @@ def solve_blocks(
     """
     known = frozenset(unknowns)
     held = [one.expression.free_symbols & known for one in residuals]
-    left_over, over, under, blocks = match(held, unknowns)
-    if left_over or under[1]:
-        raise singular(residuals, left_over, over, under, problem)
     steps: list[Step] = []
-    for rows, own in blocks:
+    for rows, own in balanced(residuals, held, unknowns, problem):
         block = [residuals[row] for row in rows]
         with problem.mistakes:
             solved = _solved(block, own, problem)
@@ -86,27 +83,31 @@ def solve_blocks(
     return tuple(steps)
 
 
-def singular(
-    residuals: Sequence[Residual],
-    left_over: Sequence[int],
-    over: Block[Any],
-    under: Block[Any],
-    problem: Problem,
-) -> ApcError:
-    """Return the mistake E502: which equations and which unknowns are too many.
+def balanced(
+    residuals: Sequence[Residual], held: Sequence[Collection[T]], unknowns: Sequence[T], problem: Problem
+) -> list[Block[T]]:
+    """Return what has to be computed together, in order, of equations that give their unknowns.
 
     Parameters
     ----------
     residuals
         The equations.
-    left_over, over, under
-        As `match` gives them, of unknowns that are shown by their text.
+    held, unknowns
+        As `match` takes them; unknowns are shown by their text.
     problem
-        What they are called.
+        What the equations are called.
+
+    Raises
+    ------
+    ApcError
+        E502 which equations and which unknowns are too many.
     """
+    left_over, over, under, blocks = match(held, unknowns)
+    if not (left_over or under[1]):
+        return blocks
     parts = []
     (too_many, held), (holding, open_) = (
-        ([residuals[i] for i in rows], [str(one) for one in unknowns]) for rows, unknowns in (over, under)
+        ([residuals[i] for i in rows], [*map(str, some)]) for rows, some in (over, under)
     )
     if too_many:
         only = f"only {counted(len(held), 'unknown')} ({listed(held)})" if held else "no unknown"
@@ -116,7 +117,7 @@ def singular(
         has = "has" if len(open_) == 1 else "have"
         parts.append(f"{counted(len(open_), 'unknown')} ({listed(open_)}) {has} {by}")
     what = f"{problem.where} can't be solved: {'; and '.join(parts)}"
-    return problem.fault("E502", [residuals[i] for i in left_over] or residuals, what)
+    raise problem.fault("E502", [residuals[i] for i in left_over] or residuals, what)
 
 
 def _solved(block: Sequence[Residual], unknowns: Sequence[Symbol], problem: Problem) -> Sequence[Step]:

@@ -21,7 +21,7 @@ from collections.abc import Iterable, Mapping, Sequence, Set
 
 import sympy
 
-from apc.compiler.equations.blocks import singular
+from apc.compiler.equations.blocks import balanced
 from apc.compiler.equations.derivatives import TIME, Derivative, Moving
 from apc.compiler.equations.elimination import Elimination
 from apc.compiler.equations.matching import match
@@ -84,9 +84,7 @@ class IndexReduction:
 
         `started` are the variables and derivatives with a declared start value.
         """
-        left_over, over, under, _ = match(self.held, list(self.order))
-        if left_over or under[1]:
-            raise singular(self.residuals, left_over, over, under, self.problem)
+        balanced(self.residuals, self.held, list(self.order), self.problem)
         self._differentiate_constraints()
         dummies = self._choose_dummies(started)
         states: list[Symbol] = []

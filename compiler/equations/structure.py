@@ -176,7 +176,7 @@ def _sorted_continuous(
     reads = [FlatEquation(Name((s.symbol,)), s.expression, s.clock, s.clock, where) for s in kind.samples]
     reads += [FlatEquation(Name((s.name,)), s.expression, s.link, None, s.place) for s in kind.flat.sends]
     sides = _sides((*equations, *reads), moving.differentiate, problem)
-    aliases = Aliases(moving, variables, started)
+    aliases = Aliases(moving, started)
     residuals = aliases.remove(
         [Residual(left - right, one) for one, (left, right) in zip(equations, sides, strict=False)]
     )

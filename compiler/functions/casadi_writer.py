@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import operator
+import re
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, TypeVar
 
@@ -134,7 +135,9 @@ class Writer:
             if s in self.known:
                 work.pop()
             elif definition is None:
-                self.known[s] = self._undefined(s.name)
+                crosses = s.name in self.crossing or s.name.startswith(f"{OTHERS}.")
+                start = re.sub(r"^initial\((.*)\)$", r"\1", s.name)
+                self.known[s] = casadi.SX.sym(s.name) if crosses else self.parameter(start)
             elif missing := self._needed(definition):
                 work += missing
             elif isinstance(definition, ImplicitBlock):
@@ -142,11 +145,6 @@ class Writer:
             else:
                 self.known[s] = self._build(definition)
         return self._build(wanted)
-
-    def _undefined(self, name: str) -> Any:
-        if name in self.crossing or name.startswith(f"{OTHERS}."):
-            return casadi.SX.sym(name)
-        return self.parameter(name[len("initial(") : -1] if name.startswith("initial(") else name)
 
     def _needed(self, expression: Definition) -> list[Symbol]:
         """Return the symbols that have to be written before an expression."""

@@ -78,7 +78,7 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     check_links(scene, kinds, places)
     links = used_links(scene, kinds, timings)
     clocks = used_clocks(scene, kinds, links, timings)
-    used = {one.name for one in (*links, *clocks)}  # no link has the name of a clock
+    used = {one.name for one in links} | {one.name for one in clocks}  # no link has the name of a clock
     dropped += [(one.name, "nobody hears what it would carry") for one in scene.links if one.name not in used]
     dropped += [(one.name, "nothing ticks with it") for one in scene.clocks if one.name not in used]
     parameters = all_parameters(scene, kinds, links)
