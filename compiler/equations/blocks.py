@@ -106,11 +106,11 @@ def balanced(
     if not (left_over or under[1]):
         return blocks
     parts = []
-    (too_many, held), (holding, open_) = (
+    (too_many, theirs), (holding, open_) = (
         ([residuals[i] for i in rows], [*map(str, some)]) for rows, some in (over, under)
     )
     if too_many:
-        only = f"only {counted(len(held), 'unknown')} ({listed(held)})" if held else "no unknown"
+        only = f"only {counted(len(theirs), 'unknown')} ({listed(theirs)})" if theirs else "no unknown"
         parts.append(f"{counted(len(too_many), 'equation')} hold {only}: {listed(too_many)}")
     if open_:
         by = f"only {counted(len(holding), 'equation')}, {listed(holding)}" if holding else "no equation"
