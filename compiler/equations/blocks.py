@@ -1,6 +1,7 @@
 """Which equation computes which unknown, in which order, and how each block of them is solved.
 
-Takes: equations as residuals, and the unknowns. Gives: `solve_blocks`: assignments and `ImplicitBlock`s.
+Takes: equations as residuals, and the unknowns. Gives: `solve_blocks`: assignments and `ImplicitBlock`s;
+`balanced`, the blocks alone.
 Guarantees: every unknown is assigned once, from what was assigned before; linear blocks come out explicit.
 Does not: differentiate anything (see `index`), or know of states and clocks.
 

@@ -1,6 +1,7 @@
 """Equations as residuals and what solving them gives: assignments, and loops that an iteration has to solve.
 
-Takes: nothing (data types). Gives: `Residual`, `Problem`; `Assignment`, `ImplicitBlock`, their union `Step`.
+Takes: nothing (data types). Gives: `Residual`, `Problem`; `Assignment`, `ImplicitBlock`, their union `Step`,
+`Definition`.
 Guarantees: plain frozen data.
 Does not: solve anything (see `blocks`).
 """
