@@ -24,6 +24,7 @@ import sympy
 
 from apc.compiler.language.expression import (
     COMPARISONS,
+    LEVELS,
     SMOOTH,
     Binary,
     Call,
@@ -37,6 +38,7 @@ from apc.compiler.language.expression import (
     Number,
     fold,
     format_expression,
+    operation,
 )
 
 Term: TypeAlias = Any  # sympy.Expr, which has no complete types
@@ -124,14 +126,16 @@ FUNCTIONS: dict[str, Any] = {
     "*": operator.mul,
     "/": operator.truediv,
     "^": operator.pow,
-    "if": If,
+    "Negate": operator.neg,
+    "Conditional": If,
     "max": Max,
     "min": Min,
     "interpolate": Interpolate,
     "abs": Abs,
     "sqrt": sympy.sqrt,
     **{name: getattr(sympy, name) for name in ("sign", "floor", "atan2", *SMOOTH)},
-    **{name: type(name, (Condition,), {}) for name in (*COMPARISONS, "and", "or", "not")},
+    **{name: type(name, (Condition,), {}) for name in (*COMPARISONS, "and", "or")},
+    "Not": type("not", (Condition,), {}),
 }
 NAMES = {sympy.Abs: "abs", **{function: name for name, function in FUNCTIONS.items()}}
 
@@ -165,18 +169,14 @@ def to_term(expression: Expr, differentiate: Callable[[Term], Term] | None = Non
             return symbol(".".join(node.parts))
         return sympy.Rational(node.value.numerator, node.value.denominator)
 
-    def operation(node: Expr, *operands: Term) -> Term:
-        match node:
-            case Call("der"):
-                assert differentiate is not None, node
-                return differentiate(*operands)
-            case Negate():
-                return -operands[0]
-            case Call(function=name) | Binary(operator=name) | Compare(operator=name) | Logic(operator=name):
-                return FUNCTIONS[name](*operands)
-        return FUNCTIONS["if" if isinstance(node, Conditional) else "not"](*operands)
+    def term(node: Expr, *operands: Term) -> Term:
+        name = operation(node)
+        if name == "der":
+            assert differentiate is not None, node
+            return differentiate(*operands)
+        return FUNCTIONS[name](*operands)
 
-    return fold(expression, leaf, operation)
+    return fold(expression, leaf, term)
 
 
 # ---- what is asked of terms ----
@@ -265,23 +265,18 @@ def _written(term: Term) -> Expr:
         return Call("sqrt", (_written(term.base),))
     arguments = tuple(map(_written, term.args))
     name = NAMES.get(term.func, term.func.__name__)
-    if name == "if":
-        return Conditional(*arguments)
-    if name in COMPARISONS:
-        return Compare(name, *arguments)
-    if name in ("and", "or"):
-        return Logic(name, *arguments)
-    return Not(*arguments) if name == "not" else Call(name, arguments)
+    if name in ("Conditional", "Not"):
+        return Conditional(*arguments) if name == "Conditional" else Not(*arguments)
+    if name in LEVELS:
+        return (Compare if name in COMPARISONS else Logic)(name, *arguments)
+    return Call(name, arguments)
 
 
 def _written_product(term: Term) -> Expr:
     """Return a product as a quotient, the number in front first."""
     number, rest = term.as_coeff_Mul()
-    factors = sympy.Mul.make_args(rest)
-    below = [factor for factor in factors if factor.is_Pow and factor.exp.is_negative]
-    above = [*([number] if number != 1 else []), *(one for one in factors if one not in below)]
-    times = functools.partial(Binary, "*")
-    whole = functools.reduce(times, map(_written, above or [ONE]))
-    if not below:
-        return whole
-    return Binary("/", whole, functools.reduce(times, (_written(1 / factor) for factor in below)))
+    below = [one for one in sympy.Mul.make_args(rest) if one.is_Pow and one.exp.is_negative]
+    above = [one for one in (number, *sympy.Mul.make_args(rest)) if one != 1 and one not in below]
+    times = functools.partial(functools.reduce, functools.partial(Binary, "*"))
+    whole = times(map(_written, above or [ONE]))
+    return Binary("/", whole, times(_written(1 / one) for one in below)) if below else whole
