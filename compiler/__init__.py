@@ -18,7 +18,7 @@ equations                   connections: where connectors meet; flatten: equatio
                             reductions: what is heard of the others; derivatives, solution: data types
                             matching, elimination, blocks: solving; aliases, index: derivatives and states
                             structure
-functions                   casadi_writer, reached: what is written; exchange: what lies beside;
+functions                   casadi_writer: what is written; exchange: what lies beside;
                             functions
 compiled, plain             the compiled model; operations of its functions
 interpolation               tables over time in these functions

@@ -33,9 +33,10 @@ from pathlib import Path, PurePath
 
 import msgspec
 
-from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import RefusedError, files_below, read_file
+from apc.compiler.errors import Place
+from apc.compiler.files import RefusedError, listing, read_file
 from apc.compiler.seal import is_sealed, seal
+from apc.compiler.source.reading import fault
 
 FORMAT = 15  # of NAME.apc
 LARGEST = 256 * 2**20  # bytes of the file
@@ -98,19 +99,20 @@ def read_archive(path: Path) -> Archive:
     ApcError
         E602 it can't be read, E603 it is of another format, E604 it is damaged.
     """
+    place = Place(str(path))
     try:
         data = read_file(path, LARGEST)
     except RefusedError as refused:
         hint = "apc compile" if refused.why == "missing" else ""
         other = ", not a compiled model" if refused.why in ("folder", "special") else ""
-        raise ApcError(Mistake("E602", Place(str(path)), f"{refused.words}{other}", hint=hint)) from None
+        raise fault("E602", place, f"{refused.words}{other}", hint=hint) from None
     topology = path.with_suffix(SUFFIX)
     hint = f"apc compile {topology}" if topology.exists() else "the file once more, from whoever made it"
     head, mark, origin, model = (*data.split(b"\n", 3), b"", b"", b"")[:4]
     form = re.fullmatch(rb"apc ([0-9]{1,6}) (compiled|saved)", head)
     if form and int(form[1]) != FORMAT:
         what = f"has format version {int(form[1])}, this program reads version {FORMAT}"
-        raise ApcError(Mistake("E603", Place(str(path)), what, hint=hint))
+        raise fault("E603", place, what, hint=hint)
     whole = b"\n".join((head, origin, model))
     sealed, _, checksum = mark.decode("latin-1").partition(" ")
     try:
@@ -120,11 +122,11 @@ def read_archive(path: Path) -> Archive:
         name = made_from.topology
         if name in ("", "..") or PurePath(name).name != name or name not in dict(made_from.texts):
             raise ValueError
-        numbers = (one for change in made_from.changes for one in change if one[0] != HANDS_CHANGE)
-        if not all(_RATIONAL.fullmatch(value) for _, value in numbers):
+        numbers = (one for change in made_from.changes for one in change)
+        if not all(name == HANDS_CHANGE or _RATIONAL.fullmatch(value) for name, value in numbers):
             raise ValueError
     except (ValueError, RecursionError):  # what is nested too deeply
-        raise ApcError(Mistake("E604", Place(str(path)), FOREIGN, hint=hint)) from None
+        raise fault("E604", place, FOREIGN, hint=hint) from None
     return Archive(made_from, model, is_sealed(whole, sealed), form[2] == b"compiled")
 
 
@@ -151,7 +153,7 @@ def _now(path: Path, name: str) -> bytes | None:
     """Return a text as it is now, None if it can't be read."""
     try:
         if name.endswith("/"):
-            return "\n".join(str(file.relative_to(path)) for file in files_below(path, SUFFIX)).encode()
+            return listing(path, SUFFIX)
         return read_file(path, LARGEST)
     except (RefusedError, ValueError):  # ValueError: a name that is no text
         return None
@@ -167,17 +169,17 @@ def origin_of(topology: Path, read: Mapping[str, bytes]) -> Origin:
     read
         What `files.recorded` noted.
     """
-    builtin = {str(path): name for name, path in builtin_files().items()}
-    texts = {builtin.get(path) or _name(path, topology): text for path, text in read.items()}
+    names = {str(path): name for name, path in builtin_files().items()} | {str(topology): topology.name}
+    texts = {names.get(path) or _name(path, topology.parent): text for path, text in read.items()}
     return Origin(topology.name, tuple(sorted(texts.items())), program_digest())
 
 
-def _name(path: str, topology: Path) -> str:
+def _name(path: str, folder: Path) -> str:
     """Return a file's name from the topology's folder, with a slash at its end for a folder."""
     plain = PurePath(path)
-    if plain == topology or not plain.is_relative_to(topology.parent):
-        return topology.name if plain == topology else path
-    return f"./{plain.relative_to(topology.parent).as_posix()}{'/' * path.endswith('/')}"
+    if not plain.is_relative_to(folder):
+        return path
+    return f"./{plain.relative_to(folder).as_posix()}{'/' * path.endswith('/')}"
 
 
 def replayable(origin: Origin, folder: Path) -> dict[str, bytes]:

@@ -8,10 +8,11 @@ Does not: change who is in a group of peers that differ, or a graph that names i
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
-from itertools import accumulate
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,8 @@ from apc.compiler.compiled import (
     group_count,
 )
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.weights import Sums, sum_weights
+from apc.compiler.source.reading import fault
+from apc.compiler.weights import sum_weights
 
 COUNT_ABOUT = "peers heard over the link, counted with their weights"
 
@@ -45,56 +47,44 @@ def with_heard(groups: Sequence[Group], kinds: Sequence[Kind], links: Sequence[L
     groups, kinds, links
         Of the model; on a graph that isn't complete, every peer sends.
     """
-    peers = sum(group.count for group in groups)
-    starts = [0, *accumulate(group.count for group in groups)]
-    counts = {count_of(link.name) for link in links}
-    counted = [
-        replace(
-            group,
-            values=tuple(value for value in group.values if value.name not in counts),
-            columns=tuple(column for column in group.columns if column.name not in counts),
-        )
-        for group in groups
-    ]
-    for link in links:
-        name = count_of(link.name)
-        sums = heard_sums(link, peers) if link.graph.shape == "arcs" else None
-        sends = [any(sent.link == link.name for sent in kinds[group.kind].sends) for group in groups]
-        total = sum(group.count for group, does in zip(groups, sends, strict=True) if does)
-        for place, group in enumerate(counted):
-            if name not in kinds[group.kind].parameters:
-                continue
-            heard: Fraction | NDArray[np.float64] = Fraction(total - sends[place])
-            if link.graph.shape != "complete":
-                heard = _on_graph(link, group.count, starts[place], peers, sums)
-            if isinstance(heard, Fraction):
-                parameter = Parameter(name, "1", float(heard), about=COUNT_ABOUT, exact=heard)
-                counted[place] = replace(group, values=(*group.values, parameter))
-            else:
-                counted[place] = replace(group, columns=(*group.columns, Column(name, heard)))
-    return tuple(counted)
+    heard = {count_of(link.name): _heard(link, groups, kinds) for link in links}
+    found = []
+    for place, group in enumerate(groups):
+        values = [one for one in group.values if one.name not in heard]
+        columns = [one for one in group.columns if one.name not in heard]
+        for name, by_group in heard.items():
+            if name in kinds[group.kind].parameters:
+                number = by_group[place]
+                if isinstance(number, Fraction):
+                    values.append(Parameter(name, "1", float(number), about=COUNT_ABOUT, exact=number))
+                else:
+                    columns.append(Column(name, number))
+        found.append(replace(group, values=tuple(values), columns=tuple(columns)))
+    return tuple(found)
 
 
-def heard_sums(link: Link, peers: int) -> Sums:
-    """Return what every peer of a scene hears in all over a link of arcs."""
+def heard_sums(link: Link, peers: int) -> NDArray[Any]:
+    """Return what every peer of a scene hears in all over a link of arcs, as `sum_weights` does."""
     return sum_weights(link.graph.arcs[:, 1], link.graph.weights, peers)
 
 
-def _on_graph(
-    link: Link, count: int, start: int, peers: int, sums: Sums | None
-) -> Fraction | NDArray[np.float64]:
-    """Return the summed weights of what each of `count` peers from `start` on hears: one number if alike."""
-    if link.graph.shape == "ring":
-        return Fraction(min(2, peers - 1))
-    if link.graph.shape == "star":
-        if start or peers == 2:
-            return Fraction(1)
-        counts = np.ones(count)
-        counts[0] = peers - 1
-        return counts if count > 1 else Fraction(peers - 1)
-    end = start + count
-    assert sums is not None, link.graph.shape
-    return sums.of(start) if sums.alike(start, end) else sums.floats[start:end]
+def _heard(
+    link: Link, groups: Sequence[Group], kinds: Sequence[Kind]
+) -> list[Fraction | NDArray[np.float64]]:
+    """Return, by group, the summed weights of what its peers hear over a link: one number if alike."""
+    counts = [group.count for group in groups]
+    peers, shape = sum(counts), link.graph.shape
+    if shape == "complete":
+        sends = [any(one.link == link.name for one in kinds[group.kind].sends) for group in groups]
+        total = sum(itertools.compress(counts, sends))
+        return [Fraction(total - does) for does in sends]
+    heard = np.full(peers, min(2, peers - 1) if shape == "ring" else 1, dtype=object)
+    if shape == "star":
+        heard[0] = peers - 1
+    if shape == "arcs":
+        heard = heard_sums(link, peers)
+    parts = np.split(heard, np.cumsum(counts)[:-1])
+    return [Fraction(one[0]) if np.all(one == one[0]) else one.astype(np.float64) for one in parts]
 
 
 def recounted(system: CompiledSystem, counts: Mapping[str, Fraction], place: Place) -> CompiledSystem:
@@ -116,33 +106,32 @@ def recounted(system: CompiledSystem, counts: Mapping[str, Fraction], place: Pla
     """
     mistakes = Mistakes()
     total = sum(counts.values())
-    groups = []
+    others = {count_of(link.name): total - 1 for link in system.links}
+    arcs = [link.name for link in system.links if link.graph.shape == "arcs"]
+    shaped = [link.name for link in system.links if link.graph.shape != "complete"]
+    groups = [replace(group, count=int(counts[group.name])) for group in system.groups]
     for group in system.groups:
         count, name = counts[group.name], group_count(group.name)
-        if count == group.count:
-            groups.append(group)
-            continue
-        own = [one.name for one in group.columns if one.name not in map(count_of, _names(system.links))]
-        arcs = [link.name for link in system.links if link.graph.shape == "arcs"]
-        shaped = [link.name for link in system.links if link.graph.shape != "complete"]
-        if count.denominator != 1 or not 1 <= count <= LARGEST_COUNT:
-            expected = f"a whole number from 1 to {LARGEST_COUNT:,}"
-            mistakes.add("E626", place, name, expected=expected, got=f"{float(count):.12g}")
-        elif own:
-            what = f"{own[0]} has one value for each of the {group.count} peers of {group.name}"
-            mistakes.add("E626", place, f"{what}: their count follows from them")
-        elif arcs:
-            what = f"the graph of {arcs[0]} names its peers: {name} is what it is in the topology"
-            mistakes.add("E626", place, what)
-        elif shaped and total > MOST_PLACED:
-            expected = f"at most {MOST_PLACED:,} peers where {shaped[0]} isn't complete"
-            mistakes.add("E626", place, name, expected=expected, got=f"{int(total):,}")
-        groups.append(replace(group, count=int(count)))
+        own = [one.name for one in group.columns if one.name not in others]
+        with mistakes:
+            if count == group.count:
+                continue
+            if count.denominator != 1 or not 1 <= count <= LARGEST_COUNT:
+                expected = f"a whole number from 1 to {LARGEST_COUNT:,}"
+                raise fault("E626", place, name, expected, f"{float(count):.12g}")
+            if own:
+                what = f"{own[0]} has one value for each of the {group.count} peers of {group.name}"
+                raise fault("E626", place, f"{what}: their count follows from them")
+            if arcs:
+                what = f"the graph of {arcs[0]} names its peers: {name} is what it is in the topology"
+                raise fault("E626", place, what)
+            if shaped and total > MOST_PLACED:
+                expected = f"at most {MOST_PLACED:,} peers where {shaped[0]} isn't complete"
+                raise fault("E626", place, name, expected, f"{int(total):,}")
     if not mistakes and total < least_peers(system.kinds):
-        what, got = "the number of all peers", f"{int(total)}"
-        mistakes.add("E626", place, what, expected="at least 2: parts follow the others", got=got)
+        what, expected = "the number of all peers", "at least 2: parts follow the others"
+        raise fault("E626", place, what, expected, f"{int(total)}")
     mistakes.raise_if_any()
-    others = {count_of(link.name): total - 1 for link in system.links}
     return replace(
         system,
         groups=with_heard(groups, system.kinds, system.links),
@@ -157,10 +146,6 @@ def least_peers(kinds: Sequence[Kind]) -> int:
     """Return how many peers a scene must have: two where some part follows the others."""
     hears = any(partition.receives for kind in kinds for partition in kind.clocks)
     return 2 if hears else 1
-
-
-def _names(links: Sequence[Link]) -> list[str]:
-    return [link.name for link in links]
 
 
 def peers_of(counts: Mapping[str, Fraction]) -> dict[str, Fraction]:

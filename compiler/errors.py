@@ -32,7 +32,7 @@ class Place:
 
     def shifted(self, columns: int) -> Place:
         """Return the place `columns` further right on the same line."""
-        return Place(self.file, self.line, self.column + columns, self.source_line)
+        return replace(self, column=self.column + columns)
 
 
 def visible(text: str) -> str:
@@ -40,16 +40,12 @@ def visible(text: str) -> str:
 
     Line breaks, tabs and spaces stay. So a JSON document stays one.
     """
-    if text.isascii() and text.isprintable():
-        return text
     return "".join(
-        c if c.isprintable() or c in "\n\t" or unicodedata.category(c) == "Zs" else _escaped(c) for c in text
+        c
+        if c.isprintable() or c in "\n\t" or unicodedata.category(c) == "Zs"
+        else re.sub("(....)", r"\\u\1", c.encode("utf-16-be", "surrogatepass").hex())
+        for c in text
     )
-
-
-def _escaped(character: str) -> str:
-    digits = character.encode("utf-16-be", "surrogatepass").hex()
-    return "".join(f"\\u{digits[at : at + 4]}" for at in range(0, len(digits), 4))
 
 
 def place_in(place: Place, text: str, offset: int) -> Place:
@@ -86,8 +82,7 @@ class Mistake:
         if not (self.place.line and line.strip()):
             return text
         # A long line is shown around its fault only; a tab or control character would move the caret.
-        start = max(0, self.place.column - 1 - SHOWN // 2) if len(line) > SHOWN else 0
-        start = min(start, max(0, len(line) - SHOWN))
+        start = max(0, min(self.place.column - 1 - SHOWN // 2, len(line) - SHOWN))
         shown = "".join(c if c.isprintable() else " " for c in line[start : start + SHOWN])
         return f"{text}\n    {shown}\n    {' ' * (self.place.column - 1 - start)}^"
 
@@ -113,7 +108,7 @@ class Mistake:
 
 def _in_one_line(text: str) -> str:
     """Return a text in one line, whatever it quotes."""
-    return visible("".join(" " if c.isspace() else c for c in text))
+    return visible(re.sub(r"\s", " ", text))
 
 
 class ApcError(Exception):
@@ -151,8 +146,7 @@ class Mistakes:
 
     def take(self, error: ApcError) -> None:
         """Record every mistake of an error raised further down."""
-        for mistake in error.mistakes:
-            self._found[mistake] = None
+        self._found |= dict.fromkeys(error.mistakes)
 
     def __enter__(self) -> None:
         """Take what is raised within: `with mistakes:`."""
@@ -168,16 +162,20 @@ class Mistakes:
 
     def pass_on(self, other: Mistakes) -> None:
         """Record all of these with others."""
-        if self._found:
-            other.take(ApcError(list(self._found)))
+        other._found |= self._found
+
+    @property
+    def found(self) -> tuple[Mistake, ...]:
+        """All mistakes in file order."""
+        any_name = "|".join(map(re.escape, self.names)) or "(?!)"  # without names, nothing
+        named = re.compile(rf"(?<!\w)({any_name})(?!\w)")
+        once = {(one.place, one.code, named.sub("…", one.sentence)): one for one in reversed(self._found)}
+        return tuple(sorted(once.values(), key=lambda mistake: (mistake.place, mistake.code)))
 
     def raise_if_any(self) -> None:
-        """Raise `ApcError` with all mistakes in file order, if there is one."""
+        """Raise `ApcError` with all mistakes, if there is one."""
         if self._found:
-            any_name = "|".join(map(re.escape, self.names)) or "(?!)"  # without names, nothing
-            named = re.compile(rf"(?<!\w)({any_name})(?!\w)")
-            once = {(one.place, one.code, named.sub("…", one.sentence)): one for one in reversed(self._found)}
-            raise ApcError(sorted(once.values(), key=lambda mistake: (mistake.place, mistake.code)))
+            raise ApcError(self.found)
 
 
 def nearest(name: str, known: Iterable[str], *, alike: float = 0.6) -> str:

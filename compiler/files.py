@@ -1,9 +1,9 @@
 """What is read from disk and written to it, whoever named the file.
 
-Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `same_file`; `recorded`,
-`replayed`; `write_file`, `write_bytes`, `write_text`, `write_texts`, `check_target`, `unwritable`,
-`is_special`, `is_stdout`, and for what is written piece by piece `begin_file`, `finish_file`, `drop_file`,
-`partial_name`; `unlink_link`.
+Takes: paths. Gives: `read_file`, `check_file`, `RefusedError`, `files_below`, `listing`, `same_file`;
+`recorded`, `replayed`; `write_file`, `write_bytes`, `write_text`, `write_texts`, `check_target`,
+`unwritable`, `is_special`, `is_stdout`, and for what is written piece by piece `begin_file`, `finish_file`,
+`drop_file`, `partial_name`; `unlink_link`.
 Guarantees: only a regular file of bounded size is read, by whatever links it is reached, and nothing is
 waited for. What is written is there whole or not at all, and what a writer left that was killed goes with the
 next: a file is replaced by one of its mode and owner unless it is read-only, a link stays and its file is
@@ -13,6 +13,7 @@ Does not: know a format, or say at which line a file was named.
 
 from __future__ import annotations
 
+import glob
 import os
 import platform
 import shutil
@@ -20,22 +21,25 @@ import stat
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from contextvars import ContextVar
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 from apc.compiler.errors import ApcError, Mistake, Place
 
 # Of a folder of a user's components: the largest library we know of has a hundred files, three deep.
 MOST_ENTRIES = 10_000
 MOST_DEPTH = 8
+NO_NAME = OSError, ValueError  # what the system and Python say of a name that can't be one
 STDOUT = 1  # the descriptor of standard output
 KERNELS = ("/proc", "/sys")  # file systems whose files are answers of the kernel
 KERNELS_OWN = "is an answer of the system's kernel"
 
 UNFINISHED = ".unfinished"  # how the name of a temporary file ends that goes with the next writer
 
+T = TypeVar("T")
 Why = Literal["missing", "folder", "special", "large", "forbidden", "unreadable"]
 
 
@@ -53,26 +57,25 @@ _replay: ContextVar[Mapping[str, bytes] | None] = ContextVar("replay", default=N
 
 
 @contextmanager
-def recorded(texts: dict[str, bytes]) -> Iterator[None]:
+def _during(variable: ContextVar[T], value: T) -> Iterator[None]:
+    token = variable.set(value)
+    try:
+        yield
+    finally:
+        variable.reset(token)
+
+
+def recorded(texts: dict[str, bytes]) -> AbstractContextManager[None]:
     """Put the bytes of every file that is read meanwhile into `texts`, by its path.
 
     Of a folder, by its path and a slash, these are the files that were listed of it, a line each.
     """
-    token = _record.set(texts)
-    try:
-        yield
-    finally:
-        _record.reset(token)
+    return _during(_record, texts)
 
 
-@contextmanager
-def replayed(texts: Mapping[str, bytes]) -> Iterator[None]:
+def replayed(texts: Mapping[str, bytes]) -> AbstractContextManager[None]:
     """Read meanwhile what was recorded, by absolute path, instead of any file or folder."""
-    token = _replay.set(texts)
-    try:
-        yield
-    finally:
-        _replay.reset(token)
+    return _during(_replay, texts)
 
 
 def _replayed(path: str, texts: Mapping[str, bytes]) -> bytes:
@@ -105,8 +108,7 @@ def read_file(path: Path, most: int) -> bytes:
     """
     texts = _replay.get()
     data = _read(path, most) if texts is None else _replayed(str(path), texts)
-    if len(data) > most:  # it grew meanwhile
-        raise _too_large(most)
+    _check_size(len(data), most)  # it may have grown meanwhile
     _note(str(path), data)
     return data
 
@@ -114,12 +116,8 @@ def read_file(path: Path, most: int) -> bytes:
 def _read(path: Path, most: int) -> bytes:
     check_file(path, most)  # first, as opening a device can already do something
     with _refusing(), open(path, "rb", opener=_without_waiting) as stream:
-        found = os.fstat(stream.fileno())
-        _check(found, most)  # of what was opened
-        data = stream.read(found.st_size + 1)  # as many bytes are set aside
-        if len(data) > found.st_size:
-            data += stream.read(most + 1 - len(data))
-    return data
+        _check(os.fstat(stream.fileno()), most)  # of what was opened
+        return stream.read(most + 1)
 
 
 def check_file(path: Path, most: int) -> None:
@@ -148,13 +146,13 @@ def _check(found: os.stat_result, most: int) -> None:
         raise RefusedError("special", "is a device, pipe or socket")
     if found.st_dev in _kernels_devices():
         raise RefusedError("special", KERNELS_OWN)
-    if found.st_size > most:
-        raise _too_large(most)
+    _check_size(found.st_size, most)
 
 
-def _too_large(most: int) -> RefusedError:
-    size = f"{most >> 20} MiB" if most % (1 << 20) == 0 else f"{most:,} bytes"
-    return RefusedError("large", f"is larger than {size}, the most it may have")
+def _check_size(size: int, most: int) -> None:
+    if size > most:
+        limit = f"{most >> 20} MiB" if most % (1 << 20) == 0 else f"{most:,} bytes"
+        raise RefusedError("large", f"is larger than {limit}, the most it may have")
 
 
 def _kernels_devices() -> set[int]:
@@ -166,7 +164,7 @@ def _without_waiting(name: str, flags: int) -> int:
     return os.open(name, flags | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0))
 
 
-def _reason(error: OSError | ValueError) -> str:
+def _reason(error: Exception) -> str:
     return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
 
 
@@ -182,29 +180,27 @@ def files_below(folder: Path, suffix: str) -> tuple[Path, ...]:
         more than `MOST_DEPTH` folders deep.
     """
     texts = _replay.get()
-    if texts is None:
-        names = "\n".join(str(path.relative_to(folder)) for path in _walked(folder, suffix))
-    else:
-        names = os.fsdecode(_replayed(f"{folder}/", texts))
-    _note(f"{folder}/", os.fsencode(names))
-    return tuple(folder / name for name in names.split("\n") if name)
+    names = listing(folder, suffix) if texts is None else _replayed(f"{folder}/", texts)
+    _note(f"{folder}/", names)
+    return tuple(folder / name for name in os.fsdecode(names).split("\n") if name)
 
 
-def _walked(folder: Path, suffix: str) -> tuple[Path, ...]:
+def listing(folder: Path, suffix: str) -> bytes:
+    """Return the names, from the folder, of the files that `files_below` gives, a line each."""
     found: list[Path] = []
     kernels, entries = _kernels_devices(), 0
     with _refusing():
         for name, folders, files in os.walk(folder, onerror=_raise):
-            path = Path(name)
-            if len(path.relative_to(folder).parts) >= MOST_DEPTH:
+            below = Path(name).relative_to(folder)
+            if len(below.parts) >= MOST_DEPTH:
                 raise RefusedError("large", f"is more than {MOST_DEPTH} folders deep")
-            if path.stat().st_dev in kernels:
+            if Path(name).stat().st_dev in kernels:
                 raise RefusedError("special", KERNELS_OWN)
             entries += len(folders) + len(files)
             if entries > MOST_ENTRIES:
                 raise RefusedError("large", f"holds more than {MOST_ENTRIES} files and folders")
-            found += [path / file for file in files if file.endswith(suffix)]
-    return tuple(sorted(found))
+            found += [below / file for file in files if file.endswith(suffix)]
+    return os.fsencode("\n".join(map(str, sorted(found))))
 
 
 def _raise(error: OSError) -> None:
@@ -213,10 +209,9 @@ def _raise(error: OSError) -> None:
 
 def same_file(one: Path, other: Path) -> bool:
     """Return whether two paths lead to one file that exists."""
-    try:
+    with suppress(OSError, ValueError):
         return one.samefile(other)
-    except (OSError, ValueError):
-        return False
+    return False
 
 
 def write_file(path: Path, write: Callable[[Path], object]) -> None:
@@ -234,30 +229,39 @@ def write_file(path: Path, write: Callable[[Path], object]) -> None:
     ApcError
         E601 it can't be written; then what was there before is as it was.
     """
-    with _writing(path):
-        temporary = begin_file(path)
+    _write_all({path: write})
+
+
+def _write_all(writers: Mapping[Path, Callable[[Path], object]]) -> None:
+    """Fill a temporary file for each path, then put all where they belong, or none. Raises ApcError E601."""
+    ready: dict[Path, Path] = {}
     try:
-        write(temporary)
-        finish_file(temporary, path)
-    except BaseException as error:
-        drop_file(temporary)
-        if isinstance(error, OSError):
-            raise unwritable(path, error) from error
-        raise
+        for path, write in writers.items():
+            with _writing(path, *NO_NAME):
+                ready[path] = begin_file(path)
+            with _writing(path, OSError):
+                write(ready[path])
+        for path in writers:
+            with _writing(path, OSError):
+                finish_file(ready[path], path)
+                del ready[path]
+    finally:
+        for temporary in ready.values():
+            drop_file(temporary)
 
 
 @contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Turn what the system says of a file that is to be written into ApcError (E601)."""
+def _writing(path: Path, *kinds: type[Exception]) -> Iterator[None]:
+    """Turn what is said of a file that is to be written, if of such a kind, into ApcError (E601)."""
     try:
         yield
-    except (OSError, ValueError) as error:
+    except kinds as error:
         raise unwritable(path, error) from error
 
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file, whole or not at all. Raises ApcError (E601) if it can't be written."""
-    write_file(path, lambda temporary: temporary.write_bytes(content))
+    write_file(path, partial(Path.write_bytes, data=content))
 
 
 def write_text(path: Path, text: str) -> None:
@@ -267,28 +271,16 @@ def write_text(path: Path, text: str) -> None:
 
 def write_texts(texts: Mapping[Path, str]) -> None:
     """Write texts that belong together, all or none. Raises ApcError (E601) if one can't be written."""
-    ready: dict[Path, Path] = {}
-    try:
-        for path, text in texts.items():
-            with _writing(path):
-                ready[path] = begin_file(path)
-                ready[path].write_bytes(text.encode())
-        for path in texts:
-            with _writing(path):
-                finish_file(ready[path], path)
-                del ready[path]
-    finally:
-        for temporary in ready.values():
-            drop_file(temporary)
+    _write_all({path: partial(Path.write_bytes, data=text.encode()) for path, text in texts.items()})
 
 
 def check_target(path: Path) -> None:
     """Refuse a place where nothing can be written, before anything is computed: ApcError E601."""
-    with _writing(path):
+    with _writing(path, *NO_NAME):
         drop_file(begin_file(path))
 
 
-def unwritable(path: Path, error: OSError | ValueError) -> ApcError:
+def unwritable(path: Path, error: Exception) -> ApcError:
     """Return the message (E601) of a file or folder that can't be written."""
     return ApcError(Mistake("E601", Place(str(path)), f"can't be written: {_reason(error)}"))
 
@@ -310,20 +302,18 @@ def begin_file(path: Path) -> Path:
     target = _target(path)
     if target.is_dir():
         raise IsADirectoryError(None, "it is a folder")
+    folder = target.parent
     if is_special(path):
-        handle, name = tempfile.mkstemp(prefix=f".{target.name[:24]}.")
-        os.close(handle)
-        return Path(name)
-    if target.exists() and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)):
+        folder = Path(tempfile.gettempdir())
+    elif target.exists() and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)):
         raise PermissionError(None, "it is read-only")
     # The name of the target need not fit: a temporary's is longer.
     prefix = f".{target.name[:24]}.{platform.node()}."
-    handle, name = tempfile.mkstemp(UNFINISHED, f"{prefix}{os.getpid()}.", target.parent)
+    handle, name = tempfile.mkstemp(UNFINISHED, f"{prefix}{os.getpid()}.", folder)
     os.close(handle)
     with suppress(OSError):  # a folder may be written to and not be read
-        for left in target.parent.iterdir():
-            if left.name.startswith(prefix) and left.name.endswith(UNFINISHED):
-                _remove_left(left, left.name.removeprefix(prefix).partition(".")[0])
+        for left in folder.glob(f"{glob.escape(prefix)}*{UNFINISHED}"):
+            _remove_left(left, left.name.removeprefix(prefix).partition(".")[0])
     return Path(name)
 
 
@@ -357,15 +347,14 @@ def finish_file(temporary: Path, path: Path) -> None:
     target = _target(path)
     try:
         before = target.stat()
+        mode = stat.S_IMODE(before.st_mode)
+        with suppress(OSError, AttributeError):  # only root may give it away; and not on Windows
+            os.chown(temporary, before.st_uid, before.st_gid)
     except FileNotFoundError:
         mask = os.umask(0)
         os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
-    else:
-        made = temporary.stat()
-        if (made.st_uid, made.st_gid) != (before.st_uid, before.st_gid):
-            _give(temporary, before)
-        temporary.chmod(stat.S_IMODE(before.st_mode))
+        mode = 0o666 & ~mask
+    temporary.chmod(mode)
     temporary.replace(target)
 
 
@@ -381,7 +370,7 @@ def unlink_link(path: Path) -> None:
 
     Raises ApcError (E601) if it can't be removed.
     """
-    with _writing(path):
+    with _writing(path, OSError):
         if path.is_symlink():
             path.unlink()
 
@@ -401,27 +390,17 @@ def _target(path: Path) -> Path:
 
 def is_special(path: Path) -> bool:
     """Return whether a path leads to what is written to in place: a device, a pipe, our standard output."""
-    try:
+    with suppress(OSError, ValueError):
         mode = path.stat().st_mode
-    except (OSError, ValueError):
-        return False
-    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)) or is_stdout(path)
+        return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)) or is_stdout(path)
+    return False
 
 
 def is_stdout(path: Path) -> bool:
     """Return whether a path leads to where our standard output goes, by whatever name, a file included."""
-    try:
+    with suppress(OSError, ValueError):
         return os.path.samestat(path.stat(), os.fstat(STDOUT))
-    except (OSError, ValueError):
-        return False
-
-
-def _give(temporary: Path, before: os.stat_result) -> None:
-    """Give a file to the owner of the one it replaces, where that is allowed."""
-    try:
-        os.chown(temporary, before.st_uid, before.st_gid)
-    except (OSError, AttributeError):  # only root may; and not on Windows
-        return
+    return False
 
 
 def _drain(path: Path) -> int:

@@ -36,29 +36,25 @@ class Interpolation:
         """The slopes of its lines, 0 before the first row and after the last (n + 1,)."""
         return np.pad(np.diff(self.numbers) / np.diff(self.times), 1)
 
-    def value(self, at: Any, number: Callable[[float], Any]) -> Any:
+    def value(self, at: Any, number: Callable[[float], Any] = float) -> Any:
         """Return what the table says at a number of some kind, which a float is turned into by `number`."""
         place = bisect.bisect_right(self.times, float(at))
-        last = max(place - 1, 0)
-        low, start = number(float(self.numbers[last])), number(float(self.times[last]))
+        low, start = (number(float(one[max(place - 1, 0)])) for one in (self.numbers, self.times))
         return low + self.slope(at, number) * (at - start) if 0 < place < len(self.times) else low
 
-    def slope(self, at: Any, number: Callable[[float], Any]) -> Any:
+    def slope(self, at: Any, number: Callable[[float], Any] = float) -> Any:
         """Return how fast that changes with it."""
         place = bisect.bisect_right(self.times, float(at))
         if place in (0, len(self.times)):
             return number(0.0)
-        rows = (self.times[place - 1 : place + 1], self.numbers[place - 1 : place + 1])
-        (start, end), (low, high) = (map(number, map(float, row)) for row in rows)
+        columns = self.times, self.numbers
+        (start, end), (low, high) = (map(number, one[place - 1 : place + 1].tolist()) for one in columns)
         return (high - low) / (end - start)
 
     def values(self, at: Any) -> Any:
         """Return what the table says at floats, or at complex steps from them."""
-        real = np.real(at)
-        place = np.searchsorted(self.times, real, side="right")
-        last = np.maximum(place - 1, 0)
-        found = self.numbers[last] + self.rates[place] * (real - self.times[last])
-        return found + 1j * self.rates[place] * np.imag(at) if np.iscomplexobj(at) else found
+        found = np.interp(np.real(at), self.times, self.numbers)
+        return found + 1j * self.slopes(at) * np.imag(at) if np.iscomplexobj(at) else found
 
     def slopes(self, at: Any) -> Any:
         """Return how fast that changes with them."""
@@ -69,7 +65,7 @@ class Interpolation:
         gaps = np.diff(self.times)[[0, -1]]
         times = np.concatenate([self.times[:1] - gaps[:1], self.times, self.times[-1:] + gaps[1:]])
         count = len(self.times)
-        return Interpolation(times, np.concatenate([[-0.5], np.arange(count), [count - 0.5]]))
+        return Interpolation(times, np.clip(np.arange(-1, count + 1), -0.5, count - 0.5))
 
 
 def function_of(table: Interpolation) -> Any:
@@ -85,18 +81,13 @@ def function_of(table: Interpolation) -> Any:
 
 def table_of(function: Any) -> Interpolation:
     """Return the table that a function of CasADi's looks up: one of `function_of`, or a derivative of it."""
-    work = [function]
-    while work:
-        one = work.pop()
+    for one in (function, *function.find_functions()):
         for k in range(one.n_instructions()):
-            code = one.instruction_id(k)
-            if code == casadi.OP_CONST:
+            if one.instruction_id(k) == casadi.OP_CONST:
                 constant = one.instruction_MX(k).to_DM()
                 if constant.size1() == 2:
                     times, numbers = np.asarray(constant)
                     return Interpolation(times, numbers)
-            elif code == casadi.OP_CALL:
-                work.append(one.instruction_MX(k).which_function())
     raise ValueError(f"{function.name()} is no table of ours")
 
 

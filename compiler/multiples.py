@@ -23,5 +23,6 @@ def common_multiple(times: Iterable[Fraction]) -> Fraction:
 def common_divisor(times: Iterable[Fraction]) -> Fraction:
     """Return the largest rational of which every time is a whole multiple."""
     listed = list(times)
-    denominator = math.lcm(*(time.denominator for time in listed))
-    return Fraction(math.gcd(*(int(time * denominator) for time in listed)), denominator)
+    return Fraction(
+        math.gcd(*(time.numerator for time in listed)), math.lcm(*(time.denominator for time in listed))
+    )

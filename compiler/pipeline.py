@@ -7,9 +7,9 @@ Does not: save anything.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, get_args
 
 from apc.compiler.cache import Origin, origin_of, replayable
 from apc.compiler.compiled import CompiledSystem
@@ -25,7 +25,7 @@ from apc.compiler.source.source import Source, read_source
 from apc.compiler.timings import part
 
 Stage = Literal["source", "scene", "flat", "clocked", "sorted", "compiled"]
-STAGES: tuple[Stage, ...] = ("source", "scene", "flat", "clocked", "sorted", "compiled")
+STAGES: tuple[Stage, ...] = get_args(Stage)
 StageValue = Source | Scene | FlatSystem | ClockedSystem | SortedSystem | CompiledSystem
 
 
@@ -74,17 +74,15 @@ def check_definition(path: Path) -> str:
     beside: list[ApcError] = []
     library = Library((path.parent,), beside)
     mistakes = Mistakes()
-    try:
-        if kind == "component":
-            if component := library.component(name):
-                check_alone(component, Place(str(path)), mistakes)
-        else:
+    with mistakes:
+        if kind == "connector":
             library.connector(name)
-        mistakes.raise_if_any()
-    except ApcError as error:  # its own mistakes first
-        beside.insert(0, error)
-    if beside:
-        raise ApcError(mistake for error in beside for mistake in error.mistakes)
+        elif component := library.component(name):
+            check_alone(component, Place(str(path)), mistakes)
+    # Its own mistakes first.
+    found = [*mistakes.found, *(mistake for error in beside for mistake in error.mistakes)]
+    if found:
+        raise ApcError(found)
     return f"{name}, a {kind}"
 
 
@@ -113,20 +111,16 @@ def stages_of(source: Source, texts: dict[str, bytes] | None = None) -> Iterator
     """
     assert source.path is not None
     path, texts = source.path, {} if texts is None else texts
-    yield "source", source
-    with part("scene"), recorded(texts):
-        library = Library(library_folders(source))
-        scene = build_scene(source, library)
-    yield "scene", scene
-    with part("flat"):
-        flat = flatten(scene)
-    yield "flat", flat
-    with part("clocked"):
-        clocked = partition(flat)
-    yield "clocked", clocked
-    with part("sorted"):
-        sorted_system = sort(clocked)
-    yield "sorted", sorted_system
-    with part("compiled"):
-        system = build_functions(sorted_system, origin_of(path, texts))
-    yield "compiled", system
+    steps: dict[Stage, Callable[[Any], StageValue]] = {
+        "scene": lambda source: build_scene(source, Library(library_folders(source))),
+        "flat": flatten,
+        "clocked": partition,
+        "sorted": sort,
+        "compiled": lambda ordered: build_functions(ordered, origin_of(path, texts)),
+    }
+    value: StageValue = source
+    yield "source", value
+    for stage, step in steps.items():
+        with part(stage), recorded(texts):
+            value = step(value)
+        yield stage, value

@@ -67,8 +67,8 @@ RULES: dict[str, Callable[..., Any]] = {
     "or": lambda a, b: int(a != 0 or b != 0),
     # The product with a condition: zero whatever b is, when the condition is false.
     "if_else_zero": lambda a, b: b if a != 0 else 0 * b,
-    LOOK: lambda table, at: table.value(at, float),
-    SLOPE: lambda table, at: table.slope(at, float),
+    LOOK: Interpolation.value,
+    SLOPE: Interpolation.slope,
 }
 
 # Those that have no rational value of a rational number.
@@ -175,20 +175,20 @@ def straight(function: Any) -> PlainFunction:
     inputs = tuple((word, int(function.nnz_in(i))) for i, word in enumerate(function.name_in()))
     starts = [0, *itertools.accumulate(size for _, size in inputs)]
     codes = [function.instruction_id(k) for k in range(function.n_instructions())]
+    # By their text zeros of both signs are two constants, and NaN is one.
+    texts = {
+        k: repr(function.instruction_constant(k)) for k, code in enumerate(codes) if code == casadi.OP_CONST
+    }
     called = _called(function, [k for k, code in enumerate(codes) if code == casadi.OP_CALL])
-    tables = tuple(dict.fromkeys(table for _, table in called.values()))
-    constants: dict[str, int] = {}
-    for k, code in enumerate(codes):
-        if code == casadi.OP_CONST:
-            constants.setdefault(_key(function.instruction_constant(k)), starts[-1] + len(constants))
-    first = starts[-1] + len(constants) + len(tables)
+    constants, tables = dict.fromkeys(texts.values()), dict.fromkeys(table for _, table in called.values())
+    number = {one: starts[-1] + place for place, one in enumerate((*constants, *tables))}
     work = [0] * function.sz_w()
     operations: list[tuple[Any, ...]] = []
     results = [[0] * function.nnz_out(i) for i in range(function.n_out())]
 
     def add(*operation: Any) -> int:
         operations.append(operation)
-        return first + len(operations) - 1
+        return starts[-1] + len(number) + len(operations) - 1
 
     for k, code in enumerate(codes):
         taken, given = function.instruction_input(k), function.instruction_output(k)
@@ -198,11 +198,10 @@ def straight(function: Any) -> PlainFunction:
         if code == casadi.OP_INPUT:
             value = starts[taken[0]] + taken[1]
         elif code == casadi.OP_CONST:
-            value = constants[_key(function.instruction_constant(k))]
+            value = number[texts[k]]
         elif code == casadi.OP_CALL:
             name, table = called[k]
-            number = first - len(tables) + tables.index(table)
-            value = add(LOOK if name == TABLE else SLOPE, number, work[taken[0]])
+            value = add(LOOK if name == TABLE else SLOPE, number[table], work[taken[0]])
             if name != TABLE:  # a derivative, of any order, is the slope times what it is taken by
                 value = add("mul", value, work[taken[-1]])
         elif code in _NAMES:
@@ -210,22 +209,17 @@ def straight(function: Any) -> PlainFunction:
         else:
             raise ValueError(f"CasADi's operation {code} of {function.name()} is none of ours")
         work[given[0]] = value
-    return PlainFunction(
-        inputs, tuple(map(float, constants)), tuple(operations), tuple(map(tuple, results)), tables
-    )
+    outputs = tuple(map(tuple, results))
+    return PlainFunction(inputs, tuple(map(float, constants)), tuple(operations), outputs, tuple(tables))
 
 
 def _called(function: Any, calls: Sequence[int]) -> dict[int, tuple[str, Interpolation]]:
     """Return what an SX function's calls, by their instructions, call, and the table that is looked up."""
     expressions: Any = function.instructions_sx() if calls else None
-    functions = {k: expressions[k].which_function() for k in calls}
     known: dict[bytes, Interpolation] = {}  # of equal rows, which are one table
     found = {}
-    for k, one in functions.items():
+    for k in calls:
+        one = expressions[k].which_function()
         table = table_of(one)
         found[k] = one.name(), known.setdefault(table.times.tobytes() + table.numbers.tobytes(), table)
     return found
-
-
-def _key(number: float) -> str:
-    return repr(float(number))  # zeros of both signs are two constants; NaN is one

@@ -10,6 +10,7 @@ Does not: know what is told, or print.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -22,6 +23,7 @@ _DIGITS = 18
 
 # Above all digits that two floats can have apart.
 _WIDE = Context(prec=1500)
+_UP = Context(prec=1, rounding=ROUND_UP)
 
 _PIECE = re.compile(r"[^*/(,]+[*/(,]*|[*/(,]+")  # of a word, broken behind an operator
 
@@ -49,27 +51,21 @@ def measured(value: float, error: float, unit: str = "1") -> str:
     """
     if not (math.isfinite(value) and math.isfinite(error)):
         return f"{with_unit(f'{value:.6g}', unit)} ± {error:.0e}"
-    if value == 0 and error < 10.0**-_DIGITS:
-        whole = Context(prec=1, rounding=ROUND_UP).plus(Decimal(repr(error)))
-        return f"{with_unit('0', unit)} ± {f'{float(whole):.0e}' if error else '0'}"
     exact, off = Decimal(repr(value)), Decimal(repr(error))
-    place = max(off.adjusted(), exact.adjusted() - _DIGITS) if error else exact.adjusted() - _DIGITS
-    while True:
+    least = exact.adjusted() - _DIGITS
+    for place in itertools.count(max(off.adjusted(), least) if error else least):
         shown = exact.quantize(Decimal((0, (1,), place)), context=_WIDE)
-        whole = _WIDE.add(abs(_WIDE.subtract(shown, exact)), off)
-        whole = Context(prec=1, rounding=ROUND_UP).plus(whole)
+        whole = _UP.plus(_WIDE.add(abs(_WIDE.subtract(shown, exact)), off))
         if whole.adjusted() <= place or not whole:
             break
-        place = whole.adjusted()
-    digits = max(exact.adjusted() - place, 0)
-    near = -5 < exact.adjusted() < _DIGITS
-    text = f"{shown:f}" if near else _scientific(shown, digits) if shown else "0"
-    return f"{with_unit(text, unit)} ± {float(whole):.0e}"
+    near = -5 < exact.adjusted() < _DIGITS and (shown or error >= 10.0**-_DIGITS)
+    text = f"{shown:f}" if near else _scientific(shown, exact.adjusted() - place) if shown else "0"
+    return f"{with_unit(text, unit)} ± {f'{float(whole):.0e}' if value or error else '0'}"
 
 
 def _scientific(number: Decimal, digits: int) -> str:
     """Return a decimal with so many digits behind the point, in the form that Python gives floats."""
-    mantissa, _, exponent = f"{number:.{digits}e}".partition("e")
+    mantissa, _, exponent = f"{number:.{max(digits, 0)}e}".partition("e")
     return f"{mantissa}e{int(exponent):+03d}"
 
 
@@ -87,10 +83,10 @@ def time_left(seconds: float, done: float, of: float) -> str:
     Nothing where none is done yet, or what is left is not worth telling.
     """
     left = seconds * (of - done) / done if done > 0 else 0.0
-    if left < 2:
-        return ""
-    name, size = next(one for one in (("h", 3600), ("min", 60), ("s", 1)) if left >= 2 * one[1])
-    return f", about {math.ceil(left / size):,} {name} left"
+    for name, size in (("h", 3600), ("min", 60), ("s", 1)):
+        if left >= 2 * size:
+            return f", about {math.ceil(left / size):,} {name} left"
+    return ""
 
 
 def with_unit(number: str, unit: str) -> str:

@@ -14,7 +14,7 @@ from typing import TypeVar
 
 from apc.compiler.errors import Place
 from apc.compiler.language.dimensions import Dimension
-from apc.compiler.language.expression import FUNCTIONS, KEYWORDS, Call, Equation, Expr, Name, walk
+from apc.compiler.language.expression import FUNCTIONS, KEYWORDS, Call, Equation, Expr, Name, names
 from apc.compiler.language.units import Unit
 from apc.compiler.language.values import Binding, Bounds
 from apc.compiler.source.nodes import Node
@@ -164,15 +164,15 @@ class Component:
     name: str
     about: str
     source: str
-    connectors: Named[Connector]
-    parameters: tuple[Parameter, ...]
-    variables: tuple[Variable, ...]
-    locals: Named[Dimension]
-    sends: tuple[Send, ...]
-    equations: tuple[Equation, ...]
-    inner: tuple[Inner, ...]
-    passed: Joined
     place: Place
+    connectors: Named[Connector] = ()
+    parameters: tuple[Parameter, ...] = ()
+    variables: tuple[Variable, ...] = ()
+    locals: Named[Dimension] = ()
+    sends: tuple[Send, ...] = ()
+    equations: tuple[Equation, ...] = ()
+    inner: tuple[Inner, ...] = ()
+    passed: Joined = ()
     grips: tuple[str, ...] = ()
     peers: int = 0
 
@@ -208,12 +208,8 @@ class Component:
     @property
     def hears_others(self) -> bool:
         """Whether an equation, here or in an inner part, reads the other peers."""
-        own = any(
-            isinstance(node, Name) and node.parts[0] == OTHERS
-            for equation in self.equations
-            for side in (equation.left, equation.right)
-            for node in walk(side)
-        )
+        read = (names(side) for equation in self.equations for side in (equation.left, equation.right))
+        own = any(name.parts[0] == OTHERS for side in read for name in side)
         return own or any(inner.component.hears_others for inner in self.inner)
 
 
@@ -223,7 +219,8 @@ Settable = Number | Option | Reference | Variable  # what a group of peers can s
 def option_test(node: Expr, options: dict[str, Option]) -> tuple[Option, str] | None:
     """Return the option and the word that a comparison such as `delays == all` is about."""
     match node:
-        case Call("==" | "!=", (Name((name,)), Name((word,)))):
-            if (option := options.get(name)) is not None and word in option.words:
-                return option, word
+        case Call("==" | "!=", (Name((name,)), Name((word,)))) if (
+            name in options and word in options[name].words
+        ):
+            return options[name], word
     return None

@@ -18,12 +18,10 @@ from fractions import Fraction
 from itertools import count
 from typing import TypeVar
 
-from apc.compiler.components.component import OTHERS, Component, Named, Option, Reference, Send, option_test
-from apc.compiler.components.declarations import Written
-from apc.compiler.errors import ApcError, Mistakes, Place, place_in
+from apc.compiler.components.component import OTHERS, Component, Option, Send, option_test
+from apc.compiler.errors import Mistakes, Place, place_in
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import (
-    FUNCTIONS,
     Call,
     Equation,
     Expr,
@@ -51,166 +49,151 @@ from apc.compiler.words import counted
 _TRUE = Call("==", (Literal(Fraction(1)), Literal(Fraction(1))))
 
 Path = tuple[str, ...]  # a name in an equation, between its dots
+Where = Equation | Send  # what an expression stands in
+Written = tuple[Expr, Where]
 T = TypeVar("T")
 
 
 class ComponentNames:
-    """Resolves a component's names to dimensions, and finds the locals on the way."""
+    """Resolves a component's names to dimensions, and finds the locals on the way.
+
+    `dimensions` are those of all names, one for a vector and its entries; `sizes` those of the vectors among
+    them and of what is being inferred; None is one that isn't known. `variables` are the names whose values
+    are computed, a vector's entry by entry.
+    """
 
     def __init__(self, component: Component, undefined: Collection[str] = ()) -> None:
         """Take a component, and the names given by equations that couldn't be read: of no known dimension."""
         self.component = component
         self.options = {p.name: p for p in component.parameters if isinstance(p, Option)}
-        self.dimensions: dict[Path, Dimension | None] = {(name,): None for name in undefined}
-        self.dimensions |= dict(_visible_names(component))
-        self.dimensions |= {(name, flow.name): flow.unit.dimension for name, flow in component.flows}
-        self.variables = frozenset(self.dimensions)
+        computed: dict[Path, Dimension | None] = {(name,): None for name in undefined}
+        computed |= dict(_visible_names(component))
+        computed |= {(name, flow.name): flow.unit.dimension for name, flow in component.flows}
+        self.variables = frozenset(computed)
+        known: dict[Path, Dimension | None] = {
+            (word,): p.unit.dimension for p in component.numbers for word, _ in p.words
+        }
         # `others` alone stands for count(others).
-        self.dimensions |= {PEERS: DIMENSIONLESS, ("time",): SECOND, (OTHERS,): DIMENSIONLESS}
-        words = {(word,): p.unit.dimension for p in component.numbers for word, _ in p.words}
-        self.dimensions = words | self.dimensions | {(p.name,): p.unit.dimension for p in component.numbers}
-        self.dimensions |= {(OTHERS, send.name): send.dimension for send in component.sends}
-        # The vectors of these names, and of those found later; None while a size isn't known.
-        self.sizes: dict[Path, int | None] = {}
-        for vector, size in sizes_of(self.dimensions).items():
-            self._add(vector, size, self.dimensions[(*vector[:-1], entry(vector[-1], 1))])
-        for parameter in component.parameters:
-            if isinstance(parameter, Reference) and parameter.role == "clock":
-                self.dimensions[(interval_of(parameter.name),)] = SECOND
-            elif isinstance(parameter, Reference) and parameter.unit is not None:
-                self.dimensions[(parameter.name,)] = parameter.unit.dimension
-
-    def _add(self, parts: Path, size: int, dimension: Dimension | None) -> None:
-        """Know a number or a vector, and each of its entries."""
-        self.sizes[parts] = size
-        self.dimensions |= dict.fromkeys([(*parts[:-1], one) for one in entries(parts[-1], size)], dimension)
-        self.dimensions[parts] = dimension
+        known |= computed | {PEERS: DIMENSIONLESS, ("time",): SECOND, (OTHERS,): DIMENSIONLESS}
+        for one in component.parameters:
+            if not isinstance(one, Option) and one.unit is not None:  # a number or a table
+                known[(one.name,)] = one.unit.dimension
+            elif getattr(one, "role", "") == "clock":
+                known[(interval_of(one.name),)] = SECOND
+        known |= {(OTHERS, send.name): send.dimension for send in component.sends}
+        self.dimensions = {_whole(path): dimension for path, dimension in known.items()}
+        self.sizes: dict[Path, int | None] = {**sizes_of(known)}
 
     def size_of(self, parts: Path) -> int | None:
         """Return the size of a name: 0 for a number, None for what is to be inferred."""
         return self.sizes.get(parts, 0)
 
-    def completed(self, sends: Mapping[str, Written], mistakes: Mistakes) -> Component:
-        """Return the component with its locals and what it sends, checked, its vectors entry by entry."""
-        locals_, found = self._infer_locals(sends), []
-        for name, (expression, text, place) in sends.items():
-            with mistakes:
-                written_out(expression, self.size_of, text, place)  # or its sizes do not fit
-                dimension = _known(self._dimension(expression, text, place))
-                found.append(Send(name, expression, text, place, dimension))
-        own = self.component
-        component = replace(own, locals=(*own.locals, *locals_), sends=(*own.sends, *found))
-        return component if mistakes else self._checked(component, mistakes)
+    def completed(self, sends: Collection[Send], mistakes: Mistakes) -> Component:
+        """Return the component with its locals and what it sends, checked, its vectors entry by entry.
 
-    def _infer_locals(self, sends: Mapping[str, Written]) -> Named[Dimension]:
-        """Return the undeclared names that stand alone on the left of an equation.
-
-        What one is may hang on another, on itself, or on what is sent: each round settles some. An unknown
-        name on the right is reported once, by `_checked`.
+        The dimensions of `sends` are found here.
         """
-        undeclared: dict[Path, Written] = {
-            equation.left.parts: (equation.right, equation.text, equation.place)
+        locals_, sent, equations = self._infer_locals(sends), list[Send](), list[Equation]()
+        for send in sends:
+            with mistakes:
+                written = written_out(send.expression, self.size_of, send.text, send.place)
+                dimension = _known(self._dimension(send.expression, send))
+                each = written or (send.expression,)
+                named = entries(send.name, len(each) if len(each) > 1 else 0)
+                pairs = zip(named, each, strict=True)
+                sent += [replace(send, name=n, expression=one, dimension=dimension) for n, one in pairs]
+        own = self.component
+        if not mistakes:
+            for send in sends:
+                with mistakes:
+                    self._check_sent(send)
+            for equation in own.equations:
+                with mistakes:
+                    equations += self._checked(equation, mistakes)
+        return replace(
+            own, locals=(*own.locals, *locals_), sends=(*own.sends, *sent), equations=tuple(equations)
+        )
+
+    def _infer_locals(self, sends: Collection[Send]) -> list[tuple[str, Dimension]]:
+        """Return the undeclared names that stand alone on the left of an equation, a vector's entry by entry.
+
+        What one is may hang on another, on itself, or on what is sent. An unknown name on the right is
+        reported once, by `_checked`.
+        """
+        undeclared = {
+            equation.left.parts: (equation.right, equation)
             for equation in reversed(self.component.equations)
             if isinstance(equation.left, Name)
-            and len(equation.left.parts) == 1
-            and not equation.left.parts[0].endswith("]")
+            and ".".join(equation.left.parts).isidentifier()
             and equation.left.parts not in self.dimensions
         }
-        open_: dict[Path, Written] = {(OTHERS, name): written for name, written in sends.items()}
-        open_ |= undeclared
-        self.dimensions |= dict.fromkeys(open_)
-        self.sizes |= dict.fromkeys(open_)
-        _settle(open_, self._size, self.sizes.__setitem__)
-        # A size that contradicts itself is none.
-        self.sizes |= {name: self._size(*written) for name, written in open_.items()}
+        waiting: dict[Path, Written] = {(OTHERS, send.name): (send.expression, send) for send in sends}
+        waiting |= undeclared
+        self.dimensions |= dict.fromkeys(waiting)
+        self.sizes |= dict.fromkeys(waiting)
+        _settle(waiting, self._size, self.sizes)
+        # A size that contradicts itself, or hangs on itself alone, is none.
+        self.sizes |= {name: self._size(*written) or 0 for name, written in waiting.items()}
+        _settle(waiting, self._inferred, self.dimensions)
+        return [
+            (one, _known(self.dimensions[name]))
+            for name in reversed(undeclared)
+            for one in entries(name[0], self.sizes[name] or 0)
+        ]
 
-        def add(name: Path, dimension: Dimension | None) -> None:
-            self._add(name, self.sizes[name] or 0, dimension)
-
-        for name in _settle(open_, self._inferred, add):
-            add(name, None)
-        return tuple((name[0], _known(self.dimensions[name])) for name in reversed(undeclared))
-
-    def _size(self, expression: Expr, text: str, place: Place) -> int | None:
+    def _size(self, expression: Expr, where: Where) -> int | None:
         """Return the size of an expression; 0 of one at fault, which `_checked` reports."""
         with Mistakes():
-            found = written_out(expression, self.size_of, text, place)
+            found = written_out(expression, self.size_of, where.text, where.place)
             return None if found is None else len(found) if len(found) > 1 else 0
         return 0
 
-    def _inferred(self, expression: Expr, text: str, place: Place) -> Dimension | None:
+    def _inferred(self, expression: Expr, where: Where) -> Dimension | None:
         with Mistakes():
-            return self._dimension(expression, text, place)
+            return self._dimension(expression, where)
         return None
 
-    def _checked(self, component: Component, mistakes: Mistakes) -> Component:
-        """Check names, then units and sizes, of every equation, and that what is sent is no reduction.
+    def _checked(self, equation: Equation, mistakes: Mistakes) -> tuple[Equation, ...]:
+        """Return an equation for each entry of it. Raises ApcError for names and sizes; records units."""
+        sides, wrong = [self._decided(side) for side in (equation.left, equation.right)], Mistakes()
+        for side in sides:
+            self._check_names(side, equation, wrong)
+            self._check_reductions(side, equation, wrong)
+        wrong.raise_if_any()
+        with mistakes:
+            check_equation(replace(equation, left=sides[0], right=sides[1]), self._lookup)
+        return written_equation(equation, self.size_of)
 
-        Return the component without vectors, everything in terms of their entries.
-        """
-        sends, written = [], list[Equation]()
-        for send in component.sends:
-            with mistakes:
-                self._check_sent(send)
-                found = written_out(send.expression, self.size_of, send.text, send.place)
-                each = found or (send.expression,)
-                named = entries(send.name, len(each) if len(each) > 1 else 0)
-                sends += [replace(send, name=n, expression=one) for n, one in zip(named, each, strict=True)]
-        for equation in component.equations:
-            with mistakes:
-                left, right = self._decided(equation.left), self._decided(equation.right)
-                wrong = Mistakes()
-                for side in (left, right):
-                    self._check_names(side, equation.text, equation.place, wrong)
-                    self._check_reductions(side, equation.text, equation.place, wrong)
-                wrong.raise_if_any()
-                with mistakes:
-                    check_equation(
-                        replace(equation, left=left, right=right),
-                        lambda name: self.dimensions.get(name.parts),
-                    )
-                written += written_equation(equation, self.size_of)
-        locals_ = (
-            (one, dimension)
-            for name, dimension in component.locals
-            for one in entries(name, self.size_of((name,)) or 0)
-        )
-        return replace(component, locals=tuple(locals_), sends=tuple(sends), equations=tuple(written))
-
-    def _check_reductions(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> None:
+    def _check_reductions(self, expression: Expr, where: Where, mistakes: Mistakes) -> None:
         """Record a reduction that doesn't run over the other peers, and an age of what is not heard."""
-        for node in walk(expression):
-            if not isinstance(node, Call) or node.function not in FUNCTIONS:
-                continue
+        for node in (node for node in walk(expression) if isinstance(node, Call)):
             function, others = node.function, [name for name in names(node) if name.parts[0] == OTHERS]
+            heard = [name for name in others if len(name.parts) > 1]
+            what, expected = function, "others.x in it"
             hint = "count(others)" if function == "count" else f"{function}(others.x)"
-            if function == "age":
-                heard = [name for name in others if len(name.parts) > 1]
-                if heard and heard[0] is node.arguments[0]:
-                    continue
-                sent = [*(send.name for send in self.component.sends), "x"][0]
+            if function == "age" and node.arguments[0] not in heard:
+                sent = next((send.name for send in self.component.sends), "x")
                 shown = format_expression(heard[0]) if heard else f"{OTHERS}.{sent}"
                 what, expected = "age is of one value that is heard of the others, and", f"{shown} in it"
                 hint = f"age({shown})"
             elif function in ("mean", "sum", "count") and not others:
-                what, expected = f"{function} runs over the other peers and", "others.x in it"
+                what = f"{function} runs over the other peers and"
             elif function in ("max", "min") and len(node.arguments) == 1 and not others:
-                what, expected = function, "two values, or one of the other peers"
+                expected = "two values, or one of the other peers"
             else:
                 continue
-            where, got = place_in(place, text, node.start), format_expression(node)
-            mistakes.add("E506", where, what, expected=expected, got=got, hint=hint)
+            got = format_expression(node)
+            mistakes.add("E506", _place(where, node), what, expected=expected, got=got, hint=hint)
 
     def _check_sent(self, send: Send) -> None:
         """Refuse a send of what is heard: that is known at ticks of the clock, not of the link."""
-        heard = next((name for name in names(send.expression) if name.parts[0] == OTHERS), None)
-        if heard is None:
-            return
-        name = next(one for n in count(1) if (one := f"sent{n}",) not in self.dimensions)
-        shown = format_expression(heard)
-        what = f"{send.name} is sent at ticks of the link, and {shown} is heard at those of the clock"
-        hint = f"{name} = {send.text} among the equations, and sends: {{{send.name}: sample(hold({name}))}}"
-        raise fault("E505", place_in(send.place, send.text, heard.start), what, hint=hint)
+        for heard in names(send.expression):
+            if heard.parts[0] == OTHERS:
+                name = next(one for n in count(1) if (one := f"sent{n}",) not in self.dimensions)
+                what = f"{send.name} is sent at ticks of the link, and {format_expression(heard)} is heard at"
+                sample = f"{{{send.name}: sample(hold({name}))}}"
+                hint = f"{name} = {send.text} among the equations, and sends: {sample}"
+                raise fault("E505", _place(send, heard), f"{what} those of the clock", hint=hint)
 
     def _decided(self, expression: Expr) -> Expr:
         """Return the expression without what has no dimension: words of options, and clocks to sample at.
@@ -219,8 +202,9 @@ class ComponentNames:
         """
 
         def decided(node: Expr) -> Expr | None:
-            if isinstance(node, Call) and node.function == "sample" and len(node.arguments) == 2:
-                return replace(node, arguments=(transform(node.arguments[0], decided),))
+            match node:
+                case Call("sample", (sampled, _)):
+                    return replace(node, arguments=(transform(sampled, decided),))
             return _TRUE if option_test(node, self.options) else None
 
         return transform(expression, decided)
@@ -229,80 +213,78 @@ class ComponentNames:
         """Return the dimension of a checked expression, or None if it is a variable, which has its own."""
         if isinstance(expression, Name) and expression.parts in self.variables:
             return None
-        return _known(self._dimension(expression, text, place))
+        return _known(dimension_of(self._decided(expression), self._lookup, text, place))
 
-    def _dimension(self, expression: Expr, text: str, place: Place) -> Dimension | None:
+    def _dimension(self, expression: Expr, where: Where) -> Dimension | None:
         """Return the dimension of an expression. Raises ApcError for its names and units."""
         expression, wrong = self._decided(expression), Mistakes()
-        self._check_names(expression, text, place, wrong)
+        self._check_names(expression, where, wrong)
         wrong.raise_if_any()
-        return dimension_of(expression, lambda name: self.dimensions.get(name.parts), text, place)
+        return dimension_of(expression, self._lookup, where.text, where.place)
 
-    def _check_names(self, expression: Expr, text: str, place: Place, mistakes: Mistakes) -> None:
+    def _lookup(self, name: Name) -> Dimension | None:
+        return self.dimensions.get(_whole(name.parts))
+
+    def _check_names(self, expression: Expr, where: Where, mistakes: Mistakes) -> None:
         """Record names that nothing of the component has, and words that an option hasn't got."""
         told = set[int]()
         for node in walk(expression):
             match node:
-                case Call("==" | "!=", (Name(left), Name(right) as second)):
-                    option, word = self.options.get(".".join(left)), ".".join(right)
-                    if option is not None:  # else it was decided
-                        told |= {part.start for part in node.arguments}
-                        what = f"{option.name} has no option {brief(word)}"
-                        at = place_in(place, text, second.start)
-                        mistakes.take(unknown("E206", at, what, word, option.words))
-            if isinstance(node, Name) and node.parts not in self.dimensions and node.start not in told:
-                mistakes.take(self._unknown(node.parts, place_in(place, text, node.start)))
+                case Call("==" | "!=", (Name((name,)) as left, Name() as right)) if name in self.options:
+                    # Else it was decided.
+                    told |= {left.start, right.start}
+                    word, words = format_expression(right), self.options[name].words
+                    what, at = f"{name} has no option {brief(word)}", _place(where, right)
+                    mistakes.take(unknown("E206", at, what, word, words))
+                case Name(parts) if node.start not in told:
+                    self._check_name(parts, _place(where, node), mistakes)
 
-    def _unknown(self, parts: Path, place: Place) -> ApcError:
-        """Return the mistake of a name there isn't, of an entry that a vector hasn't got among them."""
-        name, index = whole_and_index(parts[-1])
-        whole = (*parts[:-1], name)
+    def _check_name(self, parts: Path, place: Place, mistakes: Mistakes) -> None:
+        """Record a name there isn't, or an entry that a vector hasn't got."""
+        whole, index = _whole(parts), whole_and_index(parts[-1])[1]
         shown, size = ".".join(whole), self.size_of(whole) or 0
+        if whole in self.dimensions and index <= size:
+            return
         if parts[0] == OTHERS:
             what = f"{self.component.name} sends nothing called {brief('.'.join(parts[1:]))}"
-            return fault("E303", place, what, hint="sends: {x: sample(object.x)}")
-        if index and whole in self.dimensions:
-            told = entry(shown, index)
+            mistakes.add("E303", place, what, hint="sends: {x: sample(object.x)}")
+        elif whole in self.dimensions:
+            expected, got, hint = "a vector before the index", f"{shown}, which is a number", shown
             if size:
-                return fault(
-                    "E408", place, told, f"an index from 1 to {size}", f"{index}", entry(shown, size)
-                )
-            return fault(
-                "E408", place, told, "a vector before the index", f"{shown}, which is a number", shown
-            )
-        known = sorted(".".join(one) for one in self.dimensions if not whole_and_index(one[-1])[1])
-        return unknown("E303", place, f"{self.component.name} has no {brief(shown)}", shown, known)
+                expected, got, hint = f"an index from 1 to {size}", f"{index}", entry(shown, size)
+            mistakes.add("E408", place, entry(shown, index), expected=expected, got=got, hint=hint)
+        else:
+            what, known = f"{self.component.name} has no {brief(shown)}", map(".".join, self.dimensions)
+            mistakes.take(unknown("E303", place, what, shown, sorted(known)))
+
+
+def _whole(path: Path) -> Path:
+    """Return the vector that an entry is of; of a number its own path."""
+    return (*path[:-1], whole_and_index(path[-1])[0])
+
+
+def _place(where: Where, node: Expr) -> Place:
+    return place_in(where.place, where.text, node.start)
 
 
 def _settle(
     waiting: Mapping[Path, Written],
-    infer: Callable[[Expr, str, Place], T | None],
-    keep: Callable[[Path, T], None],
-) -> Collection[Path]:
-    """Infer something of each name, which may hang on others': each round settles some. Return the rest."""
-    while waiting:
-        found = {name: infer(*written) for name, written in waiting.items()}
-        for name, value in found.items():
-            if value is not None:
-                keep(name, value)
-        before, waiting = waiting, {name: one for name, one in waiting.items() if found[name] is None}
-        if len(before) == len(waiting):
-            break
-    return waiting
+    infer: Callable[[Expr, Where], T | None],
+    known: dict[Path, T | None],
+) -> None:
+    """Infer something of each name, which may hang on others: each round settles some, while any can be."""
+    for _ in waiting:
+        known |= {name: infer(*written) for name, written in waiting.items() if known[name] is None}
 
 
-def _visible_names(component: Component) -> Iterator[tuple[tuple[str, ...], Dimension]]:
+def _visible_names(component: Component) -> Iterator[tuple[Path, Dimension]]:
     """Yield what may be named of a component from outside: its variables and its connectors' potentials."""
-    for variable in component.variables:
-        yield (variable.name,), variable.unit.dimension
-    for name, dimension in component.locals:
-        yield (name,), dimension
+    yield from (((one.name,), one.unit.dimension) for one in component.variables)
+    yield from (((name,), dimension) for name, dimension in component.locals)
     for name, connector in component.connectors:
-        for potential in connector.potentials:
-            yield (name, potential.name), potential.unit.dimension
+        yield from (((name, one.name), one.unit.dimension) for one in connector.potentials)
     for inner in component.inner:
-        for path, dimension in _visible_names(inner.component):
-            yield (inner.name, *path), dimension
+        yield from (((inner.name, *path), its) for path, its in _visible_names(inner.component))
 
 
 def _known(dimension: Dimension | None) -> Dimension:
@@ -315,9 +297,8 @@ def check_balance(component: Component) -> None:
     unknowns = [variable.name for variable in component.variables]
     unknowns += [name for name, _ in component.locals]
     unknowns += [f"{name}.{flow.name}" for name, flow in component.flows]
-    if len(component.equations) == len(unknowns):
-        return
-    numbers = f"{counted(len(component.equations), 'equation')} for {counted(len(unknowns), 'unknown')}"
-    what = f"{component.name} is unbalanced: {numbers} ({', '.join(unknowns) or 'none'})"
-    hint = "one equation for each variable and one for each flow of a connector"
-    raise fault("E501", component.place, what, hint=hint)
+    if len(component.equations) != len(unknowns):
+        numbers = f"{counted(len(component.equations), 'equation')} for {counted(len(unknowns), 'unknown')}"
+        what = f"{component.name} is unbalanced: {numbers} ({', '.join(unknowns) or 'none'})"
+        hint = "one equation for each variable and one for each flow of a connector"
+        raise fault("E501", component.place, what, hint=hint)

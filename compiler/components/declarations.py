@@ -1,7 +1,7 @@
 """The declarations of a component: equations, what it sends, variables and parameters; YAML to typed data.
 
 Takes: the body of a definition.
-Gives: `read_equations`, `read_sends`, `read_variables`, `read_parameters`, `declared_once`.
+Gives: `read_equations`, `read_sends`, `read_variables`, `read_parameters`.
 Guarantees: a number is in SI and of its declared unit's dimension; a fault is reported and its item left out;
 a vector is declared as its entries, `x[1]`, `x[2]`.
 Does not: look at how the declarations fit together (see `definitions`).
@@ -10,20 +10,36 @@ Does not: look at how the declarations fit together (see `definitions`).
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from collections.abc import Sequence as Several
+from contextlib import suppress
+from dataclasses import replace
 from fractions import Fraction
 from functools import partial
+from itertools import chain
 
-from apc.compiler.components.component import ROLES, Number, Option, Parameter, Reference, Variable
+from apc.compiler.components.component import (
+    ROLES,
+    Named,
+    Number,
+    Option,
+    Parameter,
+    Reference,
+    Send,
+    Variable,
+)
 from apc.compiler.errors import ApcError, Mistakes, Place
-from apc.compiler.language.expression import Equation, Expr
+from apc.compiler.language.dimensions import DIMENSIONLESS
+from apc.compiler.language.expression import Equation
 from apc.compiler.language.grammar import parse_equation, parse_expression
 from apc.compiler.language.units import Unit, parse_quantity, parse_unit, quantity
-from apc.compiler.language.values import AlreadyReportedError, Bounds, Value, text_place
+from apc.compiler.language.values import AlreadyReportedError, Value, text_place
 from apc.compiler.language.vectors import SIZES
 from apc.compiler.language.vectors import entries as names_of
 from apc.compiler.source.nodes import Node, Scalar, Sequence
 from apc.compiler.source.reading import (
     Body,
+    among,
     brief,
     fault,
     form,
@@ -31,16 +47,14 @@ from apc.compiler.source.reading import (
     mapping_of,
     name_of,
     text_of,
-    unknown,
     whole_number,
 )
 
-Written = tuple[Expr, str, Place]  # an expression, its text, and where it starts
 VARIABLE = ("unit", "size", "start", "limit", "about")
 NUMBER = ("unit", "size", "min", "above", "max", "default", "about", "shared", "options")
 OPTION = ("options", "default", "about")
 TABLE = ("table", "about")
-_DEFINES = re.compile(r"\s*([A-Za-z]\w*)\s*=", re.ASCII)
+_DEFINES = re.compile(r"\A\s*([A-Za-z]\w*)\s*=", re.ASCII)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z", re.ASCII)
 
 
@@ -58,82 +72,78 @@ def read_equations(root: Body, mistakes: Mistakes) -> tuple[tuple[Equation, ...]
     -------
     The equations, and the names that stand alone on the left of those that couldn't be read.
     """
-    node = root.nodes.get("equations")
-    found, undefined = [], set()
-    if not isinstance(node, Sequence | None):
-        hint = "equations: [a + b = c]"
-        mistakes.add("E203", node.place, "equations", expected="a list", got=form(node), hint=hint)
-    for item in node.items if isinstance(node, Sequence) else ():
+    found, undefined = list[Equation](), set[str]()
+    for item in root.read("equations", _items, ()):
         with mistakes:
             text = text_of(item, "an equation", "- a + b = c")
-            defined = _DEFINES.findall(text)[:1] if _DEFINES.match(text) else []
+            defined = _DEFINES.findall(text)
             undefined.update(defined)
             found.append(parse_equation(text, text_place(item)))
             undefined.difference_update(defined)
     return tuple(found), undefined
 
 
-def read_sends(root: Body, mistakes: Mistakes) -> dict[str, Written]:
-    """Read `sends: {x: sample(object.x)}`."""
-    found = {}
+def _items(node: Node, what: str) -> tuple[Node, ...]:
+    if isinstance(node, Sequence):
+        return node.items
+    raise fault("E203", node.place, what, "a list", form(node), "equations: [a + b = c]")
+
+
+def read_sends(root: Body, mistakes: Mistakes) -> tuple[Send, ...]:
+    """Read `sends: {x: sample(object.x)}`, their dimensions left open."""
+    found = []
     for key, value in root.section("sends", "{x: sample(object.x)}"):
         with mistakes:
             name = name_of(key, "what is sent")
-            text = text_of(value, name, f"{name}: sample(object.x)")
-            place = text_place(value)
-            found[name] = parse_expression(text, place), text, place
-    return found
+            text, place = text_of(value, name, f"{name}: sample(object.x)"), text_place(value)
+            found.append(Send(name, parse_expression(text, place), text, place, DIMENSIONLESS))
+    return tuple(found)
 
 
 def read_variables(root: Body, section: str = "variables") -> tuple[Variable, ...]:
     """Read `variables: {x: {unit: m}}`, or a connector's potentials or flows."""
-    found: list[Variable] = []
-    for key, value in root.section(section, "{x: {unit: m}}"):
-        with root.mistakes:
-            name = name_of(key, "a variable")
-            meant = value.text if isinstance(value, Scalar) and _is_unit(value.text) else "…"
-            node = mapping_of(value, name, f"{name}: {{unit: {meant}}}")
-            body = Body(node, VARIABLE, f"variable {name}", root.mistakes)
-            about, limit = body.text("about"), body.text("limit", "limit: force_limit")
-            unit, size = _unit_and_size(body, name)
-            starts = _entries_of(body, "start", name, unit, size)
-            for one, start in zip(names_of(name, size), starts, strict=True):
-                found.append(Variable(one, unit, start, about, key.place, limit))
-    return tuple(found)
+
+    def read(key: Scalar, value: Node) -> list[Variable]:
+        name = name_of(key, "a variable")
+        meant = value.text if isinstance(value, Scalar) and _is_unit(value.text) else "…"
+        node = mapping_of(value, name, f"{name}: {{unit: {meant}}}")
+        body = Body(node, VARIABLE, f"variable {name}", root.mistakes)
+        about, limit = body.text("about"), body.text("limit", "limit: force_limit")
+        unit, size = _unit_and_size(body, name)
+        starts = _entry_by_entry(body, "start", name, unit, size)
+        return [Variable(one, unit, start, about, key.place, limit) for one, start in starts]
+
+    return tuple(chain(*root.each(section, "{x: {unit: m}}", read)))
 
 
 def _is_unit(text: str) -> bool:
-    try:
-        return bool(text.strip()) and parse_unit(text, Place("")) is not None
-    except ApcError:
-        return False
+    with suppress(ApcError):
+        return bool(text.strip() and parse_unit(text, Place("")))
+    return False
 
 
 def read_parameters(root: Body) -> tuple[Parameter, ...]:
     """Read `parameters: {stiffness: {unit: N/m, min: 0}}`: numbers, options, tables and roles."""
-    found: list[Parameter] = []
-    for key, value in root.section("parameters", "{stiffness: {unit: N/m, min: 0}}"):
-        with root.mistakes:
-            name = name_of(key, "a parameter")
-            what = f"parameter {name}"
-            if isinstance(value, Scalar):
-                if value.text not in ROLES:
-                    expected = f"{', '.join(ROLES)}, or a mapping with its unit"
-                    hint = f"{name}: {{unit: N/m, min: 0}}"
-                    raise fault("E203", value.place, what, expected, brief(value.text) or "nothing", hint)
-                found.append(Reference(name, value.text, "", value.place))
-                continue
-            node = mapping_of(value, what, f"{name}: {{unit: N/m}}")
-            options = node.get("options")
-            if (table := node.get("table")) is not None:
-                body = Body(node, TABLE, what, root.mistakes)
-                unit = parse_unit(text_of(table, "table", "table: N"), table.place)
-                found.append(Reference(name, "table", body.text("about"), node.place, unit))
-            elif isinstance(options, Sequence):
-                found.append(_option(name, options, Body(node, OPTION, what, root.mistakes)))
-            else:
-                found += _numbers(name, Body(node, NUMBER, what, root.mistakes))
-    return tuple(found)
+
+    def read(key: Scalar, value: Node) -> Several[Parameter]:
+        name = name_of(key, "a parameter")
+        what = f"parameter {name}"
+        if isinstance(value, Scalar):
+            if value.text in ROLES:
+                return [Reference(name, value.text, "", value.place)]
+            expected, hint = f"{', '.join(ROLES)}, or a mapping with its unit", "{unit: N/m, min: 0}"
+            got = brief(value.text) or "nothing"
+            raise fault("E203", value.place, what, expected, got, f"{name}: {hint}")
+        node = mapping_of(value, what, f"{name}: {{unit: N/m}}")
+        if (table := node.get("table")) is not None:
+            body = Body(node, TABLE, what, root.mistakes)
+            unit = _unit(table, "table", "table: N")
+            return [Reference(name, "table", body.text("about"), node.place, unit)]
+        if isinstance(options := node.get("options"), Sequence):
+            return [_option(name, options, Body(node, OPTION, what, root.mistakes))]
+        return _numbers(name, Body(node, NUMBER, what, root.mistakes))
+
+    return tuple(chain(*root.each("parameters", "{stiffness: {unit: N/m, min: 0}}", read)))
 
 
 def _option(name: str, options: Sequence, body: Body) -> Option:
@@ -141,58 +151,49 @@ def _option(name: str, options: Sequence, body: Body) -> Option:
     for item in options.items:
         with body.mistakes:
             words.append(text_of(item, "an option"))
-    default, node = body.text("default"), body.nodes.get("default")
-    if default and node is not None and default not in words:
-        what = f"{name} has no option {brief(default)}"
-        body.mistakes.take(unknown("E206", node.place, what, default, words))
-    return Option(name, tuple(words), default or None, body.text("about"), options.place)
+
+    def known(node: Node, key: str) -> str:
+        return among(text_of(node, key), words, node.place, f"{name} has no option {{}}")
+
+    return Option(name, tuple(words), body.read("default", known, None), body.text("about"), options.place)
 
 
 def _numbers(name: str, body: Body) -> list[Number]:
     """Read a number's declaration, or a vector's, of which each entry is a number."""
-    about, shared, nodes = body.text("about"), body.text("shared"), body.nodes
+    about, shared, nodes, mistakes = body.text("about"), body.text("shared"), body.nodes, body.mistakes
     if shared not in ("", "divided", "whole"):
-        wrong = fault("E203", nodes["shared"].place, "shared", "divided or whole", brief(shared))
-        body.mistakes.take(wrong)
+        mistakes.take(fault("E203", nodes["shared"].place, "shared", "divided or whole", brief(shared)))
     unit, size = _unit_and_size(body, name)
-
-    def number(node: Node, _: str) -> Fraction:
-        return _number(node, name, unit)
-
-    minimum, above, most = (body.read(key, number, None) for key in ("min", "above", "max"))
-    options, default = nodes.get("options"), nodes.get("default")
-    if size and options is not None:
-        raise fault("E203", options.place, name, "a number, to have names for its values", "a vector")
+    minimum, above, most = (
+        body.read(key, lambda node, _: _number(node, name, unit), None) for key in ("min", "above", "max")
+    )
+    if size and "options" in nodes:
+        place = nodes["options"].place
+        raise fault("E203", place, name, "a number, to have names for its values", "a vector")
     if minimum is not None and above is not None:
-        body.mistakes.add("E203", nodes["above"].place, name, expected="either min or above", got="both")
-    first = names_of(name, size)[0]
+        mistakes.add("E203", nodes["above"].place, name, expected="either min or above", got="both")
     least = minimum if above is None else above
-    bounds = Bounds(unit.text, unit.scale, least, above is not None, most)
+    first, *_ = names_of(name, size)
+    model = Number(
+        first, unit, None, least, above is not None, most, shared == "divided", (), about, body.place
+    )
 
-    def within(value: Fraction, node: Node, what: str) -> Fraction:
-        """Return a number of the declaration itself, which has to lie within its bounds."""
-        bounds.check(Value(value, unit.dimension, None, node.place), what, body.mistakes)
-        return value
+    def check(number: Fraction | None, node: Node | None, what: str) -> None:
+        """Hold a number of the declaration itself against its bounds."""
+        if number is not None and node is not None:
+            model.bounds.check(Value(number, unit.dimension, None, node.place), what, mistakes)
 
-    if most is not None:
-        within(most, nodes["max"], f"the max of {first}")
+    check(most, nodes.get("max"), f"the max of {first}")
     words: dict[str, Fraction] = {}
-    for key, node in () if options is None else mapping_of(options, "options").entries:
-        with body.mistakes:
-            value = _number(node, key.text, unit)
-            words[key.text] = within(value, node, f"{key.text} of {first}")
-    if isinstance(default, Scalar) and default.text in words:
-        defaults: list[Fraction | None] = [words[default.text]]
-    else:
-        defaults = _entries_of(body, "default", name, unit, size)
-    found = []
-    for one, start in zip(names_of(name, size), defaults, strict=True):
-        if start is not None and default is not None:
-            within(start, default, f"the default of {one}")
-        divided, named = shared == "divided", tuple(words.items())
-        limits = least, above is not None, most
-        found.append(Number(one, unit, start, *limits, divided, named, about, body.place))
-    return found
+    for key, node in mapping_of(nodes["options"], "options").entries if "options" in nodes else ():
+        with mistakes:
+            words[key.text] = _number(node, key.text, unit)
+            check(words[key.text], node, f"{key.text} of {first}")
+    defaults = _entry_by_entry(body, "default", name, unit, size, words)
+    for one, default in defaults:
+        check(default, nodes.get("default"), f"the default of {one}")
+    named = tuple(words.items())
+    return [replace(model, name=one, default=default, words=named) for one, default in defaults]
 
 
 def _unit_and_size(body: Body, name: str) -> tuple[Unit, int]:
@@ -207,8 +208,8 @@ def _unit_and_size(body: Body, name: str) -> tuple[Unit, int]:
     return unit, size
 
 
-def _unit(node: Node, what: str) -> Unit:
-    return parse_unit(text_of(node, what, "unit: N/m"), node.place)
+def _unit(node: Node, what: str, hint: str = "unit: N/m") -> Unit:
+    return parse_unit(text_of(node, what, hint), node.place)
 
 
 def _size(node: Node, what: str, name: str) -> int:
@@ -219,19 +220,25 @@ def _size(node: Node, what: str, name: str) -> int:
     raise fault("E203", node.place, f"the {what} of {name}", "2 or 3", form(node), hint)
 
 
-def _entries_of(body: Body, key: str, name: str, unit: Unit, size: int) -> list[Fraction | None]:
-    """Read the default or start of a number, or the list of a vector's; None of one that isn't given."""
+def _entry_by_entry(
+    body: Body, key: str, name: str, unit: Unit, size: int, words: Mapping[str, Fraction] | None = None
+) -> Named[Fraction | None]:
+    """Read the default or start of a number, or the list of a vector's, by names; None of one not given."""
 
     def read(node: Node, _: str) -> list[Fraction | None]:
         nodes = list_of(node, key, size, "0") if size else (node,)
-        return [_number(one, name, unit) for one in nodes]
+        return [_number(one, name, unit, words) for one in nodes]
 
-    return body.read(key, read, [None] * max(size, 1))
+    named = names_of(name, size)
+    values = body.read(key, read, [None] * len(named))
+    return tuple(zip(named, values, strict=True))
 
 
-def _number(node: Node, what: str, unit: Unit) -> Fraction:
-    """Read a number of a declaration: bare, it is in the unit declared beside it."""
+def _number(node: Node, what: str, unit: Unit, words: Mapping[str, Fraction] | None = None) -> Fraction:
+    """Read a number of a declaration: bare, it is in the unit declared beside it; or a word for one."""
     text = text_of(node, what)
+    if words and text in words:
+        return words[text]
     if _NUMBER.match(text):
         return parse_quantity(text, node.place).value * unit.scale
     return quantity(text, node.place, what=what, unit=unit.text).value

@@ -8,7 +8,6 @@ Does not: know any topology, or which component is used where.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 from typing import TypeVar
@@ -18,8 +17,7 @@ from apc.compiler.components.component import (
     Component,
     Connector,
     Inner,
-    Joined,
-    Named,
+    Number,
     Parameter,
     Reference,
     Variable,
@@ -36,8 +34,8 @@ from apc.compiler.errors import Mistakes
 from apc.compiler.language.dimensions import DIMENSIONLESS, Dimension
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import PEERS
+from apc.compiler.language.vectors import by_vector
 from apc.compiler.language.vectors import entries as elements
-from apc.compiler.language.vectors import whole_and_index
 from apc.compiler.source.nodes import Mapping, Node, Scalar
 from apc.compiler.source.reading import (
     Body,
@@ -68,7 +66,7 @@ def read_connector(source: Source) -> Connector:
     root = Body(mapping_of(source.root, "a connector definition"), CONNECTOR, "a connector", mistakes)
     name, about = root.text("connector"), root.text("about")
     potentials, flows = (read_variables(root, key) for key in ("potentials", "flows"))
-    _check_limits((*potentials, *flows), None, mistakes)
+    _check_limits((*potentials, *flows), (), mistakes)
     mistakes.raise_if_any()
     if len(potentials) != len(flows):
         numbers = f"{counted(len(potentials), 'potential')} for {counted(len(flows), 'flow')}"
@@ -97,59 +95,61 @@ def read_component(source: Source, library: Definitions) -> Component:
 
 def _read_declarations(root: Body, library: Definitions, mistakes: Mistakes) -> Component:
     """Read everything but equations and sends; what the component extends comes first."""
-    title, name = root.nodes["component"], "?"
+    title = root.nodes["component"]
+    assert isinstance(title, Scalar)  # or the library would not know it
     with mistakes:
-        name = name_of(title, "a component") if isinstance(title, Scalar) else name
-    place = title.place
-    about, cited = root.text("about"), root.text("source")
-    base = Component("", "", "", (), (), (), (), (), (), (), (), place)
-    base = root.read("extends", lambda node, key: _base(node, key, library), base)
-    connectors, grips = _connectors(root, library, mistakes)
+        name_of(title, "a component")
+    about, cited, hint = root.text("about"), root.text("source"), "extends: Mass"
+    base = root.read(
+        "extends",
+        lambda node, key: component_named(text_of(node, key, hint), node.place, library, hint),
+        Component("", "", "", title.place),
+    )
+    connectors = _connectors(root, library)
     parameters, variables = read_parameters(root), read_variables(root)
-    _check_distinct(connectors, parameters, variables, mistakes)
+    seen = {name for name, _, _ in connectors}
+    for declared in (by_vector(parameters), by_vector(variables)):
+        for own, (first, *_) in declared.items():
+            if own in seen:
+                mistakes.add("E205", first.place, f"the name {own} is used twice in this component")
+            if own in RESERVED:
+                mistakes.add("E205", first.place, f"{own} is a word of the language and can't be a name")
+            seen.add(own)
     draft = replace(
         base,
-        name=name,
+        name=title.text,
         about=about,
         source=cited,
-        connectors=(*base.connectors, *connectors),
+        connectors=(*base.connectors, *((own, kind) for own, kind, _ in connectors)),
         parameters=_overridden(base.parameters, parameters, mistakes),
         variables=_overridden(base.variables, variables, mistakes),
-        place=place,
-        grips=(*base.grips, *grips),
+        place=title.place,
+        grips=(*base.grips, *(own for own, _, for_hands in connectors if for_hands)),
         peers=root.read("peers", _peers, base.peers),
     )
-    _check_limits(draft.variables, draft, mistakes)
-    inner, passed = _read_inner(root, draft, library, mistakes)
-    return replace(draft, inner=(*draft.inner, *inner), passed=(*draft.passed, *passed))
+    _check_limits(draft.variables, draft.numbers, mistakes)
+    return _with_inner(root, draft, library, mistakes)
 
 
-def _check_limits(variables: Iterable[Variable], within: Component | None, mistakes: Mistakes) -> None:
+def _check_limits(variables: Iterable[Variable], numbers: Iterable[Number], mistakes: Mistakes) -> None:
     """Record limits of variables that are no number of the same dimension of the component around."""
-    numbers = {one.name: one.unit.dimension for one in (within.numbers if within else ())}
+    known = {one.name: one.unit.dimension for one in numbers}
     for variable in variables:
-        limit, due = variable.limit, variable.unit.dimension
-        what = f"the limit of {variable.name}"
-        if limit and limit not in numbers:
-            what = f"{what} is {brief(limit)}, which is no number here"
-            mistakes.take(unknown("E206", variable.place, what, limit, numbers))
-        elif limit and numbers[limit] != due:
-            got = f"{limit} in {format_dimension(numbers[limit])}"
+        limit, due, what = variable.limit, variable.unit.dimension, f"the limit of {variable.name}"
+        if limit and limit not in known:
+            what += f" is {brief(limit)}, which is no number here"
+            mistakes.take(unknown("E206", variable.place, what, limit, known))
+        elif limit and known[limit] != due:
+            got = f"{limit} in {format_dimension(known[limit])}"
             expected = f"a parameter in {format_dimension(due)}"
             mistakes.add("E204", variable.place, what, expected=expected, got=got)
 
 
 def _peers(node: Node, what: str) -> int:
     """Read `peers: 2`: for how many peers a component that follows others is."""
-    count = whole_number(node)
-    if count is None or count < 2:
-        raise fault("E203", node.place, what, "a whole number from 2 on", form(node), "peers: 2")
-    return count
-
-
-def _base(node: Node, key: str, library: Definitions) -> Component:
-    hint = "extends: Mass"
-    return component_named(text_of(node, key, hint), node.place, library, hint)
+    if (count := whole_number(node) or 0) >= 2:
+        return count
+    raise fault("E203", node.place, what, "a whole number from 2 on", form(node), "peers: 2")
 
 
 Declared = TypeVar("Declared", bound=Parameter | Variable)
@@ -159,22 +159,18 @@ def _overridden(
     base: tuple[Declared, ...], own: tuple[Declared, ...], mistakes: Mistakes
 ) -> tuple[Declared, ...]:
     """Return the inherited declarations, those declared again replaced in their place, then the new ones."""
-    merged = {item.name: item for item in base}
-    sizes, mine = (Counter(whole_and_index(item.name)[0] for item in items) for items in (base, own))
-    for item in own:
-        name, index = whole_and_index(item.name)
-        same = mine[name] == sizes[name] and item.name in merged
-        if name in sizes and index <= 1 and not same:
-            before = "a number" if name in merged else f"a vector of {sizes[name]}"
-            what = f"{name} is {before} in what this component extends"
-            mistakes.add("E205", item.place, what, hint="another name")
-    return tuple((merged | {item.name: item for item in own}).values())
+    inherited = by_vector(base)
+    for name, items in by_vector(own).items():
+        before = [one.name for one in inherited.get(name, items)]
+        if before != [one.name for one in items]:
+            size = "a number" if before == [name] else f"a vector of {len(before)}"
+            what = f"{name} is {size} in what this component extends"
+            mistakes.add("E205", items[0].place, what, hint="another name")
+    return tuple({one.name: one for one in (*base, *own)}.values())
 
 
-def _read_inner(
-    root: Body, outer: Component, library: Definitions, mistakes: Mistakes
-) -> tuple[tuple[Inner, ...], Joined]:
-    """Read the parts inside a component and the connectors it passes on to them."""
+def _with_inner(root: Body, outer: Component, library: Definitions, mistakes: Mistakes) -> Component:
+    """Return a component with the parts inside it, and the connectors that it passes on to them."""
     parts = Parts(library, mistakes)
     parts.read("parts", root)
     dimensions: dict[tuple[str, ...], Dimension] = {(p.name,): p.unit.dimension for p in outer.numbers}
@@ -184,85 +180,57 @@ def _read_inner(
         return [p.name for p in outer.parameters if isinstance(p, Reference) and p.role == role]
 
     names, whole = [".".join(name) for name in dimensions], f"the parts of {outer.name}"
-    scope = Scope(lambda parts: dimensions.get(parts), names, references, parts, whole, outer=outer)
-    inner = tuple(
+    scope = Scope(dimensions.get, names, references, parts, whole, outer=outer)
+    inner = [
         Inner(name, part.component, read_entry(part, scope, mistakes, index), part.place)
         for part in parts.entries.values()
         for index, name in enumerate(elements(part.name, part.count or 0), 1)
-    )
-    hint = "fewer components around one another"
-    if any(part.component.depth >= DEEPEST for part in inner):
-        what = f"the parts of {outer.name} stand inside one another more than {DEEPEST} deep"
-        mistakes.add("E216", outer.place, what, hint=hint)
-    if (size := outer.size + sum(part.component.size for part in inner)) > MOST_PARTS:
-        holds = f"{outer.name} holds {size:,} parts, those inside parts included"
-        what = f"{holds}, and {MOST_PARTS} are the most"
-        mistakes.add("E216", outer.place, what, hint=f"fewer parts, or {hint}")
+    ]
     passed = [
         (theirs, part.name, own)
         for part in inner
         for own, other, theirs in part.entry.connections
         if not other
     ]
-    return inner, (*passed, *_read_connect(root, outer, inner, parts.faulty))
-
-
-def _read_connect(root: Body, outer: Component, inner: Collection[Inner], faulty: Collection[str]) -> Joined:
-    """Read `connect: {flange: tip.flange}`: connectors of the component that are those of an inner part."""
-    found = []
-    own = dict(outer.connectors)
     known = [f"{part.name}.{name}" for part in inner for name, _ in part.component.connectors]
     for key, value in root.section("connect", "{flange: tip.flange}"):
-        with root.mistakes:
+        with mistakes:  # connectors of the component that are those of an inner part
             text = text_of(value, key.text, f"{key.text}: tip.flange")
             part, _, connector = text.partition(".")
-            if part.partition("[")[0] in faulty:
-                continue
-            what = "connect names {}, which is no connector of"
-            name = among(key.text, own, key.place, f"{what} this component")
-            among(text, known, value.place, f"{what} an inner part")
-            found.append((name, part, connector))
-    return tuple(found)
+            if part.partition("[")[0] not in parts.faulty:
+                what = "connect names {}, which is no connector of"
+                name = among(key.text, dict(outer.connectors), key.place, f"{what} this component")
+                among(text, known, value.place, f"{what} an inner part")
+                passed.append((name, part, connector))
+    found = replace(outer, inner=(*outer.inner, *inner), passed=(*outer.passed, *passed))
+    hint = "fewer components around one another"
+    if found.depth > DEEPEST:
+        what = f"the parts of {outer.name} stand inside one another more than {DEEPEST} deep"
+        mistakes.add("E216", outer.place, what, hint=hint)
+    if found.size > MOST_PARTS:
+        what = f"{outer.name} holds {found.size:,} parts, those inside parts included, and {MOST_PARTS}"
+        mistakes.add("E216", outer.place, f"{what} are the most", hint=f"fewer parts, or {hint}")
+    return found
 
 
-def _check_distinct(
-    connectors: Iterable[tuple[str, Connector]],
-    parameters: Iterable[Parameter],
-    variables: Iterable[Variable],
-    mistakes: Mistakes,
-) -> None:
-    seen = {name for name, _ in connectors}
-    for item in (*parameters, *variables):
-        name, index = whole_and_index(item.name)
-        if index <= 1 and name in seen:
-            mistakes.add("E205", item.place, f"the name {name} is used twice in this component")
-        if index <= 1 and name in RESERVED:
-            mistakes.add("E205", item.place, f"{name} is a word of the language and can't be a name")
-        seen.add(name)
+def _connectors(root: Body, library: Definitions) -> list[tuple[str, Connector, bool]]:
+    """Read `connectors: {flange: Flange, grip: {type: Flange, for: hands}}`, each with whether it is that."""
 
+    def read(key: Scalar, value: Node) -> tuple[str, Connector, bool]:
+        name, kind, for_hands = name_of(key, "a connector"), value, isinstance(value, Mapping)
+        if isinstance(value, Mapping):
+            body = Body(value, ("type", "for"), f"connector {name}", root.mistakes)
+            if body.text("for", "for: hands") != "hands":
+                meant = body.nodes.get("for")
+                got, place = ("nothing", value.place) if meant is None else (form(meant), meant.place)
+                hint = f"{name}: {{type: Flange, for: hands}}"
+                root.mistakes.take(fault("E203", place, f"what {name} is for", "hands", got, hint))
+            kind = body.nodes.get("type", value)
+        text = text_of(kind, name, f"{name}: Flange")
+        connector = library.connector(text)
+        if connector is None:
+            known = [known for known in library.names if library.connector(known)]
+            raise unknown("E206", kind.place, f"there is no connector type {brief(text)}", text, known)
+        return name, connector, for_hands
 
-def _connectors(
-    root: Body, library: Definitions, mistakes: Mistakes
-) -> tuple[Named[Connector], tuple[str, ...]]:
-    """Read `connectors: {flange: Flange, grip: {type: Flange, for: hands}}`, and which are for hands."""
-    found, grips = [], []
-    for key, value in root.section("connectors", "{flange: Flange}"):
-        with mistakes:
-            name = name_of(key, "a connector")
-            kind = value
-            if isinstance(value, Mapping):
-                body = Body(value, ("type", "for"), f"connector {name}", mistakes)
-                if body.text("for", "for: hands") != "hands":
-                    meant = body.nodes.get("for")
-                    got, place = ("nothing", value.place) if meant is None else (form(meant), meant.place)
-                    hint = f"{name}: {{type: Flange, for: hands}}"
-                    mistakes.add("E203", place, f"what {name} is for", expected="hands", got=got, hint=hint)
-                kind = body.nodes.get("type", value)
-                grips.append(name)
-            text = text_of(kind, name, f"{name}: Flange")
-            connector = library.connector(text)
-            if connector is None:
-                known = [known for known in library.names if library.connector(known)]
-                raise unknown("E206", kind.place, f"there is no connector type {brief(text)}", text, known)
-            found.append((name, connector))
-    return tuple(found), tuple(grips)
+    return root.each("connectors", "{flange: Flange}", read)

@@ -8,9 +8,11 @@ Does not: read what is in a definition (see `definitions`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 from apc.compiler.cache import SUFFIX, builtin_files
 from apc.compiler.components.component import Component, Connector
@@ -20,6 +22,8 @@ from apc.compiler.files import RefusedError, files_below, read_file, same_file
 from apc.compiler.source.nodes import MAX_BYTES, Mapping, Scalar
 from apc.compiler.source.reading import brief, fault
 from apc.compiler.source.source import Source, read_source
+
+T = TypeVar("T", Component, Connector)
 
 LONGEST_CHAIN = 50  # of components that are read for one another, each by several calls of Python's stack
 
@@ -34,8 +38,7 @@ class Library:
 
     def __init__(self, folders: tuple[Path, ...] = (), aside: list[ApcError] | None = None) -> None:
         self._sources: dict[str, Source] = {}
-        self._read: dict[str, Component | Connector | ApcError] = {}
-        self._files: dict[str, Path] = dict(builtin_files())
+        self._read: dict[str, Any] = {}  # a component, a connector, or what is wrong with it
         self._open: list[str] = []  # the components being read, each asked for by the one before
         own: dict[str, Path] = {}
         for path in (path for folder in folders for path in files_below(folder, SUFFIX)):
@@ -46,14 +49,12 @@ class Library:
                     raise
                 aside.append(error)
                 continue
-            _, name = definition_of(source)
-            if not name:
-                continue
-            if own.setdefault(name, path) != path and not same_file(own[name], path):
-                what = f"{brief(name)} is defined in {own[name]} already"
-                raise fault("E218", source.root.place, what, hint="another name in one of the two")
-            self._sources[name] = source
-        self._files |= own
+            if name := definition_of(source)[1]:
+                if own.setdefault(name, path) != path and not same_file(own[name], path):
+                    what = f"{brief(name)} is defined in {own[name]} already"
+                    raise fault("E218", source.root.place, what, hint="another name in one of the two")
+                self._sources[name] = source
+        self._files = builtin_files() | own
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -63,40 +64,36 @@ class Library:
     @property
     def component_names(self) -> tuple[str, ...]:
         """The names of the components among them."""
-        return tuple(name for name in self.names if _is_definition(self._source(name), "component"))
+        return tuple(name for name in self.names if definition_of(self._source(name))[0] == "component")
 
     def component(self, name: str) -> Component | None:
         """Return a component, or None if there is no such name. Raises ApcError if its text is at fault."""
-        found = self._definition(name, "component")
-        assert not isinstance(found, Connector)
-        return found
+        return self._definition(name, "component", lambda source: read_component(source, self))
 
     def connector(self, name: str) -> Connector | None:
         """Return a connector type as `component` does a component."""
-        found = self._definition(name, "connector")
-        assert not isinstance(found, Component)
-        return found
+        return self._definition(name, "connector", read_connector)
 
-    def _definition(self, name: str, kind: str) -> Component | Connector | None:
+    def _definition(self, name: str, kind: str, read: Callable[[Source], T]) -> T | None:
         """Return what is called so and is of a kind, read once, even if a hundred parts are of it."""
-        if name not in self._files or not _is_definition(source := self._source(name), kind):
+        if name not in self._files or definition_of(source := self._source(name))[0] != kind:
             return None
-        if name in self._open:
-            chain = " → ".join([*self._open[self._open.index(name) :], name])
-            what = f"components contain or extend each other: {chain}"
-            raise fault("E212", source.root.place, what)
-        if len(self._open) == LONGEST_CHAIN:
-            what = f"components contain or extend one another more than {LONGEST_CHAIN} deep"
-            raise fault("E212", source.root.place, what, hint="fewer of them in one another")
         if name not in self._read:
+            what = "components contain or extend"
+            if name in self._open:
+                chain = " → ".join([*self._open[self._open.index(name) :], name])
+                raise fault("E212", source.root.place, f"{what} each other: {chain}")
+            if len(self._open) == LONGEST_CHAIN:
+                what += f" one another more than {LONGEST_CHAIN} deep"
+                raise fault("E212", source.root.place, what, hint="fewer of them in one another")
             self._open.append(name)
             try:
-                is_component = kind == "component"
-                self._read[name] = read_component(source, self) if is_component else read_connector(source)
+                self._read[name] = read(source)
             except ApcError as error:
                 self._read[name] = error
             self._open.pop()
-        if isinstance(found := self._read[name], ApcError):
+        found: T | ApcError = self._read[name]
+        if isinstance(found, ApcError):
             raise found
         return found
 
@@ -130,7 +127,3 @@ def definition_of(source: Source) -> tuple[str, str]:
             if isinstance(node, Scalar):
                 return kind, node.text
     return "", ""
-
-
-def _is_definition(source: Source, kind: str) -> bool:
-    return isinstance(source.root, Mapping) and source.root.get(kind) is not None

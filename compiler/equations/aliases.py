@@ -1,6 +1,6 @@
 """Alias elimination: equations a = b, a = -b and a = 0 taken out, and what stands for what.
 
-Takes: residuals and the names of their variables. Gives: `Aliases`.
+Takes: residuals, and which of their symbols move. Gives: `Aliases`.
 Guarantees: of two names that mean the same the one to be preferred as a state is kept, and of both one value.
 Does not: look at equations of more than two unknowns.
 """
@@ -24,9 +24,9 @@ class Aliases:
     masses with one position are seen to have one velocity; it is shown by its name.
     """
 
-    def __init__(self, moving: Moving, names: Sequence[str], started: Set[str]) -> None:
+    def __init__(self, moving: Moving, started: Set[str]) -> None:
         self.moving = moving
-        self.names = sorted(names, key=lambda name: (name not in started, name.count(".")))
+        self.names = sorted(moving.variables, key=lambda name: (name not in started, name.count(".")))
         self.rank = {name: place for place, name in enumerate(self.names)}
         self.stands: dict[str, tuple[int, str, int]] = {}  # name: ± (or 0 times) a derivative of another
         self.velocities: dict[Derivative, str] = {}  # derivatives that have names of their own

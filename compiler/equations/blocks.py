@@ -1,6 +1,7 @@
 """Which equation computes which unknown, in which order, and how each block of them is solved.
 
-Takes: equations as residuals, and the unknowns. Gives: `solve_blocks`: assignments and `ImplicitBlock`s.
+Takes: equations as residuals, and the unknowns. Gives: `solve_blocks`: assignments and `ImplicitBlock`s;
+`balanced`, the blocks alone.
 Guarantees: every unknown is assigned once, from what was assigned before; linear blocks come out explicit.
 Does not: differentiate anything (see `index`), or know of states and clocks.
 
@@ -13,14 +14,15 @@ for tearing systems of equations in object-oriented modeling, 1994).
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
-from math import prod
+from collections.abc import Collection, Iterator, Sequence
+from itertools import islice
+from typing import TypeVar
 
 import sympy
 from sympy.matrices import dotprodsimp
 
 from apc.compiler.equations.elimination import eliminate
-from apc.compiler.equations.matching import Incidence, alternating, match_columns, strong_components
+from apc.compiler.equations.matching import Block, match
 from apc.compiler.equations.solution import (
     MOST_LISTED,
     Assignment,
@@ -31,9 +33,9 @@ from apc.compiler.equations.solution import (
     listed,
 )
 from apc.compiler.equations.terms import (
-    Abs,
+    ONE,
+    ZERO,
     If,
-    Max,
     NoDerivativeError,
     Symbol,
     Term,
@@ -47,7 +49,7 @@ from apc.compiler.words import counted
 
 # A loop of more guesses isn't asked whether it has one solution, nor more pieces of it between its corners.
 MOST_GUESSES, MOST_PIECES = 3, 64
-BENT = (If, Max, Abs, sympy.Abs, sympy.sign, sympy.floor)
+T = TypeVar("T")
 
 
 def solve_blocks(
@@ -58,82 +60,76 @@ def solve_blocks(
     Parameters
     ----------
     residuals, unknowns
-        As many equations as unknowns; a mistake if not.
+        As many equations as unknowns.
     problem
-        Takes E502 equations or unknowns left over, E503 a loop without an unknown to solve for, E511 linear
-        equations that depend on each other, E512 what is no number.
+        Takes E503 a loop without an unknown to solve for, E511 linear equations that depend on each other,
+        E512 what is no number.
+
+    Raises
+    ------
+    ApcError
+        E502 equations or unknowns left over.
     """
-    columns = {unknown: j for j, unknown in enumerate(unknowns)}
-    incidence = [sorted(columns[s] for s in r.expression.free_symbols & columns.keys()) for r in residuals]
-    match = match_columns(incidence, len(unknowns))
-    if not len(residuals) == len(unknowns) == len(match):
-        report_singular(residuals, [unknown.name for unknown in unknowns], incidence, match, problem)
-        return ()
-    column_of = {row: column for column, row in match.items()}
-    # Row i needs the rows that compute its other unknowns.
-    needs = [[match[j] for j in held if match[j] != i] for i, held in enumerate(incidence)]
+    known = frozenset(unknowns)
+    held = [one.expression.free_symbols & known for one in residuals]
     steps: list[Step] = []
-    for rows in strong_components(needs):
+    for rows, own in balanced(residuals, held, unknowns, problem):
         block = [residuals[row] for row in rows]
-        solved = _solved(block, [unknowns[j] for j in sorted(column_of[row] for row in rows)], problem)
-        parts = [one.expressions if isinstance(one, ImplicitBlock) else one[1:] for one in solved]
-        if any(is_no_number(expression) for part in parts for expression in part):
-            problem.report_no_number(block)  # what was divided may cancel
-        else:
+        with problem.mistakes:
+            solved = _solved(block, own, problem)
+            parts = [one.expressions if isinstance(one, ImplicitBlock) else one[1:] for one in solved]
+            if any(is_no_number(expression) for part in parts for expression in part):
+                raise problem.no_number(block)  # what was divided may cancel
             steps += solved
     return tuple(steps)
 
 
-def report_singular(
-    residuals: Sequence[Residual],
-    unknowns: Sequence[str],
-    incidence: Incidence,
-    match: Mapping[int, int],
-    problem: Problem,
-) -> None:
-    """Add the mistake E502: which equations and which unknowns are too many.
+def balanced(
+    residuals: Sequence[Residual], held: Sequence[Collection[T]], unknowns: Sequence[T], problem: Problem
+) -> list[Block[T]]:
+    """Return what has to be computed together, in order, of equations that give their unknowns.
 
     Parameters
     ----------
-    residuals, unknowns
-        The equations, and the names of what they are to give.
-    incidence
-        For each equation the places of its unknowns.
-    match
-        The unknowns that are given, each with its equation.
+    residuals
+        The equations.
+    held, unknowns
+        As `match` takes them; unknowns are shown by their text.
     problem
-        Takes the mistake.
+        What the equations are called.
+
+    Raises
+    ------
+    ApcError
+        E502 which equations and which unknowns are too many.
     """
-    columns = {row: column for column, row in match.items()}
-    holders = [[i for i, held in enumerate(incidence) if j in held] for j in range(len(unknowns))]
-    unmatched = [i for i in range(len(residuals)) if i not in columns]
-    over, over_columns = alternating(unmatched, incidence, match)
-    free = [j for j in range(len(unknowns)) if j not in match]
-    under_columns, under = alternating(free, holders, columns)
+    left_over, over, under, blocks = match(held, unknowns)
+    if not (left_over or under[1]):
+        return blocks
     parts = []
-    if over:
-        names = [unknowns[j] for j in over_columns]
-        only = f"only {counted(len(names), 'unknown')} ({listed(names)})" if names else "no unknown"
-        parts.append(f"{counted(len(over), 'equation')} hold {only}: {listed([residuals[i] for i in over])}")
-    if under_columns:
-        names = [unknowns[j] for j in under_columns]
-        by = f"only {counted(len(under), 'equation')}, {listed([residuals[i] for i in under])}"
-        has = f"{'has' if len(names) == 1 else 'have'} {by if under else 'no equation'}"
-        parts.append(f"{counted(len(names), 'unknown')} ({listed(names)}) {has}")
-    first = [residuals[i] for i in unmatched] or residuals
-    problem.report("E502", first, f"{problem.where} can't be solved: {'; and '.join(parts)}")
+    (too_many, theirs), (holding, open_) = (
+        ([residuals[i] for i in rows], [*map(str, some)]) for rows, some in (over, under)
+    )
+    if too_many:
+        only = f"only {counted(len(theirs), 'unknown')} ({listed(theirs)})" if theirs else "no unknown"
+        parts.append(f"{counted(len(too_many), 'equation')} hold {only}: {listed(too_many)}")
+    if open_:
+        by = f"only {counted(len(holding), 'equation')}, {listed(holding)}" if holding else "no equation"
+        has = "has" if len(open_) == 1 else "have"
+        parts.append(f"{counted(len(open_), 'unknown')} ({listed(open_)}) {has} {by}")
+    what = f"{problem.where} can't be solved: {'; and '.join(parts)}"
+    raise problem.fault("E502", [residuals[i] for i in left_over] or residuals, what)
 
 
 def _solved(block: Sequence[Residual], unknowns: Sequence[Symbol], problem: Problem) -> Sequence[Step]:
     """Return what gives the unknowns of one block, explicit where it is linear in them."""
     known = frozenset(unknowns)
-    forms = [linear_form(residual.expression, known) for residual in block]
-    linear = [form for form in forms if form is not None]
-    if len(linear) == len(forms):
+    linear = [form for one in block if (form := linear_form(one.expression, known)) is not None]
+    if len(linear) == len(block):
         steps, free = eliminate(linear, unknowns, problem.divisors)
         if free:
             what = f"depend on each other and don't determine {listed([one.name for one in free])}"
-            problem.report("E511", block, f"{problem.where} {what}: {listed(block)}")
+            raise problem.fault("E511", block, f"{problem.where} {what}: {listed(block)}")
         return steps
     loop = _torn(block, unknowns, problem.divisors)
     residuals = loop.residuals
@@ -145,8 +141,9 @@ def _solved(block: Sequence[Residual], unknowns: Sequence[Symbol], problem: Prob
     elif _is_open(residuals, [symbol(name) for name in loop.tearing], problem.divisors):
         fault = "hold a loop that many values solve, or none"
     if fault:
-        problem.report("E503", block, f"{problem.where} {fault}: {loop.chain}, by {listed(block)}")
-    return () if fault else (loop,)
+        what = f"{problem.where} {fault}: {loop.chain}, by {listed(block)}"
+        raise problem.fault("E503", block, what)
+    return (loop,)
 
 
 def _torn(block: Sequence[Residual], unknowns: Sequence[Symbol], divisors: Divisors) -> ImplicitBlock:
@@ -162,9 +159,9 @@ def _torn(block: Sequence[Residual], unknowns: Sequence[Symbol], divisors: Divis
     @functools.cache
     def solved(i: int, unknown: Symbol) -> Term | None:
         """Return an unknown by an equation, None where it can't be told from that."""
-        form = linear_form(block[i].expression, frozenset((unknown,)))
-        factor = form and form[0].get(unknown)
-        if not form or factor is None or factor.free_symbols & members or divisors.is_zero(factor):
+        form = linear_form(block[i].expression, {unknown})
+        factor = form[0].get(unknown, ZERO) if form else ZERO
+        if form is None or factor.free_symbols & members or divisors.is_zero(factor):
             return None
         return -form[1] / factor
 
@@ -177,7 +174,7 @@ def _torn(block: Sequence[Residual], unknowns: Sequence[Symbol], divisors: Divis
     torn: list[Symbol] = []
     while remaining:
         single = ((i, *still) for i in left if len(still := holds[i] & remaining.keys()) == 1)
-        ready = next(((i, unknown) for i, unknown in single if solved(i, unknown) is not None), None)
+        ready = next((pair for pair in single if solved(*pair) is not None), None)
         if ready is None:
             torn.append(max(remaining, key=gain))
             del remaining[torn[-1]]
@@ -190,39 +187,22 @@ def _torn(block: Sequence[Residual], unknowns: Sequence[Symbol], divisors: Divis
 
 def _is_open(residuals: Sequence[Term], guesses: Sequence[Symbol], divisors: Divisors) -> bool:
     """Return whether between corners the residuals don't depend on the guesses, or only on some."""
-    bent = {node for one in residuals for node in one.atoms(*BENT)}
-    pieces = min(MOST_PIECES, prod(len(_branches(node)) for node in bent))
-    for number in range(pieces if len(guesses) <= MOST_GUESSES else 0):
-        piece = _piece(residuals, number)
-        try:
-            slopes = sympy.Matrix([[slope(one, guess) for guess in guesses] for one in piece])
-        except NoDerivativeError:
-            continue
-        with dotprodsimp(False):  # which would expand it
-            determinant = slopes.det(method="laplace")
-        if divisors.is_zero(determinant) or divisors.vanishes(determinant):
-            return True
-    return False
+    if len(guesses) > MOST_GUESSES:
+        return False
+    try:
+        slopes = sympy.Matrix([[slope(one, guess) for guess in guesses] for one in residuals])
+    except NoDerivativeError:
+        return False
+    with dotprodsimp(False):  # which would expand it
+        pieces = islice(_pieces(slopes.det(method="laplace")), MOST_PIECES)
+    return any(divisors.is_zero(piece) or divisors.vanishes(piece) for piece in pieces)
 
 
-def _piece(residuals: Sequence[Term], number: int) -> list[Term]:
-    """Return what residuals are between their corners and jumps, by the number of a choice of branches."""
-    chosen: dict[Term, Term] = {}
-
-    def choose(node: Term) -> Term:
-        nonlocal number
-        if node not in chosen:
-            branches = _branches(node)
-            number, digit = divmod(number, len(branches))
-            chosen[node] = branches[digit]
-        return chosen[node]
-
-    return [one.replace(lambda node: isinstance(node, BENT), choose) for one in residuals]
-
-
-def _branches(node: Term) -> tuple[Term, ...]:
-    """Return what a node is on either side of its corners; what jumps is constant between jumps."""
-    if isinstance(node, If | Max):
-        return tuple(node.args[isinstance(node, If) :])
-    is_size = isinstance(node, Abs | sympy.Abs)
-    return (node.args[0], -node.args[0]) if is_size else (symbol(f"constant {node}"),)
+def _pieces(term: Term) -> Iterator[Term]:
+    """Yield what a term is between its corners, each choice of branches and signs by itself."""
+    node = next((one for one in sympy.preorder_traversal(term) if isinstance(one, If | sympy.sign)), None)
+    if node is None:
+        yield term
+    else:
+        for branch in node.args[1:] if isinstance(node, If) else (ONE, -ONE):
+            yield from _pieces(term.xreplace({node: branch}))

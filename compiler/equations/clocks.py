@@ -100,21 +100,23 @@ def _partitioned(kind: FlatKind, mistakes: Mistakes) -> ClockedKind:
     crossings = [
         one
         if isinstance(one, SampleCrossing)
-        else replace(one, clock=clocks.of(one.symbol if isinstance(one, ReceiveCrossing) else one.variable))
+        else replace(one, clock=clocks.of(getattr(one, "variable", one.symbol)))
         for one in kind.crossings
     ]
     samples = tuple(one for one in crossings if isinstance(one, SampleCrossing))
     holds = tuple(one for one in crossings if isinstance(one, HoldCrossing))
     previous = tuple(one for one in crossings if isinstance(one, PreviousCrossing))
     receives = tuple(one for one in crossings if isinstance(one, ReceiveCrossing))
-    for hold in (hold for hold in holds if hold.clock == CONTINUOUS):
-        call = format_expression(Call("hold", (Name((hold.shown,)), hold.delay)))
-        what = f"{call} holds {hold.shown}, which is continuous already"
-        mistakes.add("E505", hold.place, what, hint=hold.shown)
-    for one in (one for one in previous if one.clock == CONTINUOUS):
-        mistakes.add("E505", one.place, one.symbol, expected="a variable that belongs to a clock")
+    for hold in holds:
+        if hold.clock == CONTINUOUS:
+            call = format_expression(Call("hold", (Name((hold.shown,)), hold.delay)))
+            what = f"{call} holds {hold.shown}, which is continuous already"
+            mistakes.add("E505", hold.place, what, hint=hold.shown)
+    for one in previous:
+        if one.clock == CONTINUOUS:
+            mistakes.add("E505", one.place, one.symbol, expected="a variable that belongs to a clock")
     for send in kind.sends:
-        for variable in (".".join(name.parts) for name in names(send.expression)):
+        for variable in map(format_expression, names(send.expression)):
             clocks.check_start(variable, send.place)
             if variable in clocks.variables and (clock := clocks.of(variable)) != CONTINUOUS:
                 what = f"{send.name} is sent at ticks of {send.link}, and {variable} is on clock {clock}"
@@ -125,8 +127,7 @@ def _partitioned(kind: FlatKind, mistakes: Mistakes) -> ClockedKind:
         members.setdefault(clocks.of(f"equation {index}"), ([], []))[1].append(equation)
     for variable in clocks.variables:
         members.setdefault(clocks.of(variable), ([], []))[0].append(variable)
-    listed = ((clock, tuple(its), tuple(of)) for clock, (its, of) in members.items())
-    partitions = tuple(Partition(*one) for one in listed)
+    partitions = tuple(Partition(clock, tuple(its), tuple(of)) for clock, (its, of) in members.items())
     return ClockedKind(kind, partitions, samples, holds, previous, receives)
 
 
@@ -143,7 +144,9 @@ class _Clocks:
         self.given: dict[str, FlatEquation] = {}
         self._crossings = {one.symbol: one for one in kind.crossings}
         self._sets = DisjointSet()
-        self._clocks: dict[str, str] = {}  # of each set that has one, by its root
+        crossed = (one.clock for one in kind.crossings if isinstance(one, SampleCrossing))
+        named = {CONTINUOUS, *crossed, *(one.clock for one in kind.equations if one.clock is not None)}
+        self._clocks = {clock: clock for clock in named}  # of each set that has one, by its root
         self._reported: set[str] = set()  # parts whose clocked flow was reported
         hearing: dict[str, FlatEquation] = {}
         for index, equation in enumerate(kind.equations):
@@ -181,7 +184,7 @@ class _Clocks:
         """Join what stands in an expression with its domain: its equation, or the inside of a sample."""
         for node in walk(expression):
             if isinstance(node, Call) and node.function == "der":
-                self._pin(domain, CONTINUOUS, format_expression(node), equation)
+                self._join(domain, CONTINUOUS, format_expression(node), equation)
             if not isinstance(node, Name):
                 continue
             name = ".".join(node.parts)
@@ -189,29 +192,23 @@ class _Clocks:
             crossing = self._crossings.get(name)
             if name in self.variables:
                 self._join(domain, name, name, equation)
+            if isinstance(crossing, PreviousCrossing | ReceiveCrossing) and equation.clock is not None:
+                self._join(domain, equation.clock, name, equation)
             match crossing:
                 case SampleCrossing():
-                    self._pin(domain, crossing.clock, name, equation)
+                    self._join(domain, crossing.clock, name, equation)
                     inside = f"inside {name} of {equation.origin}"
-                    self._pin(inside, CONTINUOUS, name, equation)
+                    self._join(inside, CONTINUOUS, name, equation)
                     self._visit(crossing.expression, inside, equation, hearing)
                 case HoldCrossing():
-                    self._pin(domain, CONTINUOUS, name, equation)
+                    self._join(domain, CONTINUOUS, name, equation)
                 case PreviousCrossing():
-                    if equation.clock is not None:
-                        self._pin(domain, equation.clock, name, equation)
                     self._join(domain, crossing.variable, crossing.variable, equation)
                 case ReceiveCrossing():
                     self._visit(crossing.argument, domain, equation, hearing)
                     self._join(domain, name, name, equation)
                     if equation.clock is None:
                         hearing.setdefault(domain, equation)
-                    else:
-                        self._pin(domain, equation.clock, name, equation)
-
-    def _pin(self, domain: str, clock: str, because: str, equation: FlatEquation) -> None:
-        self._clocks[self._root(clock)] = clock
-        self._join(domain, clock, because, equation)
 
     def _join(self, domain: str, name: str, shown: str, equation: FlatEquation) -> None:
         """Merge the sets of a domain and of a name in it, unless they have different clocks."""

@@ -54,15 +54,12 @@ def connection_equations(parts: Sequence[Part], mistakes: Mistakes) -> Iterator[
     for members in {id(members): members for members in meeting.values()}.values():
         joined = [terminal for terminal in members if terminal not in passed]
         place, type_ = by_name[joined[-1][0]].place, connectors[joined[0]]
+        is_free = grounded.isdisjoint(members)
         for potential in type_.potentials:
-            first, *others = (_name(terminal, potential.name) for terminal in joined)
-            if grounded.isdisjoint(members):
-                yield from ((name, first, place) for name in others)
-            else:
-                yield from ((name, ZERO, place) for name in (first, *others))
-        if grounded.isdisjoint(members):
-            for flow in type_.flows:
-                yield _sum([_name(terminal, flow.name) for terminal in joined]), ZERO, place
+            terms = [_name(terminal, potential.name) for terminal in joined]
+            yield from ((name, terms[0] if is_free else ZERO, place) for name in terms[is_free:])
+        for flow in type_.flows if is_free else ():
+            yield _sum([_name(terminal, flow.name) for terminal in joined]), ZERO, place
 
 
 def _name(terminal: Terminal, variable: str) -> Name:

@@ -18,24 +18,25 @@ start value of a chosen state counts; the variables that depend on it follow, wh
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass
 
 import sympy
 
-from apc.compiler.equations.blocks import report_singular
+from apc.compiler.equations.blocks import balanced
 from apc.compiler.equations.derivatives import TIME, Derivative, Moving
 from apc.compiler.equations.elimination import Elimination
-from apc.compiler.equations.matching import alternating, match_columns
+from apc.compiler.equations.matching import match
 from apc.compiler.equations.solution import Problem, Residual
 from apc.compiler.equations.terms import (
     NoDerivativeError,
     Symbol,
     Term,
     derivative,
+    in_order,
     linear_form,
     size,
     text_of,
 )
+from apc.compiler.language.values import AlreadyReportedError
 
 # More derivatives than this of one variable: no mechanical model needs them (a constraint on a position
 # needs two), so the equations do not end.
@@ -45,13 +46,8 @@ HIGHEST_ORDER = 8
 LARGEST = 100_000
 
 
-@dataclass(frozen=True, slots=True)
-class Reduced:
-    """Equations to solve for the unknowns. `states` are x, and der(x) where der(der(x)) is solved."""
-
-    residuals: tuple[Residual, ...]
-    unknowns: tuple[Symbol, ...]
-    states: tuple[Symbol, ...]
+# Equations to solve, their unknowns, and the states: x, and der(x) where der(der(x)) is solved.
+Reduced = tuple[list[Residual], list[Symbol], list[Symbol]]
 
 
 class IndexReduction:
@@ -67,8 +63,8 @@ class IndexReduction:
     moving
         Knows the derivatives of the variables.
     problem
-        Takes E502 equations or unknowns left over or constraints that say the same, E508 the derivative of a
-        value that jumps, E509 states that can't be chosen once and for all.
+        What they are called. Raised are E502 equations or unknowns left over or constraints that say the
+        same, E508 the derivative of a value that jumps, E509 states that can't be chosen once and for all.
     """
 
     def __init__(
@@ -82,23 +78,15 @@ class IndexReduction:
         self.integral: dict[int, int] = {}  # of each derivative, the equation it is of
         for residual in residuals:
             self._add(residual)
-            for name, order in self.held[-1].items():
-                self.order[name] = max(self.order[name], order)
 
-    def reduced(self, started: Set[Symbol]) -> Reduced | None:
-        """Differentiate what must be and choose the states; None if the equations can't be solved.
+    def reduced(self, started: Set[Symbol]) -> Reduced:
+        """Differentiate what must be and choose the states.
 
         `started` are the variables and derivatives with a declared start value.
         """
-        column = {name: j for j, name in enumerate(self.order)}
-        incidence = [sorted(column[name] for name in held) for held in self.held]
-        match = match_columns(incidence, len(column))
-        if not len(self.residuals) == len(column) == len(match):
-            report_singular(self.residuals, list(column), incidence, match, self.problem)
-            return None
-        dummies = self._choose_dummies(started) if self._differentiate_constraints(column) else None
-        if dummies is None:
-            return None
+        balanced(self.residuals, self.held, list(self.order), self.problem)
+        self._differentiate_constraints()
+        dummies = self._choose_dummies(started)
         states: list[Symbol] = []
         unknowns: list[Symbol] = []
         for name, top in self.order.items():
@@ -107,66 +95,50 @@ class IndexReduction:
             split = max(first - 1, 0)
             states += [derivative(name, k) for k in range(split)]
             unknowns += [derivative(name, k) for k in range(split, top + 1)]
-        return Reduced(tuple(self.residuals), tuple(unknowns), tuple(states))
+        return self.residuals, unknowns, states
 
     def _add(self, residual: Residual) -> None:
         self.residuals.append(residual)
-        self.held.append({})
-        for name, order in self.moving.derivatives(residual.expression).values():
-            self.held[-1][name] = max(self.held[-1].get(name, 0), order)
+        self.held.append(dict(sorted(self.moving.derivatives(residual.expression).values())))
+        self.order |= {name: max(self.order[name], order) for name, order in self.held[-1].items()}
 
     # ---- Pantelides ----
 
-    def _differentiate_constraints(self, column: Mapping[str, int]) -> bool:
+    def _differentiate_constraints(self) -> None:
         """Match every equation to a highest derivative, differentiating those that hold none of their own."""
-        names = list(column)
         while True:
             newest = sorted({*range(len(self.residuals))} - {*self.integral.values()})
-            incidence = [
-                [column[name] for name, order in self.held[row].items() if order == self.order[name]]
-                for row in newest
-            ]
-            partner = match_columns(incidence, len(names))
-            passed: set[int] = set()
-            for start in sorted({*range(len(newest))} - {*partner.values()}):
-                rows, columns = alternating([start], incidence, partner)
-                if passed.isdisjoint(columns):
-                    passed.update(columns)
-                    if not self._pass_on([newest[i] for i in rows], [names[j] for j in columns]):
-                        return False
-            if len(partner) == len(newest):
-                return True
+            held = [[x for x, order in self.held[i].items() if order == self.order[x]] for i in newest]
+            left_over, (rows, names), *_ = match(held, list(self.order))
+            if not left_over:
+                return
+            self._pass_on([newest[i] for i in rows], names)
 
-    def _pass_on(self, rows: Sequence[int], names: Sequence[str]) -> bool:
+    def _pass_on(self, rows: Sequence[int], names: Sequence[str]) -> None:
         """Differentiate equations that block one another, and with them the order of what they hold."""
         blocking = [self.residuals[row] for row in rows]
-        for row in rows:
+        for row, residual in zip(rows, blocking, strict=True):
             if not self._moves_on(row):
                 what = (
                     "holds no unknown once what the connections and other equations say is put in: "
                     "it says what they say already, or contradicts them"
                 )
-                at_fault = self.residuals[row]
-                self.problem.report("E502", [at_fault], f"{at_fault.shown} {what}")
-                return False
+                raise self.problem.fault("E502", [residual], f"{residual.shown} {what}")
         for name in names:
             self.order[name] += 1
         # Each factor of a product stands beside the slopes of all the others.
-        sizes = (size(term) for one in blocking for term in sympy.Add.make_args(one.expression))
-        if any(self.order[name] > HIGHEST_ORDER for name in names) or sum(n * n for n in sizes) > LARGEST:
+        grown = (sum(size(term) ** 2 for term in sympy.Add.make_args(one.expression)) for one in blocking)
+        if any(self.order[name] > HIGHEST_ORDER for name in names) or max(grown) > LARGEST:
             shown = ", ".join(dict.fromkeys(one.shown for one in blocking))
             what = f"no number of derivatives of these equations determines what they hold: {shown}"
-            self.problem.report("E509", blocking, what)
-            return False
+            raise self.problem.fault("E509", blocking, what)
         for row, residual in zip(rows, blocking, strict=True):
             try:
                 expression = self.moving.differentiate(residual.expression)
             except NoDerivativeError as missing:
-                report_no_derivative(residual, missing, self.problem)
-                return False
+                raise self.problem.no_derivative(residual, missing) from missing
             self.integral[len(self.residuals)] = row
             self._add(Residual(expression, residual.equation))
-        return True
 
     def _moves_on(self, row: int) -> bool:
         """Return whether an equation holds what a derivative of it may determine.
@@ -181,7 +153,7 @@ class IndexReduction:
 
     # ---- dummy derivatives ----
 
-    def _choose_dummies(self, started: Set[Symbol]) -> set[Derivative] | None:
+    def _choose_dummies(self, started: Set[Symbol]) -> set[Derivative]:
         """Return the derivatives that become unknowns, level by level from the highest order down.
 
         At each level as many as there are constraints, so that the constraints' Jacobian in them is regular.
@@ -193,16 +165,12 @@ class IndexReduction:
         while rows:
             candidates.sort(key=lambda it: (derivative(it[0], it[1] - 1) in started, -it[1], -rank[it[0]]))
             level = self._regular_columns(rows, candidates)
-            if level is None:
-                return None
             chosen |= set(level)
             rows = [self.integral[row] for row in rows if self.integral[row] in self.integral]
             candidates = [(name, order - 1) for name, order in level if order > 1]
         return chosen
 
-    def _regular_columns(
-        self, rows: Sequence[int], candidates: Sequence[Derivative]
-    ) -> list[Derivative] | None:
+    def _regular_columns(self, rows: Sequence[int], candidates: Sequence[Derivative]) -> list[Derivative]:
         """Return the first columns, in the order given, in which the rows' Jacobian is regular.
 
         Elimination column by column; a factor that moves, such as 2·x, may vanish and is no pivot.
@@ -216,8 +184,7 @@ class IndexReduction:
             if form is None:  # else a derivative is linear in the highest derivatives
                 what = f"in the constraint {one.shown} a condition hangs on a derivative that it ties down"
                 hint = "a condition on positions, parameters or time"
-                self.problem.report("E509", [one], f"{where}: {what}", hint)
-                return None
+                raise self.problem.fault("E509", [one], f"{where}: {what}", hint)
             linear.append(form[0])
         system = Elimination(linear, divisors, "", LARGEST)
         chosen = []
@@ -234,21 +201,16 @@ class IndexReduction:
             what = f"the constraint {constraints[i].shown} says what other constraints say already"
             code, hint = "E502", ""
             if not all(divisors.vanishes(factor) for factor in entries.values()):
-                held = self.moving.derivatives(sum(entries))
                 factors = ", ".join(
-                    f"{x} (by the factor {text_of(entries[s])})" for s, (x, _) in held.items()
+                    f"{symbols[s][0]} (by the factor {text_of(entries[s])})" for s in in_order(entries)
                 )
                 what = f"no variable follows from the constraint {constraints[i].shown} in every position"
                 what, code = f"{what}, since the factor moves and may vanish: {factors}", "E509"
                 hint = "the constraint with an angle or another coordinate that gives every position"
-            self.problem.report(code, [constraints[i]], f"{where}: {what}", hint)
-        return None if system.rows else chosen
+            self.problem.mistakes.take(self.problem.fault(code, [constraints[i]], f"{where}: {what}", hint))
+        if system.rows:
+            raise AlreadyReportedError
+        return chosen
 
     def _moves(self, factor: Term) -> bool:
         return TIME in factor.free_symbols or bool(self.moving.derivatives(factor))
-
-
-def report_no_derivative(residual: Residual, missing: NoDerivativeError, problem: Problem) -> None:
-    """Add the mistake E508: an equation's derivative is needed, and what it holds has none."""
-    what = f"{residual.shown} needs the derivative of {missing}"
-    problem.report("E508", [residual], f"{what}; a position follows such a force only through a mass")

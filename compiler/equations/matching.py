@@ -1,70 +1,74 @@
-"""Which row may be matched to which column: matchings, what they leave over, and the order they imply.
+"""Which equation may be matched to which unknown, what a matching leaves over, and the order it implies.
 
-Takes: the incidence of a sparse square system, and graphs, as lists of integers.
-Gives: `match_columns`, `alternating`, `strong_components`.
+Takes: which unknowns each equation holds. Gives: `match`.
 Guarantees: the same input gives the same matching.
-Does not: know what a row or a column stands for.
+Does not: know what an equation or an unknown is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
+from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_bipartite_matching
 
-Incidence = Sequence[Sequence[int]]  # for each row, its columns
-
-
-def _graph(rows: Incidence, columns: int) -> csr_array:
-    ends = np.cumsum([0, *map(len, rows)])
-    places = np.array([column for row in rows for column in row], dtype=np.int32)
-    return csr_array((np.ones(len(places)), places, ends), shape=(len(rows), columns))
+Unknown = TypeVar("Unknown")
+Block = tuple[list[int], list[Unknown]]  # places of equations, and unknowns they hold
 
 
-def match_columns(incidence: Incidence, columns: int) -> dict[int, int]:
-    """Return the rows of the columns that are matched, as many as can be."""
-    if not incidence or not columns:
-        return {}
-    matched = maximum_bipartite_matching(_graph(incidence, columns), perm_type="row")
-    return {column: row for column, row in enumerate(matched.tolist()) if row >= 0}
+def match(
+    held: Sequence[Collection[Unknown]], unknowns: Sequence[Unknown]
+) -> tuple[list[int], Block[Unknown], Block[Unknown], list[Block[Unknown]]]:
+    """Match equations to as many unknowns as can be.
 
-
-def alternating(
-    starts: Iterable[int], neighbours: Incidence, partner: Mapping[int, int]
-) -> tuple[list[int], list[int]]:
-    """Return what alternating paths reach from nodes of one side, on that side and on the other.
-
-    From the rows that a largest matching leaves over these are the equations that are too many, and their
-    unknowns, and from the columns the other way round (Dulmage and Mendelsohn 1958).
+    In the graph of it an edge goes from each equation to what it holds, and from each matched unknown to its
+    equation. What can be reached from an equation that is left over is too much for its unknowns, and from
+    where an unknown that is left over can be reached is too little (Dulmage and Mendelsohn 1958).
 
     Parameters
     ----------
-    starts
-        Nodes without a partner.
-    neighbours
-        For each node of this side those of the other.
-    partner
-        The matched nodes of the other side, with their nodes on this side.
+    held
+        What each equation holds.
+    unknowns
+        What there is to be held.
+
+    Returns
+    -------
+    left_over
+        The equations without an unknown of their own.
+    over, under
+        The equations that are too many, with the unknowns they hold; the unknowns that are too many, with the
+        equations that hold them.
+    blocks
+        What has to be computed together, in an order in which each stands behind what it needs: SciPy numbers
+        strong components as Pearce's algorithm ends with them, after all that can be reached from them.
     """
-    near, far = dict.fromkeys(starts), set[int]()
-    queue = list(near)
-    for node in queue:
-        far.update(neighbours[node])
-        new = [partner[one] for one in neighbours[node] if partner.get(one, node) not in near]
-        near |= dict.fromkeys(new)
-        queue += dict.fromkeys(new)
-    return sorted(near), sorted(far)
+    n = len(held)
+    node = {unknown: j for j, unknown in enumerate(unknowns, n)}
+    edges = [sorted(node[one] for one in its) for its in held]
+    holds = _graph(edges + [[]] * len(node))
+    partner = maximum_bipartite_matching(holds[:n, n:], perm_type="row").tolist()
+    graph = _graph(edges + [[i] if i >= 0 else [] for i in partner])
+
+    def split(nodes: Iterable[int]) -> Block[Unknown]:
+        ordered = sorted(nodes)
+        return [i for i in ordered if i < n], [unknowns[i - n] for i in ordered if i >= n]
+
+    def reached(starts: Iterable[int], along: Any) -> Block[Unknown]:
+        walks = (breadth_first_order(along, start, return_predecessors=False) for start in starts)
+        return split({int(one) for walk in walks for one in walk})
+
+    left_over = sorted({*range(n)}.difference(partner))
+    under = reached([j for j, i in enumerate(partner, n) if i < 0], graph.T.tocsr())
+    count, labels = connected_components(graph, connection="strong")
+    blocks = [split(np.flatnonzero(labels == label).tolist()) for label in range(count)]
+    return left_over, reached(left_over, graph), under, blocks
 
 
-def strong_components(needs: Incidence) -> list[list[int]]:
-    """Return the strongly connected components of a graph, each after all it needs.
-
-    SciPy numbers them as Pearce's algorithm ends with them, which is after all that can be reached from them.
-    """
-    count, labels = connected_components(_graph(needs, len(needs)), connection="strong")
-    found: list[list[int]] = [[] for _ in range(count)]
-    for node, label in enumerate(labels):
-        found[label].append(node)
-    return found
+def _graph(edges: Sequence[Sequence[int]]) -> Any:
+    """Return the adjacency matrix of a graph, by where the edges of each of its nodes end."""
+    ends = np.cumsum([0, *map(len, edges)])
+    places = np.array([one for its in edges for one in its], dtype=np.int32)
+    return csr_array((np.ones(len(places)), places, ends), shape=(len(edges), len(edges)))

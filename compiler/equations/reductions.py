@@ -10,6 +10,7 @@ that is linear in these is that of each by itself, so that N peers cost N, not N
 
 from __future__ import annotations
 
+import re
 from collections.abc import Set
 from dataclasses import dataclass, replace
 
@@ -20,9 +21,10 @@ from apc.compiler.components.component import OTHERS
 from apc.compiler.equations.flatten import HEARD_AGE, ReceiveCrossing
 from apc.compiler.equations.terms import ZERO, Symbol, Term, linear_form, symbol, to_term
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.language.expression import names
+from apc.compiler.language.expression import format_expression, names
 
 AGE = symbol(HEARD_AGE)
+HEARD = re.compile(rf"(?:(age|previous)\()?{OTHERS}\.([^()]*)\)?")
 TEXTS = {"": "others.{0}", "factor": "age(others.{0})*others.{0}", "alone": "age(others.{0})"}
 
 
@@ -44,6 +46,13 @@ class Heard:
     before: bool = False
     edge: Term | None = None
 
+    @property
+    def sends(self) -> list[str]:
+        """The names of what is read of each other peer."""
+        symbols = () if self.edge is None else self.edge.free_symbols - {AGE}
+        others = sorted(s.name.removeprefix(f"{OTHERS}.") for s in symbols if s.name.startswith(f"{OTHERS}."))
+        return list(dict.fromkeys([self.send, *others]))
+
 
 def taken_apart(crossing: ReceiveCrossing, mistakes: Mistakes) -> tuple[Term, list[Heard]]:
     """Return a reduction as a term, and what it holds that is heard; an edge where it is not linear.
@@ -59,10 +68,9 @@ def taken_apart(crossing: ReceiveCrossing, mistakes: Mistakes) -> tuple[Term, li
     count = symbol(count_of(link))
     values: dict[Symbol, tuple[str, bool]] = {}  # what others send: its name, and whether of the tick before
     ages: dict[Symbol, str] = {}
-    for name in (".".join(one.parts) for one in names(crossing.argument)):
-        call, _, of = name.rpartition("(")
-        if of.startswith(f"{OTHERS}.") and call in ("", "age", "previous"):
-            send = of.removeprefix(f"{OTHERS}.").removesuffix(")")
+    for name in map(format_expression, names(crossing.argument)):
+        if match := HEARD.fullmatch(name):
+            call, send = match.groups()
             if call == "age":
                 ages[symbol(name)] = send
             else:
@@ -103,10 +111,12 @@ def _linear_parts(term: Term, values: Set[Symbol]) -> dict[tuple[Symbol | None, 
     """
     bent = any(not one.free_symbols.isdisjoint({*values, AGE}) for one in term.atoms(sympy.Function))
     form = None if bent else linear_form(term, values)
+    if form is None:
+        return None
     parts: dict[tuple[Symbol | None, bool], Term] = {}
-    for value, coefficient in [] if form is None else [*form[0].items(), (None, form[1])]:
+    for value, coefficient in (*form[0].items(), (None, form[1])):
         by_age = linear_form(coefficient, {AGE})
         if by_age is None:
             return None
         parts |= {(value, False): by_age[1], (value, True): by_age[0].get(AGE, ZERO)}
-    return {key: value for key, value in parts.items() if value != 0} if form is not None else None
+    return {key: value for key, value in parts.items() if value != 0}

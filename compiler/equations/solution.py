@@ -1,6 +1,7 @@
 """Equations as residuals and what solving them gives: assignments, and loops that an iteration has to solve.
 
-Takes: nothing (data types). Gives: `Residual`, `Problem`; `Assignment`, `ImplicitBlock`, their union `Step`.
+Takes: nothing (data types). Gives: `Residual`, `Problem`; `Assignment`, `ImplicitBlock`, their union `Step`,
+`Definition`.
 Guarantees: plain frozen data.
 Does not: solve anything (see `blocks`).
 """
@@ -11,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from apc.compiler.equations.flatten import FlatEquation
-from apc.compiler.equations.terms import Symbol, Term, symbol
+from apc.compiler.equations.terms import NoDerivativeError, Symbol, Term, symbol
 from apc.compiler.equations.zero_test import Divisors
-from apc.compiler.errors import Mistakes, Place
+from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 
 Assignment = tuple[str, Term]  # an unknown, and the expression that gives it
 MOST_LISTED = 8  # equations or unknowns in one message
@@ -44,15 +45,20 @@ class Problem:
     divisors: Divisors
     mistakes: Mistakes
 
-    def report(self, code: str, residuals: Sequence[Residual], what: str, hint: str = "") -> None:
-        """Add a mistake where the first of some equations stands."""
+    def fault(self, code: str, residuals: Sequence[Residual], what: str, hint: str = "") -> ApcError:
+        """Return a mistake where the first of some equations stands."""
         place = residuals[0].equation.place if residuals else self.place
-        self.mistakes.add(code, place, what, hint=hint)
+        return ApcError(Mistake(code, place, what, hint=hint))
 
-    def report_no_number(self, residuals: Sequence[Residual]) -> None:
-        """Add the mistake E512: equations in which a constant is none, maybe after others are put in."""
+    def no_number(self, residuals: Sequence[Residual]) -> ApcError:
+        """Return the mistake E512: equations in which a constant is none, maybe after others are put in."""
         holds = f"{listed(residuals)} hold{'s' if len(residuals) == 1 else ''}"
-        self.report("E512", residuals, f"{holds} a constant that is no number, such as 1/0 or sqrt(-1)")
+        return self.fault("E512", residuals, f"{holds} a constant that is no number, such as 1/0 or sqrt(-1)")
+
+    def no_derivative(self, residual: Residual, missing: NoDerivativeError) -> ApcError:
+        """Return the mistake E508: an equation's derivative is needed, and what it holds has none."""
+        what = f"{residual.shown} needs the derivative of {missing}"
+        return self.fault("E508", [residual], f"{what}; a position follows such a force only through a mass")
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +92,7 @@ class ImplicitBlock:
 
 
 Step = Assignment | ImplicitBlock
+Definition = Term | ImplicitBlock  # what gives an unknown its value
 
 
 def listed(texts: Sequence[str | Residual]) -> str:

@@ -15,15 +15,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from operator import itemgetter
 
 from apc.compiler.equations.aliases import Aliases
 from apc.compiler.equations.blocks import solve_blocks
 from apc.compiler.equations.clocks import CONTINUOUS, ClockedKind, ClockedSystem, Partition
 from apc.compiler.equations.derivatives import Moving
 from apc.compiler.equations.flatten import FlatEquation
-from apc.compiler.equations.index import IndexReduction, report_no_derivative
+from apc.compiler.equations.index import IndexReduction
 from apc.compiler.equations.reductions import Heard, taken_apart
-from apc.compiler.equations.solution import Assignment, ImplicitBlock, Problem, Residual, Step
+from apc.compiler.equations.solution import Assignment, Definition, ImplicitBlock, Problem, Residual, Step
 from apc.compiler.equations.terms import (
     ZERO,
     NoDerivativeError,
@@ -36,8 +37,9 @@ from apc.compiler.equations.terms import (
 )
 from apc.compiler.equations.zero_test import Divisors, Given
 from apc.compiler.errors import Mistakes, Place
-from apc.compiler.language.expression import Name, names
+from apc.compiler.language.expression import Name, format_expression, names
 from apc.compiler.language.unit_text import format_dimension
+from apc.compiler.language.values import AlreadyReportedError
 from apc.compiler.scene.scene import Scene
 
 
@@ -50,17 +52,6 @@ class SortedPartition:
 
     clock: str
     assignments: tuple[Step, ...]
-
-    @property
-    def definitions(self) -> dict[Symbol, Term | ImplicitBlock]:
-        """What gives each unknown its value."""
-        found: dict[Symbol, Term | ImplicitBlock] = {}
-        for step in self.assignments:
-            if isinstance(step, ImplicitBlock):
-                found |= dict.fromkeys(map(symbol, step.unknowns), step)
-            else:
-                found[symbol(step[0])] = step[1]
-        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +76,14 @@ class SortedKind:
     receives: tuple[Heard, ...]
     sends: tuple[SortedSend, ...]
 
+    @property
+    def definitions(self) -> dict[Symbol, Definition]:
+        """What gives each unknown and each sample its value."""
+        found: dict[str, Definition] = {}
+        for step in (step for part in self.partitions for step in part.assignments):
+            found |= dict.fromkeys(step.unknowns, step) if isinstance(step, ImplicitBlock) else dict([step])
+        return {symbol(name): one for name, one in (found | dict((*self.aliases, *self.samples))).items()}
+
 
 @dataclass(frozen=True, slots=True)
 class SortedSystem:
@@ -104,9 +103,12 @@ def sort(clocked: ClockedSystem) -> SortedSystem:
         for declared in part.component.numbers
         if declared.open_minimum and declared.minimum == 0
     }
-    kinds = [_sorted(kind, Divisors(nonzero, _numbers(scene, kind)), mistakes) for kind in clocked.kinds]
+    kinds = []
+    for kind in clocked.kinds:
+        with mistakes:
+            kinds.append(_sorted(kind, Divisors(nonzero, _numbers(scene, kind)), mistakes))
     mistakes.raise_if_any()
-    return SortedSystem(scene, tuple(kind for kind in kinds if kind is not None))
+    return SortedSystem(scene, tuple(kinds))
 
 
 def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[Symbol, Given]]:
@@ -114,21 +116,20 @@ def _numbers(scene: Scene, kind: ClockedKind) -> list[dict[Symbol, Given]]:
     common = {f"{part.name}.{name}": value for part in scene.parts for name, value in part.values}
     found = []
     for group in (group for group in scene.groups if group.name in kind.flat.groups):
-        columns: dict[str, Given] = dict(group.columns)
+        varying: dict[str, Given] = dict(group.columns)
         numbers: dict[str, Given] = {"peers": Fraction(scene.peers)}
         for name, value in (common | dict(group.values)).items():
             numbers[name] = value.number
             # Inside a part, what depends on a number that differs from peer to peer does so too.
-            used = () if value.expression is None or name in columns else names(value.expression)
-            if any(".".join(node.parts) in columns for node in used):
-                assert value.expression is not None
-                columns[name] = to_term(value.expression)
-        found.append({symbol(name): number for name, number in (numbers | columns).items()})
+            used = () if value.expression is None else map(format_expression, names(value.expression))
+            if value.expression is not None and not varying.keys().isdisjoint(used):
+                varying.setdefault(name, to_term(value.expression))
+        found.append({symbol(name): number for name, number in (numbers | varying).items()})
     return found
 
 
-def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> SortedKind | None:
-    """Sort and solve a kind; None where there are mistakes."""
+def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> SortedKind:
+    """Sort and solve a kind. Raises ApcError with what stands in the way of the continuous equations."""
 
     def problem(where: str, part: Partition) -> Problem:
         place = next((one.place for one in (*part.equations, *kind.flat.equations)), Place("topology"))
@@ -142,15 +143,14 @@ def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> Sorted
     partitions = []
     for part in kind.partitions[1:]:
         its = problem(f"the equations of clock {part.clock}", part)
-        if (sides := _sides(part.equations, None, its)) is not None:
-            equal = zip(part.equations, sides, strict=True)
+        with mistakes:
+            equal = zip(part.equations, _sides(part.equations, None, its), strict=True)
             residuals = [Residual((left - right).xreplace(reductions), one) for one, (left, right) in equal]
             steps = solve_blocks(residuals, [symbol(name) for name in part.variables], its)
             partitions.append(SortedPartition(part.clock, steps))
-    continuous = _sorted_continuous(kind, problem("the continuous equations", kind.partitions[0]))
-    if continuous is None or mistakes:
-        return None
-    states, aliases, steps, read = continuous
+    states, aliases, steps, read = _sorted_continuous(
+        kind, problem("the continuous equations", kind.partitions[0])
+    )
     samples = zip((one.symbol for one in kind.samples), read, strict=False)
     sends = zip(kind.flat.sends, read[len(kind.samples) :], strict=True)
     return SortedKind(
@@ -166,8 +166,8 @@ def _sorted(kind: ClockedKind, divisors: Divisors, mistakes: Mistakes) -> Sorted
 
 def _sorted_continuous(
     kind: ClockedKind, problem: Problem
-) -> tuple[tuple[str, ...], tuple[Assignment, ...], tuple[Step, ...], list[Term]] | None:
-    """Return states, aliases, steps, and what is sampled and sent; None where there are mistakes."""
+) -> tuple[tuple[str, ...], tuple[Assignment, ...], tuple[Step, ...], list[Term]]:
+    """Return states, aliases, steps, and what is sampled and sent. Raises ApcError where there is no way."""
     variables, equations = kind.partitions[0].variables, kind.partitions[0].equations
     started = {variable.name for variable in kind.flat.variables if variable.start}
     moving = Moving(dict.fromkeys(variables), {hold.symbol for hold in kind.holds})
@@ -176,27 +176,22 @@ def _sorted_continuous(
     reads = [FlatEquation(Name((s.symbol,)), s.expression, s.clock, s.clock, where) for s in kind.samples]
     reads += [FlatEquation(Name((s.name,)), s.expression, s.link, None, s.place) for s in kind.flat.sends]
     sides = _sides((*equations, *reads), moving.differentiate, problem)
-    if sides is None:
-        return None
-    aliases = Aliases(moving, variables, started)
-    pairs = list(zip((*equations, *reads), sides, strict=True))
+    aliases = Aliases(moving, started)
     residuals = aliases.remove(
-        [Residual(left - right, one) for one, (left, right) in pairs[: len(equations)]]
+        [Residual(left - right, one) for one, (left, right) in zip(equations, sides, strict=False)]
     )
-    read = [Residual(aliases.substitute(value), one) for one, (_, value) in pairs[len(equations) :]]
+    values = zip(reads, sides[len(equations) :], strict=True)
+    read = [Residual(aliases.substitute(value), one) for one, (_, value) in values]
     if none := [one for one in (*residuals, *read) if is_no_number(one.expression)]:
-        problem.report_no_number(none)
-        return None
+        raise problem.no_number(none)
     # A derivative that has a name of its own, or that is read, is asked for, even if no equation holds it.
     asked = [*aliases.velocities, *(it for one in read for it in moving.derivatives(one.expression).values())]
-    orders = dict.fromkeys((name for name in variables if name not in aliases.stands), 0)
-    for name, order in asked:
-        orders[name] = max(orders[name], order)
+    orders = {name: 0 for name in variables if name not in aliases.stands} | dict(
+        sorted(asked, key=itemgetter(1))
+    )
     reduction = IndexReduction(residuals, orders, moving, problem)
-    reduced = reduction.reduced({aliases.value(name) for name in started})
-    if reduced is None:
-        return None
-    states = tuple(aliases.shown(s).name for s in reduced.states)
+    solving, unknowns, differentiated = reduction.reduced({*map(aliases.value, started)})
+    states = tuple(aliases.shown(s).name for s in differentiated)
     for state in (state for state in states if state not in started):
         holder = next((one for one in equations if f"der({state})" in one.text), equations[0])
         what = f"{state} is a state, by `{holder.text}` ({holder.origin}), and has no start value"
@@ -204,8 +199,8 @@ def _sorted_continuous(
         if state.startswith("der("):
             hint = f"{state} = v, with a start value for v"
         problem.mistakes.add("E510", holder.place, what, hint=hint)
-    shown = [Residual(aliases.shown(one.expression), one.equation) for one in reduced.residuals]
-    steps = solve_blocks(shown, [aliases.shown(s) for s in reduced.unknowns], problem)
+    shown = [Residual(aliases.shown(one.expression), one.equation) for one in solving]
+    steps = solve_blocks(shown, [aliases.shown(s) for s in unknowns], problem)
     below = {v: aliases.shown(derivative(x, order - 1)).name for (x, order), v in aliases.velocities.items()}
     rates = [(f"der({x})", symbol(v)) for v, x in below.items() if x in states]
     known = [rate for rate in rates if rate[1].name in states]
@@ -215,17 +210,18 @@ def _sorted_continuous(
 
 def _sides(
     equations: Sequence[FlatEquation], differentiate: Callable[[Term], Term] | None, problem: Problem
-) -> list[tuple[Term, Term]] | None:
-    """Return both sides of equations; None where a derivative doesn't exist, or a constant is no number."""
+) -> list[tuple[Term, Term]]:
+    """Return both sides of equations. Raises ApcError for derivatives and constants that do not exist."""
     found = []
     for equation in equations:
-        try:
-            sides = (to_term(equation.left, differentiate), to_term(equation.right, differentiate))
-        except NoDerivativeError as missing:
-            report_no_derivative(Residual(ZERO, equation), missing, problem)
-            continue
-        if any(map(is_no_number, sides)):
-            problem.report_no_number([Residual(ZERO, equation)])
-        else:
+        with problem.mistakes:
+            try:
+                sides = (to_term(equation.left, differentiate), to_term(equation.right, differentiate))
+            except NoDerivativeError as missing:
+                raise problem.no_derivative(Residual(ZERO, equation), missing) from missing
+            if any(map(is_no_number, sides)):
+                raise problem.no_number([Residual(ZERO, equation)])
             found.append(sides)
-    return found if len(found) == len(equations) else None
+    if len(found) < len(equations):
+        raise AlreadyReportedError
+    return found

@@ -23,7 +23,7 @@ from typing import Any, TypeAlias
 import sympy
 
 from apc.compiler.language.expression import (
-    COMPARISONS,
+    CONDITIONS,
     SMOOTH,
     Call,
     Expr,
@@ -126,7 +126,7 @@ FUNCTIONS: dict[str, Any] = {
     "abs": Abs,
     "sqrt": sympy.sqrt,
     **{name: getattr(sympy, name) for name in ("sign", "floor", "atan2", *SMOOTH)},
-    **{name: type(name, (Condition,), {}) for name in (*COMPARISONS, "and", "or", "not")},
+    **{name: type(name, (Condition,), {}) for name in CONDITIONS},
 }
 NAMES = {sympy.Abs: "abs", **{function: name for name, function in FUNCTIONS.items()}}
 
@@ -160,13 +160,13 @@ def to_term(expression: Expr, differentiate: Callable[[Term], Term] | None = Non
             return symbol(".".join(node.parts))
         return sympy.Rational(node.value.numerator, node.value.denominator)
 
-    def apply(word: str, *operands: Term) -> Term:
-        if word == "der":
+    def term(name: str, *operands: Term) -> Term:
+        if name == "der":
             assert differentiate is not None, operands
             return differentiate(*operands)
-        return FUNCTIONS[word](*operands)
+        return FUNCTIONS[name](*operands)
 
-    return fold(expression, leaf, apply)
+    return fold(expression, leaf, term)
 
 
 # ---- what is asked of terms ----
@@ -259,11 +259,10 @@ def _written(term: Term) -> Expr:
 def _written_product(term: Term) -> Expr:
     """Return a product as a quotient, the number in front first."""
     number, rest = term.as_coeff_Mul()
-    factors = sympy.Mul.make_args(rest)
-    below = [factor for factor in factors if factor.is_Pow and factor.exp.is_negative]
-    above = [*([number] if number != 1 else []), *(one for one in factors if one not in below)]
+    below = [one for one in sympy.Mul.make_args(rest) if one.is_Pow and one.exp.is_negative]
+    above = [one for one in (number, *sympy.Mul.make_args(rest)) if one != 1 and one not in below]
     whole = _times(above or [ONE])
-    return Call("/", (whole, _times(1 / factor for factor in below))) if below else whole
+    return Call("/", (whole, _times(1 / one for one in below))) if below else whole
 
 
 def _times(factors: Iterable[Term]) -> Expr:

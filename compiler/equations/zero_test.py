@@ -26,7 +26,7 @@ Given: TypeAlias = Fraction | NDArray[np.float64] | Term
 Residue: TypeAlias = Any  # an integer, or one a peer: an array of Python's integers, which outgrow 64 bits
 PRIME = (1 << 61) - 1
 MOST = 200  # nodes beyond which no identity is looked for: simplifying takes its time
-POINTS, NEARLY = 4, 1e-20  # at which an identity must vanish, and how nearly, of 30 digits
+NEARLY = 1e-20  # how nearly an identity must vanish at a point, of 30 digits
 
 
 class Divisors:
@@ -79,44 +79,46 @@ class _Residues:
             return True
         if not expression.has(sympy.Function):
             return False
-        given = {s: self.given.get(s) for s in expression.free_symbols}
-        numbers = {s: sympy.Rational(one) for s, one in given.items() if isinstance(one, Fraction)}
+        numbers = {s: sympy.Rational(one) for s, one in self.given.items() if isinstance(one, Fraction)}
         return _is_identity(expression.xreplace(numbers))
 
     def __call__(self, node: Term) -> Residue:
         """Return the residue of an expression."""
-        if node not in self.known:
-            value = self._value(node)
-            if not isinstance(value, int) and not node.is_Symbol:
-                return value  # a million peers' would take 40 MB for each node
+        if node in self.known:
+            return self.known[node]
+        value = self._value(node)
+        if isinstance(value, int) or node.is_Symbol:  # a million peers' would take 40 MB for each node
             self.known[node] = value
-        return self.known[node]
+        return value
 
     def _value(self, node: Term) -> Residue:
         if node in self.given:
             value = self.given[node]
-            if isinstance(value, np.ndarray):
-                return np.frompyfunc(lambda one: _modular(Fraction(one)), 1, 1)(value)
-            return _modular(value) if isinstance(value, Fraction) else self(value)
+            return self(value) if isinstance(value, sympy.Expr) else _MODULAR(value)
         if node.is_Rational:
-            return _modular(node)
+            return _MODULAR(node)
         if node.is_Add:
             return sum(map(self, node.args)) % PRIME
         if node.is_Mul:
             return prod(map(self, node.args)) % PRIME
-        if node.is_Pow and node.exp.is_Integer:
-            base, exponent = self(node.base), int(node.exp)
-            some = self.random.randrange(1, PRIME)  # stands for what zero has none of, an inverse
-            raised = np.frompyfunc(
-                lambda one: pow(one, exponent, PRIME) if one or exponent > 0 else some, 1, 1
-            )
-            return raised(base)
-        is_none = self.nonzero is not None and node.is_Symbol and node not in self.nonzero
-        return 0 if is_none else self.random.randrange(1, PRIME)
+        some = self.random.randrange(1, PRIME)
+        if node.is_Pow and node.exp.is_Integer:  # `some` stands for what zero has none of, an inverse
+            return _POWER(self(node.base), int(node.exp), some)
+        return 0 if self.nonzero is not None and node.is_Symbol and node not in self.nonzero else some
 
 
-def _modular(value: Fraction | Term) -> int:
-    return int(value.numerator * pow(value.denominator, -1, PRIME) % PRIME)
+def _modular(value: Fraction | float | Term) -> int:
+    exact = Fraction(value) if isinstance(value, float) else value
+    return int(exact.numerator * pow(exact.denominator, -1, PRIME) % PRIME)
+
+
+def _power(base: int, exponent: int, inverse_of_zero: int) -> int:
+    return pow(base, exponent, PRIME) if base or exponent > 0 else inverse_of_zero
+
+
+# Of one number, or of each in an array.
+_MODULAR: Any = np.frompyfunc(_modular, 1, 1)
+_POWER: Any = np.frompyfunc(_power, 3, 1)
 
 
 def _is_identity(expression: Term) -> bool:
@@ -125,8 +127,7 @@ def _is_identity(expression: Term) -> bool:
     if size(expression) > MOST or expression.has(Choice):
         return bool(expression == 0)
     chance = random.Random(0)
-    for _ in range(POINTS):
-        point = {s: sympy.Rational(chance.randrange(1, 999), 499) for s in in_order(expression.free_symbols)}
-        if not abs(complex(expression.xreplace(point).evalf(30, maxn=60))) < NEARLY:
-            return False
+    point = {s: sympy.Rational(chance.randrange(1, 999), 499) for s in in_order(expression.free_symbols)}
+    if not abs(complex(expression.xreplace(point).evalf(30, maxn=60))) < NEARLY:
+        return False
     return any(sympy.simplify(one) == 0 for one in (expression, expression.rewrite(sympy.exp)))

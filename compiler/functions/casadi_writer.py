@@ -1,9 +1,9 @@
 """Terms written as CasADi's, each definition once.
 
-Takes: symbols whose values are known, and what defines the others. Gives: `Writer`, `Definition`.
-Guarantees: written in the order in which things depend on one another; a chain of definitions may be as long
-as it likes; what a nonlinear loop finds is a symbol, and a function that needs it solves the loop by
-Newton's iteration first.
+Takes: `SortedKind`. Gives: `Writer`.
+Guarantees: written in the order in which things depend on one another, and nothing that isn't needed; a chain
+of definitions may be as long as it likes; what a nonlinear loop finds is a symbol, and a function that needs
+it solves the loop by Newton's iteration first.
 Does not: choose what is written (see `functions`).
 """
 
@@ -11,24 +11,28 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, TypeAlias
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Any, TypeVar
 
 import casadi
 from sympy import Mul, tan
 
-from apc.compiler.equations.solution import ImplicitBlock
+from apc.compiler.components.component import OTHERS
+from apc.compiler.equations.flatten import HoldCrossing, PreviousCrossing
+from apc.compiler.equations.reductions import Heard
+from apc.compiler.equations.solution import Definition, ImplicitBlock
+from apc.compiler.equations.structure import SortedKind
 from apc.compiler.equations.terms import HALF, NAMES, ONE, Symbol, Term, in_order, symbol
 from apc.compiler.interpolation import Interpolation, function_of
 from apc.compiler.language.expression import SMOOTH
-from apc.compiler.language.recordings import TimeTable
 from apc.compiler.plain import Loop, composed
 
-Definition: TypeAlias = Term | ImplicitBlock
 MOST_FACTORS = 100  # of a power that is written as a product
 # Functions that are infinite or no number somewhere, or whose slopes are; and where none of them is.
 _SOMEWHERE_NONE = ("exp", "log", "tan", "asin", "acos", "sinh", "cosh", "atan2")
 HARMLESS = 0.5
+Crossing = TypeVar("Crossing", HoldCrossing, PreviousCrossing, Heard)
 _CASADI: dict[str, Callable[..., Any]] = {
     "+": operator.add,
     "min": casadi.fmin,
@@ -50,34 +54,50 @@ _CASADI: dict[str, Callable[..., Any]] = {
 
 
 class Writer:
-    """Translates terms to CasADi's SX, each definition once.
+    """Translates terms of a kind to CasADi's SX, each definition once.
 
-    `starts` gives the start values of the unknowns that have one, where a loop's iteration begins.
+    `known` are the symbols written so far: what has no definition is a symbol of its own there, which crosses
+    into the site, or is one of the `parameters`, the numbers and start values that were needed.
     """
 
-    def __init__(
-        self,
-        known: Mapping[Symbol, Any],
-        definitions: Mapping[Symbol, Definition],
-        tables: Mapping[str, TimeTable],
-        starts: Mapping[str, Any],
-    ) -> None:
-        self.known = dict(known)
-        self.definitions = dict(definitions)
-        self.tables = tables
-        self.starts = starts
+    def __init__(self, kind: SortedKind) -> None:
+        flat = kind.clocked.flat
+        self.kind = kind
+        self.definitions = kind.definitions
+        self.tables = {f"{part.name}.{table.name}": table for part in flat.parts for table in part.tables}
+        self.started = {one.name for one in flat.variables if one.start}
+        self.known: dict[Symbol, Any] = {symbol(name): casadi.SX.sym(name) for name in ("time", *kind.states)}
+        self.crossing = {one.symbol for one in flat.crossings} | {one.symbol for one in kind.receives}
+        self.parameters: dict[str, Any] = {}
         self.loops: list[tuple[Any, Any, Any]] = []  # unknowns (n,), where they begin, what is to be zero
 
-    def column(self, values: Iterable[Any]) -> Any:
-        """Return a dense column of scalars, (0, 1) when there are none."""
-        listed = list(values)
-        return casadi.densify(casadi.vertcat(*listed)) if listed else casadi.SX(0, 1)
+    def follow(self, heard: Collection[str]) -> None:
+        """Write what the motion of any state follows from, what has a limit, and the sends that are heard.
 
-    def extended(self, known: Mapping[Symbol, Any]) -> Writer:
-        """Return a writer that knows more."""
-        more = Writer({**self.known, **known}, self.definitions, self.tables, self.starts)
-        more.loops = list(self.loops)
-        return more
+        What a crossing that was read stands for is written too; what that reads, when this is called again.
+        """
+        clocked = self.kind.clocked
+        remembered = [one.variable for one in self.read(clocked.previous)]
+        for name in (*self.kind.states, *remembered):
+            self.parameter(name)
+        limited = [one.name for one in clocked.flat.variables if one.limit]
+        held = [one.variable for one in self.read(clocked.holds)]
+        self.column([*map("der({})".format, self.kind.states), *limited, *held, *remembered])
+        edges = [one.edge for one in self.read(self.kind.receives) if one.edge is not None]
+        for expression in (*edges, *(one.expression for one in self.kind.sends if one.name in heard)):
+            self.write(expression)
+
+    def column(self, names: Iterable[str]) -> Any:
+        """Return the values of some names as a dense column, (0, 1) when there are none."""
+        return casadi.densify(casadi.vertcat(casadi.SX(0, 1), *(self.write(symbol(name)) for name in names)))
+
+    def parameter(self, name: str) -> Any:
+        """Return the symbol of a parameter; a start value has the name of its variable."""
+        return self.parameters.setdefault(name, casadi.SX.sym(name))
+
+    def read(self, crossings: Iterable[Crossing]) -> list[Crossing]:
+        """Return the crossings whose symbols were needed."""
+        return [one for one in crossings if symbol(one.symbol) in self.known]
 
     def function(self, name: str, inputs: Mapping[str, Any], output: str, value: Any) -> Any:
         """Return the CasADi function of some columns that gives a value written in them.
@@ -111,17 +131,19 @@ class Writer:
         """
         work = self._needed(wanted)
         while work:
-            s = work[-1]
-            missing = [] if s in self.known else self._needed(self.definitions[s])
-            if s not in self.known and not missing:
-                definition = self.definitions[s]
-                if isinstance(definition, ImplicitBlock):
-                    self._tear(definition)
-                else:
-                    self.known[s] = self._build(definition)
-            work += missing
+            s, definition = work[-1], self.definitions.get(work[-1])
             if s in self.known:
                 work.pop()
+            elif definition is None:
+                crosses = s.name in self.crossing or s.name.startswith(f"{OTHERS}.")
+                start = re.sub(r"^initial\((.*)\)$", r"\1", s.name)
+                self.known[s] = casadi.SX.sym(s.name) if crosses else self.parameter(start)
+            elif missing := self._needed(definition):
+                work += missing
+            elif isinstance(definition, ImplicitBlock):
+                self._tear(definition)
+            else:
+                self.known[s] = self._build(definition)
         return self._build(wanted)
 
     def _needed(self, expression: Definition) -> list[Symbol]:
@@ -133,10 +155,10 @@ class Writer:
     def _tear(self, loop: ImplicitBlock) -> None:
         """Make known the unknowns of a loop that are torn; the others follow from them."""
         z = casadi.SX.sym("z", len(loop.tearing))
-        begin = self.column(self.starts.get(name, casadi.SX(0)) for name in loop.tearing)
+        begin = casadi.vertcat(*(self.parameter(x) if x in self.started else 0 for x in loop.tearing))
         self.known |= {symbol(name): z[i] for i, name in enumerate(loop.tearing)}
         self.definitions |= {symbol(name): expression for name, expression in loop.inner}
-        self.loops.append((z, begin, self.column(map(self.write, loop.residuals))))
+        self.loops.append((z, begin, casadi.densify(casadi.vertcat(*map(self.write, loop.residuals)))))
 
     def _build(self, expression: Term, taken: Any = None) -> Any:
         """Return the value of an expression whose symbols are known.

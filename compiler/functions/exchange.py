@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from graphlib import TopologicalSorter
+from itertools import islice
 
 import numpy as np
 
@@ -33,11 +34,12 @@ from apc.compiler.compiled import (
 from apc.compiler.components.component import Component, Variable
 from apc.compiler.components.component import Number as NumberParameter
 from apc.compiler.crowd import COUNT_ABOUT, heard_sums, with_heard
+from apc.compiler.equations.connections import ZERO
 from apc.compiler.equations.flatten import FlatKind, HoldCrossing
 from apc.compiler.errors import ApcError, Mistake, Mistakes, Place
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND
 from apc.compiler.language.evaluation import evaluate, formula_of
-from apc.compiler.language.expression import Expr, Name, Number, transform
+from apc.compiler.language.expression import Expr, Name, format_expression
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import Value, renamed
 from apc.compiler.scene.groups import SceneGroup
@@ -46,12 +48,7 @@ from apc.compiler.scene.scene import Scene
 from apc.compiler.words import enumerated
 
 NO_DELAY = "no delay"
-Left = list[tuple[str, str]]  # what the scene names and nothing needs, with the reason
-
-
-def period_of(clock: str) -> str:
-    """Return the name of a clock's period among timings and parameters."""
-    return f"{clock}.period"
+Path = tuple[str, ...]  # a name, between its dots
 
 
 class Timings:
@@ -59,7 +56,7 @@ class Timings:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self._values = {period_of(clock.name): clock.period for clock in scene.clocks}
+        self._values = {f"{clock.name}.period": clock.period for clock in scene.clocks}
         self._values |= {f"{part.name}.{name}": value for part in scene.parts for name, value in part.values}
         self._found: dict[str, Timing] = {}
 
@@ -70,48 +67,41 @@ class Timings:
 
     def use(self, name: str, value: Value) -> str:
         """Register a timing and return its name."""
-        if name not in self._found:
-            self._found[name] = Timing(name, value.number, _formula(value.expression))
+        self._found.setdefault(name, Timing(name, value.number, _formula(value.expression)))
         return name
 
     def delay(self, hold: HoldCrossing, kind: FlatKind) -> str:
         """Register the delay of a hold: none, a parameter of a part, or an expression over such."""
-        if isinstance(hold.delay, Number) and hold.delay.value == 0:
-            return self.use(NO_DELAY, Value(Fraction(0), SECOND, None, Place("")))
+        if hold.delay == ZERO:
+            return self.use(NO_DELAY, Value(ZERO.value, SECOND, None, Place("")))
 
-        def register(node: Expr) -> Expr | None:
-            if isinstance(node, Name) and node.parts != (PEERS,):
-                return Name(tuple(self._parameter(".".join(node.parts), kind).split(".")))
-            return None
-
-        def number(parts: tuple[str, ...]) -> Fraction:
+        def number(parts: Path) -> Fraction:
             return Fraction(self.scene.peers) if parts == (PEERS,) else self._found[".".join(parts)].value
 
-        tree = transform(hold.delay, register)
+        tree = renamed(hold.delay, lambda parts: parts if parts == (PEERS,) else self._parameter(parts, kind))
         if isinstance(tree, Name):
-            return ".".join(tree.parts)
+            return format_expression(tree)
         value = Fraction(evaluate(tree, number, Place(self.scene.name)))
         name = f"delay of {hold.variable}" + (f" at {kind.name}" if kind.delays else "")
         return self.use(name, Value(value, SECOND, tree, hold.place))
 
-    def _parameter(self, name: str, kind: FlatKind) -> str:
-        """Register a delay parameter, under the group's name if it sets its own."""
-        own = dict(kind.delays)
+    def _parameter(self, parts: Path, kind: FlatKind) -> Path:
+        """Register a delay parameter, under the group's name if it sets its own; return its name's parts.
+
+        What a group's own number depends on is its own as well, if it has one of that name.
+        """
+        name, own = ".".join(parts), dict(kind.delays)
         if name not in own:
-            return self.use(name, self._values[name])
-
-        def whole(parts: tuple[str, ...]) -> tuple[str, ...]:
-            """Return what a group's own number depends on: its own as well, if it has one of that name."""
-            other = ".".join(parts)
-            return tuple(self._parameter(other, kind).split(".")) if other in own else parts
-
-        expression = own[name].expression
-        tree = None if expression is None else renamed(expression, whole)
-        return self.use(f"{kind.groups[0]}.{name}", replace(own[name], expression=tree))
+            self.use(name, self._values[name])
+            return parts
+        tree = own[name].expression
+        if tree is not None:
+            tree = renamed(tree, lambda one: self._parameter(one, kind) if ".".join(one) in own else one)
+        return tuple(self.use(f"{kind.groups[0]}.{name}", replace(own[name], expression=tree)).split("."))
 
 
-def used_links(scene: Scene, kinds: Sequence[Kind], timings: Timings) -> tuple[list[Link], Left]:
-    """Return the links over which something is heard, and those left out with the reason.
+def used_links(scene: Scene, kinds: Sequence[Kind], timings: Timings) -> tuple[Link, ...]:
+    """Return the links over which something is heard.
 
     Parameters
     ----------
@@ -123,25 +113,23 @@ def used_links(scene: Scene, kinds: Sequence[Kind], timings: Timings) -> tuple[l
     heard = {receive.link for kind in kinds for clock in kind.clocks for receive in clock.receives}
     links = []
     for link in (link for link in scene.links if link.name in heard):
-        pairs = [
-            (pair, timings.use(f"{link.name}.delays.{pair.sender}.{pair.receiver}", pair.delay))
-            for pair in link.delays
-        ]
-        delays = tuple(PairDelay(pair.sender, pair.receiver, name) for pair, name in pairs)
+        pairs = ((one, f"{link.name}.delays.{one.sender}.{one.receiver}") for one in link.delays)
+        delays = tuple(
+            PairDelay(one.sender, one.receiver, timings.use(name, one.delay)) for one, name in pairs
+        )
         delay, channel, its = timings.use(f"{link.name}.delay", link.delay), None, link.channel
         if its is not None:
             loss = Loss(*(name for name, _ in its.loss)) if its.loss else None
             jitter = None if its.jitter is None else timings.use(f"{link.name}.jitter", its.jitter)
             channel = Channel(loss, jitter, its.distribution, its.reorder, its.on_loss, its.trace)
         links.append(Link(link.name, link.clock, delay, link.graph, delays, channel))
-    unheard = [link.name for link in scene.links if link.name not in heard]
-    return links, [(name, "nobody hears what it would carry") for name in unheard]
+    return tuple(links)
 
 
 def used_clocks(
     scene: Scene, kinds: Sequence[Kind], links: Sequence[Link], timings: Timings
-) -> tuple[list[Clock], Left]:
-    """Return the clocks that something ticks with, and those left out with the reason.
+) -> tuple[Clock, ...]:
+    """Return the clocks that something ticks with.
 
     Parameters
     ----------
@@ -153,72 +141,63 @@ def used_clocks(
         Takes the periods and phases that are used.
     """
     used = {link.clock for link in links} | {clock.clock for kind in kinds for clock in kind.clocks}
-    clocks = []
-    for clock in (clock for clock in scene.clocks if clock.name in used):
-        period = timings.use(period_of(clock.name), clock.period)
-        phase, place = timings.use(f"{clock.name}.phase", clock.phase), clock.period.place
-        clocks.append(Clock(clock.name, period, phase, place.line, place.column))
-    return clocks, [(one.name, "nothing ticks with it") for one in scene.clocks if one.name not in used]
+    return tuple(
+        Clock(
+            clock.name,
+            timings.use(f"{clock.name}.period", clock.period),
+            timings.use(f"{clock.name}.phase", clock.phase),
+            clock.period.place.line,
+            clock.period.place.column,
+        )
+        for clock in scene.clocks
+        if clock.name in used
+    )
 
 
-def check_channels(scene: Scene, kinds: Sequence[Kind]) -> None:
-    """Refuse a link over which some peers send what others don't: who hears it would hear them send nothing.
+def check_links(scene: Scene, kinds: Sequence[Kind], places: Sequence[int]) -> None:
+    """Refuse a link whose peers can't all hear what they ask for.
+
+    Parameters
+    ----------
+    scene, kinds
+        The links, and who sends and hears over them.
+    places
+        The place of the kind of each group.
 
     Raises
     ------
     ApcError
-        E215 for each such link.
+        E215 a link over which some peers send what others don't: who hears it would hear them send nothing.
+        E801 a graph, given arc by arc, that leaves a peer deaf which takes a mean, maximum or minimum.
     """
     mistakes = Mistakes()
     for link in scene.links:
-        sent = {kind.name: one.channels for kind in kinds for one in kind.sends if one.link == link.name}
-        every = dict.fromkeys(channel for channels in sent.values() for channel in channels)
-        missing = [(name, one) for one in every for name, channels in sent.items() if one not in channels]
-        for name, channel in missing[:1]:
+        sent = [(kind.name, one.channels) for kind in kinds for one in kind.sends if one.link == link.name]
+        every = [channel for _, channels in sent for channel in channels]
+        missing = ((name, one) for one in every for name, channels in sent if one not in channels)
+        for name, channel in islice(missing, 1):
             what = f"{channel} travels over {link.name}, and those of {name} send other values over it"
             hint = "a link of its own for what only some groups send"
             mistakes.add("E215", link.place, what, hint=hint)
     mistakes.raise_if_any()
-
-
-def check_heard(scene: Scene, kinds: Mapping[str, Kind]) -> None:
-    """Refuse a graph, given arc by arc, that leaves a peer deaf which takes a mean, maximum or minimum.
-
-    Parameters
-    ----------
-    scene
-        The scene.
-    kinds
-        The kind of each group, by its name.
-
-    Raises
-    ------
-    ApcError
-        E801 for each such link.
-    """
-    mistakes = Mistakes()
-    groups = scene.groups
-    counts = np.array([group.count for group in groups])
+    groups, counts = scene.groups, [group.count for group in scene.groups]
     for link in (link for link in scene.links if link.graph.shape == "arcs"):  # else all hear somebody
-        taken = [_taken(kinds[group.name], link.name) for group in groups]
-        sends = [any(one.link == link.name for one in kinds[group.name].sends) for group in groups]
         owner = np.repeat(np.arange(len(groups)), counts)
+        taken = [_taken(kinds[place], link.name) for place in places]
+        sends = [any(one.link == link.name for one in kinds[place].sends) for place in places]
         senders, receivers = link.graph.arcs.T
-        deaf = np.array([bool(one) for one in taken])[owner]
-        deaf[receivers[np.array(sends)[owner[senders]]]] = False
-        places = np.flatnonzero(deaf)
-        if not places.size:
+        asking = np.flatnonzero(np.array(taken, dtype=bool)[owner])
+        deaf = np.setdiff1d(asking, receivers[np.array(sends)[owner[senders]]])
+        if not deaf.size:
             continue
-        first = [
-            (groups[owner[place]].name, place - np.searchsorted(owner, owner[place])) for place in places[:3]
-        ]
-        names = [f"{name}[{place + 1}]" for name, place in first]
-        if len(places) > len(names):
-            names.append(f"{len(places) - len(names)} more")
-        hear = f"{enumerated(names)} {'hears' if len(places) == 1 else 'hear'} nobody over {link.name}"
-        what = f"{hear}: there is no {taken[owner[places[0]]]} over nobody"
-        hint = f"an arc to {'each' if len(places) > 1 else names[0]} in its graph"
-        hearing = np.bincount(owner[places], minlength=len(groups)) < counts
+        first = [(int(owner[place]), place) for place in deaf[:3]]
+        names = [f"{groups[k].name}[{place - sum(counts[:k]) + 1}]" for k, place in first]
+        if len(deaf) > len(names):
+            names.append(f"{len(deaf) - len(names)} more")
+        hear = f"{enumerated(names)} {'hears' if len(deaf) == 1 else 'hear'} nobody over {link.name}"
+        what = f"{hear}: there is no {taken[first[0][0]]} over nobody"
+        hint = f"an arc to {'each' if len(deaf) > 1 else names[0]} in its graph"
+        hearing = np.bincount(owner[deaf], minlength=len(groups)) < counts
         if not hearing.all() and hearing.any():
             others = [group.name for group, hears in zip(groups, hearing, strict=True) if hears]
             hint += f", or at: [{', '.join(others)}] in what uses {link.name}"
@@ -233,7 +212,7 @@ def _taken(kind: Kind, link: str) -> str:
 
 
 def compiled_groups(
-    scene: Scene, kinds: Sequence[Kind], kind_of: Mapping[str, int], links: Sequence[Link], timings: Timings
+    scene: Scene, kinds: Sequence[Kind], places: Sequence[int], links: Sequence[Link], timings: Timings
 ) -> tuple[Group, ...]:
     """Return the groups, with how many peers each hears: a setting that is a timing follows that timing.
 
@@ -241,7 +220,7 @@ def compiled_groups(
     ----------
     scene
         The scene.
-    kinds, kind_of
+    kinds, places
         The kinds of peers, and the place among them of each group's.
     links
         The links that are used.
@@ -256,17 +235,17 @@ def compiled_groups(
     exact = {timing.name for timing in timings.found}
     components = {part.name: part.component for part in scene.parts}
     found = []
-    for group in scene.groups:
+    for group, place in zip(scene.groups, places, strict=True):
         values = []
         for name, value in group.values:
             timing = f"{group.name}.{name}"
             own = replace(value, expression=Name(tuple(timing.split(".")))) if timing in exact else value
             values.append(_of_part(name, own, components))
         columns = tuple(Column(name, numbers) for name, numbers in group.columns)
-        found.append(Group(group.name, group.count, kind_of[group.name], tuple(values), columns))
+        found.append(Group(group.name, group.count, place, tuple(values), columns))
     for link in (link for link in scene.links if link.graph.shape != "complete"):
-        senders = [any(one.link == link.name for one in kind.sends) for kind in kinds]
-        silent = [group.name for group in found if not senders[group.kind]]
+        sending = [any(one.link == link.name for one in kind.sends) for kind in kinds]
+        silent = [group.name for group in found if not sending[group.kind]]
         if silent and any(count_of(link.name) in kind.parameters for kind in kinds):
             what = f"the graph of {link.name} joins all peers, and those of {silent[0]} send nothing over it"
             raise ApcError(Mistake("E215", link.place, what))
@@ -285,7 +264,7 @@ def with_rounded(scene: Scene, kind: Kind, links: Sequence[Link]) -> Kind:
     rounded = []
     for link in links:
         if count_of(link.name) in kind.parameters and link.graph.shape == "arcs":
-            values = heard_sums(link, scene.peers).values
+            values = set(heard_sums(link, scene.peers).tolist())
             if len(set(map(float, values))) < len(values):
                 what = f"what two peers hear over {link.name} adds up to sums that doubles can't tell apart"
                 raise ApcError(Mistake("E217", places[link.name], what, hint="weights of at most 15 digits"))
@@ -297,10 +276,21 @@ def with_rounded(scene: Scene, kind: Kind, links: Sequence[Link]) -> Kind:
 # ---- numbers by name ----
 
 
-def _named(name: str, value: Value, about: str = "") -> Parameter:
-    """Return a number as a parameter without bounds."""
+def _named(
+    name: str,
+    value: Value,
+    about: str = "",
+    minimum: Fraction | float | None = None,
+    maximum: Fraction | float | None = None,
+    *,
+    open_minimum: bool = False,
+) -> Parameter:
+    """Return a number as a parameter."""
     unit, formula = format_dimension(value.dimension), _formula(value.expression)
-    return Parameter(name, unit, float(value.number), formula, about=about, exact=value.number)
+    least, most = (None if one is None else float(one) for one in (minimum, maximum))
+    return Parameter(
+        name, unit, float(value.number), formula, least, open_minimum, most, about=about, exact=value.number
+    )
 
 
 def _of_part(name: str, value: Value, components: Mapping[str, Component]) -> Parameter:
@@ -310,9 +300,8 @@ def _of_part(name: str, value: Value, components: Mapping[str, Component]) -> Pa
     if isinstance(declared, Variable):
         return _named(name, value, f"start value: {declared.about}")
     assert isinstance(declared, NumberParameter)
-    least, most = (None if one is None else float(one) for one in (declared.minimum, declared.maximum))
-    bare = _named(name, value, declared.about)
-    return replace(bare, minimum=least, open_minimum=declared.open_minimum, maximum=most)
+    least, most = declared.minimum, declared.maximum
+    return _named(name, value, declared.about, least, most, open_minimum=declared.open_minimum)
 
 
 def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -> tuple[Parameter, ...]:
@@ -335,23 +324,25 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
             for one in part.component.variables
             if one.start is not None
         } | dict(part.starts)
-        in_use = ((name, value) for name, value in starts.items() if f"{part.name}.{name}" in needed)
-        found += [_of_part(f"{part.name}.{own}", value, components) for own, value in (*part.values, *in_use)]
+        numbers = dict(part.values) | {
+            own: value for own, value in starts.items() if f"{part.name}.{own}" in needed
+        }
+        found += [_of_part(f"{part.name}.{own}", value, components) for own, value in numbers.items()]
     for link in scene.links:
         if count_of(link.name) in needed:  # every group has its own value
             found.append(Parameter(count_of(link.name), "1", float(scene.peers - 1), about=COUNT_ABOUT))
         if link.channel is not None and link.name in used:
-            for (name, value), about in zip(link.channel.loss, PROBABILITIES.values(), strict=False):
-                found.append(replace(_named(name, value, about), minimum=0.0, maximum=1.0))
+            probabilities = zip(link.channel.loss, PROBABILITIES.values(), strict=False)
+            found += [_named(*number, about, 0, 1) for number, about in probabilities]
     for clock in scene.clocks:
-        if (name := period_of(clock.name)) in needed:  # by `interval`: the same number as the timing
-            one = _named(name, clock.period, f"from one tick of {clock.name} to the next")
-            found.append(replace(one, minimum=0.0, open_minimum=True))
+        if (name := f"{clock.name}.period") in needed:  # by `interval`: the same number as the timing
+            about = f"from one tick of {clock.name} to the next"
+            found.append(_named(name, clock.period, about, 0, open_minimum=True))
     for group in scene.groups:
         expression = None if group.counted is None else group.counted.expression
         count = Value(Fraction(group.count), DIMENSIONLESS, expression, group.place)
-        one = _named(group_count(group.name), count, f"number of peers of group {group.name}")
-        found.append(replace(one, minimum=1.0, maximum=_most_peers(scene, group)))
+        about, most = f"number of peers of group {group.name}", _most_peers(scene, group)
+        found.append(_named(group_count(group.name), count, about, 1, most))
     found.append(Parameter(PEERS, "1", float(scene.peers), about="number of peers"))
     return tuple({one.name: one for one in found}.values())
 
@@ -371,12 +362,13 @@ def followers_of(
     parameters: Sequence[Parameter], timings: Sequence[Timing], groups: Sequence[Group]
 ) -> tuple[str, ...]:
     """Return the names of all numbers that follow from others, each behind what it follows from."""
-    found: dict[str, dict[str, None]] = {}
     numbers: list[Parameter | Timing] = [*parameters, *timings]
+    followed, names = TopologicalSorter[str](), set[str]()
     for one in (*numbers, *(value for group in groups for value in group.values)):
         if one.formula is not None:
-            found.setdefault(one.name, {}).update(dict.fromkeys(one.formula.names))
-    return tuple(name for name in TopologicalSorter(found).static_order() if name in found)
+            followed.add(one.name, *one.formula.names)
+            names.add(one.name)
+    return tuple(name for name in followed.static_order() if name in names)
 
 
 def _formula(expression: Expr | None) -> Formula | None:

@@ -28,25 +28,24 @@ from apc.compiler.compiled import (
 )
 from apc.compiler.components.component import OTHERS
 from apc.compiler.components.parts import GROUND
+from apc.compiler.equations.derivatives import TIME
 from apc.compiler.equations.flatten import HEARD_AGE, FlatVariable, HoldCrossing, PreviousCrossing
 from apc.compiler.equations.reductions import Heard
-from apc.compiler.equations.solution import ImplicitBlock
-from apc.compiler.equations.structure import SortedSystem
-from apc.compiler.equations.terms import Symbol, derivative, symbol
+from apc.compiler.equations.solution import Definition, ImplicitBlock
+from apc.compiler.equations.structure import SortedKind, SortedSystem
+from apc.compiler.equations.terms import Symbol, symbol
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.functions.casadi_writer import Writer
 from apc.compiler.functions.exchange import (
     Timings,
     all_parameters,
-    check_channels,
-    check_heard,
+    check_links,
     compiled_groups,
     followers_of,
     used_clocks,
     used_links,
     with_rounded,
 )
-from apc.compiler.functions.reached import Reached, reached_together, sends_of
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import names
 from apc.compiler.language.unit_text import format_dimension
@@ -61,31 +60,39 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     """Write every kind as CasADi functions, and what lies between the sites beside them."""
     scene = system.scene
     timings = Timings(scene)
-    reached = reached_together(system.kinds)
-    heard = dict.fromkeys(name for kind in reached for one in kind.receives for name in sends_of(one))
-    kinds = [_kind(one, heard, timings) for one in reached]
+    writers = [Writer(kind) for kind in system.kinds]
+    before, heard = -1, list[str]()
+    while before < (before := sum(len(writer.known) for writer in writers)):  # until nothing new is read
+        for writer in writers:
+            writer.follow(heard)
+        receives = (one for writer in writers for one in writer.read(writer.kind.receives))
+        heard = list(dict.fromkeys(name for one in receives for name in one.sends))
+    kinds = [_kind(writer, heard, timings) for writer in writers]
     dropped = []
-    for one in reached:
-        unread = (hold for hold in one.kind.clocked.holds if hold not in one.holds)
-        dropped += [(hold.variable, "nobody reads this held value") for hold in unread]
-        dropped += [(send.name, "nobody hears it") for send in one.kind.sends if send.name not in heard]
-    check_channels(scene, kinds)
+    for kind, writer in zip(system.kinds, writers, strict=True):
+        unread = (one.variable for one in kind.clocked.holds if symbol(one.symbol) not in writer.known)
+        dropped += [(name, "nobody reads this held value") for name in unread]
+        dropped += [(send.name, "nobody hears it") for send in kind.sends if send.name not in heard]
     numbers = {group: i for i, kind in enumerate(system.kinds) for group in kind.clocked.flat.groups}
-    check_heard(scene, {group: kinds[place] for group, place in numbers.items()})
-    links, unheard = used_links(scene, kinds, timings)
-    clocks, silent = used_clocks(scene, kinds, links, timings)
+    places = [numbers[group.name] for group in scene.groups]
+    check_links(scene, kinds, places)
+    links = used_links(scene, kinds, timings)
+    clocks = used_clocks(scene, kinds, links, timings)
+    used = {one.name for one in links} | {one.name for one in clocks}  # no link has the name of a clock
+    dropped += [(one.name, "nobody hears what it would carry") for one in scene.links if one.name not in used]
+    dropped += [(one.name, "nothing ticks with it") for one in scene.clocks if one.name not in used]
     parameters = all_parameters(scene, kinds, links)
-    groups = compiled_groups(scene, kinds, numbers, links, timings)
+    groups = compiled_groups(scene, kinds, places, links, timings)
     return CompiledSystem(
         scene.name,
         scene.about,
-        tuple(clocks),
-        tuple(links),
+        clocks,
+        links,
         timings.found,
         parameters,
         tuple(with_rounded(scene, kind, links) for kind in kinds),
         groups,
-        tuple(dict.fromkeys([*dropped, *unheard, *silent])),
+        tuple(dict.fromkeys(dropped)),
         origin,
         scene.experiment,
         scene.region,
@@ -94,69 +101,53 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
     )
 
 
-def _kind(reached: Reached, heard: Iterable[str], timings: Timings) -> Kind:
+def _kind(writer: Writer, heard: Iterable[str], timings: Timings) -> Kind:
     """Write a kind's functions; `heard` are the names of the sends that any kind hears."""
-    kind, flat, holds = reached.kind, reached.kind.clocked.flat, reached.holds
+    kind, flat = writer.kind, writer.kind.clocked.flat
+    holds, previous = writer.read(kind.clocked.holds), writer.read(kind.clocked.previous)
     sends = {send.name: send for send in kind.sends}
-    tables = {f"{part.name}.{table.name}": table for part in flat.parts for table in part.tables}
     units = {one.name: format_dimension(one.dimension) for one in flat.variables}
     channels: dict[str, list[str]] = {}  # over each link, what is heard of this kind
     for name in (name for name in heard if name in sends):
         channels.setdefault(sends[name].link, []).append(name)
     outputs: dict[str, dict[str, None]] = {part.clock: {} for part in kind.partitions[1:]}
-    switched: list[HoldCrossing | PreviousCrossing] = [*holds, *reached.previous]
+    switched: list[HoldCrossing | PreviousCrossing] = [*holds, *previous]
     for one in switched:
         outputs[one.clock][one.variable] = None
-
-    p = {name: casadi.SX.sym(name) for name in reached.parameters}
-    states = {symbol(name): casadi.SX.sym(name) for name in kind.states}
-    crossings: list[HoldCrossing | PreviousCrossing | Heard] = [*switched, *reached.receives]
-    crossed = {one.symbol: casadi.SX.sym(one.symbol) for one in crossings}
-    time = casadi.SX.sym("time")
-    # A start value has the name of its variable; the name itself is what is computed.
-    known = {symbol(name): value for name, value in p.items() if symbol(name) not in reached.definitions}
-    known |= {symbol(f"initial({name})"): value for name, value in p.items()}
-    known |= {symbol(name): value for name, value in crossed.items()} | states | {symbol("time"): time}
-    writer = Writer(known, reached.definitions, tables, p)
-
-    def column(some: Iterable[HoldCrossing | PreviousCrossing | Heard]) -> Any:
-        return writer.column(crossed[one.symbol] for one in some)
+    parameters = tuple(sorted(writer.parameters))
 
     around = (
-        {"x": writer.column(states.values()), "u": column(holds)},
-        {"p": writer.column(p.values()), "t": time},
+        {"x": writer.column(kind.states), "u": writer.column(one.symbol for one in holds)},
+        {"p": casadi.vertcat(casadi.SX(0, 1), *map(writer.parameter, parameters)), "t": writer.known[TIME]},
     )
 
-    def function(name: str, output: str, value: Any, between: Mapping[str, Any], by: Writer = writer) -> Any:
-        return by.function(name, {**around[0], **between, **around[1]}, output, value)
+    def function(name: str, output: str, value: Any, between: Mapping[str, Any]) -> Any:
+        return writer.function(name, {**around[0], **between, **around[1]}, output, value)
 
     def edge(one: Heard, m: Any, r: Any) -> Any | None:
         """Write what a reduction runs over, for one peer that hears and one that is heard, if anything."""
         if one.edge is None:
             return None
-        theirs = [symbol(f"{OTHERS}.{name}") for name in channels[one.link]]
-        theirs += [symbol(HEARD_AGE)] if one.age == "edge" else []
-        sent = casadi.SX.sym("s", len(theirs))
-        pair = writer.extended(dict(zip(theirs, casadi.vertsplit(sent), strict=True)))
-        value = pair.write(one.edge)
+        theirs = [f"{OTHERS}.{name}" for name in channels[one.link]]
+        sent = writer.column([*theirs, HEARD_AGE] if one.age == "edge" else theirs)
+        value = writer.write(one.edge)
         if casadi.depends_on(value, r):
             what = f"{one.symbol} asks of each other peer what depends on all that are heard"
             expected = "a mean or sum that is linear in what the others send"
             raise ApcError(Mistake("E506", one.place, what, expected))
-        return function("edge", "value", value, {"m": m, "s": sent}, pair)
+        return function("edge", "value", value, {"m": m, "s": sent})
 
     def clock(name: str, computed: Sequence[str]) -> ClockPartition:
         """Write what one clock's tick computes, from what is remembered and heard as well."""
-        received = [one for one in reached.receives if one.clock == name]
-        remembered = [one for one in reached.previous if one.clock == name]
-        m, r = column(remembered), column(received)
-        values = writer.column(writer.write(symbol(output)) for output in computed)
+        received = [one for one in writer.read(kind.receives) if one.clock == name]
+        remembered = [one for one in previous if one.clock == name]
+        m, r = (writer.column(one.symbol for one in some) for some in (remembered, received))
         return ClockPartition(
             name,
             tuple(computed),
             tuple(units[output] for output in computed),
-            tuple(computed.index(previous.variable) for previous in remembered),
-            tuple(previous.variable for previous in remembered),
+            tuple(computed.index(one.variable) for one in remembered),
+            tuple(one.variable for one in remembered),
             tuple(
                 Receive(
                     *(one.symbol, one.operator, one.link, channels[one.link].index(one.send)),
@@ -164,12 +155,12 @@ def _kind(reached: Reached, heard: Iterable[str], timings: Timings) -> Kind:
                 )
                 for one in received
             ),
-            function(f"tick_{name}", "y", values, {"m": m, "r": r}),
+            function(f"tick_{name}", "y", writer.column(computed), {"m": m, "r": r}),
         )
 
     def send(link: str, names: Sequence[str]) -> SendPartition:
-        values = writer.column(writer.write(sends[name].expression) for name in names)
-        written = function(f"send_{link}", "s", values, {})
+        values = [writer.write(sends[name].expression) for name in names]
+        written = function(f"send_{link}", "s", casadi.densify(casadi.vertcat(*values)), {})
         return SendPartition(link, tuple(names), tuple(sends[name].unit for name in names), written)
 
     def limit(variable: FlatVariable) -> Limit:
@@ -180,17 +171,14 @@ def _kind(reached: Reached, heard: Iterable[str], timings: Timings) -> Kind:
             what = f"{name} has a limit and is computed at ticks; a limit is of what holds at every moment"
             hint = f"acting = hold({whole_and_index(own)[0]}), with the limit of acting"
             raise ApcError(Mistake("E513", variable.declared.place, what, hint=hint))
-        state = name in kind.states
-        value = (
-            None if state else function("limited", "value", writer.column([writer.write(symbol(name))]), {})
-        )
+        value = None if name in kind.states else function("limited", "value", writer.column([name]), {})
         return Limit(name, units[name], f"{part}.{variable.limit}", value)
 
     held = [hold.variable for hold in holds]
     hands = [part for part in flat.parts if part.section == "hands"]
-    rates = writer.column(writer.write(derivative(name)) for name in kind.states)
-    ports = [port for port in _held_ports(reached) if port[3] <= writer.known.keys()]
-    acting = writer.column(writer.write(port[row]) for row in (1, 2) for port in ports)
+    rates = writer.column(f"der({name})" for name in kind.states)
+    ports = [port for port in _held_ports(kind) if port[3] <= writer.known.keys()]
+    acting = writer.column([*(port[1] for port in ports), *(port[2] for port in ports)])
     port = function("port", "potentials_flows", acting, {})
     return Kind(
         flat.name,
@@ -204,7 +192,7 @@ def _kind(reached: Reached, heard: Iterable[str], timings: Timings) -> Kind:
             )
             for hold in holds
         ),
-        reached.parameters,
+        parameters,
         function("derivative", "dx", rates, {}),
         tuple(clock(name, list(computed)) for name, computed in outputs.items() if computed),
         tuple(send(link, listed) for link, listed in channels.items()),
@@ -217,38 +205,38 @@ def _kind(reached: Reached, heard: Iterable[str], timings: Timings) -> Kind:
     )
 
 
-def _held_ports(reached: Reached) -> Iterable[tuple[str, Symbol, Symbol, set[Symbol]]]:
+def _held_ports(kind: SortedKind) -> Iterable[tuple[str, str, str, set[Symbol]]]:
     """Yield (part, potential, flow into it, what these follow from) where a part's own hold gives the flow.
 
     The work a part does at a port over an interval in which nothing switches is, exactly, minus the flow
     into it times the change of the potential.
     """
-    held = {symbol(hold.symbol): hold.variable.rpartition(".")[0] for hold in reached.kind.clocked.holds}
-    moving = {symbol(name) for name in (*reached.kind.states, "time")}
-    for part in reached.kind.clocked.flat.parts:
+    definitions = kind.definitions
+    held = {symbol(hold.symbol): hold.variable.rpartition(".")[0] for hold in kind.clocked.holds}
+    moving = {*map(symbol, kind.states), TIME}
+    for part in kind.clocked.flat.parts:
         passed = {outer for outer, _, _ in part.component.passed}
         for name, connector in part.component.connectors if part.name in held.values() else ():
             for pair in zip(connector.potentials, connector.flows, strict=False):
                 if name in passed or pair[0].unit.dimension.multiply(pair[1].unit.dimension) != WORK:
                     continue  # it makes no work, or is the inner part's
-                potential, flow = (symbol(f"{part.name}.{name}.{one.name}") for one in pair)
-                at, through = _follows_from(potential, reached), _follows_from(flow, reached)
+                potential, flow = (f"{part.name}.{name}.{one.name}" for one in pair)
+                at, through = (_follows_from(symbol(one), definitions) for one in (potential, flow))
                 own = {s for s in through if held.get(s) == part.name}
                 if own and not (through - own) & (moving | held.keys()) and not at & held.keys():
                     yield part.name, potential, flow, at | through
 
 
-def _follows_from(wanted: Symbol, reached: Reached) -> set[Symbol]:
+def _follows_from(wanted: Symbol, definitions: Mapping[Symbol, Definition]) -> set[Symbol]:
     """Return the states, holds and parameters that give a symbol; a loop's unknown stands for itself."""
-    seen, work = {wanted}, [wanted]
-    for s in work:
-        definition = reached.definitions.get(s)
-        if definition is not None and not isinstance(definition, ImplicitBlock):
-            new = definition.free_symbols - seen
-            work += new
-            seen |= new
-    ends = {s for s in seen if s not in reached.definitions}
-    return ends | {s for s in seen - ends if isinstance(reached.definitions[s], ImplicitBlock)}
+    seen, ends = [wanted], set[Symbol]()
+    for s in seen:
+        definition = definitions.get(s)
+        if definition is None or isinstance(definition, ImplicitBlock):
+            ends.add(s)
+        else:
+            seen += definition.free_symbols.difference(seen)
+    return ends
 
 
 def _answers(part: Part) -> bool:

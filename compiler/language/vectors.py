@@ -20,6 +20,7 @@ from dataclasses import replace
 from fractions import Fraction
 from functools import partial, reduce
 from itertools import islice
+from operator import attrgetter
 from typing import NoReturn, TypeVar
 
 from apc.compiler.errors import ApcError, Mistake, Place, place_in
@@ -70,8 +71,8 @@ def whole_and_index(name: str) -> tuple[str, int]:
     return (whole, int(index)) if bracket and name.endswith("]") else (name, 0)
 
 
-def by_vector(items: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
-    """Return named items by the vectors whose entries they are of; what is of a number stands alone."""
+def by_vector(items: Iterable[T], name: Callable[[T], str] = attrgetter("name")) -> dict[str, list[T]]:
+    """Return items by the vectors whose entries their names are of; what is of a number stands alone."""
     vectors: dict[str, list[T]] = {}
     for item in items:
         vectors.setdefault(whole_and_index(name(item))[0], []).append(item)

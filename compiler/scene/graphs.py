@@ -17,7 +17,7 @@ import numpy as np
 from apc.compiler.compiled import MOST_PLACED, Graph
 from apc.compiler.errors import Mistakes, Place
 from apc.compiler.language.dimensions import SECOND
-from apc.compiler.language.tables import NamedFiles, Table, read_table
+from apc.compiler.language.tables import Table, read_table
 from apc.compiler.language.values import AlreadyReportedError, Value
 from apc.compiler.scene.named_numbers import NamedNumbers
 from apc.compiler.source.nodes import Node, Scalar, Sequence
@@ -38,49 +38,49 @@ class SceneDelay:
     delay: Value
 
 
-def read_graph(node: Node, counts: Mapping[str, int], files: NamedFiles) -> Graph:
+def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
     """Read `complete`, `ring`, `star`, `{edges: …}` or `{arcs: …}`.
 
     Parameters
     ----------
     node
         The node.
-    counts
-        The number of peers by group, in order.
-    files
-        Reads tables of arcs, and takes what is at fault in them.
+    numbers
+        Knows the groups, reads tables of arcs, and takes what is at fault in them.
 
     Raises
     ------
     ApcError
         What is at fault.
     """
-    peers, word = sum(counts.values()), node.text if isinstance(node, Scalar) else None
-    if peers > MOST_PLACED and word != COMPLETE.shape:
+    mistakes, word = numbers.mistakes, node.text if isinstance(node, Scalar) else None
+    if numbers.peers > MOST_PLACED and word != COMPLETE.shape:
         expected = f"at most {MOST_PLACED:,} peers where it isn't complete"
-        raise fault("E208", node.place, "a graph", expected, f"{peers:,}", "graph: complete")
-    if word in SHAPES:
-        return replace(COMPLETE, shape=str(word))
+        raise fault("E208", node.place, "a graph", expected, f"{numbers.peers:,}", "graph: complete")
+    if word is not None and word in SHAPES:
+        return replace(COMPLETE, shape=word)
     if word is not None:
         what = f"there is no graph {brief(word)}"
         raise unknown("E206", node.place, what, word, (*SHAPES, *PAIRS))
     hint = "[[1, 2], [2, 3]]"
-    body = Body(mapping_of(node, "graph", f"graph: {{edges: {hint}}}"), PAIRS, "graph", files.mistakes)
+    body = Body(mapping_of(node, "graph", f"graph: {{edges: {hint}}}"), PAIRS, "graph", mistakes)
     if len(body.nodes) != 1:
         raise fault("E203", node.place, "graph", "either edges or arcs", hint=f"edges: {hint}")
     [(key, pairs)] = body.nodes.items()
     if key not in PAIRS:
         raise AlreadyReportedError
     if isinstance(pairs, Scalar) and pairs.text.endswith(".csv"):
-        table = files.read(pairs.text, partial(read_table, named_at=pairs.place))
-        pairs = Sequence((), pairs.place) if table is None else _pairs_of(table)
-    if not isinstance(pairs, Sequence):
+        table = numbers.files.read(pairs.text, partial(read_table, named_at=pairs.place))
+        items = () if table is None else _pairs_of(table)
+    elif isinstance(pairs, Sequence):
+        items = pairs.items
+    else:
         raise fault("E203", pairs.place, key, "a list of pairs or a .csv file", form(pairs), f"{key}: {hint}")
-    numbered = _peers(counts)
+    numbered = _peers(numbers.counts)
     found: dict[tuple[int, int], float] = {}
-    for pair in pairs.items:
-        with files.mistakes:
-            sender, receiver, weight = _arc(pair, key, numbered, files.mistakes)
+    for pair in items:
+        with mistakes:
+            sender, receiver, weight = _arc(pair, key, numbered, mistakes)
             if (sender, receiver) in found or (key == "edges" and (receiver, sender) in found):
                 raise fault("E213", pair.place, f"the pair {sender + 1}, {receiver + 1} is given twice")
             found[sender, receiver] = weight
@@ -89,8 +89,8 @@ def read_graph(node: Node, counts: Mapping[str, int], files: NamedFiles) -> Grap
     return Graph("arcs", np.array([*found], np.int64).reshape(-1, 2), np.array([*found.values()]))
 
 
-def _pairs_of(table: Table) -> Sequence:
-    """Return the rows of a table with the columns from, to and weight or none as a list of pairs."""
+def _pairs_of(table: Table) -> tuple[Node, ...]:
+    """Return the rows of a table with the columns from, to and weight or none as pairs."""
     names, place = [column.name for column in table.columns], table.columns[0].place
     if names not in (["from", "to"], ["from", "to", "weight"]):
         expected = "the headings from, to and weight or none"
@@ -102,7 +102,7 @@ def _pairs_of(table: Table) -> Sequence:
         at = Place(place.file, line, 1)
         values = (int(number) if number.is_integer() else number for number in numbers)
         pairs.append(Sequence(tuple(Scalar(str(value), value, True, at) for value in values), at))
-    return Sequence(tuple(pairs), place)
+    return tuple(pairs)
 
 
 def _peers(counts: Mapping[str, int]) -> dict[str, int]:
@@ -118,13 +118,14 @@ def _arc(pair: Node, what: str, numbered: Mapping[str, int], mistakes: Mistakes)
         raise fault("E203", pair.place, what, expected, form(pair), "[1, 2]")
     ends: list[int] = []
     for node in pair.items[:2]:
-        text = node.text if isinstance(node, Scalar) and not (node.text.isdigit() and not node.plain) else ""
-        if text in numbered:
+        with mistakes:
+            quoted = isinstance(node, Scalar) and node.text.isdigit() and not node.plain
+            text = node.text if isinstance(node, Scalar) and not quoted else ""
+            if text not in numbered:
+                first = next((name for name in numbered if name.endswith("]")), "user[1]")
+                numbers = f'a number from 1 to {len(numbered) // 2}, or a name in quotes such as "{first}"'
+                raise fault("E213", node.place, "a peer", numbers, form(node))
             ends.append(numbered[text])
-            continue
-        first = next((name for name in numbered if name.endswith("]")), "user[1]")
-        expected = f'a number from 1 to {len(numbered) // 2}, or a name in quotes such as "{first}"'
-        mistakes.add("E213", node.place, "a peer", expected=expected, got=form(node))
     weight = 1.0
     for node in pair.items[2:]:
         number = node.value if isinstance(node, Scalar) else None
@@ -139,17 +140,15 @@ def _arc(pair: Node, what: str, numbered: Mapping[str, int], mistakes: Mistakes)
     return ends[0], ends[1], weight
 
 
-def read_delays(node: Node, counts: Mapping[str, int], numbers: NamedNumbers) -> tuple[SceneDelay, ...]:
+def read_delays(node: Node, numbers: NamedNumbers) -> tuple[SceneDelay, ...]:
     """Read `{SENDER: {RECEIVER: 12 ms}}`: the delays of pairs of groups that differ from the link's.
 
     Parameters
     ----------
     node
         The mapping.
-    counts
-        How many peers each group has.
     numbers
-        Reads a delay.
+        Knows the groups, and reads a delay.
 
     Raises
     ------
@@ -157,8 +156,7 @@ def read_delays(node: Node, counts: Mapping[str, int], numbers: NamedNumbers) ->
         E203 it is no mapping; other mistakes are recorded.
     """
     found, what = [], "delays names {}, which is no group of peers"
-    hint = "delays: {left: {right: 12 ms}}"
-
+    hint, counts = "delays: {left: {right: 12 ms}}", numbers.counts
     for key, body in mapping_of(node, "delays", hint).entries:
         with numbers.mistakes:
             sender = among(key.text, counts, key.place, what)

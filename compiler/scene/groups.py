@@ -16,6 +16,7 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,27 +106,26 @@ def read_counts(root: Body, files: NamedFiles) -> dict[str, GroupBody]:
     """
     found: dict[str, GroupBody] = {}
     example = "{user: {count: 3}}"
-    section = root.section("peers", example)
-    peers = root.nodes.get("peers")
+    section, peers = root.section("peers", example), root.nodes.get("peers")
     if isinstance(peers, MappingNode) and not section:
         root.mistakes.add("E201", peers.place, "peers names no group", hint=f"peers: {example}")
-    if peers is not None and len(section) > MOST_GROUPS:
-        expected, hint = f"at most {MOST_GROUPS} groups", "one group, {table: users.csv}, with a row a peer"
-        got = f"{len(section):,}"
-        root.mistakes.add("E208", peers.place, "peers", expected=expected, got=got, hint=hint)
-        return found
-    for key, value in section:
-        with root.mistakes:
-            name = name_of(key, "a group of peers")
-            node = mapping_of(value, name, f"{name}: {{count: 3}}")
-            body = Body(node, GROUP, f"group {name}", root.mistakes)
-            table, counted = None, None
-            if text := body.text("table", "table: users.csv"):
-                table = files.read(text, partial(read_table, named_at=body.nodes["table"].place))
-            count = body.nodes.get("count")
-            if isinstance(count, Scalar) and count.plain and _IN_NAMES.match(count.text):
-                counted = read_count_by_names(count, root)
-            found[name] = GroupBody(name, _count(name, body, table, counted), body, table, counted)
+    with root.mistakes:
+        if peers is not None and len(section) > MOST_GROUPS:
+            hint = "one group, {table: users.csv}, with a row a peer"
+            got = f"{len(section):,}"
+            raise fault("E208", peers.place, "peers", f"at most {MOST_GROUPS} groups", got, hint)
+        for key, value in section:
+            with root.mistakes:
+                name = name_of(key, "a group of peers")
+                node = mapping_of(value, name, f"{name}: {{count: 3}}")
+                body = Body(node, GROUP, f"group {name}", root.mistakes)
+                table, counted = None, None
+                if text := body.text("table", "table: users.csv"):
+                    table = files.read(text, partial(read_table, named_at=body.nodes["table"].place))
+                count = body.nodes.get("count")
+                if isinstance(count, Scalar) and count.plain and _IN_NAMES.match(count.text):
+                    counted = read_count_by_names(count, root)
+                found[name] = GroupBody(name, _count(name, body, table, counted), body, table, counted)
     return found
 
 
@@ -169,54 +169,52 @@ class GroupReader:
     numbers: NamedNumbers
     explain: Callable[[str, Place], None]
 
-    @property
-    def mistakes(self) -> Mistakes:
-        """Where faults go."""
-        return self.numbers.mistakes
-
     def read(self, group: GroupBody) -> SceneGroup:
         """Read what a group sets, and what follows from it."""
         values: dict[str, Value] = {}
         words: dict[str, str] = {}
         columns: dict[str, NDArray[np.float64]] = {}
+        mistakes, table = self.numbers.mistakes, group.table
         for key, node in self._entry_by_entry(group):
-            with self.mistakes:
+            with mistakes:
                 what = f"set names {brief(key.text)}, which is no parameter or variable of a part"
-                for whole, item in self._items(key.text, key.place, group.name, "E206", what):
-                    if isinstance(item, Option | Reference):
-                        words[whole] = self._word(node, key.text, item)
-                    elif isinstance(node, Sequence):
-                        columns[whole] = self._listed(node, key.text, item, group.count)
-                    else:
-                        values[whole] = self.numbers.read_for(node, key.text, item)
-        for column in group.table.columns if group.table is not None else ():
-            with self.mistakes:
+                item, wholes = self._settable(key.text, key.place, group.name, "E206", what)
+                if isinstance(item, Option | Reference):
+                    words |= dict.fromkeys(wholes, self._word(node, key.text, item))
+                elif isinstance(node, Sequence):
+                    columns |= dict.fromkeys(wholes, self._listed(node, key.text, item, group.count))
+                else:
+                    values |= dict.fromkeys(wholes, self.numbers.read_for(node, key.text, item))
+        for column in () if table is None else table.columns:
+            with mistakes:
                 what = f"a heading names {brief(column.name)}, which is no number of a part"
-                for whole, item in self._items(column.name, column.place, group.name, "E702", what):
+                item, wholes = self._settable(column.name, column.place, group.name, "E702", what)
+                for whole in wholes:
                     if whole in columns or whole in values:
-                        told = f"{whole} is given by set and by the table"
-                        self.mistakes.add("E702", column.place, told)
-                    columns[whole] = column.numbers
-                    assert group.table is not None and isinstance(item, Number | Variable)
-                    _check_column(column, group.table.lines, item, self.mistakes)
+                        mistakes.add("E702", column.place, f"{whole} is given by set and by the table")
+                columns |= dict.fromkeys(wholes, column.numbers)
+                assert table is not None and isinstance(item, Number | Variable)
+                _check_column(column, table.lines, item, mistakes)
         self._add_followers(values, words, columns, group.body.place)
         settings = tuple(values.items()), tuple(words.items()), tuple(columns.items())
         return SceneGroup(group.name, group.count, *settings, group.body.place, group.counted)
 
-    def _items(self, name: str, place: Place, group: str, code: str, what: str) -> list[tuple[str, Settable]]:
-        """Return the whole names that a name stands for; in a heading, which is told by E702, of numbers."""
+    def _settable(
+        self, name: str, place: Place, group: str, code: str, what: str
+    ) -> tuple[Settable, list[str]]:
+        """Return what a name stands for, with its whole names; in a heading, told by E702, only a number."""
         kinds = (Number, Variable) if code == "E702" else (Number, Variable, Option, Reference)
-        items = [(whole, item) for whole, item in self.settable.get(name, ()) if isinstance(item, kinds)]
-        if not items:
+        item, wholes = self.settable.get(name, (None, []))
+        if not isinstance(item, kinds):
             self.explain(name, place)
-            known = [known for known, found in self.settable.items() if isinstance(found[0][1], kinds)]
+            known = [known for known, (other, _) in self.settable.items() if isinstance(other, kinds)]
             raise unknown(code, place, what, name, known)
-        part = items[0][0].rpartition(".")[0]
+        part = wholes[0].rpartition(".")[0]
         at = next(one.groups for one in self.parts if one.name == part)
         if at and group not in at:
             what = f"{group} sets {name} and has no {part}, which is at {', '.join(at)}"
             raise fault("E211", place, what, hint=f"at: [{', '.join((*at, group))}]")
-        return items
+        return item, wholes
 
     def _entry_by_entry(self, group: GroupBody) -> Iterator[tuple[Scalar, Node]]:
         """Yield what a group sets, a vector as its entries.
@@ -228,14 +226,14 @@ class GroupReader:
             if not size:
                 yield key, node
                 continue
-            _, item = self.settable[entry(key.text, 1)][0]
+            item, _ = self.settable[entry(key.text, 1)]
             assert isinstance(item, Number | Variable)
             one = f"1 {item.unit.text}".removesuffix(" 1")
             nested = isinstance(node, Sequence) and any(isinstance(item, Sequence) for item in node.items)
             if not nested and group.table is None and "count" not in group.body.nodes:
                 what = f"{key.text} is a vector of {size}, and its list doesn't tell how many peers there are"
-                self.mistakes.add("E201", node.place, what, hint="count: 3")
-            with self.mistakes:
+                self.numbers.mistakes.add("E201", node.place, what, hint="count: 3")
+            with self.numbers.mistakes:
                 rows = node.items if nested and isinstance(node, Sequence) else (node,)
                 columns = zip(*(list_of(row, key.text, size, one) for row in rows), strict=True)
                 for name, column in zip(entries(key.text, size), columns, strict=True):
@@ -243,9 +241,8 @@ class GroupReader:
 
     def _word(self, node: Node, what: str, item: Option | Reference) -> str:
         """Read an option, or the name of a clock."""
-        known = item.words if isinstance(item, Option) else self.clocks
+        role, known = ("option", item.words) if isinstance(item, Option) else ("clock", self.clocks)
         word = text_of(node, what, f"{what}: {next(iter(known), 'name')}")
-        role = "option" if isinstance(item, Option) else "clock"
         return among(word, known, node.place, f"{what} has no {role} {{}}")
 
     def _listed(self, node: Sequence, what: str, item: Settable, count: int) -> NDArray[np.float64]:
@@ -259,32 +256,28 @@ class GroupReader:
         self, values: dict[str, Value], words: dict[str, str], columns: Collection[str], place: Place
     ) -> None:
         """Add what follows from a group's settings, inside the parts that they set."""
-        known = {
-            f"{part.name}.{name}": value
-            for part in self.parts
-            for name, value in (*part.values, *part.starts)
-        }
+        known: dict[str, Value] = {}
+        for part in self.parts:
+            known |= {f"{part.name}.{name}": value for name, value in (*part.values, *part.starts)}
+            for inner in part.component.inner:  # which takes its clocks over from the outer part
+                for own, outer in inner.entry.references:
+                    if (word := words.get(f"{part.name}.{outer}")) is not None:
+                        words.setdefault(f"{part.name}.{inner.name}.{own}", word)
 
         def number(parts: tuple[str, ...]) -> Fraction:
             value = values.get(name := ".".join(parts), known.get(name))
             return self.numbers.number(parts) if value is None else value.number
 
-        for part in self.parts:
-            for inner in part.component.inner:  # which takes its clocks over from the outer part
-                for own, outer in inner.entry.references:
-                    if (word := words.get(f"{part.name}.{outer}")) is not None:
-                        words.setdefault(f"{part.name}.{inner.name}.{own}", word)
         for whole, value in known.items():  # of an outer part before those inside it
             tree = value.expression
             if tree is None or whole in values or whole in columns:
                 continue
             if any(".".join(node.parts) in values for node in names(tree)):
-                with self.mistakes:
+                with self.numbers.mistakes:
                     follows = Fraction(evaluate(tree, number, place))
                     values[whole] = replace(value, number=follows, place=place)
-                    item = next((item for _, item in self.settable.get(whole, ())), None)
-                    if isinstance(item, Number):
-                        item.bounds.check(values[whole], whole, self.mistakes)
+                    if isinstance(item := self.settable[whole][0], Number):
+                        item.bounds.check(values[whole], whole, self.numbers.mistakes)
 
 
 def _check_column(
@@ -300,10 +293,8 @@ def _check_column(
             hint += f", each {'divided by' if expected == 'Hz' else 'times'} 2*pi"
         raise fault("E702", column.place, f"the heading {column.name}", f"[{expected}]", got, hint)
     if isinstance(item, Number):
-        bounds, wrong = item.bounds, 0
-        for line, number in zip(lines, map(Fraction, column.numbers.tolist()), strict=True):
-            if wrong < MOST_FAULTS and (expected := bounds.fault(number)):
-                wrong += 1
-                got = f"{float(number / bounds.scale):.12g} {bounds.unit}"
-                place = Place(column.place.file, line, 1)
-                mistakes.add("E207", place, column.name, expected=expected, got=got)
+        bounds, rows = item.bounds, zip(lines, map(Fraction, column.numbers.tolist()), strict=True)
+        wrong = ((line, number) for line, number in rows if bounds.fault(number))
+        for line, number in islice(wrong, MOST_FAULTS):
+            value = Value(number, due, None, Place(column.place.file, line, 1))
+            bounds.check(value, column.name, mistakes)

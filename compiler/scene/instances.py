@@ -9,18 +9,17 @@ Does not: read a section (see `scene`), or look into equations.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import partial
 from itertools import product
 
-from apc.compiler.components.component import Component, Inner, Joined, Named, Reference, Settable
+from apc.compiler.components.component import Component, Inner, Joined, Named, Number, Reference, Settable
 from apc.compiler.components.parts import GROUND, MOST_PARTS, PartEntry, Scope, read_entry
-from apc.compiler.errors import Mistakes, Place
-from apc.compiler.language.expression import Name, names
+from apc.compiler.errors import ApcError, Place
 from apc.compiler.language.recordings import TimeTable, read_time_table
-from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.values import PEERS, Binding, Value, renamed, settle
 from apc.compiler.language.vectors import entries, whole_and_index
 from apc.compiler.scene.named_numbers import NamedNumbers
@@ -29,8 +28,8 @@ from apc.compiler.source.reading import among, fault, form, text_of
 
 LINK_ROLES = ("graph", "delays", "loss", "trace")
 
-# What can be set: by the name a person writes, the whole names it stands for.
-SettableNames = Mapping[str, list[tuple[str, Settable]]]
+# What can be set: by the name a person writes, what that is and the whole names it stands for.
+SettableNames = Mapping[str, tuple[Settable, list[str]]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,74 +61,63 @@ class Part:
         return named[0] if len(named) == 1 else None
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class PartReader:
-    """Reads the entries of parts, one after the other; counts the parts there are so far.
-
-    `counts` are the groups and how many peers each has.
-    """
+    """Reads the entries of parts, one after the other, into `parts`, each before those inside it."""
 
     scope: Scope
     numbers: NamedNumbers
-    counts: Mapping[str, int]
-    files: NamedFiles
-    number_of_parts: int = 0
+    parts: list[Part] = field(default_factory=list)
 
-    def read(self, entry: PartEntry) -> list[Part]:
+    def read(self, entry: PartEntry) -> None:
         """Read a part's entry, once for each element of an array, and write out the parts inside."""
-        name, component, mistakes = entry.name, entry.component, self.numbers.mistakes
-        shared, groups = False, tuple(self.counts)
+        name, component = entry.name, entry.component
+        counts, mistakes = self.numbers.counts, self.numbers.mistakes
+        shared, groups = False, tuple(counts)
         with mistakes:
-            shared = self._shared(entry)
+            shared = _shared(entry)
         with mistakes:
             groups = self._groups_of(entry)
-        roles = [p for p in component.parameters if isinstance(p, Reference) and p.role in LINK_ROLES]
+        roles = [p.name for p in component.parameters if isinstance(p, Reference) and p.role in LINK_ROLES]
         if roles and entry.section != "links":
-            what = f"{name} is a {component.name}, whose {roles[0].name} only a link has"
+            what = f"{name} is a {component.name}, whose {roles[0]} only a link has"
             mistakes.add("E210", entry.place, what, hint=f"links: {{{name}: …}}")
-        peers, due, shown = (
-            sum(self.counts[group] for group in groups),
-            component.peers,
-            f"{name} ({component.name})",
-        )
+        peers, due = sum(counts[group] for group in groups), component.peers
+        shown = f"{name} ({component.name})"
         if component.hears_others and peers == 1:
             what = f"{shown} follows the other peers and"
-            hint = f"at: [{', '.join(self.counts)}]" if len(self.counts) > 1 else "count: 2"
+            hint = f"at: [{', '.join(counts)}]" if len(counts) > 1 else "count: 2"
             mistakes.add("E208", entry.place, what, expected="at least 2 peers", got="1", hint=hint)
         if due and peers > due:
             hint = f"count: {due}, or groups that make {due}: at: [left, right]"
             mistakes.add("E208", entry.place, shown, expected=f"{due} peers", got=f"{peers:,}", hint=hint)
-        parts: list[Part] = []
         for index, element in enumerate(entries(name, entry.count or 0), 1):
             read = read_entry(entry, self.scope, mistakes, index)
-            part = Part(
-                element,
-                entry.section,
-                component,
-                self.numbers.settled(read.values, component),
-                read.options,
-                read.references,
-                self._tables(entry, dict(read.described)),
-                self.numbers.settled(read.starts, component),
-                read.connections,
-                shared,
-                groups,
-                entry.place,
-            )
-            parts += self._with_inner(part)
-        return parts
+            values, starts = (self._settled(one, component) for one in (read.values, read.starts))
+            tables = self._tables(entry, dict(read.described))
+            said = values, read.options, read.references, tables, starts, read.connections
+            self._add(Part(element, entry.section, component, *said, shared, groups, entry.place))
 
-    def _with_inner(self, part: Part) -> list[Part]:
-        """Return a part and the parts inside it."""
-        self.number_of_parts += 1
-        if self.number_of_parts > MOST_PARTS:
+    def _add(self, part: Part) -> None:
+        """Add a part and those inside it."""
+        self.parts.append(part)
+        if len(self.parts) <= MOST_PARTS:
+            for inner in part.component.inner:
+                self._add(_inside(part, inner, self.numbers.peers))
+        elif len(self.parts) == MOST_PARTS + 1:
             what = f"a peer would have more than {MOST_PARTS} parts, those inside parts included"
-            if self.number_of_parts == MOST_PARTS + 1:
-                hint = "fewer or smaller arrays and components"
-                self.numbers.mistakes.add("E216", part.place, what, hint=hint)
-            return [part]
-        inner = (_inside(part, inner, self.numbers.peers) for inner in part.component.inner)
-        return [part, *(one for part in inner for one in self._with_inner(part))]
+            hint = "fewer or smaller arrays and components"
+            self.numbers.mistakes.add("E216", part.place, what, hint=hint)
+
+    def _settled(self, bindings: Named[Binding], component: Component) -> Named[Value]:
+        """Return what named bindings come to, within the bounds of a component's parameters."""
+        found = []
+        for name, binding in bindings:
+            with self.numbers.mistakes:
+                found.append((name, value := settle(binding, self.numbers.number)))
+                if isinstance(parameter := component.parameter(name), Number):
+                    parameter.bounds.check(value, name, self.numbers.mistakes)
+        return tuple(found)
 
     def _tables(self, entry: PartEntry, nodes: Mapping[str, Node]) -> tuple[TimeTable, ...]:
         """Read the files of a part's quantities over time."""
@@ -143,26 +131,15 @@ class PartReader:
                     if (node := nodes.get(name)) is None:
                         raise fault("E201", entry.place, f"{entry.name} has no {name}", hint=hint)
                     reader = partial(read_time_table, name=name, unit=unit, named_at=node.place)
-                    found.append(self.files.read(text_of(node, name, hint), reader))
-        return tuple(table for table in found if table is not None)
-
-    def _shared(self, entry: PartEntry) -> bool:
-        """Return whether a part says that it is the copy of one object, which its component allows."""
-        if (node := entry.body.get("shared")) is None:
-            return False
-        if not (isinstance(node, Scalar) and node.plain and isinstance(node.value, bool)):
-            raise fault("E203", node.place, "shared", "true or false", form(node), "shared: true")
-        if node.value and not any(parameter.divided for parameter in entry.component.numbers):
-            what = f"{entry.name} can't be shared: nothing of a {entry.component.name} is divided"
-            raise fault("E210", node.place, what)
-        return node.value
+                    found.append(self.numbers.files.read(text_of(node, name, hint), reader))
+        return tuple(filter(None, found))
 
     def _groups_of(self, entry: PartEntry) -> tuple[str, ...]:
         """Return the groups whose peers have a part."""
-        node, name, groups = entry.body.get("at"), entry.name, ", ".join(self.counts)
+        node, name, counts = entry.body.get("at"), entry.name, self.numbers.counts
         if node is None:
-            return tuple(self.counts)
-        items = node.items if isinstance(node, Sequence) else (node,)
+            return tuple(counts)
+        items, groups = node.items if isinstance(node, Sequence) else (node,), ", ".join(counts)
         if entry.section == "links":
             parts = self.scope.parts.entries.values()
             user = next((part.name for part in parts if name in part.words), "coordination")
@@ -175,27 +152,53 @@ class PartReader:
         found = []
         for item in items:
             with self.numbers.mistakes:
-                group = text_of(item, "a group")
                 what = f"{name} is at {{}}, which is no group of peers"
-                found.append(among(group, self.counts, item.place, what))
+                found.append(among(text_of(item, "a group"), counts, item.place, what))
         return tuple(found)
 
 
+def _shared(entry: PartEntry) -> bool:
+    """Return whether a part says that it is the copy of one object, which its component allows."""
+    if (node := entry.body.get("shared")) is None:
+        return False
+    if not (isinstance(node, Scalar) and node.plain and isinstance(node.value, bool)):
+        raise fault("E203", node.place, "shared", "true or false", form(node), "shared: true")
+    if node.value and not any(parameter.divided for parameter in entry.component.numbers):
+        what = f"{entry.name} can't be shared: nothing of a {entry.component.name} is divided"
+        raise fault("E210", node.place, what)
+    return node.value
+
+
 def _inside(part: Part, inner: Inner, peers: int) -> Part:
-    """Return a part inside a part; its numbers are expressions over the outer one's."""
+    """Return a part inside a part; its numbers are expressions over the outer one's, in whole names."""
     entry, references = inner.entry, dict(part.references)
     tables = {table.name: table for table in part.tables}
+    numbers: dict[tuple[str, ...], Fraction] = {(name,): value.number for name, value in part.values}
+    numbers[PEERS] = Fraction(peers)
+
+    def whole(parts: tuple[str, ...]) -> tuple[str, ...]:
+        return parts if parts == PEERS else (*part.name.split("."), *parts)
+
+    def settled(bindings: Named[Binding]) -> Named[Value]:
+        found = []
+        for name, binding in bindings:
+            with suppress(ApcError, KeyError):  # what the outer part has no value for was reported there
+                value = settle(binding, numbers.__getitem__)
+                tree = value.expression and renamed(value.expression, whole)
+                found.append((name, replace(value, place=part.place, expression=tree)))
+        return tuple(found)
+
     return replace(
         part,
         name=f"{part.name}.{inner.name}",
         component=inner.component,
-        values=_settled_inside(part, entry.values, peers),
+        values=settled(entry.values),
         options=entry.options,
         references=tuple(
             (own, references.get(outer, "?")) for own, outer in entry.references if outer not in tables
         ),
         tables=tuple(replace(tables[outer], name=own) for own, outer in entry.references if outer in tables),
-        starts=_settled_inside(part, entry.starts, peers),
+        starts=settled(entry.starts),
         connections=tuple(
             (own, GROUND if other == GROUND else f"{part.name}.{other}", its)
             for own, other, its in entry.connections
@@ -204,32 +207,12 @@ def _inside(part: Part, inner: Inner, peers: int) -> Part:
     )
 
 
-def _settled_inside(part: Part, bindings: Collection[tuple[str, Binding]], peers: int) -> Named[Value]:
-    """Return what numbers in terms of an outer part come to, their expressions in whole names."""
-    values: dict[tuple[str, ...], Fraction] = {PEERS: Fraction(peers)}
-    values |= {(name,): value.number for name, value in part.values}
-
-    def whole(parts: tuple[str, ...]) -> tuple[str, ...]:
-        return parts if parts == PEERS else (*part.name.split("."), *parts)
-
-    found = []
-    for name, binding in bindings:
-        if all(own.parts in values for own in names(binding.expression or Name(PEERS))):
-            with Mistakes():
-                value = replace(settle(binding, values.__getitem__), place=part.place)
-                tree = value.expression
-                found.append(
-                    (name, value if tree is None else replace(value, expression=renamed(tree, whole)))
-                )
-    return tuple(found)
-
-
-def settable_names(parts: Collection[Part]) -> dict[str, list[tuple[str, Settable]]]:
-    """Return what a group can set: by the name a person writes, the whole names it stands for.
+def settable_names(parts: Iterable[Part]) -> dict[str, tuple[Settable, list[str]]]:
+    """Return what a group can set: by the name a person writes, what it is and its whole names.
 
     The name of an array stands for all its elements: `a[1].b[2]` is one of `a.b[2]`, `a[1].b` and `a.b`.
     """
-    found: dict[str, list[tuple[str, Settable]]] = {}
+    found: dict[str, tuple[Settable, list[str]]] = {}
     for part in parts:
         items: list[Settable] = [
             p for p in part.component.parameters if not isinstance(p, Reference) or p.role == "clock"
@@ -238,7 +221,7 @@ def settable_names(parts: Collection[Part]) -> dict[str, list[tuple[str, Settabl
         elements = product(
             *(dict.fromkeys((name, whole_and_index(name)[0])) for name in part.name.split("."))
         )
-        for name in map(".".join, elements):
-            for item in items:
-                found.setdefault(f"{name}.{item.name}", []).append((f"{part.name}.{item.name}", item))
+        for name, item in product(map(".".join, elements), items):
+            _, wholes = found.setdefault(f"{name}.{item.name}", (item, []))
+            wholes.append(f"{part.name}.{item.name}")
     return found

@@ -28,11 +28,10 @@ from apc.compiler.components.component import Number as Parameter
 from apc.compiler.components.parts import PartEntry
 from apc.compiler.errors import Place
 from apc.compiler.language.dimensions import DIMENSIONLESS
-from apc.compiler.language.expression import Call, Name, Number
+from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.recordings import read_trace
-from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.units import Unit
-from apc.compiler.language.values import Value
+from apc.compiler.language.values import AlreadyReportedError, Value
 from apc.compiler.scene.graphs import COMPLETE, SceneDelay, read_delays, read_graph
 from apc.compiler.scene.instances import Part
 from apc.compiler.scene.named_numbers import NamedNumbers
@@ -65,8 +64,11 @@ PROBABILITY = Parameter(
 )
 
 # What each word is where a link does not say it, and what it is about: on a link without, it says nothing.
-_DEFAULTS = {"distribution": "uniform", "reorder": "newest", "on_loss": "hold"}
-_ABOUT = {"distribution": ("jitter",), "reorder": ("jitter", "trace"), "on_loss": ("loss", "trace")}
+_WORDS = {
+    "distribution": ("uniform", ("jitter",)),
+    "reorder": ("newest", ("jitter", "trace")),
+    "on_loss": ("hold", ("loss", "trace")),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,8 +91,9 @@ class SceneChannel:
         """What it is, in words."""
         lines = []
         if self.loss:
-            p, r, one_minus_h, one_minus_k = (float(100 * value.number) for _, value in self.loss)
-            lines.append(f"loss: p {p:.6g} %, r {r:.6g} %, 1-h {one_minus_h:.6g} %, 1-k {one_minus_k:.6g} %")
+            four = zip(PROBABILITIES, self.loss, strict=True)
+            shares = (f"{key} {float(100 * value.number):.6g} %" for key, (_, value) in four)
+            lines.append(f"loss: {', '.join(shares)}")
         if self.jitter is not None:
             lines.append(f"jitter {float(1000 * self.jitter.number):.6g} ms, {self.distribution}")
         if self.trace is not None:
@@ -113,91 +116,69 @@ class SceneLink:
     place: Place
 
 
-def read_link(
-    part: Part, entry: PartEntry, counts: Mapping[str, int], numbers: NamedNumbers, files: NamedFiles
-) -> SceneLink | None:
+def read_link(part: Part, entry: PartEntry, numbers: NamedNumbers) -> SceneLink:
     """Read what a link's entry says beyond numbers and words.
 
     Parameters
     ----------
     part, entry
         The link as a part, and its entry.
-    counts
-        How many peers each group has.
     numbers
-        Reads delays and probabilities.
-    files
-        Reads tables and traces.
-
-    Returns
-    -------
-    None if its clock or delay is at fault, which was reported.
+        Reads delays, probabilities and files.
 
     Raises
     ------
     ApcError
-        E210 it is no link.
+        E210 it is no link; none if its clock or delay is at fault, which was reported.
     """
     component, clock, delay = part.component, part.reference("clock"), dict(part.values).get("delay")
     roles = {p.name: p.role for p in component.parameters if isinstance(p, Reference)}
-    nodes = {roles.get(key.text, key.text): node for key, node in entry.body.entries}
+    given = ((p.name, entry.body.get(p.name)) for p in component.parameters)
+    nodes = {roles.get(name, name): node for name, node in given if node is not None}
     graph, delays = COMPLETE, tuple[SceneDelay, ...]()
-    if "graph" in roles.values() and "graph" in nodes:
+    if "graph" in nodes:
         with numbers.mistakes:
-            graph = read_graph(nodes["graph"], counts, files)
-    if "delays" in roles.values() and "delays" in nodes:
+            graph = read_graph(nodes["graph"], numbers)
+    if "delays" in nodes:
         with numbers.mistakes:
-            delays = read_delays(nodes["delays"], counts, numbers)
+            delays = read_delays(nodes["delays"], numbers)
     told = f"{part.name} is a {component.name}, which is no link:"
     if "clock" not in roles.values() or component.parameter("delay") is None:
         raise fault("E210", part.place, f"{told} it has no clock and delay", hint="type: Link")
     # Of a link's component nothing may be declared that no link obeys.
-    idle = [name for name, _ in component.connectors]
-    idle += [
-        one.name for one in (*component.variables, *component.parameters) if one.name not in (*OBEYED, *roles)
-    ]
-    idle += [name for name, role in roles.items() if role == "link"]
+    obeyed = {*OBEYED, *(name for name, role in roles.items() if role != "link")}
+    declared = [one.name for one in (*component.variables, *component.parameters)]
+    idle = [name for name in (*dict(component.connectors), *declared) if name not in obeyed]
     idle += ["equations"] * bool(component.equations or component.inner)
     if idle:
         raise fault("E210", part.place, f"{told} a link has no {idle[0]}", hint="type: Link")
-    channel = _read_channel(part.name, nodes, dict(part.values), dict(part.options), numbers, files)
+    channel = _read_channel(part, nodes, numbers)
     if clock is None or delay is None:
-        return None
+        raise AlreadyReportedError
     return SceneLink(part.name, clock, delay, graph, delays, channel, part.place)
 
 
-def _read_channel(
-    link: str,
-    nodes: Mapping[str, Node],
-    values: Mapping[str, Value],
-    words: Mapping[str, str],
-    numbers: NamedNumbers,
-    files: NamedFiles,
-) -> SceneChannel | None:
+def _read_channel(part: Part, nodes: Mapping[str, Node], numbers: NamedNumbers) -> SceneChannel | None:
     """Read what makes a link unreliable; None when its entry says nothing of the kind.
 
     Parameters
     ----------
-    link
-        The link's name.
+    part
+        The link.
     nodes
         What its entry gives, by key, but its loss, trace and delays by their roles.
-    values, words
-        The link's numbers and words, given or by default.
     numbers
-        Reads probabilities.
-    files
-        Reads a trace.
+        Reads probabilities and a trace.
     """
-    mistakes = numbers.mistakes
-    given = {key for key in _EXAMPLES if key in nodes}
-    for word, about in _ABOUT.items():
+    link, mistakes, words = part.name, numbers.mistakes, dict(part.options)
+    given = _EXAMPLES.keys() & nodes
+    for word, (_, about) in _WORDS.items():
         if word in nodes and not given.intersection(about):
             what = f"{link} says {word} but has no {' or '.join(about)} that this would be about"
             mistakes.add("E262", nodes[word].place, what, hint=_EXAMPLES[about[0]])
     if not given:
         return None
-    loss: dict[str, Value] = {}
+    loss: Named[Value] = ()
     trace = None
     if "loss" in nodes:
         with mistakes:
@@ -206,42 +187,41 @@ def _read_channel(
         place = nodes["trace"].place
         for key in ("loss", "jitter", "delays"):
             if key in nodes:
-                told = (
-                    f"{link} has a trace, which says when every packet arrives: it can't have {key} as well"
-                )
-                mistakes.add("E262", nodes[key].place, told)
+                what = f"{link} has a trace, which says when every packet arrives: it can't have"
+                mistakes.add("E262", nodes[key].place, f"{what} {key} as well")
         with mistakes:
             text = text_of(nodes["trace"], "trace", _EXAMPLES["trace"])
-            trace = files.read(text, lambda path: read_trace(path, place))
-    jitter = values.get("jitter") if "jitter" in given else None
-    distribution, reorder, on_loss = (words.get(key, default) for key, default in _DEFAULTS.items())
+            trace = numbers.files.read(text, partial(read_trace, named_at=place))
+    jitter = dict(part.values).get("jitter") if "jitter" in given else None
+    distribution, reorder, on_loss = (words.get(word, default) for word, (default, _) in _WORDS.items())
     delays = None if trace is None else trace.delays
-    return SceneChannel(tuple(loss.items()), jitter, distribution, reorder, on_loss, delays)
+    return SceneChannel(loss, jitter, distribution, reorder, on_loss, delays)
 
 
-def _loss(link: str, node: Node, numbers: NamedNumbers) -> dict[str, Value]:
-    """Read a probability, or a mapping of netem's four; those not given are as netem has them."""
-    name = f"{link}.loss"
-    if not isinstance(node, MappingNode):
-        return _completed(name, name, {"p": _probability(node, "loss", numbers)})
-    body = Body(node, PROBABILITIES, f"the loss of {link}", numbers.mistakes)
-    read = {key: body.read(key, partial(_probability, numbers=numbers), None) for key in PROBABILITIES}
-    if "p" not in body.nodes:
-        raise fault("E201", node.place, f"the loss of {link} has no p", hint=LOSS_EXAMPLE)
-    known = {key: value for key, value in read.items() if value is not None}
-    return _completed(name, f"{name}.p", known) if "p" in known else {}
+def _loss(link: str, node: Node, numbers: NamedNumbers) -> Named[Value]:
+    """Read a probability, or a mapping of netem's four; return all by their whole names.
 
-
-def _completed(name: str, name_p: str, given: Mapping[str, Value]) -> dict[str, Value]:
-    """Return all four probabilities by their whole names."""
-    p = given["p"]
-    rest = Call("-", (Number(Fraction(1)), Name(tuple(name_p.split(".")))))
-    known = {
-        "r": Value(1 - p.number, DIMENSIONLESS, rest, p.place),
-        "1-h": Value(Fraction(1), DIMENSIONLESS, None, p.place),
-        "1-k": Value(Fraction(0), DIMENSIONLESS, None, p.place),
-    }
-    return {name_p: p} | {f"{name}.{key}": given.get(key, value) for key, value in known.items()}
+    Those that are not given are as netem has them, none is known without p.
+    """
+    name = name_p = f"{link}.loss"
+    given: dict[str, Value | None] = {}
+    if isinstance(node, MappingNode):
+        name_p += ".p"
+        body = Body(node, PROBABILITIES, f"the loss of {link}", numbers.mistakes)
+        given = {key: body.read(key, partial(_probability, numbers=numbers), None) for key in PROBABILITIES}
+        if "p" not in body.nodes:
+            raise fault("E201", node.place, f"the loss of {link} has no p", hint=LOSS_EXAMPLE)
+    else:
+        given["p"] = _probability(node, "loss", numbers)
+    if (p := given["p"]) is None:
+        return ()
+    rest = parse_expression(f"1 - {name_p}", p.place)
+    usual = {"r": (1 - p.number, rest), "1-h": (Fraction(1), None), "1-k": (Fraction(0), None)}
+    others = (
+        (f"{name}.{key}", given.get(key) or Value(number, DIMENSIONLESS, expression, p.place))
+        for key, (number, expression) in usual.items()
+    )
+    return ((name_p, p), *others)
 
 
 def _probability(node: Node, what: str, numbers: NamedNumbers) -> Value:

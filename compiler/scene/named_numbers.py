@@ -1,7 +1,7 @@
 """The named numbers of a topology, and reading numbers that may be expressions over them.
 
-Takes: the section `parameters` and the number of peers.
-Gives: `NamedNumbers`, `read_named_numbers`, `read_count_by_names`.
+Takes: the section `parameters`, the groups' counts and the topology's files.
+Gives: `NamedNumbers`, which all sections read by, `read_named_numbers`, `read_count_by_names`.
 Guarantees: a number read has the dimension it must have; what depends on a name whose fault was reported adds
 no message of its own.
 Does not: know what a number is for, but for the bounds of a component's parameter.
@@ -13,11 +13,13 @@ import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from pathlib import Path
 
-from apc.compiler.components.component import RESERVED, Component, Named, Number, Settable, Variable
+from apc.compiler.components.component import RESERVED, Number, Settable, Variable
 from apc.compiler.errors import Mistakes
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import names
+from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.values import (
     PEERS,
     AlreadyReportedError,
@@ -34,16 +36,27 @@ from apc.compiler.source.reading import Body, brief, fault, name_of
 _WORD = re.compile(r"[A-Za-z]\w*", re.ASCII)
 
 
-def read_named_numbers(root: Body, peers: int, mistakes: Mistakes) -> NamedNumbers:
-    """Read `parameters: {kt: 2000 N/m}`; `peers` is the number that the name `peers` stands for."""
+def read_named_numbers(root: Body, counts: Mapping[str, int], files: NamedFiles) -> NamedNumbers:
+    """Read `parameters: {kt: 2000 N/m}`.
+
+    Parameters
+    ----------
+    root
+        The topology.
+    counts
+        How many peers each group has; the name `peers` stands for their sum.
+    files
+        Reads the topology's files, and takes mistakes.
+    """
     waiting: dict[str, Binding] = {}
     section = root.section("parameters", "{kt: 2000 N/m}")
     for key, value in section:
-        with mistakes:
+        with files.mistakes:
             name = name_of(key, "a parameter", words=RESERVED)
             waiting[name] = read_free(value, name)
-    values = resolve_in_order(waiting, peers, mistakes)
-    return NamedNumbers(values, frozenset(key.text for key, _ in section) - values.keys(), peers, mistakes)
+    values = resolve_in_order(waiting, sum(counts.values()), files.mistakes)
+    faulty = {key.text for key, _ in section} - values.keys()
+    return NamedNumbers(values, faulty, counts, files)
 
 
 def read_count_by_names(node: Scalar, root: Body) -> Value:
@@ -61,35 +74,46 @@ def read_count_by_names(node: Scalar, root: Body) -> Value:
     ApcError
         E208 what the count names that isn't there, or what follows from the number of peers.
     """
-    numbers = read_named_numbers(root, 1, Mistakes())
-    known = {"peers", *numbers.values, *numbers.faulty}
+    numbers = read_named_numbers(root, {"": 1}, NamedFiles(Path(), Mistakes()))
+    known = {*numbers.names, *numbers.faulty}
     if unknown := [word for word in _WORD.findall(node.text) if word not in known]:
         expected = "a whole number, or an expression over numbers of parameters"
         raise fault("E208", node.place, "count", expected, brief(unknown[0]), "count: 3")
     count = numbers.read(node, "count", DIMENSIONLESS, "1")
-    waiting, seen = [count.expression], set()
+    used, waiting = set[tuple[str, ...]](), [count]
     while waiting:
-        for name in names(tree) if (tree := waiting.pop()) is not None else ():
-            if name.parts == PEERS:
+        if (tree := waiting.pop().expression) is not None:
+            new = {name.parts for name in names(tree)} - used
+            if PEERS in new:
                 what = f"{brief(node.text)} depends on peers, which it is a part of"
                 raise fault("E208", node.place, what, hint="count: 3")
-            if name.parts not in seen:
-                seen.add(name.parts)
-                waiting.append(numbers.values[".".join(name.parts)].expression)
+            used |= new
+            waiting += (numbers.values[".".join(parts)] for parts in new)
     return count
 
 
 @dataclass(frozen=True, slots=True)
 class NamedNumbers:
-    """What an expression of the topology may name: `values`, and the number of `peers`.
+    """What an expression of the topology may name: `values`, and the number of peers.
 
-    `faulty` are names without a value, each of which was reported; `mistakes` takes numbers out of bounds.
+    `faulty` are names without a value, each of which was reported; `counts` the groups and how many peers
+    each has; `files` reads files that are named, and takes mistakes.
     """
 
     values: Mapping[str, Value]
-    faulty: frozenset[str]
-    peers: int
-    mistakes: Mistakes
+    faulty: Collection[str]
+    counts: Mapping[str, int]
+    files: NamedFiles
+
+    @property
+    def mistakes(self) -> Mistakes:
+        """Where faults go."""
+        return self.files.mistakes
+
+    @property
+    def peers(self) -> int:
+        """The number of all peers."""
+        return sum(self.counts.values())
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -167,14 +191,3 @@ class NamedNumbers:
         if isinstance(item, Number):
             item.bounds.check(value, what, self.mistakes)
         return value
-
-    def settled(self, bindings: Collection[tuple[str, Binding]], component: Component) -> Named[Value]:
-        """Return what named bindings come to, within the bounds of a component's parameters."""
-        found = []
-        for name, binding in bindings:
-            with self.mistakes:
-                found.append((name, settle(binding, self.number)))
-        for name, value in found:
-            if isinstance(parameter := component.parameter(name), Number):
-                parameter.bounds.check(value, name, self.mistakes)
-        return tuple(found)

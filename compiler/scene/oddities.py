@@ -8,17 +8,18 @@ Does not: look into equations, or decide what was meant.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 
-from apc.compiler.components.parts import GROUND, PartEntry
-from apc.compiler.errors import Mistake, Place
+from scipy.cluster.hierarchy import DisjointSet
+
+from apc.compiler.components.parts import PartEntry
+from apc.compiler.errors import Mistake, Mistakes
+from apc.compiler.scene.groups import SceneGroup
 from apc.compiler.scene.instances import Part
 
 
 def oddities(
-    parts: Sequence[Part],
-    entries: Mapping[str, PartEntry],
-    counts: Mapping[str, int],
-    set_by_groups: Collection[str],
+    parts: Sequence[Part], entries: Mapping[str, PartEntry], groups: Iterable[SceneGroup]
 ) -> tuple[Mistake, ...]:
     """Return the warnings about a scene, in the order of its file.
 
@@ -28,33 +29,32 @@ def oddities(
         The parts of a peer, links too, those inside parts among them.
     entries
         The entries of the topology.
-    counts
-        The groups, and how many peers each has.
-    set_by_groups
-        The whole names of what groups set for themselves.
+    groups
+        The groups of peers.
     """
     used = {word for part in parts for _, word in part.references}
-    found = [
-        Mistake("W271", entry.place, f"nobody uses the link {name}")
-        for name, entry in entries.items()
-        if entry.section == "links" and name not in used
-    ]
+    warnings = Mistakes()
+    for name, entry in entries.items():
+        if entry.section == "links" and name not in used:
+            warnings.add("W271", entry.place, f"nobody uses the link {name}")
     outer = [part for part in parts if part.name.partition("[")[0] in entries and "." not in part.name]
+    counts = {group.name: group.count for group in groups}
     joined = {group: _joined([part for part in outer if group in part.groups]) for group in counts}
     hearing = {part.name: part for part in outer if part.component.hears_others}
     masses = [part for part in outer if part.section == "masses"]
+    given = {name for group in groups for name, _ in (*group.values, *group.words, *group.columns)}
     for part in masses:
-        alone = [group for group in part.groups if len(joined[group][part.name]) == 1]
+        near = {group: joined[group].subset(part.name) for group in part.groups}
+        alone = [group for group, names in near.items() if len(names) == 1]
         if alone and part.component.connectors and not part.connections:
-            where = "" if len(alone) == len(part.groups) else f" of {' and '.join(alone)}"
+            where = "" if len(alone) == len(near) else f" of {' and '.join(alone)}"
             what = f"{part.name}{where} is joined to nothing: no coupler, no hand and no other mass"
-            found.append(Mistake("W272", part.place, what))
-        near = {name for group in part.groups for name in joined[group][part.name]}
-        if sum(counts[group] for group in part.groups) < 2:
+            warnings.add("W272", part.place, what)
+        anywhere = {name for names in near.values() for name in names}
+        if sum(counts[group] for group in near) < 2:
             continue
-        if part.shared and not near & hearing.keys():
-            what = f"{part.name} is shared, and nothing couples its copies"
-            found.append(Mistake("W273", part.place, what))
+        if part.shared and not anywhere & hearing.keys():
+            warnings.add("W273", part.place, f"{part.name} is shared, and nothing couples its copies")
         # A mass is taken for a copy if a coupler follows the others by it alone, the same in all groups, and
         # something else of the peer moves it too.
         followed = [
@@ -63,31 +63,29 @@ def oddities(
         divided = [number.name for number in part.component.numbers if number.divided]
         own = {f"{part.name}.{name}" for name in divided}
         own |= {f"{one.name}.{name}" for one in followed for name, _ in one.options}
-        touched = any(one is not part and one.name in near for one in masses)
+        touched = any(one is not part and one.name in anywhere for one in masses)
         said = entries[part.name.partition("[")[0]].body.get("shared") is not None
-        if not said and followed and divided and touched and own.isdisjoint(set_by_groups):
+        if not said and followed and divided and touched and own.isdisjoint(given):
             follows = f"{part.name} follows the other peers' by {followed[0].name} and is not shared"
-            hint = "shared: true, or shared: false where each is a mass of its own"
             what = f"{follows}: its {divided[0]} counts once a peer"
-            found.append(Mistake("W274", part.place, what, hint=hint))
-    return tuple(sorted(dict.fromkeys(found), key=lambda one: (one.place, one.code)))
+            hint = "shared: true, or shared: false where each is a mass of its own"
+            warnings.add("W274", part.place, what, hint=hint)
+    return warnings.found
 
 
-def _joined(parts: Iterable[Part]) -> dict[str, set[str]]:
-    """Return what is joined to each part of one group, directly or by others; the ground joins nothing."""
-    found = {part.name: {part.name} for part in parts}
+def _joined(parts: Sequence[Part]) -> DisjointSet:
+    """Return the parts of one group as sets of what is joined, directly or not; the ground joins nothing."""
+    found = DisjointSet(part.name for part in parts)
     for part in parts:
         for _, other, _ in part.connections:
-            if other != GROUND and other in found:
-                found[part.name] |= found[other]
-                found |= dict.fromkeys(found[part.name], found[part.name])
+            if other in found:
+                found.merge(part.name, other)
     return found
 
 
 def warning_texts(warnings: Collection[Mistake]) -> tuple[str, ...]:
     """Return warnings as texts, each with its place in the topology, whose folder is left out."""
     return tuple(
-        f"{Place(one.place.file.rpartition('/')[2], one.place.line, one.place.column)}: "
-        f"{one.code} {one.sentence}"
+        f"{replace(one.place, file=one.place.file.rpartition('/')[2])}: {one.code} {one.sentence}"
         for one in warnings
     )

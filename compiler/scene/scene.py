@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from apc.compiler.cache import SUFFIX
 from apc.compiler.compiled import Axis, Experiment
-from apc.compiler.components.component import Named, Settable
+from apc.compiler.components.component import Named
 from apc.compiler.components.library import Library, definition_of
 from apc.compiler.components.parts import Parts, Scope
 from apc.compiler.errors import Mistake, Mistakes, Place, visible
@@ -74,7 +74,7 @@ class Scene:
     region: tuple[Axis, ...]
     texts: tuple[str, ...]
     place: Place
-    warnings: tuple[Mistake, ...] = ()
+    warnings: tuple[Mistake, ...]
 
     @property
     def peers(self) -> int:
@@ -132,7 +132,7 @@ def build_scene(source: Source, library: Library) -> Scene:
     bodies = read_counts(root, files)
     counts = {name: group.count for name, group in bodies.items()}
     mistakes.names = tuple(counts)
-    numbers = read_named_numbers(root, sum(counts.values()), mistakes)
+    numbers = read_named_numbers(root, counts, files)
     clocks = read_clocks(root, numbers, {*numbers.values, *counts})
     sections = Parts(library, mistakes, {*numbers.values, *counts, *clocks})
     for section in SECTIONS:
@@ -140,41 +140,43 @@ def build_scene(source: Source, library: Library) -> Scene:
     names = _Names(root, sections, clocks, tuple(counts))
     entries = sections.entries
     scope = Scope(numbers.dimension, numbers.names, names.of_role, sections, "this topology", names.complete)
-    reader = PartReader(scope, numbers, counts, files)
-    parts = [part for entry in entries.values() for part in reader.read(entry)]
-    links: list[SceneLink | None] = []
+    reader = PartReader(scope, numbers)
+    for entry in entries.values():
+        reader.read(entry)
+    parts = reader.parts
+    links: list[SceneLink] = []
     for part in parts:
         if part.section == "links" and "." not in part.name:
             with mistakes:
-                links.append(read_link(part, entries[part.name], counts, numbers, files))
-    read_links = tuple(link for link in links if link is not None)
-    settable = settable_names(parts)
-    of_groups = {name: items for name, items in settable.items() if not names.is_of_link(name)}
-    group_reader = GroupReader(of_groups, parts, clocks, numbers, names.explain)
+                links.append(read_link(part, entries[part.name], numbers))
+    others = tuple(part for part in parts if part.section != "links")
+    group_reader = GroupReader(settable_names(others), others, clocks, numbers, names.explain)
     groups = tuple(group_reader.read(group) for group in bodies.values())
-    # What a link loses by can vary where it follows from no other number.
-    losses: dict[str, list[tuple[str, Settable]]] = {
-        name: [(name, PROBABILITY)]
-        for link in read_links
-        for name, value in (link.channel.loss if link.channel is not None else ())
-        if value.expression is None
-    }
-    set_by_groups = {name for group in groups for name, _ in (*group.values, *group.words, *group.columns)}
-    scene = Scene(
-        visible(root.text("topology")),
-        visible(root.text("about")),
+    settable = settable_names(parts)
+    for link in links:  # what one loses by can vary where it follows from no other number
+        for name, value in link.channel.loss if link.channel is not None else ():
+            if value.expression is None:
+                settable[name] = PROBABILITY, [name]
+    experiment, region = (
+        read_experiment(root, numbers),
+        read_region(root, settable, numbers, names.is_reported),
+    )
+    name, about = (visible(root.text(key)) for key in ("topology", "about"))
+    mistakes.raise_if_any()  # before warnings, which would tell a second time what is missing for a mistake
+    return Scene(
+        name,
+        about,
         tuple(clocks.values()),
         tuple(numbers.values.items()),
         groups,
-        tuple(part for part in parts if part.section != "links"),
-        read_links,
-        read_experiment(root, numbers),
-        read_region(root, settable | losses, numbers, names.is_reported),
+        others,
+        tuple(links),
+        experiment,
+        region,
         tuple(sorted(files.names)),
         root.place,
+        oddities(parts, entries, groups),
     )
-    mistakes.raise_if_any()  # before warnings, which would tell a second time what is missing for a mistake
-    return replace(scene, warnings=oddities(parts, entries, counts, set_by_groups))
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,18 +194,22 @@ class _Names:
         nodes = self.root.nodes
         return "masses" in nodes and all(isinstance(nodes.get(key), Mapping | None) for key in SECTIONS)
 
+    @property
+    def links(self) -> list[str]:
+        """The names of the links."""
+        return [name for name, entry in self.sections.entries.items() if entry.section == "links"]
+
     def of_role(self, role: str, word: str) -> Collection[str]:
         """Return the clocks or links, unused ones first. Raises what is wrong with their section."""
         section = f"{role}s"
-        node, entries = self.root.nodes.get(section), self.sections.entries
+        node = self.root.nodes.get(section)
         if word and node is None:
             example = "clocks: {haptic: 1 ms}" if role == "clock" else "links: {lan: {clock: network}}"
             raise fault("E201", self.root.place, f"the topology has no {section} section", hint=example)
-        links = [name for name, entry in entries.items() if entry.section == "links"]
-        known = self.clocks if role == "clock" else links
+        known = self.clocks if role == "clock" else self.links
         if word and word not in known and not (isinstance(node, Mapping) and node.get(word) is None):
             raise AlreadyReportedError
-        said = set[str]().union(*(entry.words for entry in entries.values())) if not word else set()
+        said = () if word else {one for entry in self.sections.entries.values() for one in entry.words}
         return sorted(known, key=lambda name: name in said)
 
     def is_reported(self, name: str) -> bool:
@@ -211,15 +217,10 @@ class _Names:
         part = re.split(r"[.\[]", name)[0]
         return part in self.sections.faulty or (not self.complete and part not in self.sections.entries)
 
-    def is_of_link(self, name: str) -> bool:
-        """Return whether `part.parameter` is of a link."""
-        entry = self.sections.entries.get(name.partition(".")[0])
-        return entry is not None and entry.section == "links"
-
     def explain(self, name: str, place: Place) -> None:
         """Raise why a group can't set `part.parameter`, if that is known or was reported."""
-        if self.is_of_link(name):
-            link, _, parameter = name.partition(".")
+        link, _, parameter = name.partition(".")
+        if link in self.links:
             example = f"{link}: {{delays: {{{self.groups[0]}: {{{self.groups[-1]}: 12 ms}}}}}}"
             what = f"{name} is of a link, the same for all peers: a group can't set it"
             raise fault("E211", place, what, hint=example if parameter == "delay" else "")

@@ -72,7 +72,7 @@ def read_region(
         name, span = body.entries[0]
         if not (isinstance(span, Sequence) and len(span.items) == 2):
             raise fault("E203", span.place, name.text, "a list of two values", form(span), hint)
-        known = {known: items[0][1] for known, items in settable.items() if isinstance(items[0][1], Number)}
+        known = {known: item for known, (item, _) in settable.items() if isinstance(item, Number)}
         if name.text not in known:
             if is_reported(name.text):
                 raise AlreadyReportedError

@@ -7,11 +7,13 @@ Does not: know what ticks with a clock (see `clocks`).
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Container
 from dataclasses import dataclass
 from fractions import Fraction
 
 from apc.compiler.components.component import RESERVED
+from apc.compiler.digits import plain_float
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.values import AlreadyReportedError, Value
 from apc.compiler.scene.named_numbers import NamedNumbers
@@ -59,13 +61,16 @@ def _read_clock(name: str, node: Node, numbers: NamedNumbers, root: Body) -> Sce
         if "period" not in body.nodes:
             raise fault("E201", node.place, f"clock {name} has no period", hint="period: 1 ms")
         given = body.read("period", numbers.read_time, None)
-        shift = body.read("phase", numbers.read_time, phase if "phase" not in body.nodes else None)
+        shift = body.read("phase", numbers.read_time, None if "phase" in body.nodes else phase)
         if given is None or shift is None:
             raise AlreadyReportedError
         period, phase = given, shift
     elif isinstance(node, Scalar) and type(node.value) in (int, float) and node.plain:
-        rates = f"{name}: {node.text} Hz", f"{name}: {node.text} ms"
-        hint = ", or ".join(rates if abs(float(node.text)) > LIKE_A_RATE else reversed(rates))
+        hint = f"{name}: 1 ms"
+        with contextlib.suppress(ValueError):  # YAML's other ways to write a number are no rate's
+            if (size := plain_float(node.text)) > 0:
+                rates = f"{name}: {node.text} Hz", f"{name}: {node.text} ms"
+                hint = ", or ".join(rates if size > LIKE_A_RATE else reversed(rates))
         raise fault("E204", node.place, name, "a time or a rate", f"{brief(node.text)} (no unit)", hint)
     else:
         period = numbers.read_time(node, name)

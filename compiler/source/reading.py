@@ -161,6 +161,14 @@ class Body:
         """Return the entries of the mapping that a key has; `hint` is what to write instead of another."""
         return self.read(key, lambda node, _: mapping_of(node, key, f"{key}: {hint}").entries, ())
 
+    def each(self, key: str, hint: str, reader: Callable[[Scalar, Node], T]) -> list[T]:
+        """Return what a reader makes of the entries of a section, each its key and value."""
+        found = []
+        for name, node in self.section(key, hint):
+            with self.mistakes:
+                found.append(reader(name, node))
+        return found
+
 
 def unknown(code: str, place: Place, what: str, name: str, known: Collection[str]) -> ApcError:
     """Return the mistake of an unknown name, with the nearest known one or, failing that, a list of them.

@@ -23,33 +23,33 @@ from apc.compiler.language.vectors import by_vector
 from apc.compiler.pipeline import run_stages
 from apc.compiler.scene.scene import Scene
 from apc.compiler.source.nodes import Mapping, Scalar
-from apc.compiler.source.source import read_source
+from apc.compiler.source.source import Source, read_source
 from apc.compiler.view.schema import in_unit, is_required, limits_of
 from apc.compiler.words import WIDTH, beside, wrapped
 
 TEMPLATE = "template"  # the scene that `apc new` writes where no other is asked for
 
 
-def _line(name: str, width: int, about: str) -> str:
-    """Return a name and what it is, cut to one line."""
-    line = f"  {name:<{width}}  {about}"
-    return line if len(line) <= WIDTH else f"{line[: WIDTH - 1].rstrip()}…"
-
-
 def library_lines() -> Iterator[str]:
     """Yield the components and connectors of the library, a line each, by folder."""
     for room, rows in library_document().items():
         yield room
-        width = max(len(row["name"]) for row in rows)
-        yield from (_line(row["name"], width, row["about"]) for row in rows)
-        yield ""
+        yield from _lines({row["name"]: row["about"] for row in rows})
     yield "apc library NAME shows one: its parameters with units and limits, its equations."
+
+
+def _lines(abouts: dict[str, str]) -> Iterator[str]:
+    """Yield names and what they are, each cut to one line, and an empty line."""
+    width = max(map(len, abouts))
+    for name, about in abouts.items():
+        line = f"  {name:<{width}}  {about}"
+        yield line if len(line) <= WIDTH else f"{line[: WIDTH - 1].rstrip()}…"
+    yield ""
 
 
 def library_document() -> dict[str, Any]:
     """Return the same as plain data, what each is about in full."""
-    library = Library()
-    rooms: dict[str, list[dict[str, str]]] = {}
+    library, rooms = Library(), dict[str, list[dict[str, str]]]()
     for name, path in builtin_files().items():
         row = {"name": name, "about": _found(library, name).about}
         rooms.setdefault(path.parent.name, []).append(row)
@@ -58,10 +58,9 @@ def library_document() -> dict[str, Any]:
 
 def _found(library: Library, name: str) -> Component | Connector:
     """Return a component or connector. Raises ApcError (E206) where the library has none of that name."""
-    found = library.component(name) or library.connector(name)
-    if found is None:
-        near = nearest(name.lower(), {one.lower(): one for one in library.names})
-        near = next((one for one in library.names if one.lower() == near), "")
+    if (found := library.component(name) or library.connector(name)) is None:
+        names = {one.lower(): one for one in library.names}
+        near = names.get(nearest(name.lower(), names), "")
         what = f"the library has no {name[:80] or 'nameless component'}"
         raise ApcError(Mistake("E206", Place("apc library"), what, hint=f"apc library {near}".rstrip()))
     return found
@@ -79,14 +78,13 @@ def component_text(name: str) -> str:
     lines = [name, *wrapped(facts["about"], "  ", "  ")]
     lines += wrapped(f"Source: {facts['source']}", "  ", "    ") if facts["source"] else []
     lines += [f"  File: {facts['file']}", ""]
-    rows = [tuple(one[key] for key in ("name", "unit", "value", "limits")) for one in facts["parameters"]]
-    if rows:
-        rows = [("parameter", "unit", "if not given", "limits"), *rows]
-        widths = [max(len(row[column]) for row in rows) for column in range(4)]
-        abouts = ["", *(one["about"] for one in facts["parameters"])]
-        for row, about in zip(rows, abouts, strict=True):
-            told = "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True))
-            lines += beside(f"  {told}", about)
+    if parameters := facts["parameters"]:
+        titles = {"name": "parameter", "unit": "unit", "value": "if not given", "limits": "limits"}
+        rows = [titles | {"about": ""}, *parameters]
+        widths = {key: max(len(row[key]) for row in rows) for key in titles}
+        for row in rows:
+            cells = "  ".join(f"{row[key]:<{width}}" for key, width in widths.items())
+            lines += beside(f"  {cells}", row["about"])
         lines.append("")
     for title, text in facts["definitions"].items():
         lines += [f"{title} as it is written:", "", *(f"  {line}" for line in text.splitlines()), ""]
@@ -96,45 +94,36 @@ def component_text(name: str) -> str:
 def component_document(name: str) -> dict[str, Any]:
     """Return a component of the library, or a connector, as plain data: see `component_text`."""
     found = _found(Library(), name)
-    facts = {
-        "name": found.name,
-        "kind": "connector",
-        "about": found.about,
-        "source": "",
-        "file": str(builtin_files()[name]),
-        "connectors": {},
-        "parameters": [],
-        "equations": [],
-        "definitions": _definitions(name),
-    }
-    if isinstance(found, Connector):
-        return facts
-    vectors = by_vector(found.parameters, lambda parameter: parameter.name)
+    kind, whole = "component", found
+    if isinstance(whole, Connector):  # it has no parts of its own to tell of
+        kind, whole = "connector", Component(name, found.about, "", Place(""))
+    vectors = by_vector(whole.parameters)
     return {
-        **facts,
-        "kind": "component",
-        "source": found.source,
-        "connectors": {own: kind.name for own, kind in found.connectors},
+        "name": name,
+        "kind": kind,
+        "about": whole.about,
+        "source": whole.source,
+        "file": str(builtin_files()[name]),
+        "connectors": {own: its.name for own, its in whole.connectors},
         "parameters": [_parameter(own, entries) for own, entries in vectors.items()],
-        "equations": list(dict.fromkeys(one.text for one in found.equations)),
+        "equations": [*dict.fromkeys(one.text for one in whole.equations)],
+        "definitions": _definitions(name),
     }
 
 
 def _parameter(name: str, entries: list[Parameter]) -> dict[str, str]:
     """Return what a person reads of a parameter, or of the entries of a vector."""
-    one = entries[0]
-    facts = {"name": name, "unit": "", "value": "needed" if is_required(one) else "", "limits": ""}
-    facts["about"] = one.about
+    one, unit, value, limits = entries[0], "", "needed" if is_required(entries[0]) else "", ""
     if isinstance(one, Option):
-        return {**facts, "value": one.default or "needed", "limits": ", ".join(one.words)}
-    if not isinstance(one, Number):
-        return {**facts, "limits": f"a {one.role}"}
-    shown = [
-        in_unit(one, each.default) for each in entries if isinstance(each, Number) and not is_required(each)
-    ]
-    value = f"[{', '.join(shown)}]" if len(shown) > 1 else (shown or ["needed"])[0]
-    limits = ", ".join([*limits_of(one), *(word for word, _ in one.words)])
-    return {**facts, "unit": one.unit.text, "value": value, "limits": limits}
+        value, limits = one.default or "needed", ", ".join(one.words)
+    elif not isinstance(one, Number):
+        limits = f"a {one.role}"
+    else:
+        unit, limits = one.unit.text, ", ".join([*limits_of(one), *(word for word, _ in one.words)])
+        if not value:
+            first, *more = (in_unit(one, getattr(each, "default", None)) for each in entries)
+            value = f"[{', '.join((first, *more))}]" if more else first
+    return {"name": name, "unit": unit, "value": value, "limits": limits, "about": one.about}
 
 
 def _definitions(name: str) -> dict[str, str]:
@@ -142,10 +131,14 @@ def _definitions(name: str) -> dict[str, str]:
     texts: dict[str, str] = {}
     while name:
         source = read_source(builtin_files()[name])
-        texts[name] = source.text.rstrip()
-        base = source.root.get("extends") if isinstance(source.root, Mapping) else None
-        name = base.text if isinstance(base, Scalar) else ""
+        texts[name], name = source.text.rstrip(), _text(source, "extends")
     return texts
+
+
+def _text(source: Source, key: str) -> str:
+    """Return the text of a key of a file, empty without one."""
+    node = source.root.get(key) if isinstance(source.root, Mapping) else None
+    return node.text if isinstance(node, Scalar) else ""
 
 
 # ---- scenes ----
@@ -159,13 +152,7 @@ def scenes() -> dict[str, Path]:
 
 def scene_lines() -> Iterator[str]:
     """Yield the topologies that come with the program, a line each."""
-    known = scenes()
-    width = max(map(len, known))
-    for name, path in known.items():
-        root = read_source(path).root
-        about = root.get("about") if isinstance(root, Mapping) else None
-        yield _line(name, width, about.text if isinstance(about, Scalar) else "")
-    yield ""
+    yield from _lines({name: _text(read_source(path), "about") for name, path in scenes().items()})
     yield "apc new --like NAME copies one to NAME.yaml."
 
 

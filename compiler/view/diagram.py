@@ -10,27 +10,27 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from html import escape
+from operator import itemgetter
 
-from apc.compiler.components.component import Number, Reference
+from apc.compiler.components.component import Number, Reference, Variable
 from apc.compiler.components.parts import DEFAULT_TYPES, GROUND
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.expression import format_expression
-from apc.compiler.language.unit_text import format_si
 from apc.compiler.language.values import Value
 from apc.compiler.language.vectors import by_vector, whole_and_index
 from apc.compiler.scene.instances import Part
 from apc.compiler.scene.links import SceneLink
 from apc.compiler.scene.scene import Scene
-from apc.compiler.words import counted
+from apc.compiler.words import counted, with_unit
 
 ROLES = {"masses": "mass", "couplers": "coupler", "hands": "hand"}
 LONGEST_ARRAY = 4  # with more elements an array is one box
 MOST_LINES = 7  # of numbers in one box
 MOST_GROUPS = 8  # that are drawn
-LONGEST_EXPRESSION = 24  # characters shown beside its value
+LONGEST_EXPRESSION = 27  # characters shown behind its value, with the sign between them
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,39 +77,33 @@ def build_diagram(scene: Scene) -> Diagram:
 
     for part in parts:
         if (name := shown(part.name)) not in boxes:
-            words = _words_of(part)
-            clock = next((word for role, word in words if role == "clock"), "")
-            lines = tuple(_part_lines(scene, part, sizes[name] if name != part.name else 1))
+            roles = {one.name: one.role for one in part.component.parameters if isinstance(one, Reference)}
+            named = [(roles[own], word) for own, word in part.references]
+            clock = next((word for role, word in named if role == "clock"), "")
+            lines = _part_lines(scene, part, sizes[name] if name != part.name else 1)
             boxes[name] = Box(name, ROLES[part.section], (name, *lines), clock)
-            heard = dict.fromkeys(word for role, word in words if role == "link")
+            heard = dict.fromkeys(word for role, word in named if role == "link")
             sent += [Edge(name, f"link {link}", sent=True) for link in heard]
     for part in parts:
         for _, other, _ in part.connections:
             one, two = shown(part.name), shown(other.partition(".")[0])
             if other == GROUND:
                 two = f"{GROUND} of {one}"  # each has its own: the ground joins nothing
-                boxes.setdefault(two, Box(two, GROUND, (GROUND,)))
+                boxes[two] = Box(two, GROUND, (GROUND,))
             elif (boxes[one].role == "mass") == (boxes[two].role == "mass"):
                 # Parts of one role are joined rigidly, at a point of its own: the graph has two sides.
                 middle = f"{one} and {two}"
-                boxes.setdefault(middle, Box(middle, "joint", (middle,)))
+                boxes[middle] = Box(middle, "joint", (middle,))
                 joined[Edge(middle, one, sent=False)] = None
                 one = middle
             joined[Edge(two, one, sent=False)] = None
-    links = [_link_box(link) for link in scene.links]
-    groups = _group_boxes(scene)
+    links, groups = [*map(_link_box, scene.links)], [*_group_boxes(scene)]
     sent += [Edge(link.key, group.key, sent=True) for link in links for group in groups]
     return Diagram(scene, (*boxes.values(), *links, *groups), (*joined, *sent))
 
 
 def _array(name: str) -> str:
     return name.partition("[")[0]
-
-
-def _words_of(part: Part) -> list[tuple[str, str]]:
-    """Return the clocks, links and so on that a part names, each with its role."""
-    roles = {one.name: one.role for one in part.component.parameters if isinstance(one, Reference)}
-    return [(roles.get(name, ""), word) for name, word in part.references]
 
 
 def _part_lines(scene: Scene, part: Part, count: int) -> Iterator[str]:
@@ -119,61 +113,55 @@ def _part_lines(scene: Scene, part: Part, count: int) -> Iterator[str]:
         yield f"{count} of them"
     if component.name != DEFAULT_TYPES.get(part.section):
         yield component.name
-    potentials = [name for _, connector in component.connectors for name in connector.potentials]
-    axes = max((whole_and_index(one.name)[1] for one in potentials), default=0)
-    if part.section == "masses" and axes > 1:
-        yield "in a plane" if axes == 2 else "in space"
+    axes = {whole_and_index(one.name)[1] for _, kind in component.connectors for one in kind.potentials}
+    if part.section == "masses" and 2 in axes:
+        yield "in space" if 3 in axes else "in a plane"
     if part.groups != tuple(group.name for group in scene.groups):
         yield f"only at {', '.join(part.groups)}"
     numbers = list(_numbers(scene, part))
-    yield from numbers if len(numbers) <= MOST_LINES else numbers[: MOST_LINES - 1]
     if len(numbers) > MOST_LINES:
-        yield f"… and {len(numbers) - MOST_LINES + 1} more"
+        numbers[MOST_LINES - 1 :] = [f"… and {len(numbers) - MOST_LINES + 1} more"]
+    yield from numbers
 
 
 def _numbers(scene: Scene, part: Part) -> Iterator[str]:
     """Yield a part's numbers, those that are zero left out, and its words that are no default."""
-    for name, entries in by_vector(part.values, lambda named: named[0]).items():
+    for name, entries in by_vector(part.values, itemgetter(0)).items():
         if any(value.number for _, value in entries):
             yield f"{name} {_quantities(part, entries)}"
         for own, value in entries:
-            parameter = part.component.parameter(own)
-            if part.shared and isinstance(parameter, Number) and parameter.divided:
-                each = Value(value.number / scene.peers, value.dimension, None, value.place)
+            if part.shared and getattr(part.component.parameter(own), "divided", False):
+                each = replace(value, number=value.number / scene.peers)
                 yield f"shared: {_quantity(part, own, each)} a copy"
-    for name, entries in by_vector(part.starts, lambda named: named[0]).items():
+    for name, entries in by_vector(part.starts, itemgetter(0)).items():
         yield f"{name} starts at {_quantities(part, entries)}"
     for own, word in part.options:
         if word != getattr(part.component.parameter(own), "default", None):
             yield f"{own} {word}"
-    for table in part.tables:
-        yield f"{table.name}: a table of {len(table.times)} rows"
+    yield from (f"{table.name}: a table of {len(table.times)} rows" for table in part.tables)
 
 
 def _quantities(part: Part, entries: list[tuple[str, Value]]) -> str:
     """Return a number with its unit and its expression, or the numbers of a vector's entries."""
-    shown = [_quantity(part, name, value) for name, value in entries]
-    return f"{shown[0]}{_expression(entries[0][1])}" if len(shown) == 1 else f"[{', '.join(shown)}]"
-
-
-def _expression(value: Value) -> str:
-    text = format_expression(value.expression) if value.expression else ""
-    return f" = {text}" if text and len(text) <= LONGEST_EXPRESSION else ""
+    first, *more = (_quantity(part, name, value) for name, value in entries)
+    if more:
+        return f"[{', '.join((first, *more))}]"
+    tree = entries[0][1].expression
+    text = "" if tree is None else f" = {format_expression(tree)}"
+    return first + text if len(text) <= LONGEST_EXPRESSION else first
 
 
 def _quantity(part: Part, name: str, value: Value) -> str:
-    """Return a number in the unit that its component declares."""
+    """Return a number in the unit that its component declares, or the word that stands for it."""
     declared = part.component.parameter(name) or part.component.variable(name)
+    assert isinstance(declared, Number | Variable)
     for word, number in declared.words if isinstance(declared, Number) else ():
         if number == value.number:
             return word
-    unit = getattr(declared, "unit", None)
     if value.dimension == SECOND:
         return seconds(value.number)
-    if unit is None:
-        return format_si(float(value.number), value.dimension)
-    text = "" if unit.text == "1" else f" {unit.text.replace('*', '·')}"
-    return f"{float(value.number / unit.scale):.6g}{text}"
+    unit = declared.unit
+    return with_unit(f"{float(value.number / unit.scale):.6g}", unit.text.replace("*", "·"))
 
 
 def seconds(number: Fraction) -> str:
@@ -182,16 +170,14 @@ def seconds(number: Fraction) -> str:
 
 
 def _link_box(link: SceneLink) -> Box:
-    delay = link.delay.number
+    delay, told = link.delay.number, () if link.channel is None else link.channel.told
     later = f"available {seconds(delay)} later" if delay else "available at once"
-    lines = [link.name, shape_of(link), f"a packet each tick of {link.clock}", later]
-    lines += [f"{d.sender} to {d.receiver}: {seconds(d.delay.number)} later" for d in link.delays]
-    lines += [] if link.channel is None else link.channel.told
-    return Box(f"link {link.name}", "link", tuple(lines), link.clock)
+    lines = (link.name, shape_of(link), f"a packet each tick of {link.clock}", later)
+    delays = (f"{d.sender} to {d.receiver}: {seconds(d.delay.number)} later" for d in link.delays)
+    return Box(f"link {link.name}", "link", (*lines, *delays, *told), link.clock)
 
 
-def _group_boxes(scene: Scene) -> list[Box]:
-    boxes = []
+def _group_boxes(scene: Scene) -> Iterator[Box]:
     for group in scene.groups[:MOST_GROUPS]:
         lines = []
         for name, value in group.values:
@@ -200,10 +186,9 @@ def _group_boxes(scene: Scene) -> list[Box]:
         lines += [f"{name} {word}" for name, word in group.words]
         lines += [f"{name} of its own for each peer" for name, _ in group.columns]
         title = f"{group.name}: {counted(group.count, 'peer', ',')}"
-        boxes.append(Box(f"group {group.name}", "group", (title, *lines[:MOST_LINES])))
-    if len(scene.groups) > MOST_GROUPS:
-        boxes.append(Box("groups", "group", (f"and {len(scene.groups) - MOST_GROUPS} more groups",)))
-    return boxes
+        yield Box(f"group {group.name}", "group", (title, *lines[:MOST_LINES]))
+    if (more := len(scene.groups) - MOST_GROUPS) > 0:
+        yield Box("groups", "group", (f"and {more} more groups",))
 
 
 def one_of(scene: Scene) -> str:

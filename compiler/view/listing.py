@@ -13,13 +13,14 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from apc.compiler.compiled import CompiledSystem, Kind
+from apc.compiler.compiled import CompiledSystem
 from apc.compiler.equations.clocks import ClockedKind
 from apc.compiler.equations.flatten import FlatKind
-from apc.compiler.equations.solution import ImplicitBlock
+from apc.compiler.equations.solution import Assignment, ImplicitBlock
 from apc.compiler.equations.structure import SortedKind
 from apc.compiler.equations.terms import text_of
 from apc.compiler.language.unit_text import format_dimension
@@ -39,15 +40,12 @@ def show_text(path: Path) -> str:
     scene: Scene = stages["scene"]
     lines = [scene.name, *wrapped(scene.about)]
     lines += ["", f"GRAPH of {one_of(scene)}", *_graph_lines(build_diagram(scene))]
-    lines += ["", "EQUATIONS", *_stage_lines(stages["flat"]), "", "COMPUTED", *_stage_lines(stages["sorted"])]
-    lines += ["", "SCHEDULE", *_schedule_lines(schedule(stages["compiled"]))]
-    return "\n".join(lines)
-
-
-def _stage_lines(value: object) -> Iterator[str]:
-    for line in describe(value).splitlines():
-        indent = " " * (2 + len(line) - len(line.lstrip()))
-        yield from wrapped(line, indent, indent + "    ")
+    for title, stage in (("EQUATIONS", "flat"), ("COMPUTED", "sorted")):
+        lines += ["", title]
+        for line in describe(stages[stage]).splitlines():
+            indent = " " * (2 + len(line) - len(line.lstrip()))
+            lines += wrapped(line, indent, indent + "    ")
+    return "\n".join([*lines, "", "SCHEDULE", *_schedule_lines(schedule(stages["compiled"]))])
 
 
 def show_document(path: Path) -> dict[str, Any]:
@@ -64,13 +62,8 @@ def show_document(path: Path) -> dict[str, Any]:
             "boxes": [asdict(box) for box in diagram.boxes],
             "edges": [asdict(edge) for edge in diagram.edges],
             "links": [
-                {
-                    "name": one.name,
-                    "clock": one.clock,
-                    "shape": shape_of(one),
-                    "arcs": one.graph.arcs.tolist(),
-                }
-                for one in scene.links
+                {"name": k.name, "clock": k.clock, "shape": shape_of(k), "arcs": k.graph.arcs.tolist()}
+                for k in scene.links
             ],
             "groups": [{"name": group.name, "count": group.count} for group in scene.groups],
         },
@@ -84,21 +77,31 @@ def _kind_document(flat: FlatKind, clocked: ClockedKind, ordered: SortedKind) ->
     """Return the equations of the peers of one structure, as they are written and as they are computed."""
     return {
         "name": flat.name,
-        "groups": list(flat.groups),
+        "groups": flat.groups,
         "unknowns": [{"name": v.name, "unit": format_dimension(v.dimension)} for v in flat.variables],
         "equations": [{"equation": e.text, "origin": e.origin} for e in flat.equations],
         "partitions": [
-            {"clock": p.clock, "variables": list(p.variables), "equations": [e.text for e in p.equations]}
+            {"clock": p.clock, "variables": p.variables, "equations": [e.text for e in p.equations]}
             for p in clocked.partitions
         ],
-        "states": list(ordered.states),
-        "aliases": [{"name": name, "is": text_of(value)} for name, value in ordered.aliases],
+        "states": ordered.states,
+        "aliases": _computed(ordered.aliases),
         "computed": [
-            {"clock": p.clock, "steps": [_step_document(step) for step in p.assignments]}
-            for p in ordered.partitions
+            {"clock": p.clock, "steps": [*map(_step_document, p.assignments)]} for p in ordered.partitions
         ],
         "sent": [{"name": s.name, "link": s.link, "is": text_of(s.expression)} for s in ordered.sends],
     }
+
+
+def _step_document(step: Assignment | ImplicitBlock) -> dict[str, Any]:
+    if not isinstance(step, ImplicitBlock):
+        return {"name": step[0], "is": str(step[1])}
+    inner, zero = _computed(step.inner), [str(residual) for residual in step.residuals]
+    return {"loop": step.unknowns, "guess": step.tearing, "inner": inner, "zero": zero}
+
+
+def _computed(values: Iterable[Assignment]) -> list[dict[str, str]]:
+    return [{"name": name, "is": text_of(value)} for name, value in values]
 
 
 def diagram_of(path: Path) -> Diagram:
@@ -114,21 +117,10 @@ def _graph_lines(diagram: Diagram) -> Iterator[str]:
     for box in diagram.boxes:
         ticks = [f"at each tick of {box.clock}"] if box.clock and box.role != "link" else []
         about = ", ".join((*box.lines[1:], *ticks))
-        yield from wrapped(f"{box.lines[0]}: {about}" if about else box.lines[0], "  ", "    ")
-        ends = [(edge.one, edge.two) for edge in diagram.edges if box.key in (edge.one, edge.two)]
-        if joined := [titles[two if one == box.key else one] for one, two in ends]:
-            yield from wrapped(f"joined to {', '.join(joined)}", "    ", "      ")
-
-
-def _step_document(step: Any) -> dict[str, Any]:
-    if not isinstance(step, ImplicitBlock):
-        return {"name": step[0], "is": str(step[1])}
-    return {
-        "loop": list(step.unknowns),
-        "guess": list(step.tearing),
-        "inner": [{"name": name, "is": text_of(value)} for name, value in step.inner],
-        "zero": [str(residual) for residual in step.residuals],
-    }
+        yield from wrapped(": ".join(filter(None, (box.lines[0], about))), "  ", "    ")
+        ends = ({edge.one, edge.two} for edge in diagram.edges)
+        joined = ", ".join(titles[other] for pair in ends if box.key in pair for other in pair - {box.key})
+        yield from wrapped(f"joined to {joined}" if joined else "", "    ", "      ")
 
 
 # ---- the schedule ----
@@ -151,7 +143,15 @@ def schedule(system: CompiledSystem) -> dict[str, Any]:
                 "period_s": float(periods[clock.name]),
                 "first_s": float(timings[clock.phase]),
                 "ticks": int(frame / periods[clock.name]) if frame is not None else 0,
-                "computes": _computed_at(system.kinds, clock.name),
+                "computes": [
+                    *dict.fromkeys(
+                        name
+                        for kind in system.kinds
+                        for one in kind.clocks
+                        if one.clock == clock.name
+                        for name in one.outputs
+                    )
+                ],
                 "sends": [link.name for link in system.links if link.clock == clock.name],
             }
             for clock in system.clocks
@@ -172,7 +172,15 @@ def schedule(system: CompiledSystem) -> dict[str, Any]:
                 "link": link.name,
                 "from": sender,
                 "to": receiver,
-                "sends": _sent_over(system.kinds, link.name),
+                "sends": [
+                    *dict.fromkeys(
+                        name
+                        for kind in system.kinds
+                        for one in kind.sends
+                        if one.link == link.name
+                        for name in one.channels
+                    )
+                ],
                 "period_s": float(periods[link.clock]),
                 "delay_s": float(timings[delay]),
                 "on_the_way": math.ceil(timings[delay] / periods[link.clock]),
@@ -199,33 +207,23 @@ def schedule(system: CompiledSystem) -> dict[str, Any]:
     }
 
 
-def _computed_at(kinds: Iterable[Kind], clock: str) -> list[str]:
-    outputs = (name for kind in kinds for part in kind.clocks if part.clock == clock for name in part.outputs)
-    return list(dict.fromkeys(outputs))
-
-
-def _sent_over(kinds: Iterable[Kind], link: str) -> list[str]:
-    channels = (name for kind in kinds for part in kind.sends if part.link == link for name in part.channels)
-    return list(dict.fromkeys(channels))
-
-
 def _schedule_lines(facts: dict[str, Any]) -> Iterator[str]:
     """Yield clocks, holds, links and receives, each with what is said of it; what is nothing is left out."""
-    if facts["frame_s"] is None:
+    frame, *tables = facts.values()
+    if frame is None:
         yield "  No clock ticks: everything is continuous."
         return
-    yield f"  frame of {seconds(Fraction(facts['frame_s']))}, after which every clock stands as before"
-    for row in (row for rows in facts.values() if isinstance(rows, list) for row in rows):
-        told = (
-            f"{key.removesuffix('_s').replace('_', ' ')} {_shown(key, row[key])}" for key in row if row[key]
-        )
-        yield from wrapped(", ".join(map(str.strip, told)), "  ", "    ")
+    yield f"  frame of {seconds(Fraction(frame))}, after which every clock stands as before"
+    for row in chain(*tables):
+        told = (_shown(key, value) for key, value in row.items() if value)
+        yield from wrapped(", ".join(told), "  ", "    ")
 
 
 def _shown(key: str, value: Any) -> str:
-    """Return a fact as text; one that holds needs no more than its name."""
+    """Return a fact as text, times with their unit; one that holds needs no more than its name."""
+    name, texts = key.removesuffix("_s").replace("_", " "), value if isinstance(value, list) else [value]
     if value is True:
-        return ""
-    if isinstance(value, list):
-        return " to ".join(map(seconds, map(Fraction, value))) if key.endswith("_s") else " and ".join(value)
-    return seconds(Fraction(value)) if key.endswith("_s") else str(value)
+        return name
+    if key.endswith("_s"):
+        return f"{name} {' to '.join(seconds(Fraction(one)) for one in texts)}"
+    return f"{name} {' and '.join(map(str, texts))}"

@@ -16,13 +16,21 @@ from typing import Any
 
 import yaml
 
-from apc.compiler.components.component import Component, Number, Option, Parameter, Reference
+from apc.compiler.components.component import (
+    Component,
+    Number,
+    Option,
+    Parameter,
+    Reference,
+    Settable,
+    Variable,
+)
 from apc.compiler.components.library import Library
 from apc.compiler.components.parts import PART_KEYS
 from apc.compiler.errors import Place
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.units import Unit, parse_unit
-from apc.compiler.language.vectors import whole_and_index
+from apc.compiler.language.vectors import by_vector, whole_and_index
 from apc.compiler.scene.scene import SECTIONS
 
 Schema = dict[str, Any]
@@ -105,19 +113,12 @@ def _part(component: Component, quantities: dict[str, Schema]) -> Schema:
     for name, connector in component.connectors:
         about = f"the part, or its connector, that this {connector.name} is joined to"
         properties[name] = {"$ref": "#/$defs/joined", "description": about}
-    entries: dict[str, list[Schema]] = {}
-    for parameter in component.parameters:
-        entries.setdefault(whole_and_index(parameter.name)[0], []).append(_parameter(parameter, quantities))
-    for variable in component.variables:
-        if variable.start is not None:
-            name, _ = whole_and_index(variable.name)
-            start = {"description": f"start value of the {variable.about or name}"}
-            entries.setdefault(name, []).append(_quantity(variable.unit, quantities) | start)
-    for name, schemas in entries.items():
+    starts = (variable for variable in component.variables if variable.start is not None)
+    for name, items in by_vector((*component.parameters, *starts)).items():
+        schemas = [_settable(name, one, quantities) for one in items]
         size, about = len(schemas), schemas[0].get("description", "")
-        vector: Schema = {"type": "array", "description": about, "prefixItems": schemas}
-        vector |= {"minItems": size, "maxItems": size}
-        properties[name] = schemas[0] if size == 1 else vector
+        vector = {"type": "array", "description": about, "prefixItems": schemas}
+        properties[name] = schemas[0] if size == 1 else vector | {"minItems": size, "maxItems": size}
     required = dict.fromkeys(whole_and_index(p.name)[0] for p in component.parameters if is_required(p))
     return {
         "description": component.about,
@@ -128,14 +129,17 @@ def _part(component: Component, quantities: dict[str, Schema]) -> Schema:
     }
 
 
-def _parameter(parameter: Parameter, quantities: dict[str, Schema]) -> Schema:
-    about = {"description": parameter.about} if parameter.about else {}
+def _settable(name: str, parameter: Settable, quantities: dict[str, Schema]) -> Schema:
+    """Return the schema of a parameter or a start value; `name` is that of the vector it is an entry of."""
+    if isinstance(parameter, Variable):
+        about = f"start value of the {parameter.about or name}"
+        return _quantity(parameter.unit, quantities) | {"description": about}
     if isinstance(parameter, Option):
-        default = {} if parameter.default is None else {"default": parameter.default}
-        return {"enum": list(parameter.words), **default, **about}
+        facts = {"enum": list(parameter.words), "default": parameter.default, "description": parameter.about}
+        return {key: fact for key, fact in facts.items() if fact}
     if isinstance(parameter, Reference):
         role = {"clock": "name"}.get(parameter.role, parameter.role)
-        return {"$ref": f"#/$defs/{role}", **(about or {"description": f"a {parameter.role}"})}
+        return {"$ref": f"#/$defs/{role}", "description": parameter.about or f"a {parameter.role}"}
     schema = _quantity(parameter.unit, quantities)
     if parameter.words:
         schema = {"anyOf": [{"enum": [word for word, _ in parameter.words]}, schema]}

@@ -46,7 +46,7 @@ def _degree(link: str, exchange: Exchange) -> Fraction | None:
     """Return the sum of the weights that every peer hears over a link, None when it differs."""
     pairs, weights = exchange.arcs(link)
     sums = sum_weights(pairs[:, 1], weights, exchange.peers)
-    return sums.of(0) if sums.alike(0, exchange.peers) else None
+    return sums[0] if np.all(sums == sums[0]) else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +71,8 @@ def graph_scale(group: PeerGroup, ways: Sequence[Way], exchange: Exchange) -> Gr
     if means:
         sums = sum_weights(pairs[:, 1], weights, exchange.peers)
         hears = np.bincount(pairs[:, 1], minlength=exchange.peers) > 0
-        for peer in np.flatnonzero((sums.floats == 0) | ~hears).tolist():
-            check_mean(exchange, peer, link, "mean", bool(hears[peer]), sums.of(peer))
+        for peer in np.flatnonzero((sums == 0) | ~hears).tolist():
+            check_mean(exchange, peer, link, "mean", bool(hears[peer]), sums[peer])
     degree = _degree(link, exchange)
     return GraphScale(
         {

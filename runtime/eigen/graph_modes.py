@@ -132,7 +132,7 @@ def _numeric_modes(graph: Graph, n: int, *, mean: bool) -> tuple[GraphMode, ...]
     pairs, weights = arcs(graph, n)
     plain = np.zeros((n, n))
     np.add.at(plain, (pairs[:, 1], pairs[:, 0]), weights)
-    sums = sum_weights(pairs[:, 1], weights, n).floats  # those that cancel lose no digits
+    sums = sum_weights(pairs[:, 1], weights, n).astype(np.float64)  # those that cancel lose no digits
     matrix = plain / sums[:, None] if mean else plain
     size = EIGEN_ROUNDINGS * n * UNIT
     if np.array_equal(plain, plain.T) and (not mean or np.all(sums > 0)):
@@ -192,7 +192,7 @@ def _row_sum(graph: Graph, n: int, *, mean: bool) -> Fraction | None:
         return Fraction(1)
     pairs, weights = arcs(graph, n)
     sums = sum_weights(pairs[:, 1], weights, n)
-    return sums.of(0) if sums.alike(0, n) else None
+    return sums[0] if np.all(sums == sums[0]) else None
 
 
 def _is_exact(graph: Graph, n: int, value: Fraction, multiplicity: int, *, mean: bool) -> bool:

@@ -30,6 +30,7 @@ from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here
 from apc.frame.course import turns
 from apc.frame.discretize import UNIT
 from apc.frame.schedule import Propagate
+from apc.frame.site import every_matrix
 from apc.later import Later
 from apc.threads import single_threaded
 
@@ -453,9 +454,8 @@ def angles_in_frame(system: ClosedSystem, values: Complexes, vectors: Complexes,
     for g, (group, offset, heard) in enumerate(zip(system.sites, system.offsets, system.heard, strict=True)):
         own = np.flatnonzero(moving & (site_of == g))
         if len(own):
-            start = vectors[offset : offset + len(group.lifted.z_names), own]
-            received = heard @ vectors[:, own]
-            angles[own] = turns(
-                group.site, group.schedule, start, received, dominant[own] - offset, values[own]
-            )
+            start = vectors[offset : offset + len(group.lifted.z_names), own].T
+            received = (heard @ vectors[:, own]).T
+            site = every_matrix(group.site, lambda matrix: matrix[None])
+            angles[own] = turns(site, group.schedule, start, received, dominant[own] - offset, values[own])
     return angles

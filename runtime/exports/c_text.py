@@ -328,7 +328,7 @@ def _receive(peer: Peer, p: int, place: int) -> list[str]:
     weights = np.array([sender.weight for sender in line.senders])
     divided = mean and line.complete and not edge
     if mean and not divided:
-        weights = weights / sum_weights(np.zeros(count, np.int64), weights, 1).floats[0]
+        weights = weights / float(sum_weights(np.zeros(count, np.int64), weights, 1)[0])
     return [
         f"static const double weights_{place}[{count}] = {{{row(map(number, weights.tolist()))}}};",
         f"double {total} = 0.0;",

@@ -29,7 +29,7 @@ from apc.frame.linearize import linearize_rows, site_of_row
 from apc.frame.parameters import Numbers
 from apc.frame.radius import RADII, radius_of, rounded, value_of
 from apc.frame.schedule import Schedule
-from apc.frame.site import LinearSite
+from apc.frame.site import LinearSite, every_matrix
 from apc.memory import refuse_beyond
 
 Floats = NDArray[np.float64]
@@ -220,8 +220,11 @@ def turned_by(
     if not count:
         return 0.0, 1.0
     state = np.array([int(np.argmax(np.abs(covector[:count] * z[:count])))])
-    start = z[: count + len(schedule.carried), None].astype(np.complex128)
-    angle = turns(site, schedule, start, heard[:, None].astype(np.complex128), state, np.array([value]))
+    start, received = (
+        block[None].astype(np.complex128) for block in (z[: count + len(schedule.carried)], heard)
+    )
+    site = every_matrix(site, lambda matrix: matrix[None])
+    angle = turns(site, schedule, start, received, state, np.array([value]))
     return oscillation(abs(value), float(angle[0]), float(schedule.frame_s))
 
 

@@ -366,7 +366,7 @@ class _Listing:
         """
         member = self.members[listener]
         hears = np.bincount(receivers, minlength=member.count) > 0
-        totals = sum_weights(receivers, weights, member.count).floats
+        totals = sum_weights(receivers, weights, member.count).astype(np.float64)
         enough = hears & (totals != 0) if way.operator == "mean" else hears
         for place in np.flatnonzero(~enough).tolist():
             peer = int(member.peers[place])

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.eigen.closing import Closed, ClosedSystem, Feedback, Loop, close, close_loop
+from apc.eigen.closing import ClosedSystem, Loop, close, close_loop
 from apc.eigen.modes import split
 from apc.eigen.peer_group import PeerGroup
 from apc.eigen.relative import relative, with_doubt
@@ -35,7 +35,6 @@ from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import FrameMap, LiftedSite, compose, composed_bounded, lift
 from apc.frame.linearize import linearize_exact, linearize_rows, of_rows, site_of_row, sites_of_rows
 from apc.frame.names import Free, value_now
-from apc.frame.nearby import NEARBY, alike, composed_nearby
 from apc.frame.parameters import free_rows
 from apc.frame.radius import RADII, radius_of, value_of
 from apc.frame.schedule import Propagate
@@ -124,18 +123,6 @@ class Bounded:
             heard=tuple(map(some, self.heard)),
             sites=tuple(every_matrix(one, some) for one in self.sites),
         )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Lift:
-    """A group's sites at k points, and their frames: in floats, and with bounds, of groups of points or each.
-
-    Where each point has its own bound, `plain` is that as well.
-    """
-
-    site: LinearSite
-    plain: FrameMap
-    bounded: FrameMap
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -230,63 +217,42 @@ class BatchEvaluator:
                 found[site_key(group)] = self._lift(group, values)
         return found
 
-    def bounded(
-        self, vectors: Callable[[PeerGroup], Floats], starts: Places | None = None
-    ) -> tuple[Bounded, ...]:
+    def bounded(self, vectors: Callable[[PeerGroup], Floats]) -> tuple[Bounded, ...]:
         """Return each system at k points with bounds on all its errors; no time varies.
 
         Parameters
         ----------
         vectors
             Gives the parameters of a group at each point (k, n_p), or (1, n_p) where no value reaches it.
-        starts
-            Where the points of each of g groups start (g,) that are near each other and have one bound
-            (`frame.nearby`); without it, each point has its own.
         """
         assert not self.timed, "the errors of a step belong to its time"
-        lifts: dict[tuple[int, int], _Lift] = {}
+        lifts: dict[tuple[int, int], tuple[LinearSite, FrameMap]] = {}
         for group in self.groups:
             if site_key(group) not in lifts:
-                lifts[site_key(group)] = self._lift_bounded(group, vectors(group), starts)
-        bounds = {key: one.bounded for key, one in lifts.items()}
+                lifts[site_key(group)] = self._lift_bounded(group, vectors(group))
         found = []
         for wiring in self.wirings:
-            closed = _closed_bounded(wiring, bounds, starts)
-            if starts is None:
-                whole, heard = value_of(closed.matrix), tuple(map(value_of, closed.heard))
-                at, sound = relative_at(wiring, whole)
-                within = relative(closed.matrix, with_doubt(at), RADII)
-                matrix, error = value_of(within), radius_of(within)
-            else:
-                assert not wiring.moving, "directions that follow what varies are each point's own"
-                at = with_doubt(wiring.relative)
-                error = radius_of(relative(closed.matrix, replace(at, weights=alike(at.weights)), NEARBY))
-                maps = [lifts[site_key(group)].plain for group in wiring.system.sites]
-                plain = close(maps, [one.plain for one in wiring.feedback], wiring.system.layout)
-                whole, matrix, heard = plain.matrix, relative(plain.matrix, wiring.relative), plain.heard
-                _, sound = relative_at(wiring, whole)
-                if len(error) > 1:
-                    error = np.repeat(error, np.diff(starts, append=len(matrix)), axis=0)
+            system = wiring.system
+            sites, maps = zip(*(lifts[site_key(group)] for group in system.sites), strict=True)
+            closed = close(maps, wiring.feedback, system.layout, numbers=RADII)
+            whole = value_of(closed.matrix)
+            at, sound = relative_at(wiring, whole)
+            within = relative(closed.matrix, with_doubt(at), RADII)
+            matrix, error = value_of(within), radius_of(within)
             sound = sound & np.isfinite(error.sum(axis=(1, 2)))
             if not sound.all():
                 matrix = np.where(sound[:, None, None], matrix, np.nan)
-            sites = tuple(lifts[site_key(group)].site for group in wiring.system.sites)
-            found.append(Bounded(matrix, error, whole, heard, sites))
+            found.append(Bounded(matrix, error, whole, tuple(map(value_of, closed.heard)), sites))
         return tuple(found)
 
-    def _lift_bounded(self, group: PeerGroup, vectors: Floats, starts: Places | None) -> _Lift:
+    def _lift_bounded(self, group: PeerGroup, vectors: Floats) -> tuple[LinearSite, FrameMap]:
         rows = linearize_rows(group.jacobians, vectors)
         site, steps, lost = self._placed(group, sites_of_rows(group.jacobians, rows))
         steps = steps or self.steps(site, np.zeros((1, 1)), exponential_rows)
         with np.errstate(all="ignore"):
-            if starts is None:
-                frame = composed_bounded(site, group.schedule, steps)
-                plain = frame
-            else:
-                plain = compose(site, group.schedule, {one: step.matrix for one, step in steps.items()})
-                frame = composed_nearby(site, group.schedule, steps, starts)
-        _lose(plain, lost)
-        return _Lift(site, plain, frame)
+            frame = composed_bounded(site, group.schedule, steps)
+        _lose(frame, lost)
+        return site, frame
 
     def _lift(self, group: PeerGroup, values: Matrices) -> FrameMap:
         if self.tangents:
@@ -426,21 +392,6 @@ def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Step
         if not (np.iscomplexobj(site.a) and (site.a.imag.any() or site.b.imag.any())):
             found[site_key(group)] = evaluator.steps(site, point, exponential_rows)
     return found
-
-
-def _closed_bounded(
-    wiring: Wiring, maps: Mapping[tuple[int, int], FrameMap], starts: Places | None = None
-) -> Closed:
-    """Return the closed matrices (k, 2, n, n) of a system with their radii, from such maps of its sites.
-
-    With `starts`, those of groups of points (g, 3, n, n), see `frame.nearby`.
-    """
-    system = wiring.system
-    sites = [maps[site_key(group)] for group in system.sites]
-    if starts is None:
-        return close(sites, wiring.feedback, system.layout, numbers=RADII)
-    heard = [Feedback(alike(one.now), alike(one.before)) for one in wiring.feedback]
-    return close(sites, heard, system.layout, numbers=NEARBY)
 
 
 def lifted_here(systems: Sequence[Wired]) -> tuple[Wired, ...]:

@@ -58,9 +58,6 @@ class Sheet(Protocol):
     def at(self, values: Floats, rows: Integers, points: Complexes) -> Logarithm:
         """Return its logarithm at points (z,), each at the value (k,) of its row (z,)."""
 
-    def over(self, values: Floats, points: Complexes) -> Logarithm:
-        """Return its logarithm (k, z) at all values (k,) and points (z,)."""
-
 
 def _principal(logarithm: Complexes) -> Complexes:
     """Return logarithms of one number with the argument nearest to 0."""
@@ -84,8 +81,9 @@ def _on_circle(angles: Floats) -> Complexes:
 def count_beyond(sheet: Sheet, values: Floats) -> Floats:
     """Return how many eigenvalues are beyond the circle at values (k,), NaN where one is on it."""
     angles = _angles(sheet.longest)
-    found = sheet.over(values, _on_circle(angles))
-    value, turning = found.value, found.turning
+    every = np.repeat(np.arange(len(values)), len(angles))
+    found = sheet.at(values, every, np.tile(_on_circle(angles), len(values)))
+    value, turning = (part.reshape(len(values), -1) for part in (found.value, found.turning))
     row = np.repeat(np.arange(len(values)), len(angles) - 1)
     left, right = np.tile(angles[:-1], len(values)), np.tile(angles[1:], len(values))
     # The arcs about 1 and −1 are halved by them, and mirror themselves.

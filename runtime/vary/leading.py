@@ -19,7 +19,7 @@ from apc.eigen.eigenpairs import components
 from apc.eigen.enclosure import SMALL, enclose_stack
 from apc.eigen.relative import relative_bounded
 from apc.eigen.spectrum import LEAST_SHARE, STRAIGHT
-from apc.frame.course import turns_of_many
+from apc.frame.course import turns
 from apc.frame.discretize import UNIT
 from apc.vary.batch import BatchEvaluator, Bounded
 from apc.vary.wiring import Wiring
@@ -191,5 +191,5 @@ def _angles(
         start = vectors[own, offset : offset + len(group.lifted.z_names)]
         received = (here.heard[g] @ vectors[own, :, None])[:, :, 0]
         states = leads[own] - offset
-        found[own] = turns_of_many(here.sites[g], group.schedule, start, received, states, values[own])
+        found[own] = turns(here.sites[g], group.schedule, start, received, states, values[own])
     return found

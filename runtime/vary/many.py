@@ -58,10 +58,6 @@ FAULT = "error: "
 # a processor, and is not given back to the system and fetched anew each time.
 TOGETHER, ENTRIES = 2048, 112 * 2**10
 
-# Points whose values differ by no more than this share are near each other: they have one bound on what
-# rounding does, wider than each one's own by about that. Of fewer on average than so many each has its own.
-NEAR, WORTH = 0.25, 4
-
 # A bound that is so many times as wide as most is made anew, by an analysis of its point, unless more than
 # this share of all are.
 WIDER, RARE = 4.0, 0.01
@@ -404,31 +400,11 @@ def _filled(
     done = np.zeros(len(some), dtype=np.bool_)
     states = max(len(one.layout.names) for one in family.evaluator.closed)
     together = max(1, min(TOGETHER, ENTRIES // states**2))
-    near = _near(family, varied, places[some])
-    order = np.argsort(near, kind="stable")
     with single_threaded(), np.errstate(all="ignore"):
         for start in range(0, len(some), together):
-            mine = order[start : start + together]
-            starts = np.flatnonzero(np.diff(near[mine], prepend=-1))
-            alone = len(starts) * WORTH > len(mine)
-            chunk = some[mine]
-            done[mine] = _decided(
-                family, varied, places[chunk], chunk, found, starts=None if alone else starts
-            )
+            mine = slice(start, start + together)
+            done[mine] = _decided(family, varied, places[some[mine]], some[mine], found)
     return done
-
-
-def _near(family: _Family, varied: Sequence[Varied], places: Integers) -> Integers:
-    """Return a number for each point (k,), the same for those whose values are near each other."""
-    found = np.zeros(len(places), dtype=np.int64)
-    for column in family.columns:
-        numbers = varied[column].numbers
-        size = np.floor(np.log(np.maximum(np.abs(numbers), np.finfo(np.float64).tiny)) / np.log1p(NEAR))
-        _, steps = np.unique(np.stack([np.sign(numbers), size]), axis=1, return_inverse=True)
-        _, found = np.unique(
-            found * (len(numbers) + 1) + steps.ravel()[places[:, column]], return_inverse=True
-        )
-    return found
 
 
 def _decided(
@@ -437,12 +413,10 @@ def _decided(
     places: Integers,
     rows: Integers,
     found: Rows,
-    *,
-    starts: NDArray[np.intp] | None,
 ) -> Truths:
-    """Do so for few points at a time; `starts` as for `BatchEvaluator.bounded`."""
+    """Do so for few points at a time."""
     allowed, vectors = _vectors(family, varied, places)
-    systems = family.evaluator.bounded(vectors, starts)
+    systems = family.evaluator.bounded(vectors)
     for one, pattern in zip(systems, family.patterns, strict=True):
         # What is 0 at a value of no meaning is so at all; NaN and infinite are no matrices.
         size = np.abs(one.matrix) + one.error

@@ -136,7 +136,7 @@ def tuned(found: PassiveHands) -> np.ndarray:
 
 @pytest.mark.whole
 def test_no_passive_hand_shakes_what_is_called_passive_and_a_tuned_one_what_is_not() -> None:
-    luck, passive, tried, struck, scenes = np.random.default_rng(1), 0, 0, 0, 60
+    luck, passive, tried, struck, scenes = np.random.default_rng(1), 0, 0, 0, 30
     for _ in range(scenes):
         system = random_users(luck)
         found = passive_hands(system)

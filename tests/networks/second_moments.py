@@ -78,7 +78,7 @@ class Lossy:
 
     What happens, k, begins at the state of luck `before[k]`; `moved[k]` (n, n) is what it makes of motions,
     `pushed[k]` of pushes; with the chance `shares[after, k]` it leads to a state. Of the states of motion,
-    those that nobody reads are left out (`read` are the others of `whole`), and of motions what stands still.
+    those are left out that no body follows from in that state of luck, and of motions what stands still.
     """
 
     def __init__(self, scene: Scene, law: Law) -> None:
@@ -102,24 +102,27 @@ class Lossy:
                 luck = Luck(dict(zip(ways, there, strict=True)), gone, law.zero)
                 made[missed, there] = lossy_frame(scene, luck)
         moved = np.array([made[missed, there][0] for _, missed, there in happens])
-        self.whole = moved.shape[1]
-        self.size = (self.whole - 2 * len(ways)) // scene.peers
-        place = np.arange(self.whole)
-        follows = (place % self.size < 4) & (place < scene.peers * self.size)
+        place = np.arange(moved.shape[1])
+        size = (len(place) - 2 * len(ways)) // scene.peers
+        bodies = (place % size < 4) & (place < scene.peers * size)
+        reads = np.tile(bodies, (len(states), 1))
         for _ in place:
-            follows |= moved[:, follows].any(axis=(0, 1))
-        self.read = place[follows]
-        moved = moved[:, self.read][:, :, self.read]
-        unit = np.eye(len(self.read))
+            for k, first in enumerate(self.before):
+                reads[first] |= moved[k][reads[self.shares[:, k] > 0].any(axis=0)].any(axis=0)
+        read = place[reads.any(axis=0)]
+        self.reads = reads[:, read, None] & reads[:, None, read]
+        self.cubes = np.searchsorted(read, size * np.arange(scene.peers) + 2)
+        moved = moved[:, read][:, :, read]
+        unit = np.eye(len(read))
         standing = scipy.linalg.null_space((moved - unit).reshape(-1, len(unit)), rcond=STANDING)
-        self.apart = unit - standing @ standing.T
+        self.apart = unit - standing @ np.linalg.pinv(standing[bodies[read]]) @ unit[bodies[read]]
         self.moved = self.apart @ moved
-        self.pushed = self.apart @ np.array([made[m, there][1][self.read] for _, m, there in happens])
+        self.pushed = self.apart @ np.array([made[m, there][1][read] for _, m, there in happens])
 
     def frame(self, moments: Floats) -> Floats:
         """Return second moments a frame later."""
         after = self.moved @ moments[self.before] @ self.moved.transpose(0, 2, 1)
-        return np.asarray(np.tensordot(self.shares, after, 1))
+        return np.asarray(np.tensordot(self.shares, after, 1) * self.reads)
 
     def driven(self) -> Floats:
         """Return the second moments that pushes of variance 1, drawn anew at each tick, make in a frame."""
@@ -127,21 +130,21 @@ class Lossy:
         stays = np.linalg.svd(chain - np.eye(len(chain)))[2][-1]
         after = self.pushed @ self.pushed.transpose(0, 2, 1)
         weighted = self.shares * (stays / stays.sum())[self.before]
-        return np.asarray(np.tensordot(weighted, after, 1))
+        return np.asarray(np.tensordot(weighted, after, 1) * self.reads)
 
 
 def second_moment_radius(scene: Scene, law: Law) -> float:
     """Return what second moments grow by in a frame, without motions that no luck moves."""
     lossy = Lossy(scene, law)
     shape = (len(lossy.shares), *lossy.apart.shape)
-    start = np.broadcast_to(lossy.apart, shape)
+    start = np.broadcast_to(lossy.apart @ lossy.apart.T, shape)
 
     def step(flat: Floats) -> Floats:
         return lossy.frame(flat.reshape(shape)).ravel()
 
     operator = scipy.sparse.linalg.LinearOperator((start.size,) * 2, matvec=step, dtype=np.float64)
     # Moments map a cone into itself, so the largest value is real; a small Krylov space may miss it.
-    options = {"ncv": min(start.size, 300), "tol": 1e-12, "return_eigenvectors": False}
+    options = {"ncv": min(start.size, 144), "tol": 1e-12, "return_eigenvectors": False}
     values = scipy.sparse.linalg.eigs(operator, 2, v0=step(start.ravel()), which="LR", **options)
     return float(np.abs(values).max())
 
@@ -152,10 +155,9 @@ def rms_error(scene: Scene, law: Law) -> float:
     Each device is pushed by a force of variance 1 N², drawn anew at every tick.
     """
     lossy = Lossy(scene, law)
-    cubes = np.searchsorted(lossy.read, [peer * lossy.size + 2 for peer in range(scene.peers)])
-    forms = np.zeros((scene.peers, len(lossy.read)))
-    forms[:, cubes] = -1 / (scene.peers - 1)
-    forms[range(scene.peers), cubes] = 1.0
+    forms = np.zeros((scene.peers, len(lossy.apart)))
+    forms[:, lossy.cubes] = -1 / (scene.peers - 1)
+    forms[range(scene.peers), lossy.cubes] = 1.0
     driven = lossy.driven()
     moments, before, found = driven, 0.0, 1.0
     while abs(found - before) > 1e-13 * found:
