@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.lift import LiftedSite, check_packets, lift, steps_alone
+from apc.frame.lift import LiftedSite, check_packets, lift
 from apc.frame.linearize import linearize_exact
 from apc.frame.schedule import Schedule, Way
 from apc.frame.site import LinearSite, rational_floats
@@ -197,8 +197,6 @@ def build_group(
         return linearize_exact(built, vector, listening) if built.walkable else rational_floats(site)
 
     def lifting() -> LiftedSite:
-        if built.parameters_suffice:
-            return lift(site, schedule, steps=steps_alone(built, vector, schedule))
         return lift(site, schedule, exact=exacting() if built.walkable else None)
 
     return PeerGroup(

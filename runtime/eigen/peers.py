@@ -10,8 +10,7 @@ Does not: close the loop between them (see `modes`).
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.listening import StartClasses
-from apc.eigen.peer_group import PeerGroup, Peers, Runs, build_group, check_size, joined, states_of, used_ways
+from apc.eigen.peer_group import PeerGroup, Peers, Runs, build_group, check_size, joined, used_ways
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.linearize import linearize, linearize_rows, site_of_row
@@ -36,9 +35,6 @@ MOST_DIFFERENT = 400
 
 # Peers looked at together for whether they differ: mostly, the first ones tell.
 PEEK = 1024
-
-# Groups of peers that are remembered, and of how many states.
-KEPT, FEW_STATES = 64, 64
 
 # What equal peers have in common: their kind, their role in the exchange, their numbers as bytes.
 _Key = tuple[int, int, bytes]
@@ -102,39 +98,10 @@ def _by_matrices(
     found = []
     for number, (key, parts) in enumerate(members.items()):
         place, vector, matrices = rows[key]
-        found.append(_group(number, parts, vector, matrices, jacobians[key[0]], schedules[place], exchange))
-    return tuple(found)
-
-
-def _group(
-    number: int,
-    parts: Sequence[tuple[int, Peers]],
-    vector: Floats,
-    matrices: Floats,
-    built: SiteJacobians,
-    schedule: Schedule,
-    exchange: Exchange,
-) -> PeerGroup:
-    """Return the group of peers of these matrices, row by row; of a few, what an analysis has made is kept.
-
-    What follows an analysis asks for the same peers again, and their map of a frame is most of their cost.
-    """
-    runs = [(group, peers.ranges) for group, peers in parts if isinstance(peers, Runs)]
-    if len(runs) < len(parts) or states_of(schedule, built) > FEW_STATES:
-        return build_group(number, parts, vector, built, site_of_row(built, matrices), schedule, exchange)
-    numbers = vector.tobytes(), matrices.tobytes()
-    known = _known_group((number, *runs, *numbers, id(built), id(schedule), id(exchange)))
-    if not known:
+        built = jacobians[key[0]]
         site = site_of_row(built, matrices)
-        group = build_group(number, parts, vector, built, site, schedule, exchange)
-        known.append((group, exchange))  # which holds all that the key knows by identity
-    return known[0][0]
-
-
-@functools.lru_cache(maxsize=KEPT)
-def _known_group(key: tuple[Hashable, ...]) -> list[tuple[PeerGroup, Exchange]]:
-    """Return a place for the group of peers of these numbers, and what the key knows by identity."""
-    return []
+        found.append(build_group(number, parts, vector, built, site, schedules[place], exchange))
+    return tuple(found)
 
 
 def _by_start(

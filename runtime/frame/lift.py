@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from functools import lru_cache
 from typing import Any
 
@@ -28,8 +27,6 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize
-from apc.frame.jacobians import SiteJacobians, structural_pattern
-from apc.frame.linearize import linearize_exact
 from apc.frame.radius import FLOATS, RADII, Arithmetic, common_shape, radius_of, value_of, with_radius
 from apc.frame.schedule import HELD, Act, Event, Propagate, Repeats, Schedule, Send, Tick, Value, shifted
 from apc.frame.site import LinearSite, every_matrix
@@ -107,7 +104,6 @@ def lift(
     schedule: Schedule,
     *,
     exact: LinearSite | None = None,
-    steps: Sequence[Step] | None = None,
 ) -> LiftedSite:
     """Compose a site's events over one frame.
 
@@ -120,55 +116,13 @@ def lift(
     exact
         The site's matrices in rationals, whose exponentials are taken; without it, those of `site` count as
         exact.
-    steps
-        These exponentials, one for each of `step_durations`, where they are at hand.
     """
     check_packets(schedule)
     durations = step_durations(schedule)
     exact = site if exact is None else exact
-    found = steps or discretize(exact.a, exact.b, [duration * schedule.quantum for duration in durations])
+    found = discretize(exact.a, exact.b, [duration * schedule.quantum for duration in durations])
     both = composed_bounded(site, schedule, dict(zip(durations, found, strict=True)))
     return named(site.kind, schedule, both.mapped(value_of), both.mapped(radius_of))
-
-
-def steps_alone(site: SiteJacobians, parameters: NDArray[np.float64], schedule: Schedule) -> tuple[Step, ...]:
-    """Return the exponentials of a site whose matrices follow from its parameters, by `step_durations`.
-
-    Those of few states are remembered: what only couplers and links change leaves them as they are.
-    """
-    durations = step_durations(schedule)
-    if len(site.kind.states) > FEW_STATES:
-        return _steps_alone(site, parameters, schedule.quantum, durations)
-    known = _known_steps(site, parameters[_moving_parameters(site)].tobytes(), schedule.quantum, *durations)
-    if not known:
-        known.append(_steps_alone(site, parameters, schedule.quantum, durations))
-    return known[0]
-
-
-def _steps_alone(
-    site: SiteJacobians, parameters: NDArray[np.float64], quantum: Fraction, durations: Sequence[int]
-) -> tuple[Step, ...]:
-    exact = linearize_exact(site, parameters)
-    found = discretize(exact.a, exact.b, [duration * quantum for duration in durations])
-    for step in found:
-        step.matrix.flags.writeable = step.size.flags.writeable = False
-    return found
-
-
-@lru_cache(maxsize=KEPT)
-def _known_steps(
-    site: SiteJacobians, numbers: bytes, quantum: Fraction, *durations: int
-) -> list[tuple[Step, ...]]:
-    """Return a place for the exponentials of a site of such parameters as move it between events."""
-    return []
-
-
-@lru_cache(maxsize=KEPT)
-def _moving_parameters(site: SiteJacobians) -> NDArray[np.intp]:
-    """Return the places of the parameters that A and B follow from, by structure."""
-    pattern = structural_pattern(site.function.jac_sparsity(0, 4))
-    of_rates = sum(rows * columns for rows, columns in site.shapes[:2])
-    return np.flatnonzero(pattern[:of_rates].any(axis=0))
 
 
 def check_packets(schedule: Schedule) -> None:

@@ -10,7 +10,6 @@ Does not: decide when anything happens (see `scheduling`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import lru_cache
 from typing import Any
@@ -66,7 +65,7 @@ def linearize_exact(
     assert listening is not None or not site.edges, "who is heard decides what an edge function does"
     assert site.function.is_a("SXFunction"), "the solution of a nonlinear loop is no rational number"
     if listening is None:
-        return _exact_alone(_Asked(id(site), parameters.tobytes(), site))
+        return _exact(site, parameters, None)
     exact = _exact(site, parameters, listening)
     rest = iter(listening.own)
     own = [
@@ -74,21 +73,6 @@ def linearize_exact(
         for partition in site.kind.clocks
     ]
     return with_own_parts(exact, own, np.add, np.multiply.outer)
-
-
-@dataclass(frozen=True, slots=True)
-class _Asked:
-    """What the matrices of a site follow from: `site`, which `known` is the identity of, and its numbers."""
-
-    known: int
-    numbers: bytes
-    site: SiteJacobians = field(compare=False)
-
-
-@lru_cache(maxsize=KEPT)
-def _exact_alone(of: _Asked) -> LinearSite:
-    """Return the exact matrices of a site for its parameters: an analysis and what follows it ask again."""
-    return _exact(of.site, np.frombuffer(of.numbers), None)
 
 
 def _exact(site: SiteJacobians, parameters: NDArray[np.float64], listening: Listening | None) -> LinearSite:
