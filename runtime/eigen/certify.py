@@ -13,6 +13,7 @@ decides without an eigenvalue being known.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -90,12 +91,18 @@ def prove(system: ClosedSystem, free: RigidModes) -> Proof:
         with precision(bits):
             matrix = frame_balls(system)
             polynomials = _polynomials(matrix, free)
-            if not searched and any(map(_may_vanish_at_one, polynomials)):
+            if not searched and any(_may_vanish_at_one(one) for one, _ in polynomials):
                 free, searched = find_rigid_modes(system), True
                 polynomials = _polynomials(matrix, free)
-            values, centres, wide = np.concatenate([np.empty((3, 0)), *map(_root_discs, polynomials)], axis=1)
+            values, centres, wide = np.concatenate(
+                [np.empty((3, 0)), *itertools.starmap(_root_discs, polynomials)], axis=1
+            )
             radii = wide.real
-            inside = _inside(polynomials, centres, radii) if _stands_still(matrix, free) else None
+            inside = (
+                _inside([one for one, _ in polynomials], centres, radii)
+                if _stands_still(matrix, free)
+                else None
+            )
         settled = settled or (bits if inside is not None else 0)
         if best is None or inside is not None or bits == PRECISIONS[-1]:
             best = Proof(inside, settled or bits, free, values, centres, radii)
@@ -107,12 +114,24 @@ def prove(system: ClosedSystem, free: RigidModes) -> Proof:
     return best
 
 
-def _polynomials(matrix: Balls, free: RigidModes) -> list[Any]:
-    """Return the characteristic polynomials of the parts of the matrix in relative coordinates."""
+def _polynomials(matrix: Balls, free: RigidModes) -> list[tuple[Any, Complexes]]:
+    """Return the characteristic polynomials of the parts of the matrix in relative coordinates.
+
+    Each comes with what its roots are in floats.
+    """
     reduced = reduced_balls(matrix, free.exact, independent_places(free.basis.T))
     vanishing = [bool(entry == 0) for entry in reduced.ravel()]  # exactly
     driven = ~np.array(vanishing, dtype=np.bool_).reshape(reduced.shape)
-    return [square(reduced[np.ix_(part, part)]).charpoly() for part in components(driven)]
+    blocks = [reduced[np.ix_(part, part)] for part in components(driven)]
+    return [(square(block).charpoly(), _eigenvalues(block)) for block in blocks]
+
+
+def _eigenvalues(block: Balls) -> Complexes:
+    """Return the eigenvalues (n,) of the middles of balls (n, n), in floats."""
+    middles = np.array([float(flint.arb(one).mid()) for one in block.ravel()]).reshape(block.shape)
+    if not np.isfinite(middles).all():
+        return np.zeros(len(block), dtype=np.complex128)
+    return np.linalg.eigvals(middles).astype(np.complex128)
 
 
 def _may_vanish_at_one(polynomial: Any) -> bool:
@@ -121,8 +140,8 @@ def _may_vanish_at_one(polynomial: Any) -> bool:
     return bool(at_one.contains(0)) and float(at_one.rad()) < SETTLED
 
 
-def _root_discs(polynomial: Any) -> Complexes:
-    """Estimate and enclose the roots of a monic polynomial of degree n.
+def _root_discs(polynomial: Any, guesses: Complexes) -> Complexes:
+    """Estimate and enclose the roots of a monic polynomial of degree n, from guesses (n,).
 
     Returns
     -------
@@ -133,7 +152,6 @@ def _root_discs(polynomial: Any) -> Complexes:
     if not all(math.isfinite(float(one.abs_upper())) for one in coefficients):  # more bits may tell
         nothing = np.zeros(len(coefficients) - 1, dtype=np.complex128)
         return np.stack([nothing, nothing, nothing + np.inf])
-    guesses = np.roots([float(one.mid()) for one in reversed(coefficients)]).astype(np.complex128)
     bits = flint.ctx.prec
     roots = approach_roots(polynomial, guesses, bits)
     centres, radii = root_discs(polynomial, roots, bits)

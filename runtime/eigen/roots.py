@@ -29,6 +29,9 @@ PUSH = 2.0**-44
 # Rounds of Aberth's iteration at most: a fourfold root gains 70 bits, a simple one is done in five.
 ROUNDS = 100
 
+# Points are far from each other whose difference, relatively, is more than that, and is in this range.
+FAR, LARGE = 2.0**-26, 1e150
+
 # A number of magnitude one with as many digits as a float has.
 BESIDE = complex(np.exp(1j))
 
@@ -66,22 +69,36 @@ def approach_roots(polynomial: Any, guesses: Complexes, bits: int) -> list[Any]:
     points = _starts([one.mid() for one in coefficients[zeros:]], guesses)
     small = flint.arb(2) ** (-bits // 2)
     moving = list(range(len(points)))
+    floats = np.array([complex(point) for point in points], dtype=np.complex128)
     for _ in range(ROUNDS):
         still = []
         for i in moving:
             point = points[i]
             value = function(point)
-            away = sum((1 / (point - other) for j, other in enumerate(points) if j != i), flint.acb(0))
-            move = (value / (slope(point) - value * away)).mid()
+            move = (value / (slope(point) - value * _away(points, floats, i))).mid()
             if not move.is_finite():
                 continue
             points[i] = (point - move).mid()
+            floats[i] = complex(points[i])
             if not abs(move) <= small * abs(points[i]):
                 still.append(i)
         moving = still
         if not moving:
             break
     return [*points, *[flint.acb(0)] * zeros]
+
+
+def _away(points: Sequence[Any], floats: Complexes, i: int) -> Any:
+    """Return Σ_{j≠i} 1/(z_i − z_j): of points far from each other the digits of a float do.
+
+    Half of them are lost to a point so near, and all of them out of the range of floats.
+    """
+    apart = floats[i] - floats
+    size = np.abs(apart)
+    far = (size > FAR * np.abs(floats[i])) & (size > 1 / LARGE) & (size < LARGE)
+    total = complex((1 / apart[far]).sum())
+    near = (1 / (points[i] - points[j]) for j in np.flatnonzero(~far).tolist() if j != i)
+    return sum(near, flint.acb(total.real, total.imag))
 
 
 def _starts(coefficients: Sequence[Any], guesses: Complexes) -> list[Any]:

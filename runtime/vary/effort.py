@@ -24,7 +24,7 @@ from apc.eigen.peer_group import states_of
 PARAMETER, PARAMETER_SQUARE, PARAMETER_EVENT = 0.025, 60e-6, 4e-6
 
 # Of an analysis, and of each state that is no packet.
-ANALYSIS, ANALYSIS_STATE = 0.02, 2e-3
+ANALYSIS, ANALYSIS_STATE = 0.1, 0.01
 
 # Of a piece of a delay: its schedules, bounded matrices and eigenvalues at three values or more.
 PIECE, PIECE_SQUARE, PIECE_EVENT, PIECE_ENTRY = 0.015, 40e-6, 40e-6, 0.6e-6
