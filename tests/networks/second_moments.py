@@ -2,8 +2,7 @@
 
 Takes: a scene of `bruteforce`, and how its packets get lost.
 Gives: `Law`, `second_moment_radius`, `rms_error`.
-Guarantees: on frames stepped event by event, one for each pattern of packets that are there or not.
-Does not: use any symmetry, or serve jitter.
+Guarantees: frames are stepped event by event for each pattern of packets; no symmetry is used, no jitter.
 
 Luck is a Markov chain of each way from peer to peer: whether it is bad, whether its last packet is missed.
 Of X, the second moments at each combination of these, a frame makes Σ P M X Mᵀ, over all that can happen.
@@ -144,8 +143,8 @@ def second_moment_radius(scene: Scene, law: Law) -> float:
 
     operator = scipy.sparse.linalg.LinearOperator((start.size,) * 2, matvec=step, dtype=np.float64)
     # Moments map a cone into itself, so the largest value is real; a small Krylov space may miss it.
-    options = {"ncv": min(start.size, 144), "tol": 1e-12, "return_eigenvectors": False}
-    values = scipy.sparse.linalg.eigs(operator, 2, v0=step(start.ravel()), which="LR", **options)
+    options = {"which": "LR", "ncv": min(start.size, 144), "tol": 1e-12, "return_eigenvectors": False}
+    values = scipy.sparse.linalg.eigs(operator, 2, v0=step(start.ravel()), **options)
     return float(np.abs(values).max())
 
 
@@ -156,8 +155,7 @@ def rms_error(scene: Scene, law: Law) -> float:
     """
     lossy = Lossy(scene, law)
     forms = np.zeros((scene.peers, len(lossy.apart)))
-    forms[:, lossy.cubes] = -1 / (scene.peers - 1)
-    forms[range(scene.peers), lossy.cubes] = 1.0
+    forms[:, lossy.cubes] = np.eye(scene.peers) * scene.peers / (scene.peers - 1) - 1 / (scene.peers - 1)
     driven = lossy.driven()
     moments, before, found = driven, 0.0, 1.0
     while abs(found - before) > 1e-13 * found:
