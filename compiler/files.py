@@ -116,8 +116,12 @@ def read_file(path: Path, most: int) -> bytes:
 def _read(path: Path, most: int) -> bytes:
     check_file(path, most)  # first, as opening a device can already do something
     with _refusing(), open(path, "rb", opener=_without_waiting) as stream:
-        _check(os.fstat(stream.fileno()), most)  # of what was opened
-        return stream.read(most + 1)
+        found = os.fstat(stream.fileno())
+        _check(found, most)  # of what was opened
+        data = stream.read(found.st_size + 1)  # as many bytes are set aside
+        if len(data) > found.st_size:
+            data += stream.read(most + 1 - len(data))
+    return data
 
 
 def check_file(path: Path, most: int) -> None:

@@ -43,7 +43,7 @@ def oddities(
     hearing = {part.name: part for part in outer if part.component.hears_others}
     masses = [part for part in outer if part.section == "masses"]
     given = {name for group in groups for name, _ in (*group.values, *group.words, *group.columns)}
-    for part in masses:
+    for part in reversed(masses):  # of one place, `Mistakes` tells the last first
         near = {group: joined[group].subset(part.name) for group in part.groups}
         alone = [group for group, names in near.items() if len(names) == 1]
         if alone and part.component.connectors and not part.connections:
