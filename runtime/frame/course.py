@@ -81,6 +81,7 @@ def turns(
         Which continuous state is followed (k,), and the eigenvalues (k,).
     """
     found = np.full(len(values), np.nan)
+    start, heard = _real_where_real(start, heard, values)
     one_site = _of_one(site)
     swing = _fastest(site.a)
     durations = [event.duration for event in schedule.events if isinstance(event, Propagate)]
@@ -105,6 +106,16 @@ def turns(
             agreed[first : first + chunk] = known
         left = left[~agreed]
     return found
+
+
+def _real_where_real(start: Complexes, heard: Complexes, values: Complexes) -> tuple[Complexes, Complexes]:
+    """Return what modes begin with, a vector of a real eigenvalue as a real one: it passes 0 on no side."""
+    largest = np.take_along_axis(start, np.abs(start).argmax(axis=1)[:, None], axis=1)
+    size = np.abs(largest)
+    turn = np.where(size > 0, largest.conj() / np.where(size > 0, size, 1.0), 1.0)
+    real = (values.imag == 0)[:, None]
+    begun, hears = (np.where(real, (block * turn).real, block) for block in (start, heard))
+    return begun, hears
 
 
 def _of_one(site: LinearSite) -> bool:

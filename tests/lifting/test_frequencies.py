@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from fractions import Fraction
 
+import numpy as np
 import pytest
 
-from apc.analysis.analysis import analyze
+import apc
+from apc.analysis.analysis import analyze, lifted_groups
+from apc.eigen.modes import split
+from apc.eigen.spectrum import angles_in_frame
 from tests.sites import paper
-from tests.topologies import OSCILLATOR, compiled
+from tests.topologies import OSCILLATOR, SCENES, compiled
 
 
 def numbers(hertz: float, ratio: float) -> dict[str, str]:
@@ -54,6 +58,16 @@ def test_what_folds_onto_the_real_axis_is_told_by_its_changes_of_sign(halves: in
     for mode in analyze(compiled(text)).modes:
         assert mode.frequency_hz == pytest.approx(halves / 2, rel=1e-6)
         assert mode.damping_ratio == pytest.approx(0.5 / math.hypot(damped, 0.5), rel=1e-6)
+
+
+def test_what_a_mode_turns_hangs_on_no_phase_of_its_vector() -> None:
+    for system in split(*lifted_groups(apc.compile(SCENES / "two-users-reported.yaml"))).systems:
+        values, vectors = np.linalg.eig(system.matrix.astype(complex))
+        values.imag[np.abs(values.imag) < 1e-12] = 0.0
+        shares = np.abs(vectors * np.linalg.pinv(vectors).T)
+        turned = np.exp(1j * np.array([0.0, 0.7, 2.0]))
+        angles = [angles_in_frame(system, values, vectors * turn, shares) for turn in turned]
+        assert np.allclose(angles, angles[0], equal_nan=True)
 
 
 def test_what_is_gone_within_a_frame_has_no_frequency_rather_than_a_wrong_one() -> None:

@@ -46,8 +46,7 @@ def as_alone(system: CompiledSystem, given: Mapping[str, Any], points: Any = Non
             one.rigid_modes,
         )
         assert abs(radii[point] - one.spectral_radius) <= errors[point] + one.spectral_radius_error
-        # Points share the largest of what their frames round, so that a bound may be some times an own one's;
-        # and a defective cluster, split by itself alone, costs a stack more.
+        # A defective cluster, split by itself alone, costs a stack more.
         assert errors[point] <= 8 * one.spectral_radius_error + 1e-15
         # What the radius may be off by, the angle and the rate may be too.
         away = 100 * (errors[point] + one.spectral_radius_error) / one.frame_s + 1e-12
