@@ -51,14 +51,11 @@ PARTS, MOST_OPEN, MOST_LEVELS = 8, 64, 12
 # Places at which a cubic is looked at.
 PLACES = 9
 
-# Half the bracket first tried, relative to the value; where it decides nothing the next is so much wider.
-HALF, WIDER, TRIES = 1e-13, 16.0, 12
+# Half the bracket first tried, relative to the value; how much wider the next is where it decides nothing.
+HALF, WIDER, TRIES = 1e-13, 4.0, 24
 
 # Steps of Newton's method.
 NEWTON = 12
-
-# A bracket that took more than two tries is halved until it is as wide as the second.
-HARDLY = WIDER
 
 # A bracket this wide, relative to the value, with one verdict on both sides has no crossing.
 NOWHERE = 1e-6
@@ -381,13 +378,24 @@ def _crossing(
     for _ in range(TRIES):
         left, right = max(value - width, low), min(value + width, high)
         below, above = stretch.judge(Fraction(left)), stretch.judge(Fraction(right))
-        if None not in (below.stable, above.stable):
-            if below.stable == rising != above.stable:
-                return _held(stretch, (left, right), (below, above), side)
-            if below.stable == above.stable and width > NOWHERE * abs(value):
-                return None
+        if below.stable is rising and above.stable is (not rising):
+            grows = above if rising else below
+            bits = re.search(r"\d+ bits", f"{below.proof} {above.proof}")
+            proof = f"proved with {bits[0]}" if bits else grows.proof or "bounded in floats"
+            half = (right - left) / 2
+            return Crossing((left + right) / 2, half, side, grows.frequency_hz, "crossing", proof)
+        if None not in (below.stable, above.stable) and width > NOWHERE * abs(value):
+            return None
         if (left, right) == (low, high):
             break
+        if below.stable == above.stable is not None:
+            # What floats saw is off by more than the bracket; what is bounded says where to look.
+            moved = above.radius - below.radius
+            sure = abs(moved) > below.error + above.error
+            nearer = left + (right - left) * (1 - below.radius) / moved if sure else math.nan
+            if low < nearer < high:
+                value = nearer
+                continue
         width *= WIDER
     frequency = (above if rising else below).frequency_hz
     return Crossing(value, min(width, high - low), side, frequency, "crossing", ESTIMATE)
@@ -419,20 +427,3 @@ def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float]) -> f
     # Imported where Newton's method fails: it takes as long as an analysis.
     brentq = load_pool("scipy.optimize").brentq
     return float(brentq(lambda value: at(value)[0], low, high, xtol=5e-324, rtol=1e-15))
-
-
-def _held(stretch: Stretch, ends: tuple[float, float], sides: tuple[Verdict, Verdict], side: str) -> Crossing:
-    """Return the crossing between two values of other verdicts, halved as long as analyses decide."""
-    (left, right), (below, above) = ends, sides
-    while right - left > HARDLY * 2 * HALF * abs(right):
-        middle = (left + right) / 2
-        found = stretch.judge(Fraction(middle))
-        if found.stable is None or middle in (left, right):
-            break
-        left, below, right, above = (
-            (middle, found, right, above) if found.stable == below.stable else (left, below, middle, found)
-        )
-    grows = above if below.stable else below
-    bits = re.search(r"\d+ bits", f"{below.proof} {above.proof}")
-    proof = f"proved with {bits[0]}" if bits else grows.proof or "bounded in floats"
-    return Crossing((left + right) / 2, (right - left) / 2, side, grows.frequency_hz, "crossing", proof)
