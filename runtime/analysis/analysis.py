@@ -42,10 +42,11 @@ from apc.frame.ages import at_timings, linear_sites
 from apc.frame.discretize import TOO_LARGE
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.jacobians import SiteJacobians
+from apc.frame.names import Free
 from apc.frame.parameters import Numbers, resolve
 from apc.frame.schedule import ORDER, Schedule
 from apc.frame.scheduling import build_schedules
-from apc.frame.start import at_start
+from apc.frame.start import at_start, reaches_start, sends_nothing
 from apc.network.nominal import left_out
 from apc.result import Look, Result
 from apc.threads import single_threaded
@@ -133,10 +134,13 @@ def prepare(system: CompiledSystem) -> Prepared:
     return _scheduled(system, linear_sites(system, timings, ORDER), timings, ORDER)
 
 
-def prepare_at_start(system: CompiledSystem, prepared: Prepared) -> Prepared | None:
+def prepare_at_start(
+    system: CompiledSystem, prepared: Prepared, varied: Sequence[Free] = ()
+) -> Prepared | None:
     """Return what was prepared with every kind linearized where it starts, as its parameters say.
 
-    None where that does not follow from the parameters alone (see `start.at_start`).
+    None where that does not follow from the parameters alone (see `start.at_start`), nor does every peer
+    send zeros at the start whatever is varied.
 
     Parameters
     ----------
@@ -144,6 +148,8 @@ def prepare_at_start(system: CompiledSystem, prepared: Prepared) -> Prepared | N
         The compiled scene.
     prepared
         From `prepare`, of this system.
+    varied
+        The parameters that will have other values.
 
     Raises
     ------
@@ -151,14 +157,23 @@ def prepare_at_start(system: CompiledSystem, prepared: Prepared) -> Prepared | N
         As `plan.refuse_varying`.
     """
     refuse_varying(system, prepared.jacobians)
-    found = _starting(system, prepared.jacobians)
+    found = _starting(system, prepared.jacobians, varied)
     return None if found is None else replace(prepared, jacobians=found, starting=True)
 
 
-def _starting(system: CompiledSystem, sites: tuple[SiteJacobians, ...]) -> tuple[SiteJacobians, ...] | None:
+def _starting(
+    system: CompiledSystem, sites: tuple[SiteJacobians, ...], varied: Sequence[Free] = ()
+) -> tuple[SiteJacobians, ...] | None:
     """Return the Jacobians of each kind where it starts, None where one's don't follow from parameters."""
     used = {group.kind for group in system.groups}
-    listed = [at_start(site) if kind in used else site for kind, site in enumerate(sites)]
+    silent = False
+    if any(at_start(sites[kind]) is None for kind in used):
+        silent = not any(reaches_start(system, one) for one in varied) and all(
+            sends_nothing(system.kinds[group.kind], row)
+            for group, rows in zip(system.groups, resolve(system).parameters, strict=True)
+            for row in rows
+        )
+    listed = [at_start(site, silent=silent) if kind in used else site for kind, site in enumerate(sites)]
     found = tuple(site for site in listed if site is not None)
     return found if len(found) == len(sites) else None
 

@@ -45,9 +45,10 @@ from apc.explore.sliders import (
 from apc.explore.written import with_values
 from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
+from apc.frame.start import reaches_start
 from apc.present.forms import json_text
 from apc.processes import model_bytes
-from apc.vary.evaluator import reaches_count, reaches_start, reaches_time
+from apc.vary.evaluator import reaches_count, reaches_time
 from apc.vary.growth import MEAN_SQUARE, NOMINAL
 
 # Who computes what, first things first: what is redrawn while a slider moves waits for nothing else. A region

@@ -23,7 +23,8 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import with_unit
 from apc.frame.names import Free, Range, named_times, parameter_of, unit_of
 from apc.frame.overrides import Override, parse_override
-from apc.vary.evaluator import free_parameters, start_names
+from apc.frame.start import start_names
+from apc.vary.evaluator import free_parameters
 from apc.vary.margins import STIFFNESSES, coupler_parameters
 
 # How many values a slider has at most: one a pixel of its length, no more can be told apart by hand.

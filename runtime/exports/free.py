@@ -67,7 +67,7 @@ def state_space_of(system: CompiledSystem, *, cut: str = "", free: Sequence[str]
     frees = _frees(system, free)
     ports = tuple(Port(one.label, unit_of(system, one.name)) for one in frees)
     symbols = [casadi.SX.sym(word) for word in words(ports)]
-    prepared = prepare_at_start(system, prepare(system))
+    prepared = prepare_at_start(system, prepare(system), frees)
     if prepared is None:
         what = "where the scene is linearized does not follow from its numbers alone"
         raise ApcError(Mistake("E954", Place(OPTION), what, hint=f"no {OPTION}"))

@@ -1,7 +1,8 @@
 """A site at the start of time: its states, what it remembers, what it sends and what it hears.
 
 Takes: a kind's Jacobians and a parameter vector, in any kind of number.
-Gives: `start_values`, `start_sends`, `start_arguments`; `at_start`; `Listening`.
+Gives: `start_values`, `start_sends`, `start_arguments`; `at_start`, `sends_nothing`; `start_names`,
+`reaches_start`; `Listening`.
 Guarantees: holds put out zero.
 Does not: ask who hears whom (see `peers`).
 """
@@ -17,9 +18,11 @@ from typing import Any
 import casadi
 import numpy as np
 
-from apc.compiler.compiled import PEERS
+from apc.compiler.compiled import PEERS, CompiledSystem, Kind
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians
+from apc.frame.names import Free
+from apc.frame.parameters import scope_of
 
 # Kinds that are kept as they start.
 KEPT = 64
@@ -63,11 +66,41 @@ def start_sends(
     return sent
 
 
+def start_names(system: CompiledSystem) -> set[str]:
+    """Return the parameters that are start values of states and of what clocks remember."""
+    return {name for kind in system.kinds for name in _starts(kind)}
+
+
+def _starts(kind: Kind) -> list[str]:
+    remembered = (name for clock in kind.clocks for name in clock.starts)
+    return [*(state.start for state in kind.states), *remembered]
+
+
+def reaches_start(system: CompiledSystem, free: Free) -> bool:
+    """Say whether where a scene starts is, or depends on, this parameter."""
+    starts = start_names(system)
+    return free.name in starts or free.name in scope_of(system).needed(sorted(starts))
+
+
+def sends_nothing(kind: Kind, parameters: Sequence[float]) -> bool:
+    """Say whether all that a peer sends at the start is 0, whatever its parameters but the start values."""
+    starts = set(_starts(kind))
+    listed = [
+        casadi.SX(value) if name in starts else casadi.SX.sym(name)
+        for name, value in zip(kind.parameters, parameters, strict=True)
+    ]
+    place = {name: index for index, name in enumerate(kind.parameters)}
+    x = [listed[place[state.start]] for state in kind.states]
+    arguments = [casadi.vertcat(*x), casadi.SX.zeros(len(kind.holds)), casadi.vertcat(*listed), casadi.SX(0)]
+    return all(one.send.is_a("SXFunction") and one.send(*arguments).is_zero() for one in kind.sends)
+
+
 @lru_cache(maxsize=KEPT)
-def at_start(site: SiteJacobians) -> SiteJacobians | None:
+def at_start(site: SiteJacobians, *, silent: bool = False) -> SiteJacobians | None:
     """Return a kind's Jacobians where it starts, which follow from its parameters alone.
 
-    Start values are parameters, too. None where what is heard decides as well, or a nonlinear loop does.
+    Start values are parameters, too. None where what is heard decides as well, or a nonlinear loop does;
+    with `silent` all that is heard at the start is 0.
     """
     if site.parameters_suffice:
         return site
@@ -79,7 +112,9 @@ def at_start(site: SiteJacobians) -> SiteJacobians | None:
     m = [value for one in memories for value in one]
     flat = site.function(casadi.vertcat(*x), casadi.vertcat(*u), casadi.vertcat(*m), heard, parameters, 0)
     if flat.numel() and casadi.depends_on(flat, heard):
-        return None
+        if not silent:
+            return None
+        flat = casadi.substitute(flat, heard, casadi.SX.zeros(heard.shape))
     return replace(site, function=casadi.Function("jacobians", symbols, [flat]), affine=True, timed=False)
 
 

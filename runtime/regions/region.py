@@ -286,7 +286,7 @@ def region(
             times = []
         found: Striped | None = None
         plain = source if not times and isinstance(source, PointEvaluator) else None
-        start = prepare_at_start(system, prepared) if plain or len(times) == 1 else None
+        start = prepare_at_start(system, prepared, free) if plain or len(times) == 1 else None
         if start is not None and plain is not None:
             at_once = evaluator_of_many(system, free, PLACE, prepared=start)
             try:

@@ -2,7 +2,7 @@
 
 Takes: a `CompiledSystem` and the parameters that vary.
 Gives: `evaluator`, `evaluator_of_many`, `PointEvaluator`; `Asked`; `many_packets`;
-`free_parameters`, `reaches_time`, `reaches_count`, `reaches_start`, `start_names`, `overrides_at`.
+`free_parameters`, `reaches_time`, `reaches_count`, `overrides_at`.
 Guarantees: peers that are alike at some values only are kept apart.
 Does not: vary times (see `delays`).
 """
@@ -428,15 +428,3 @@ def reaches_time(system: CompiledSystem, free: Free) -> bool:
     if any(timing.name == free.name for timing in system.timings):
         return True
     return free.name in scope_of(system).needed([timing.name for timing in system.timings])
-
-
-def reaches_start(system: CompiledSystem, free: Free) -> bool:
-    """Say whether where a scene starts is, or depends on, this parameter."""
-    starts = start_names(system)
-    return free.name in starts or free.name in scope_of(system).needed(sorted(starts))
-
-
-def start_names(system: CompiledSystem) -> set[str]:
-    """Return the parameters that are start values of states and of what clocks remember."""
-    found = {state.start for kind in system.kinds for state in kind.states}
-    return found | {name for kind in system.kinds for clock in kind.clocks for name in clock.starts}
