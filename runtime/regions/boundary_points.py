@@ -79,11 +79,10 @@ def cross(
         spots = stable[rest] + looked_at[:, None] * along[rest]
         top = deciding.log_magnitudes(deciding.family.matrices(just_inside(spots)), 1)[:, 0]
         good = arrived.copy()
-        good[arrived] = top[arrived] <= rounded_growth(spots[arrived], found.gradient[arrived])
-        done = rest[good]
-        if len(done):
-            points[done] = place[good]
-            _put(pairs, done, found.at(good))
+        if arrived.any():
+            good[arrived] = top[arrived] <= rounded_growth(spots[arrived], found.gradient[arrived])
+            points[rest[good]] = place[good]
+            _put(pairs, rest[good], found.at(good))
         out = ~good & (top > 0)
         low[rest[~good & ~out]] = looked_at[~good & ~out]
         high[rest[out]] = looked_at[out]

@@ -2,7 +2,9 @@
 
 Takes: an `Evaluator` of two free parameters and their ranges.
 Gives: `Rectangle`, `rectangle_of`; `DirectFamily`, `family_over`.
-Guarantees: every point is computed anew; errors are bounds at points inside the rectangle.
+Guarantees: every point is computed anew; errors are bounds at points inside the rectangle. States that drive
+each other are a system of their own: peers that hear each other one way only share nearly equal eigenvalues,
+which one matrix of all would tell apart by rounding alone.
 Does not: know what happens between points.
 """
 
@@ -14,8 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.eigen.eigenpairs import components
 from apc.frame.names import Range
 from apc.vary.batch import MatrixSource
+from apc.vary.leading import Part
 
 Floats = NDArray[np.float64]
 
@@ -52,27 +56,45 @@ def rectangle_of(x: Range, y: Range) -> Rectangle:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DirectFamily:
-    """A `Family` that asks the evaluator for every point."""
+    """A `Family` that asks the evaluator for every point.
+
+    `parts` are its systems, `states` how many states each of the evaluator's has; without parts those are
+    taken as they are.
+    """
 
     evaluator: MatrixSource
     rectangle: Rectangle
-    sizes: tuple[int, ...]
+    parts: tuple[Part, ...]
+    states: tuple[int, ...]
     errors: tuple[Floats, ...]
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The number of states of each system."""
+        return tuple(len(part.states) for part in self.parts)
 
     def matrices(self, points: Floats) -> tuple[Floats, ...]:
         """Return each system's matrices (k, n, n) at points (k, 2)."""
-        return self.evaluator.matrices(self.rectangle.values(points))
+        whole = self.evaluator.matrices(self.rectangle.values(points))
+        return tuple(self._part(part, whole[part.system]) for part in self.parts) or whole
 
     def slopes(self, system: int, points: Floats) -> tuple[Floats, Floats]:
         """Return one system's matrices (k, n, n) and their derivatives (2, k, n, n) over x and y."""
-        count = len(points)
+        count, part = len(points), self.parts[system]
         values = np.concatenate([self.rectangle.values(points)] * 2)
         along = np.zeros_like(values)
         along[:count, 0], along[count:, 1] = self.rectangle.width
         matrix, slope = (
-            _sized(one, self.sizes[system]) for one in self.evaluator.slopes(values, along)[system]
+            self._part(part, _sized(one, self.states[part.system]))
+            for one in self.evaluator.slopes(values, along)[part.system]
         )
         return matrix[:count], slope.reshape(2, count, *slope.shape[1:])
+
+    def _part(self, part: Part, matrices: Floats) -> Floats:
+        """Return the rows and columns of a part in matrices (k, n, n) of its system."""
+        if len(part.states) == self.states[part.system]:
+            return matrices
+        return matrices[:, part.states[:, None], part.states]
 
 
 def _sized(matrices: Floats, size: int) -> Floats:
@@ -91,7 +113,7 @@ def _sized(matrices: Floats, size: int) -> Floats:
     return found
 
 
-def family_over(source: MatrixSource, rectangle: Rectangle, errors: Errors) -> DirectFamily:
+def family_over(source: MatrixSource, rectangle: Rectangle, errors: Errors, *, split: bool) -> DirectFamily:
     """Return the matrices over a rectangle.
 
     Parameters
@@ -102,7 +124,19 @@ def family_over(source: MatrixSource, rectangle: Rectangle, errors: Errors) -> D
         Their ranges.
     errors
         Bounds (k, n, n) on the errors of each system's matrices at values (k, 2), entry by entry.
+    split
+        Whether a system has the same states everywhere: those that drive each other are then taken by
+        themselves.
     """
     corners = rectangle.values(np.array([[0.1, 0.1], [0.1, 0.9], [0.9, 0.1], [0.9, 0.9]]))
     wrong = tuple(one.max(axis=0) for one in errors(corners))
-    return DirectFamily(source, rectangle, tuple(map(len, wrong)), wrong)
+    parts: list[Part] = []
+    for system, (error, matrix) in enumerate(zip(wrong, source.matrices(corners), strict=True)):
+        if split:
+            size = np.abs(matrix).max(axis=0) + error
+            driven = [states for states in components(size != 0) if size[np.ix_(states, states)].any()]
+        if not split or not driven:
+            driven = [np.arange(len(error))]
+        parts += [Part(system, states) for states in driven]
+    own = tuple(wrong[part.system][np.ix_(part.states, part.states)] for part in parts)
+    return DirectFamily(source, rectangle, tuple(parts), tuple(map(len, wrong)), own)

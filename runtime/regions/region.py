@@ -55,6 +55,7 @@ from apc.vary.growth import (
     growth_at,
     refuse_time,
 )
+from apc.vary.leading import Part
 
 if TYPE_CHECKING:
     import pandas
@@ -391,10 +392,11 @@ def _family(source: Source, rectangle: Rectangle, *, timed: bool) -> Family:
     """Return the closed systems over the unit square."""
     if isinstance(source, GrowthEvaluator):  # one point's bounds are enough, and dear
         errors = tuple(one[0] for one in source.errors(rectangle.values(np.array([[0.5, 0.5]]))))
-        return DirectFamily(source, rectangle, tuple(len(one) for one in errors), errors)
+        parts = tuple(Part(place, np.arange(len(one))) for place, one in enumerate(errors))
+        return DirectFamily(source, rectangle, parts, tuple(map(len, errors)), errors)
     if timed:  # each point has a schedule of its own: there are no slopes, and no one size
-        return DirectFamily(source, rectangle, (), ())
-    return family_over(source, rectangle, source.errors)
+        return DirectFamily(source, rectangle, (), (), ())
+    return family_over(source, rectangle, source.errors, split=isinstance(source, BatchEvaluator))
 
 
 def _samples(deciding: Eigenvalues, source: Source, rectangle: Rectangle, points: Floats) -> Floats:

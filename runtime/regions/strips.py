@@ -256,7 +256,7 @@ def _within(source: PointEvaluator, piece: Piece, rectangle: Rectangle) -> Direc
 
     if any(wiring.moving for wiring in family.wirings):
         return None
-    return family_over(family, rectangle, errors)
+    return family_over(family, rectangle, errors, split=True)
 
 
 def _placed(arc: Arc, ends: Sequence[float]) -> Arc:
