@@ -244,7 +244,9 @@ def _halve(
         off = (off[good] + unseen[good]) / GAIN
         middle = knots.add(place, pairs, a, (knots.key[a] + knots.key[b]) / 2)
         knots.error[a] = knots.error[middle] = off
-        fine = off <= FILLED * tolerance * relative_to(place, pairs.gradient, offset)
+        # No nearer than where rounding has the boundary, which the curve's error counts as well.
+        known = _rounding(deciding, pairs)
+        fine = off <= np.maximum(FILLED * tolerance * relative_to(place, pairs.gradient, offset), known)
         left += [np.stack([a, middle], axis=1)[~fine], np.stack([middle, b], axis=1)[~fine]]
     if len(lost):
         left.append(_search(deciding, knots, lost, tolerance, offset))
@@ -400,9 +402,7 @@ def _arc(deciding: Eigenvalues, knots: _Knots, piece: Integers, chain: int) -> A
         return _straight(knots.points[piece], knots.error[piece[:-1]], knots.points[middle], value, chain)
     pairs = knots.pairs.at(piece)
     system = int(pairs.system[0])
-    steepness = np.linalg.norm(pairs.gradient, axis=1)
     points, along = knots.points[piece], knots.tangents(piece)
-    rounding = deciding.value_errors(pairs) / np.maximum(steepness, np.finfo(np.float64).tiny)
     return Arc(
         points=points,
         handles=handles_of(points[:-1], points[1:], along[:-1], along[1:]),
@@ -410,9 +410,16 @@ def _arc(deciding: Eigenvalues, knots: _Knots, piece: Integers, chain: int) -> A
         knots=points,
         values=pairs.value,
         system=system,
-        rounding=float(rounding.max()),
+        rounding=float(_rounding(deciding, pairs).max()),
         chain=chain,
     )
+
+
+def _rounding(deciding: Eigenvalues, pairs: Pairs) -> Floats:
+    """Return how far rounding moves points of the boundary (k,), by its pairs there."""
+    steepness = np.linalg.norm(pairs.gradient, axis=1)
+    moved_by: Floats = deciding.value_errors(pairs) / np.maximum(steepness, np.finfo(np.float64).tiny)
+    return moved_by
 
 
 def trace_steps(

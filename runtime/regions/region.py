@@ -69,6 +69,9 @@ CELLS = 12
 # could not be followed so closely it is said, see `Region.coarse`.
 TOLERANCE = 1e-9
 
+# The same by a criterion of one number, whose slopes are differences: each of its values takes milliseconds.
+TOLERANCE_OF_GROWTH = 1e-6
+
 # How often the straight lines of a boundary known by verdicts alone are halved, where it has no steps.
 HALVINGS = 3
 
@@ -227,7 +230,7 @@ def region(
     axes: tuple[Range, Range],
     *,
     cells: int = CELLS,
-    tolerance: float = TOLERANCE,
+    tolerance: float | None = None,
     criterion: str | None = None,
     prepared: Prepared | None = None,
     told: Told | None = None,
@@ -267,6 +270,7 @@ def region(
     """
     free = tuple(axis.free for axis in axes)
     meant = criterion_of(system, criterion, PLACE, free)
+    tolerance = tolerance or (TOLERANCE_OF_GROWTH if meant in BY_GROWTH else TOLERANCE)
     for one in free:
         if meant == NOMINAL:
             refuse_channel_number(system, one, PLACE, instead=f"--in {MEAN_SQUARE}")
