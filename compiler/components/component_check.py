@@ -46,7 +46,7 @@ from apc.compiler.language.vectors import (
 from apc.compiler.source.reading import brief, fault, unknown
 from apc.compiler.words import counted
 
-_TRUE = Call("==", (Literal(Fraction(1)), Literal(Fraction(1))))
+TRUE = Call("==", (Literal(Fraction(1)), Literal(Fraction(1))))
 
 Path = tuple[str, ...]  # a name in an equation, between its dots
 Where = Equation | Send  # what an expression stands in
@@ -66,6 +66,7 @@ class ComponentNames:
         """Take a component, and the names given by equations that couldn't be read: of no known dimension."""
         self.component = component
         self.options = {p.name: p for p in component.parameters if isinstance(p, Option)}
+        self.tables = {p.name for p in component.parameters if getattr(p, "role", "") == "table"}
         computed: dict[Path, Dimension | None] = {(name,): None for name in undefined}
         computed |= dict(_visible_names(component))
         computed |= {(name, flow.name): flow.unit.dimension for name, flow in component.flows}
@@ -205,7 +206,7 @@ class ComponentNames:
             match node:
                 case Call("sample", (sampled, _)):
                     return replace(node, arguments=(transform(sampled, decided),))
-            return _TRUE if option_test(node, self.options) else None
+            return TRUE if option_test(node, self.options) else None
 
         return transform(expression, decided)
 
@@ -226,7 +227,7 @@ class ComponentNames:
         return self.dimensions.get(_whole(name.parts))
 
     def _check_names(self, expression: Expr, where: Where, mistakes: Mistakes) -> None:
-        """Record names that nothing of the component has, and words that an option hasn't got."""
+        """Record names that nothing of the component has, and words and tables in the place of numbers."""
         told = set[int]()
         for node in walk(expression):
             match node:
@@ -236,6 +237,22 @@ class ComponentNames:
                     word, words = format_expression(right), self.options[name].words
                     what, at = f"{name} has no option {brief(word)}", _place(where, right)
                     mistakes.take(unknown("E206", at, what, word, words))
+                case Call("interpolate", (Name((name,)) as table, _)) if name in self.tables:
+                    told.add(table.start)
+                case Call("interpolate", (other, _)):
+                    told.add(other.start)
+                    got, known = format_expression(other), ", ".join(sorted(self.tables)) or "none"
+                    what, expected = "interpolate", f"the name of a table ({known} in {self.component.name})"
+                    mistakes.add("E325", _place(where, other), what, expected=expected, got=got)
+                case Call("count" | "age", (Name((name,)) as every,)) if name == OTHERS:
+                    told.add(every.start)
+                case Name((name,)) if name == OTHERS and node.start not in told:
+                    heard = (".".join(path) for path in self.dimensions if path[:-1] == (OTHERS,))
+                    what, sent = "a value of the other peers", next(heard, f"count({OTHERS})")
+                    mistakes.add("E506", _place(where, node), what, expected=sent, got=name, hint=sent)
+                case Name((name,)) if name in self.tables and node.start not in told:
+                    hint = f"interpolate({name}, time)"
+                    mistakes.add("E303", _place(where, node), f"{name} is a table and no number", hint=hint)
                 case Name(parts) if node.start not in told:
                     self._check_name(parts, _place(where, node), mistakes)
 

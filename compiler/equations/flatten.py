@@ -25,7 +25,7 @@ from apc.compiler.components.component import (
     Variable,
     option_test,
 )
-from apc.compiler.components.component_check import ComponentNames
+from apc.compiler.components.component_check import TRUE, ComponentNames
 from apc.compiler.equations.connections import ZERO, connection_equations
 from apc.compiler.errors import Mistakes, Place, place_in
 from apc.compiler.language.dimensions import Dimension
@@ -339,13 +339,19 @@ class _PartWriter:
         return transform(transform(expression, self._decided), whole)
 
     def _decided(self, node: Expr) -> Expr | None:
-        """Return the branch of a condition on an option."""
+        """Return the branch of a condition on an option, or whether a comparison of one holds."""
         match node:
-            case Call("if", (Call(relation) as condition, then, otherwise)):
-                if test := option_test(condition, self.names.options):
-                    holds = dict(self.part.options)[test[0].name] == test[1]
-                    return transform(then if holds == (relation == "==") else otherwise, self._decided)
-        return None
+            case Call("if", (condition, then, otherwise)) if (holds := self._holds(condition)) is not None:
+                return transform(then if holds else otherwise, self._decided)
+        holds = self._holds(node)
+        return None if holds is None else TRUE if holds else Call("not", (TRUE,))
+
+    def _holds(self, node: Expr) -> bool | None:
+        """Say whether a comparison of an option with a word holds; None of all else."""
+        test = option_test(node, self.names.options)
+        if test is None or not isinstance(node, Call):
+            return None
+        return (dict(self.part.options)[test[0].name] == test[1]) == (node.function == "==")
 
     def _called(self, call: Call, of: Name) -> str:
         return f"{call.function}({format_expression(self._name(of))})"
@@ -364,7 +370,7 @@ class _PartWriter:
         """Report what is of each other peer outside of a reduction."""
         shown = format_expression(node)
         what = f"{shown} of {self.part.name} is a value of each other peer, and one is due here"
-        self.mistakes.add("E506", self.where.place, what, hint=f"mean({shown}), or sum, max, min")
+        self._report("E506", node, what, hint=f"mean({shown}), or sum, max, min")
         return ZERO
 
     def _receive(self, function: str, argument: Expr) -> Expr:

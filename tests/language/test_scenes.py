@@ -238,7 +238,7 @@ variables: {pull: {unit: N}, acting: {unit: N}, f: {unit: N}}
 equations:
   - pull = stiffness*(sample(object.x) - mean(others.x))
   - acting = hold(pull)
-  - f = if role == server then -sum(others.f) else pull
+  - f = if role == server and not (role == client) then -sum(others.f) else pull
   - object.f = hold(f)
 """
     text = """\
