@@ -23,7 +23,7 @@ from apc.analysis.analysis import Prepared, lifted_groups, prepare, prepare_at_s
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.timings import part
 from apc.compiler.words import counted
-from apc.eigen.eigenpairs import eigenpairs
+from apc.eigen.eigenpairs import components, eigenpairs
 from apc.eigen.modes import split
 from apc.eigen.spectrum import solve_spectrum
 from apc.finite_equations import finite_equations
@@ -36,6 +36,7 @@ from apc.vary.batch import BatchEvaluator
 from apc.vary.evaluator import PointEvaluator, evaluator, free_parameters
 
 Floats = NDArray[np.float64]
+Places = NDArray[np.intp]
 Complexes = NDArray[np.complex128]
 
 # Eigenvalues whose magnitudes differ by less than this may be one within the rounding of their matrices:
@@ -244,12 +245,24 @@ def _clusters(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) 
         still &= np.isfinite(one).all(axis=(1, 2))
     found = []
     for name, (matrix, slopes) in zip(_names(family, len(pairs)), pairs, strict=True):
-        if matrix.shape[1]:
-            found += _of_system(name, matrix[0], slopes[: len(free)], here, still)
+        for states in _alone(matrix[0], slopes) if matrix.shape[1] else ():
+            block = np.index_exp[..., states[:, None], states]
+            found += _of_system(name, matrix[0][block], slopes[block][: len(free)], here, still)
     sizes = [float(np.abs(one.values).max()) for one in found]
     least = max(sizes, default=0.0) - SHARED * max(1.0, *sizes, 0.0)
     kept = [one for one, size in zip(found, sizes, strict=True) if size >= least]
     return sorted(kept, key=lambda one: -float(np.abs(one.values).max()))
+
+
+def _alone(matrix: Floats, slopes: Floats) -> list[Places]:
+    """Return the states that drive each other in a matrix (n, n) of slopes (m, n, n), equal blocks once.
+
+    Each block has eigenvalues of its own; without any all states are one.
+    """
+    driving = (matrix != 0) | (slopes != 0).any(axis=0)
+    both = np.concatenate([matrix[None], slopes])
+    own = {both[:, part[:, None], part].tobytes(): part for part in reversed(components(driving))}
+    return [part for part in own.values() if matrix[np.ix_(part, part)].any()] or [np.arange(len(matrix))]
 
 
 def _names(family: BatchEvaluator | PointEvaluator, count: int) -> list[str]:
