@@ -10,6 +10,7 @@ The grammar is expression.lark; Lark reads it.
 
 from __future__ import annotations
 
+import contextlib
 import unicodedata
 from collections.abc import Callable
 from dataclasses import replace
@@ -186,6 +187,8 @@ def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
             what = f"{cut(said)} is not a number, and units stand on parameters only"
             hint = f"a parameter, with default: {number} {token}; of a name, {number}*name"
             hint = hint if Fraction(number) else str(number)  # nothing is nothing in any unit
+            with contextlib.suppress(ValueError):
+                hint = str(int(said, 0))  # 0x10 is 16
             raise FaultError("E323", number, what, hint="" if kinds[0] == "NUMBER" else hint)
     if token.type == "COMPARISON":
         raise FaultError("E322", token, "a comparison has two sides", hint="a < b and b < c")

@@ -199,6 +199,8 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
             right, slip = _meant(parsed.unit, wanted)
             got += f" ({slip} is {_long_name(slip)}: case matters)" if slip else ""
         hint = f"{what}: {parsed.number} {right}".removesuffix(" 1") if right else ""
+        if actual == due.power(-1) and parsed.value:  # a rate in the place of a time, or the other way round
+            hint = f"{what}: {float(1 / (parsed.value * wanted.scale)):.9g} {unit}"
     raise ApcError(Mistake("E204", place, what, named, got, hint))
 
 
@@ -305,7 +307,7 @@ def _refuse(text: str, fault: UnexpectedToken) -> NoReturn:
         expected = ")"
     else:
         expected, joined = "* or / between two names", re.sub(r"(\w)\s+(?=\w)", r"\1*", bare)
-        hint = joined if joined != bare else ""
+        hint = joined if joined != bare and "+" not in bare else ""
     at = len(text.rstrip()) if token.type == "$END" else token
     got = {"$END": "its end", "POWER": "^"}.get(token.type, str(token))
     raise FaultError("E222", at, "a unit", expected, got, hint)

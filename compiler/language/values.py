@@ -207,7 +207,7 @@ def _misfit(tree: Expr, actual: Dimension, due: Dimension, unit: str) -> tuple[s
     """Return what is wrong with an expression of another dimension than is due, and what to write."""
     if actual != due:
         told = "has no unit" if actual == DIMENSIONLESS else f"is in {format_dimension(actual)}"
-        return told, f"1 {unit}"
+        return told, f"1 {unit}".removesuffix(" 1")
     # Of a name, a sum or a choice: no product counts cycles or radians.
     text = format_expression(tree)
     whole = text if isinstance(tree, Name) else f"({text})"
