@@ -44,7 +44,7 @@ _PLACE = Place("box")
 GENERIC = Fraction(6180339887, 10**10)
 
 
-def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Range:
+def parse_range(system: CompiledSystem, text: str) -> Range:
     """Read `NAME=±P%` or `NAME=LOW UNIT:HIGH UNIT`.
 
     Parameters
@@ -53,8 +53,6 @@ def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Ran
         The compiled scene.
     text
         As written; the name as in `names.find`.
-    place
-        Where it stands, for messages.
 
     Raises
     ------
@@ -67,77 +65,77 @@ def parse_range(system: CompiledSystem, text: str, place: Place = _PLACE) -> Ran
 
     name, equals, value = (part.strip() for part in text.partition("="))
     if not (equals and name and value):
-        raise _malformed(text, place)
-    free = find(system, name, place)
-    parameter = _parameter(system, free, place)
+        raise _malformed(text)
+    free = find(system, name, _PLACE)
+    parameter = _parameter(system, free)
     if value.startswith(("±", "+-")):
-        share = _percentage(value.removeprefix("±").removeprefix("+-"), text, place)
+        share = _percentage(value.removeprefix("±").removeprefix("+-"), text)
         middle = Fraction(parameter.value)
         spread = abs(middle) * share
         if not spread:
             what = f"{name} is 0, and any share of it is 0 as well"
-            raise ApcError(Mistake("E833", place, what, hint=f"{name}=LOW:HIGH"))
+            raise ApcError(Mistake("E833", _PLACE, what, hint=f"{name}=LOW:HIGH"))
         low, high = middle - spread, middle + spread
     else:
         first, colon, last = (part.strip() for part in value.partition(":"))
         if not (colon and first and last):
-            raise _malformed(text, place)
+            raise _malformed(text)
         try:
-            low, high = (quantity(one, place, what=name, unit=parameter.unit).value for one in (first, last))
+            low, high = (quantity(one, _PLACE, what=name, unit=parameter.unit).value for one in (first, last))
         except ApcError as error:  # what is to be written is an end of a range
             mistakes = [replace(one, hint=one.hint.removeprefix(f"{name}: ")) for one in error.mistakes]
             raise ApcError(mistakes) from None
-    _check_limits(parameter, low, high, name, place)
+    _check_limits(parameter, low, high, name)
     return Range(free, parameter.unit, low, high)
 
 
-def _malformed(text: str, place: Place) -> ApcError:
+def _malformed(text: str) -> ApcError:
     form = "NAME=±PERCENT% or NAME=LOW:HIGH"
-    return ApcError(Mistake("E830", place, "a box", form, text[:80], "contact.stiffness=±1%"))
+    return ApcError(Mistake("E830", _PLACE, "a box", form, text[:80], "contact.stiffness=±1%"))
 
 
-def _percentage(text: str, whole: str, place: Place) -> Fraction:
+def _percentage(text: str, whole: str) -> Fraction:
     number = text.strip()
     if not number.endswith("%"):
-        raise _malformed(whole, place)
+        raise _malformed(whole)
     try:
         plain_float(number[:-1])  # Fraction reads more than a plain number
         share = Fraction(number[:-1].strip()) / 100
     except (ValueError, ZeroDivisionError):
-        raise _malformed(whole, place) from None
+        raise _malformed(whole) from None
     if share <= 0:
-        raise ApcError(Mistake("E833", place, "a box", "more than 0 %", number[:80]))
+        raise ApcError(Mistake("E833", _PLACE, "a box", "more than 0 %", number[:80]))
     return share
 
 
-def _parameter(system: CompiledSystem, free: Free, place: Place) -> Parameter:
+def _parameter(system: CompiledSystem, free: Free) -> Parameter:
     """Return the parameter a box is about; refuse times and values that differ from peer to peer."""
     name, group = free.name, free.group
     common = {parameter.name: parameter for parameter in system.parameters}
     if name not in common:
         what = f"{name} is a time: what happens in a frame changes with it by jumps, not by degrees"
-        raise ApcError(Mistake("E831", place, what))
+        raise ApcError(Mistake("E831", _PLACE, what))
     for one in system.groups:
         own = {value.name: value for value in one.values}
         columns = {column.name for column in one.columns}
         if group == one.name:
             if name in columns:
-                raise ApcError(Mistake("E831", place, f"{name} differs from peer to peer of {group}"))
+                raise ApcError(Mistake("E831", _PLACE, f"{name} differs from peer to peer of {group}"))
             return own.get(name, common[name])
         if group is None and (name in own or name in columns):
             what = f"{name} is not the same for all: {one.name} has its own"
-            raise ApcError(Mistake("E831", place, what, hint=f"{one.name}.{name}=±1%"))
+            raise ApcError(Mistake("E831", _PLACE, what, hint=f"{one.name}.{name}=±1%"))
     return common[name]
 
 
-def _check_limits(parameter: Parameter, low: Fraction, high: Fraction, name: str, place: Place) -> None:
+def _check_limits(parameter: Parameter, low: Fraction, high: Fraction, name: str) -> None:
     """Refuse an empty range, and one beyond the parameter's bounds."""
     what, mistakes = f"the box of {name}", Mistakes()
     if not low < high:
         ends = " to ".join(with_unit(f"{float(end):g}", parameter.unit) for end in (low, high))
-        mistakes.add("E833", place, what, expected="a low below the high", got=ends)
+        mistakes.add("E833", _PLACE, what, expected="a low below the high", got=ends)
     for end in (low, high):
-        check_bounds(replace(parameter, value=float(end), exact=None), what, mistakes, "E833", place)
+        check_bounds(replace(parameter, value=float(end), exact=None), what, mistakes, "E833", _PLACE)
     mistakes.raise_if_any()
 
 

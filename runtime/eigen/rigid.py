@@ -20,7 +20,7 @@ eigenvector, a Jordan pair.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from operator import mul
 from typing import Any
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import ANGLES, LENGTH
 from apc.eigen.balls import BALLS, closed_frame, frame_steps
-from apc.eigen.closing import ClosedSystem, Coupling, Loop
+from apc.eigen.closing import ClosedSystem, Loop
 from apc.eigen.enclosure import misses_one
 from apc.eigen.null_space import null_space, null_space_modulo, residue
 from apc.eigen.peer_group import PeerGroup, states_of
@@ -195,9 +195,7 @@ def _places(sites: Sequence[PeerGroup], units: Sequence[str]) -> list[int]:
     return found
 
 
-def stays_rigid(
-    system: ClosedSystem | Loop, others: Sequence[LinearSite], *, coupling: Coupling | None = None
-) -> bool:
+def stays_rigid(system: ClosedSystem | Loop, others: Sequence[LinearSite]) -> bool:
     """Say whether the directions of a system's rigid modes are rigid with other matrices of its sites, too.
 
     Parameters
@@ -206,14 +204,11 @@ def stays_rigid(
         The closed system.
     others
         Matrices of each site, over rationals or quotients of polynomials: then for all values of these.
-    coupling
-        What the sites hear of each other then, where that is another, too.
     """
     solutions = _standing_solutions(system)
     if not solutions:
         return True
-    other = system if coupling is None else replace(system, coupling=coupling)
-    equations, states = _standing(other, others)
+    equations, states = _standing(system, others)
     for solution, state in solutions:
         moving = [(place, value) for place, value in enumerate(solution) if value]
         left, reached = (

@@ -289,15 +289,13 @@ def _inverse(kind: Kind, velocity: int, mass: int, at: int, peers: int | None) -
     return casadi.Function("inverse_inertia", inputs, [casadi.simplify(-copies * change[at] / slopes[at])])
 
 
-def devices_of(system: CompiledSystem, *, part: str = "", option: str = "--hands") -> dict[int, Device]:
+def devices_of(system: CompiledSystem, *, option: str) -> dict[int, Device]:
     """Return the device of each kind of peer.
 
     Parameters
     ----------
     system
         The compiled scene.
-    part
-        The part that is meant; without it, as `find_device`.
     option
         What asked for it.
 
@@ -313,14 +311,11 @@ def devices_of(system: CompiledSystem, *, part: str = "", option: str = "--hands
         if group.kind in found:
             continue
         site = jacobians(system.kinds[group.kind])
-        one = find_device(site, numbers.parameters[place][0], unit_of, part=part)
+        one = find_device(site, numbers.parameters[place][0], unit_of)
         if isinstance(one, Device):
             found[group.kind] = one
             continue
-        why = (
-            one
-            or f"{group.name} has no {part or 'device: every mass of it is a copy that others are told of'}"
-        )
+        why = one or f"{group.name} has no device: every mass of it is a copy that others are told of"
         raise ApcError(
             Mistake("E931", Place(system.origin.topology), f"{option}: {why}", hint="" if one else OWN_MASS)
         )

@@ -36,7 +36,7 @@ class Override:
     value: Fraction
 
 
-def parse_override(system: CompiledSystem, text: str, place: Place = OVERRIDE) -> Override:
+def parse_override(system: CompiledSystem, text: str) -> Override:
     """Read `NAME=QUANTITY`; the name may start with a group, or with the section it stands in.
 
     Raises
@@ -52,16 +52,14 @@ def parse_override(system: CompiledSystem, text: str, place: Place = OVERRIDE) -
     name, value = name.strip(), value.strip()
     if not (equals and name and value):
         form = "contact.stiffness=800 N/m"
-        raise ApcError(Mistake("E621", place, "an override", "NAME=VALUE", text[:80], form))
+        raise ApcError(Mistake("E621", OVERRIDE, "an override", "NAME=VALUE", text[:80], form))
     try:
-        free = find(system, name, place, counts=True)
+        free = find(system, name, OVERRIDE, counts=True)
     except ApcError as error:  # of one peer, with the value that it was to have
         raise ApcError(replace(one, hint=one.hint.replace(GIVEN, value)) for one in error.mistakes) from None
     unit = unit_of(system, free.name)
     try:
-        found = quantity(
-            value, place.shifted(len(text) - len(value)) if place.line else place, what=name, unit=unit
-        )
+        found = quantity(value, OVERRIDE, what=name, unit=unit)
     except ApcError as error:  # what is to be written is a setting, too
         mistakes = [replace(one, hint=one.hint.replace(f"{name}: ", f"{name}=")) for one in error.mistakes]
         raise ApcError(mistakes) from None

@@ -2,7 +2,7 @@
 
 Takes: a `CompiledSystem`.
 Gives: `PassiveHands`, `PassiveMode`, `passive_hands`; `passive_growth`; `circulates`,
-`worst_at`, `frequency_of`.
+`frequency_of`.
 Guarantees: no grid of frequencies decides anything; a verdict is proved, or it is undecided. Hands may be
 anything that gives back no more energy than it was given, each by itself, or, where devices feel each other
 alike, joined to each other too.
@@ -391,7 +391,11 @@ def frequency_of(loop: PortLoop, angle: float) -> float:
     Frequencies that differ by a multiple of the frame rate have one angle: which of them it is, its course
     within a frame says: the one that most of it is at.
     """
-    moved = worst_at(loop, angle)[1] * np.sqrt(loop.seconds)
+    maps = loop.maps
+    a, b, c, d, weight = map(value_of, (maps.a, maps.b, maps.c, maps.d, maps.weight))
+    response = c @ np.linalg.solve(np.exp(1j * angle) * np.eye(len(a)) - a, b + 0j) + d
+    # The vector of the least eigenvalue of He H + diag(b/τ).
+    moved = np.linalg.eigh((response + response.conj().T) / 2 + weight)[1][:, 0] * np.sqrt(loop.seconds)
     most = round(loop.frame_s / float(loop.seconds.min()) / 2) + 1
     found = sorted(angle + 2 * np.pi * turn for turn in range(-most, most + 1))
     found.sort(key=abs)  # of two that can't be told apart, the slower
@@ -403,18 +407,3 @@ def frequency_of(loop: PortLoop, angle: float) -> float:
     fits = np.linalg.norm((np.exp(-1j * turned) * shares * moved) @ each.T, axis=1)
     best = next(one for one, fit in zip(found, fits, strict=True) if fit >= max(fits) * (1 - ALIKE))
     return abs(best) / (2 * np.pi * loop.frame_s)
-
-
-def worst_at(loop: PortLoop, angle: float) -> tuple[float, Complexes]:
-    """Return the least eigenvalue of He H + diag(b/τ) at an angle, in floats, and its vector (m,).
-
-    Parameters
-    ----------
-    loop, angle
-        As for `frequency_of`.
-    """
-    maps = loop.maps
-    a, b, c, d, weight = map(value_of, (maps.a, maps.b, maps.c, maps.d, maps.weight))
-    response = c @ np.linalg.solve(np.exp(1j * angle) * np.eye(len(a)) - a, b + 0j) + d
-    values, vectors = np.linalg.eigh((response + response.conj().T) / 2 + weight)
-    return float(values[0]), vectors[:, 0]

@@ -15,12 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.weights import exact_weight
 from apc.eigen.closing import Loop
 from apc.eigen.modes import complete_loops
 from apc.eigen.peer_group import PeerGroup
@@ -30,7 +28,6 @@ from apc.frame.exact import evaluate_exact
 from apc.frame.exchange import Exchange
 from apc.frame.linearize import site_of_entries
 from apc.frame.residues import PRIMES, Residues, residues_of, residues_of_rounded
-from apc.frame.schedule import Way
 from apc.frame.site import LinearSite
 from apc.large.populations import Population
 
@@ -74,89 +71,22 @@ def count_translations(listed: Sequence[Population], exchange: Exchange) -> int 
     return total
 
 
-def _shares(groups: Sequence[PeerGroup], exchange: Exchange, way: Way) -> tuple[tuple[Fraction, ...], ...]:
-    """Return what each population hears of each on a way, in shares of all that it hears.
-
-    As if it heard as much of every population that it hears.
-    """
-    sending = [one.sends(way.link) for one in groups]
-    rows = []
-    for g, group in enumerate(groups):
-        heard = exchange.hears(way.link, g, sending)
-        late = [exchange.delay(way.link, one.role, group.role) == way.delay for one in groups]
-        rows.append(
-            tuple(
-                Fraction(1, len(heard)) if h in heard and late[h] else Fraction(0) for h in range(len(groups))
-            )
-        )
-    return tuple(rows)
-
-
-def _weighed(
-    rows: Sequence[Sequence[Fraction]], totals: Sequence[Fraction]
-) -> tuple[tuple[Fraction, ...], ...]:
-    """Return shares as parts of totals."""
-    return tuple(tuple(total * share for share in row) for row, total in zip(rows, totals, strict=True))
-
-
-def _heard_arcs(listed: Sequence[Population], exchange: Exchange, link: str) -> tuple[Integers, Floats]:
-    """Return who hears something over a link, arc by arc, and the weights."""
-    pairs, weights = exchange.arcs(link)
-    sends = np.repeat(
-        [population.sends(link) for population in listed], [len(population.rows) for population in listed]
-    )
-    heard = sends[pairs[:, 0]]
-    return pairs[heard, 1], weights[heard]
-
-
-def _all_totals(listed: Sequence[Population], exchange: Exchange, link: str, prime: int) -> Integers:
-    """Return what each peer hears over a link in all, modulo a prime (N,)."""
-    receivers, weights = _heard_arcs(listed, exchange, link)
-    found = np.zeros(exchange.peers, np.int64)
-    exact = [exact_weight(weight) for weight in np.unique(weights).tolist()]
-    np.add.at(found, receivers, residues_of_rounded(weights, exact, prime).column)
-    return found % prime
-
-
-def _subtract(vector: list[Fraction], times: Fraction, other: Sequence[Fraction], start: int) -> None:
-    """Take so many times another vector from a part of a vector, in place."""
-    if times:
-        for place, entry in enumerate(other):
-            vector[start + place] -= times * entry
-
-
-def hold_for_all(loop: Loop, listed: Sequence[Population], *, exchange: Exchange | None = None) -> bool:
+def hold_for_all(loop: Loop, listed: Sequence[Population]) -> bool:
     """Say whether the rigid modes of a loop of representatives are those of every peer of their populations.
 
     Parameters
     ----------
     loop
-        Its sites are the representatives.
+        Its sites are the representatives; all peers hear what they do.
     listed
         The population of each site.
-    exchange
-        The links, where a sum over one is as large as what each peer hears itself; else all hear what their
-        representative does.
     """
-    sums = [way for way in loop.coupling if way.operator == "sum"]
-    shares = {way: _shares(loop.sites, exchange, way) for way in sums} if exchange else {}
     try:
         for prime in PRIMES:
-            links = dict.fromkeys(way.link for way in shares)
-            totals = [_all_totals(listed, exchange, link, prime) for link in links] if exchange else []
             for place, population in enumerate(listed):
-                # Its peers, each once that differ in their numbers or in what they hear.
-                first = int(exchange.starts[population.group]) if exchange else 0
-                own = [one[first : first + len(population.rows)] for one in totals]
-                rows, *heard = np.unique(np.stack([population.rows, *own]), axis=1)
-                total_of = {link: Residues(one, prime) for link, one in zip(links, heard, strict=True)}
                 sites = [group.exact for group in loop.sites]
-                sites[place] = _all_peers(population, rows, prime)
-                coupling: dict[Way, Any] = dict(loop.coupling)
-                for way, listed_shares in shares.items():
-                    weights = tuple(total_of[way.link] * share for share in listed_shares[place])
-                    coupling[way] = (*coupling[way][:place], weights, *coupling[way][place + 1 :])
-                if not stays_rigid(loop, sites, coupling=coupling):
+                sites[place] = _all_peers(population, np.unique(population.rows), prime)
+                if not stays_rigid(loop, sites):
                     return False
     except (TypeError, ValueError, ZeroDivisionError):  # an operation that is none of a field
         return False

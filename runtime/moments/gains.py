@@ -14,7 +14,7 @@ largest eigenvalue of G is 1, or by ρ(A)² where it is smaller than 1 all the w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -37,7 +37,6 @@ Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
 
 # G(λ) in numbers of a kind, None where the means grow faster.
-Gain = Callable[[float, Arithmetic], Matrix | None]
 
 # What is left of a sum that is doubled, relative to the whole: far below any rounding.
 NOTHING = 1e-24

@@ -74,7 +74,7 @@ class Survey:
     finest: float
 
 
-def survey(log_magnitudes: Callable[[Floats], Floats], *, cells: int, halvings: int = HALVINGS) -> Survey:
+def survey(log_magnitudes: Callable[[Floats], Floats], *, cells: int) -> Survey:
     """Find the crossings of the boundary with the cells' edges, and link them.
 
     Parameters
@@ -83,16 +83,14 @@ def survey(log_magnitudes: Callable[[Floats], Floats], *, cells: int, halvings: 
         The logarithms (k, m) of the m largest magnitudes at points (k, 2), descending.
     cells
         Coarse cells along each side.
-    halvings
-        How many times a cell may be halved.
 
     Raises
     ------
     ApcError
         E905 a coarse cell in which the largest magnitude is 1 to rounding: signs would be noise there.
     """
-    lattice = _Lattice(log_magnitudes, cells, halvings)
-    step = 2**halvings
+    lattice = _Lattice(log_magnitudes, cells)
+    step = 2**HALVINGS
     axis = np.arange(cells + 1) * step
     grid = lattice.sample([(int(i), int(j)) for j in axis for i in axis]).reshape(cells + 1, cells + 1, -1)
     unsure = np.abs(grid[..., 0]) <= UNSURE
@@ -126,10 +124,10 @@ def survey(log_magnitudes: Callable[[Floats], Floats], *, cells: int, halvings: 
 class _Lattice:
     """The samples taken so far, by lattice coordinates."""
 
-    def __init__(self, function: Callable[[Floats], Floats], cells: int, halvings: int) -> None:
+    def __init__(self, function: Callable[[Floats], Floats], cells: int) -> None:
         self.function = function
         self.cells = cells
-        self.side = cells * 2**halvings
+        self.side = cells * 2**HALVINGS
         self.values: dict[Node, Floats] = {}
 
     def point(self, nodes: Iterable[Node]) -> Floats:

@@ -86,9 +86,9 @@ def delay_pieces(
     prepared: Prepared,
     *,
     place: Place,
-    high: Fraction | None = None,
+    high: Fraction,
 ) -> Iterator[Piece]:
-    """Yield the pieces from a value on upwards, for ever where there is no limit.
+    """Yield the pieces from a value on upwards.
 
     Parameters
     ----------
@@ -111,10 +111,9 @@ def delay_pieces(
         E844 a period or phase, or what is not linear in the parameter; E846 too many pieces up to `high`.
     """
     following = borders(system, free, place=place)
-    if high is not None:
-        _count(free, low, high, following, place)
+    _count(free, low, high, following, place)
     piece = _pieces(Asked.of(system, [free], prepared))
-    while high is None or low < high:
+    while low < high:
         end = following(low)
         yield piece(low, end)
         low = end

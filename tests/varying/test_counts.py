@@ -87,7 +87,7 @@ def test_a_count_that_cannot_be_is_refused(text: str, setting: str, message: str
 @pytest.mark.parametrize(
     ("count", "message"),
     [
-        ("count: kt", " count wants 1, got kt, which is in N/m. Write: count: 1 1"),
+        ("count: kt", " count wants 1, got kt, which is in N/m. Write: count: 1"),
         ("count: m", "count wants a whole number, or an expression over numbers of parameters, got m."),
         ("count: n/2", "count wants a whole number from 1 to 1000000000, got n/2, which is 1.5"),
         ("count: peers", "peers depends on peers, which it is a part of. Write: count: 3"),
