@@ -1,7 +1,8 @@
 """Eigenvalues with their right and left vectors, of one matrix or of many, and what follows from both.
 
 Takes: matrices (…, n, n), their derivatives, or what they are off by.
-Gives: `Eigenpairs`, `eigenpairs`, `pairs_to`, `refined`; `eigenvalues`; `components`, `inverses`.
+Gives: `Eigenpairs`, `eigenpairs`, `pairs_to`, `refined`; `eigenvalues`, `plain_eigenvalues`; `components`,
+`inverses`.
 Guarantees: a derivative that `eigenvalues` gives and that would be mostly rounding comes as 0.
 Does not: bound the errors of eigenvalues (see `enclosure`).
 
@@ -115,6 +116,14 @@ def eigenvalues(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
         block = np.index_exp[:, part[:, None], part]
         found[:, :, part] = _by_vectors(matrix[block], slope[block])
     return found[0], found[1]
+
+
+def plain_eigenvalues(matrix: Floats) -> Complexes:
+    """Return the eigenvalues (k, n) of matrices (k, n, n), of states that drive each other by themselves."""
+    found = np.zeros(matrix.shape[:2], dtype=np.complex128)
+    for part in components((matrix != 0).any(axis=0)):
+        found[:, part] = np.linalg.eigvals(matrix[:, part[:, None], part])
+    return found
 
 
 def _by_vectors(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:

@@ -58,8 +58,8 @@ def rectangle_of(x: Range, y: Range) -> Rectangle:
 class DirectFamily:
     """A `Family` that asks the evaluator for every point.
 
-    `parts` are its systems, `states` how many states each of the evaluator's has; without parts those are
-    taken as they are.
+    `parts` are its systems, `states` how many states each of the evaluator's has; without parts they are
+    those of the points asked for.
     """
 
     evaluator: MatrixSource
@@ -76,7 +76,14 @@ class DirectFamily:
     def matrices(self, points: Floats) -> tuple[Floats, ...]:
         """Return each system's matrices (k, n, n) at points (k, 2)."""
         whole = self.evaluator.matrices(self.rectangle.values(points))
-        return tuple(self._part(part, whole[part.system]) for part in self.parts) or whole
+        if self.parts:
+            return tuple(self._part(part, whole[part.system]) for part in self.parts)
+        driving = [components((one != 0).any(axis=0)) for one in whole]
+        return tuple(
+            one[:, states[:, None], states]
+            for one, parts in zip(whole, driving, strict=True)
+            for states in parts
+        )
 
     def slopes(self, system: int, points: Floats) -> tuple[Floats, Floats]:
         """Return one system's matrices (k, n, n) and their derivatives (2, k, n, n) over x and y."""
