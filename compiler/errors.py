@@ -15,6 +15,9 @@ from dataclasses import dataclass, replace
 
 SHOWN = 75  # characters of a source line, so that it fits a terminal of 80 with its indent
 
+# A line to write that is longer than this is not read to its end: what is wrong is said alone.
+LONGEST_HINT = 400
+
 
 @dataclass(frozen=True, slots=True, order=True)
 class Place:
@@ -96,7 +99,7 @@ class Mistake:
             text += f", got {self.got}" if self.expected else f" {self.got}"
         if not text.endswith((".", "?", "!")):
             text += "."
-        if self.hint:
+        if 0 < len(self.hint) <= LONGEST_HINT:
             text += f" Write: {self.hint}"
         return _in_one_line(text)
 
