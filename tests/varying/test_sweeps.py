@@ -25,7 +25,7 @@ from apc.__main__ import run
 from apc.compiler import seal
 from apc.sweeps.sweep import Sweep, sweep
 from tests.sweeping import CHEAP, alive, children, parts, start, start_waiting, wait_for_parts
-from tests.topologies import AVERAGE, ONE_MASS, compiled, told
+from tests.topologies import AVERAGE, ONE_MASS, SCENES, compiled, told
 
 WALL = compiled(CHEAP)
 MODEL = compiled(ONE_MASS)  # the cheapest of scenes, for what is about files and processes
@@ -82,7 +82,7 @@ def test_every_row_is_the_analysis_of_its_point() -> None:
     assert found.points == 4 and sum(count for _, count in found.verdicts) == 4
 
 
-def test_a_walls_verdict_turns_at_its_known_limit_and_a_search_may_be_swept() -> None:
+def test_a_walls_verdict_turns_at_its_known_limit_and_searches_and_mean_squares_are_swept() -> None:
     # m = 0.1 kg, b = 5 N·s/m, T = 1 ms: 3378.939 N/m at a delay of 1 ms, to the digits printed.
     found = apc.sweep(WALL, {"it.stiffness": "3378.9,3378.98 N/m"}, jobs=1, set={"it.delay": "1 ms"})
     assert list(found.column("verdict")) == ["stable", "unstable"]
@@ -92,6 +92,10 @@ def test_a_walls_verdict_turns_at_its_known_limit_and_a_search_may_be_swept() ->
     assert values[1] == pytest.approx(3378.939, abs=5e-4) and values[0] > values[1]
     assert found.column("error [N/m]")[1] < 1e-6
     assert list(found.column("verdict")) == ["stable below the value"] * 2
+    model = apc.compile(SCENES / "lossy-average.yaml")
+    [error] = apc.sweep(model, {"lan.loss": "20 %"}, jobs=1).column("mean_square_radius_error")
+    judged = apc.judge_network(model, set={"lan.loss": "20 %"})
+    assert judged is not None and error == judged.error < 1e-6
 
 
 @pytest.mark.whole
