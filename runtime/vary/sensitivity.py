@@ -245,9 +245,15 @@ def _clusters(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) 
         still &= np.isfinite(one).all(axis=(1, 2))
     found = []
     for name, (matrix, slopes) in zip(_names(family, len(pairs)), pairs, strict=True):
-        for states in _alone(matrix[0], slopes) if matrix.shape[1] else ():
-            block = np.index_exp[..., states[:, None], states]
-            found += _of_system(name, matrix[0][block], slopes[block][: len(free)], here, still)
+        if not matrix.shape[1]:
+            continue
+        own = _of_system(name, matrix[0], slopes[: len(free)], here, still)
+        if not all(one.condition < WORST for one in own):  # peers in a chain share eigenvalues, no motion
+            own = []
+            for states in _alone(matrix[0], slopes):
+                block = np.index_exp[..., states[:, None], states]
+                own += _of_system(name, matrix[0][block], slopes[block][: len(free)], here, still)
+        found += own
     sizes = [float(np.abs(one.values).max()) for one in found]
     least = max(sizes, default=0.0) - SHARED * max(1.0, *sizes, 0.0)
     kept = [one for one, size in zip(found, sizes, strict=True) if size >= least]

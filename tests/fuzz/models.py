@@ -9,6 +9,7 @@ Does not: watch over what it runs (see `running`).
 
 from __future__ import annotations
 
+import copy
 import functools
 import hashlib
 import io
@@ -177,11 +178,11 @@ def _forge_model(seed: str) -> Input:
     if sort == "origin":
         document = json.loads(text)
         for _ in range(chance.choice((1, 1, 2))):
-            document[chance.choice(list(document))] = chance.choice(_HOSTILE)
+            document[chance.choice(list(document))] = copy.deepcopy(chance.choice(_HOSTILE))
             texts = document["texts"]
             if isinstance(texts, list) and texts and isinstance(texts[0], list):
                 row = chance.choice(texts)
-                row[:1] = [chance.choice(_HOSTILE)] if chance.random() < 0.3 else row[:1]
+                row[:1] = [copy.deepcopy(chance.choice(_HOSTILE))] if chance.random() < 0.3 else row[:1]
         text = json.dumps(document).encode()
     elif sort == "model":
         model = chance.randbytes(chance.choice((0, 1, 100, len(model))))
