@@ -199,7 +199,8 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
             right, slip = _meant(parsed.unit, wanted)
             got += f" ({slip} is {_long_name(slip)}: case matters)" if slip else ""
         hint = f"{what}: {parsed.number} {right}".removesuffix(" 1") if right else ""
-        if actual == due.power(-1) and parsed.value:  # a rate in the place of a time, or the other way round
+        # A rate in the place of a time, or the other way round; radians don't say how long a turn takes.
+        if actual == due.power(-1) and actual.turning != "rad" and parsed.value:
             hint = f"{what}: {float(1 / (parsed.value * wanted.scale)):.9g} {unit}"
     raise ApcError(Mistake("E204", place, what, named, got, hint))
 

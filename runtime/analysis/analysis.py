@@ -139,8 +139,8 @@ def prepare_at_start(
 ) -> Prepared | None:
     """Return what was prepared with every kind linearized where it starts, as its parameters say.
 
-    None where that does not follow from the parameters alone (see `start.at_start`), nor does every peer
-    send zeros at the start whatever is varied.
+    None where what is heard at the start decides as well (see `start.at_start`), unless that is 0 from
+    every peer, whatever `varied` parameters are.
 
     Parameters
     ----------
@@ -169,9 +169,8 @@ def _starting(
     silent = False
     if any(at_start(sites[kind]) is None for kind in used):
         silent = not any(reaches_start(system, one) for one in varied) and all(
-            sends_nothing(system.kinds[group.kind], row)
+            sends_nothing(system.kinds[group.kind], rows)
             for group, rows in zip(system.groups, resolve(system).parameters, strict=True)
-            for row in rows
         )
     listed = [at_start(site, silent=silent) if kind in used else site for kind, site in enumerate(sites)]
     found = tuple(site for site in listed if site is not None)

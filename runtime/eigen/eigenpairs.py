@@ -1,8 +1,8 @@
 """Eigenvalues with their right and left vectors, of one matrix or of many, and what follows from both.
 
 Takes: matrices (…, n, n), their derivatives, or what they are off by.
-Gives: `Eigenpairs`, `eigenpairs`, `pairs_to`, `refined`; `eigenvalues`, `plain_eigenvalues`; `components`,
-`inverses`.
+Gives: `Eigenpairs`, `eigenpairs`, `pairs_to`, `refined`; `eigenvalues`; `components`,
+`driving_parts`, `inverses`.
 Guarantees: a derivative that `eigenvalues` gives and that would be mostly rounding comes as 0.
 Does not: bound the errors of eigenvalues (see `enclosure`).
 
@@ -118,14 +118,6 @@ def eigenvalues(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
     return found[0], found[1]
 
 
-def plain_eigenvalues(matrix: Floats) -> Complexes:
-    """Return the eigenvalues (k, n) of matrices (k, n, n), of states that drive each other by themselves."""
-    found = np.zeros(matrix.shape[:2], dtype=np.complex128)
-    for part in components((matrix != 0).any(axis=0)):
-        found[:, part] = np.linalg.eigvals(matrix[:, part[:, None], part])
-    return found
-
-
 def _by_vectors(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
     """Return the eigenvalues (k, n) of matrices (k, n, n) and their derivatives, see `eigenvalues`."""
     values, right = np.linalg.eig(matrix)
@@ -178,3 +170,11 @@ def components(driven: NDArray[np.bool_]) -> list[Places]:
     count, labels = connected_components(driven, connection="strong")
     parts = [np.flatnonzero(labels == part) for part in range(count)]
     return sorted(parts, key=lambda part: int(part[0]))
+
+
+def driving_parts(driven: NDArray[np.bool_]) -> list[Places]:
+    """Return the `components` in which some state drives one of them, itself or another.
+
+    What only passes on, as packets on their way, has the eigenvalue 0 whatever the entries are.
+    """
+    return [states for states in components(driven) if driven[np.ix_(states, states)].any()]

@@ -22,7 +22,7 @@ from apc.analysis.analysis import Analysis, Prepared, analyze, prepare, prepare_
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import in_hertz
-from apc.eigen.eigenpairs import plain_eigenvalues
+from apc.eigen.eigenpairs import eigenvalues
 from apc.eigen.spectrum import Mode
 from apc.explore.motion import motion_of
 from apc.explore.sliders import text_of
@@ -174,7 +174,7 @@ def _roots(
 def _roots_of(matrices: Sequence[NDArray[np.float64]]) -> NDArray[np.complex128]:
     """Return the eigenvalues of all matrices that there are."""
     known = (one[None] for one in matrices if np.isfinite(one).all())
-    return np.concatenate([EMPTY, *(plain_eigenvalues(one)[0] for one in known)])
+    return np.concatenate([EMPTY, *(eigenvalues(one, np.zeros_like(one))[0][0] for one in known)])
 
 
 def _thinned(values: Sequence[Fraction], most: int) -> list[Fraction]:

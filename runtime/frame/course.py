@@ -109,7 +109,10 @@ def turns(
 
 
 def _real_where_real(start: Complexes, heard: Complexes, values: Complexes) -> tuple[Complexes, Complexes]:
-    """Return what modes begin with, a vector of a real eigenvalue as a real one: it passes 0 on no side."""
+    """Return what modes begin with and hear, (k, n) and (k, n_r), real where their `values` (k,) are.
+
+    A real vector passes 0 on no side, where its phase would be that of rounding.
+    """
     largest = np.take_along_axis(start, np.abs(start).argmax(axis=1)[:, None], axis=1)
     size = np.abs(largest)
     turn = np.where(size > 0, largest.conj() / np.where(size > 0, size, 1.0), 1.0)

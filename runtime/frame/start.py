@@ -17,6 +17,7 @@ from typing import Any
 
 import casadi
 import numpy as np
+from numpy.typing import NDArray
 
 from apc.compiler.compiled import PEERS, CompiledSystem, Kind
 from apc.frame.exact import evaluate_exact
@@ -82,17 +83,29 @@ def reaches_start(system: CompiledSystem, free: Free) -> bool:
     return free.name in starts or free.name in scope_of(system).needed(sorted(starts))
 
 
-def sends_nothing(kind: Kind, parameters: Sequence[float]) -> bool:
-    """Say whether all that a peer sends at the start is 0, whatever its parameters but the start values."""
-    starts = set(_starts(kind))
-    listed = [
-        casadi.SX(value) if name in starts else casadi.SX.sym(name)
-        for name, value in zip(kind.parameters, parameters, strict=True)
-    ]
+def sends_nothing(kind: Kind, rows: NDArray[np.float64]) -> bool:
+    """Say whether all that peers send at the start is 0, whatever their parameters but the start values.
+
+    Parameters
+    ----------
+    kind
+        The peers' kind.
+    rows
+        The parameters of each different one, in SI (k, n_p).
+    """
+    if not all(one.send.is_a("SXFunction") for one in kind.sends):
+        return False
     place = {name: index for index, name in enumerate(kind.parameters)}
-    x = [listed[place[state.start]] for state in kind.states]
-    arguments = [casadi.vertcat(*x), casadi.SX.zeros(len(kind.holds)), casadi.vertcat(*listed), casadi.SX(0)]
-    return all(one.send.is_a("SXFunction") and one.send(*arguments).is_zero() for one in kind.sends)
+    starts = sorted({place[name] for name in _starts(kind)})
+    symbols = [casadi.SX.sym(name) for name in kind.parameters]
+    for values in np.unique(rows[:, starts], axis=0).tolist():
+        known = dict(zip(starts, values, strict=True))
+        listed = [known.get(index, symbol) for index, symbol in enumerate(symbols)]
+        x = casadi.vertcat(*(listed[place[state.start]] for state in kind.states))
+        arguments = [x, casadi.SX.zeros(len(kind.holds)), casadi.vertcat(*listed), casadi.SX(0)]
+        if not all(one.send(*arguments).is_zero() for one in kind.sends):
+            return False
+    return True
 
 
 @lru_cache(maxsize=KEPT)

@@ -74,6 +74,12 @@ class Survey:
     finest: float
 
 
+def blurred() -> ApcError:
+    """Return the refusal of a boundary that rounding puts anywhere."""
+    what = "in part of the rectangle some motion neither grows nor dies out, as far as floats can tell"
+    return ApcError(Mistake("E905", Place("region"), what, hint="some damping, or wider ranges"))
+
+
 def survey(log_magnitudes: Callable[[Floats], Floats], *, cells: int) -> Survey:
     """Find the crossings of the boundary with the cells' edges, and link them.
 
@@ -95,8 +101,7 @@ def survey(log_magnitudes: Callable[[Floats], Floats], *, cells: int) -> Survey:
     grid = lattice.sample([(int(i), int(j)) for j in axis for i in axis]).reshape(cells + 1, cells + 1, -1)
     unsure = np.abs(grid[..., 0]) <= UNSURE
     if (unsure[1:, 1:] & unsure[1:, :-1] & unsure[:-1, 1:] & unsure[:-1, :-1]).any():
-        what = "in part of the rectangle some motion neither grows nor dies out, as far as floats can tell"
-        raise ApcError(Mistake("E905", Place("region"), what, hint="some damping, or wider ranges"))
+        raise blurred()
     suspect = _suspect(grid[None])[0]
     leaves: dict[Node, int] = {}
     divided = [(int(i) * step, int(j) * step, step) for j, i in np.argwhere(suspect)]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.eigenpairs import components
+from apc.eigen.eigenpairs import components, driving_parts
 from apc.frame.names import Range
 from apc.vary.batch import MatrixSource
 from apc.vary.leading import Part
@@ -139,11 +139,7 @@ def family_over(source: MatrixSource, rectangle: Rectangle, errors: Errors, *, s
     wrong = tuple(one.max(axis=0) for one in errors(corners))
     parts: list[Part] = []
     for system, (error, matrix) in enumerate(zip(wrong, source.matrices(corners), strict=True)):
-        if split:
-            size = np.abs(matrix).max(axis=0) + error
-            driven = [states for states in components(size != 0) if size[np.ix_(states, states)].any()]
-        if not split or not driven:
-            driven = [np.arange(len(error))]
-        parts += [Part(system, states) for states in driven]
+        driving = driving_parts(np.abs(matrix).max(axis=0) + error != 0) if split else []
+        parts += [Part(system, states) for states in driving or [np.arange(len(error))]]
     own = tuple(wrong[part.system][np.ix_(part.states, part.states)] for part in parts)
     return DirectFamily(source, rectangle, tuple(parts), tuple(map(len, wrong)), own)

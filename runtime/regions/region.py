@@ -29,7 +29,7 @@ from apc.frame.overrides import apply
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, relative_to, stable_area, trace, trace_steps
-from apc.regions.cells import survey
+from apc.regions.cells import blurred, survey
 from apc.regions.curves import between
 from apc.regions.eigenpairs import Eigenvalues, Family, largest
 from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
@@ -247,7 +247,7 @@ def region(
         Into how many cells each side of the rectangle is divided to begin with.
     tolerance
         Largest distance between curves and boundary, relative to a coordinate; curves that could not be
-        followed so closely are `Region.coarse`.
+        followed so closely are `Region.coarse`. None: `TOLERANCE`, in mean square `TOLERANCE_OF_GROWTH`.
     criterion
         "mean-square" or "nominal", see `critical.critical`.
     prepared
@@ -258,14 +258,16 @@ def region(
     Raises
     ------
     ApcError
-        E896 a number of an unreliable link; E905 the scene can't be analysed everywhere in the rectangle; and
+        E896 a number of an unreliable link; E905 the scene can't be analysed everywhere in the rectangle, or
+        rounding leaves open where in it the boundary runs; and
         those of `analysis.lifted_groups`.
 
     Notes
     -----
     Where one axis is a delay, the rectangle is cut where events coincide (see `strips`). Where both axes are
-    times, or the scene is linearized at its start, each point is analysed by itself, and the boundary is a
-    line from cell edge to cell edge, its error the size of a cell. With passive hands there are no steps: its
+    times each point is analysed by itself, and the boundary is a line from cell edge to cell edge, its error
+    the size of a cell. A scene that is linearized at its start, and starts elsewhere along an axis, is
+    analysed point by point where other motions are free. With passive hands there are no steps: its
     points are on the boundary, straight lines between, and its error is an estimate by their middles.
     """
     free = tuple(axis.free for axis in axes)
@@ -389,6 +391,8 @@ def _surveyed(
     else:
         arcs = trace(deciding, found, tolerance=tolerance, offset=rectangle.offset)
     area, off = stable_area(arcs, found)
+    if off >= 1:  # of the unit square: the boundary may be anywhere in it
+        raise blurred()
     return Striped(arcs, area, off, found.corners[0], (found.cell, found.cell), found.finest / found.cell)
 
 

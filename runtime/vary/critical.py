@@ -182,7 +182,7 @@ def critical(
             if chosen_criterion == PASSIVE and not passive_hands(system, prepared).why:
                 found = replace(found, enters=True)  # where clamped devices shake all values are one
         elif timed:
-            start = _at_start(system, prepared)
+            start = _at_start(system, prepared, free)
             begin = limits[0] or Fraction(0)
             end = limits[1] or delay_reach(system, free, begin, pieces=PIECES, further=FURTHER)[0]
             tell = pace(system, free, begin, end, place=_PLACE, told=told)
@@ -260,9 +260,9 @@ def _line(system: CompiledSystem, free: Free, limits: Sequence[Fraction | None],
     return line
 
 
-def _at_start(system: CompiledSystem, prepared: Prepared) -> Prepared:
+def _at_start(system: CompiledSystem, prepared: Prepared, free: Free) -> Prepared:
     """Return what was prepared, as the parameters say; refuse a delay of a scene where they don't suffice."""
-    found = prepare_at_start(system, prepared)
+    found = prepare_at_start(system, prepared, [free])
     if found is None:
         raise hangs_on_heard(system)
     return found

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.eigenpairs import components
+from apc.eigen.eigenpairs import driving_parts
 from apc.eigen.enclosure import SMALL, enclose_stack
 from apc.eigen.relative import relative_bounded
 from apc.eigen.spectrum import LEAST_SHARE, STRAIGHT
@@ -69,9 +69,7 @@ def parts_of(evaluator: BatchEvaluator) -> tuple[tuple[Part, ...], tuple[Truths,
         matrix, error = relative_bounded(wiring.system.matrix, wiring.system.error, wiring.relative)
         size = np.abs(matrix) + error
         patterns.append(size != 0)
-        parts += [
-            Part(place, states) for states in components(size != 0) if size[np.ix_(states, states)].any()
-        ]
+        parts += [Part(place, states) for states in driving_parts(size != 0)]
     return tuple(parts), tuple(patterns)
 
 

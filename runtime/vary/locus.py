@@ -18,7 +18,7 @@ from apc.analysis.analysis import analyze, prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Place
 from apc.compiler.timings import part
-from apc.eigen.eigenpairs import plain_eigenvalues
+from apc.eigen.eigenpairs import eigenvalues as eigenvalues_of
 from apc.frame.names import Free, find
 from apc.frame.overrides import apply
 from apc.vary.evaluator import evaluator_of_many, overrides_at, reaches_time
@@ -79,7 +79,8 @@ def _at_once(
         family = evaluator_of_many(system, [free], Place(free.label), prepared=prepare(system))
         matrices = family.matrices(values[:, None])
     known = np.all([np.isfinite(one).all(axis=(1, 2)) for one in matrices], axis=0) & np.isfinite(values)
-    listed = [plain_eigenvalues(one[known] if len(one) > 1 else one) for one in matrices]
+    chosen = [one[known] if len(one) > 1 else one for one in matrices]
+    listed = [eigenvalues_of(one, np.zeros_like(one))[0] for one in chosen]
     count = int(known.sum())
     every = np.concatenate([np.broadcast_to(one, (count, one.shape[1])) for one in listed], axis=1)
     return values[known], tuple(every.astype(np.complex128))

@@ -107,8 +107,9 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
-        start = prepare_at_start(system, prepared)
-        free, at = coupler_parameters(system), start or prepared
+        free = coupler_parameters(system)
+        start = prepare_at_start(system, prepared, [*free, *_delays(system)])
+        at = start or prepared
         delays = _delays(system) if start is not None else []
         most = MOST_IN_PASSING if quick else math.inf
         effort = effort_of(system, at, most=most)

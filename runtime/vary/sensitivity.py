@@ -23,7 +23,7 @@ from apc.analysis.analysis import Prepared, lifted_groups, prepare, prepare_at_s
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.timings import part
 from apc.compiler.words import counted
-from apc.eigen.eigenpairs import components, eigenpairs
+from apc.eigen.eigenpairs import driving_parts, eigenpairs
 from apc.eigen.modes import split
 from apc.eigen.spectrum import solve_spectrum
 from apc.finite_equations import finite_equations
@@ -116,7 +116,7 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         free, prepared = varied(system), prepared or prepare(system)
-        start = prepare_at_start(system, prepared) or prepared
+        start = prepare_at_start(system, prepared, free) or prepared
         systems = split(*lifted_groups(system, prepared=start)).systems
         most = solve_spectrum(systems, in_balls=False).spectral_radius + SHARED
 
@@ -267,8 +267,8 @@ def _alone(matrix: Floats, slopes: Floats) -> list[Places]:
     """
     driving = (matrix != 0) | (slopes != 0).any(axis=0)
     both = np.concatenate([matrix[None], slopes])
-    own = {both[:, part[:, None], part].tobytes(): part for part in reversed(components(driving))}
-    return [part for part in own.values() if matrix[np.ix_(part, part)].any()] or [np.arange(len(matrix))]
+    own = {both[:, part[:, None], part].tobytes(): part for part in reversed(driving_parts(driving))}
+    return list(own.values()) or [np.arange(len(matrix))]
 
 
 def _names(family: BatchEvaluator | PointEvaluator, count: int) -> list[str]:

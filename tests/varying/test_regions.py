@@ -127,9 +127,9 @@ def test_a_region_made_by_construction_has_its_curves_and_its_area(name: str) ->
 
 
 @pytest.mark.whole
-def test_a_boundary_that_rounding_blurs_is_followed_no_finer_than_that() -> None:
-    found = apc.region(scene("high-rate-ratio"), x=X, y=Y)
-    assert found.coarse and sum(len(one.points) for one in found.curves) < 10_000
+def test_a_boundary_that_rounding_puts_anywhere_is_refused() -> None:
+    with pytest.raises(ApcError, match=KEEPS):
+        apc.region(scene("high-rate-ratio"), x=X, y=Y)
 
 
 def test_ends_where_modes_meet_are_the_corner_and_a_cusp_is_followed_to_its_tangent() -> None:
