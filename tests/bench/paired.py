@@ -1,0 +1,256 @@
+"""This version beside another, question by question over all scenes: `python -m tests.bench.paired OTHER`.
+
+OTHER is the Python of an environment in which another version of apc is installed. Both answer the same
+question on the same scene in turn, in one process each, with one thread. A number is wrong if the two are
+farther apart than both their errors, a verdict if it is another one; a time is that of a processor. What one
+version answers and the other does not is listed with its message.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDERS = ("models/scenes", "tests/scenes", "tests/hard")
+LONGEST_S = 60
+Numbers = list[tuple[float, float]]
+
+
+def _stiffnesses(model: Any) -> list[str]:
+    import apc
+
+    return [row.name for row in apc.parameters(model).rows if row.name.endswith("stiffness")]
+
+
+def _critical(model: Any, ending: str, place: int) -> tuple[str, Numbers]:
+    import apc
+
+    names = [row.name for row in apc.parameters(model).rows if row.name.endswith(ending)]
+    found = apc.critical(model, names[place])
+    words = " ".join(str(crossing.stable_side) for crossing in found.crossings)
+    return words, [(crossing.value, crossing.error) for crossing in found.crossings]
+
+
+def _analyze(model: Any) -> tuple[str, Numbers]:
+    import apc
+
+    found = apc.analyze(model)
+    return found.verdict, [(found.spectral_radius, found.spectral_radius_error)]
+
+
+def _many(model: Any) -> tuple[str, Numbers]:
+    import numpy as np
+
+    import apc
+
+    name = _stiffnesses(model)[0]
+    found = apc.analyze_many(model, {name: np.linspace(10, 3000, 10_000)})
+    errors = np.nan_to_num(found.spectral_radius_error[::100], nan=np.inf)
+    return "", list(zip(found.spectral_radius[::100].tolist(), errors.tolist(), strict=True))
+
+
+def _region(model: Any) -> tuple[str, Numbers]:
+    import apc
+
+    x, y = _stiffnesses(model)[:2]
+    found = apc.region(model, x=f"{x}=10 N/m:3000 N/m", y=f"{y}=10 N/m:2000 N/m")
+    return "", [(found.stable_area, found.stable_area_error)]
+
+
+def _passive(model: Any) -> tuple[str, Numbers]:
+    import apc
+
+    return str(apc.passive_hands(model).verdict), []
+
+
+def _network(model: Any) -> tuple[str, Numbers]:
+    import apc
+
+    found = apc.judge_network(model)
+    return "|".join(str(getattr(row, "verdict", "")) for row in getattr(found, "rows", ())), []
+
+
+def _simulate(model: Any) -> tuple[str, Numbers]:
+    import apc
+
+    found = apc.simulate(model, duration="0.5 s")
+    # What contacts make of a rounding is not known: a hundred-thousandth is what both players state.
+    ends = {name: float(value) for name, value in zip(found.names, found.values[-1], strict=True)}
+    return "", [(ends[name], 1e-5 * max(1.0, abs(ends[name]))) for name in sorted(ends)]
+
+
+def _feel(model: Any) -> tuple[str, Numbers]:
+    import apc
+
+    found = apc.feel(model, [1.0, 10.0], unstable=True)
+    values = [abs(complex(value)) for value in found.error_per_force]
+    return "", [(value, 1e-9 * value) for value in values]
+
+
+def _answer(model: Any) -> tuple[str, Numbers]:
+    from apc.answer import answer
+
+    answer(model)
+    return "", []
+
+
+def _margins(model: Any) -> tuple[str, Numbers]:
+    import apc
+
+    apc.margins(model)
+    return "", []
+
+
+QUESTIONS: dict[str, Callable[[Any], tuple[str, Numbers]]] = {
+    "analyze": _analyze,
+    "10,000 points": _many,
+    "first stiffness": lambda model: _critical(model, "stiffness", 0),
+    "last delay": lambda model: _critical(model, "delay", -1),
+    "region": _region,
+    "passive hands": _passive,
+    "network": _network,
+    "feel": _feel,
+    "simulate": _simulate,
+    "margins": _margins,
+    "default output": _answer,
+}
+
+
+def serve() -> None:
+    """Answer the questions on standard input, a line each, as long as there are any."""
+    import signal
+    import time
+
+    import apc
+
+    class TooLong(BaseException):
+        """The time is up; no handler of errors may catch it."""
+
+    def stop(*_: object) -> None:
+        raise TooLong
+
+    signal.signal(signal.SIGALRM, stop)
+    models: dict[str, Any] = {}
+    for line in sys.stdin:
+        file, question, runs = json.loads(line)
+        told: dict[str, Any] = {"refused": "", "words": "", "numbers": [], "seconds": []}
+        signal.alarm(LONGEST_S)
+        try:
+            models[file] = models.get(file) or apc.compile(file)
+            for _ in range(runs):
+                begun = time.process_time()
+                told["words"], told["numbers"] = QUESTIONS[question](models[file])
+                told["seconds"].append(time.process_time() - begun)
+        except TooLong:
+            told["refused"] = f"took more than {LONGEST_S} s"
+        except Exception as error:
+            told["refused"] = f"{type(error).__name__}: {str(error)[:120]}"
+        signal.alarm(0)
+        print(json.dumps(told), flush=True)
+
+
+@dataclass(slots=True)
+class Version:
+    """A process of a version of apc that answers questions."""
+
+    process: subprocess.Popen[str]
+
+    @classmethod
+    def start(cls, python: str) -> Version:
+        """Start the process in the environment of a Python."""
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+        # The file itself is run, with nothing of this checkout on the path.
+        command = [python, "-P", str(Path(__file__)), "--serve"]
+        pipe = subprocess.PIPE
+        return cls(
+            subprocess.Popen(
+                command, stdin=pipe, stdout=pipe, text=True, cwd="/", env=os.environ | threads, bufsize=1
+            )
+        )
+
+    def ask(self, *question: object) -> dict[str, Any]:
+        """Return what it answers to a scene's file, a question and a number of runs."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(json.dumps(question) + "\n")
+        return dict(json.loads(self.process.stdout.readline()))
+
+
+@dataclass(slots=True)
+class Pairs:
+    """What two versions took and how they differ, over the scenes."""
+
+    seconds: list[tuple[float, float, str]] = field(default_factory=list)
+    bounds: list[float] = field(default_factory=list)
+    different: list[str] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
+
+    def add(self, scene: str, ours: dict[str, Any], theirs: dict[str, Any]) -> None:
+        """Take down the two answers of a scene."""
+        if ours["refused"] or theirs["refused"]:
+            if bool(ours["refused"]) != bool(theirs["refused"]):
+                who = "this version" if ours["refused"] else "the other"
+                self.refused.append(f"{scene}: {who}: {ours['refused'] or theirs['refused']}")
+            return
+        self.seconds.append((min(ours["seconds"]), min(theirs["seconds"]), scene))
+        pairs = list(zip(ours["numbers"], theirs["numbers"], strict=False))
+        self.bounds += [a[1] / b[1] for a, b in pairs if b[1] > 0 and a[1] < float("inf")]
+        apart = any(abs(a[0] - b[0]) > a[1] + b[1] for a, b in pairs)
+        unequal = len(ours["numbers"]) != len(theirs["numbers"])
+        if apart or unequal or ours["words"] != theirs["words"]:
+            said = [f"{answer['words']} {answer['numbers'][:3]}" for answer in (ours, theirs)]
+            self.different.append(f"{scene}: {said[0]}, the other {said[1]}")
+
+    def report(self, question: str) -> None:
+        """Print what the scenes took, and where the answers differ."""
+        if not self.seconds:
+            print(f"\n{question}: no scene has an answer of both")
+        else:
+            ours, theirs = (sum(row[place] for row in self.seconds) for place in (0, 1))
+            ratios = sorted((row[0] / max(row[1], 1e-6), row[2]) for row in self.seconds)
+            middle = statistics.median(ratio for ratio, _ in ratios)
+            print(
+                f"\n{question}: {len(ratios)} scenes, {theirs:.3g} s -> {ours:.3g} s; "
+                f"ratio: median {middle:.2f}, largest {ratios[-1][0]:.2f} ({ratios[-1][1]})"
+            )
+        if self.bounds:
+            print(f"  bounds: median {statistics.median(self.bounds):.2f}, largest {max(self.bounds):.2f}")
+        for title, rows in (("different", self.different), ("answered by only one", self.refused)):
+            for row in rows:
+                print(f"  {title}: {row}")
+
+
+def main() -> None:
+    """Ask both versions every question on every scene, and print the comparison."""
+    from tests.bench.judge import Judge, parser_of
+
+    parser = parser_of("paired", __doc__)
+    parser.add_argument("other", help="the Python of the other version's environment")
+    parser.add_argument("--only", action="append", choices=QUESTIONS, help="may be repeated")
+    given = parser.parse_args()
+    judge = Judge(given.strict)
+    ours, theirs = Version.start(sys.executable), Version.start(given.other)
+    files = [file for folder in FOLDERS for file in sorted((ROOT / folder).glob("*.yaml"))]
+    for question in given.only or QUESTIONS:
+        pairs, runs = Pairs(), 3 if question == "analyze" else 1
+        for file in files[:5] if given.quick else files:
+            asked = (str(file), question, runs)
+            pairs.add(file.stem, ours.ask(*asked), theirs.ask(*asked))
+        pairs.report(question)
+        judge.right(f"{question}: the same answers", not pairs.different)
+    judge.end()
+
+
+if __name__ == "__main__":
+    if "--serve" in sys.argv:
+        serve()
+    else:
+        main()
