@@ -112,6 +112,8 @@ def least_real(a: Floats, b: Floats, c: Floats, d: Floats, weight: Floats) -> tu
 
     def hamiltonian(best: float) -> Floats:
         level = best + ABOVE * max(abs(best), scale)
+        if not level:  # nothing is given nor taken at any frequency looked at
+            return np.zeros((0, 0))
         r = np.linalg.inv(d_c + d_c.T + 2 * weight + 2 * level * np.eye(len(weight)))
         a_h = a_c - b_c @ r @ c_c
         return np.block([[a_h, -b_c @ r @ b_c.T], [c_c.T @ r @ c_c, -a_h.T]])

@@ -67,6 +67,8 @@ def _worst(found: PassiveHands, worst: PassiveMode) -> str:
             f"damping {-worst.more:.4g} N*s/m could be spared, with the least left as they move {moved} at "
             f"{worst.frequency_hz:.4g} Hz."
         )
+    if found.clamped_stable is False:
+        return "Hands that hold the devices still are passive, and with these the scene is not stable."
     if found.stable is False:
         return (
             f"Hands that move the devices {moved} at {worst.frequency_hz:.4g} Hz get energy out of the scene "

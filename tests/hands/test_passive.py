@@ -6,6 +6,7 @@ import itertools
 import json
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.hands.box import prove_box
 from apc.hands.passivity import STABLE, UNSTABLE, PassiveHands, passive_hands
-from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced, wall
+from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced, wall
+from tests.truths import LIBRARY
 
 PULL = "coordination.stiffness"
 
@@ -290,6 +292,20 @@ def test_where_one_is_pulled_harder_than_it_pulls_hands_by_themselves_do_no_harm
     assert found.stable and not found.joined
     assert "each by itself" in " ".join(str(found).split())
     assert not shaken(system, 10 ** np.random.default_rng(3).uniform(-6, [3, 4, 7], size=(60, 3)))
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("file", [*LIBRARY, *(ROOT / "tests" / "hard").glob("[!v]*.yaml")], ids=str)
+def test_every_scene_has_a_verdict_or_a_reason_why_not(file: Path) -> None:
+    try:  # of 2,007 states at once there are none: very-long-delay takes 24 GB
+        assert apc.passive_hands(apc.compile(file)).verdict
+    except ApcError as error:
+        assert error.mistakes[0].code in {"E931", "E932", "E933"}
+
+
+def test_where_nothing_brakes_held_devices_leave_the_object_coasting() -> None:
+    found = apc.passive_hands(apc.compile(ROOT / "tests" / "hard" / "coasting.yaml"))
+    assert not found.stable and "hold the devices still" in str(found)
 
 
 def test_what_is_not_judged_is_refused_by_name() -> None:
