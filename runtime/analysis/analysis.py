@@ -24,8 +24,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.eigen.closing import Loop, close_loop
 from apc.eigen.modes import arrange
-from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of, used_ways
-from apc.eigen.peers import group_of_row, peer_groups
+from apc.eigen.peers import MOST_STATES, PeerGroup, group_of_row, peer_groups, states_of, used_ways
 from apc.eigen.rest import unrest
 from apc.eigen.rigid import Standing, what_stands
 from apc.eigen.spectrum import (
@@ -42,11 +41,11 @@ from apc.frame.ages import at_timings, linear_sites
 from apc.frame.discretize import TOO_LARGE
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.jacobians import SiteJacobians
+from apc.frame.linearize import at_start, reaches_start, sends_nothing
 from apc.frame.names import Free
 from apc.frame.parameters import Numbers, resolve
 from apc.frame.schedule import ORDER, Schedule
 from apc.frame.scheduling import build_schedules
-from apc.frame.start import at_start, reaches_start, sends_nothing
 from apc.network.nominal import left_out
 from apc.result import Look, Result
 from apc.threads import single_threaded

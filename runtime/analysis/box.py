@@ -27,7 +27,7 @@ from apc.compiler.plain import RULES
 from apc.compiler.words import with_unit
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import split
-from apc.eigen.peer_group import PeerGroup, Runs
+from apc.eigen.peers import PeerGroup, Runs
 from apc.eigen.ratios import NotRational, Ratio, Ratios, open_site
 from apc.frame.exchange import Exchange
 from apc.frame.names import Free, Range, find

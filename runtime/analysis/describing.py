@@ -28,7 +28,7 @@ from apc.analysis.pushes import Push
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import close_loop
 from apc.eigen.modes import arrange
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peers import PeerGroup
 from apc.eigen.spectrum import Spectrum, solve_spectrum
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.parameters import resolve

@@ -32,8 +32,7 @@ from apc.analysis.switches import bind, find_switches
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import Loop, close_loop, close_outside, lay_out
 from apc.eigen.modes import loops_at_right_angles
-from apc.eigen.peer_group import PeerGroup
-from apc.eigen.peers import peer_groups
+from apc.eigen.peers import PeerGroup, peer_groups
 from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.discretize import UNIT, discretize

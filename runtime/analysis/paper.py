@@ -42,7 +42,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import ClosedSystem, Feedback, StateLayout, close
 from apc.eigen.modes import dense
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peers import PeerGroup
 from apc.eigen.relative import relative_bounded, relative_coordinates, relative_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, Spectrum, solve_spectrum

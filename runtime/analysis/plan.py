@@ -19,8 +19,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Loop
 from apc.eigen.graph_loops import common_graph
 from apc.eigen.modes import arrange, dense_loop
-from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of, too_large, used_ways
-from apc.eigen.peers import more_differ, peer_groups
+from apc.eigen.peers import MOST_STATES, PeerGroup, more_differ, peer_groups, states_of, too_large, used_ways
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.parameters import Numbers

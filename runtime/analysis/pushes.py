@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from apc.analysis.switches import SwitchedKind, SwitchingPart
 from apc.compiler.interpolation import jacobian
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.start import start_values
+from apc.frame.linearize import start_values
 
 Floats = NDArray[np.float64]
 

@@ -32,7 +32,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.interpolation import Interpolation, jacobian
 from apc.compiler.plain import LOOK, straight, symbolic, walk
 from apc.frame.jacobians import SiteJacobians, jacobians
-from apc.frame.start import start_values
+from apc.frame.linearize import start_values
 
 # A part with more decisions than this is refused: its pieces are as many as 2 to that power.
 MOST_DECISIONS = 6

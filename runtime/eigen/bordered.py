@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.closing import Coupling, bounded_weight
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peers import PeerGroup
 from apc.frame.lift import FrameMap
 from apc.frame.schedule import Way
 from apc.threads import load_pool

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.graph_modes import Surd
-from apc.eigen.peer_group import PeerGroup, states_of
+from apc.eigen.peers import PeerGroup, states_of
 from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap
 from apc.frame.radius import FLOATS, RADII, Arithmetic, common_shape, radius_of, value_of

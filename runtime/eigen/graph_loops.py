@@ -20,7 +20,7 @@ import numpy as np
 from apc.compiler.weights import sum_weights
 from apc.eigen.closing import Coupling, Loop
 from apc.eigen.graph_modes import GraphMode, Surd
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peers import PeerGroup
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.schedule import Way
 

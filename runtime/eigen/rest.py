@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.words import with_unit
-from apc.eigen.peer_group import PeerGroup
-from apc.frame.start import start_values
+from apc.eigen.peers import PeerGroup
+from apc.frame.linearize import start_values
 
 # Of the size of what adds up to a rate, what may be left of it where all of it balances.
 ROUNDED = 1e-12

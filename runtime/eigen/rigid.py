@@ -34,7 +34,7 @@ from apc.eigen.balls import BALLS, closed_frame, frame_steps
 from apc.eigen.closing import ClosedSystem, Loop
 from apc.eigen.enclosure import misses_one
 from apc.eigen.null_space import null_space, null_space_modulo, residue
-from apc.eigen.peer_group import PeerGroup, states_of
+from apc.eigen.peers import PeerGroup, states_of
 from apc.frame.lift import Seen
 from apc.frame.site import LinearSite, entrywise
 

@@ -43,9 +43,9 @@ from apc.explore.sliders import (
     with_value,
 )
 from apc.explore.written import with_values
+from apc.frame.linearize import reaches_start
 from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
-from apc.frame.start import reaches_start
 from apc.present.forms import json_text
 from apc.processes import model_bytes
 from apc.vary.evaluator import reaches_count, reaches_time

@@ -25,7 +25,7 @@ from apc.analysis.analysis import prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.plain import symbolic
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peers import PeerGroup
 from apc.exports.lifted import Numbers, StateSpace, lifted, peers_of, state_space, steps_in_floats
 from apc.exports.words import Port, words
 from apc.frame.devices import Push

@@ -37,7 +37,7 @@ from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.distribution import versions
 from apc.eigen.closing import Feedback, Loop, close, feedback_of, lay_out_loop
 from apc.eigen.modes import dense_loop
-from apc.eigen.peer_group import PeerGroup, states_of
+from apc.eigen.peers import PeerGroup, states_of
 from apc.exports.words import Port
 from apc.finite_equations import finite_equations
 from apc.frame.devices import Device, Push, find_push

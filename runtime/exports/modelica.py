@@ -45,8 +45,8 @@ from apc.finite_equations import finite_equations
 from apc.frame.ages import stamped
 from apc.frame.exchange import Exchange, build_exchange, check_mean
 from apc.frame.jacobians import jacobians
+from apc.frame.linearize import start_sends
 from apc.frame.parameters import resolve
-from apc.frame.start import start_sends
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.simulation.trajectory import texts_of

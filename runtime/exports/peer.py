@@ -33,9 +33,9 @@ from apc.frame.devices import Device, find_device, find_devices
 from apc.frame.discretize import moved_together
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, edge_name, structural_pattern
+from apc.frame.linearize import start_arguments, start_values
 from apc.frame.parameters import exact_numbers
 from apc.frame.schedule import Schedule
-from apc.frame.start import start_arguments, start_values
 from apc.simulation.flow import flow_of, rows_to_move, state_scales
 from apc.simulation.propagate import rates, transition_rows
 from apc.simulation.settings import Method

@@ -32,9 +32,9 @@ from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.interpolation import jacobian
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, jacobians
+from apc.frame.linearize import Listening, start_arguments
 from apc.frame.overrides import apply, parse_override
 from apc.frame.parameters import exact_numbers, resolve
-from apc.frame.start import Listening, start_arguments
 
 if TYPE_CHECKING:
     from apc.compiler.components.component import Component

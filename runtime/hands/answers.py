@@ -28,8 +28,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.language.vectors import whole_and_index
 from apc.eigen.closing import Loop
 from apc.eigen.modes import arrange, dense_loop
-from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of, used_ways
-from apc.eigen.peers import more_differ
+from apc.eigen.peers import MOST_STATES, PeerGroup, more_differ, states_of, used_ways
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.devices import OWN_MASS, Device, find_device, find_devices
 from apc.frame.discretize import UNIT

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, timed
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.language.vectors import whole_and_index
-from apc.eigen.peer_group import PeerGroup
-from apc.eigen.peers import group_of_row
+from apc.eigen.peers import PeerGroup, group_of_row
 from apc.frame.batch_lift import lift_sites
 from apc.frame.devices import Device
 from apc.frame.discretize import UNIT

@@ -34,7 +34,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.balls import BALLS
 from apc.eigen.closing import Loop, close_loop
 from apc.eigen.modes import arrange, dense_loop
-from apc.eigen.peer_group import MOST_STATES, PeerGroup, states_of
+from apc.eigen.peers import MOST_STATES, PeerGroup, states_of
 from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.devices import OWN_MASS, Device, find_device

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.closing import Loop, close_loop
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peers import PeerGroup
 from apc.frame.devices import Device
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize, exponential_rows
 from apc.frame.lift import FrameMap, bounded, check_packets, named, step_durations

@@ -21,7 +21,7 @@ import numpy as np
 from apc.analysis.analysis import lifted_groups, prepare
 from apc.compiler.compiled import CompiledSystem, Link, Timing, count_of
 from apc.compiler.language.vectors import whole_and_index
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peers import PeerGroup
 from apc.frame.ages import aged
 
 # The timing of packets that take no time.

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.bordered import wires_of
 from apc.eigen.closing import Coupling
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peers import PeerGroup
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.lift import BoundedMap, FrameMap
 from apc.frame.schedule import Heard, Sent, Way

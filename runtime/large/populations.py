@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Closed, Feedback, StateLayout, close, lay_out
-from apc.eigen.peer_group import states_of
+from apc.eigen.peers import states_of
 from apc.eigen.spectrum import Mode, Motion, oscillation
 from apc.frame.batch_lift import CHUNK, lift_rows
 from apc.frame.course import turns

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.closing import Loop
 from apc.eigen.modes import complete_loops
-from apc.eigen.peer_group import PeerGroup
-from apc.eigen.peers import group_of_row
+from apc.eigen.peers import PeerGroup, group_of_row
 from apc.eigen.rigid import find_rigid_modes, stays_rigid
 from apc.frame.exact import evaluate_exact
 from apc.frame.exchange import Exchange

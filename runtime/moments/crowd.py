@@ -22,7 +22,7 @@ from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import Clock, CompiledSystem, Kind
 from apc.eigen.closing import Coupling, Loop, without_packets
 from apc.eigen.modes import complete_degrees, complete_loops, couple, dense_loop, split_exchangeable
-from apc.eigen.peer_group import PeerGroup, used_ways
+from apc.eigen.peers import PeerGroup, used_ways
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.exchange import Exchange
 from apc.frame.lift import FrameMap

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.eigen.modes import dense_loop
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peers import PeerGroup
 from apc.eigen.relative import Relative
 from apc.frame.devices import Device, find_device
 from apc.frame.ports import with_holds, with_ports

@@ -28,7 +28,7 @@ from apc.analysis.analysis import Prepared, lifted_groups, timed
 from apc.compiler.compiled import CompiledSystem, Link
 from apc.eigen.closing import Feedback, Loop, bounded_weight, close, feedback_of, lay_out_loop
 from apc.eigen.modes import dense_loop
-from apc.eigen.peer_group import MOST_STATES, PeerGroup
+from apc.eigen.peers import MOST_STATES, PeerGroup
 from apc.eigen.relative import Relative, relative_coordinates, relative_rows, with_doubt
 from apc.frame.parameters import resolve
 from apc.frame.radius import RADII

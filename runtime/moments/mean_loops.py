@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.closing import Feedback, Loop, StateLayout, bounded_weight, close
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peers import PeerGroup
 from apc.eigen.relative import Relative, relative_coordinates, relative_rows, with_doubt
 from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap

@@ -27,7 +27,7 @@ from apc.compiler.compiled import CompiledSystem, Link
 from apc.eigen.closing import Loop, close, feedback_of, lay_out_loop
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.modes import arrange
-from apc.eigen.peer_group import MOST_STATES
+from apc.eigen.peers import MOST_STATES
 from apc.eigen.relative import Relative, relative, relative_coordinates, with_doubt
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.radius import RADII, radius_of, value_of, with_radius

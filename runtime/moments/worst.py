@@ -38,7 +38,7 @@ from apc.eigen.closing import Loop
 from apc.eigen.dissipation import peak_gain, proves_gain
 from apc.eigen.enclosure import enclose_eigenvalues
 from apc.eigen.modes import loops_at_right_angles
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peers import PeerGroup
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, value_of
 from apc.frame.schedule import Way

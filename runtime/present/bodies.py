@@ -25,8 +25,8 @@ from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.interpolation import jacobian
 from apc.compiler.language.vectors import whole_and_index
 from apc.frame.jacobians import guards_of, jacobians
+from apc.frame.linearize import start_values
 from apc.frame.parameters import resolve
-from apc.frame.start import start_values
 from apc.simulation.signals import sent_states
 
 Floats = NDArray[np.float64]

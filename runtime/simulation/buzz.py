@@ -28,7 +28,7 @@ from apc.analysis.pushes import Push
 from apc.compiler.compiled import LENGTH, CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peers import PeerGroup
 from apc.frame.exchange import build_exchange
 from apc.frame.parameters import resolve
 from apc.result import Result

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.interpolation import jacobian
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.start import start_values
+from apc.frame.linearize import start_values
 from apc.simulation.integrate import Integrated
 from apc.simulation.propagate import nonlinear_rows
 from apc.simulation.settings import EXACT, RK4, WHERE_NEEDED, Method

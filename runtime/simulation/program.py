@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Kind
 from apc.frame.jacobians import SiteJacobians
+from apc.frame.linearize import start_values
 from apc.frame.schedule import Event, Propagate, Schedule, Value
-from apc.frame.start import start_values
 from apc.simulation.pairs import Pairwise
 from apc.simulation.propagate import Rates
 from apc.simulation.signals import LocalSignal

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.closing import ClosedSystem, Loop, close, close_loop
 from apc.eigen.modes import split
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peers import PeerGroup
 from apc.eigen.relative import relative, with_doubt
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.discretize import Step, exponential_rows, exponential_values

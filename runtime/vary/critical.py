@@ -24,8 +24,8 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.compiler.words import with_unit
 from apc.finite_equations import finite_equations
+from apc.frame.linearize import reaches_start
 from apc.frame.names import Free, find, parameter_of, unit_of, values_by_group
-from apc.frame.start import reaches_start
 from apc.hands.passivity import passive_hands
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.option_value import option_value

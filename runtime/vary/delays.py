@@ -28,7 +28,7 @@ from apc.compiler.compiled import CompiledSystem, Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.multiples import common_divisor
 from apc.compiler.words import time_left
-from apc.eigen.peer_group import states_of
+from apc.eigen.peers import states_of
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve

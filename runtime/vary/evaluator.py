@@ -22,7 +22,7 @@ from apc.compiler.compiled import CompiledSystem, Group, Parameter, group_count
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.modes import split
-from apc.eigen.peer_group import PeerGroup, states_of
+from apc.eigen.peers import PeerGroup, states_of
 from apc.eigen.relative import relative_bounded, relative_coordinates
 from apc.eigen.rigid import RigidModes, find_rigid_modes
 from apc.frame.discretize import UNIT

@@ -26,7 +26,7 @@ from apc.analysis.analysis import Analysis, Prepared, analyze, near_start, prepa
 from apc.analysis.plan import make_plan
 from apc.compiler.compiled import CompiledSystem, Parameter
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peers import PeerGroup
 from apc.eigen.rigid import what_stands
 from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE, judge
 from apc.finite_equations import finite_equations

@@ -18,10 +18,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from apc.analysis.analysis import Prepared, analyze, prepare, prepare_at_start
+from apc.analysis.analysis import Prepared, analyze, lifted_groups, prepare, prepare_at_start
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
+from apc.eigen.modes import arrange
+from apc.eigen.peers import states_of
 from apc.eigen.spectrum import DRIFTS, finite
 from apc.finite_equations import finite_equations
 from apc.frame.names import Free, named_times, parameter_of, unit_of, value_now
@@ -29,7 +31,6 @@ from apc.result import Result
 from apc.threads import single_threaded
 from apc.vary.crossing import ESTIMATE, Crossing, search
 from apc.vary.delays import delay_now
-from apc.vary.effort import Effort, affordable, effort_of
 from apc.vary.evaluator import evaluator, free_parameters, many_packets
 from apc.vary.line import AnalysedLine, DelayLine, MatrixLine, delay_reach
 
@@ -44,13 +45,10 @@ GROWTH = 1e3
 # a tick, and up to so many times its present value; over more pieces than the most it takes too long.
 PIECES, FURTHER, MOST_PIECES = 4, 1.5, 64
 
-# How many analyses a parameter takes where each value has its own.
-VALUES = 30
-
-# In passing so many seconds are spent, as `effort` estimates them; of the rest it is said how to ask for it.
-MOST_IN_PASSING = 2.5
-IN_PASSING = "takes long (--margins)"
-ASKED = "apc analyze --margins looks for what takes long"
+# In passing they are looked for where the states of all loops times the events of a frame are no more: within
+# a second, mostly. Of the rest it is said how to ask for it.
+MOST_IN_PASSING = 2000
+TAKES_LONG = "not looked for in passing in so large a scene (apc analyze --margins does)"
 
 # Of larger systems a stiffness or damping is not looked at value by value, which takes half a minute of 400
 # states, nor a delay, which takes a minute or two of 800.
@@ -103,38 +101,42 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
     prepared
         From `analysis.prepare`, of this system with any numbers.
     quick
-        Spend no more than `MOST_IN_PASSING`, and say of which parameters nothing was looked for.
+        Look for none in a scene beyond `MOST_IN_PASSING`, and say so.
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         prepared = prepared or prepare(system)
         free = coupler_parameters(system)
-        start = prepare_at_start(system, prepared, [*free, *_delays(system)])
+        delays = _delays(system)
+        start = prepare_at_start(system, prepared, [*free, *delays])
         at = start or prepared
-        delays = _delays(system) if start is not None else []
-        most = MOST_IN_PASSING if quick else math.inf
-        effort = effort_of(system, at, most=most)
-        slow = effort.largest > MOST_SCANNED and many_packets(system, at)
-        fitting = slow or effort.largest <= MOST_SCANNED
-        each = effort.of_analyses(VALUES) if slow else effort.of_parameter()
-        borne = affordable([each] * len(free), most if fitting else -1.0)
-        chosen = [one for one, within in zip(free, borne, strict=True) if within]
-        why = IN_PASSING if fitting else f"{effort.largest:,} states"
-        rest = [not_looked(system, one, why) for one in free if one not in chosen]
-        if quick and rest and not chosen:  # and whether the scene is stable is not known
-            return Margins((*rest, *(not_looked(system, one, why) for one in delays)), _notes(rest, start))
+        delays = delays if start is not None else []
+        states = _loops(system, at, most=MOST_IN_PASSING if quick else math.inf)
+        if not states:
+            return Margins((), TAKES_LONG)
+        largest = max(states)
+        slow = largest > MOST_SCANNED and many_packets(system, at)
+        chosen = free if slow or largest <= MOST_SCANNED else []
+        rest = [not_looked(system, one, f"{largest:,} states") for one in free if one not in chosen]
         now = analyze(system, prepared=prepared)
         if not now.stable and now.verdict != DRIFTS:
             return Margins((), NOT_STABLE.format("stable" if now.stable is False else "proved stable"))
         lines = _lines(system, chosen, at, slow=slow)
         found = [row for pair in zip(chosen, lines, strict=True) if (row := _along(system, *pair))]
         found += rest
-        most -= each * len(chosen)
-        for one in delays:
-            assert start is not None, "else there are no delays"
-            cost, row = _delay_margin(system, one, start, effort, most)
-            most -= cost
-            found.append(row)
+        found += [_delay_margin(system, one, at, largest) for one in delays]
         return Margins(tuple(found), _notes(found, start))
+
+
+def _loops(system: CompiledSystem, prepared: Prepared, *, most: float) -> list[int]:
+    """Return how many states each loop has, none where their sum times the events of a frame is beyond."""
+    schedules = prepared.schedules
+    events = max(len(one.events) for one in schedules)
+    kinds = [prepared.jacobians[group.kind] for group in system.groups]
+    # Of one peer alone it is known without a matrix.
+    if events * max(map(states_of, schedules, kinds)) > most:
+        return []
+    states = [loop.states for loop in arrange(*lifted_groups(system, prepared=prepared)).loops]
+    return states if events * sum(states) <= most else []
 
 
 def _notes(rows: Sequence[Margin], start: Prepared | None) -> str:
@@ -144,7 +146,6 @@ def _notes(rows: Sequence[Margin], start: Prepared | None) -> str:
         start is None
     )
     notes += [f"{ESTIMATE}: {', '.join(estimated)}"] * bool(estimated)
-    notes += [ASKED] * any(one.note == IN_PASSING for one in rows)
     notes += ["none: there is nothing to vary"] * (not rows)
     return "; ".join(notes)
 
@@ -209,27 +210,21 @@ def _along(system: CompiledSystem, free: Free, line: MatrixLine | AnalysedLine |
     return _margin(free.label, unit, present, lost[0] if lost else None, found.scanned[1])
 
 
-def _delay_margin(
-    system: CompiledSystem, free: Free, prepared: Prepared, effort: Effort, most: float
-) -> tuple[float, Margin]:
-    """Return what the margin of a delay takes, nothing where that is more than the most, and the margin."""
+def _delay_margin(system: CompiledSystem, free: Free, prepared: Prepared, largest: int) -> Margin:
+    """Return the margin of a delay, in a scene whose largest loop has so many states."""
     now = delay_now(system, free)
     end, count = delay_reach(system, free, now, pieces=PIECES, further=FURTHER)
     if count > MOST_PIECES:
-        why = f"{count} orders of events up to {float(end):.4g} s"
-        return 0.0, not_looked(system, free, why)
+        return not_looked(system, free, f"{count} orders of events up to {float(end):.4g} s")
     late = all(free.name != hold.delay for kind in system.kinds for hold in kind.holds)
-    if effort.largest > MOST_DELAYED and not late:
-        return 0.0, not_looked(system, free, f"{effort.largest:,} states in each order of events")
-    cost = effort.of_delay(count, late=late)
-    if cost > most:
-        return 0.0, not_looked(system, free, IN_PASSING)
+    if largest > MOST_DELAYED and not late:
+        return not_looked(system, free, f"{largest:,} states in each order of events")
     try:
         found = search(DelayLine(system, free, prepared, now, end), first=True)
     except ApcError as error:
-        return cost, not_looked(system, free, error.mistakes[0].what)
+        return not_looked(system, free, error.mistakes[0].what)
     crossing = found.edges[0] if found.edges else None
-    return cost, _margin(free.name, "s", float(now), crossing, found.scanned[1])
+    return _margin(free.name, "s", float(now), crossing, found.scanned[1])
 
 
 def not_looked(system: CompiledSystem, free: Free, why: str) -> Margin:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.closing import ClosedSystem, Feedback, close, feedback_of
-from apc.eigen.peer_group import PeerGroup
+from apc.eigen.peers import PeerGroup
 from apc.eigen.relative import Relative, relative, relative_coordinates, relative_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes, rigid_modes_here
 from apc.frame.lift import FrameMap
