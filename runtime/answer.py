@@ -234,11 +234,11 @@ def proved_box(
     Raises
     ------
     ApcError
-        As `box_proof.prove_box`, or `moments.box.prove_box` where links are, or may become, unreliable; as
-        `hands.box.prove_box`.
+        As `box_proof.prove_box`, or `moments.mean_square_box.prove_box` where links are, or may become,
+        unreliable; as `hands.passive_box.prove_box`.
     """
     if passive:
-        from apc.hands.box import prove_box as prove_for_hands
+        from apc.hands.passive_box import prove_box as prove_for_hands
 
         return prove_for_hands(system, box, cells=cells)
     from apc.analysis.box_proof import prove_box
@@ -246,7 +246,7 @@ def proved_box(
 
     numbers = channel_numbers(system)
     if left_out(system) or any(one.free.name in numbers for one in box):
-        from apc.moments.box import prove_box as prove_over_network
+        from apc.moments.mean_square_box import prove_box as prove_over_network
 
         return prove_over_network(system, box, cells=cells)
     return prove_box(system, box, cells=cells)

@@ -17,7 +17,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import write_texts
 from apc.exports.c_text import driver, header, source
 from apc.exports.fmu import Unit, unit_of
-from apc.exports.peer import Peer, peer_of, refused, sites_of
+from apc.exports.peer_step import Peer, peer_of, refused, sites_of
 from apc.exports.scene_text import c_scene, one_peer
 from apc.finite_equations import finite_equations
 from apc.loop.peer import number_of

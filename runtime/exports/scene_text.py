@@ -22,7 +22,16 @@ from fractions import Fraction
 from typing import Any
 
 from apc.exports.c_text import block, filled, memory, number, row
-from apc.exports.peer import MOST_HEARD, Peer, first_packet, group_of, lines_of, peer_of, refused, sites_of
+from apc.exports.peer_step import (
+    MOST_HEARD,
+    Peer,
+    first_packet,
+    group_of,
+    lines_of,
+    peer_of,
+    refused,
+    sites_of,
+)
 from apc.exports.words import identifier, unique
 from apc.network.channel import luck_key
 from apc.network.timetable import Luck, luck_of

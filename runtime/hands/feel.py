@@ -251,7 +251,7 @@ def feel(
 def _responses(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) -> AbstractResponses:
     """Return the answers to a push: of modes, or of peers of which more differ than one system holds."""
     if many_differ(system, prepared):
-        from apc.hands.populations import PopulationResponses
+        from apc.hands.different_peers import PopulationResponses
 
         return PopulationResponses(system, prepared, port, other)
     modes, exchange = open_modes(system, prepared, port, other)

@@ -27,7 +27,7 @@ from apc.finite_equations import finite_equations
 from apc.frame.devices import clamped, refuse_hands
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, solve, value_of
-from apc.hands.certify import certified
+from apc.hands.passivity_in_balls import certified
 from apc.hands.port import PortLoop, open_ports, port_loop, port_loops
 from apc.moments.network import Growth
 from apc.network.nominal import left_out

@@ -32,7 +32,7 @@ from apc.frame.scheduling import build_schedules
 from apc.frame.taylor import arithmetic_of
 from apc.moments.gains import Answer, Drive, Moments, Part, number_of
 from apc.moments.mean_loops import Listened, Remembered, Route, mean_loop, remember, scaled
-from apc.moments.memory import memory_of
+from apc.moments.packet_memory import memory_of
 from apc.network.channel import ChannelLaw, channel_law
 
 Floats = NDArray[np.float64]

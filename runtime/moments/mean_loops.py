@@ -7,9 +7,9 @@ Guarantees: each matrix comes with the radius of its rounding, those of the site
 motions are taken out, which no luck moves.
 Does not: compute second moments (see `gains`).
 
-A channel's memory is what its receiver goes on with (see `memory`). Its mean depends on the sender alone and
-is a state η of the sender, as packets on their way are; what is left, δ = h − η, moves by itself, driven by
-its own luck ξ, and reaches the receiver:
+A channel's memory is what its receiver goes on with (see `packet_memory`). Its mean depends on the sender
+alone and is a state η of the sender, as packets on their way are; what is left, δ = h − η, moves by itself,
+driven by its own luck ξ, and reaches the receiver:
 
     η⁺ = (1 − π) η + π q        δ⁺ = (1 − π) δ + ξ        ξ = (I − π)(q − η − δ)
 
@@ -34,7 +34,7 @@ from apc.frame.lift import FrameMap
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
 from apc.frame.schedule import Selected, Sent, Way
 from apc.frame.taylor import arithmetic_of, entrywise, hull, over_as_many
-from apc.moments.memory import Memory
+from apc.moments.packet_memory import Memory
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]

@@ -26,7 +26,7 @@ from apc.moments.crowd import Hearing, crowd, hearing, peer_classes
 from apc.moments.errors import forced, moments_error
 from apc.moments.gains import Moments, mean_square_radius
 from apc.moments.held import every_channel, held_scene
-from apc.moments.memory import is_memoryless
+from apc.moments.packet_memory import is_memoryless
 from apc.moments.patterns import (
     MOST_CHANNELS,
     held_patterns,

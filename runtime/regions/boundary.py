@@ -37,9 +37,9 @@ from apc.regions.boundary_points import (
     moved,
     polish,
 )
-from apc.regions.cells import Survey
 from apc.regions.curves import area_beside, handles_of, off_an_arc, straight_handles, tangents
-from apc.regions.eigenpairs import Eigenvalues, Pairs, join
+from apc.regions.deciding import Eigenvalues, Pairs, join
+from apc.regions.survey import Survey
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

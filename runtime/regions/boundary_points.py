@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.regions.cells import INSIDE_RIM
-from apc.regions.eigenpairs import Eigenvalues, Pairs
+from apc.regions.deciding import Eigenvalues, Pairs
+from apc.regions.survey import INSIDE_RIM
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

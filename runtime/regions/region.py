@@ -10,7 +10,7 @@ Does not: draw, or write files (see `present`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -22,6 +22,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.timings import part
 from apc.compiler.words import counted
+from apc.eigen.closing import ClosedSystem
 from apc.eigen.spectrum import mode_near
 from apc.finite_equations import finite_equations
 from apc.frame.names import Free, Range, notes_for_all_groups
@@ -29,14 +30,13 @@ from apc.frame.overrides import apply
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, relative_to, stable_area, trace, trace_steps
-from apc.regions.cells import blurred, survey
 from apc.regions.curves import between
-from apc.regions.eigenpairs import Eigenvalues, Family, largest
+from apc.regions.deciding import Eigenvalues, largest
 from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
 from apc.regions.strips import BRANCHES, Striped, trace_strips
+from apc.regions.survey import blurred, survey
 from apc.result import Look, Result
 from apc.threads import single_threaded
-from apc.vary.batch import BatchEvaluator
 from apc.vary.crossing import Told
 from apc.vary.evaluator import (
     PointEvaluator,
@@ -82,7 +82,8 @@ FOLD = 0.1
 CHUNK = 1024
 
 
-Source = BatchEvaluator | PointEvaluator | GrowthEvaluator
+# What gives the closed systems at a point; none where one number decides.
+ClosedAt = Callable[[Sequence[float]], tuple[ClosedSystem, ...]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,15 +106,16 @@ class Curve:
     smooth: bool
     knots: Floats
     eigenvalues: NDArray[np.complex128]
-    source: Source
+    criterion: str
+    closed_at: ClosedAt | None
 
     @property
     def mode(self) -> str:
         """The name of the closed system that makes the boundary here, or the criterion that does."""
-        if isinstance(self.source, GrowthEvaluator):
-            return self.source.criterion
+        if self.closed_at is None:
+            return self.criterion
         middle = len(self.knots) // 2
-        return _identify(self.source, self.knots[middle], complex(self.eigenvalues[middle]))[0]
+        return _identify(self.closed_at, self.knots[middle], complex(self.eigenvalues[middle]))[0]
 
     @property
     def frequency_hz(self) -> tuple[float, float]:
@@ -121,7 +123,7 @@ class Curve:
 
         Both are NaN where it can't be told.
         """
-        if isinstance(self.source, GrowthEvaluator):
+        if self.closed_at is None:
             return np.nan, np.nan
         angles = np.abs(np.angle(self.eigenvalues))
         middle = len(self.knots) // 2
@@ -130,7 +132,7 @@ class Curve:
             places |= {0, len(self.knots) - 1}
         found: list[float] = []
         for place in sorted(places):
-            _, turn, frame = _identify(self.source, self.knots[place], complex(self.eigenvalues[place]))
+            _, turn, frame = _identify(self.closed_at, self.knots[place], complex(self.eigenvalues[place]))
             if np.isnan(turn):
                 return np.nan, np.nan
             # turn = 2πm ± angle, and so is it along the curve.
@@ -288,29 +290,30 @@ def region(
         if counts:
             _check_count(axes[counts[0]], len(counts) == 2, bool(times), meant, affine=affine)
         times += counts
-        source = _source(system, free, prepared, meant, timed=bool(times))
-        if isinstance(source, GrowthEvaluator):
-            times = []
+        by_growth = meant in BY_GROWTH
+        times = [] if by_growth else times
+        suffice = all(site.parameters_suffice for site in used)
+        plane = _plane(system, free, rectangle, prepared, meant, timed=bool(times))
         found: Striped | None = None
-        plain = source if not times and isinstance(source, PointEvaluator) else None
-        start = prepare_at_start(system, prepared, free) if plain or len(times) == 1 else None
-        if start is not None and plain is not None:
-            at_once = evaluator_of_many(system, free, PLACE, prepared=start)
+        anywhere = not (by_growth or times or suffice)
+        start = prepare_at_start(system, prepared, free) if anywhere or len(times) == 1 else None
+        if start is not None and anywhere:
+            at_once = _plane(system, free, rectangle, start, meant, timed=False)
             try:
-                found = _surveyed(at_once, rectangle, False, cells, tolerance, told)
-                source = at_once
+                found = _surveyed(at_once, cells, tolerance, told)
+                plane = at_once
             except ApcError as error:
                 if error.mistakes[0].code != "E905":
                     raise
                 # Other motions are free where it starts elsewhere: they are told point by point.
-                source = replace(plain, start=start)
+                points = PointEvaluator(system, free, prepared, start)
+                family = replace(plane.family, evaluator=points)
+                plane = replace(plane, family=family, closed_at=points.closed_at)
         elif start is not None:
             found = trace_strips(system, axes, times[0], start, cells=cells, tolerance=tolerance, told=told)
-        # What hands can draw is known as the damping needed, which jumps.
-        stepped = (bool(times) or meant == PASSIVE) and found is None
-        if found is None:
-            found = _surveyed(source, rectangle, stepped, cells, tolerance, told)
-        curves = tuple(_curve(source, rectangle, arc) for arc in found.arcs)
+        stepped = plane.stepped and found is None
+        found = found or _surveyed(plane, cells, tolerance, told)
+        curves = tuple(_curve(plane, arc, meant) for arc in found.arcs)
     whole = float(rectangle.width.prod())
     return Region(
         topology=system.name,
@@ -349,28 +352,45 @@ def _check_count(axis: Range, both: bool, timed: bool, meant: str, *, affine: bo
         raise ApcError(Mistake("E903", PLACE, what, hint=f"apc critical {axis.free.label}"))
 
 
-def _source(
-    system: CompiledSystem, free: Sequence[Free], prepared: Prepared, meant: str, *, timed: bool
-) -> Source:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Plane:
+    """The systems over the unit square; `stepped`: known at single points only, by verdicts."""
+
+    family: DirectFamily
+    closed_at: ClosedAt | None
+    stepped: bool
+    halvings: int = 0
+
+
+def _plane(
+    system: CompiledSystem,
+    free: tuple[Free, ...],
+    rectangle: Rectangle,
+    prepared: Prepared,
+    meant: str,
+    *,
+    timed: bool,
+) -> _Plane:
     """Return what gives the matrices of a criterion; `timed`: a time or a number of peers varies."""
     if meant in BY_GROWTH:
-        return GrowthEvaluator(system, tuple(free), prepared, PLACE, meant)
-    if timed:
-        return PointEvaluator(system, tuple(free), prepared)
-    return evaluator_of_many(system, free, PLACE, prepared=prepared)
+        growth = GrowthEvaluator(system, free, prepared, PLACE, meant)
+        # One point's bounds are enough, and dear.
+        errors = tuple(one[0] for one in growth.errors(rectangle.values(np.array([[0.5, 0.5]]))))
+        parts = tuple(Part(place, np.arange(len(one))) for place, one in enumerate(errors))
+        family = DirectFamily(growth, rectangle, parts, tuple(map(len, errors)), errors)
+        # What hands can draw is known as the damping needed, which jumps.
+        return _Plane(family, None, meant == PASSIVE, HALVINGS)
+    if timed:  # each point has a schedule of its own: there are no slopes, and no one size
+        points = PointEvaluator(system, free, prepared)
+        return _Plane(DirectFamily(points, rectangle, (), (), ()), points.closed_at, stepped=True)
+    source = evaluator_of_many(system, free, PLACE, prepared=prepared)
+    family = family_over(source, rectangle, source.errors, split=source.one_shape)
+    return _Plane(family, source.closed_at, stepped=False)
 
 
-def _surveyed(
-    source: Source,
-    rectangle: Rectangle,
-    stepped: bool,
-    cells: int,
-    tolerance: float,
-    told: Told | None,
-) -> Striped:
+def _surveyed(plane: _Plane, cells: int, tolerance: float, told: Told | None) -> Striped:
     """Survey the whole rectangle and follow the boundary through it, or go by steps from cell to cell."""
-    family = _family(source, rectangle, timed=stepped)
-    deciding = Eigenvalues(family)
+    deciding = Eigenvalues(plane.family)
     looked = 0
 
     def samples(points: Floats) -> Floats:
@@ -378,53 +398,44 @@ def _surveyed(
         looked += len(points)
         if told:
             told(f"looking at {counted(looked, 'point')}")
-        return _samples(deciding, source, rectangle, points)
+        return _samples(deciding, plane, points)
 
     found = survey(samples, cells=cells)
-    if stepped:
+    if plane.stepped:
         arcs = trace_steps(
             lambda points: samples(points)[:, 0],
-            lambda point: largest(family.matrices(point[None])),
+            lambda point: largest(plane.family.matrices(point[None])),
             found,
-            halvings=HALVINGS if isinstance(source, GrowthEvaluator) else 0,
+            halvings=plane.halvings,
         )
     else:
-        arcs = trace(deciding, found, tolerance=tolerance, offset=rectangle.offset)
+        arcs = trace(deciding, found, tolerance=tolerance, offset=plane.family.rectangle.offset)
     area, off = stable_area(arcs, found)
     if off >= 1:  # of the unit square: the boundary may be anywhere in it
         raise blurred()
     return Striped(arcs, area, off, found.corners[0], (found.cell, found.cell), found.finest / found.cell)
 
 
-def _family(source: Source, rectangle: Rectangle, *, timed: bool) -> Family:
-    """Return the closed systems over the unit square."""
-    if isinstance(source, GrowthEvaluator):  # one point's bounds are enough, and dear
-        errors = tuple(one[0] for one in source.errors(rectangle.values(np.array([[0.5, 0.5]]))))
-        parts = tuple(Part(place, np.arange(len(one))) for place, one in enumerate(errors))
-        return DirectFamily(source, rectangle, parts, tuple(map(len, errors)), errors)
-    if timed:  # each point has a schedule of its own: there are no slopes, and no one size
-        return DirectFamily(source, rectangle, (), (), ())
-    return family_over(source, rectangle, source.errors, split=isinstance(source, BatchEvaluator))
-
-
-def _samples(deciding: Eigenvalues, source: Source, rectangle: Rectangle, points: Floats) -> Floats:
+def _samples(deciding: Eigenvalues, plane: _Plane, points: Floats) -> Floats:
     """Return the logarithms of the largest magnitudes, or raise what is wrong with a point."""
-    matrices = deciding.family.matrices(points)
+    source, rectangle = plane.family.evaluator, plane.family.rectangle
+    matrices = plane.family.matrices(points)
     for one in matrices:
         wrong = np.flatnonzero(~np.isfinite(one).all(axis=(1, 2)))
         if len(wrong):
             value = rectangle.values(points[wrong[:1]])[0].tolist()
             overrides = overrides_at(source.system, source.free, value)
             apply(source.system, overrides)  # says so itself if the value can't be
-            if isinstance(source, BatchEvaluator | PointEvaluator):
-                source.closed_at(value)
+            if plane.closed_at is not None:
+                plane.closed_at(value)
             what = "the scene's frame leaves the range of floating point numbers in part of the rectangle"
             raise ApcError(Mistake("E905", PLACE, what, hint="a smaller range"))
     return deciding.log_magnitudes(matrices, BRANCHES)
 
 
-def _curve(source: Source, rectangle: Rectangle, arc: Arc) -> Curve:
+def _curve(plane: _Plane, arc: Arc, criterion: str) -> Curve:
     """Return an arc in SI."""
+    rectangle = plane.family.rectangle
     return Curve(
         points=rectangle.values(arc.points),
         handles=rectangle.values(arc.handles),
@@ -434,7 +445,8 @@ def _curve(source: Source, rectangle: Rectangle, arc: Arc) -> Curve:
         smooth=arc.smooth,
         knots=rectangle.values(arc.knots),
         eigenvalues=arc.values,
-        source=source,
+        criterion=criterion,
+        closed_at=plane.closed_at,
     )
 
 
@@ -445,10 +457,9 @@ def _relative_error(arc: Arc, offset: Floats) -> float:
     return float((errors / size).max())
 
 
-def _identify(source: Source, value: Floats, eigenvalue: complex) -> tuple[str, float, float]:
+def _identify(closed_at: ClosedAt, value: Floats, eigenvalue: complex) -> tuple[str, float, float]:
     """Return the name of an eigenvalue's closed system, its turn in a frame, and the frame in s."""
-    assert not isinstance(source, GrowthEvaluator), "one number has no mode"
-    closed = source.closed_at(value.tolist())
+    closed = closed_at(value.tolist())
     found, frame_s = mode_near(closed, eigenvalue), closed[0].frame_s
     return found.shape, 2 * np.pi * found.frequency_hz * frame_s, frame_s
 

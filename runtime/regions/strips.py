@@ -26,10 +26,10 @@ from apc.eigen.spectrum import mode_near
 from apc.frame.names import Range, parameter_of
 from apc.regions.axes import PLACE
 from apc.regions.boundary import Arc, stable_area, trace
-from apc.regions.cells import HALVINGS, survey
 from apc.regions.curves import straight_handles, tangents
-from apc.regions.eigenpairs import Eigenvalues, largest, log_magnitudes
+from apc.regions.deciding import Eigenvalues, largest, log_magnitudes
 from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
+from apc.regions.survey import HALVINGS, survey
 from apc.vary.batch import batch_evaluator
 from apc.vary.counts import count_pieces
 from apc.vary.crossing import ESTIMATE, search

@@ -77,6 +77,10 @@ class MatrixSource(Protocol):
     """Matrices of which the largest eigenvalue decides, over values of some parameters."""
 
     @property
+    def system(self) -> CompiledSystem:
+        """The compiled scene."""
+
+    @property
     def free(self) -> tuple[Free, ...]:
         """The m parameters that vary, in the order of the columns of values."""
 
@@ -90,8 +94,22 @@ class MatrixSource(Protocol):
 class Evaluator(MatrixSource, Protocol):
     """Frame matrices of closed systems over values of some parameters."""
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the systems whose matrices are given."""
+
+    @property
+    def one_shape(self) -> bool:
+        """Whether each system has the same states everywhere."""
+
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems at one point (m,), as an analysis has them: with error bounds."""
+
+    def errors(self, values: Floats) -> tuple[Floats, ...]:
+        """Return bounds (k, n, n) on the errors of the matrices at values (k, m), entry by entry."""
+
+    def states(self) -> int:
+        """Return how many states the largest closed system has."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,6 +168,16 @@ class BatchEvaluator:
         return tuple(wiring.system for wiring in self.wirings)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the closed systems."""
+        return tuple(one.name for one in self.closed)
+
+    @property
+    def one_shape(self) -> bool:
+        """Each system has the same states everywhere."""
+        return True
+
+    @property
     def timed(self) -> bool:
         """Whether it is a time that varies."""
         return any(slope for _, slope in self.durations.values())
@@ -158,6 +186,10 @@ class BatchEvaluator:
         """Return each system's reduced frame matrices (k, n, n) at values (k, m)."""
         lifted = self.lifted(values)
         return tuple(reduced(wiring, closed_loop(wiring, lifted), len(values)) for wiring in self.wirings)
+
+    def states(self) -> int:
+        """Return how many states the largest closed system has."""
+        return max((len(one.matrix) for one in self.closed), default=0)
 
     def errors(self, values: Floats) -> tuple[Floats, ...]:
         """Return bounds (k, n, n) on the errors of the matrices at values (k, m), entry by entry."""

@@ -30,7 +30,7 @@ from apc.frame.exchange import Exchange
 from apc.frame.names import Free, is_named, parameter_of
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import free_rows, scope_of
-from apc.vary.batch import BatchEvaluator, batch_evaluator
+from apc.vary.batch import BatchEvaluator, Evaluator, batch_evaluator
 from apc.vary.wiring import wire
 
 Floats = NDArray[np.float64]
@@ -84,6 +84,21 @@ class PointEvaluator:
     prepared: Prepared
     start: Prepared | None = None
     alike: list[BatchEvaluator] = field(default_factory=list)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """One name: all systems are blocks of one matrix."""
+        return ("all systems",)
+
+    @property
+    def one_shape(self) -> bool:
+        """A point may have other states than the next."""
+        return False
+
+    def states(self) -> int:
+        """Return how many states the largest closed system has, with the scene's own numbers."""
+        systems = split(*lifted_groups(self.system, prepared=self.prepared)).systems
+        return max((len(one.matrix) for one in systems), default=0)
 
     def matrices(self, values: Floats) -> tuple[Floats, ...]:
         """Return the reduced frame matrices of all systems as blocks (k, n, n) at values (k, m).
@@ -247,9 +262,7 @@ def _filled_up_pairs(pairs: Sequence[Sequence[tuple[Floats, Floats]]]) -> tuple[
     return _filled_up(matrices), _filled_up(errors)
 
 
-def evaluator(
-    system: CompiledSystem, free: Sequence[Free], *, prepared: Prepared | None = None
-) -> BatchEvaluator | PointEvaluator:
+def evaluator(system: CompiledSystem, free: Sequence[Free], *, prepared: Prepared | None = None) -> Evaluator:
     """Prepare a system for many values of some of its parameters.
 
     Parameters
@@ -296,7 +309,7 @@ class Asked:
 
 
 @lru_cache(maxsize=KEPT)
-def _evaluator(of: Asked) -> BatchEvaluator | PointEvaluator:
+def _evaluator(of: Asked) -> Evaluator:
     """Prepare a system, see `evaluator`."""
     if not of.parameters_suffice:
         lifted_groups(of.system, prepared=of.prepared)  # what is refused at every value is refused here
@@ -313,7 +326,7 @@ def many_packets(system: CompiledSystem, prepared: Prepared) -> bool:
 
 def evaluator_of_many(
     system: CompiledSystem, free: Sequence[Free], place: Place, *, prepared: Prepared
-) -> BatchEvaluator | PointEvaluator:
+) -> Evaluator:
     """Return `evaluator`, for work that takes a hundred points and more.
 
     Parameters
@@ -331,16 +344,11 @@ def evaluator_of_many(
     hint = "apc sweep, which analyses value by value"
     try:
         found = evaluator(system, free, prepared=prepared)
-        closed = (
-            found.closed
-            if isinstance(found, BatchEvaluator)
-            else split(*lifted_groups(system, prepared=prepared)).systems
-        )
+        states = found.states()
     except ApcError as error:  # an analysis has methods that spare the matrix, a range of values has none
         raise ApcError(
             [replace(one, hint=hint) if "--method" in one.hint else one for one in error.mistakes]
         ) from None
-    states = max((len(one.matrix) for one in closed), default=0)
     if states > MOST_STATES:
         what = (
             f"a range of values is looked at in hundreds of matrices, here of {states:,} states; "

@@ -23,7 +23,7 @@ from apc.analysis.analysis import Prepared, lifted_groups, prepare, prepare_at_s
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.timings import part
 from apc.compiler.words import counted
-from apc.eigen.eigenpairs import driving_parts, eigenpairs
+from apc.eigen.eigenpairs import driving_parts, eigenpairs, inverses
 from apc.eigen.modes import split
 from apc.eigen.spectrum import solve_spectrum
 from apc.finite_equations import finite_equations
@@ -32,8 +32,7 @@ from apc.frame.names import Free, parameter_of
 from apc.network.nominal import channel_numbers
 from apc.result import Result
 from apc.threads import single_threaded
-from apc.vary.batch import BatchEvaluator
-from apc.vary.evaluator import PointEvaluator, evaluator, free_parameters
+from apc.vary.evaluator import evaluator, free_parameters
 
 Floats = NDArray[np.float64]
 Places = NDArray[np.intp]
@@ -244,15 +243,17 @@ def _clusters(system: CompiledSystem, free: Sequence[Free], prepared: Prepared) 
     for one in beside:
         still &= np.isfinite(one).all(axis=(1, 2))
     found = []
-    for name, (matrix, slopes) in zip(_names(family, len(pairs)), pairs, strict=True):
+    for name, (matrix, slopes), (error,) in zip(family.names, pairs, family.errors(here[None]), strict=True):
         if not matrix.shape[1]:
             continue
-        own = _of_system(name, matrix[0], slopes[: len(free)], here, still)
+        own = _of_system(name, matrix[0], error, slopes[: len(free)], here, still)
         if not all(one.condition < WORST for one in own):  # peers in a chain share eigenvalues, no motion
             own = []
             for states in _alone(matrix[0], slopes):
                 block = np.index_exp[..., states[:, None], states]
-                own += _of_system(name, matrix[0][block], slopes[block][: len(free)], here, still)
+                own += _of_system(
+                    name, matrix[0][block], error[block], slopes[block][: len(free)], here, still
+                )
         found += own
     sizes = [float(np.abs(one.values).max()) for one in found]
     least = max(sizes, default=0.0) - SHARED * max(1.0, *sizes, 0.0)
@@ -271,19 +272,35 @@ def _alone(matrix: Floats, slopes: Floats) -> list[Places]:
     return list(own.values()) or [np.arange(len(matrix))]
 
 
-def _names(family: BatchEvaluator | PointEvaluator, count: int) -> list[str]:
-    """Return the names of the closed systems; of a scene linearized anew at each point all are one."""
-    if isinstance(family, BatchEvaluator):
-        return [one.name for one in family.closed]
-    return ["all systems"] * count
+def _turned(
+    matrix: Floats, off: Floats, slopes: Floats, value: complex, left: Complexes, right: Complexes
+) -> Floats:
+    """Return what slopes (m, n, n) make of how far rounding `off` (n, n) turns an eigenvalue's vectors, (m,).
+
+    Notes
+    -----
+    To first order an E that is added to the matrix adds w E S M′ v + w M′ S E v, S being the inverse of
+    M − λ on all other motions: the larger, the nearer another eigenvalue is.
+    """
+    n, c = right.shape
+    bordered = np.block([[matrix - value * np.eye(n), right], [left, np.zeros((c, c))]])
+    rest = inverses(bordered)[:n, :n]
+    into = np.abs(left) @ off @ np.abs(rest @ slopes @ right)
+    out_of = np.abs(left @ slopes @ rest) @ off @ np.abs(right)
+    return np.asarray((into + out_of).max(axis=(1, 2), initial=0.0))
 
 
 def _of_system(
-    name: str, matrix: Floats, slopes: Floats, here: Floats, still: NDArray[np.bool_]
+    name: str, matrix: Floats, error: Floats, slopes: Floats, here: Floats, still: NDArray[np.bool_]
 ) -> list[_Cluster]:
-    """Return the largest eigenvalues of a matrix (n, n), and what its slopes (m, n, n) do to them."""
+    """Return the largest eigenvalues of a matrix (n, n), and what its slopes (m, n, n) do to them.
+
+    `error` (n, n) bounds what the matrix is off by; the slopes are taken to be off as much, relatively.
+    """
     pairs = eigenpairs(matrix)
     sizes = np.abs(pairs.values)
+    off = error + ROUNDINGS * len(matrix) * UNIT * np.abs(matrix)
+    rounded = float(off.max() / np.abs(matrix).max(initial=np.finfo(np.float64).tiny))
     least = sizes.max() - SHARED * max(1.0, sizes.max()) - 2 * CLOSE * max(sizes.max(), CLOSE)
     left_over = set(np.flatnonzero((pairs.values.imag >= 0) & (sizes >= least)).tolist())
     found = []
@@ -300,12 +317,12 @@ def _of_system(
         condition = norms / size if size > 0 else np.inf
         rates, rounding = np.zeros((len(slopes), len(near), len(near)), np.complex128), np.zeros(len(slopes))
         if condition < WORST:
-            left = np.linalg.solve(product, own.left)
+            left = np.asarray(np.linalg.solve(product, own.left), dtype=np.complex128)
             rates = left @ slopes @ own.right
-            rounded = ROUNDINGS * len(matrix) * UNIT
             felt = np.abs(left) @ np.abs(slopes) @ np.abs(own.right)
             # A change by all of the value that is less than the matrix is rounded by can't be told.
             told = np.divide(float(sizes.max()), np.abs(here), out=np.zeros(len(here)), where=here != 0)
             rounding = rounded * (condition * felt.max(axis=(1, 2), initial=0.0) + told)
+            rounding += _turned(matrix, off, slopes, value, left, own.right)
         found.append(_Cluster(name, own.values, rates, rounding, still, condition))
     return found

@@ -15,7 +15,7 @@ import pytest
 
 import apc
 from apc.exports.c_text import driver, header, source
-from apc.exports.peer import Peer, peer_of
+from apc.exports.peer_step import Peer, peer_of
 from apc.network.channel import PacketSource, channel_law
 from apc.simulation.settings import DEFAULT, parse_method
 from apc.simulation.simulation import Plan, plan_of

@@ -11,7 +11,7 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.exports.peer import peer_of
+from apc.exports.peer_step import peer_of
 from apc.simulation.settings import DEFAULT, parse_method
 from apc.simulation.simulation import plan_of
 from tests.hand_over.in_c import SANITIZED, STRICT, build, compiler, differences, worst

@@ -16,7 +16,7 @@ from apc.__main__ import run
 from apc.analysis.box import parse_range
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.hands.box import prove_box
+from apc.hands.passive_box import prove_box
 from apc.hands.passivity import STABLE, UNSTABLE, PassiveHands, passive_hands
 from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced, wall
 from tests.truths import LIBRARY

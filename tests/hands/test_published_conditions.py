@@ -10,7 +10,7 @@ import pytest
 import apc
 from apc.frame.names import Free, Range
 from apc.regions.overlay import overlay_points, parse_overlay, symbol_values
-from apc.regions.passivity import colgate_limit, diolaiti_limit, gil_limit
+from apc.regions.wall_conditions import colgate_limit, diolaiti_limit, gil_limit
 from tests.topologies import AVERAGE, compiled, told, wall
 
 

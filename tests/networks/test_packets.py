@@ -15,7 +15,7 @@ import pytest
 
 import apc
 from apc.compiler.errors import ApcError
-from apc.moments.memory import arrives
+from apc.moments.packet_memory import arrives
 from apc.network.channel import PARETO_MOST, ChannelLaw, PacketSource, channel_law, deviates
 from apc.network.timetable import Listener
 from apc.simulation.settings import Settings
