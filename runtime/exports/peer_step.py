@@ -29,7 +29,7 @@ from apc.compiler.interpolation import jacobian
 from apc.compiler.language.vectors import whole_and_index
 from apc.exports.words import identifier, unique
 from apc.frame import schedule as frames
-from apc.frame.devices import Device, find_device, find_devices
+from apc.frame.devices import Device, coupled_directly, find_device, find_devices
 from apc.frame.discretize import moved_together
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, edge_name, structural_pattern
@@ -302,9 +302,8 @@ def _outside(
             what = f"--device: no mass of {name} is called {one[:40] or 'so'}"
             raise refused(system, what, f"--device {near}", "E961")
     else:
-        devices = find_devices(
-            site, vector, {parameter.name: parameter.unit for parameter in system.parameters}
-        )
+        unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
+        devices = find_devices(site, vector, unit_of, direct=coupled_directly(system.kinds))
         chosen = {one.rpartition(".")[0] if one.endswith("]") else one for one in devices}
     if not chosen:
         hint = f"--device {NO_DEVICE} if its computer moves them all, or --device "

@@ -1,14 +1,15 @@
 """What a hand holds: a peer's device, found in its equations, and the peer with a hand on it.
 
 Takes: a kind's Jacobians and exact numbers; a `CompiledSystem`.
-Gives: `Device`, `find_device`, `find_devices`, `devices_of`; `Push`, `find_push`; `HANDS`, `with_hands`,
-`clamped`, `held`; `refuse_hands`; `published`; `OWN_MASS`, `UNHELD`.
+Gives: `Device`, `find_device`, `find_devices`, `devices_of`, `coupled_directly`; `no_device`; `Push`,
+`find_push`; `HANDS`, `with_hands`, `clamped`, `held`; `refuse_hands`; `published`; `OWN_MASS`, `UNHELD`.
 Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
 Does not: ask whether it is stable (see `passivity` for hands of every kind).
 
 A device is the part that a hand of the scene is joined to. Where there is none, it is what a peer moves and
-does not tell others about: what it tells them of is a copy of what all hold. With m v' = f + …, a slope of v'
-over anything at all is J = j/m, so 1/m = −(∂J/∂m)/J: what a force at that place does, whatever is rigidly
+does not tell others about: what it tells them of is a copy of what all hold; where no peer has anything else,
+it is a mass that is no such copy, as of two devices that are coupled directly. With m v' = f + …, a slope of
+v' over anything at all is J = j/m, so 1/m = −(∂J/∂m)/J: what a force at that place does, whatever is rigidly
 connected with it. A copy of a shared mass is one of n: there J = n j/m.
 With M v' = f of several that move with one another, a mass of place i adds to M there: ∂J/∂m = −M⁻¹ eᵢ Jᵢ,
 whose columns say what a force at i does to all of them, M⁻¹ eᵢ.
@@ -80,18 +81,19 @@ def find_device(
     listening: Listening | None = None,
     *,
     part: str = "",
+    direct: bool = False,
 ) -> Device | str | None:
     """Return what a hand holds, None where there is nothing; or say why that can't be said.
 
     Parameters
     ----------
-    site, parameters, unit_of, listening, part
+    site, parameters, unit_of, listening, part, direct
         As for `find_devices`.
     """
     kind = site.kind
     if not _is_plain(site):
         return f"{kind.name} has a nonlinear loop"
-    found = find_devices(site, parameters, unit_of, listening, part=part)
+    found = find_devices(site, parameters, unit_of, listening, part=part, direct=direct)
     if not found:
         return None
     if len(found) > 1 and any(isinstance(one, Device) for one in found.values()):
@@ -112,6 +114,7 @@ def find_devices(
     listening: Listening | None = None,
     *,
     part: str = "",
+    direct: bool = False,
 ) -> dict[str, Device | str]:
     """Return what a hand may hold, by name; or why that can't be held, in words.
 
@@ -122,6 +125,9 @@ def find_devices(
     part
         The part that is meant, or the axis of one that moves along several, `device.x[2]`; without it, the
         only one that a hand is joined to, or else that others are not told about.
+    direct
+        Whether devices are coupled directly (see `coupled_directly`): without a part, one is meant that
+        others are told about, too, if it is no copy of a shared one.
     """
     kind = site.kind
     owners = {_part(one.name) for one in kind.states}
@@ -137,7 +143,7 @@ def find_devices(
     for place, state in enumerate(kind.states):
         driven = np.flatnonzero(site.pattern.a[place])
         own = _part(state.name)
-        wanted = own in gripped if gripped else own not in told_of
+        wanted = own in gripped if gripped else direct or own not in told_of
         wanted = part in (own, state.name) if part else wanted
         if state.unit != "m" or not wanted or len(driven) != 1 or site.pattern.b[place].any():
             continue
@@ -157,12 +163,35 @@ def find_devices(
             own = state.name  # one axis of several
         if len(set(inverses.values())) == 1:
             (mass, at), inverse = next(iter(inverses.items()))
+            if copied[at] and direct and not part:
+                continue
             shared = peers if copied[at] else None
             symbolic = _inverse(kind, velocity, masses[mass], at, shared)
             found[own] = Device(own, place, velocity, inverse, symbolic)
         elif inverses:
             found[own] = f"{own} moves with masses that move otherwise, and a hand may hold any of them"
     return found
+
+
+@functools.lru_cache(maxsize=64)
+def coupled_directly(kinds: tuple[Kind, ...]) -> bool:
+    """Say whether no kind of peer has a mass that others are not told about, nor a hand.
+
+    Parameters
+    ----------
+    kinds
+        Those of a scene.
+    """
+    return not any(kind.held or _keeps_to_itself(jacobians(kind)) for kind in kinds)
+
+
+def _keeps_to_itself(site: SiteJacobians) -> bool:
+    """Say whether a peer moves something that it tells nobody about."""
+    told_of = _told_of(site)
+    return any(
+        state.unit == "m" and _part(state.name) not in told_of and site.pattern.a[place].any()
+        for place, state in enumerate(site.kind.states)
+    )
 
 
 def _told_of(site: SiteJacobians) -> set[str]:
@@ -290,7 +319,7 @@ def _inverse(kind: Kind, velocity: int, mass: int, at: int, peers: int | None) -
 
 
 def devices_of(system: CompiledSystem, *, option: str) -> dict[int, Device]:
-    """Return the device of each kind of peer.
+    """Return the device of each kind of peer that has one; a server without any is not held.
 
     Parameters
     ----------
@@ -302,24 +331,28 @@ def devices_of(system: CompiledSystem, *, option: str) -> dict[int, Device]:
     Raises
     ------
     ApcError
-        E931 a peer without a device, or with several that a hand might hold.
+        E931 no peer with a device, or one with several that a hand might hold.
     """
     unit_of = {one.name: one.unit for one in system.parameters}
-    numbers = resolve(system)
+    numbers, direct = resolve(system), coupled_directly(system.kinds)
     found: dict[int, Device] = {}
     for place, group in enumerate(system.groups):
-        if group.kind in found:
-            continue
         site = jacobians(system.kinds[group.kind])
-        one = find_device(site, numbers.parameters[place][0], unit_of)
-        if isinstance(one, Device):
-            found[group.kind] = one
-            continue
-        why = one or f"{group.name} has no device: every mass of it is a copy that others are told of"
-        raise ApcError(
-            Mistake("E931", Place(system.origin.topology), f"{option}: {why}", hint="" if one else OWN_MASS)
-        )
+        one = find_device(site, numbers.parameters[place][0], unit_of, direct=direct)
+        if isinstance(one, str):
+            raise ApcError(Mistake("E931", Place(system.origin.topology), f"{option}: {one}"))
+        if one is not None:
+            found.setdefault(group.kind, one)
+    if not found:
+        raise no_device(system, option)
     return found
+
+
+def no_device(system: CompiledSystem, option: str) -> ApcError:
+    """Return the refusal of a scene in which nobody has a device."""
+    names = ", ".join(group.name for group in system.groups)
+    what = f"{option}: nothing can be held at {names}: each mass is a copy that others are told of"
+    return ApcError(Mistake("E931", Place(system.origin.topology), what, hint=OWN_MASS))
 
 
 def refuse_hands(system: CompiledSystem, option: str) -> None:

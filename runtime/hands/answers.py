@@ -30,7 +30,7 @@ from apc.eigen.closing import Loop
 from apc.eigen.modes import arrange, dense_loop
 from apc.eigen.peers import MOST_STATES, PeerGroup, more_differ, states_of, used_ways
 from apc.eigen.rigid import find_rigid_modes
-from apc.frame.devices import OWN_MASS, Device, find_device, find_devices
+from apc.frame.devices import OWN_MASS, Device, coupled_directly, find_device, find_devices
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange, build_exchange
 from apc.frame.parameters import resolve
@@ -97,6 +97,7 @@ def open_modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Po
     """Open all peers of a scene, and put them together to modes."""
     groups, exchange = lifted_groups(system, prepared=prepared)
     unit_of = {one.name: one.unit for one in system.parameters}
+    direct = coupled_directly(system.kinds)
     opened, sites, held = [], {}, {}
     for group in groups:
         device = None
@@ -107,7 +108,7 @@ def open_modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Po
             named = one.part or (port.part if along else "")
             held[one] = device = held_device(system, prepared, group, named, unit_of)
         if device is None:
-            found = find_device(group.jacobians, group.parameters, unit_of, group.listening)
+            found = find_device(group.jacobians, group.parameters, unit_of, group.listening, direct=direct)
             device = found if isinstance(found, Device) else None
         check_kicks(system, group)
         own, site = open_site(group, device)
@@ -158,7 +159,10 @@ def held_device(
     ApcError
         E931 no device, or none that can be told.
     """
-    device = find_device(group.jacobians, group.parameters, unit_of, group.listening, part=part)
+    direct = coupled_directly(system.kinds)
+    device = find_device(
+        group.jacobians, group.parameters, unit_of, group.listening, part=part, direct=direct
+    )
     if isinstance(device, Device):
         return device
     what = device or f"{group.name} has no device"
@@ -171,11 +175,12 @@ def held_device(
 def held_names(system: CompiledSystem, prepared: Prepared) -> list[str]:
     """Return what hands may hold, of the first peer of each group: `left[1].device`."""
     unit_of, numbers = {one.name: one.unit for one in system.parameters}, resolve(system)
+    direct = coupled_directly(system.kinds)
     return [
         f"{group.name}[1].{part}"
         for place, group in enumerate(system.groups)
         for part, found in find_devices(
-            prepared.jacobians[group.kind], numbers.parameters[place][0], unit_of
+            prepared.jacobians[group.kind], numbers.parameters[place][0], unit_of, direct=direct
         ).items()
         if isinstance(found, Device)
     ]

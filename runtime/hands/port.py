@@ -19,7 +19,7 @@ remains has the motions of the scene with devices clamped, and no others.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -37,7 +37,7 @@ from apc.eigen.modes import arrange, dense_loop
 from apc.eigen.peers import MOST_STATES, PeerGroup, states_of
 from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.eigen.rigid import find_rigid_modes
-from apc.frame.devices import OWN_MASS, Device, find_device
+from apc.frame.devices import Device, coupled_directly, find_device, no_device
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.ports import Ports, with_holds, with_ports
@@ -138,9 +138,14 @@ class Openings:
     weighted: bool
 
     def of(self, loop: Loop) -> list[Opened]:
-        """Return the groups of a loop's sites."""
-        known = {id(one.ported.schedule): one for one in self.groups}
-        return [known[id(group.schedule)] for group in loop.sites]
+        """Return the groups of a loop's sites that are held."""
+        return [self.groups[place] for _, place in self.places(loop)]
+
+    def places(self, loop: Loop) -> list[tuple[int, int]]:
+        """Return which of a loop's sites are held, and which of the groups each is."""
+        known = {id(one.ported.schedule): place for place, one in enumerate(self.groups)}
+        sites = ((number, known.get(id(site.schedule))) for number, site in enumerate(loop.sites))
+        return [(number, place) for number, place in sites if place is not None]
 
 
 def port_loops(system: CompiledSystem, prepared: Prepared, *, option: str) -> tuple[PortLoop, ...] | str:
@@ -184,26 +189,43 @@ def open_ports(
         As `port_loops`.
     """
     unit_of = {one.name: one.unit for one in system.parameters}
-    opened = []
+    heard = {
+        (receive.link, row)
+        for group in groups
+        for partition, tick in zip(group.jacobians.kind.clocks, group.exact.ticks, strict=True)
+        for receive, column, rows in zip(partition.receives, tick.r.T, tick.channels, strict=True)
+        if column.astype(np.bool_).any()
+        for row in rows
+    }
+    direct = coupled_directly(system.kinds)
+    opened: list[Opened] = []
+    ported: list[PeerGroup] = []
     for group in groups:
-        device = find_device(group.jacobians, group.parameters, unit_of, group.listening)
-        if not isinstance(device, Device):
-            what = f"{option}: {device or f'{group.name} has no device'}"
-            hint = "" if device else OWN_MASS
-            raise ApcError(Mistake("E931", Place(system.origin.topology), what, hint=hint))
-        felt = _felt_velocity(group, device)
+        device = find_device(group.jacobians, group.parameters, unit_of, group.listening, direct=direct)
+        if device is None:  # a server, say: it is not held
+            ported.append(group)
+            continue
+        if isinstance(device, str):
+            raise ApcError(Mistake("E931", Place(system.origin.topology), f"{option}: {device}"))
+        felt = _felt_velocity(group, device, heard)
         if felt:
             return felt
         if touch := _other_touch(group, device):
             why, hint = touch
             raise ApcError(Mistake("E933", Place(system.origin.topology), f"{option}: {why}", hint=hint))
         opened.append(_opened(group, device))
-    loops, weighted = _loops(system, [one.ported for one in opened], exchange, option=option)
+        ported.append(opened[-1].ported)
+    if not opened:
+        raise no_device(system, option)
+    loops, weighted = _loops(system, ported, exchange, option=option)
+    moved = {id(one.ported.schedule) for one in opened}
+    # A loop in which nothing is held is one of the scene with its devices clamped.
+    loops = tuple(loop for loop in loops if any(id(site.schedule) in moved for site in loop.sites))
     return Openings(system.origin.topology, tuple(opened), loops, weighted)
 
 
-def _felt_velocity(group: PeerGroup, device: Device) -> str:
-    """Say what samples a device's velocity, "" if nothing does."""
+def _felt_velocity(group: PeerGroup, device: Device, heard: Set[tuple[str, int]]) -> str:
+    """Say what samples a device's velocity, "" if nothing does: of what is sent, the channels heard count."""
     kind = group.jacobians.kind
     for partition, tick in zip(kind.clocks, group.exact.ticks, strict=True):
         for row in np.flatnonzero(tick.x[:, device.velocity].astype(np.bool_)):
@@ -213,7 +235,8 @@ def _felt_velocity(group: PeerGroup, device: Device) -> str:
                 "hardly at all, gets any force for nothing"
             )
     for sending, send in zip(kind.sends, group.exact.sends, strict=True):
-        if send.x[:, device.velocity].astype(np.bool_).any():
+        rows = np.flatnonzero(send.x[:, device.velocity].astype(np.bool_))
+        if any((sending.link, row) in heard for row in rows.tolist()):
             return f"the velocity of {device.part} is sent over {sending.link} as sampled"
     return ""
 
@@ -463,15 +486,17 @@ def port_loop(found: Openings, loop: Loop, *, option: str) -> tuple[PortLoop, Cu
     ApcError
         E933 too many intervals, or a motion that nothing holds back.
     """
-    opened = found.of(loop)
-    sites = [one.touched for one in opened]
-    counts = [group.count if found.weighted and len(loop.sites) > 1 else 1 for group in loop.sites]
+    held = [number for number, _ in found.places(loop)]
+    sites = [one.touched for one in found.of(loop)]
+    together = found.weighted and len(loop.sites) > 1
+    counts = [loop.sites[number].count if together else 1 for number in held]
     if (intervals := sum(len(one.seconds) for one in sites)) > MOST_INTERVALS:
         what = f"devices that differ are sampled and pushed over {intervals:,} intervals of a frame"
         hint = f"fewer peers that differ: {MOST_INTERVALS:,} intervals at most"
         raise ApcError(Mistake("E933", Place(found.scene), f"{option}: {what}", hint=hint))
     closed = close_loop(loop)
-    at = _wires(closed.offsets, len(closed.matrix), sites)
+    offsets = [closed.offsets[number] for number in held]
+    at = _wires(offsets, len(closed.matrix), sites)
     whole = with_radius(closed.matrix, closed.error)
     dampings = RADII.exact(np.array([[float(one.damping)] for one in sites]))
     cut = Cut(at, tuple(counts), np.zeros((len(closed.matrix), 0)))

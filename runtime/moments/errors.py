@@ -27,7 +27,7 @@ from apc.compiler.compiled import CompiledSystem, Kind
 from apc.eigen.modes import dense_loop
 from apc.eigen.peers import PeerGroup
 from apc.eigen.relative import Relative
-from apc.frame.devices import Device, find_device
+from apc.frame.devices import Device, coupled_directly, find_device
 from apc.frame.ports import with_holds, with_ports
 from apc.frame.radius import FLOATS, RADII
 from apc.frame.site import LinearSite
@@ -87,6 +87,7 @@ def forced(system: CompiledSystem, told: Hearing, first: Fraction = Fraction(0))
         It is not clear what hands hold.
     """
     unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
+    direct = coupled_directly(system.kinds)
     used = {part.clock for kind in system.kinds for part in kind.clocks} | {one.clock for one in system.links}
     fastest = min(
         (clock for clock in system.clocks if clock.name in used), key=lambda clock: told.timings[clock.period]
@@ -97,7 +98,7 @@ def forced(system: CompiledSystem, told: Hearing, first: Fraction = Fraction(0))
     for group in told.groups:
         key = id(group.schedule), id(group.lifting)
         if key not in built:
-            held = find_device(group.jacobians, group.parameters, unit_of, group.listening)
+            held = find_device(group.jacobians, group.parameters, unit_of, group.listening, direct=direct)
             if isinstance(held, str):
                 raise UnservedError(held)
             built[key] = _pushed(group, held, ticks, -first % told.frame)

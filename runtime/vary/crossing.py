@@ -335,6 +335,8 @@ def _may_hide(samples: _Samples, cells: NDArray[np.intp]) -> NDArray[np.bool_]:
     """Say of the cells that begin at these samples whether another crossing than the ends show may hide."""
     shares = np.linspace(0, 1, PLACES)[:, None]
     found = np.zeros(len(cells), dtype=bool)
+    if not samples.values.shape[1]:  # nothing moves: of devices that are held fast, say
+        return found
     for number, place in enumerate(cells):
         width = samples.points[place + 1] - samples.points[place]
         (value, end), (slope, end_slope) = (

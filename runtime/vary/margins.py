@@ -45,9 +45,9 @@ GROWTH = 1e3
 # a tick, and up to so many times its present value; over more pieces than the most it takes too long.
 PIECES, FURTHER, MOST_PIECES = 4, 1.5, 64
 
-# In passing they are looked for where the states of all loops times the events of a frame are no more: within
-# a second, mostly. Of the rest it is said how to ask for it.
-MOST_IN_PASSING = 2000
+# In passing they are looked for where the squares of the loops' states, and so much for each event of a
+# frame, come to no more: within a second, mostly. Of the rest it is said how to ask for it.
+MOST_IN_PASSING, OF_EVENT = 3000, 8
 TAKES_LONG = "not looked for in passing in so large a scene (apc analyze --margins does)"
 
 # Of larger systems a stiffness or damping is not looked at value by value, which takes half a minute of 400
@@ -120,6 +120,8 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
         now = analyze(system, prepared=prepared)
         if not now.stable and now.verdict != DRIFTS:
             return Margins((), NOT_STABLE.format("stable" if now.stable is False else "proved stable"))
+        if not any(states):
+            return Margins((), "none: nothing moves")
         lines = _lines(system, chosen, at, slow=slow)
         found = [row for pair in zip(chosen, lines, strict=True) if (row := _along(system, *pair))]
         found += rest
@@ -128,15 +130,15 @@ def margins(system: CompiledSystem, *, prepared: Prepared | None = None, quick: 
 
 
 def _loops(system: CompiledSystem, prepared: Prepared, *, most: float) -> list[int]:
-    """Return how many states each loop has, none where their sum times the events of a frame is beyond."""
+    """Return how many states each loop has, none where what they would take is beyond the most."""
     schedules = prepared.schedules
-    events = max(len(one.events) for one in schedules)
+    events = OF_EVENT * max(len(one.events) for one in schedules)
     kinds = [prepared.jacobians[group.kind] for group in system.groups]
     # Of one peer alone it is known without a matrix.
-    if events * max(map(states_of, schedules, kinds)) > most:
+    if events + max(map(states_of, schedules, kinds)) ** 2 > most:
         return []
     states = [loop.states for loop in arrange(*lifted_groups(system, prepared=prepared)).loops]
-    return states if events * sum(states) <= most else []
+    return states if events + sum(one**2 for one in states) <= most else []
 
 
 def _notes(rows: Sequence[Margin], start: Prepared | None) -> str:

@@ -303,6 +303,41 @@ def test_every_scene_has_a_verdict_or_a_reason_why_not(file: Path) -> None:
         assert error.mistakes[0].code in {"E931", "E932", "E933"}
 
 
+DIRECT = """\
+topology: direct
+clocks: {haptic: 1 ms, network: 8 ms}
+peers: {master: {count: 1}, slave: {count: 1, set: {device.mass: 0.6 kg, device.damping: 10 N*s/m}}}
+masses: {device: {mass: 0.1 kg, damping: 2 N*s/m}}
+couplers:
+  coordination:
+    {type: AveragePosition, object: device, stiffness: 50 N/m, clock: haptic, delay: 1 ms, link: wan}
+links: {wan: {clock: network, delay: 16 ms}}
+"""
+
+
+def test_two_devices_coupled_directly_are_held_each_at_its_only_mass() -> None:
+    """Slow motions need (b₁ − K d)(b₂ − K d) ≥ (K D)², own forces d = 1.5 ms late, the other's D = 21 ms."""
+    system = compiled(DIRECT)
+    found = apc.critical(system, PULL, criterion="passive").value
+    slow = float(np.roots([1.5e-3**2 - 21e-3**2, -12 * 1.5e-3, 20]).max())
+    assert found is not None and 0.99 * slow < found <= slow
+    below = apc.set_parameters(system, {PULL: f"{0.99 * found!r} N/m"})
+    assert not shaken(below, 10 ** np.random.default_rng(3).uniform(-6, [3, 4, 7], size=(100, 3)))
+    assert apc.feel(below, [0.01]).low_frequency.damping > 12
+
+
+def test_a_server_without_a_device_is_not_held() -> None:
+    system = apc.compile(SCENES / "client-server.yaml")
+    found = apc.critical(system, "contact.stiffness", criterion="passive").value
+    assert found is not None
+    hands = 10 ** np.random.default_rng(3).uniform(-6, [3, 4, 7], size=(100, 3))
+    for part in (0.99, 1.01):
+        at = apc.set_parameters(system, {"contact.stiffness": f"{part * found!r} N/m"})
+        told = passive_hands(at)
+        assert told.stable is (part < 1)
+        assert shaken(at, hands if told.stable else tuned(told)) is (part > 1)
+
+
 def test_where_nothing_brakes_held_devices_leave_the_object_coasting() -> None:
     found = apc.passive_hands(apc.compile(ROOT / "tests" / "hard" / "coasting.yaml"))
     assert not found.stable and "hold the devices still" in str(found)
