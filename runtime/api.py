@@ -8,6 +8,7 @@ Does not: print.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -49,7 +50,7 @@ Criterion = Literal["mean-square", "nominal", "passive"]
 
 @checked
 def compile(path: str | Path) -> CompiledSystem:
-    """Compile a topology file and check the result: one frame event by event against the lifted map.
+    """Compile a topology file.
 
     Parameters
     ----------
@@ -116,7 +117,7 @@ def with_hands(model: CompiledSystem | str | Path, hands: str) -> CompiledSystem
 
 
 @checked
-def set_parameters(model: CompiledSystem, values: Mapping[str, str]) -> CompiledSystem:
+def set_parameters(model: CompiledSystem, values: Mapping[str, str | float]) -> CompiledSystem:
     """Return the model with other parameter values, without compiling again.
 
     Parameters
@@ -124,7 +125,7 @@ def set_parameters(model: CompiledSystem, values: Mapping[str, str]) -> Compiled
     model
         The compiled model; it stays as it is.
     values
-        Quantities by name: `{"contact.stiffness": "800 N/m", "lan.delay": "16 ms"}`.
+        Quantities by name, or numbers in SI: `{"contact.stiffness": "800 N/m", "lan.delay": 0.016}`.
 
     Raises
     ------
@@ -133,15 +134,34 @@ def set_parameters(model: CompiledSystem, values: Mapping[str, str]) -> Compiled
     """
     from apc.frame.overrides import apply, parse_override
 
-    overrides = [parse_override(model, f"{name}={value}") for name, value in values.items()]
+    overrides = [
+        parse_override(model, f"{name}={_quantity(model, name, value)}") for name, value in values.items()
+    ]
     return apply(model, overrides)
+
+
+def _quantity(system: CompiledSystem, name: str, value: str | float) -> str:
+    """Return a value of a parameter as it is written: a number without a unit is in SI."""
+    if isinstance(value, str):
+        return value
+    from apc.frame.names import find, unit_of
+
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise ApcError(Mistake("E204", Place(name), name, "a quantity or a number in SI", repr(value)[:80]))
+    number = int(value) if isinstance(value, Integral) else float(value)
+    return f"{number!r} {unit_of(system, find(system, name, counts=True).name)}".rstrip()
+
+
+def _range(system: CompiledSystem, name: str, value: str | Sequence[str | float]) -> str:
+    """Return a range of a parameter as it is written, of a text or of its two ends."""
+    return value if isinstance(value, str) else ":".join(_quantity(system, name, end) for end in value)
 
 
 @checked
 def analyze(
     model: CompiledSystem | str | Path,
     *,
-    set: Mapping[str, str] | None = None,
+    set: Mapping[str, str | float] | None = None,
     method: Method = "auto",
     certify: bool = False,
 ) -> Analysis:
@@ -178,7 +198,10 @@ def analyze(
 
 @checked
 def analyze_many(
-    model: CompiledSystem | str | Path, values: Mapping[str, Any], *, set: Mapping[str, str] | None = None
+    model: CompiledSystem | str | Path,
+    values: Mapping[str, Any],
+    *,
+    set: Mapping[str, str | float] | None = None,
 ) -> Analyses:
     """Say the same of many values of some parameters at once, a hundred times as fast as one by one.
 
@@ -211,9 +234,9 @@ def critical(
     model: CompiledSystem | str | Path,
     parameter: str,
     *,
-    set: Mapping[str, str] | None = None,
-    lower: str | None = None,
-    upper: str | None = None,
+    set: Mapping[str, str | float] | None = None,
+    lower: str | float | None = None,
+    upper: str | float | None = None,
     criterion: Criterion | None = None,
 ) -> Critical:
     """Find the values of a parameter or delay at which a scene becomes stable or unstable.
@@ -225,7 +248,7 @@ def critical(
     parameter
         Its name, such as "coordination.stiffness" or "lan.delay".
     lower, upper
-        Quantities between which to look, such as "5000 N/m".
+        Quantities between which to look, such as "5000 N/m", or numbers in SI.
     criterion
         "mean-square": stable means that second moments die out over the network as it is, the default where
         a link loses or delays packets; "nominal": that motions die out if every packet is on time; "passive":
@@ -238,14 +261,16 @@ def critical(
     """
     from apc.vary import critical as crossings
 
-    return crossings.critical(_model(model, set), parameter, lower=lower, upper=upper, criterion=criterion)
+    system = _model(model, set)
+    low, high = (None if one is None else _quantity(system, parameter, one) for one in (lower, upper))
+    return crossings.critical(system, parameter, lower=low, upper=high, criterion=criterion)
 
 
 @checked
 def compare(
     models: _Scene | Sequence[_Scene],
     *,
-    set: Mapping[str, str] | None = None,
+    set: Mapping[str, str | float] | None = None,
     over: Sequence[str] = (),
     criterion: Criterion | None = None,
     at: str = "",
@@ -284,7 +309,7 @@ def compare(
 
 @checked
 def passive_hands(
-    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None
 ) -> PassiveHands:
     """Say whether a scene is stable with every passive hand at every device, and how much damping that takes.
 
@@ -308,7 +333,7 @@ def feel(
     model: CompiledSystem | str | Path,
     frequencies: Sequence[float] | float,
     *,
-    set: Mapping[str, str] | None = None,
+    set: Mapping[str, str | float] | None = None,
     at: str = "",
     between: str = "",
     unstable: bool = False,
@@ -374,7 +399,7 @@ def describe_network(recording: str | Path, *, interval: str | None = None) -> N
 
 @checked
 def judge_network(
-    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None, certify: bool = False
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None, certify: bool = False
 ) -> NetworkVerdict | None:
     """Say what becomes of a scene over the network that it has, lost and late packets included.
 
@@ -400,7 +425,7 @@ def judge_network(
 
 
 @checked
-def margins(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Margins:
+def margins(model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None) -> Margins:
     """Say how far each coupler's stiffness and damping and each delay may grow, all else as it is.
 
     Parameters
@@ -415,7 +440,7 @@ def margins(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None
 
 @checked
 def sensitivities(
-    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None
 ) -> Sensitivities:
     """Differentiate the spectral radius with respect to every parameter.
 
@@ -430,7 +455,9 @@ def sensitivities(
 
 
 @checked
-def conventions(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Conventions:
+def conventions(
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None
+) -> Conventions:
     """Repeat the analysis under every order of coincident events and both readings of the start.
 
     Parameters
@@ -445,7 +472,7 @@ def conventions(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | 
 
 @checked
 def contact_modes(
-    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None
 ) -> ContactModes:
     """Analyse a scene whose couplers push and never pull in each of their modes.
 
@@ -460,7 +487,9 @@ def contact_modes(
 
 
 @checked
-def switching(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Switching:
+def switching(
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None
+) -> Switching:
     """Say whether a scene is proved stable however its contacts open and close, or as they do by themselves.
 
     Parameters
@@ -476,7 +505,7 @@ def switching(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | No
 
 
 @checked
-def buzz(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> Buzz:
+def buzz(model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None) -> Buzz:
     """Predict the buzz of a scene's one-sided contacts, and play it beside.
 
     Parameters
@@ -497,10 +526,10 @@ def buzz(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = 
 @checked
 def prove_box(
     model: CompiledSystem | str | Path,
-    box: Mapping[str, str],
+    box: Mapping[str, str | Sequence[str | float]],
     *,
     cells: int | None = None,
-    set: Mapping[str, str] | None = None,
+    set: Mapping[str, str | float] | None = None,
 ) -> BoxProof:
     """Prove that a scene is stable for every value of some parameters within their ranges.
 
@@ -509,7 +538,7 @@ def prove_box(
     model, set
         As for `analyze`.
     box
-        Ranges by parameter, such as {"contact.stiffness": "±1%"} or "900 N/m:1100 N/m".
+        Ranges by parameter, such as {"contact.stiffness": "±1%"}, "900 N/m:1100 N/m" or, in SI, (900, 1100).
     cells
         How many cells are looked at at most; without it, as many as take some seconds.
     """
@@ -517,7 +546,7 @@ def prove_box(
     from apc.answer import proved_box
 
     system = _model(model, set)
-    ranges = [parse_range(system, f"{name}={value}") for name, value in box.items()]
+    ranges = [parse_range(system, f"{name}={_range(system, name, value)}") for name, value in box.items()]
     return proved_box(system, ranges, cells=cells)
 
 
@@ -536,7 +565,9 @@ def parameters(model: CompiledSystem | str | Path) -> Parameters:
 
 
 @checked
-def paper_route(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None) -> PaperRoute:
+def paper_route(
+    model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None
+) -> PaperRoute:
     """Return the lifted matrices of Rakhsha and Constantinescu, eqs. (18) to (20), rows and columns named.
 
     Parameters
@@ -558,10 +589,10 @@ def paper_route(model: CompiledSystem | str | Path, *, set: Mapping[str, str] | 
 def region(
     model: CompiledSystem | str | Path,
     *,
-    x: str | None = None,
-    y: str | None = None,
+    x: str | tuple[str, str | float, str | float] | None = None,
+    y: str | tuple[str, str | float, str | float] | None = None,
     criterion: Criterion | None = None,
-    set: Mapping[str, str] | None = None,
+    set: Mapping[str, str | float] | None = None,
 ) -> Region:
     """Find the boundary of the stable region of two parameters, as curves with their errors.
 
@@ -570,8 +601,8 @@ def region(
     model, set
         As for `analyze`.
     x, y
-        A parameter and its range, such as "contact.stiffness=10 N/m:3000 N/m"; those of the scene's
-        `studies: region:` if not given.
+        A parameter and its range, such as "contact.stiffness=10 N/m:3000 N/m" or, in SI,
+        ("contact.stiffness", 10, 3000); those of the scene's `studies: region:` if not given.
     criterion
         As for `critical`.
 
@@ -589,20 +620,24 @@ def region(
     from apc.regions.axes import parse_axes
 
     system = _model(model, set)
-    return stable_region.region(system, parse_axes(system, x, y), criterion=criterion)
+    first, second = (
+        axis if axis is None or isinstance(axis, str) else f"{axis[0]}={_range(system, axis[0], axis[1:])}"
+        for axis in (x, y)
+    )
+    return stable_region.region(system, parse_axes(system, first, second), criterion=criterion)
 
 
 @checked
 def sweep(
     model: CompiledSystem | str | Path,
-    over: Mapping[str, str | Sequence[str]],
+    over: Mapping[str, str | Sequence[str | float]],
     *,
     of: str = "analyze",
     criterion: Criterion | None = None,
     out: str | Path | None = None,
     jobs: int | None = None,
     cluster: str | None = None,
-    set: Mapping[str, str] | None = None,
+    set: Mapping[str, str | float] | None = None,
 ) -> Sweep:
     """Compute a result at every combination of some parameters' values.
 
@@ -611,7 +646,8 @@ def sweep(
     model, set
         As for `analyze`.
     over
-        Values by parameter: "500 N/m:1500 N/m:11" (lower end, upper end, how many), or a list of quantities.
+        Values by parameter: "500 N/m:1500 N/m:11" (lower end, upper end, how many), or a list of quantities
+        or of numbers in SI.
     of
         "analyze", or "critical:PARAMETER".
     criterion
@@ -628,7 +664,11 @@ def sweep(
     path = None if out is None else Path(out)
     system = _model(model, set)
     _check_out(model, system, path)
-    return points.sweep(system, over, of=of, criterion=criterion, out=path, jobs=jobs, cluster=cluster)
+    values = {
+        name: one if isinstance(one, str) else [_quantity(system, name, value) for value in one]
+        for name, one in over.items()
+    }
+    return points.sweep(system, values, of=of, criterion=criterion, out=path, jobs=jobs, cluster=cluster)
 
 
 def _several(scenes: _Scene | Iterable[_Scene], function: str) -> list[_Scene]:
@@ -653,7 +693,7 @@ def _path(scene: _Scene, function: str) -> Path:
     return path
 
 
-def _model(model: CompiledSystem | str | Path, set: Mapping[str, str] | None) -> CompiledSystem:
+def _model(model: CompiledSystem | str | Path, set: Mapping[str, str | float] | None) -> CompiledSystem:
     """Return a compiled model, with the parameters set."""
     if not isinstance(model, CompiledSystem):
         from apc.inputs import load_or_compile
@@ -674,8 +714,8 @@ def _check_out(model: CompiledSystem | str | Path, system: CompiledSystem, path:
 def simulate(
     model: CompiledSystem | str | Path,
     *,
-    duration: str | None = None,
-    set: Mapping[str, str] | None = None,
+    duration: str | float | None = None,
+    set: Mapping[str, str | float] | None = None,
     signals: Sequence[str] = (),
     jit: bool = True,
     seed: int | None = None,
@@ -690,7 +730,7 @@ def simulate(
     model
         A compiled model, or the path of a topology or compiled model.
     duration
-        How long, such as "2 s"; that of the scene's experiment if not given.
+        How long, such as "2 s" or 2; that of the scene's experiment if not given.
     set
         Parameter values to change first, as in `set_parameters`.
     signals
@@ -725,9 +765,10 @@ def simulate(
         from apc.moments.worst import trace_of_worst
 
         system = trace_of_worst(system)
+    length = duration if duration is None or isinstance(duration, str) else f"{float(duration)!r} s"
     return trajectory.simulate(
         system,
-        duration=trajectory.parse_duration(duration) if duration is not None else None,
+        duration=trajectory.parse_duration(length) if length is not None else None,
         signals=signals,
         jit=jit,
         seed=seed,
@@ -738,7 +779,10 @@ def simulate(
 
 @checked
 def bench(
-    model: CompiledSystem | str | Path, *, set: Mapping[str, str] | None = None, rounds: int | None = None
+    model: CompiledSystem | str | Path,
+    *,
+    set: Mapping[str, str | float] | None = None,
+    rounds: int | None = None,
 ) -> Bench:
     """Measure every method of analysis and of simulation on a scene: time against true error.
 
@@ -767,7 +811,7 @@ def export(
     to: str | None = None,
     out: str | Path | None = None,
     *,
-    set: Mapping[str, str] | None = None,
+    set: Mapping[str, str | float] | None = None,
     cut: str = "",
     free: Sequence[str] = (),
     peer: str = "",
@@ -824,7 +868,7 @@ def report(
     files: str | Path | Sequence[str | Path],
     out: str | Path | None = None,
     *,
-    set: Mapping[str, str] | None = None,
+    set: Mapping[str, str | float] | None = None,
 ) -> Report:
     """Gather all that is known of scenes, for one page.
 

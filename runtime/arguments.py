@@ -74,6 +74,8 @@ def _fits(value: Any, hint: Any) -> bool:
         return isinstance(value, Mapping) and all(
             _fits(one, inner[1]) for one in value.values() if isinstance(one, list | tuple)
         )
+    if origin is tuple:
+        return isinstance(value, tuple | list) and len(value) == len(inner) and all(map(_fits, value, inner))
     if origin in (Sequence, Iterable):
         listed = isinstance(value, Iterable) and not isinstance(value, Mapping | bytes)
         return listed and (origin is Iterable or all(_fits(one, inner[0]) for one in value))

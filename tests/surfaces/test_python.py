@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 import apc
@@ -110,10 +111,21 @@ def test_an_argument_of_a_wrong_type_is_said_to_be_one(
             assert isinstance(raised.value, apc.ApcError) or f"apc.{name}: {one} wants" in str(raised.value)
 
 
-def test_a_range_that_is_no_text_is_refused(model: apc.CompiledSystem) -> None:
-    wants = r"apc.region: x wants str \| None, got tuple: \('contact.stiffness', '10 N/m', '3000 N/m'\)"
-    with pytest.raises(TypeError, match=wants):
-        apc.region(model, x=("contact.stiffness", "10 N/m", "3000 N/m"))  # type: ignore[arg-type] # it is wrong
+def test_a_number_in_si_is_the_quantity(model: apc.CompiledSystem) -> None:
+    name, other = "contact.stiffness", "coordination.stiffness"
+    assert apc.analyze(model, set={"lan.delay": 0.016, "user.count": 4, name: np.float64(800)}) == (
+        apc.analyze(model, set={"lan.delay": "16 ms", "user.count": "4", name: "800 N/m"})
+    )
+    assert apc.critical(model, other, upper=3000).value == apc.critical(model, other, upper="3 kN/m").value
+    assert apc.prove_box(model, {name: (900, 1100)}) == apc.prove_box(model, {name: "900 N/m:1100 N/m"})
+    lists = apc.sweep(model, {name: [800, 900.0]}, jobs=1), apc.sweep(model, {name: "800,900 N/m"}, jobs=1)
+    assert str(lists[0].to_dataframe()) == str(lists[1].to_dataframe())
+    areas = [
+        apc.region(model, x=x, y=(other, 10, 3000)).stable_area
+        for x in ((name, 10, "3000 N/m"), f"{name}=10 N/m:3000 N/m")
+    ]
+    assert areas[0] == areas[1]
+    assert len(apc.simulate(model, duration=0.1).times) == 101
 
 
 @pytest.mark.parametrize("wrong", [7, None, ("1 N/m", "2 N/m"), {"a": "b"}, [3]], ids=repr)
