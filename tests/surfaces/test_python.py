@@ -125,7 +125,7 @@ def test_a_number_in_si_is_the_quantity(model: apc.CompiledSystem) -> None:
         for x in ((name, 10, "3000 N/m"), f"{name}=10 N/m:3000 N/m")
     ]
     assert areas[0] == areas[1]
-    assert len(apc.simulate(model, duration=0.1).times) == 101
+    assert len(apc.simulate(model, duration=0.1).values) == 101
 
 
 @pytest.mark.parametrize("wrong", [7, None, ("1 N/m", "2 N/m"), {"a": "b"}, [3]], ids=repr)
