@@ -243,7 +243,7 @@ def _verdict(system: CompiledSystem, call: str) -> Section:
         ),
         Table(
             "What moves the radius most",
-            ("parameter", "unit", "value", "by a whole of it", "eigenvalue"),
+            ("parameter", "unit", "value", "change for 100 %", "eigenvalue"),
             tuple((row.parameter, row.unit, row.value, row.relative, row.mode + 1) for row in moved),
         ),
     )
