@@ -10,13 +10,20 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import statistics
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+
+import apc
+from apc.answer import answer
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ("models/scenes", "tests/scenes", "tests/hard")
@@ -25,14 +32,10 @@ Numbers = list[tuple[float, float]]
 
 
 def _stiffnesses(model: Any) -> list[str]:
-    import apc
-
     return [row.name for row in apc.parameters(model).rows if row.name.endswith("stiffness")]
 
 
 def _critical(model: Any, ending: str, place: int) -> tuple[str, Numbers]:
-    import apc
-
     names = [row.name for row in apc.parameters(model).rows if row.name.endswith(ending)]
     found = apc.critical(model, names[place])
     words = " ".join(str(crossing.stable_side) for crossing in found.crossings)
@@ -40,17 +43,11 @@ def _critical(model: Any, ending: str, place: int) -> tuple[str, Numbers]:
 
 
 def _analyze(model: Any) -> tuple[str, Numbers]:
-    import apc
-
     found = apc.analyze(model)
     return found.verdict, [(found.spectral_radius, found.spectral_radius_error)]
 
 
 def _many(model: Any) -> tuple[str, Numbers]:
-    import numpy as np
-
-    import apc
-
     name = _stiffnesses(model)[0]
     found = apc.analyze_many(model, {name: np.linspace(10, 3000, 10_000)})
     errors = np.nan_to_num(found.spectral_radius_error[::100], nan=np.inf)
@@ -58,55 +55,22 @@ def _many(model: Any) -> tuple[str, Numbers]:
 
 
 def _region(model: Any) -> tuple[str, Numbers]:
-    import apc
-
     x, y = _stiffnesses(model)[:2]
     found = apc.region(model, x=f"{x}=10 N/m:3000 N/m", y=f"{y}=10 N/m:2000 N/m")
     return "", [(found.stable_area, found.stable_area_error)]
 
 
-def _passive(model: Any) -> tuple[str, Numbers]:
-    import apc
-
-    return str(apc.passive_hands(model).verdict), []
-
-
-def _network(model: Any) -> tuple[str, Numbers]:
-    import apc
-
-    found = apc.judge_network(model)
-    return "|".join(str(getattr(row, "verdict", "")) for row in getattr(found, "rows", ())), []
-
-
 def _simulate(model: Any) -> tuple[str, Numbers]:
-    import apc
-
     found = apc.simulate(model, duration="0.5 s")
     # What contacts make of a rounding is not known: a hundred-thousandth is what both players state.
-    ends = {name: float(value) for name, value in zip(found.names, found.values[-1], strict=True)}
+    ends = {one.name: float(value) for one, value in zip(found.signals, found.values[-1], strict=True)}
     return "", [(ends[name], 1e-5 * max(1.0, abs(ends[name]))) for name in sorted(ends)]
 
 
 def _feel(model: Any) -> tuple[str, Numbers]:
-    import apc
-
     found = apc.feel(model, [1.0, 10.0], unstable=True)
     values = [abs(complex(value)) for value in found.error_per_force]
     return "", [(value, 1e-9 * value) for value in values]
-
-
-def _answer(model: Any) -> tuple[str, Numbers]:
-    from apc.answer import answer
-
-    answer(model)
-    return "", []
-
-
-def _margins(model: Any) -> tuple[str, Numbers]:
-    import apc
-
-    apc.margins(model)
-    return "", []
 
 
 QUESTIONS: dict[str, Callable[[Any], tuple[str, Numbers]]] = {
@@ -115,21 +79,15 @@ QUESTIONS: dict[str, Callable[[Any], tuple[str, Numbers]]] = {
     "first stiffness": lambda model: _critical(model, "stiffness", 0),
     "last delay": lambda model: _critical(model, "delay", -1),
     "region": _region,
-    "passive hands": _passive,
-    "network": _network,
+    "passive hands": lambda model: (apc.passive_hands(model).verdict, []),
     "feel": _feel,
     "simulate": _simulate,
-    "margins": _margins,
-    "default output": _answer,
+    "default output": lambda model: (answer(model).analysis.verdict, []),
 }
 
 
 def serve() -> None:
     """Answer the questions on standard input, a line each, as long as there are any."""
-    import signal
-    import time
-
-    import apc
 
     class TooLong(BaseException):
         """The time is up; no handler of errors may catch it."""
@@ -196,7 +154,7 @@ class Pairs:
     def add(self, scene: str, ours: dict[str, Any], theirs: dict[str, Any]) -> None:
         """Take down the two answers of a scene."""
         if ours["refused"] or theirs["refused"]:
-            if bool(ours["refused"]) != bool(theirs["refused"]):
+            if ours["refused"] != theirs["refused"]:
                 who = "this version" if ours["refused"] else "the other"
                 self.refused.append(f"{scene}: {who}: {ours['refused'] or theirs['refused']}")
             return
