@@ -79,6 +79,11 @@ if TYPE_CHECKING:
     "not given.",
 )
 @click.option(
+    "--strike",
+    metavar="PEER",
+    help='Strike a peer as it begins, such as "user[1]": its device starts at 0.1 m/s.',
+)
+@click.option(
     "--trace-of",
     type=click.Choice(["worst"]),
     help="Lose packets by the periodic pattern that analyze finds to shake the scene.",
@@ -98,6 +103,7 @@ def simulate_command(
     runs: int | None,
     jobs: int,
     method: str | None,
+    strike: str | None,
     trace_of: str | None,
     error: bool,
 ) -> None:
@@ -113,6 +119,7 @@ def simulate_command(
         apc simulate --duration "3 s" --plot run.png
         apc simulate --signals cube.x --out run.csv
         apc simulate --out run.gif
+        apc simulate --strike "user[1]" --plot run.png
         apc simulate --runs 1000 --seed 1 --jobs 4
         apc simulate --method semi-implicit:1ms --error
     """
@@ -130,6 +137,13 @@ def simulate_command(
         from apc.moments.worst import trace_of_worst
 
         system = trace_of_worst(system)
+    if strike is not None:
+        from apc.simulation.strike import WATCHED
+        from apc.simulation.strike import strike as struck
+
+        system, what = struck(system, strike)
+        note_aside(f"{what} is struck as the scene begins")
+        asked = asked or system.experiment.duration or WATCHED
     seconds = duration_of(system, asked, runs=runs or 1)
     if still is not None:
         from apc.present.still import save_still
