@@ -2,7 +2,8 @@
 
 Takes: a kind's Jacobians and exact numbers; a `CompiledSystem`.
 Gives: `Device`, `find_device`, `find_devices`, `devices_of`, `coupled_directly`; `no_device`; `Push`,
-`find_push`; `HANDS`, `with_hands`, `clamped`, `held`; `refuse_hands`; `published`; `OWN_MASS`, `UNHELD`.
+`find_push`; `HANDS`, `with_hands`, `without_hands`, `clamped`, `held`; `replaced_hands`; `refuse_hands`;
+`published`; `OWN_MASS`, `UNHELD`.
 Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
 Does not: ask whether it is stable (see `passivity` for hands of every kind).
 
@@ -52,6 +53,8 @@ OWN_MASS = "a mass of its own at each peer, as masses: {device: {mass: 0.1 kg}}"
 
 # What the parameters of a hand that is put on every device are named after, and what each is.
 HAND = "hand"
+# Units of what makes a hand a mass, a damper or a spring.
+_IMPEDANCE = ("kg", "N*s/m", "kg/s", "N/m", "kg/s^2")
 _NUMBERS = (
     ("mass", "kg", "what of the hand moves with the device"),
     ("damping", "N*s/m", "of the hand, to where the arm stands"),
@@ -364,6 +367,64 @@ def refuse_hands(system: CompiledSystem, option: str) -> None:
             raise ApcError(Mistake("E932", Place(system.origin.topology), what, hint=hint))
 
 
+def without_hands(system: CompiledSystem, option: str) -> CompiledSystem:
+    """Return a scene without its hands, in the place of which others stand.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    option
+        What asked for it.
+
+    Raises
+    ------
+    ApcError
+        E932 a hand that is more than a mass, damper and spring between a device and where it stands.
+    """
+    if not any(kind.hands for kind in system.kinds):
+        return system
+    unit_of = {one.name: one.unit for one in system.parameters}
+    kinds = tuple(_without_hands(kind, tuple(map(unit_of.get, kind.parameters))) for kind in system.kinds)
+    bare = tuple(one or kind for one, kind in zip(kinds, system.kinds, strict=True))
+    found = replace(system, kinds=bare)
+    refuse_hands(found, option)
+    return found
+
+
+@functools.lru_cache(maxsize=64)
+def _without_hands(kind: Kind, units: tuple[str | None, ...]) -> Kind | None:
+    """Return a kind whose hands have no mass, damping nor stiffness, None where more of them is left."""
+    own = [
+        place for place, name in enumerate(kind.parameters) if any(_is_of(name, hand) for hand in kind.hands)
+    ]
+    if any(_is_of(state.name, hand) for state in kind.states for hand in kind.hands) or not kind.hands:
+        return None
+
+    def rates(x: Any, u: Any, p: Any, t: Any) -> Any:
+        numbers = casadi.vertsplit(p)
+        for place in own:
+            if units[place] in _IMPEDANCE:
+                numbers[place] = casadi.SX(0)
+        return kind.derivative(x, u, casadi.vertcat(*numbers), t)
+
+    found = _rewritten(replace(kind, hands=()), kind, lambda x, p: x, rates)
+    x, u, p, t = found.derivative.sx_in()
+    left = casadi.depends_on(found.derivative(x, u, p, t), casadi.vertcat(*(p[place] for place in own)))
+    return None if left else found
+
+
+def _is_of(name: str, hand: str) -> bool:
+    """Say whether a state or a parameter is of a hand."""
+    return name.startswith(f"{hand}.") or _part(name) == hand
+
+
+def replaced_hands(system: CompiledSystem) -> tuple[str, ...]:
+    """Return what is said of hands of the scene in the place of which others stand."""
+    names = [f"{hand} of {group.name}" for group in system.groups for hand in system.kinds[group.kind].hands]
+    return (f"{', '.join(names)}: any passive hand stands there instead",) if names else ()
+
+
 def with_hands(system: CompiledSystem, hands: str) -> CompiledSystem:
     """Return a scene with hands of a kind, its name saying so.
 
@@ -373,7 +434,7 @@ def with_hands(system: CompiledSystem, hands: str) -> CompiledSystem:
         The compiled scene.
     hands
         "free": as it is. "clamped": its devices are held fast. "held": a hand of `hand.mass`, `hand.damping`
-        and `hand.stiffness` on each, 0 at first. "passive": as it is, and refused if it has hands. Or one of
+        and `hand.stiffness` on each, 0 at first. "passive": as it is. Or one of
         the library, of its usual numbers (see `published`).
 
     Raises
@@ -382,8 +443,6 @@ def with_hands(system: CompiledSystem, hands: str) -> CompiledSystem:
         E930 no such hands; E931 no device; E932 hands in the scene.
     """
     option = f"--hands {hands}"
-    if hands == PASSIVE:
-        refuse_hands(system, option)
     if hands in (FREE, PASSIVE):
         return system
     if hands == CLAMPED:
@@ -403,9 +462,9 @@ def clamped(system: CompiledSystem, *, option: str = "--hands clamped") -> Compi
     Raises
     ------
     ApcError
-        E931 as `devices_of`, E932 hands in the scene.
+        E931 as `devices_of`, E932 as `without_hands`.
     """
-    refuse_hands(system, option)
+    system = without_hands(system, option)
     devices = devices_of(system, option=option)
     kinds = list(system.kinds)
     for number, device in devices.items():

@@ -24,7 +24,7 @@ from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
 from apc.eigen.dissipation import least_real, proves_positive
 from apc.finite_equations import finite_equations
-from apc.frame.devices import clamped, refuse_hands
+from apc.frame.devices import clamped, replaced_hands, without_hands
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, solve, value_of
 from apc.hands.passivity_in_balls import certified
@@ -146,8 +146,9 @@ def passive_hands(
     After Colgate and Schenkel, J. Robotic Systems 14 (1997) 37, for any number of devices, delays and clocks:
     see `port`.
     """
-    refuse_hands(system, OPTION)
-    prepared = prepared or prepare(system)
+    of_scene, system = system, without_hands(system, OPTION)
+    if prepared is None or system is not of_scene:
+        prepared = prepare(system)
     fixed = analyze(clamped(system, option=OPTION), certify=certify)
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         opened = open_ports(system, *lifted_groups(system, prepared=prepared), option=OPTION)
@@ -199,6 +200,7 @@ def passive_hands(
         proof=proof,
         linearized=not linear,
         left_out=(
+            *replaced_hands(of_scene),
             *near_start(system, prepared),
             *left_out(system),
             *_as_at_start(system, prepared, linear=linear),
@@ -236,7 +238,8 @@ def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool 
     bounded
         Whether bounds are asked for.
     """
-    refuse_hands(system, OPTION)
+    of_scene, system = system, without_hands(system, OPTION)
+    prepared = prepared if system is of_scene else prepare(system)
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         loops = port_loops(system, prepared, option=OPTION)
         found, scale = [(-np.inf, -np.inf, -np.inf)], 1.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -343,11 +344,22 @@ def test_where_nothing_brakes_held_devices_leave_the_object_coasting() -> None:
     assert not found.stable and "hold the devices still" in str(found)
 
 
+@pytest.mark.parametrize("name", ["lifted-box", "star-lecture"])
+def test_in_the_place_of_a_scenes_own_arms_stands_any_passive_hand(name: str) -> None:
+    text = (SCENES / f"{name}.yaml").read_text(encoding="utf-8")
+    bare = re.sub(r"^hands:.*\n(  .*\n)+|, arm.stiffness: 400 N/m", "", text, flags=re.MULTILINE)
+    assert bare != text
+    found, alone = (apc.passive_hands(compiled(one)) for one in (text, bare))
+    assert (found.modes, found.verdict, found.clamped_radius) == (
+        (alone.modes, alone.verdict, alone.clamped_radius)
+    )
+    assert found.left_out[0].endswith("any passive hand stands there instead")
+
+
 def test_what_is_not_judged_is_refused_by_name() -> None:
     text = AVERAGE + "hands: {grip: {type: SpringDamperArm, flange: device, stiffness: 100 N/m}}\n"
-    for hands in ("clamped", "held", "passive"):
-        with pytest.raises(ApcError, match=r"E932.*grip"):
-            apc.with_hands(compiled(text), hands)
+    with pytest.raises(ApcError, match=r"E932.*grip"):
+        apc.with_hands(compiled(text), "held")
     with pytest.raises(ApcError, match="E930"):
         apc.with_hands(compiled(AVERAGE), "claped")
     text = replaced(AVERAGE, ("type: Sampled", "type: "), ("N/m, clock: haptic, delay: 1 ms}", "N/m}"))
