@@ -1,7 +1,8 @@
 """What a hand holds: a peer's device, found in its equations, and the peer with a hand on it.
 
 Takes: a kind's Jacobians and exact numbers; a `CompiledSystem`.
-Gives: `Device`, `find_device`, `find_devices`, `devices_of`, `coupled_directly`; `no_device`; `Push`,
+Gives: `Device`, `find_device`, `find_devices`, `devices_of`, `coupled_directly`,
+`directions_of`; `no_device`; `Push`,
 `find_push`; `HANDS`, `with_hands`, `without_hands`, `clamped`, `held`; `replaced_hands`; `refuse_hands`;
 `published`; `OWN_MASS`, `UNHELD`.
 Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
@@ -32,6 +33,7 @@ from apc.compiler.cache import HANDS_CHANGE
 from apc.compiler.compiled import PEERS, CompiledSystem, Kind, Parameter, Ports, Receive
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.interpolation import jacobian
+from apc.compiler.language.vectors import whole_and_index
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.linearize import Listening, start_arguments
@@ -351,6 +353,47 @@ def devices_of(system: CompiledSystem, *, option: str) -> dict[int, Device]:
     return found
 
 
+def directions_of(system: CompiledSystem) -> dict[str, CompiledSystem]:
+    """Return the scene once for each direction in which its devices move, held fast in all others.
+
+    Nothing where each device moves along one line only.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    """
+    unit_of = {one.name: one.unit for one in system.parameters}
+    numbers, direct = resolve(system), coupled_directly(system.kinds)
+    wanted: dict[str, None] = {}
+    for place, group in enumerate(system.groups):
+        site = jacobians(system.kinds[group.kind])
+        found = find_devices(site, numbers.parameters[place][0], unit_of, direct=direct)
+        axes = {own: one for own, one in found.items() if isinstance(one, Device)}
+        wholes = {whole_and_index(own)[0] if own.endswith("]") else "" for own in axes}
+        if len(axes) == len(found) > 1 and len(wholes) == 1 and "" not in wholes:
+            wanted |= dict.fromkeys(own.rpartition(".")[2] for own in axes)
+    return {axis: _along(system, [one for one in wanted if one != axis]) for axis in wanted}
+
+
+def _along(system: CompiledSystem, others: Sequence[str]) -> CompiledSystem:
+    """Return a scene in which whatever moves along other axes is held where it starts."""
+    kinds = []
+    for kind in system.kinds:
+        moving = [
+            (place, int(driven[0]))
+            for place, state in enumerate(kind.states)
+            if state.unit == "m" and any(state.name.endswith(f".{axis}") for axis in others)
+            if len(driven := np.flatnonzero(jacobians(kind).pattern.a[place])) == 1
+        ]
+        names = [(kind.states[position].name, kind.states[velocity].name) for position, velocity in moving]
+        for pair in names:
+            place = {state.name: number for number, state in enumerate(kind.states)}
+            kind = _without(kind, *(place[name] for name in pair))
+        kinds.append(kind)
+    return replace(system, kinds=tuple(kinds))
+
+
 def no_device(system: CompiledSystem, option: str) -> ApcError:
     """Return the refusal of a scene in which nobody has a device."""
     names = ", ".join(group.name for group in system.groups)
@@ -465,6 +508,8 @@ def clamped(system: CompiledSystem, *, option: str = "--hands clamped") -> Compi
         E931 as `devices_of`, E932 as `without_hands`.
     """
     system = without_hands(system, option)
+    # Of devices that move along several directions all but one are held first.
+    system = next(iter(directions_of(system).values()), system)
     devices = devices_of(system, option=option)
     kinds = list(system.kinds)
     for number, device in devices.items():

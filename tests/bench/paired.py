@@ -115,31 +115,18 @@ def serve() -> None:
         print(json.dumps(told), flush=True)
 
 
-@dataclass(slots=True)
-class Version:
-    """A process of a version of apc that answers questions."""
+def started(python: str) -> subprocess.Popen[str]:
+    """Start a version that answers questions, with one thread and nothing of this checkout on its path."""
+    threads = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    command, pipe = [python, "-P", str(Path(__file__)), "--serve"], subprocess.PIPE
+    return subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd="/", env=threads, bufsize=1)
 
-    process: subprocess.Popen[str]
 
-    @classmethod
-    def start(cls, python: str) -> Version:
-        """Start the process in the environment of a Python."""
-        threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-        # The file itself is run, with nothing of this checkout on the path.
-        command = [python, "-P", str(Path(__file__)), "--serve"]
-        pipe = subprocess.PIPE
-        return cls(
-            subprocess.Popen(
-                command, stdin=pipe, stdout=pipe, text=True, cwd="/", env=os.environ | threads, bufsize=1
-            )
-        )
-
-    def ask(self, *question: object) -> dict[str, Any]:
-        """Return what it answers to a scene's file, a question and a number of runs."""
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.process.stdin.write(json.dumps(question) + "\n")
-        return dict(json.loads(self.process.stdout.readline()))
+def answered(version: subprocess.Popen[str], *question: object) -> dict[str, Any]:
+    """Return what a version says to a scene's file, a question and a number of runs."""
+    assert version.stdin is not None and version.stdout is not None
+    version.stdin.write(json.dumps(question) + "\n")
+    return dict(json.loads(version.stdout.readline()))
 
 
 @dataclass(slots=True)
@@ -195,13 +182,13 @@ def main() -> None:
     parser.add_argument("--only", action="append", choices=QUESTIONS, help="may be repeated")
     given = parser.parse_args()
     judge = Judge(given.strict)
-    ours, theirs = Version.start(sys.executable), Version.start(given.other)
+    ours, theirs = started(sys.executable), started(given.other)
     files = [file for folder in FOLDERS for file in sorted((ROOT / folder).glob("*.yaml"))]
     for question in given.only or QUESTIONS:
         pairs, runs = Pairs(), 3 if question == "analyze" else 1
         for file in files[:5] if given.quick else files:
             asked = (str(file), question, runs)
-            pairs.add(file.stem, ours.ask(*asked), theirs.ask(*asked))
+            pairs.add(file.stem, answered(ours, *asked), answered(theirs, *asked))
         pairs.report(question)
         judge.right(f"{question}: the same answers", not pairs.different)
     judge.end()
