@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from apc.analysis.box_proof import BoxProof
     from apc.analysis.switching import Switching
     from apc.frame.names import Range
+    from apc.hands.passivity import PassiveHands
     from apc.moments.network import NetworkVerdict
     from apc.simulation.buzz import Buzz
 
@@ -238,6 +240,10 @@ def proved_box(
         As `box_proof.prove_box`, or `moments.mean_square_box.prove_box` where links are, or may become,
         unreliable; as `hands.passive_box.prove_box`.
     """
+    from apc.vary.delay_box import is_delay, prove_over_delay
+
+    if any(is_delay(system, one.free) for one in box):
+        return prove_over_delay(system, box, partial(_proved_at, passive=passive, cells=cells))
     if passive:
         from apc.hands.passive_box import prove_box as prove_for_hands
 
@@ -251,6 +257,29 @@ def proved_box(
 
         return prove_over_network(system, box, cells=cells)
     return prove_box(system, box, cells=cells)
+
+
+def _proved_at(system: CompiledSystem, box: Sequence[Range], *, passive: bool, cells: int | None) -> BoxProof:
+    """Return the proof over the other ranges at one delay; without any, the verdict there."""
+    if box:
+        return proved_box(system, box, passive=passive, cells=cells)
+    from apc.analysis.box_proof import BoxProof
+    from apc.network.nominal import left_out
+
+    found: Analysis | NetworkVerdict | PassiveHands
+    if passive:
+        from apc.hands.passivity import passive_hands
+
+        found = passive_hands(system)
+    elif left_out(system):
+        from apc.moments.network import judge_network
+
+        network = judge_network(system, prepare(system))
+        assert network is not None, "a link is unreliable"
+        found = network
+    else:
+        found = analyze(system)
+    return BoxProof(system.name, (), found.verdict, found.stable, 1, float(found.stable is None), (), ())
 
 
 def sensitivities_of(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Sensitivities:

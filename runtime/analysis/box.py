@@ -70,7 +70,7 @@ def parse_range(system: CompiledSystem, text: str) -> Range:
     parameter = _parameter(system, free)
     if value.startswith(("±", "+-")):
         share = _percentage(value.removeprefix("±").removeprefix("+-"), text)
-        middle = Fraction(parameter.value)
+        middle = parameter.number
         spread = abs(middle) * share
         if not spread:
             what = f"{name} is 0, and any share of it is 0 as well"
@@ -112,9 +112,14 @@ def _parameter(system: CompiledSystem, free: Free) -> Parameter:
     """Return the parameter a box is about; refuse times and values that differ from peer to peer."""
     name, group = free.name, free.group
     common = {parameter.name: parameter for parameter in system.parameters}
-    if name not in common:
-        what = f"{name} is a time: what happens in a frame changes with it by jumps, not by degrees"
-        raise ApcError(Mistake("E831", _PLACE, what))
+    times = {timing.name: timing.value for timing in system.timings}
+    delays = {one for link in system.links for one in (link.delay, *(pair.delay for pair in link.delays))}
+    if name in delays:  # judged piece by piece
+        return Parameter(name, "s", float(times[name]), minimum=0.0, exact=times[name])
+    if name in scope_of(system).needed([*times]) or name not in common:
+        what = f"{name} is a time, or sets one: what happens in a frame changes with it by jumps"
+        rhythm = any(name in (clock.period, clock.phase) for clock in system.clocks)
+        raise ApcError(Mistake("E831", _PLACE, what, hint="" if rhythm else f"apc critical {name}"))
     for one in system.groups:
         own = {value.name: value for value in one.values}
         columns = {column.name for column in one.columns}

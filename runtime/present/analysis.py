@@ -333,7 +333,7 @@ def box_proof_text(found: BoxProof) -> str:
             more += wrapped(f"more cells may decide it: --cells {MORE_CELLS * found.cells}")
     told = [line for text in (*found.left_out, said) for line in wrapped(text)]
     ranges = [f"  {_range(one)}" for one in found.ranges]
-    return "\n".join([f"{found.topology}:", *told, *ranges, *more, *(f"  {one}" for one in found.notes)])
+    return "\n".join([f"{found.topology}:", *told, *ranges, *more, *notes(found.notes)])
 
 
 def _range(found: Range) -> str:

@@ -139,6 +139,17 @@ def test_a_box_stands_before_the_answer_and_says_that_more_cells_may_decide_it(
     assert capsys.readouterr().out.startswith("three-users-average:\nproved stable")
 
 
+def test_a_box_over_a_delay_is_stable_where_every_delay_in_it_is() -> None:
+    luck = np.random.default_rng(4)
+    for low, high in np.sort(luck.integers(0, 36, (6, 2)) / 2000, axis=1).tolist():
+        system = apc.set_parameters(compiled(AVERAGE), {"coordination.stiffness": luck.uniform(300, 1500)})
+        found = apc.prove_box(system, {"lan.delay": (low, high + 0.0005)})
+        grid = np.arange(low, high + 0.0006, 0.00025).round(7)
+        stable = [apc.analyze(system, set={"lan.delay": one}).stable for one in grid]
+        assert found.stable is all(stable)
+        assert found.stable or not apc.analyze(system, set={"lan.delay": found.point[0]}).stable
+
+
 @pytest.mark.parametrize(
     ("text", "box", "message"),
     [
@@ -154,7 +165,7 @@ def test_a_box_stands_before_the_answer_and_says_that_more_cells_may_decide_it(
         ),
         (AVERAGE, "contact.stiffness=-5 N/m:1 N/m", "E833"),
         (AVERAGE, "device.mass=0 kg:1 kg", "E833"),
-        (AVERAGE, "lan.delay=±1%", "E831 lan.delay is a time"),
+        (AVERAGE, "contact.delay=±1%", "E831 contact.delay is a time, or sets one"),
         (AVERAGE, "contact.stiffness=900:1100", "E204"),
         (AVERAGE, "contact.stiffness=±1%|couplers.contact.stiffness=±2%", "E831"),
         (COLUMN, "device.mass=±1%", "E831 device.mass is not the same for all"),

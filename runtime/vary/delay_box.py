@@ -1,0 +1,88 @@
+"""Proof that a scene is stable at every delay of a link in a range, whatever constant it is.
+
+Takes: a `CompiledSystem`, ranges of which one is a link's delay, and what proves the others at one delay.
+Gives: `is_delay`, `prove_over_delay`.
+Guarantees: a packet is read at ticks, so that between two delays at which it is read a tick later nothing
+changes: each such piece is judged at one delay within, and each delay between two pieces by itself.
+Does not: say anything of delays that change from packet to packet (see `moments` for jitter).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from fractions import Fraction
+
+from apc.analysis.analysis import prepare
+from apc.analysis.box_proof import UNDECIDED, BoxProof
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.frame.names import Free, Range
+from apc.vary.delays import delay_pieces, system_with_delay
+
+PLACE = Place("box")
+
+CONSTANT = "at every constant delay: one that changes from packet to packet is jitter, and not among these"
+
+
+def is_delay(system: CompiledSystem, free: Free) -> bool:
+    """Say whether a timing is the delay of a link, or of some pairs of its peers."""
+    return any(free.name in (link.delay, *(pair.delay for pair in link.delays)) for link in system.links)
+
+
+def prove_over_delay(
+    system: CompiledSystem, ranges: Sequence[Range], prove: Callable[[CompiledSystem, list[Range]], BoxProof]
+) -> BoxProof:
+    """Prove a scene stable in a box of which one range is a link's delay.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    ranges
+        The parameters left open, the delay among them.
+    prove
+        Proves a scene with one delay stable in the box of the other ranges, of which there may be none.
+
+    Raises
+    ------
+    ApcError
+        E831 two delays, or one that forces wait for, too; E846 too many pieces; those of `prove`.
+    """
+    delays = [one for one in ranges if is_delay(system, one.free)]
+    if len(delays) > 1:
+        names = " and ".join(one.free.label for one in delays)
+        raise ApcError(Mistake("E831", PLACE, f"{names} are two delays, and a box takes one"))
+    (delay,) = delays
+    rest = [one for one in ranges if one is not delay]
+    place, width = list(ranges).index(delay), delay.high - delay.low
+    cells, left, verdict = 0, Fraction(0), UNDECIDED
+    open_point: tuple[float, ...] = ()
+    for value, share in _values(system, delay):
+        found = prove(system_with_delay(system, delay.free, value), rest)
+        cells += found.cells
+        point = (*found.point[:place], float(value), *found.point[place:])
+        if found.stable is False:
+            return replace(found, ranges=tuple(ranges), cells=cells, open_share=1.0, point=point)
+        if found.stable is None:
+            left += (share or Fraction(1, 10**9)) / width * Fraction(found.open_share or 1.0)
+            open_point = open_point or point
+        else:
+            verdict = found.verdict
+    stable = None if left else True
+    notes = (*found.notes, CONSTANT)
+    whole = replace(found, ranges=tuple(ranges), cells=cells, notes=notes, stable=stable)
+    return replace(whole, verdict=UNDECIDED if left else verdict, open_share=float(left), point=open_point)
+
+
+def _values(system: CompiledSystem, delay: Range) -> Iterator[tuple[Fraction, Fraction]]:
+    """Yield the delays that stand for all of a range, each with how much of the range it stands for."""
+    pieces = delay_pieces(system, delay.free, delay.low, prepare(system), place=PLACE, high=delay.high)
+    for piece in pieces:
+        if piece.evaluator is not None:
+            what = f"forces wait for {delay.free.label}, too: what happens when changes with it by degrees"
+            raise ApcError(Mistake("E831", PLACE, what, hint=f"apc critical {delay.free.label}"))
+        high = min(piece.high, delay.high)
+        yield piece.low, Fraction(0)
+        yield (piece.low + high) / 2, high - piece.low
+    yield delay.high, Fraction(0)
