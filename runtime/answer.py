@@ -141,7 +141,7 @@ def answer(
         Repeat the analysis under every order of coincident events, however long it takes.
     margins
         Whether to look for margins: True, for all of them, however long it takes; False, for none; None, for
-        those that take no more than seconds together.
+        all in a scene where that takes a second or so.
     with_buzz
         Predict the buzz of one-sided contacts, and play the scene to lay it beside.
 

@@ -60,7 +60,7 @@ SECONDS_A_PEER = 1e-4
     multiple=True,
     metavar="PATH=±P%",
     help="Prove stability for every value within, over the network as it is, e.g. "
-    '--box contact.stiffness=±1%, or --box "contact.stiffness=900 N/m:1100 N/m". May be repeated.',
+    '--box contact.stiffness=±1%, or --box "lan.delay=8 ms:20 ms", at every constant delay. May be repeated.',
 )
 @click.option(
     "--cells",
@@ -79,7 +79,7 @@ SECONDS_A_PEER = 1e-4
     "--margins/--no-margins",
     default=None,
     help="Look for all margins, however long it takes, or for none: how far stiffnesses, dampings and delays "
-    "may grow. Without either, for those that take no more than seconds together.",
+    "may grow. Without either, for all in a scene where that takes a second or so.",
 )
 @click.option(
     "--nominal",

@@ -51,8 +51,8 @@ def prove_over_delay(
     """
     delays = [one for one in ranges if is_delay(system, one.free)]
     if len(delays) > 1:
-        names = " and ".join(one.free.label for one in delays)
-        raise ApcError(Mistake("E831", PLACE, f"{names} are two delays, and a box takes one"))
+        names = " and ".join(dict.fromkeys(one.free.label for one in delays))
+        raise ApcError(Mistake("E831", PLACE, f"one range of one delay is taken in a box, not more: {names}"))
     (delay,) = delays
     rest = [one for one in ranges if one is not delay]
     place, width = list(ranges).index(delay), delay.high - delay.low
