@@ -113,4 +113,4 @@ def _differs(kept: KeptScene, again: Report) -> Iterator[str]:
         elif old["refused"] != section["refused"]:
             yield f"{title}: {section['refused'] or 'there is one'}, not: {old['refused'] or 'there is one'}"
         else:
-            yield from (f"{title}: {what}" for what in differences(old["tables"], section["tables"]))
+            yield from (f"{title}: {what}" for what in differences(old["results"], section["results"]))
