@@ -301,8 +301,8 @@ def differences(before: Any, now: Any) -> Iterator[str]:
 def _leaves(data: Any, name: str = "", known: float = 0.0) -> Iterator[tuple[str, tuple[Any, float]]]:
     """Yield what is no list or mapping by its place, and how far off it may be, which no error is itself."""
     if isinstance(data, Mapping):
-        errors = [one for key, one in data.items() if key.endswith("error") and one is not None]
-        known = sum(errors) if errors else known
+        errors = (one for key, one in data.items() if key.endswith("error") and isinstance(one, int | float))
+        known = sum(errors) or known
         for key, one in data.items():
             if "error" not in key:
                 yield from _leaves(one, f"{name}.{key}" if name else key, known)
