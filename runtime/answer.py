@@ -64,7 +64,7 @@ class Answer(Result):
     squares and how far that lets each number grow; None where all packets are on time.
     `switching` says whether contacts may open and close at will, None where nothing switches; `buzz` is None
     where it was not asked for, and where there is none to predict, which `no_buzz` says. `warnings` are those
-    of the topology.
+    of the topology. `nominal` says that beside `network` all of the nominal network is wanted in words.
     """
 
     shown_by = "analysis:answer"
@@ -81,6 +81,7 @@ class Answer(Result):
     box: BoxProof | None
     no_buzz: str = ""
     warnings: tuple[str, ...] = ()
+    nominal: bool = False
 
 
 def judge(

@@ -170,7 +170,7 @@ def results(
 
 def _tell_silence(seconds: float, patience: Patience, place: Place) -> None:
     """Say that nothing came for a while. Raises ApcError E889 if that is too long."""
-    what = f"nothing has come from those who compute for {seconds:g} s"
+    what = f"no result from the processes that compute for {seconds:g} s"
     if patience.limit is not None and seconds >= patience.limit:
         what += ": they are stuck, or a part takes longer"
         raise ApcError(Mistake("E889", place, what, hint=f'--patience "{2 * seconds:g} s"'))

@@ -117,7 +117,9 @@ def read_counts(root: Body, files: NamedFiles) -> dict[str, GroupBody]:
         for key, value in section:
             with root.mistakes:
                 name = name_of(key, "a group of peers")
-                node = mapping_of(value, name, f"{name}: {{count: 3}}")
+                group = "user" if name == "count" else name  # a number of peers in the place of a group
+                number = value.text if isinstance(value, Scalar) and value.text.isdecimal() else "3"
+                node = mapping_of(value, name, f"{group}: {{count: {number}}}")
                 body = Body(node, GROUP, f"group {name}", root.mistakes)
                 table, counted = None, None
                 if text := body.text("table", "table: users.csv"):

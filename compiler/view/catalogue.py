@@ -25,7 +25,7 @@ from apc.compiler.scene.scene import Scene
 from apc.compiler.source.nodes import Mapping, Scalar
 from apc.compiler.source.source import Source, read_source
 from apc.compiler.view.schema import in_unit, is_required, limits_of
-from apc.compiler.words import WIDTH, beside, wrapped
+from apc.compiler.words import beside, wrapped
 
 TEMPLATE = "template"  # the scene that `apc new` writes where no other is asked for
 
@@ -39,11 +39,10 @@ def library_lines() -> Iterator[str]:
 
 
 def _lines(abouts: dict[str, str]) -> Iterator[str]:
-    """Yield names and what they are, each cut to one line, and an empty line."""
+    """Yield names and the first sentence of what they are, and an empty line."""
     width = max(map(len, abouts))
     for name, about in abouts.items():
-        line = f"  {name:<{width}}  {about}"
-        yield line if len(line) <= WIDTH else f"{line[: WIDTH - 1].rstrip()}…"
+        yield from beside(f"  {name:<{width}}", about.partition(". ")[0].rstrip("."))
     yield ""
 
 

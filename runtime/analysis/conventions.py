@@ -259,7 +259,8 @@ def _silent(site: SiteJacobians) -> SiteJacobians:
 def _too_much(prepared: Prepared, default: Analysis, times: int) -> str:
     """Say why an analysis is not repeated so many times in passing, "" if it is."""
     if default.method not in QUICK_METHODS:
-        return f"not repeated under other conventions: a {default.method} analysis is no passing matter"
+        why = f"analysed by {default.method} they take long (--conventions)"
+        return f"not repeated under other conventions: {why}"
     sizes = Counter(mode.shape for mode in default.modes)
     events = max(len(schedule.events) for schedule in prepared.schedules) * len(set(prepared.schedules))
     if times * sum(size**3 for size in sizes.values()) > QUICK_CUBES or times * events > QUICK_EVENTS:

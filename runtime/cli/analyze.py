@@ -7,6 +7,7 @@ Does not: compute.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -81,6 +82,12 @@ SECONDS_A_PEER = 1e-4
     "may grow. Without either, for those that take no more than seconds together.",
 )
 @click.option(
+    "--nominal",
+    is_flag=True,
+    help="Of a network that loses or delays packets, say all of the nominal one, too: modes, sensitivities, "
+    "margins.",
+)
+@click.option(
     "--buzz",
     "with_buzz",
     is_flag=True,
@@ -98,6 +105,7 @@ def analyze_command(
     cells: int | None,
     every_convention: bool,
     margins: bool | None,
+    nominal: bool,
     with_buzz: bool,
     hands: str,
     plot: Path | None,
@@ -146,6 +154,7 @@ def analyze_command(
             margins=margins,
             with_buzz=with_buzz,
         )
+    found = replace(found, nominal=nominal)
     if plot is not None:
         from apc.present.eigenvalues import save_eigenvalues
 

@@ -17,6 +17,29 @@ from apc.cli.options import tell
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 80}
 SUFFIX = "_command"  # of the functions that `apc.cli` names
 
+# The commands as they are listed: in the order of work.
+LISTED = [
+    "new",
+    "check",
+    "compile",
+    "analyze",
+    "critical",
+    "region",
+    "sweep",
+    "compare",
+    "feel",
+    "simulate",
+    "explore",
+    "network",
+    "play",
+    "report",
+    "export",
+    "show",
+    "library",
+    "schema",
+    "bench",
+]
+
 
 class Commands(Mapping[str, click.Command]):
     """The commands of `apc.cli` by their names."""
@@ -45,7 +68,15 @@ def _print_version(context: click.Context, _: click.Parameter, wanted: bool) -> 
         context.exit()
 
 
-@click.group(commands=Commands(), context_settings=CONTEXT)
+class Group(click.Group):
+    """The group of all commands, listed in the order of work."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of the commands."""
+        return LISTED
+
+
+@click.group(cls=Group, commands=Commands(), context_settings=CONTEXT)
 @click.option(
     "--version",
     is_flag=True,
@@ -58,25 +89,7 @@ def apc() -> None:
     """Is a shared virtual object stable in the hands of all its users?
 
     Describe users, masses, couplers and network links in a YAML file, a
-    topology. Compile it to equations and read the verdict:
-
-    \b
-        apc new            write a topology.yaml to start from
-        apc compile        check it and turn it into topology.apc
-        apc analyze        stable or not, by how much, in which modes
-        apc critical       the largest stable value of a parameter
-        apc compare        schemes side by side: the same asked of several files
-        apc explore        all of it in the browser, with sliders
-        apc feel           what a hand feels at its device, at each frequency
-        apc simulate       what happens over time, as rows and a picture
-        apc region         where it is stable over two parameters: curves, areas
-        apc sweep          any of it at many values of some parameters
-        apc network        what a recording of ping or irtt amounts to
-        apc play           the same in real time, over a network
-        apc export         files that other tools read
-        apc report         all of it as one page, to keep and to mail
-        apc show           what the scene is made of, as text or a picture
-        apc library        the components there are, and what one is
+    topology; `apc new` writes one to start from.
 
     Without FILE a command takes the only topology of the folder.
     """

@@ -60,7 +60,7 @@ def compare_command(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Put schemes side by side: the same questions asked of several scenes.
+    """Put schemes side by side: verdicts, limits, what is felt, costs.
 
     Of each FILE, a topology or a compiled model: the verdict and spectral
     radius of `apc analyze`; what `apc simulate` says of its experiment, if it

@@ -74,12 +74,13 @@ def feel_command(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Say what a hand feels at its device, and what of it arrives at another.
+    """Say what a hand feels at its device, frequency by frequency.
 
     The impedance (force by velocity, in N*s/m) at each frequency, all other
-    hands as the scene has them; mass, damping and stiffness of slow motions; the velocity at
-    another device and how far the copies of the object are apart, a newton;
-    the largest gains at any frequency; what noise does. FILE is a topology
+    hands as the scene has them; mass, damping and stiffness of slow motions;
+    the velocity at another device and how far the copies of the object are
+    apart, a newton (transparency); the largest gains at any frequency; what
+    noise does. FILE is a topology
     or a compiled model.
 
     \b

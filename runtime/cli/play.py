@@ -80,7 +80,7 @@ def play_command(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Play a scene in real time, its peers as processes that exchange packets by UDP.
+    """Play a scene in real time, over a network.
 
     Each peer ticks at its clocks, with its simulated device, and hears what
     has arrived. What was sent, heard and when is kept in a folder, NAME.run;

@@ -120,7 +120,7 @@ def _check_frame_length(
     if ticks > MOST_TICKS:
         clocks = ", ".join(f"{name} {float(value) * 1e3:.9g} ms" for name, value in period.items() if name)
         what = (
-            f"all clocks stand as before only after {float(frame * quantum):.6g} s and {ticks} ticks "
+            f"the clocks' common period is {float(frame * quantum):.6g} s, {ticks} ticks "
             f"({clocks}); at most {MOST_TICKS} can be analysed"
         )
         hint = "periods that are simple multiples of one another"

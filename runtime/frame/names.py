@@ -69,6 +69,10 @@ class Range:
     high: Fraction
 
 
+# Numbers of a link that may be left out, and what they are then.
+UNWRITTEN = {"loss": "0 %", "jitter": "0 ms"}
+
+
 def find(system: CompiledSystem, name: str, place: Place = OVERRIDE, *, counts: bool = False) -> Free:
     """Return the parameter or timing a person's name means, of the group it names, if any.
 
@@ -116,6 +120,11 @@ def find(system: CompiledSystem, name: str, place: Place = OVERRIDE, *, counts: 
     one_peer = _ONE_PEER.fullmatch(name)
     if one_peer is not None and one_peer["group"] in groups and one_peer["rest"] in parameters:
         raise _of_one_peer(system, one_peer, place)
+    if name not in known and rest in UNWRITTEN and any(link.name == first for link in system.links):
+        what = f"{written} is not written in the topology, and only what is written can be varied"
+        raise ApcError(
+            Mistake("E622", place, what, hint=f"links: {{{first}: {{{rest}: {UNWRITTEN[rest]}}}}}")
+        )
     if name not in known:
         near = nearest(name, sorted(known))
         raise ApcError(Mistake("E622", place, f"{written} is no parameter of {system.name}", hint=near))

@@ -397,8 +397,9 @@ def mean_square_radius(of: Moments, *, bounded: bool = True) -> Enclosed:
     """
     if of.entries * of.states**3 > MOST_WORK:
         raise UnservedError(
-            f"{of.entries:,} covariances of luck that drive loops of {of.states} states would take minutes: "
-            "fewer ticks at which a packet may arrive, a shorter delay, or fewer peers that differ"
+            f"{of.entries:,} covariances of random losses and delays that drive loops of {of.states} states "
+            "would take minutes: fewer ticks at which a packet may arrive, a shorter delay, or fewer peers "
+            "that differ"
         )
     driven, undriven = of.means
     largest_driven, largest_undriven = _growth(driven), _growth(undriven)

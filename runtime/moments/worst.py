@@ -434,7 +434,11 @@ def shaking(of: HeldParts, *, known: int = 0) -> tuple[tuple[bool, ...] | None, 
                 note += f"; of at most {losses} losses in a row, the most met is "
                 note += f"{growth[most]:.8g} a frame, by {spelled}"
             return pattern_of(words[place]), float(growth[place]), note
-    return None, None, f"no pattern tried of fewer than {LONE} losses in a row shakes the scene"
+    return (
+        None,
+        None,
+        f"no periodic pattern tried, of fewer than {LONE} losses in a row, makes the scene unstable",
+    )
 
 
 def pattern_of(word: Sequence[int]) -> tuple[bool, ...]:

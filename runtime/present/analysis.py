@@ -167,12 +167,13 @@ def answer_text(found: Answer) -> str:
     """Return what `apc analyze` prints: the analysis, and what stands beside it."""
     conventions = found.conventions
     warning = conventions.warning and "\n".join(wrapped(f"Warning: {conventions.warning}"))
+    nominal: tuple[object, ...] = (analysis_text(found.analysis), found.sensitivities, found.margins)
+    if found.network is not None and not found.nominal:
+        nominal = ("\n".join(_in_short(found.analysis)),)
     parts = (
         found.box,
         found.network,
-        analysis_text(found.analysis),
-        found.sensitivities,
-        found.margins,
+        *nominal,
         found.contact_modes,
         found.switching,
         found.buzz,
@@ -181,6 +182,16 @@ def answer_text(found: Answer) -> str:
     )
     first, *rest = "\n\n".join(str(one) for one in parts if one is not None and one != "").split("\n")
     return "\n".join((first, *warning_lines(found.warnings), *rest))
+
+
+def _in_short(found: Analysis) -> list[str]:
+    """Return the verdict of the nominal network, beside that of the network as it is."""
+    radius = measured(found.spectral_radius, found.spectral_radius_error)
+    text = (
+        f"With every packet on time: {found.verdict}, spectral radius {radius} per frame of "
+        f"{found.frame_s * 1000:.6g} ms (apc analyze --nominal says all of it)."
+    )
+    return wrapped(text, "  ", "  ")
 
 
 def warning_lines(warnings: Sequence[str]) -> list[str]:

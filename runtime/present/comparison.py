@@ -103,7 +103,8 @@ def _verdict(one: Scheme, feet: dict[str, int]) -> tuple[str, str]:
         root, error = math.sqrt(one.network.mean_square_radius), one.network.error or 0.0
         grown = measured(root, error / (2 * root) if root else error)
         told.append(
-            f"the radius is that with every packet on time; mean squares grow by {grown} squared a frame"
+            "the radius is that with every packet on time; "
+            f"mean squares are multiplied by {grown} squared a frame"
         )
     if one.passive is not None:
         told.append("the radius is that with free hands")

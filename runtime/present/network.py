@@ -35,11 +35,11 @@ def network_text(found: NetworkVerdict) -> str:
         error, root = found.error or 0.0, math.sqrt(radius)
         rooted = measured(root, error / (2 * root) if root else error)
         facts = [
-            ("mean squares", f"grow by {measured(radius, error)} a frame"),
-            ("its root", f"{rooted}, beside the nominal spectral radius"),
+            ("mean squares", f"multiplied by {measured(radius, error)} a frame"),
+            ("their root", f"{rooted}, to compare with a spectral radius"),
         ]
     if found.rms_error_m is not None:
-        apart = f"{found.rms_error_m * 1e3:.4g} mm rms, as every hand pushes with 1 N rms, anew each tick"
+        apart = f"{found.rms_error_m * 1e3:.4g} mm rms, for 1 N rms at every hand, white from tick to tick"
         facts.append(("copies apart", apart))
     if found.almost_sure is not None:
         low, high = found.almost_sure.interval

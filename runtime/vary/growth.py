@@ -100,7 +100,7 @@ def refuse_time(system: CompiledSystem, free: Free, place: Place, criterion: str
     """
     jitter = {link.channel.jitter for link in system.links if link.channel is not None}
     if reaches_time(system, free) and free.name not in jitter:
-        what = f"{free.label} can't be varied {BY_GROWTH[criterion]}: what happens when would change with it"
+        what = f"{free.label} can't be varied {BY_GROWTH[criterion]}: it changes the order of events"
         if criterion == PASSIVE:
             hint = f'apc analyze --hands passive --set {free.label}="…", one value after the other'
             raise ApcError(Mistake("E930", place, what, hint=hint))

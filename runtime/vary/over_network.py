@@ -111,13 +111,13 @@ def network_margins(
                 beyond.setdefault(found.why, []).append(one.label)
             if found.edges and found.edges[0].proof != BOUNDED[MEAN_SQUARE]:
                 open_sides.append(f"{one.label} ({found.edges[0].proof})")
-    notes += [f"farther of {', '.join(labels)}, {why}" for why, labels in beyond.items()]
+    notes += [f"beyond these values of {', '.join(labels)}, {why}" for why, labels in beyond.items()]
     if open_sides:
         notes.append(f"not bounded on either side: {', '.join(open_sides)}")
     notes.append(
         f"{counted(looked, 'value')} were looked at: a narrow change of the verdict could hide between two"
     )
-    notes.append("delays and periods were not varied: what happens when would change with them")
+    notes.append("delays and periods were not varied: they change the order of events")
     return Margins(tuple(rows), "; ".join(notes))
 
 

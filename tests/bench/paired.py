@@ -152,7 +152,7 @@ def serve() -> None:
         except TooLong:
             told["refused"] = f"took more than {LONGEST_S} s"
         except Exception as error:
-            told["refused"] = f"{type(error).__name__}: {str(error)[:120]}"
+            told["refused"] = f"{type(error).__name__}: {str(error)[:120].splitlines()[0]}"
         signal.alarm(0)
         print(json.dumps(told), flush=True)
 

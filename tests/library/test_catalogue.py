@@ -29,10 +29,10 @@ def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     return run_it
 
 
-def test_every_component_has_one_line(call: Call) -> None:
+def test_every_component_is_listed_with_its_whole_first_sentence(call: Call) -> None:
     code, out, _ = call("library")
-    lines = [line for line in out.splitlines() if line.startswith("  ")]
-    assert code == 0
+    lines = [line for line in out.splitlines() if line.startswith("  ") and line[2] != " "]
+    assert code == 0 and "…" not in out
     assert sorted(line.split()[0] for line in lines) == NAMES
     assert all(len(line) <= 80 for line in out.splitlines())
     rooms = json.loads(call("library", "--json")[1])
@@ -78,7 +78,8 @@ def test_a_misspelt_component_or_scene_is_told_with_the_nearest(call: Call) -> N
 
 @pytest.mark.whole
 def test_every_scene_of_the_library_is_listed_and_copied_so_that_it_is_sound(call: Call) -> None:
-    listed = [line.split()[0] for line in call("new", "--list")[1].splitlines() if line.startswith("  ")]
+    lines = call("new", "--list")[1].splitlines()
+    listed = [line.split()[0] for line in lines if line.startswith("  ") and line[2] != " "]
     assert listed == sorted(path.stem for path in SCENES.glob("*.yaml"))
     for name in listed:
         assert call("new", "--like", name)[0] == 0

@@ -218,7 +218,7 @@ def test_a_proof_is_told_where_it_is_asked_for_and_there_is_one(
         ("loss: 1 %, jitter: 9 ms, reorder: all", "overtaken and count all the same"),
         ("loss: 1 %, jitter: 1 ms, on_loss: zero", "together with on_loss: zero"),
         ("loss: {p: 1 %, r: 10 %}, jitter: 1 ms", "jitter and bursts of lan"),
-        ("jitter: 24 ms", "covariances of luck that drive loops of"),
+        ("jitter: 24 ms", "covariances of random losses and delays that drive loops of"),
     ],
 )
 def test_what_is_not_served_is_not_judged_and_says_why(more: str, why: str) -> None:

@@ -62,7 +62,7 @@ def test_who_shakes_or_drifts_anyhow_is_told_so() -> None:
     text = scene(2, 0.0).replace("1000 N/m", "0 N/m").replace("0.6 kg, damping: 5", "0.6 kg, damping: 0")
     found = losses(text)
     assert (found.certified, found.unstable_pattern) == (None, None)
-    assert found.note.startswith("the scene is not proved to settle with no packet lost; no pattern tried")
+    assert found.note.startswith("the scene is not proved to settle with no packet lost; no periodic pattern")
 
 
 @pytest.mark.few(1)
@@ -171,7 +171,7 @@ def test_the_command_plays_the_pattern_or_says_why_not(
     assert json.loads(capsys.readouterr().out)["topology"] == "lossy"
     path.write_text(scene(2, 50.0), encoding="utf-8")
     assert run(words) == 1
-    message = "E897 --trace-of worst has nothing to play: no pattern tried of fewer than 40 losses in a row"
+    message = "E897 --trace-of worst has nothing to play: no periodic pattern tried, of fewer than 40 losses"
     assert message in capsys.readouterr().err
     with pytest.raises(ApcError, match=r"E897 --trace-of worst has nothing to play: .* lan has jitter"):
         apc.simulate(system_of(scene(3, 300.0, more=", jitter: 1 ms")), trace_of="worst")

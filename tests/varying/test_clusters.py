@@ -164,8 +164,9 @@ def test_a_frozen_worker_is_waited_for_aloud_and_only_so_long(monkeypatch: pytes
             (message,) = told(lambda: sweep(MODEL, OVER, cluster=frozen.scheduler_address, patience=waiting))
         finally:
             os.kill(worker, signal.SIGCONT)
-    assert heard == [f"nothing has come from those who compute for {s} s; still waiting" for s in (0.1, 0.2)]
+    waited = "no result from the processes that compute for {} s; still waiting"
+    assert heard == [waited.format(s) for s in (0.1, 0.2)]
     assert message == (
-        "sweep: E889 nothing has come from those who compute for 0.3 s: they are stuck, or a part takes "
+        "sweep: E889 no result from the processes that compute for 0.3 s: they are stuck, or a part takes "
         'longer. Write: --patience "0.6 s"'
     )
