@@ -116,9 +116,9 @@ def analyze_command(
         )
     found = replace(found, nominal=nominal)
     if plot is not None:
-        from apc.present.eigenvalues import save_eigenvalues
+        from apc.present.pictures import write_picture
 
-        save_eigenvalues(found.analysis, plot)
+        write_picture(found.analysis.plot, plot)
     print_result(found, as_json=as_json, written=[plot])
 
 

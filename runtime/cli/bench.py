@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import command, note_aside, option, picture_option, print_result
+from apc.cli.options import command, note_aside, option, picture_option, print_result, tell
 from apc.cli.progress import at_work
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -74,11 +74,14 @@ def bench_command(
     system = open_scene(file, settings, {"--plot": plot}, told=note_aside)
     with at_work("measuring"):
         found = bench(system)
-    if plot is not None:
-        from apc.present.bench import save_bench
+    print_result(found, as_json=as_json)
+    if plot is not None:  # what took minutes is printed already, should it be unable to be written
+        from apc.present.bench import bench_picture
+        from apc.present.pictures import write_picture
 
-        save_bench(found, plot)
-    print_result(found, as_json=as_json, written=[plot], before="  ")
+        write_picture(lambda: bench_picture(found), plot)
+        if not as_json:
+            tell(f"  {plot} is written")
     if found.faults:
         what = f"not everything came out right: {'; '.join(found.faults)}"
         raise ApcError(Mistake("E922", Place(found.topology), what))

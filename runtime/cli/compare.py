@@ -68,7 +68,7 @@ def compare_command(
     from apc.comparison.comparison import compare
     from apc.frame.devices import UNHELD
     from apc.inputs import open_scene
-    from apc.present.comparison import write_comparison
+    from apc.present.pictures import write_result
 
     asked = criterion_with(hands, criterion)
     note_usual(hands)
@@ -85,7 +85,7 @@ def compare_command(
     with status_line() as told:
         found = compare(systems, over=over, criterion=asked, at=at, refused=refused, told=told)
     if out is not None:
-        write_comparison(out, found)
+        write_result(out, found, found.plot)
     print_result(found, as_json=as_json, written=[out])
 
 

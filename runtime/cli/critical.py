@@ -63,10 +63,9 @@ def critical_command(
     with status_line() as told:
         found = critical(system, path, lower=lower, upper=upper, criterion=asked, told=told)
     if plot is not None:
-        from apc.present.eigenvalues import save_eigenvalues
-        from apc.vary.locus import root_locus
+        from apc.present.pictures import write_picture
 
-        save_eigenvalues(root_locus(system, found), plot)
+        write_picture(found.plot, plot)
     print_result(found, as_json=as_json, written=[plot])
 
 

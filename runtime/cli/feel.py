@@ -53,8 +53,7 @@ def feel_command(
     from apc.hands.asked import read_frequencies
     from apc.hands.feel import feel
     from apc.inputs import open_scene
-    from apc.present.hands import write_feel
-    from apc.present.pictures import FORMATS
+    from apc.present.pictures import FORMATS, write_result
 
     context = click.get_current_context()
     given = [name for name in _SPANNED if context.get_parameter_source(name) is ParameterSource.COMMANDLINE]
@@ -77,5 +76,5 @@ def feel_command(
         unstable=unstable,
     )
     if out is not None:
-        write_feel(out, found, nyquist=nyquist)
+        write_result(out, found, lambda: found.plot(kind="nyquist" if nyquist else "bode"))
     print_result(found, as_json=as_json, written=[out])

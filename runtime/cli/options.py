@@ -20,7 +20,7 @@ import click
 
 from apc.compiler.digits import plain_int
 from apc.compiler.errors import ApcError, Mistake, Place, visible
-from apc.compiler.files import is_stdout
+from apc.compiler.files import check_target, is_stdout
 from apc.compiler.timings import part, record
 from apc.present.forms import json_text
 from apc.result import Result
@@ -82,6 +82,7 @@ def _drawable(_: click.Context, asked: click.Parameter, path: Path | None) -> Pa
     if path is not None:
         from apc.present.pictures import check_format
 
+        check_target(path)
         check_format(path, asked.opts[0])
     return path
 

@@ -66,7 +66,7 @@ def region_command(
                    --out regions.svg
     """
     from apc.inputs import open_scene
-    from apc.present.region import write_panels
+    from apc.present.pictures import write_result
     from apc.regions.panels import compare_regions, parse_panel, parse_vary
 
     if vary and panels:
@@ -91,5 +91,5 @@ def region_command(
             told=told,
         )
     if out is not None:
-        write_panels(out, found)
+        write_result(out, found, found.plot)
     print_result(found, as_json=as_json, written=[out])

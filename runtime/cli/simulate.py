@@ -106,9 +106,10 @@ def simulate_command(
         system = trace_of_worst(system)
     seconds = duration_of(system, asked, runs=runs or 1)
     if still is not None:
-        from apc.present.still import save_still
+        from apc.present.pictures import write_picture
+        from apc.present.still import draw_actors
 
-        save_still(system, still)
+        write_picture(lambda: draw_actors(system)[0], still)
     how = Settings(seconds, chosen, seed, jit=not no_jit)
     if runs is not None:
         _play_many(system, how, runs, jobs, as_json=as_json)
@@ -177,10 +178,10 @@ def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bo
         out = partial_name(moving) if interrupted else moving
         save_animation(system, trajectory_of(simulation, keeper, summary, interrupted), out)
     if plot is not None and keeper is not None:
-        from apc.present.simulation import save_picture
+        from apc.present.pictures import write_picture
 
         plot = partial_name(plot) if interrupted else plot
-        save_picture(trajectory_of(simulation, keeper, summary, interrupted), plot)
+        write_picture(trajectory_of(simulation, keeper, summary, interrupted).plot, plot)
     found = Played(
         topology=system.name,
         summary=summary,

@@ -13,18 +13,16 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.language.vectors import entry, whole_and_index
-from apc.compiler.timings import part
 from apc.compiler.words import counted, in_hertz, wrapped
 from apc.optional import need
 from apc.present.forms import document, json_text, labelled, note, notes, quantity, record, table
-from apc.present.pictures import check_format, colours_of, write_figure
+from apc.present.pictures import colours_of
 from apc.simulation.settings import EXACT
 
 if TYPE_CHECKING:
@@ -245,19 +243,6 @@ def played_dataset(found: Trajectory) -> Any:
     }
     time = ("time", found.time, {"units": "s"})
     return xarray.Dataset(variables, {"time": time}, {"provenance": provenance_json(found.provenance)})
-
-
-@part("draw")
-def save_picture(found: Trajectory, path: Path) -> None:
-    """Draw a run into a file, its format chosen by the suffix.
-
-    Raises
-    ------
-    ApcError
-        E878 no such format, E601 it can't be written, E875 matplotlib is not installed.
-    """
-    check_format(path)
-    write_figure(found.plot(), path)
 
 
 def played_picture(trajectory: Trajectory, ax: Any = None) -> Any:
