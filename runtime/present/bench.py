@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from apc.benchmark.bench import SAME, Bench, Comparison, Measured
 from apc.compiler.words import counted, wrapped
-from apc.optional import need
 from apc.present.forms import document, notes, table
-from apc.present.pictures import COLOURS
+from apc.present.pictures import COLOURS, new_figure
 
 if TYPE_CHECKING:
     from apc.benchmark.hard import HardReport
@@ -150,8 +149,7 @@ def bench_picture(found: Bench) -> Any:
     ApcError
         E875 matplotlib is not installed.
     """
-    figures = need("matplotlib.figure", "plot")
-    figure = figures.Figure(figsize=(WIDTH * len(found.comparisons), HEIGHT), layout="constrained")
+    figure = new_figure((WIDTH * len(found.comparisons), HEIGHT))
     axes = figure.subplots(1, len(found.comparisons), squeeze=False)[0]
     for ax, one in zip(axes, found.comparisons, strict=True):
         _panel(ax, one)

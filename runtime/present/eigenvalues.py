@@ -19,7 +19,7 @@ import numpy as np
 from apc.compiler.words import in_hertz
 from apc.optional import need
 from apc.present.forms import quantity
-from apc.present.pictures import COLOURS
+from apc.present.pictures import COLOURS, new_figure
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
@@ -98,9 +98,9 @@ def locus_picture(found: Locus, ax: Any = None) -> Any:
 
 def _circle(ax: Any) -> Any:
     """Return an Axes with the unit circle in it, to scale."""
-    figures, patches = need("matplotlib.figure", "plot"), need("matplotlib.patches", "plot")
+    patches = need("matplotlib.patches", "plot")
     if ax is None:
-        ax = figures.Figure(figsize=SIZE, layout="constrained").subplots()
+        ax = new_figure(SIZE).subplots()
     ax.add_patch(patches.Circle((0, 0), 1, facecolor="none", edgecolor="0.4", linewidth=0.9))
     for line in (ax.axhline, ax.axvline):
         line(0, color="0.8", linewidth=0.6, zorder=0)

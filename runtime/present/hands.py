@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.words import known_digits, measured, wrapped
-from apc.optional import need
 from apc.present.forms import LINEARIZED, document, labelled, note, notes, record, table
-from apc.present.pictures import COLOURS
+from apc.present.pictures import COLOURS, new_figure
 from apc.tables import Column, Row
 
 if TYPE_CHECKING:
@@ -199,12 +198,11 @@ def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
 
     Into an `ax` of somebody's, of Bode's plot the magnitudes alone are drawn.
     """
-    figures = need("matplotlib.figure", "plot")
     size, phase = ax, None
     if ax is None and kind == "nyquist":
-        size = figures.Figure(figsize=(4.2, 4.0), layout="constrained").subplots()
+        size = new_figure((4.2, 4.0)).subplots()
     elif ax is None:
-        size, phase = figures.Figure(figsize=(5.2, 5.6), layout="constrained").subplots(2, 1, sharex=True)
+        size, phase = new_figure((5.2, 5.6)).subplots(2, 1, sharex=True)
     size.set_title(f"{found.topology}: felt at {found.at}", fontsize=9)
     if kind == "nyquist":
         size.plot(found.impedance.real, found.impedance.imag, color=COLOURS[0])

@@ -1,8 +1,8 @@
 """What all pictures share: their formats, and how a figure becomes a file.
 
 Takes: a matplotlib Figure and a path.
-Gives: `COLOURS`, `LINES`, `colours_of`; `FORMATS`, `check_format`, `check_result_path`, `write_figure`,
-`write_picture`, `write_result`, `table_of`, `svg_text`, `svg_image`.
+Gives: `COLOURS`, `LINES`, `colours_of`, `new_figure`; `FORMATS`, `check_format`, `check_result_path`,
+`write_figure`, `write_picture`, `write_result`, `table_of`, `svg_text`, `svg_image`.
 Guarantees: the same figure gives the same bytes; a file is there whole or not at all; text in an SVG is text.
 Does not: draw, or need a display.
 
@@ -49,6 +49,17 @@ LINES: tuple[Any, ...] = (
     (0, (10, 3)),
     (0, (5, 1, 5, 1, 1, 1)),
 )
+
+
+def new_figure(size: tuple[float, float]) -> Any:
+    """Return an empty matplotlib Figure of a size in inches, with room for all its labels.
+
+    Raises
+    ------
+    ApcError
+        E875 matplotlib is not installed.
+    """
+    return need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained")
 
 
 def colours_of(count: int) -> list[Any]:

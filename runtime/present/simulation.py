@@ -22,7 +22,7 @@ from apc.compiler.language.vectors import entry, whole_and_index
 from apc.compiler.words import counted, in_hertz, wrapped
 from apc.optional import need
 from apc.present.forms import document, json_text, labelled, note, notes, quantity, record, table
-from apc.present.pictures import colours_of
+from apc.present.pictures import colours_of, new_figure
 from apc.simulation.settings import EXACT
 
 if TYPE_CHECKING:
@@ -260,7 +260,6 @@ def played_picture(trajectory: Trajectory, ax: Any = None) -> Any:
     ApcError
         E875 matplotlib is not installed.
     """
-    figures = need("matplotlib.figure", "plot")
     panels = _panels(trajectory.signals)
     if ax is not None:
         assert len(panels) == 1, f"one Axes can't show signals in {', '.join(panels)}"
@@ -270,7 +269,7 @@ def played_picture(trajectory: Trajectory, ax: Any = None) -> Any:
         return ax.figure
     paths = paths_of(trajectory.signals)
     heights = [1.0] * len(panels) + [PATHS] * bool(paths)
-    figure = figures.Figure(figsize=(WIDTH, HEIGHT * sum(heights) + 0.6), layout="constrained")
+    figure = new_figure((WIDTH, HEIGHT * sum(heights) + 0.6))
     axes = figure.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
     for one, (unit, places) in zip(axes, panels.items(), strict=False):
         _panel(one, trajectory, unit, places)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import CompiledSystem
 from apc.optional import need
 from apc.present.bodies import Body, Disc, Line, PeerView, moves_in_plane, positions_of, views_of
-from apc.present.pictures import colours_of
+from apc.present.pictures import colours_of, new_figure
 
 MM = 1e3
 COLUMNS, PANEL, MARGIN = 4, 3.2, 1.0  # planes in a row; inches: of a plane, of title and labels
@@ -87,7 +87,7 @@ def _planes(views: Sequence[PeerView]) -> list[Any]:
     columns = min(COLUMNS, len(views))
     lines = -(-len(views) // columns)
     size = (PANEL * columns + 1, PANEL * lines + MARGIN)
-    figure = need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained")
+    figure = new_figure(size)
     axes: list[Any] = figure.subplots(lines, columns, squeeze=False).ravel().tolist()
     for ax in axes[len(views) :]:
         ax.set_visible(False)
@@ -101,7 +101,7 @@ def _planes(views: Sequence[PeerView]) -> list[Any]:
 def _rows(views: Sequence[PeerView]) -> list[Any]:
     """Return one Axes for all peers, as often as there are peers."""
     size = (WIDTH, ROW * len(views) + MARGIN + 0.3)
-    ax = need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained").subplots()
+    ax = new_figure(size).subplots()
     ax.set(ylim=(len(views) - 0.45, -0.55), xlabel="position [mm]")
     ax.set_yticks(range(len(views)), [view.name for view in views])
     ax.grid(axis="x", linewidth=0.4, alpha=0.5)
