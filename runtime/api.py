@@ -707,6 +707,7 @@ def simulate(
     jit: bool = True,
     seed: int | None = None,
     method: str | None = None,
+    strike: str | None = None,
     trace_of: Literal["worst"] | None = None,
     error: bool = False,
 ) -> Trajectory:
@@ -729,6 +730,8 @@ def simulate(
     method
         "exact", "rk4:STEP", "semi-implicit:STEP" or "cvodes:RTOL", such as "rk4:0.1 ms"; exact where linear
         and by CVODES elsewhere if not given.
+    strike
+        A peer that is struck as the scene begins, such as "user[1]": its device starts at 0.1 m/s.
     trace_of
         "worst": lose packets by the periodic pattern that `analyze` finds to shake the scene.
     error
@@ -748,6 +751,12 @@ def simulate(
     from apc.simulation.settings import DEFAULT, parse_method
 
     system = _model(model, set)
+    if strike is not None:
+        from apc.simulation import strike as push
+
+        system, _ = push.strike(system, strike)
+        if duration is None and system.experiment.duration is None:
+            duration = float(push.WATCHED)
     if trace_of is not None:
         from apc.moments.worst import trace_of_worst
 

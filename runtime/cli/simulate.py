@@ -68,6 +68,9 @@ def simulate_command(
         "not given.",
         "METHOD",
     ),
+    strike: str | None = option(
+        'Strike a peer as it begins, such as "user[1]": its device starts at 0.1 m/s.', "PEER"
+    ),
     trace_of: str | None = option(
         "Lose packets by the periodic pattern that analyze finds to shake the scene.",
         type=click.Choice(["worst"]),
@@ -86,6 +89,7 @@ def simulate_command(
         apc simulate --duration "3 s" --plot run.png
         apc simulate --signals cube.x --out run.csv
         apc simulate --out run.gif
+        apc simulate --strike "user[1]" --plot run.png
         apc simulate --runs 1000 --seed 1 --jobs 4
         apc simulate --method semi-implicit:1ms --error
     """
@@ -104,6 +108,13 @@ def simulate_command(
         from apc.moments.worst import trace_of_worst
 
         system = trace_of_worst(system)
+    if strike is not None:
+        from apc.simulation.strike import WATCHED
+        from apc.simulation.strike import strike as struck
+
+        system, what = struck(system, strike)
+        note_aside(f"{what} is struck as the scene begins")
+        asked = asked or system.experiment.duration or WATCHED
     seconds = duration_of(system, asked, runs=runs or 1)
     if still is not None:
         from apc.present.pictures import write_picture

@@ -1,7 +1,7 @@
 """A scene played for the page: a push and what follows of it, and the bodies that move.
 
 Takes: a `CompiledSystem`.
-Gives: `Motion`, `Body`, `motion_of`; `STRUCK`.
+Gives: `Motion`, `Body`, `motion_of`.
 Guarantees: rows are those of `simulation`, some of them left out where more are not seen; what grows without
 end is shown until it has left the picture, and says so.
 Does not: draw.
@@ -9,22 +9,19 @@ Does not: draw.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from fractions import Fraction
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Column, CompiledSystem, Kind
+from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.present.bodies import Disc, moves_in_plane, views_of
-from apc.simulation.signals import sent_states
+from apc.simulation.strike import SPEED, WATCHED, strike
 from apc.simulation.trajectory import simulate
 
 Floats = NDArray[np.float64]
 
-# How fast the struck device starts, in m/s, and how long that is watched, in s, where the scene says nothing.
-STRUCK, WATCHED = 0.1, Fraction(1)
 # Rows that are shown: more are not seen.
 ROWS = 300
 # In m: what moves farther than this from where it started has left the picture.
@@ -70,7 +67,7 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
     system
         The compiled scene.
     struck
-        Whether the first peer's device starts with `STRUCK`.
+        Whether the first peer's device is struck as it begins.
 
     Raises
     ------
@@ -81,8 +78,8 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
     views = views_of(system)
     told = []
     if struck:
-        system, what = _struck(system)
-        told.append(f"{what} is struck: it starts at {STRUCK * MM:g} mm/s.")
+        system, what = strike(system)
+        told.append(f"{what} is struck: it starts at {SPEED * MM:g} mm/s.")
     names = [f"{view.name}.{state}" for view in views for body in view.bodies for state in body.states[:2]]
     if not names:
         raise ApcError(Mistake("E983", Place(system.name), "nothing here has a position that could be shown"))
@@ -117,26 +114,3 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
         told=tuple(told),
         others=system.peers - len(views),
     )
-
-
-def _struck(system: CompiledSystem) -> tuple[CompiledSystem, str]:
-    """Return the scene with the first peer's device moving at the start, and the name of what moves."""
-    group = system.groups[0]
-    kind: Kind = system.kinds[group.kind]
-    sent = sent_states(kind)
-    moving = [place for place, one in enumerate(kind.states) if one.unit == "m/s"]
-    own = [place for place in moving if place not in sent] or moving
-    if not own:
-        raise ApcError(
-            Mistake("E983", Place(system.name), "nothing here has a velocity that a push could change")
-        )
-    state = kind.states[own[0]]
-    known = {column.name: column.values for column in group.columns}
-    present = [one.value for one in (*system.parameters, *group.values) if one.name == state.start][-1]
-    values = np.array(known.get(state.start, np.full(group.count, present)), dtype=np.float64)
-    values[0] += STRUCK
-    columns = (*(one for one in group.columns if one.name != state.start), Column(state.start, values))
-    changed = replace(group, columns=columns)
-    return replace(
-        system, groups=(changed, *system.groups[1:])
-    ), f"{group.name}[1].{state.name.rpartition('.')[0]}"

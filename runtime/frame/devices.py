@@ -1,8 +1,10 @@
 """What a hand holds: a peer's device, found in its equations, and the peer with a hand on it.
 
 Takes: a kind's Jacobians and exact numbers; a `CompiledSystem`.
-Gives: `Device`, `find_device`, `find_devices`, `devices_of`, `coupled_directly`; `no_device`; `Push`,
-`find_push`; `HANDS`, `with_hands`, `clamped`, `held`; `refuse_hands`; `published`; `OWN_MASS`, `UNHELD`.
+Gives: `Device`, `find_device`, `find_devices`, `devices_of`, `coupled_directly`,
+`directions_of`; `no_device`; `Push`,
+`find_push`; `HANDS`, `with_hands`, `without_hands`, `clamped`, `held`; `replaced_hands`; `refuse_hands`;
+`published`; `OWN_MASS`, `UNHELD`.
 Guarantees: a scene that is clamped or held is a scene as any other: parameters, groups and clocks stay.
 Does not: ask whether it is stable (see `passivity` for hands of every kind).
 
@@ -31,6 +33,7 @@ from apc.compiler.cache import HANDS_CHANGE
 from apc.compiler.compiled import PEERS, CompiledSystem, Kind, Parameter, Ports, Receive
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.compiler.interpolation import jacobian
+from apc.compiler.language.vectors import whole_and_index
 from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians, jacobians
 from apc.frame.linearize import Listening, start_arguments
@@ -52,6 +55,8 @@ OWN_MASS = "a mass of its own at each peer, as masses: {device: {mass: 0.1 kg}}"
 
 # What the parameters of a hand that is put on every device are named after, and what each is.
 HAND = "hand"
+# Units of what makes a hand a mass, a damper or a spring.
+_IMPEDANCE = ("kg", "N*s/m", "kg/s", "N/m", "kg/s^2")
 _NUMBERS = (
     ("mass", "kg", "what of the hand moves with the device"),
     ("damping", "N*s/m", "of the hand, to where the arm stands"),
@@ -348,6 +353,47 @@ def devices_of(system: CompiledSystem, *, option: str) -> dict[int, Device]:
     return found
 
 
+def directions_of(system: CompiledSystem) -> dict[str, CompiledSystem]:
+    """Return the scene once for each direction in which its devices move, held fast in all others.
+
+    Nothing where each device moves along one line only.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    """
+    unit_of = {one.name: one.unit for one in system.parameters}
+    numbers, direct = resolve(system), coupled_directly(system.kinds)
+    wanted: dict[str, None] = {}
+    for place, group in enumerate(system.groups):
+        site = jacobians(system.kinds[group.kind])
+        found = find_devices(site, numbers.parameters[place][0], unit_of, direct=direct)
+        axes = {own: one for own, one in found.items() if isinstance(one, Device)}
+        wholes = {whole_and_index(own)[0] if own.endswith("]") else "" for own in axes}
+        if len(axes) == len(found) > 1 and len(wholes) == 1 and "" not in wholes:
+            wanted |= dict.fromkeys(own.rpartition(".")[2] for own in axes)
+    return {axis: _along(system, [one for one in wanted if one != axis]) for axis in wanted}
+
+
+def _along(system: CompiledSystem, others: Sequence[str]) -> CompiledSystem:
+    """Return a scene in which whatever moves along other axes is held where it starts."""
+    kinds = []
+    for kind in system.kinds:
+        moving = [
+            (place, int(driven[0]))
+            for place, state in enumerate(kind.states)
+            if state.unit == "m" and any(state.name.endswith(f".{axis}") for axis in others)
+            if len(driven := np.flatnonzero(jacobians(kind).pattern.a[place])) == 1
+        ]
+        names = [(kind.states[position].name, kind.states[velocity].name) for position, velocity in moving]
+        for pair in names:
+            place = {state.name: number for number, state in enumerate(kind.states)}
+            kind = _without(kind, *(place[name] for name in pair))
+        kinds.append(kind)
+    return replace(system, kinds=tuple(kinds))
+
+
 def no_device(system: CompiledSystem, option: str) -> ApcError:
     """Return the refusal of a scene in which nobody has a device."""
     names = ", ".join(group.name for group in system.groups)
@@ -364,6 +410,64 @@ def refuse_hands(system: CompiledSystem, option: str) -> None:
             raise ApcError(Mistake("E932", Place(system.origin.topology), what, hint=hint))
 
 
+def without_hands(system: CompiledSystem, option: str) -> CompiledSystem:
+    """Return a scene without its hands, in the place of which others stand.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    option
+        What asked for it.
+
+    Raises
+    ------
+    ApcError
+        E932 a hand that is more than a mass, damper and spring between a device and where it stands.
+    """
+    if not any(kind.hands for kind in system.kinds):
+        return system
+    unit_of = {one.name: one.unit for one in system.parameters}
+    kinds = tuple(_without_hands(kind, tuple(map(unit_of.get, kind.parameters))) for kind in system.kinds)
+    bare = tuple(one or kind for one, kind in zip(kinds, system.kinds, strict=True))
+    found = replace(system, kinds=bare)
+    refuse_hands(found, option)
+    return found
+
+
+@functools.lru_cache(maxsize=64)
+def _without_hands(kind: Kind, units: tuple[str | None, ...]) -> Kind | None:
+    """Return a kind whose hands have no mass, damping nor stiffness, None where more of them is left."""
+    own = [
+        place for place, name in enumerate(kind.parameters) if any(_is_of(name, hand) for hand in kind.hands)
+    ]
+    if any(_is_of(state.name, hand) for state in kind.states for hand in kind.hands) or not kind.hands:
+        return None
+
+    def rates(x: Any, u: Any, p: Any, t: Any) -> Any:
+        numbers = casadi.vertsplit(p)
+        for place in own:
+            if units[place] in _IMPEDANCE:
+                numbers[place] = casadi.SX(0)
+        return kind.derivative(x, u, casadi.vertcat(*numbers), t)
+
+    found = _rewritten(replace(kind, hands=()), kind, lambda x, p: x, rates)
+    x, u, p, t = found.derivative.sx_in()
+    left = casadi.depends_on(found.derivative(x, u, p, t), casadi.vertcat(*(p[place] for place in own)))
+    return None if left else found
+
+
+def _is_of(name: str, hand: str) -> bool:
+    """Say whether a state or a parameter is of a hand."""
+    return name.startswith(f"{hand}.") or _part(name) == hand
+
+
+def replaced_hands(system: CompiledSystem) -> tuple[str, ...]:
+    """Return what is said of hands of the scene in the place of which others stand."""
+    names = [f"{hand} of {group.name}" for group in system.groups for hand in system.kinds[group.kind].hands]
+    return (f"{', '.join(names)}: any passive hand stands there instead",) if names else ()
+
+
 def with_hands(system: CompiledSystem, hands: str) -> CompiledSystem:
     """Return a scene with hands of a kind, its name saying so.
 
@@ -373,7 +477,7 @@ def with_hands(system: CompiledSystem, hands: str) -> CompiledSystem:
         The compiled scene.
     hands
         "free": as it is. "clamped": its devices are held fast. "held": a hand of `hand.mass`, `hand.damping`
-        and `hand.stiffness` on each, 0 at first. "passive": as it is, and refused if it has hands. Or one of
+        and `hand.stiffness` on each, 0 at first. "passive": as it is. Or one of
         the library, of its usual numbers (see `published`).
 
     Raises
@@ -382,8 +486,6 @@ def with_hands(system: CompiledSystem, hands: str) -> CompiledSystem:
         E930 no such hands; E931 no device; E932 hands in the scene.
     """
     option = f"--hands {hands}"
-    if hands == PASSIVE:
-        refuse_hands(system, option)
     if hands in (FREE, PASSIVE):
         return system
     if hands == CLAMPED:
@@ -403,9 +505,11 @@ def clamped(system: CompiledSystem, *, option: str = "--hands clamped") -> Compi
     Raises
     ------
     ApcError
-        E931 as `devices_of`, E932 hands in the scene.
+        E931 as `devices_of`, E932 as `without_hands`.
     """
-    refuse_hands(system, option)
+    system = without_hands(system, option)
+    # Of devices that move along several directions all but one are held first.
+    system = next(iter(directions_of(system).values()), system)
     devices = devices_of(system, option=option)
     kinds = list(system.kinds)
     for number, device in devices.items():

@@ -35,7 +35,7 @@ from apc.eigen.dissipation import is_positive, least_real, proves_positive_betwe
 from apc.eigen.modes import split
 from apc.eigen.pseudospectrum import balance
 from apc.eigen.rigid import find_rigid_modes, stays_rigid
-from apc.frame.devices import refuse_hands
+from apc.frame.devices import replaced_hands, without_hands
 from apc.frame.exact import evaluate_exact
 from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
@@ -103,7 +103,7 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range], *, cells: int | N
         E896 a number of an unreliable link; E930 devices that feel each other unevenly; E831 and E832 as
         `box.open_sites`; those of `passivity.passive_hands`.
     """
-    refuse_hands(system, OPTION)
+    of_scene, system = system, without_hands(system, OPTION)
     for one in ranges:
         low, high = (with_unit(f"{float(end):g}", one.unit) for end in (one.low, one.high))
         hint = f'apc analyze --box "{one.free.label}={low}:{high}"'
@@ -116,7 +116,7 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range], *, cells: int | N
         else:
             looks = partial(_looked, asked), partial(_is_unstable, asked)
             found = search_box(system.name, ranges, *looks, stable=STABLE, unstable=UNSTABLE, cells=cells)
-        return replace(found, left_out=left_out(system))
+        return replace(found, left_out=(*replaced_hands(of_scene), *left_out(system)))
 
 
 def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question | str:

@@ -11,8 +11,8 @@ Does not: say with which hand it shakes: which motion of the devices takes energ
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Prepared, analyze, lifted_groups, near_start, prepare
 from apc.analysis.contact_modes import contact_modes
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.eigen.dissipation import least_real, proves_positive
+from apc.eigen.modes import split
 from apc.finite_equations import finite_equations
-from apc.frame.devices import clamped, refuse_hands
+from apc.frame.devices import clamped, directions_of, replaced_hands, without_hands
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, solve, value_of
 from apc.hands.passivity_in_balls import certified
@@ -32,7 +33,7 @@ from apc.hands.port import PortLoop, open_ports, port_loop, port_loops
 from apc.moments.network import Growth
 from apc.network.nominal import left_out
 from apc.result import Result
-from apc.threads import single_threaded
+from apc.threads import load_pool, single_threaded
 
 Complexes = NDArray[np.complex128]
 
@@ -146,8 +147,12 @@ def passive_hands(
     After Colgate and Schenkel, J. Robotic Systems 14 (1997) 37, for any number of devices, delays and clocks:
     see `port`.
     """
-    refuse_hands(system, OPTION)
-    prepared = prepared or prepare(system)
+    of_scene, system = system, without_hands(system, OPTION)
+    if prepared is None or system is not of_scene:
+        prepared = prepare(system)
+    if along := _directions(system, prepared):
+        parts = {axis: passive_hands(one, certify=certify) for axis, one in along.items()}
+        return _together(parts, replaced_hands(of_scene))
     fixed = analyze(clamped(system, option=OPTION), certify=certify)
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         opened = open_ports(system, *lifted_groups(system, prepared=prepared), option=OPTION)
@@ -199,11 +204,45 @@ def passive_hands(
         proof=proof,
         linearized=not linear,
         left_out=(
+            *replaced_hands(of_scene),
             *near_start(system, prepared),
             *left_out(system),
             *_as_at_start(system, prepared, linear=linear),
         ),
     )
+
+
+def _directions(system: CompiledSystem, prepared: Prepared) -> dict[str, CompiledSystem]:
+    """Return the scene along each direction of its devices, none where they move along a line.
+
+    Raises
+    ------
+    ApcError
+        E933 where what moves along one direction acts on what moves along another.
+    """
+    along = directions_of(system)
+    for loop in split(*lifted_groups(system, prepared=prepared)).systems if along else ():
+        parts = load_pool("scipy.sparse.csgraph").connected_components(loop.matrix != 0, connection="weak")[1]
+        of: dict[str, set[str]] = {}
+        for name, part_ in zip(loop.layout.names, parts.tolist(), strict=True):
+            if (axis := f"x{name[name.rindex('[') :]}" if "[" in name else "") in along:
+                of.setdefault(str(part_), set()).add(axis)
+        if any(len(axes) > 1 for axes in of.values()):
+            what = f"{OPTION}: devices move along {', '.join(along)}, which act on one another"
+            raise ApcError(Mistake("E933", Place(system.origin.topology), what))
+    return along
+
+
+def _together(parts: Mapping[str, PassiveHands], replaced: tuple[str, ...]) -> PassiveHands:
+    """Return what is said of all directions together, which don't act on one another."""
+    verdicts = [one.stable for one in parts.values()]
+    stable = False if False in verdicts else None if None in verdicts else True
+    deciding = next(one for one in parts.values() if one.stable is stable)
+    modes = tuple(
+        replace(mode, name=f"{mode.name}, {axis}") for axis, one in parts.items() for mode in one.modes
+    )
+    joined = all(one.joined for one in parts.values())
+    return replace(deciding, modes=modes, joined=joined, left_out=(*replaced, *deciding.left_out))
 
 
 def _as_at_start(system: CompiledSystem, prepared: Prepared, *, linear: bool) -> tuple[str, ...]:
@@ -236,7 +275,12 @@ def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool 
     bounded
         Whether bounds are asked for.
     """
-    refuse_hands(system, OPTION)
+    of_scene, system = system, without_hands(system, OPTION)
+    prepared = prepared if system is of_scene else prepare(system)
+    if along := _directions(system, prepared):
+        each = [passive_growth(one, prepare(one), bounded=bounded) for one in along.values()]
+        radius, low, high = (max(getattr(one, name) for one in each) for name in ("radius", "low", "high"))
+        return Growth(radius, low, high, exact=True, proved=True)
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         loops = port_loops(system, prepared, option=OPTION)
         found, scale = [(-np.inf, -np.inf, -np.inf)], 1.0

@@ -25,6 +25,7 @@ from apc.compiler.words import counted
 from apc.eigen.closing import ClosedSystem
 from apc.eigen.spectrum import mode_near
 from apc.finite_equations import finite_equations
+from apc.frame.devices import replaced_hands
 from apc.frame.names import Free, Range, notes_for_all_groups
 from apc.frame.overrides import apply
 from apc.network.nominal import left_out, refuse_channel_number
@@ -332,6 +333,7 @@ def region(
         left_out=(
             *near_start(system, prepared),
             *left_out(system, network=meant != MEAN_SQUARE),
+            *(replaced_hands(system) if meant == PASSIVE else ()),
             *notes_for_all_groups(system, free),
         ),
         system=system,

@@ -24,6 +24,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.compiler.words import with_unit
 from apc.finite_equations import finite_equations
+from apc.frame.devices import replaced_hands
 from apc.frame.linearize import reaches_start
 from apc.frame.names import Free, find, parameter_of, unit_of, values_by_group
 from apc.hands.passivity import passive_hands
@@ -218,6 +219,7 @@ def critical(
         left_out=(
             *near_start(system, prepared),
             *left_out(system, network=chosen_criterion != MEAN_SQUARE),
+            *(replaced_hands(system) if chosen_criterion == PASSIVE else ()),
         ),
         criterion=chosen_criterion,
         groups=values_by_group(system, free),

@@ -38,11 +38,8 @@ PARTS = {
     "work_precision": ("Methods of simulation", "tests.bench.work_precision"),
     "play": ("Peers in real time", "tests.bench.play"),
     "simulate": ("Simulation", "tests.bench.simulate"),
-    "critical": ("Critical values", "tests.bench.critical"),
     "region": ("Regions", "tests.bench.region"),
-    "network": ("Unreliable networks", "tests.bench.network"),
     "hands": ("Hands", "tests.bench.hands"),
-    "sweep": ("Sweeps", "tests.bench.sweep"),
 }
 
 

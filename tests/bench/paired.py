@@ -10,13 +10,20 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import statistics
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+
+import apc
+from apc.answer import answer
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ("models/scenes", "tests/scenes", "tests/hard")
@@ -25,14 +32,10 @@ Numbers = list[tuple[float, float]]
 
 
 def _stiffnesses(model: Any) -> list[str]:
-    import apc
-
     return [row.name for row in apc.parameters(model).rows if row.name.endswith("stiffness")]
 
 
 def _critical(model: Any, ending: str, place: int) -> tuple[str, Numbers]:
-    import apc
-
     names = [row.name for row in apc.parameters(model).rows if row.name.endswith(ending)]
     found = apc.critical(model, names[place])
     words = " ".join(str(crossing.stable_side) for crossing in found.crossings)
@@ -40,17 +43,11 @@ def _critical(model: Any, ending: str, place: int) -> tuple[str, Numbers]:
 
 
 def _analyze(model: Any) -> tuple[str, Numbers]:
-    import apc
-
     found = apc.analyze(model)
     return found.verdict, [(found.spectral_radius, found.spectral_radius_error)]
 
 
 def _many(model: Any) -> tuple[str, Numbers]:
-    import numpy as np
-
-    import apc
-
     name = _stiffnesses(model)[0]
     found = apc.analyze_many(model, {name: np.linspace(10, 3000, 10_000)})
     errors = np.nan_to_num(found.spectral_radius_error[::100], nan=np.inf)
@@ -58,55 +55,22 @@ def _many(model: Any) -> tuple[str, Numbers]:
 
 
 def _region(model: Any) -> tuple[str, Numbers]:
-    import apc
-
     x, y = _stiffnesses(model)[:2]
     found = apc.region(model, x=f"{x}=10 N/m:3000 N/m", y=f"{y}=10 N/m:2000 N/m")
     return "", [(found.stable_area, found.stable_area_error)]
 
 
-def _passive(model: Any) -> tuple[str, Numbers]:
-    import apc
-
-    return str(apc.passive_hands(model).verdict), []
-
-
-def _network(model: Any) -> tuple[str, Numbers]:
-    import apc
-
-    found = apc.judge_network(model)
-    return "|".join(str(getattr(row, "verdict", "")) for row in getattr(found, "rows", ())), []
-
-
 def _simulate(model: Any) -> tuple[str, Numbers]:
-    import apc
-
     found = apc.simulate(model, duration="0.5 s")
     # What contacts make of a rounding is not known: a hundred-thousandth is what both players state.
-    ends = {name: float(value) for name, value in zip(found.names, found.values[-1], strict=True)}
+    ends = {one.name: float(value) for one, value in zip(found.signals, found.values[-1], strict=True)}
     return "", [(ends[name], 1e-5 * max(1.0, abs(ends[name]))) for name in sorted(ends)]
 
 
 def _feel(model: Any) -> tuple[str, Numbers]:
-    import apc
-
     found = apc.feel(model, [1.0, 10.0], unstable=True)
     values = [abs(complex(value)) for value in found.error_per_force]
     return "", [(value, 1e-9 * value) for value in values]
-
-
-def _answer(model: Any) -> tuple[str, Numbers]:
-    from apc.answer import answer
-
-    answer(model)
-    return "", []
-
-
-def _margins(model: Any) -> tuple[str, Numbers]:
-    import apc
-
-    apc.margins(model)
-    return "", []
 
 
 QUESTIONS: dict[str, Callable[[Any], tuple[str, Numbers]]] = {
@@ -115,21 +79,15 @@ QUESTIONS: dict[str, Callable[[Any], tuple[str, Numbers]]] = {
     "first stiffness": lambda model: _critical(model, "stiffness", 0),
     "last delay": lambda model: _critical(model, "delay", -1),
     "region": _region,
-    "passive hands": _passive,
-    "network": _network,
+    "passive hands": lambda model: (apc.passive_hands(model).verdict, []),
     "feel": _feel,
     "simulate": _simulate,
-    "margins": _margins,
-    "default output": _answer,
+    "default output": lambda model: (answer(model).analysis.verdict, []),
 }
 
 
 def serve() -> None:
     """Answer the questions on standard input, a line each, as long as there are any."""
-    import signal
-    import time
-
-    import apc
 
     class TooLong(BaseException):
         """The time is up; no handler of errors may catch it."""
@@ -157,31 +115,18 @@ def serve() -> None:
         print(json.dumps(told), flush=True)
 
 
-@dataclass(slots=True)
-class Version:
-    """A process of a version of apc that answers questions."""
+def started(python: str) -> subprocess.Popen[str]:
+    """Start a version that answers questions, with one thread and nothing of this checkout on its path."""
+    threads = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    command, pipe = [python, "-P", str(Path(__file__)), "--serve"], subprocess.PIPE
+    return subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd="/", env=threads, bufsize=1)
 
-    process: subprocess.Popen[str]
 
-    @classmethod
-    def start(cls, python: str) -> Version:
-        """Start the process in the environment of a Python."""
-        threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-        # The file itself is run, with nothing of this checkout on the path.
-        command = [python, "-P", str(Path(__file__)), "--serve"]
-        pipe = subprocess.PIPE
-        return cls(
-            subprocess.Popen(
-                command, stdin=pipe, stdout=pipe, text=True, cwd="/", env=os.environ | threads, bufsize=1
-            )
-        )
-
-    def ask(self, *question: object) -> dict[str, Any]:
-        """Return what it answers to a scene's file, a question and a number of runs."""
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.process.stdin.write(json.dumps(question) + "\n")
-        return dict(json.loads(self.process.stdout.readline()))
+def answered(version: subprocess.Popen[str], *question: object) -> dict[str, Any]:
+    """Return what a version says to a scene's file, a question and a number of runs."""
+    assert version.stdin is not None and version.stdout is not None
+    version.stdin.write(json.dumps(question) + "\n")
+    return dict(json.loads(version.stdout.readline()))
 
 
 @dataclass(slots=True)
@@ -196,7 +141,7 @@ class Pairs:
     def add(self, scene: str, ours: dict[str, Any], theirs: dict[str, Any]) -> None:
         """Take down the two answers of a scene."""
         if ours["refused"] or theirs["refused"]:
-            if bool(ours["refused"]) != bool(theirs["refused"]):
+            if ours["refused"] != theirs["refused"]:
                 who = "this version" if ours["refused"] else "the other"
                 self.refused.append(f"{scene}: {who}: {ours['refused'] or theirs['refused']}")
             return
@@ -237,13 +182,13 @@ def main() -> None:
     parser.add_argument("--only", action="append", choices=QUESTIONS, help="may be repeated")
     given = parser.parse_args()
     judge = Judge(given.strict)
-    ours, theirs = Version.start(sys.executable), Version.start(given.other)
+    ours, theirs = started(sys.executable), started(given.other)
     files = [file for folder in FOLDERS for file in sorted((ROOT / folder).glob("*.yaml"))]
     for question in given.only or QUESTIONS:
         pairs, runs = Pairs(), 3 if question == "analyze" else 1
         for file in files[:5] if given.quick else files:
             asked = (str(file), question, runs)
-            pairs.add(file.stem, ours.ask(*asked), theirs.ask(*asked))
+            pairs.add(file.stem, answered(ours, *asked), answered(theirs, *asked))
         pairs.report(question)
         judge.right(f"{question}: the same answers", not pairs.different)
     judge.end()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -326,6 +327,16 @@ def test_two_devices_coupled_directly_are_held_each_at_its_only_mass() -> None:
     assert apc.feel(below, [0.01]).low_frequency.damping > 12
 
 
+def test_in_a_plane_every_direction_is_held() -> None:
+    """Both axes of the paper's scene in a plane are the line's, which don't act on one another."""
+    plane, line = apc.compile(SCENES / "planar-users.yaml"), apc.passive_hands(users(3, 500))
+    found = apc.passive_hands(plane)
+    assert found.stable is line.stable and found.clamped_radius == pytest.approx(line.clamped_radius)
+    for mode, own in zip(found.modes, line.modes * 2, strict=True):
+        assert mode.name[:-6] == own.name and mode.needed == pytest.approx(own.needed, rel=1e-9)
+    by_critical(plane, 458.24216)
+
+
 def test_a_server_without_a_device_is_not_held() -> None:
     system = apc.compile(SCENES / "client-server.yaml")
     found = apc.critical(system, "contact.stiffness", criterion="passive").value
@@ -338,16 +349,20 @@ def test_a_server_without_a_device_is_not_held() -> None:
         assert shaken(at, hands if told.stable else tuned(told)) is (part > 1)
 
 
-def test_where_nothing_brakes_held_devices_leave_the_object_coasting() -> None:
-    found = apc.passive_hands(apc.compile(ROOT / "tests" / "hard" / "coasting.yaml"))
-    assert not found.stable and "hold the devices still" in str(found)
+@pytest.mark.parametrize("name", ["lifted-box", "star-lecture"])
+def test_in_the_place_of_a_scenes_own_arms_stands_any_passive_hand(name: str) -> None:
+    text = (SCENES / f"{name}.yaml").read_text(encoding="utf-8")
+    bare = re.sub(r"^hands:.*\n(  .*\n)+|, arm.stiffness: 400 N/m", "", text, flags=re.MULTILINE)
+    assert bare != text
+    found, alone = (apc.passive_hands(compiled(one)) for one in (text, bare))
+    assert (found.modes, found.verdict) == (alone.modes, alone.verdict)
+    assert found.left_out[0].endswith("any passive hand stands there instead")
 
 
 def test_what_is_not_judged_is_refused_by_name() -> None:
     text = AVERAGE + "hands: {grip: {type: SpringDamperArm, flange: device, stiffness: 100 N/m}}\n"
-    for hands in ("clamped", "held", "passive"):
-        with pytest.raises(ApcError, match=r"E932.*grip"):
-            apc.with_hands(compiled(text), hands)
+    with pytest.raises(ApcError, match=r"E932.*grip"):
+        apc.with_hands(compiled(text), "held")
     with pytest.raises(ApcError, match="E930"):
         apc.with_hands(compiled(AVERAGE), "claped")
     text = replaced(AVERAGE, ("type: Sampled", "type: "), ("N/m, clock: haptic, delay: 1 ms}", "N/m}"))

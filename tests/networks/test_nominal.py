@@ -59,7 +59,7 @@ def test_other_questions_say_in_their_second_line_what_is_left_out(
 
 @pytest.mark.whole
 def test_an_analysis_answers_for_the_network_first(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["analyze", "s.yaml", "--method", "paper"]) == 0
+    assert run(["analyze", "s.yaml", "--method", "paper", "--nominal"]) == 0
     told, _, nominal = capsys.readouterr().out.partition("\n\nthree-users-average: ")
     assert told.startswith("three-users-average: stable in mean square\n")
     assert nominal.splitlines()[1].startswith(f"  {LEFT_OUT[:55]}")

@@ -35,7 +35,7 @@ from bokeh.document import Document
 
 from apc.explore import sections
 from apc.explore.desk import Desk
-from apc.explore.motion import STRUCK, motion_of
+from apc.explore.motion import motion_of
 from apc.explore.page import Page, scene_of
 from apc.explore.sections import Task, Told, compute
 from apc.explore.server import MOST, _shortened
@@ -51,6 +51,7 @@ from apc.explore.sliders import (
 )
 from apc.explore.written import with_values
 from apc.processes import Workers, model_bytes
+from apc.simulation.strike import SPEED
 
 NOTHING = "topology: none\npeers: {user: {count: 1}}\nmasses: {}\n"
 LOSSY = AVERAGE.replace("delay: 8 ms}", "delay: 8 ms, loss: 10 %, jitter: 1 ms}")
@@ -161,7 +162,7 @@ def test_a_struck_device_moves_as_its_equation_says(tmp_path: Path) -> None:
     text = "topology: one\npeers: {user: {count: 1}}\nmasses: {device: {mass: 2 kg, damping: 3 N*s/m}}\n"
     motion = motion_of(compiled(text, tmp_path), struck=True)
     (body,) = motion.bodies
-    expected = 1e3 * STRUCK * 2 / 3 * (1 - np.exp(-1.5 * motion.time))
+    expected = 1e3 * SPEED * 2 / 3 * (1 - np.exp(-1.5 * motion.time))
     assert np.allclose(body.x, expected, rtol=1e-9, atol=1e-12)
     with pytest.raises(apc.ApcError, match="E983"):
         motion_of(compiled(NOTHING, tmp_path), struck=True)

@@ -14,7 +14,7 @@ import pytest
 
 import apc
 from apc.arguments import _fits, _hints
-from tests.topologies import SCENES, replaced, told
+from tests.topologies import AVERAGE, SCENES, compiled, replaced, told
 
 PATH = SCENES / "three-users-average.yaml"
 
@@ -126,6 +126,14 @@ def test_a_number_in_si_is_the_quantity(model: apc.CompiledSystem) -> None:
     ]
     assert areas[0] == areas[1]
     assert len(apc.simulate(model, duration=0.1).values) == 101
+
+
+def test_one_peer_is_struck(model: apc.CompiledSystem) -> None:
+    found = apc.simulate(model, strike="user[2]")  # as fast as a list says, with a value a peer
+    text = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.v: [0 m/s, 0.1 m/s, 0 m/s]}}"))
+    assert np.array_equal(found.values, apc.simulate(compiled(text), duration="1 s").values)
+    with pytest.raises(apc.ApcError, match=r'E983 there is no peer user\[4\] .*Write: --strike "user\[1\]"'):
+        apc.simulate(model, strike="user[4]")
 
 
 @pytest.mark.parametrize("wrong", [7, None, ("1 N/m", "2 N/m"), {"a": "b"}, [3]], ids=repr)

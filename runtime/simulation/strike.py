@@ -1,0 +1,67 @@
+"""A peer that is struck: its device moves as the scene begins.
+
+Takes: a `CompiledSystem` and the name of a peer.
+Gives: `strike`; `SPEED`, `WATCHED`.
+Guarantees: all else begins as the scene says.
+Does not: play it (see `trajectory`).
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+
+from apc.compiler.compiled import Column, CompiledSystem, Kind
+from apc.compiler.errors import ApcError, Mistake, Place
+from apc.simulation.signals import sent_states
+
+# How fast the struck device starts, in m/s, and how long that is watched, in s, where the scene says nothing.
+SPEED, WATCHED = 0.1, Fraction(1)
+
+_PEER = re.compile(r"(?P<group>.+?)(\[(?P<number>\d+)\])?")
+
+
+def strike(system: CompiledSystem, peer: str = "") -> tuple[CompiledSystem, str]:
+    """Return the scene with a peer's device moving by `SPEED` at the start, and the name of what moves.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    peer
+        Such as "user[2]"; of a group's name alone, the first of it; without a name, the first of all.
+
+    Raises
+    ------
+    ApcError
+        E983 no such peer, or nothing of it that a push could move.
+    """
+    names = [group.name for group in system.groups]
+    found = _PEER.fullmatch(peer.strip() or names[0])
+    number = int(found["number"] or 1) if found else 0
+    place = names.index(found["group"]) if found and found["group"] in names else -1
+    if place < 0 or not 1 <= number <= system.groups[place].count:
+        what = f"there is no peer {peer.strip()[:60]} to strike"
+        raise ApcError(
+            Mistake("E983", Place(system.name), what, hint=f'--strike "{names[max(place, 0)]}[1]"')
+        )
+    group = system.groups[place]
+    kind: Kind = system.kinds[group.kind]
+    sent = sent_states(kind)
+    moving = [row for row, one in enumerate(kind.states) if one.unit == "m/s"]
+    own = [row for row in moving if row not in sent] or moving
+    if not own:
+        what = f"nothing of {group.name} has a velocity that a push could change"
+        raise ApcError(Mistake("E983", Place(system.name), what))
+    state = kind.states[own[0]]
+    known = {column.name: column.values for column in group.columns}
+    present = [one.value for one in (*system.parameters, *group.values) if one.name == state.start][-1]
+    values = np.array(known.get(state.start, np.full(group.count, present)), dtype=np.float64)
+    values[number - 1] += SPEED
+    columns = (*(one for one in group.columns if one.name != state.start), Column(state.start, values))
+    changed = replace(group, columns=columns)
+    groups = (*system.groups[:place], changed, *system.groups[place + 1 :])
+    return replace(system, groups=groups), f"{group.name}[{number}].{state.name.rpartition('.')[0]}"
