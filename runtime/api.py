@@ -43,7 +43,8 @@ if TYPE_CHECKING:
     from apc.vary.margins import Margins
     from apc.vary.sensitivity import Sensitivities
 
-_Scene = CompiledSystem | str | Path
+Scene = CompiledSystem | str | Path
+Values = Mapping[str, str | float]  # by the name of a parameter, quantities or numbers in SI
 Format = Literal["text", "json", "dot", "mermaid", "svg"]
 Criterion = Literal["mean-square", "nominal", "passive"]
 
@@ -90,7 +91,7 @@ def load(path: str | Path) -> CompiledSystem:
 
 
 @checked
-def with_hands(model: CompiledSystem | str | Path, hands: str) -> CompiledSystem:
+def with_hands(model: Scene, hands: str) -> CompiledSystem:
     """Return the model with hands at all devices.
 
     Parameters
@@ -159,9 +160,9 @@ def _range(system: CompiledSystem, name: str, value: str | Sequence[str | float]
 
 @checked
 def analyze(
-    model: CompiledSystem | str | Path,
+    model: Scene,
     *,
-    set: Mapping[str, str | float] | None = None,
+    set: Values | None = None,
     method: Method = "auto",
     certify: bool = False,
 ) -> Analysis:
@@ -198,10 +199,10 @@ def analyze(
 
 @checked
 def analyze_many(
-    model: CompiledSystem | str | Path,
+    model: Scene,
     values: Mapping[str, Any],
     *,
-    set: Mapping[str, str | float] | None = None,
+    set: Values | None = None,
 ) -> Analyses:
     """Say the same of many values of some parameters at once, a hundred times as fast as one by one.
 
@@ -231,10 +232,10 @@ def analyze_many(
 
 @checked
 def critical(
-    model: CompiledSystem | str | Path,
+    model: Scene,
     parameter: str,
     *,
-    set: Mapping[str, str | float] | None = None,
+    set: Values | None = None,
     lower: str | float | None = None,
     upper: str | float | None = None,
     criterion: Criterion | None = None,
@@ -268,9 +269,9 @@ def critical(
 
 @checked
 def compare(
-    models: _Scene | Sequence[_Scene],
+    models: Scene | Sequence[Scene],
     *,
-    set: Mapping[str, str | float] | None = None,
+    set: Values | None = None,
     over: Sequence[str] = (),
     criterion: Criterion | None = None,
     at: str = "",
@@ -308,9 +309,7 @@ def compare(
 
 
 @checked
-def passive_hands(
-    model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None
-) -> PassiveHands:
+def passive_hands(model: Scene, *, set: Values | None = None) -> PassiveHands:
     """Say whether a scene is stable with every passive hand at every device, and how much damping that takes.
 
     Parameters
@@ -330,10 +329,10 @@ def passive_hands(
 
 @checked
 def feel(
-    model: CompiledSystem | str | Path,
+    model: Scene,
     frequencies: Sequence[float] | float,
     *,
-    set: Mapping[str, str | float] | None = None,
+    set: Values | None = None,
     at: str = "",
     between: str = "",
     unstable: bool = False,
@@ -398,9 +397,7 @@ def describe_network(recording: str | Path, *, interval: str | None = None) -> N
 
 
 @checked
-def judge_network(
-    model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None, certify: bool = False
-) -> NetworkVerdict | None:
+def judge_network(model: Scene, *, set: Values | None = None, certify: bool = False) -> NetworkVerdict | None:
     """Say what becomes of a scene over the network that it has, lost and late packets included.
 
     Parameters
@@ -425,7 +422,7 @@ def judge_network(
 
 
 @checked
-def margins(model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None) -> Margins:
+def margins(model: Scene, *, set: Values | None = None) -> Margins:
     """Say how far each coupler's stiffness and damping and each delay may grow, all else as it is.
 
     Parameters
@@ -439,9 +436,7 @@ def margins(model: CompiledSystem | str | Path, *, set: Mapping[str, str | float
 
 
 @checked
-def sensitivities(
-    model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None
-) -> Sensitivities:
+def sensitivities(model: Scene, *, set: Values | None = None) -> Sensitivities:
     """Differentiate the spectral radius with respect to every parameter.
 
     Parameters
@@ -455,9 +450,7 @@ def sensitivities(
 
 
 @checked
-def conventions(
-    model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None
-) -> Conventions:
+def conventions(model: Scene, *, set: Values | None = None) -> Conventions:
     """Repeat the analysis under every order of coincident events and both readings of the start.
 
     Parameters
@@ -471,9 +464,7 @@ def conventions(
 
 
 @checked
-def contact_modes(
-    model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None
-) -> ContactModes:
+def contact_modes(model: Scene, *, set: Values | None = None) -> ContactModes:
     """Analyse a scene whose couplers push and never pull in each of their modes.
 
     Parameters
@@ -487,9 +478,7 @@ def contact_modes(
 
 
 @checked
-def switching(
-    model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None
-) -> Switching:
+def switching(model: Scene, *, set: Values | None = None) -> Switching:
     """Say whether a scene is proved stable however its contacts open and close, or as they do by themselves.
 
     Parameters
@@ -505,7 +494,7 @@ def switching(
 
 
 @checked
-def buzz(model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None) -> Buzz:
+def buzz(model: Scene, *, set: Values | None = None) -> Buzz:
     """Predict the buzz of a scene's one-sided contacts, and play it beside.
 
     Parameters
@@ -525,11 +514,11 @@ def buzz(model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] |
 
 @checked
 def prove_box(
-    model: CompiledSystem | str | Path,
+    model: Scene,
     box: Mapping[str, str | Sequence[str | float]],
     *,
     cells: int | None = None,
-    set: Mapping[str, str | float] | None = None,
+    set: Values | None = None,
 ) -> BoxProof:
     """Prove that a scene is stable for every value of some parameters within their ranges.
 
@@ -551,7 +540,7 @@ def prove_box(
 
 
 @checked
-def parameters(model: CompiledSystem | str | Path) -> Parameters:
+def parameters(model: Scene) -> Parameters:
     """List what may be set of a scene: its names, values, units and limits.
 
     Parameters
@@ -565,9 +554,7 @@ def parameters(model: CompiledSystem | str | Path) -> Parameters:
 
 
 @checked
-def paper_route(
-    model: CompiledSystem | str | Path, *, set: Mapping[str, str | float] | None = None
-) -> PaperRoute:
+def paper_route(model: Scene, *, set: Values | None = None) -> PaperRoute:
     """Return the lifted matrices of Rakhsha and Constantinescu, eqs. (18) to (20), rows and columns named.
 
     Parameters
@@ -587,12 +574,12 @@ def paper_route(
 
 @checked
 def region(
-    model: CompiledSystem | str | Path,
+    model: Scene,
     *,
     x: str | tuple[str, str | float, str | float] | None = None,
     y: str | tuple[str, str | float, str | float] | None = None,
     criterion: Criterion | None = None,
-    set: Mapping[str, str | float] | None = None,
+    set: Values | None = None,
 ) -> Region:
     """Find the boundary of the stable region of two parameters, as curves with their errors.
 
@@ -629,7 +616,7 @@ def region(
 
 @checked
 def sweep(
-    model: CompiledSystem | str | Path,
+    model: Scene,
     over: Mapping[str, str | Sequence[str | float]],
     *,
     of: str = "analyze",
@@ -637,7 +624,7 @@ def sweep(
     out: str | Path | None = None,
     jobs: int | None = None,
     cluster: str | None = None,
-    set: Mapping[str, str | float] | None = None,
+    set: Values | None = None,
 ) -> Sweep:
     """Compute a result at every combination of some parameters' values.
 
@@ -671,7 +658,7 @@ def sweep(
     return points.sweep(system, values, of=of, criterion=criterion, out=path, jobs=jobs, cluster=cluster)
 
 
-def _several(scenes: _Scene | Iterable[_Scene], function: str) -> list[_Scene]:
+def _several(scenes: Scene | Iterable[Scene], function: str) -> list[Scene]:
     """Return the scenes that a function is given, of which one needs no list; refuse none."""
     if isinstance(scenes, CompiledSystem | str | Path):
         return [scenes]
@@ -681,7 +668,7 @@ def _several(scenes: _Scene | Iterable[_Scene], function: str) -> list[_Scene]:
     raise ApcError(Mistake("E610", Place(function), "no scene is given", hint=hint))
 
 
-def _path(scene: _Scene, function: str) -> Path:
+def _path(scene: Scene, function: str) -> Path:
     """Return the path of a topology; refuse a compiled model, beside which it stands."""
     from apc.inputs import refuse_model
 
@@ -693,7 +680,7 @@ def _path(scene: _Scene, function: str) -> Path:
     return path
 
 
-def _model(model: CompiledSystem | str | Path, set: Mapping[str, str | float] | None) -> CompiledSystem:
+def _model(model: Scene, set: Values | None) -> CompiledSystem:
     """Return a compiled model, with the parameters set."""
     if not isinstance(model, CompiledSystem):
         from apc.inputs import load_or_compile
@@ -702,7 +689,7 @@ def _model(model: CompiledSystem | str | Path, set: Mapping[str, str | float] | 
     return set_parameters(model, set) if set else model
 
 
-def _check_out(model: CompiledSystem | str | Path, system: CompiledSystem, path: Path | None) -> None:
+def _check_out(model: Scene, system: CompiledSystem, path: Path | None) -> None:
     """Refuse to write over what the model was read from."""
     if path is not None and not isinstance(model, CompiledSystem):
         from apc.inputs import check_outputs
@@ -712,10 +699,10 @@ def _check_out(model: CompiledSystem | str | Path, system: CompiledSystem, path:
 
 @checked
 def simulate(
-    model: CompiledSystem | str | Path,
+    model: Scene,
     *,
     duration: str | float | None = None,
-    set: Mapping[str, str | float] | None = None,
+    set: Values | None = None,
     signals: Sequence[str] = (),
     jit: bool = True,
     seed: int | None = None,
@@ -788,9 +775,9 @@ def simulate(
 
 @checked
 def bench(
-    model: CompiledSystem | str | Path,
+    model: Scene,
     *,
-    set: Mapping[str, str | float] | None = None,
+    set: Values | None = None,
     rounds: int | None = None,
 ) -> Bench:
     """Measure every method of analysis and of simulation on a scene: time against true error.
@@ -816,11 +803,11 @@ def bench(
 
 @checked
 def export(
-    model: CompiledSystem | str | Path,
+    model: Scene,
     to: str | None = None,
     out: str | Path | None = None,
     *,
-    set: Mapping[str, str | float] | None = None,
+    set: Values | None = None,
     cut: str = "",
     free: Sequence[str] = (),
     peer: str = "",
@@ -877,7 +864,7 @@ def report(
     files: str | Path | Sequence[str | Path],
     out: str | Path | None = None,
     *,
-    set: Mapping[str, str | float] | None = None,
+    set: Values | None = None,
 ) -> Report:
     """Gather all that is known of scenes, for one page.
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import inspect
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
@@ -46,7 +47,8 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
         hints = _hints(function)
         for name, value in signature.bind(*args, **kwargs).arguments.items():
             if name in hints and not _fits(value, hints[name]):
-                wants, got = signature.parameters[name].annotation, f"{type(value).__name__}: {value!r:.80}"
+                wants = re.sub(r"\w+\.", "", inspect.formatannotation(hints[name]))
+                got = f"{type(value).__name__}: {value!r:.80}"
                 raise TypeError(f"apc.{function.__name__}: {name} wants {wants}, got {got}")
         return function(*args, **kwargs)
 

@@ -75,9 +75,13 @@ class Result:
         return drawn
 
     def _shown(self, form: str, *arguments: Any) -> Any:
-        """Return the result in another form: as a document by its fields, if nothing else is said."""
+        """Return the result in another form, as its module has it.
+
+        Without one its document is made of its fields, and a table of its `rows`: see `pictures.table_of`.
+        """
         module, _, name = self.shown_by.partition(":")
         forms: Any = import_module(f"apc.present.{module}")
-        if form == "document" and not hasattr(forms, f"{name}_{form}"):
-            return import_module("apc.present.forms").document(self)
-        return getattr(forms, f"{name}_{form}")(self, *arguments)
+        if hasattr(forms, f"{name}_{form}"):
+            return getattr(forms, f"{name}_{form}")(self, *arguments)
+        other, called = {"document": ("forms", "document"), "table": ("pictures", "table_of")}[form]
+        return getattr(import_module(f"apc.present.{other}"), called)(self)

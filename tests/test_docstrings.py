@@ -24,7 +24,7 @@ def test_modules_and_functions_of_many_arguments_say_what_they_take() -> None:
         ]:
             taken = len(node.args.posonlyargs) + len(node.args.args) + len(node.args.kwonlyargs)
             # A command's docstring is its help; its options have a help of their own.
-            command = any("command(" in ast.unparse(one) for one in node.decorator_list)
+            command = any("command" in ast.unparse(one) for one in node.decorator_list)
             if taken >= MANY and node.name[0] != "_" and not command:
                 section = "Parameters\n-" in (ast.get_docstring(node) or "")
                 missing += [] if section else [f"{path}: {node.name}"]

@@ -14,19 +14,7 @@ from typing import TYPE_CHECKING
 import click
 
 from apc.analysis.methods import AUTO, METHODS
-from apc.cli.options import (
-    Command,
-    beside,
-    check_plot,
-    file_argument,
-    file_option,
-    hands_option,
-    json_option,
-    note_aside,
-    print_result,
-    set_option,
-    tell,
-)
+from apc.cli.options import command, note_aside, option, picture_option, print_result
 from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Mistake, Place
 
@@ -37,78 +25,52 @@ if TYPE_CHECKING:
 SECONDS_A_PEER = 1e-4
 
 
-@click.command("analyze", cls=Command)
-@file_argument
-@set_option
-@click.option(
-    "--method",
-    type=click.Choice(METHODS),
-    default=AUTO,
-    show_default=True,
-    metavar="METHOD",
-    help="auto: what serves the scene. modes: a few small systems. dense: all peers in one, to check. "
-    "determinant: zeros of a small determinant, for peers that all differ and for long delays. "
-    "paper: the lifted matrices of Rakhsha and "
-    "Constantinescu, eqs. (18) to (20).",
-)
-@click.option(
-    "--certify", is_flag=True, help="Prove the verdict in ball arithmetic, for the numbers as doubles."
-)
-@click.option(
-    "--box",
-    "box",
-    multiple=True,
-    metavar="PATH=±P%",
-    help="Prove stability for every value within, over the network as it is, e.g. "
-    '--box contact.stiffness=±1%, or --box "lan.delay=8 ms:20 ms", at every constant delay. May be repeated.',
-)
-@click.option(
-    "--cells",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Divide the box into so many cells at most before it is left undecided; without it, into as many as "
-    "take some seconds.",
-)
-@click.option(
-    "--conventions",
-    "every_convention",
-    is_flag=True,
-    help="Repeat the analysis under every order of events that coincide.",
-)
-@click.option(
-    "--margins/--no-margins",
-    default=None,
-    help="Look for all margins, however long it takes, or for none: how far stiffnesses, dampings and delays "
-    "may grow. Without either, for all in a scene where that takes a second or so.",
-)
-@click.option(
-    "--nominal",
-    is_flag=True,
-    help="Of a network that loses or delays packets, say all of the nominal one, too: modes, sensitivities, "
-    "margins.",
-)
-@click.option(
-    "--buzz",
-    "with_buzz",
-    is_flag=True,
-    help="Predict how one-sided contacts buzz, and play the scene for up to 80 s to lay it beside.",
-)
-@hands_option
-@file_option("--plot", "Draw the eigenvalues over the unit circle: .png, .svg or .pdf.")
-@json_option
+@command
 def analyze_command(
+    *,
     file: str | None,
     settings: tuple[str, ...],
-    method: str,
-    certify: bool,
-    box: tuple[str, ...],
-    cells: int | None,
-    every_convention: bool,
-    margins: bool | None,
-    nominal: bool,
-    with_buzz: bool,
+    method: str = option(
+        "auto: what serves the scene. modes: a few small systems. dense: all peers in one, to check. "
+        "determinant: zeros of a small determinant, for peers that all differ and for long delays. "
+        "paper: the lifted matrices of Rakhsha and "
+        "Constantinescu, eqs. (18) to (20).",
+        "METHOD",
+        type=click.Choice(METHODS),
+        default=AUTO,
+    ),
+    certify: bool = option("Prove the verdict in ball arithmetic, for the numbers as doubles."),
+    box: tuple[str, ...] = option(
+        "Prove stability for every value within, over the network as it is, e.g. "
+        '--box contact.stiffness=±1%, or --box "lan.delay=8 ms:20 ms", at every constant delay. '
+        "May be repeated.",
+        "PATH=±P%",
+    ),
+    cells: int | None = option(
+        "Divide the box into so many cells at most before it is left undecided; without it, into as many as "
+        "take some seconds.",
+        "N",
+        type=click.IntRange(min=1),
+    ),
+    every_convention: bool = option(
+        "Repeat the analysis under every order of events that coincide.", name="--conventions"
+    ),
+    margins: bool | None = option(
+        "Look for all margins, however long it takes, or for none: how far stiffnesses, dampings and delays "
+        "may grow. Without either, for all in a scene where that takes a second or so.",
+        name="--margins/--no-margins",
+        default=None,
+    ),
+    nominal: bool = option(
+        "Of a network that loses or delays packets, say all of the nominal one, too: modes, sensitivities, "
+        "margins."
+    ),
+    with_buzz: bool = option(
+        "Predict how one-sided contacts buzz, and play the scene for up to 80 s to lay it beside.",
+        name="--buzz",
+    ),
     hands: str,
-    plot: Path | None,
+    plot: Path | None = picture_option("Draw the eigenvalues over the unit circle: .png, .svg or .pdf."),
     as_json: bool,
 ) -> None:
     """Say whether a scene is stable, by how much, and in which modes.
@@ -125,7 +87,6 @@ def analyze_command(
     from apc.frame.devices import HANDS, PASSIVE, published
     from apc.inputs import open_scene
 
-    check_plot(plot)
     if cells is not None and not box and hands in (*HANDS, PASSIVE):  # hands of the library make a box
         raise click.UsageError("--cells wants a --box to divide")
     system = open_scene(file, settings, {"--plot": plot}, hands=hands, told=note_aside)
@@ -156,12 +117,10 @@ def analyze_command(
         )
     found = replace(found, nominal=nominal)
     if plot is not None:
-        from apc.present.eigenvalues import save_eigenvalues
+        from apc.present.pictures import write_picture
 
-        save_eigenvalues(found.analysis, plot)
-    print_result(found, as_json=as_json, err=beside(plot))
-    if plot is not None and not as_json:
-        tell(f"\n{plot} is written", err=beside(plot))
+        write_picture(found.analysis.plot, plot)
+    print_result(found, as_json=as_json, written=[plot])
 
 
 def _judge_passive(

@@ -11,52 +11,34 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import (
-    Command,
-    file_argument,
-    file_option,
-    json_option,
-    note_aside,
-    print_result,
-    set_option,
-    tell,
-)
+from apc.cli.options import command, note_aside, option, picture_option, print_result, tell
 from apc.cli.progress import at_work
 from apc.compiler.digits import plain_float
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.compiler.files import check_target
 
 HARD = Path("tests/hard")  # of a copy of the repository
 
 
-@click.command("bench", cls=Command)
-@file_argument
-@set_option
-@file_option("--plot", "Draw error against time: .png, .svg or .pdf.")
-@click.option(
-    "--scale",
-    "counts",
-    metavar="3,30,300",
-    help="Measure with these numbers of peers of one group instead: that of the largest written count. "
-    "Not with --set or --plot.",
-)
-@click.option(
-    "--hard",
-    "folder",
-    type=click.Path(path_type=Path),
-    is_flag=False,
-    flag_value=HARD,
-    metavar="[FOLDER]",
-    help=f"Analyse a folder of scenes whose truth is known instead ({HARD} if not given). "
-    "Not with FILE, --set, --plot or --scale.",
-)
-@json_option
+@command
 def bench_command(
+    *,
     file: str | None,
     settings: tuple[str, ...],
-    plot: Path | None,
-    counts: str | None,
-    folder: Path | None,
+    plot: Path | None = picture_option("Draw error against time: .png, .svg or .pdf."),
+    counts: str | None = option(
+        "Measure with these numbers of peers of one group instead: that of the largest written count. "
+        "Not with --set or --plot.",
+        "3,30,300",
+        name="--scale",
+    ),
+    folder: Path | None = option(
+        f"Analyse a folder of scenes whose truth is known instead ({HARD} if not given). "
+        "Not with FILE, --set, --plot or --scale.",
+        "[FOLDER]",
+        name="--hard",
+        is_flag=False,
+        flag_value=HARD,
+    ),
     as_json: bool,
 ) -> None:
     """Measure speed against error, on this scene and this machine.
@@ -89,19 +71,15 @@ def bench_command(
         return
     from apc.benchmark.bench import bench
 
-    if plot is not None:
-        from apc.present.pictures import check_format
-
-        check_target(plot)
-        check_format(plot)
     system = open_scene(file, settings, {"--plot": plot}, told=note_aside)
     with at_work("measuring"):
         found = bench(system)
     print_result(found, as_json=as_json)
-    if plot is not None:
-        from apc.present.bench import save_bench
+    if plot is not None:  # what took minutes is printed already, should it be unable to be written
+        from apc.present.bench import bench_picture
+        from apc.present.pictures import write_picture
 
-        save_bench(found, plot)
+        write_picture(lambda: bench_picture(found), plot)
         if not as_json:
             tell(f"  {plot} is written")
     if found.faults:

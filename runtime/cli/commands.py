@@ -7,8 +7,6 @@ Does not: compute, or decide exit codes (see `__main__`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-
 import click
 
 from apc import cli
@@ -41,25 +39,6 @@ LISTED = [
 ]
 
 
-class Commands(Mapping[str, click.Command]):
-    """The commands of `apc.cli` by their names."""
-
-    def __iter__(self) -> Iterator[str]:
-        """Return their names."""
-        return (name.removesuffix(SUFFIX) for name in cli.__all__)
-
-    def __len__(self) -> int:
-        """Return how many there are."""
-        return len(cli.__all__)
-
-    def __getitem__(self, name: str) -> click.Command:
-        """Return the command of a name. Raises KeyError if there is none."""
-        if f"{name}{SUFFIX}" not in cli.__all__:
-            raise KeyError(name)
-        found: click.Command = getattr(cli, f"{name}{SUFFIX}")
-        return found
-
-
 def _print_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
     if wanted:
         from apc.distribution import program_version
@@ -75,8 +54,13 @@ class Group(click.Group):
         """Return the names of the commands."""
         return LISTED
 
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return the command of a name, whose module is loaded now; None if there is none."""
+        found: click.Command | None = getattr(cli, f"{cmd_name}{SUFFIX}", None)
+        return found
 
-@click.group(cls=Group, commands=Commands(), context_settings=CONTEXT)
+
+@click.group(cls=Group, context_settings=CONTEXT)
 @click.option(
     "--version",
     is_flag=True,

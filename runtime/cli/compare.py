@@ -10,54 +10,37 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import click
-
 from apc.cli.options import (
-    Command,
-    beside,
+    argument,
+    command,
     criterion_with,
-    file_option,
-    hands_option,
-    in_option,
-    json_option,
     note_aside,
     note_usual,
+    option,
     print_result,
-    set_option,
-    tell,
+    result_option,
 )
 from apc.cli.progress import status_line
 from apc.compiler.errors import ApcError
 
 
-@click.command("compare", cls=Command)
-@click.argument("files", nargs=-1, required=True, metavar="FILE...")
-@click.option(
-    "--over",
-    multiple=True,
-    metavar="PATH",
-    help="Which stiffness, delay or loss is looked at, where a scene has several. May be repeated; a scene "
-    "takes those it has.",
-)
-@set_option
-@in_option
-@hands_option
-@click.option(
-    "--at",
-    default="",
-    metavar="PEER.PART",
-    help="The device whose hand feels: left[1].device, or an axis of it. The first peer's that has one.",
-)
-@file_option("--out", "Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json.")
-@json_option
+@command
 def compare_command(
-    files: tuple[str, ...],
-    over: tuple[str, ...],
+    *,
+    files: tuple[str, ...] = argument(nargs=-1, required=True, metavar="FILE..."),
+    over: tuple[str, ...] = option(
+        "Which stiffness, delay or loss is looked at, where a scene has several. May be repeated; a scene "
+        "takes those it has.",
+        "PATH",
+    ),
     settings: tuple[str, ...],
     criterion: str | None,
     hands: str,
-    at: str,
-    out: Path | None,
+    at: str = option(
+        "The device whose hand feels: left[1].device, or an axis of it. The first peer's that has one.",
+        "PEER.PART",
+    ),
+    out: Path | None = result_option(),
     as_json: bool,
 ) -> None:
     """Put schemes side by side: verdicts, limits, what is felt, costs.
@@ -85,11 +68,8 @@ def compare_command(
     from apc.comparison.comparison import compare
     from apc.frame.devices import UNHELD
     from apc.inputs import open_scene
-    from apc.present.comparison import write_comparison
-    from apc.present.pictures import check_result_path
+    from apc.present.pictures import write_result
 
-    if out is not None:
-        check_result_path(out)
     asked = criterion_with(hands, criterion)
     note_usual(hands)
     systems, refused = [], {}
@@ -105,10 +85,8 @@ def compare_command(
     with status_line() as told:
         found = compare(systems, over=over, criterion=asked, at=at, refused=refused, told=told)
     if out is not None:
-        write_comparison(out, found)
-    print_result(found, as_json=as_json, err=beside(out))
-    if out is not None and not as_json:
-        tell(f"\n{out} is written", err=beside(out))
+        write_result(out, found, found.plot)
+    print_result(found, as_json=as_json, written=[out])
 
 
 def _compare_run(folder: Path, *, as_json: bool) -> None:

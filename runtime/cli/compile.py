@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import Command, file_argument, tell
+from apc.cli.options import command, option, tell
 from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import recording
@@ -20,9 +20,11 @@ from apc.compiler.words import counted
 STAGES = ("source", "scene", "flat", "clocked", "sorted", "compiled")
 
 
-@click.command("check", cls=Command)
-@file_argument
-def check_command(file: str | None) -> None:
+@command
+def check_command(
+    *,
+    file: str | None,
+) -> None:
     """Report every mistake in a topology or component; write nothing.
 
     Exit code 0 if there is none, 1 otherwise.
@@ -43,17 +45,19 @@ def check_command(file: str | None) -> None:
         tell(line)
 
 
-@click.command("compile", cls=Command)
-@file_argument
-@click.option(
-    "--until",
-    type=click.Choice(STAGES),
-    default="compiled",
-    metavar="STAGE",
-    help=f"Stop after a stage, print what it made and write nothing. One of {', '.join(STAGES[:-1])}.",
-)
-@click.option("--force", is_flag=True, help="Compile even if nothing has changed since it was compiled.")
-def compile_command(file: str | None, until: str, force: bool) -> None:
+@command
+def compile_command(
+    *,
+    file: str | None,
+    until: str = option(
+        f"Stop after a stage, print what it made and write nothing. One of {', '.join(STAGES[:-1])}.",
+        "STAGE",
+        type=click.Choice(STAGES),
+        default="compiled",
+        show_default=False,
+    ),
+    force: bool = option("Compile even if nothing has changed since it was compiled."),
+) -> None:
     """Turn a topology into equations: NAME.yaml to NAME.apc beside it.
 
     Prints what the scene needed: states, delays and packets kept for a peer,

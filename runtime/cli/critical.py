@@ -10,23 +10,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import click
-
 from apc.cli.options import (
-    Command,
-    beside,
-    check_plot,
+    argument,
+    command,
     criterion_with,
-    file_argument,
-    file_option,
-    hands_option,
-    in_option,
-    json_option,
     note_aside,
     note_usual,
+    option,
+    picture_option,
     print_result,
-    set_option,
-    tell,
 )
 from apc.cli.progress import status_line
 from apc.compiler.errors import ApcError, Mistake, Place
@@ -35,25 +27,19 @@ from apc.compiler.errors import ApcError, Mistake, Place
 SCENES = (".yaml", ".yml", ".apc")
 
 
-@click.command("critical", cls=Command)
-@click.argument("path")
-@file_argument
-@set_option
-@click.option("--upper", metavar='"VALUE UNIT"', help="Look no further up than this.")
-@click.option("--lower", metavar='"VALUE UNIT"', help="Look no further down than this.")
-@in_option
-@hands_option
-@file_option("--plot", "Draw where the eigenvalues go as it grows (root locus): .png, .svg or .pdf.")
-@json_option
+@command
 def critical_command(
-    path: str,
+    *,
+    path: str = argument(),
     file: str | None,
     settings: tuple[str, ...],
-    upper: str | None,
-    lower: str | None,
+    upper: str | None = option("Look no further up than this.", '"VALUE UNIT"'),
+    lower: str | None = option("Look no further down than this.", '"VALUE UNIT"'),
     criterion: str | None,
     hands: str,
-    plot: Path | None,
+    plot: Path | None = picture_option(
+        "Draw where the eigenvalues go as it grows (root locus): .png, .svg or .pdf."
+    ),
     as_json: bool,
 ) -> None:
     """Find the largest stable value of a parameter, with its error.
@@ -70,7 +56,6 @@ def critical_command(
     _check_order(path, file)
     asked = criterion_with(hands, criterion)
     note_usual(hands)
-    check_plot(plot)
     if plot is not None and asked == "passive":
         what = "--plot and --hands passive don't go together: what hands can draw has no eigenvalues"
         raise ApcError(Mistake("E930", Place("--hands"), what, hint="--hands clamped"))
@@ -78,13 +63,10 @@ def critical_command(
     with status_line() as told:
         found = critical(system, path, lower=lower, upper=upper, criterion=asked, told=told)
     if plot is not None:
-        from apc.present.eigenvalues import save_eigenvalues
-        from apc.vary.locus import root_locus
+        from apc.present.pictures import write_picture
 
-        save_eigenvalues(root_locus(system, found), plot)
-    print_result(found, as_json=as_json, err=beside(plot))
-    if plot is not None and not as_json:
-        tell(f"\n{plot} is written", err=beside(plot))
+        write_picture(found.plot, plot)
+    print_result(found, as_json=as_json, written=[plot])
 
 
 def _check_order(path: str, file: str | None) -> None:

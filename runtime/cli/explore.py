@@ -10,29 +10,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import click
-
-from apc.cli.options import (
-    Command,
-    WholeNumber,
-    file_argument,
-    set_option,
-    tell,
-)
+from apc.cli.options import WholeNumber, command, option, tell
 
 
-@click.command("explore", cls=Command)
-@file_argument
-@set_option
-@click.option(
-    "--port",
-    type=WholeNumber(0, 65535),
-    default=0,
-    metavar="N",
-    help="Listen on this port of this machine; any that is free if not given.",
-)
-@click.option("--no-browser", is_flag=True, help="Only print the link.")
-def explore_command(file: str | None, settings: tuple[str, ...], port: int, no_browser: bool) -> None:
+@command
+def explore_command(
+    *,
+    file: str | None,
+    settings: tuple[str, ...],
+    port: int = option(
+        "Listen on this port of this machine; any that is free if not given.",
+        "N",
+        type=WholeNumber(0, 65535),
+        default=0,
+    ),
+    no_browser: bool = option("Only print the link."),
+) -> None:
     """Open a page in the browser: sliders, and what follows from them.
 
     Sliders of the scene's parameters, delays, periods and number of users;

@@ -10,73 +10,42 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import click
-
-from apc.cli.options import (
-    Command,
-    beside,
-    file_argument,
-    file_option,
-    json_option,
-    note_aside,
-    print_result,
-    set_option,
-    tell,
-)
+from apc.cli.options import command, note_aside, option, print_result
 
 
-@click.command("export", cls=Command)
-@file_argument
-@click.option(
-    "--to",
-    metavar="FORMAT",
-    help="control: a script that makes a python-control StateSpace (.py); mat, npz: the same matrices for "
-    "MATLAB, SciPy, NumPy; modelica: a flat model with clocks (.mo); c: one tick of a peer in C99, with "
-    "header and driver; fmu: the scene or a peer for co-simulation (FMI 2.0). Taken from --out if not given.",
-)
-@set_option
-@click.option(
-    "--cut",
-    default="",
-    metavar="NAME",
-    help="Cut the loop open at a link or a coupler, for margins and designs of your own: closed again by "
-    "u = -y it is the closed loop.",
-)
-@click.option(
-    "--free",
-    multiple=True,
-    metavar="PATH",
-    help="Leave a number free: A, B, C and D are a casadi.Function of it too, `casadi_function` in the "
-    "file. May be repeated.",
-)
-@click.option(
-    "--peer", default="", metavar="NAME", help="For c and fmu: one peer, such as 'left[1]'. An FMU is of all."
-)
-@click.option(
-    "--device",
-    default="",
-    metavar="MASS",
-    help="For c: what the peer's computer doesn't move, several with commas between, or none. What a hand "
-    "holds, or others are not told of, if not given.",
-)
-@click.option(
-    "--method",
-    default="",
-    metavar="METHOD",
-    help="For c and fmu: how states move between ticks, as for simulate; rk4:STEP where they are not linear.",
-)
-@file_option("--out", "The file to write.", required=True)
-@json_option
+@command
 def export_command(
+    *,
     file: str | None,
-    to: str | None,
+    to: str | None = option(
+        "control: a script that makes a python-control StateSpace (.py); mat, npz: the same matrices for "
+        "MATLAB, SciPy, NumPy; modelica: a flat model with clocks (.mo); c: one tick of a peer in C99, with "
+        "header and driver; fmu: the scene or a peer for co-simulation (FMI 2.0). Taken from --out if not "
+        "given.",
+        "FORMAT",
+    ),
     settings: tuple[str, ...],
-    cut: str,
-    free: tuple[str, ...],
-    peer: str,
-    device: str,
-    method: str,
-    out: Path,
+    cut: str = option(
+        "Cut the loop open at a link or a coupler, for margins and designs of your own: closed again by "
+        "u = -y it is the closed loop.",
+        "NAME",
+    ),
+    free: tuple[str, ...] = option(
+        "Leave a number free: A, B, C and D are a casadi.Function of it too, `casadi_function` in the "
+        "file. May be repeated.",
+        "PATH",
+    ),
+    peer: str = option("For c and fmu: one peer, such as 'left[1]'. An FMU is of all.", "NAME"),
+    device: str = option(
+        "For c: what the peer's computer doesn't move, several with commas between, or none. What a hand "
+        "holds, or others are not told of, if not given.",
+        "MASS",
+    ),
+    method: str = option(
+        "For c and fmu: how states move between ticks, as for simulate; rk4:STEP where they are not linear.",
+        "METHOD",
+    ),
+    out: Path = option("The file to write."),
     as_json: bool,
 ) -> None:
     """Hand a scene over to other tools.
@@ -101,6 +70,4 @@ def export_command(
     chosen = format_of(to, out)
     system = open_scene(file, settings, {"--out": out}, told=note_aside)
     found = export(system, chosen, Asked(cut, free, peer, device, method), out)
-    print_result(found, as_json=as_json, err=beside(out))
-    if not as_json:
-        tell(f"\n{out} is written", err=beside(out))
+    print_result(found, as_json=as_json, written=[out])

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import Command, json_option, tell
+from apc.cli.options import argument, command, option, tell
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import unwritable
 from apc.present.forms import json_text
@@ -24,10 +24,12 @@ _FIRST_LINE = re.compile(r"\A# yaml-language-server:.*\n")
 _TOPOLOGY = re.compile(r"^topology:\s*[^\s#]+", re.MULTILINE)
 
 
-@click.command("library", cls=Command)
-@click.argument("name", required=False)
-@json_option
-def library_command(name: str | None, as_json: bool) -> None:
+@command
+def library_command(
+    *,
+    name: str | None = argument(required=False),
+    as_json: bool,
+) -> None:
     """List the components of the library, or show one.
 
     NAME is a component or connector: what it is, its parameters with their
@@ -42,11 +44,13 @@ def library_command(name: str | None, as_json: bool) -> None:
         tell(json_text(catalogue.component_document(name)) if as_json else catalogue.component_text(name))
 
 
-@click.command("new", cls=Command)
-@click.argument("name", required=False)
-@click.option("--like", metavar="SCENE", help="Copy this scene of the library, and the tables it names.")
-@click.option("--list", "listing", is_flag=True, help="Name the scenes of the library; write nothing.")
-def new_command(name: str | None, like: str | None, listing: bool) -> None:
+@command
+def new_command(
+    *,
+    name: str | None = argument(required=False),
+    like: str | None = option("Copy this scene of the library, and the tables it names.", "SCENE"),
+    listing: bool = option("Name the scenes of the library; write nothing.", name="--list"),
+) -> None:
     """Write NAME.yaml, a commented topology to start from.
 
     NAME is "topology" if not given, or the name of the scene that is copied.

@@ -9,20 +9,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import click
-
-from apc.cli.options import Command, beside, file_option, json_option, print_result, tell
+from apc.cli.options import argument, command, option, print_result
 from apc.compiler.errors import ApcError, Mistake, Place
 
 
-@click.command("network", cls=Command)
-@click.argument("recording")
-@click.option(
-    "--interval", metavar='"VALUE UNIT"', help="What lies between two packets, where RECORDING doesn't say."
-)
-@file_option("--out", "Write the delays as a table, a row a packet (.csv).")
-@json_option
-def network_command(recording: str, interval: str | None, out: Path | None, as_json: bool) -> None:
+@command
+def network_command(
+    *,
+    recording: str = argument(),
+    interval: str | None = option(
+        "What lies between two packets, where RECORDING doesn't say.", '"VALUE UNIT"'
+    ),
+    out: Path | None = option("Write the delays as a table, a row a packet (.csv)."),
+    as_json: bool,
+) -> None:
     """Say what a recorded network amounts to, as a link's own keys.
 
     RECORDING is what `ping HOST > FILE` or `irtt client -o FILE.json HOST`
@@ -54,6 +54,4 @@ def network_command(recording: str, interval: str | None, out: Path | None, as_j
         from apc.present.recorded_network import recording_table
 
         write_text(out, recording_table(found))
-    print_result(found, as_json=as_json, err=beside(out))
-    if out is not None and not as_json:
-        tell(f"\n{out} is written", err=beside(out))
+    print_result(found, as_json=as_json, written=[out])

@@ -1,86 +1,140 @@
-"""What commands have in common: FILE, the options `--set` and `--json`, and how a result is printed.
+"""What commands have in common: how they are declared, options that several take, how a result is printed.
 
-Takes: a result.
-Gives: `Command`; `file_argument`, `file_option`, `set_option`, `in_option`, `hands_option`,
-`duration_option`, `seed_option`, `json_option`, `check_plot`, `criterion_with`, `WholeNumber`;
-`print_result`, `tell`, `beside`.
-Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal.
+Takes: a function whose parameters say what a command takes; a result.
+Gives: `command`, `option`, `argument`; `picture_option`, `result_option`, `seed_option`, `WholeNumber`;
+`criterion_with`; `print_result`, `tell`, `beside`, `note_aside`, `note_usual`.
+Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal;
+a file that can't be written is refused before anything is computed.
 Does not: know any command.
 """
 
 from __future__ import annotations
 
+import inspect
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 
 from apc.compiler.digits import plain_int
 from apc.compiler.errors import ApcError, Mistake, Place, visible
-from apc.compiler.files import is_stdout
+from apc.compiler.files import check_target, is_stdout
 from apc.compiler.timings import part, record
 from apc.present.forms import json_text
 from apc.result import Result
 from apc.threads import start_single_threaded
 
-Function = TypeVar("Function", bound=Callable[..., None])
-
-file_argument = click.argument("file", required=False)
-set_option = click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar='PATH="VALUE UNIT"',
-    help='Change a parameter first, e.g. --set contact.stiffness="800 N/m". May be repeated.',
-)
-in_option = click.option(
-    "--in",
-    "criterion",
-    type=click.Choice(("mean-square", "nominal")),
-    help="What stable means. mean-square: second moments die out over the network as it is, the default "
-    "where a link is unreliable; nominal: motions die out if every packet takes its nominal delay.",
-)
-hands_option = click.option(
-    "--hands",
-    default="free",
-    show_default=True,
-    metavar="HANDS",
-    help="What holds the devices. free: nothing but what the scene says. clamped: they are held fast. held: "
-    "each by a hand of hand.mass, hand.damping and hand.stiffness, 0 unless --set. passive: stable means "
-    "stable with all hands that give back no more energy than they got. Or a hand of the library, such as "
-    "StylusArmForward.",
-)
-duration_option = click.option(
-    "--duration",
-    metavar='"TIME"',
-    help='How long, such as "2 s"; that of the scene\'s experiment if not given.',
-)
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
+# What the annotation of a parameter says of its option, where `option` says nothing else.
+FILE = {"type": click.Path(path_type=Path), "metavar": "FILE"}
+BY_TYPE: dict[str, dict[str, Any]] = {
+    "bool": {"is_flag": True},
+    "str": {"default": ""},
+    "tuple[str, ...]": {"multiple": True},
+    "Path | None": FILE,
+    "Path": {**FILE, "required": True},
+}
 
 
-def file_option(name: str, told: str, *, required: bool = False) -> Callable[[Function], Function]:
-    """Return an option that names a file to write; `told` is its help."""
-    return click.option(name, type=click.Path(path_type=Path), metavar="FILE", help=told, required=required)
+def option(told: str, metavar: str | None = None, *, name: str = "", **settings: Any) -> Any:
+    """Return what a parameter of a command has in the place of a default: its option.
+
+    Parameters
+    ----------
+    told
+        The option's help.
+    metavar
+        What stands for its value in the help.
+    name
+        As it is written; `--` and the parameter's name if not given.
+    settings
+        More that click's `Option` takes, beside what the parameter's annotation says: see `BY_TYPE`.
+    """
+
+    def make(parameter: inspect.Parameter) -> click.Parameter:
+        said = {**BY_TYPE.get(parameter.annotation, {}), **({"metavar": metavar} if metavar else {})}
+        said = {"show_default": bool(settings.get("default")), **said, **settings}
+        return click.Option(
+            [name or f"--{parameter.name.replace('_', '-')}", parameter.name], help=told, **said
+        )
+
+    return make
 
 
-def seed_option(packets: str) -> Callable[[Function], Function]:
-    """Return the option `--seed` of what happens by chance to `packets`, such as "that get lost"."""
-    return click.option(
-        "--seed",
-        type=WholeNumber(0, 2**63 - 1),
-        metavar="NUMBER",
-        help=f"Of packets {packets}; the experiment's if not given.",
-    )
+def argument(**settings: Any) -> Any:
+    """Return the same for an argument: `settings` are those of click's `Argument`."""
+    return lambda parameter: click.Argument([parameter.name], **settings)
 
 
-def check_plot(plot: Path | None) -> None:
-    """Refuse a picture that can't be drawn, before anything is computed."""
-    if plot is not None:
+def picture_option(told: str) -> Any:
+    """Return an option that names a picture to write."""
+    return option(told, callback=_drawable)
+
+
+def result_option() -> Any:
+    """Return the option `--out` of a result that can be drawn, tabulated, or written as JSON."""
+    told = "Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json."
+    return option(told, callback=_writable)
+
+
+def _drawable(_: click.Context, asked: click.Parameter, path: Path | None) -> Path | None:
+    if path is not None:
         from apc.present.pictures import check_format
 
-        check_format(plot)
+        check_target(path)
+        check_format(path, asked.opts[0])
+    return path
+
+
+def _writable(_: click.Context, asked: click.Parameter, path: Path | None) -> Path | None:
+    if path is not None:
+        from apc.present.pictures import check_result_path
+
+        check_result_path(path)
+    return path
+
+
+def seed_option(packets: str) -> Any:
+    """Return the option `--seed` of what happens by chance to `packets`, such as "that get lost"."""
+    told = f"Of packets {packets}; the experiment's if not given."
+    return option(told, "NUMBER", type=WholeNumber(0, 2**63 - 1))
+
+
+# What parameters without a default are, by their names.
+SHARED: dict[str, Callable[[inspect.Parameter], click.Parameter]] = {
+    "file": argument(required=False),
+    "settings": option(
+        'Change a parameter first, e.g. --set contact.stiffness="800 N/m". May be repeated.',
+        'PATH="VALUE UNIT"',
+        name="--set",
+    ),
+    "criterion": option(
+        "What stable means. mean-square: second moments die out over the network as it is, the default "
+        "where a link is unreliable; nominal: motions die out if every packet takes its nominal delay.",
+        name="--in",
+        type=click.Choice(("mean-square", "nominal")),
+    ),
+    "hands": option(
+        "What holds the devices. free: nothing but what the scene says. clamped: they are held fast. held: "
+        "each by a hand of hand.mass, hand.damping and hand.stiffness, 0 unless --set. passive: stable means "
+        "stable with all hands that give back no more energy than they got. Or a hand of the library, such "
+        "as StylusArmForward.",
+        "HANDS",
+        default="free",
+    ),
+    "duration": option('How long, such as "2 s"; that of the scene\'s experiment if not given.', '"TIME"'),
+    "as_json": option("Print one JSON document instead of text.", name="--json"),
+}
+
+
+def command(function: Callable[..., None]) -> Command:
+    """Return a function `NAME_command` as the command of that name, its options in their order."""
+    asked = inspect.signature(function).parameters.values()
+    made = [(SHARED[one.name] if one.default is one.empty else one.default)(one) for one in asked]
+    made.append(click.Option(["--timings"], is_flag=True, help="Say on stderr how long each part took."))
+    name = function.__name__.removesuffix("_command")
+    return Command(name, callback=function, params=made, help=inspect.cleandoc(function.__doc__ or ""))
 
 
 def criterion_with(hands: str, criterion: str | None) -> str | None:
@@ -95,11 +149,6 @@ def criterion_with(hands: str, criterion: str | None) -> str | None:
 
 class Command(click.Command):
     """A command that says with --timings how long each of its parts took."""
-
-    def __init__(self, *arguments: Any, **settings: Any) -> None:
-        super().__init__(*arguments, **settings)
-        told = "Say on stderr how long each part took."
-        self.params.append(click.Option(["--timings"], is_flag=True, help=told))
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command with one thread of each library, its parts measured if that is asked for."""
@@ -128,9 +177,27 @@ class WholeNumber(click.IntRange):
 
 
 @part("print")
-def print_result(found: Result, *, as_json: bool, err: bool = False) -> None:
-    """Print a result, as one JSON document or in words."""
+def print_result(
+    found: Result, *, as_json: bool, written: Iterable[Path | None] = (), before: str | None = "\n"
+) -> None:
+    """Print a result, as one JSON document or in words, and which files of it are written.
+
+    Parameters
+    ----------
+    found
+        The result.
+    as_json
+        Whether as JSON, which goes alone.
+    written
+        The files, None for those not asked for; if one is stdout all is printed on stderr.
+    before
+        What stands before the name of a file; None where the result names it itself.
+    """
+    files = [one for one in written if one is not None]
+    err = beside(*files)
     tell(json_text(found.to_dict()) if as_json else str(found), err=err)
+    for one in () if as_json or before is None else files:
+        tell(f"{before}{one} is written", err=err)
 
 
 def beside(*outputs: Path | None) -> bool:

@@ -14,70 +14,31 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import (
-    Command,
-    duration_option,
-    file_argument,
-    file_option,
-    json_option,
-    note_aside,
-    print_result,
-    seed_option,
-    set_option,
-    tell,
-)
+from apc.cli.options import command, note_aside, option, print_result, seed_option, tell
 from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Mistake, Place
 
 
-@click.command("play", cls=Command)
-@file_argument
-@duration_option
-@set_option
-@click.option(
-    "--peer", metavar="PEER", help="Play this peer alone, such as left[1]; all of them if not given."
-)
-@click.option("--listen", metavar="HOST:PORT", help="Where this peer listens.")
-@click.option(
-    "--to", multiple=True, metavar="PEER=HOST:PORT", help="Where another peer is. Repeated for each."
-)
-@click.option(
-    "--emulate",
-    is_flag=True,
-    help="Hold back and lose packets at the sender, as the scene's links say, beside what the network does.",
-)
-@seed_option("that --emulate loses")
-@click.option(
-    "--device",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="A device in the place of this peer's simulated one: a function device(time, force) in a .py file, "
-    "double apc_device(double, const double *) in a .so.",
-)
-@file_option("--secret-file", "What only the peers know: datagrams without it are dropped.")
-@click.option(
-    "--wait", "patience", default="30 s", show_default=True, metavar='"TIME"', help="For the others."
-)
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    metavar="FOLDER",
-    help="Where the run is kept; NAME.run for NAME.yaml.",
-)
-@json_option
+@command
 def play_command(
+    *,
     file: str | None,
     duration: str | None,
     settings: tuple[str, ...],
-    peer: str | None,
-    listen: str | None,
-    to: tuple[str, ...],
-    emulate: bool,
-    seed: int | None,
-    device: Path | None,
-    secret_file: Path | None,
-    patience: str,
-    out: Path | None,
+    peer: str | None = option("Play this peer alone, such as left[1]; all of them if not given.", "PEER"),
+    listen: str | None = option("Where this peer listens.", "HOST:PORT"),
+    to: tuple[str, ...] = option("Where another peer is. Repeated for each.", "PEER=HOST:PORT"),
+    emulate: bool = option(
+        "Hold back and lose packets at the sender, as the scene's links say, beside what the network does."
+    ),
+    seed: int | None = seed_option("that --emulate loses"),
+    device: Path | None = option(
+        "A device in the place of this peer's simulated one: a function device(time, force) in a .py file, "
+        "double apc_device(double, const double *) in a .so."
+    ),
+    secret_file: Path | None = option("What only the peers know: datagrams without it are dropped."),
+    patience: str = option("For the others.", '"TIME"', name="--wait", default="30 s"),
+    out: Path | None = option("Where the run is kept; NAME.run for NAME.yaml.", "FOLDER"),
     as_json: bool,
 ) -> None:
     """Play a scene in real time, over a network.

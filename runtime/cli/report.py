@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from apc.cli.options import Command, file_option, set_option, tell
+from apc.cli.options import argument, command, option, tell
 from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Mistake, Place
 
@@ -23,18 +23,13 @@ if TYPE_CHECKING:
     from apc.reports.contents import Report
 
 
-@click.command("report", cls=Command)
-@click.argument("files", nargs=-1, metavar="[FILE...]")
-@set_option
-@file_option("--out", "Write the page here: .html, or .pdf by Chromium.")
-@click.option(
-    "--check",
-    type=click.Path(path_type=Path),
-    metavar="REPORT",
-    help="Compute the numbers of a report.html anew, and say what differs.",
-)
+@command
 def report_command(
-    files: tuple[str, ...], settings: tuple[str, ...], out: Path | None, check: Path | None
+    *,
+    files: tuple[str, ...] = argument(nargs=-1, metavar="[FILE...]"),
+    settings: tuple[str, ...],
+    out: Path | None = option("Write the page here: .html, or .pdf by Chromium."),
+    check: Path | None = option("Compute the numbers of a report.html anew, and say what differs.", "REPORT"),
 ) -> None:
     """Gather all that is known of scenes in one page.
 
@@ -113,4 +108,4 @@ def _differs(kept: KeptScene, again: Report) -> Iterator[str]:
         elif old["refused"] != section["refused"]:
             yield f"{title}: {section['refused'] or 'there is one'}, not: {old['refused'] or 'there is one'}"
         else:
-            yield from (f"{title}: {what}" for what in differences(old["tables"], section["tables"]))
+            yield from (f"{title}: {what}" for what in differences(old["results"], section["results"]))

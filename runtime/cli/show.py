@@ -12,7 +12,7 @@ from pathlib import Path
 
 import click
 
-from apc.cli.options import Command, beside, file_argument, file_option, tell
+from apc.cli.options import beside, command, option, tell
 from apc.compiler.files import write_text
 from apc.present.forms import json_text
 from apc.suffixes import check_suffix
@@ -22,22 +22,19 @@ FORMATS |= {".png": "picture", ".pdf": "picture"}
 PICTURES = (".svg", ".png", ".pdf")
 
 
-@click.command("show", cls=Command)
-@file_argument
-@click.option(
-    "--format",
-    "format_",
-    type=click.Choice(["text", "json", "dot", "mermaid", "svg"]),
-    help="text: graph, equations, schedule. json: the same as one document. dot, mermaid: the graph for "
-    "Graphviz and Mermaid. svg: the graph as a picture. Taken from --out if not given, else text.",
-)
-@click.option(
-    "--parameters",
-    is_flag=True,
-    help="List what may be set instead: names, values, units, limits; as text or json.",
-)
-@file_option("--out", "Write to this file: .txt .json .dot .mmd, or as a picture .svg .png .pdf.")
-def show_command(file: str | None, format_: str | None, parameters: bool, out: Path | None) -> None:
+@command
+def show_command(
+    *,
+    file: str | None,
+    format_: str | None = option(
+        "text: graph, equations, schedule. json: the same as one document. dot, mermaid: the graph for "
+        "Graphviz and Mermaid. svg: the graph as a picture. Taken from --out if not given, else text.",
+        name="--format",
+        type=click.Choice(["text", "json", "dot", "mermaid", "svg"]),
+    ),
+    parameters: bool = option("List what may be set instead: names, values, units, limits; as text or json."),
+    out: Path | None = option("Write to this file: .txt .json .dot .mmd, or as a picture .svg .png .pdf."),
+) -> None:
     """Show what a scene is made of: its graph, equations and schedule.
 
     The graph has the parts of one peer and how they are joined, and the
@@ -80,9 +77,11 @@ def _show_parameters(file: str | None, wanted: str, out: Path | None) -> None:
     _print_or_write(json_text(found.to_dict()) if wanted == "json" else str(found), out)
 
 
-@click.command("schema", cls=Command)
-@file_option("--out", "Write to this file instead of the terminal.")
-def schema_command(out: Path | None) -> None:
+@command
+def schema_command(
+    *,
+    out: Path | None = option("Write to this file instead of the terminal."),
+) -> None:
     """Print the JSON Schema of topologies, for editors.
 
     An editor that knows YAML schemas completes and checks a topology whose

@@ -16,17 +16,13 @@ from typing import TYPE_CHECKING
 import click
 
 from apc.cli.options import (
-    Command,
     WholeNumber,
-    beside,
-    duration_option,
-    file_argument,
-    file_option,
-    json_option,
+    command,
     note_aside,
+    option,
+    picture_option,
     print_result,
     seed_option,
-    set_option,
     tell,
 )
 from apc.cli.progress import progress_bar
@@ -42,70 +38,44 @@ if TYPE_CHECKING:
     from apc.simulation.trajectory import Sink
 
 
-@click.command("simulate", cls=Command)
-@file_argument
-@duration_option
-@set_option
-@click.option(
-    "--signals",
-    multiple=True,
-    metavar="PATTERN",
-    help="Record only what fits, such as cube.x, 'left[2].*' or '*.v'. May be repeated.",
-)
-@file_option("--out", "Write the rows to this file: .csv, .parquet, .mat or .npz; or what moves: .gif, .mp4.")
-@file_option("--plot", "Draw them, a panel a quantity: .png, .svg or .pdf.")
-@file_option("--still", "Draw how it begins, the peers' bodies side by side: .png, .svg or .pdf.")
-@json_option
-@click.option("--no-jit", is_flag=True, help="Don't compile to machine code.")
-@seed_option("that get lost or come late")
-@click.option(
-    "--runs",
-    type=WholeNumber(1, 10_000_000),
-    metavar="NUMBER",
-    help="Play it so often, with other packets each time, and say what that amounts to.",
-)
-@click.option(
-    "--jobs",
-    type=WholeNumber(1, 1024),
-    default=1,
-    show_default=True,
-    metavar="NUMBER",
-    help="Processes that share the runs.",
-)
-@click.option(
-    "--method",
-    metavar="METHOD",
-    help="exact, rk4:STEP, semi-implicit:STEP or cvodes:RTOL; exact where linear and CVODES elsewhere if "
-    "not given.",
-)
-@click.option(
-    "--strike",
-    metavar="PEER",
-    help='Strike a peer as it begins, such as "user[1]": its device starts at 0.1 m/s.',
-)
-@click.option(
-    "--trace-of",
-    type=click.Choice(["worst"]),
-    help="Lose packets by the periodic pattern that analyze finds to shake the scene.",
-)
-@click.option("--error", is_flag=True, help="Play it a second time, more closely, and say how far off it is.")
+@command
 def simulate_command(
+    *,
     file: str | None,
     duration: str | None,
     settings: tuple[str, ...],
-    signals: tuple[str, ...],
-    out: Path | None,
-    plot: Path | None,
-    still: Path | None,
+    signals: tuple[str, ...] = option(
+        "Record only what fits, such as cube.x, 'left[2].*' or '*.v'. May be repeated.", "PATTERN"
+    ),
+    out: Path | None = option(
+        "Write the rows to this file: .csv, .parquet, .mat or .npz; or what moves: .gif, .mp4."
+    ),
+    plot: Path | None = picture_option("Draw them, a panel a quantity: .png, .svg or .pdf."),
+    still: Path | None = picture_option(
+        "Draw how it begins, the peers' bodies side by side: .png, .svg or .pdf."
+    ),
     as_json: bool,
-    no_jit: bool,
-    seed: int | None,
-    runs: int | None,
-    jobs: int,
-    method: str | None,
-    strike: str | None,
-    trace_of: str | None,
-    error: bool,
+    no_jit: bool = option("Don't compile to machine code."),
+    seed: int | None = seed_option("that get lost or come late"),
+    runs: int | None = option(
+        "Play it so often, with other packets each time, and say what that amounts to.",
+        "NUMBER",
+        type=WholeNumber(1, 10_000_000),
+    ),
+    jobs: int = option("Processes that share the runs.", "NUMBER", type=WholeNumber(1, 1024), default=1),
+    method: str | None = option(
+        "exact, rk4:STEP, semi-implicit:STEP or cvodes:RTOL; exact where linear and CVODES elsewhere if "
+        "not given.",
+        "METHOD",
+    ),
+    strike: str | None = option(
+        'Strike a peer as it begins, such as "user[1]": its device starts at 0.1 m/s.', "PEER"
+    ),
+    trace_of: str | None = option(
+        "Lose packets by the periodic pattern that analyze finds to shake the scene.",
+        type=click.Choice(["worst"]),
+    ),
+    error: bool = option("Play it a second time, more closely, and say how far off it is."),
 ) -> None:
     """Play a scene in time.
 
@@ -131,7 +101,8 @@ def simulate_command(
         raise click.UsageError("--runs keeps no rows: --signals, --out, --plot and --error are for one run")
     chosen = parse_method(method) if method is not None else DEFAULT
     asked = parse_duration(duration) if duration is not None else None
-    _check_files(out, plot, still)
+    if out is not None:
+        _check_rows(out)
     system = open_scene(file, settings, {"--out": out, "--plot": plot, "--still": still}, told=note_aside)
     if trace_of is not None:
         from apc.moments.worst import trace_of_worst
@@ -146,9 +117,10 @@ def simulate_command(
         asked = asked or system.experiment.duration or WATCHED
     seconds = duration_of(system, asked, runs=runs or 1)
     if still is not None:
-        from apc.present.still import save_still
+        from apc.present.pictures import write_picture
+        from apc.present.still import draw_actors
 
-        save_still(system, still)
+        write_picture(lambda: draw_actors(system)[0], still)
     how = Settings(seconds, chosen, seed, jit=not no_jit)
     if runs is not None:
         _play_many(system, how, runs, jobs, as_json=as_json)
@@ -167,19 +139,13 @@ class _Kept:
     error: bool
 
 
-def _check_files(out: Path | None, plot: Path | None, still: Path | None) -> None:
-    """Refuse a file that can't be written, or a picture that can't be drawn, before anything is computed."""
-    if out is not None:
-        from apc.present import animation
-        from apc.present.recording import SUFFIXES
+def _check_rows(out: Path) -> None:
+    """Refuse a file that can't be written, before anything is computed."""
+    from apc.present import animation
+    from apc.present.recording import SUFFIXES
 
-        if check_suffix(out, (*SUFFIXES, *animation.SUFFIXES), "--out") in animation.SUFFIXES:
-            animation.check_animation(out)
-    for path, option in ((plot, "--plot"), (still, "--still")):
-        if path is not None:
-            from apc.present.pictures import check_format
-
-            check_format(path, option)
+    if check_suffix(out, (*SUFFIXES, *animation.SUFFIXES), "--out") in animation.SUFFIXES:
+        animation.check_animation(out)
 
 
 def _play_many(system: CompiledSystem, how: Settings, runs: int, jobs: int, *, as_json: bool) -> None:
@@ -223,10 +189,10 @@ def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bo
         out = partial_name(moving) if interrupted else moving
         save_animation(system, trajectory_of(simulation, keeper, summary, interrupted), out)
     if plot is not None and keeper is not None:
-        from apc.present.simulation import save_picture
+        from apc.present.pictures import write_picture
 
         plot = partial_name(plot) if interrupted else plot
-        save_picture(trajectory_of(simulation, keeper, summary, interrupted), plot)
+        write_picture(trajectory_of(simulation, keeper, summary, interrupted).plot, plot)
     found = Played(
         topology=system.name,
         summary=summary,
@@ -234,12 +200,7 @@ def _play_one(system: CompiledSystem, how: Settings, kept: _Kept, *, as_json: bo
         interrupted=interrupted,
         error=estimate,
     )
-    err = beside(out, plot, kept.still)
-    print_result(found, as_json=as_json, err=err)
-    if not as_json:
-        for written in (out, plot, kept.still):
-            if written is not None:
-                tell(f"  {written} is written", err=err)
+    print_result(found, as_json=as_json, written=[out, plot, kept.still], before="  ")
     if interrupted:
         until = f"{summary.end:g} s of {float(how.duration):g} s"
         tell(f"stopped at {until}; what was done is kept", err=True)

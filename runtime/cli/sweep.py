@@ -12,22 +12,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import click
-
 from apc.cli.options import (
-    Command,
     WholeNumber,
-    beside,
+    command,
     criterion_with,
-    file_argument,
-    file_option,
-    hands_option,
-    in_option,
-    json_option,
     note_aside,
     note_usual,
+    option,
     print_result,
-    set_option,
     tell,
 )
 from apc.cli.progress import Bar, progress_bar
@@ -36,51 +28,30 @@ from apc.compiler.files import is_special
 from apc.option_value import option_value
 
 
-@click.command("sweep", cls=Command)
-@file_argument
-@click.option(
-    "--over",
-    multiple=True,
-    required=True,
-    metavar="PATH=VALUES",
-    help="Vary a parameter: PATH='LOW:HIGH', 'LOW:HIGH:COUNT', 'LOW:HIGH:COUNT:log' or 'V1,V2,V3', with "
-    "units. May be repeated: every combination is computed, the last parameter turning fastest.",
-)
-@file_option("--out", "Write the rows to this file, .parquet or .csv.", required=True)
-@click.option(
-    "--of",
-    default="analyze",
-    show_default=True,
-    metavar="WHAT",
-    help="What to compute at each point; see below.",
-)
-@in_option
-@hands_option
-@set_option
-@click.option("--jobs", type=WholeNumber(min=1), help="Processes to compute with; all cores by default.")
-@click.option(
-    "--cluster",
-    metavar="ADDRESS",
-    help="Compute on a running Dask cluster instead: its scheduler's address, tcp://HOST:8786.",
-)
-@click.option(
-    "--patience",
-    metavar='"TIME"',
-    help='End when nothing has come from processes or cluster for so long, such as "10 min"; wait for ever '
-    "if not given.",
-)
-@json_option
+@command
 def sweep_command(
+    *,
     file: str | None,
-    over: tuple[str, ...],
-    out: Path,
-    of: str,
+    over: tuple[str, ...] = option(
+        "Vary a parameter: PATH='LOW:HIGH', 'LOW:HIGH:COUNT', 'LOW:HIGH:COUNT:log' or 'V1,V2,V3', with "
+        "units. May be repeated: every combination is computed, the last parameter turning fastest.",
+        "PATH=VALUES",
+        required=True,
+    ),
+    out: Path = option("Write the rows to this file, .parquet or .csv."),
+    of: str = option("What to compute at each point; see below.", "WHAT", default="analyze"),
     criterion: str | None,
     hands: str,
     settings: tuple[str, ...],
-    jobs: int | None,
-    cluster: str | None,
-    patience: str | None,
+    jobs: int | None = option("Processes to compute with; all cores by default.", type=WholeNumber(min=1)),
+    cluster: str | None = option(
+        "Compute on a running Dask cluster instead: its scheduler's address, tcp://HOST:8786.", "ADDRESS"
+    ),
+    patience: str | None = option(
+        'End when nothing has come from processes or cluster for so long, such as "10 min"; wait for ever '
+        "if not given.",
+        '"TIME"',
+    ),
     as_json: bool,
 ) -> None:
     """Compute a result at every combination of parameter values.
@@ -121,7 +92,7 @@ def sweep_command(
             progress=progress,
             patience=waiting,
         )
-    print_result(result, as_json=as_json, err=beside(out))
+    print_result(result, as_json=as_json, written=[out], before=None)
 
 
 def _seconds(patience: str | None) -> float | None:

@@ -475,35 +475,31 @@ class Page:
             self._ask_region(tuple(overrides_of(self.sliders, self.places)))
         if section == "region" and self.modes is not None:
             self._later(lambda: self.roots.show(self.modes), FRAMES)
+        if found is None:
+            clearing = {"region": self.region.clear, "feel": self.feel.clear, "motion": self.motion.clear}
+            clearing.get(section, self._words(section).nothing)(told.why)
+            return
         match section:
-            case "verdict" if found is not None:
+            case "verdict":
                 self.verdict.verdict(found)
                 self.modes = found
                 if self.desks[REGION].busy is None:
                     self.roots.show(found)
-            case "roots" if found is not None:
+            case "roots":
                 self.roots.way_of(found)
-            case "region" if found is not None:
+            case "region":
                 self.region.show(found)
-            case "motion" if found is not None:
+            case "motion":
                 self.motion.show(found["motion"])
-            case "feel" if found is not None:
+            case "feel":
                 self.feel.show(found)
                 self.held = found["names"]
                 if len(self.held) > 1:
                     self.at.update(options=self.held, value=found["at"], visible=True)
-            case "numbers" if found is not None:
+            case "numbers":
                 self._save_numbers(found)
-            case "margins" | "network" if found is not None:
-                self._words(section).table(found["text"])
-            case "region":
-                self.region.clear(told.why)
-            case "feel":
-                self.feel.clear(told.why)
-            case "motion":
-                self.motion.clear(told.why)
             case _:
-                self._words(section).nothing(told.why)
+                self._words(section).table(found["text"])
 
     def _words(self, section: str) -> Words:
         words = {"verdict": self.verdict, "roots": self.roots.way_words}

@@ -1,6 +1,6 @@
 """Measurements as text, plain data and a picture: error against time, a panel a task.
 
-Takes: a `Bench`, a `HardReport`, a `Scale`. Gives: their texts, documents and pictures; `save_bench`.
+Takes: a `Bench`, a `HardReport`, a `Scale`. Gives: their texts, documents and pictures.
 Guarantees: an error stands beside every time. In a picture every point is named; the Pareto front is a line
 of steps, the default a filled mark.
 Does not: compute, or need a display.
@@ -11,14 +11,12 @@ matplotlib is loaded when something is drawn and not before.
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apc.benchmark.bench import SAME, Bench, Comparison, Measured
 from apc.compiler.words import counted, wrapped
-from apc.optional import need
 from apc.present.forms import document, notes, table
-from apc.present.pictures import COLOURS, write_figure
+from apc.present.pictures import COLOURS, new_figure
 
 if TYPE_CHECKING:
     from apc.benchmark.hard import HardReport
@@ -151,18 +149,12 @@ def bench_picture(found: Bench) -> Any:
     ApcError
         E875 matplotlib is not installed.
     """
-    figures = need("matplotlib.figure", "plot")
-    figure = figures.Figure(figsize=(WIDTH * len(found.comparisons), HEIGHT), layout="constrained")
+    figure = new_figure((WIDTH * len(found.comparisons), HEIGHT))
     axes = figure.subplots(1, len(found.comparisons), squeeze=False)[0]
     for ax, one in zip(axes, found.comparisons, strict=True):
         _panel(ax, one)
     figure.suptitle(f"{found.topology}: error against time", fontsize=11)
     return figure
-
-
-def save_bench(found: Bench, path: Path) -> None:
-    """Draw to a file whose suffix says the format. Raises ApcError if it can't be written."""
-    write_figure(bench_picture(found), path)
 
 
 def _panel(ax: Any, found: Comparison) -> None:

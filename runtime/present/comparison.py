@@ -1,7 +1,6 @@
-"""Schemes side by side as text, plain data and a table; the file of a comparison.
+"""Schemes side by side as text, plain data and rows of a table.
 
-Takes: a `Comparison`, and a path.
-Gives: its text, document and table; `write_comparison`.
+Takes: a `Comparison`. Gives: its text, document and rows.
 Guarantees: what is left out stands first; a cell that can't be had says why in a footnote; a line is at most
 80 columns wide.
 Does not: compute, or draw itself (see `comparison_picture`).
@@ -11,22 +10,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apc.compiler.timings import part
 from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
-from apc.optional import need
 from apc.present.comparison_picture import comparison_picture  # noqa: F401 -- looked up
 from apc.present.forms import MEANT, notes, picked, quantity, reached, record, table
-from apc.present.pictures import write_result
 from apc.tables import Column, Row
 
 if TYPE_CHECKING:
-    import pandas
-
     from apc.comparison.comparison import Comparison, Scheme
     from apc.vary.critical import Critical
 
@@ -174,20 +167,11 @@ def _document(one: Scheme) -> dict[str, Any]:
     return record(one, {**picked(one, "verdict", "stable", "left_out"), **told, "missing": dict(one.missing)})
 
 
-def comparison_table(found: Comparison) -> pandas.DataFrame:
-    """Return a pandas table with a row a scheme."""
-    headings = [column.heading for column, _ in COLUMNS]
-    return need("pandas", "data").DataFrame([_row(one) for one in found.schemes], columns=headings)
-
-
-@part("draw")
-def write_comparison(path: Path, found: Comparison) -> None:
-    """Write a comparison to a picture, a table or JSON, by the suffix."""
+def comparison_rows(found: Comparison) -> tuple[list[Column], Iterator[Row], dict[str, Any]]:
+    """Return the columns of a table of schemes, a row a scheme, and what was left out."""
     left_out = {one.topology: list(one.left_out) for one in found.schemes}
     columns = [column for column, _ in COLUMNS]
-    rows = (_row(one) for one in found.schemes)
-    made = {"left_out": left_out, "notes": list(found.notes)}
-    write_result(path, found, found.plot, (columns, rows, made))
+    return columns, map(_row, found.schemes), {"left_out": left_out, "notes": list(found.notes)}
 
 
 def _varied_columns(key: str, unit: str) -> list[tuple[Column, str]]:

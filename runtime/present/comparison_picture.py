@@ -15,9 +15,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from apc.optional import need
 from apc.present.forms import reached
-from apc.present.pictures import COLOURS
+from apc.present.pictures import COLOURS, new_figure
 
 if TYPE_CHECKING:
     from apc.comparison.comparison import Comparison, Scheme
@@ -72,7 +71,6 @@ def comparison_picture(found: Comparison) -> Any:
     ApcError
         E875 matplotlib is not installed.
     """
-    figures = need("matplotlib.figure", "plot")
     schemes = found.schemes
     panels = [(title, [_number(one, path, scale) for one in schemes]) for title, path, scale in NUMBERS]
     reaches = [
@@ -84,7 +82,7 @@ def comparison_picture(found: Comparison) -> Any:
         "\n".join(textwrap.wrap(f"{place}  {one.topology}", LABEL)) for place, one in enumerate(schemes, 1)
     ]
     size = (PANEL * COLUMNS + 1.4, (0.9 + BAR * 1.25 * len(names)) * rows + 0.5)
-    figure = figures.Figure(figsize=size, layout="constrained")
+    figure = new_figure(size)
     axes = figure.subplots(rows, COLUMNS, squeeze=False, sharey=True).ravel()
     for ax, (title, bars) in zip(axes, panels, strict=True):
         _draw(ax, title, bars)

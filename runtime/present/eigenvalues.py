@@ -1,6 +1,6 @@
 """Eigenvalues as a picture: those of a scene over the unit circle, and where they go as a number grows.
 
-Takes: an `Analysis`, a `Locus`. Gives: `eigenvalues_picture`, `locus_picture`; `save_eigenvalues`.
+Takes: an `Analysis`, a `Locus`. Gives: `eigenvalues_picture`, `locus_picture`.
 Guarantees: what decides is in sight, and so are the unit circle and every eigenvalue; nothing is written over
 a mark, what marks mean stands beside the circle.
 Does not: compute, or need a display.
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +19,7 @@ import numpy as np
 from apc.compiler.words import in_hertz
 from apc.optional import need
 from apc.present.forms import quantity
-from apc.present.pictures import COLOURS, check_format, write_figure
+from apc.present.pictures import COLOURS, new_figure
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
@@ -99,9 +98,9 @@ def locus_picture(found: Locus, ax: Any = None) -> Any:
 
 def _circle(ax: Any) -> Any:
     """Return an Axes with the unit circle in it, to scale."""
-    figures, patches = need("matplotlib.figure", "plot"), need("matplotlib.patches", "plot")
+    patches = need("matplotlib.patches", "plot")
     if ax is None:
-        ax = figures.Figure(figsize=SIZE, layout="constrained").subplots()
+        ax = new_figure(SIZE).subplots()
     ax.add_patch(patches.Circle((0, 0), 1, facecolor="none", edgecolor="0.4", linewidth=0.9))
     for line in (ax.axhline, ax.axvline):
         line(0, color="0.8", linewidth=0.6, zorder=0)
@@ -126,18 +125,3 @@ def _entitle(ax: Any, lines: Sequence[str]) -> None:
     ax.autoscale_view()
     ax.set_title("\n".join(one for line in lines for one in textwrap.wrap(line, LETTERS)), fontsize=9)
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), fontsize=8, frameon=False, ncols=2)
-
-
-def save_eigenvalues(found: Analysis | Locus, path: Path) -> None:
-    """Draw eigenvalues into a file, its format chosen by the suffix.
-
-    Raises
-    ------
-    ApcError
-        E878 no such format, E601 it can't be written, E875 matplotlib is not installed.
-    """
-    from apc.vary.locus import Locus
-
-    check_format(path)
-    drawn = locus_picture(found) if isinstance(found, Locus) else eigenvalues_picture(found)
-    write_figure(drawn.figure, path)

@@ -96,8 +96,9 @@ def _places(boxes: Sequence[Box], edges: Sequence[Edge]) -> _Places:
             continue
         joined = networkx.node_connected_component(graph, box.key)
         hands = [key for key in by_key if key in joined and by_key[key].role == "hand"]
-        columns = networkx.bfs_layers(graph, hands or [box.key])
-        columns = [[by_key[key] for key in column] for column in columns]
+        # A layer comes in any order: boxes keep that of the scene.
+        layers = map(set, networkx.bfs_layers(graph, hands or [box.key]))
+        columns = [[one for one in boxes if one.key in layer] for layer in layers]
         heights = [sum(_height(one) + BETWEEN for one in column) - BETWEEN for column in columns]
         left = 0.0
         for column, height in zip(columns, heights, strict=True):

@@ -1,6 +1,6 @@
 """What hands do and feel, as text, plain data, a picture and a table.
 
-Takes: a `PassiveHands` or a `Feel`. Gives: of each its text and document; `feel_picture`, `write_feel`.
+Takes: a `PassiveHands` or a `Feel`. Gives: of each its text and document; `feel_picture`, `feel_rows`.
 Guarantees: what the answer leaves out stands first; no digit beyond its bound.
 Does not: compute.
 """
@@ -8,16 +8,14 @@ Does not: compute.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.words import known_digits, measured, wrapped
-from apc.optional import need
 from apc.present.forms import LINEARIZED, document, labelled, note, notes, record, table
-from apc.present.pictures import COLOURS, write_result
+from apc.present.pictures import COLOURS, new_figure
 from apc.tables import Column, Row
 
 if TYPE_CHECKING:
@@ -200,12 +198,11 @@ def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
 
     Into an `ax` of somebody's, of Bode's plot the magnitudes alone are drawn.
     """
-    figures = need("matplotlib.figure", "plot")
     size, phase = ax, None
     if ax is None and kind == "nyquist":
-        size = figures.Figure(figsize=(4.2, 4.0), layout="constrained").subplots()
+        size = new_figure((4.2, 4.0)).subplots()
     elif ax is None:
-        size, phase = figures.Figure(figsize=(5.2, 5.6), layout="constrained").subplots(2, 1, sharex=True)
+        size, phase = new_figure((5.2, 5.6)).subplots(2, 1, sharex=True)
     size.set_title(f"{found.topology}: felt at {found.at}", fontsize=9)
     if kind == "nyquist":
         size.plot(found.impedance.real, found.impedance.imag, color=COLOURS[0])
@@ -237,24 +234,16 @@ def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
     return size.figure
 
 
-def write_feel(path: Path, found: Feel, *, nyquist: bool = False) -> None:
-    """Write responses to a picture, a table or JSON, by the suffix."""
-    made = {"at": found.at, "left_out": list(found.left_out)}
-    kind = "nyquist" if nyquist else "bode"
-    write_result(path, found, lambda: feel_picture(found, kind), (_columns(), _rows(found), made))
-
-
-def _columns() -> list[Column]:
-    """Return the columns of a table of responses."""
+def feel_rows(found: Feel) -> tuple[list[Column], Iterator[Row], dict[str, Any]]:
+    """Return the columns of a table of responses, a row a frequency, and what it is of."""
     responses = (("impedance", "N*s/m"), ("transmitted admittance", "m/s/N"), ("error per force", "m/N"))
-    parts = [Column(f"{name} {which}", unit) for name, unit in responses for which in ("real", "imaginary")]
-    bounds = [Column(name) for name in ("alias", "bound", "transmitted bound", "error bound")]
-    return [Column("frequency", "Hz"), *parts, *bounds]
-
-
-def _rows(found: Feel) -> Iterator[Row]:
-    """Yield a row a frequency."""
-    responses = [part for values, *_ in _curves(found) for part in (values.real, values.imag)]
-    bounds = [bound for _, bound, *_ in _curves(found)]
-    columns = [found.frequency_hz, *responses, found.alias, *bounds]
-    yield from zip(*(column.tolist() for column in columns), strict=True)
+    headings = [Column("frequency", "Hz")]
+    headings += [
+        Column(f"{name} {which}", unit) for name, unit in responses for which in ("real", "imaginary")
+    ]
+    headings += [Column(name) for name in ("alias", "bound", "transmitted bound", "error bound")]
+    curves = _curves(found)
+    parts = [part for values, *_ in curves for part in (values.real, values.imag)]
+    columns = [found.frequency_hz, *parts, found.alias, *(bound for _, bound, *_ in curves)]
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    return headings, rows, {"at": found.at, "left_out": list(found.left_out)}

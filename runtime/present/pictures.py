@@ -1,8 +1,8 @@
 """What all pictures share: their formats, and how a figure becomes a file.
 
 Takes: a matplotlib Figure and a path.
-Gives: `COLOURS`, `LINES`, `colours_of`; `FORMATS`, `check_format`, `check_result_path`, `write_figure`,
-`write_result`, `svg_text`, `svg_image`.
+Gives: `COLOURS`, `LINES`, `colours_of`, `new_figure`; `FORMATS`, `check_format`, `check_result_path`,
+`write_figure`, `write_picture`, `write_result`, `table_of`, `svg_text`, `svg_image`.
 Guarantees: the same figure gives the same bytes; a file is there whole or not at all; text in an SVG is text.
 Does not: draw, or need a display.
 
@@ -14,19 +14,22 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apc.compiler.files import check_target, write_file, write_text
+from apc.compiler.timings import part
 from apc.distribution import program_version
 from apc.optional import need
 from apc.present.forms import json_text
 from apc.suffixes import check_suffix
-from apc.tables import SUFFIXES, Column, Row, blocks_of, check_table_path, write_table
+from apc.tables import SUFFIXES, blocks_of, check_table_path, write_table
 
 if TYPE_CHECKING:
+    import pandas
+
     from apc.result import Result
 
 FORMATS = (".png", ".svg", ".pdf")
@@ -46,6 +49,17 @@ LINES: tuple[Any, ...] = (
     (0, (10, 3)),
     (0, (5, 1, 5, 1, 1, 1)),
 )
+
+
+def new_figure(size: tuple[float, float]) -> Any:
+    """Return an empty matplotlib Figure of a size in inches, with room for all its labels.
+
+    Raises
+    ------
+    ApcError
+        E875 matplotlib is not installed.
+    """
+    return need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained")
 
 
 def colours_of(count: int) -> list[Any]:
@@ -95,6 +109,12 @@ def svg_image(figure: Any, title: str) -> str:
     return f'<img alt="{escape(title)}" src="data:image/svg+xml;base64,{image}">'
 
 
+@part("draw")
+def write_picture(draw: Callable[[], Any], path: Path) -> None:
+    """Write what is drawn, a matplotlib Figure or one with an Axes, as `write_figure` does."""
+    write_figure(draw().figure, path)
+
+
 def write_figure(figure: Any, path: Path) -> None:
     """Write a matplotlib Figure, its format chosen by the suffix; the same figure gives the same bytes."""
     matplotlib = need("matplotlib", "plot")
@@ -108,12 +128,7 @@ def write_figure(figure: Any, path: Path) -> None:
     write_file(path, write)
 
 
-def write_result(
-    path: Path,
-    found: Result,
-    draw: Callable[[], Any],
-    rows: tuple[Sequence[Column], Iterable[Row], dict[str, Any]],
-) -> None:
+def write_result(path: Path, found: Result, draw: Callable[[], Any]) -> None:
     """Write a result as a picture, a table or JSON, by the suffix.
 
     Parameters
@@ -121,11 +136,9 @@ def write_result(
     path
         The file.
     found
-        The result.
+        The result; its table is made of the `rows` that its module has: see `table_of`.
     draw
         Makes its picture, a matplotlib Figure or Axes.
-    rows
-        The columns of its table, the rows, and what the table says of how it was made.
 
     Raises
     ------
@@ -134,9 +147,18 @@ def write_result(
     """
     suffix = check_result_path(path)
     if suffix in FORMATS:
-        write_figure(draw().figure, path)
+        write_picture(draw, path)
     elif suffix in SUFFIXES:
-        columns, cells, made = rows
+        columns, cells, made = found._shown("rows")
         write_table(path, columns, blocks_of(cells), {"apc": program_version(), **made})
     else:
         write_text(path, json_text(found.to_dict()))
+
+
+def table_of(found: Result) -> pandas.DataFrame:
+    """Return the rows of a result as a pandas table.
+
+    `NAME_rows` in the result's module gives its columns, its rows, and what a file says of how it was made.
+    """
+    columns, rows, _ = found._shown("rows")
+    return need("pandas", "data").DataFrame(list(rows), columns=[one.heading for one in columns])

@@ -1,33 +1,26 @@
 """Stable regions as text, plain data, tables and files.
 
-Takes: a `Region`, or `Panels` of them, and a path.
-Gives: their texts, documents, tables and pictures; `write_panels`.
-Guarantees: a text says what was not looked for. A file that can't be written is refused before anything is
-computed, as far as that can be known, and written whole or not at all.
+Takes: a `Region`, or `Panels` of them.
+Gives: their texts, documents, rows and pictures.
+Guarantees: a text says what was not looked for.
 Does not: compute, or draw itself (see `region_picture`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.timings import part
 from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
-from apc.optional import need
 from apc.present.analysis import range_document
 from apc.present.forms import MEANT, notes, picked, quantity, table
-from apc.present.pictures import write_result
 from apc.present.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up
 from apc.tables import Column, Row
 
 if TYPE_CHECKING:
-    import pandas
-
     from apc.regions.panels import Panel, Panels
     from apc.regions.region import Curve, Region
 
@@ -43,12 +36,12 @@ def region_text(found: Region) -> str:
         (letter, one.free.label, with_unit(f"{float(one.low):.6g} to {float(one.high):.6g}", one.unit))
         for letter, one in (("x", found.x), ("y", found.y))
     ]
-    share = 100 * found.stable_area / float(found.rectangle.width.prod())
-    off = found.stable_area_error
+    off, percent = found.stable_area_error, 100 / float(found.rectangle.width.prod())
+    share = known_digits(percent * found.stable_area, percent * off, 4)
     area = measured(found.stable_area, off) if off else f"{found.stable_area:.9g}"
     meant = [MEANT[found.criterion]] if found.criterion in MEANT else []
     lines = [f"{found.topology}: {_words(found)}", *notes([*meant, *found.left_out]), "", *table(axes)]
-    lines += ["", f"  stable area  {area} in SI, {share:.4g} % of the rectangle"]
+    lines += ["", f"  stable area  {area} in SI, {share} % of the rectangle"]
     if found.curves:
         rows = [("boundary", "frequency [Hz]", "from (x, y)", "to (x, y)", "error")]
         lines += ["", *table([*rows, *map(_row, found.curves[:MOST_CURVES])])]
@@ -117,13 +110,6 @@ def _product(x: str, y: str) -> str:
     return "*".join(f"({unit})" if "/" in unit or "*" in unit else unit for unit in units) or "1"
 
 
-def region_table(found: Region) -> pandas.DataFrame:
-    """Return the points of all curves of a region."""
-    return need("pandas", "data").DataFrame(
-        list(_rows(found)), columns=[one.heading for one in _columns(found)]
-    )
-
-
 def panels_text(found: Panels) -> str:
     """Return what `apc region` prints of several regions."""
     lines: list[str] = []
@@ -156,18 +142,21 @@ def _panel_document(panel: Panel) -> dict[str, Any]:
     }
 
 
-@part("draw")
-def write_panels(path: Path, found: Panels) -> None:
-    """Write regions to a file, its format chosen by the suffix. Raises ApcError E601 if it can't."""
+def panels_rows(found: Panels) -> tuple[list[Column], Iterator[Row], dict[str, Any]]:
+    """Return the columns of a table of boundary points, a row a point, and how they were made."""
     regions = [(one, panel.title) for panel in found.panels for one in panel.regions]
-    first, _ = regions[0]
     made = {
-        "axes": [range_document(first.x), range_document(first.y)],
+        "axes": [range_document(one) for one in (regions[0][0].x, regions[0][0].y)],
         "left_out": {one.topology: list(one.left_out) for one, _ in regions},
         "origin": {one.topology: dict(one.system.origin.digests) for one, _ in regions},
     }
     rows = (row for one, title in regions for row in _rows(one, title))
-    write_result(path, found, found.plot, (_columns(first), rows, made))
+    return _columns(regions[0][0]), rows, made
+
+
+def region_rows(found: Region) -> tuple[list[Column], Iterator[Row], dict[str, Any]]:
+    """Return the same of one region."""
+    return _columns(found), _rows(found), {}
 
 
 def _columns(found: Region) -> list[Column]:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from apc.optional import need
 from apc.present.forms import MEANT
-from apc.present.pictures import COLOURS, LINES
+from apc.present.pictures import COLOURS, LINES, new_figure
 from apc.regions.curves import between
 
 if TYPE_CHECKING:
@@ -56,9 +56,8 @@ def region_picture(found: Region, ax: Any = None) -> Any:
     ApcError
         E875 matplotlib is not installed.
     """
-    figures = need("matplotlib.figure", "plot")
     if ax is None:
-        ax = figures.Figure(figsize=(PANEL + 0.6, PANEL), layout="constrained").subplots()
+        ax = new_figure((PANEL + 0.6, PANEL)).subplots()
     _draw_panel(ax, "", (found,), (1,))
     return ax
 
@@ -71,11 +70,10 @@ def panels_picture(found: Panels) -> Any:
     ApcError
         E875 matplotlib is not installed.
     """
-    figures = need("matplotlib.figure", "plot")
     count = len(found.panels)
     columns = 2 if count == 4 else min(count, 3)
     rows = -(-count // columns)
-    figure = figures.Figure(figsize=(PANEL * columns + 0.6, PANEL * rows + 0.6), layout="constrained")
+    figure = new_figure((PANEL * columns + 0.6, PANEL * rows + 0.6))
     axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
     for place, (ax, panel) in enumerate(zip(axes, found.panels, strict=False)):
         letter = f"({panel_letter(place)}) " if count > 1 else ""

@@ -12,7 +12,6 @@ A PDF is printed by Chromium, where there is one.
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import shutil
@@ -28,16 +27,14 @@ import msgspec
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, check_target, read_file, unwritable, write_file, write_text
 from apc.compiler.timings import part
-from apc.compiler.words import counted, wrapped
+from apc.compiler.words import wrapped
 from apc.optional import missing, need
 from apc.present.comparison_picture import comparison_picture
-from apc.present.eigenvalues import locus_picture
-from apc.present.forms import document, json_text
+from apc.present.forms import document, json_text, record
 from apc.present.graph import graph_picture
 from apc.present.pictures import svg_image
-from apc.reports.contents import Cell, Report, SceneReport, Table
+from apc.reports.contents import Report, SceneReport, Section
 from apc.suffixes import check_suffix
-from apc.vary.locus import Locus
 
 FORMATS = (".html", ".pdf")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
@@ -52,6 +49,8 @@ TITLES = {
     "network": "How much may get lost",
     "feel": "What a hand feels",
 }
+# What differs from run to run, from machine to machine, or with which of equal motions is named first.
+UNLIKE = {"provenance", "origin", "points", "handles", "participation"}
 _KEPT = re.compile(r'<script type="application/json" id="apc-report">(.*?)</script>', re.DOTALL)
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1f2933; --faint: #52606d; --page: #fff; --line: #cbd2d9;
@@ -70,15 +69,10 @@ a { color: var(--link); } nav a { margin-right: 1rem; white-space: nowrap; }
 figure { margin: .6rem 0; padding: .5rem; background: #fff; border: 1px solid var(--line); border-radius: 4px;
   overflow-x: auto; }
 figure img { display: block; margin: auto; max-width: 100%; height: auto; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; }
-th, td { text-align: left; padding: .15rem .7rem .15rem 0; border-bottom: 1px solid var(--line);
-  vertical-align: top; } td.number { white-space: nowrap; }
 pre { background: var(--tint); padding: .6rem; overflow-x: auto; font-size: .8rem; line-height: 1.4; }
 code { background: var(--tint); padding: .1rem .3rem; overflow-wrap: anywhere; }
-@media print { body { padding: 0; max-width: none; font-size: 11px; } figure, tr { break-inside: avoid; }
-  h2, h3, thead, p:has(+ p, + figure, + h3) { break-after: avoid; } .scenes { display: block; }
-  .scroll:not(:has(tr:nth-child(12))) { break-inside: avoid; } /* short tables stay whole */
+@media print { body { padding: 0; max-width: none; font-size: 11px; } figure { break-inside: avoid; }
+  h2, h3, p:has(+ p, + figure, + h3) { break-after: avoid; } .scenes { display: block; }
   pre { white-space: pre-wrap; } nav { display: none; } }
 """
 
@@ -89,19 +83,37 @@ def report_text(found: Report) -> str:
     for one in found.scenes:
         lines += ["", one.name]
         for section in one.sections:
-            told = section.refused or f"{counted(len(section.tables), 'table')}, as {section.command}"
+            told = section.refused or f"as {section.command}"
             lines += wrapped(f"{TITLES[section.key]}: {told}", "  ", "    ")
     return "\n".join(lines[1:])
 
 
 def report_document(found: Report) -> dict[str, Any]:
     """Return a report as plain data: what is needed to compute it again, and all of its tables."""
-    sections = [[document(each, {"drawn": ...}) for each in one.sections] for one in found.scenes]
     scenes = [
-        document(one, {"path": ..., "file": one.path.name, "sections": kept})
-        for one, kept in zip(found.scenes, sections, strict=True)
+        document(one, {"path": ..., "file": one.path.name, "sections": [*map(_kept, one.sections)]})
+        for one in found.scenes
     ]
-    return {"apc_report": 1, "versions": dict(found.versions), "scenes": scenes}
+    return {"apc_report": 2, "versions": dict(found.versions), "scenes": scenes}
+
+
+def _kept(section: Section) -> dict[str, Any]:
+    """Return a section as plain data: of its results what is the same wherever it is computed anew."""
+    results = [_comparable(one.to_dict()) for one in section.results]
+    return record(section, {"drawn": ..., "results": results})
+
+
+def _comparable(data: Any) -> Any:
+    """Return plain data without what is told by `UNLIKE`, and without modes that are not told from zero."""
+    if isinstance(data, dict):
+        return {key: _comparable(one) for key, one in data.items() if key not in UNLIKE}
+    return [_comparable(one) for one in data if not _is_dead(one)] if isinstance(data, list) else data
+
+
+def _is_dead(one: Any) -> bool:
+    """Say whether plain data are of a mode that is not told from zero."""
+    mode = isinstance(one, dict) and "magnitude" in one
+    return mode and (one["error"] is None or one["magnitude"] <= one["error"])
 
 
 @part("page")
@@ -182,33 +194,14 @@ def _section(one: SceneReport, key: str, several: bool) -> str:
         return head + _refused(section.refused)
     told = "".join(f"<p>{escape(text)}</p>" for text in section.told)
     title = f"{one.name}: {TITLES[key]}"
-    figures = (locus_picture(each) if isinstance(each, Locus) else each.plot() for each in section.drawn)
-    pictures = "".join(_picture(drawn.figure, title) for drawn in figures)
-    tables = "".join(map(_table, section.tables))
-    return f"{head}{told}{pictures}{tables}<p>As by {_code(section.command)}.</p>"
-
-
-def _table(table: Table) -> str:
-    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in table.columns)
-    rows = "".join(
-        f"<tr>{''.join(_cell(*pair) for pair in zip(row, table.columns, strict=True))}</tr>"
-        for row in table.rows
-    )
-    caption = f"<h3>{escape(table.title)}</h3>"
-    body = f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody>"
-    return f'{caption}<div class="scroll"><table>{body}</table></div>'
-
-
-def _cell(cell: Cell, column: str) -> str:
-    if isinstance(cell, int | float) and not math.isnan(cell):
-        return f'<td class="number">{f"± {cell:.0e}" if column == "error" else f"{cell + 0:.9g}"}</td>'
-    return f"<td>{escape(cell) if isinstance(cell, str) else '–'}</td>"
+    pictures = "".join(_picture(each.plot().figure, title) for each in section.drawn)
+    texts = "".join(f"<pre>{escape(str(each))}</pre>" for each in section.results)
+    return f"{head}{told}{pictures}{texts}<p>As by {_code(section.command)}.</p>"
 
 
 def _made(one: SceneReport, found: Report) -> str:
-    versions = Table("Versions", ("what", "version"), found.versions)
-    digests = Table("SHA-256 of what it is made of", ("what", "digest"), one.origin)
-    return f"<h3>{escape(one.name)}</h3>{_table(versions)}{_table(digests)}"
+    rows = "\n".join(f"{name:<16} {value}" for name, value in (*found.versions, *one.origin))
+    return f"<h3>{escape(one.name)}</h3><pre>{escape(rows)}</pre>"
 
 
 def _picture(figure: Any, title: str) -> str:
@@ -269,20 +262,12 @@ def _print(page: str, target: Path, path: Path) -> None:
             raise unwritable(path, OSError(None, f"{Path(command[0]).name} has not printed it")) from error
 
 
-class KeptTable(TypedDict):
-    """A table that a page keeps."""
-
-    title: str
-    columns: list[str]
-    rows: list[list[Cell]]
-
-
 class KeptSection(TypedDict):
     """A section that a page keeps."""
 
     key: str
     refused: str
-    tables: list[KeptTable]
+    results: list[dict[str, Any]]
 
 
 class KeptScene(TypedDict):

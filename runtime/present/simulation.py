@@ -13,18 +13,16 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.language.vectors import entry, whole_and_index
-from apc.compiler.timings import part
 from apc.compiler.words import counted, in_hertz, wrapped
 from apc.optional import need
 from apc.present.forms import document, json_text, labelled, note, notes, quantity, record, table
-from apc.present.pictures import check_format, colours_of, write_figure
+from apc.present.pictures import colours_of, new_figure
 from apc.simulation.settings import EXACT
 
 if TYPE_CHECKING:
@@ -247,19 +245,6 @@ def played_dataset(found: Trajectory) -> Any:
     return xarray.Dataset(variables, {"time": time}, {"provenance": provenance_json(found.provenance)})
 
 
-@part("draw")
-def save_picture(found: Trajectory, path: Path) -> None:
-    """Draw a run into a file, its format chosen by the suffix.
-
-    Raises
-    ------
-    ApcError
-        E878 no such format, E601 it can't be written, E875 matplotlib is not installed.
-    """
-    check_format(path)
-    write_figure(found.plot(), path)
-
-
 def played_picture(trajectory: Trajectory, ax: Any = None) -> Any:
     """Draw a trajectory, a panel a quantity, or everything into one Axes; return the matplotlib Figure.
 
@@ -275,7 +260,6 @@ def played_picture(trajectory: Trajectory, ax: Any = None) -> Any:
     ApcError
         E875 matplotlib is not installed.
     """
-    figures = need("matplotlib.figure", "plot")
     panels = _panels(trajectory.signals)
     if ax is not None:
         assert len(panels) == 1, f"one Axes can't show signals in {', '.join(panels)}"
@@ -285,7 +269,7 @@ def played_picture(trajectory: Trajectory, ax: Any = None) -> Any:
         return ax.figure
     paths = paths_of(trajectory.signals)
     heights = [1.0] * len(panels) + [PATHS] * bool(paths)
-    figure = figures.Figure(figsize=(WIDTH, HEIGHT * sum(heights) + 0.6), layout="constrained")
+    figure = new_figure((WIDTH, HEIGHT * sum(heights) + 0.6))
     axes = figure.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
     for one, (unit, places) in zip(axes, panels.items(), strict=False):
         _panel(one, trajectory, unit, places)

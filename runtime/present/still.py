@@ -1,8 +1,7 @@
 """A picture of how a scene begins: the bodies of every peer, and the surfaces between them.
 
 Takes: a `CompiledSystem`.
-Gives: `draw_still`, `save_still`; `Actor`, `draw_actors` and `keep_in_sight`, the same with what moves in it
-(see `animation`).
+Gives: `draw_actors`; `Actor`, `keep_in_sight` and `widen`, for what moves in it (see `animation`).
 Guarantees: bodies on an axis stand in a row a peer; those of a plane have a plane a peer, all to one scale.
 Of space the first two coordinates are drawn, and beside bodies of a plane none that move along one axis.
 Does not: play the scene, or find what there is to draw (see `bodies`).
@@ -12,17 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.timings import part
 from apc.optional import need
 from apc.present.bodies import Body, Disc, Line, PeerView, moves_in_plane, positions_of, views_of
-from apc.present.pictures import check_format, colours_of, write_figure
+from apc.present.pictures import colours_of, new_figure
 
 MM = 1e3
 COLUMNS, PANEL, MARGIN = 4, 3.2, 1.0  # planes in a row; inches: of a plane, of title and labels
@@ -51,37 +48,14 @@ class Actor:
         self.shift.clear().translate(place[0], place[1] if len(place) > 1 else self.row)
 
 
-def draw_still(system: CompiledSystem) -> Any:
-    """Draw how a scene begins; return the matplotlib Figure.
-
-    Parameters
-    ----------
-    system
-        The compiled scene.
+def draw_actors(system: CompiledSystem) -> tuple[Any, list[Actor]]:
+    """Draw how a scene begins; return the matplotlib Figure and the bodies in it, which can be moved.
 
     Raises
     ------
     ApcError
         E875 matplotlib is not installed.
     """
-    return draw_actors(system)[0]
-
-
-@part("draw")
-def save_still(system: CompiledSystem, path: Path) -> None:
-    """Draw how a scene begins into a file, its format chosen by the suffix.
-
-    Raises
-    ------
-    ApcError
-        E878 no such format, E601 it can't be written, E875 matplotlib is not installed.
-    """
-    check_format(path, "--still")
-    write_figure(draw_still(system), path)
-
-
-def draw_actors(system: CompiledSystem) -> tuple[Any, list[Actor]]:
-    """Draw how a scene begins; return the matplotlib Figure and the bodies in it, which can be moved."""
     views, plane = views_of(system), moves_in_plane(system)
     axes = _planes(views) if plane else _rows(views)
     names = list(dict.fromkeys(body.name for view in views for body in view.bodies))
@@ -113,7 +87,7 @@ def _planes(views: Sequence[PeerView]) -> list[Any]:
     columns = min(COLUMNS, len(views))
     lines = -(-len(views) // columns)
     size = (PANEL * columns + 1, PANEL * lines + MARGIN)
-    figure = need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained")
+    figure = new_figure(size)
     axes: list[Any] = figure.subplots(lines, columns, squeeze=False).ravel().tolist()
     for ax in axes[len(views) :]:
         ax.set_visible(False)
@@ -127,7 +101,7 @@ def _planes(views: Sequence[PeerView]) -> list[Any]:
 def _rows(views: Sequence[PeerView]) -> list[Any]:
     """Return one Axes for all peers, as often as there are peers."""
     size = (WIDTH, ROW * len(views) + MARGIN + 0.3)
-    ax = need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained").subplots()
+    ax = new_figure(size).subplots()
     ax.set(ylim=(len(views) - 0.45, -0.55), xlabel="position [mm]")
     ax.set_yticks(range(len(views)), [view.name for view in views])
     ax.grid(axis="x", linewidth=0.4, alpha=0.5)

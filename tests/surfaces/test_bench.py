@@ -192,7 +192,7 @@ def test_what_goes_wrong_in_the_end_costs_no_figures(
     note = "WRONG: the bound of dense does not hold"
     first, *rest = found.comparisons
     broken = replace(found, comparisons=(replace(first, notes=(note,)), *rest))
-    monkeypatch.setattr("apc.present.bench.save_bench", full)
+    monkeypatch.setattr("apc.present.pictures.write_figure", full)
     for measured, plot, messages in (
         (found, "--plot bench.png", ["E601 can't be written"]),
         (broken, "", ["E922", note]),

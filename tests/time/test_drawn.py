@@ -8,8 +8,9 @@ import pytest
 
 import apc
 from apc.compiler.compiled import CompiledSystem
-from apc.present.simulation import paths_of, save_picture
-from apc.present.still import draw_still, save_still
+from apc.present.pictures import write_picture
+from apc.present.simulation import paths_of
+from apc.present.still import draw_actors
 from tests.topologies import AVERAGE, SCENES, compiled, library, replaced
 
 pytest.importorskip("matplotlib")
@@ -20,12 +21,12 @@ def scene(name: str) -> CompiledSystem:
 
 
 def test_every_peer_has_a_row_and_the_rest_is_counted(tmp_path: Path) -> None:
-    drawn = draw_still(scene("experiment-average")).axes[0]
+    drawn = draw_actors(scene("experiment-average"))[0].axes[0]
     assert [one.get_text() for one in drawn.get_yticklabels()] == ["right[1]", "left[1]", "left[2]"]
     assert len(drawn.patches) == 3
-    many = draw_still(compiled(replaced(AVERAGE, ("count: 3", "count: 1000"))))
+    many = draw_actors(compiled(replaced(AVERAGE, ("count: 3", "count: 1000"))))[0]
     assert many.get_suptitle() == "three-users-average: at the start (988 more peers)"
-    save_still(scene("experiment-average"), tmp_path / "still.svg")
+    write_picture(lambda: draw_actors(scene("experiment-average"))[0], tmp_path / "still.svg")
     assert (tmp_path / "still.svg").read_text(encoding="utf-8").startswith("<?xml")
 
 
@@ -55,7 +56,7 @@ equations: ["b.x = at_"]
 
 def test_every_peer_has_a_plane_of_its_own_to_one_scale(tmp_path: Path) -> None:
     system = compiled(PUCK, library(tmp_path, PEG))
-    axes = draw_still(system).axes
+    axes = draw_actors(system)[0].axes
     assert [one.get_title() for one in axes] == ["user[1]", "user[2]", "user[3]"]
     assert len({(one.get_xlim(), one.get_ylim()) for one in axes}) == 1
     (left, right), (low, high) = axes[0].get_xlim(), axes[0].get_ylim()
@@ -90,8 +91,8 @@ RUN = apc.simulate(SCENES / "experiment-mesh.yaml", duration="0.5 s", jit=False)
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
 def test_a_picture_is_written_and_the_same_run_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     one, two = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
-    save_picture(RUN, one)
-    save_picture(RUN, two)
+    write_picture(RUN.plot, one)
+    write_picture(RUN.plot, two)
     assert one.stat().st_size > 5_000
     assert one.read_bytes() == two.read_bytes()
 
