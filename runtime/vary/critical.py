@@ -46,6 +46,7 @@ from apc.vary.growth import (
     MEAN_SQUARE,
     NOMINAL,
     PASSIVE,
+    GrowthEvaluator,
     GrowthLine,
     criterion_of,
     growth_at,
@@ -179,7 +180,10 @@ def critical(
             refuse_time(system, free, _PLACE, chosen_criterion)
             low, high = (None if one is None else float(one) for one in limits)
             points = growth_points(system, free, low, high, present)
-            found = search(GrowthLine(system, free, prepared, points, _PLACE, chosen_criterion), told=told)
+            found = search(
+                GrowthLine(GrowthEvaluator(system, (free,), prepared, _PLACE, chosen_criterion), points),
+                told=told,
+            )
             if chosen_criterion == PASSIVE and not passive_hands(system, prepared).why:
                 found = replace(found, enters=True)  # where clamped devices shake all values are one
         elif timed:

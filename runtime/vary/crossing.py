@@ -1,7 +1,7 @@
 """Where the verdict of a scene changes as one of its numbers varies, held between two verdicts.
 
 Takes: a `Line`, a scene along one of its numbers.
-Gives: `Verdict`, `Crossing`, `Stretch`, `Line`, `Search`; `search`.
+Gives: `Verdict`, `Crossing`, `Stretch`, `Line`, `OneStretch`, `Search`; `search`.
 Guarantees: on either side of a crossing, by its error, the scene's own analysis gives another verdict; where
 it gives none, the crossing is called an estimate. A jump is at an exact value.
 Does not: prove that there are no others between two values that were looked at.
@@ -138,6 +138,14 @@ class Line(Protocol):
 
     def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
         """Return the crossing between two stretches, the first stable or the second."""
+
+
+class OneStretch:
+    """A line of one stretch."""
+
+    def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
+        """There is one stretch."""
+        raise AssertionError("a line of one stretch has no jump")
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ from apc.frame.overrides import Override, apply
 from apc.hands.passivity import passive_growth
 from apc.moments.network import Growth, growth, unreliable
 from apc.network.nominal import channel_numbers
-from apc.vary.crossing import Crossing, Stretch, Verdict
+from apc.vary.crossing import OneStretch, Stretch, Verdict
 from apc.vary.evaluator import reaches_time
 from apc.vary.line import SAMPLES, SPAN
 
@@ -216,41 +216,30 @@ def allowed(system: CompiledSystem, free: Free) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class GrowthLine:
-    """A parameter by a criterion of one number, at `points` (k,) to begin with."""
+class GrowthLine(OneStretch):
+    """The one parameter of an evaluator of one number, at `points` (k,) to begin with."""
 
-    system: CompiledSystem
-    free: Free
-    prepared: Prepared
+    source: GrowthEvaluator
     points: Floats
-    place: Place
-    criterion: str = MEAN_SQUARE
     known: dict[float, Growth] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
         """The number that varies."""
-        return self.free.label
-
-    def growth(self, value: float, *, bounded: bool) -> Growth:
-        """Return what second moments grow by at a value, or what stands for that."""
-        overrides = [Override(self.free, Fraction(value))]
-        return growth_at(
-            *(self.system, self.prepared, overrides, self.place), bounded=bounded, criterion=self.criterion
-        )
+        return self.source.free[0].label
 
     def look(self, values: Floats) -> tuple[Complexes, Complexes]:
         """Return the growth at values (k, 1) without bounds, and no slopes."""
         for value in values.tolist():
             if value not in self.known:
-                self.known[value] = self.growth(value, bounded=False)
+                self.known[value] = self.source.growth([value])
         found = np.array([self.known[value].radius for value in values.tolist()], np.complex128)[:, None]
         return found, np.full(found.shape, np.nan, np.complex128)
 
     def judge(self, value: Fraction) -> Verdict:
         """Return the verdict at a value, bounded."""
-        found = self.growth(float(value), bounded=True)
-        proof = BOUNDED[self.criterion] if found.proved else ITERATED
+        found = self.source.growth([float(value)], bounded=True)
+        proof = BOUNDED[self.source.criterion] if found.proved else ITERATED
         error = max(found.high - found.radius, found.radius - found.low)
         return Verdict(found.stable, found.radius, error, (), proof if found.exact else TAGGED)
 
@@ -259,10 +248,6 @@ class GrowthLine:
         low, high = Fraction(self.points[0]), Fraction(self.points[-1])
         least = float(self.points[self.points > 0].min(initial=1.0))
         yield Stretch(low, high, self.points, least, self.look, self.judge, slow=True)
-
-    def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
-        """There is one stretch."""
-        raise AssertionError("a line of one stretch has no jump")
 
 
 def growth_points(

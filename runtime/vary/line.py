@@ -27,7 +27,7 @@ from apc.eigen.spectrum import DRIFTS, Spectrum, solve_spectrum
 from apc.frame.names import Free
 from apc.frame.overrides import Override, apply
 from apc.vary.batch import BatchEvaluator, Evaluator
-from apc.vary.crossing import ESTIMATE, UNSURE, Crossing, Stretch, Verdict
+from apc.vary.crossing import ESTIMATE, UNSURE, Crossing, OneStretch, Stretch, Verdict
 from apc.vary.delays import (
     INSIDE,
     Piece,
@@ -112,7 +112,7 @@ def spread(bottom: float, top: float, scale: float) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class MatrixLine:
+class MatrixLine(OneStretch):
     """One of an evaluator's free parameters varies, the others stay at `base` (m,): a line of one stretch.
 
     `bottom` and `top` are its ends, None for those of `SPAN`.
@@ -160,10 +160,6 @@ class MatrixLine:
         top = self.top if self.top is not None else max(SPAN * self.scale, bottom + self.scale)
         points = spread(bottom, top, self.scale)
         yield Stretch(Fraction(bottom), Fraction(top), points, self.scale / SPAN, self.look, self.judge)
-
-    def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
-        """There is one stretch."""
-        raise AssertionError("a line of one stretch has no jump")
 
 
 def matrix_look(family: Evaluator, points: Floats, column: int) -> tuple[Complexes, Complexes]:
@@ -223,7 +219,7 @@ class _JudgedLine:
 
 
 @dataclass(frozen=True, eq=False)
-class AnalysedLine(_JudgedLine):
+class AnalysedLine(OneStretch, _JudgedLine):
     """A parameter of a scene whose matrices are too large for many of them: each value is analysed."""
 
     prepared: Prepared
@@ -242,10 +238,6 @@ class AnalysedLine(_JudgedLine):
             *(Fraction(self.bottom), Fraction(self.top), points, self.scale / SPAN, look, self.judge),
             slow=True,
         )
-
-    def change(self, before: Stretch, after: Stretch, *, stable_below: bool) -> Crossing:
-        """There is one stretch."""
-        raise AssertionError("a line of one stretch has no jump")
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,7 @@ from apc.network.nominal import channel_numbers
 from apc.threads import single_threaded
 from apc.vary.crossing import Search, search
 from apc.vary.evaluator import free_parameters
-from apc.vary.growth import BOUNDED, MEAN_SQUARE, GrowthLine, allowed, growth_at
+from apc.vary.growth import BOUNDED, MEAN_SQUARE, GrowthEvaluator, GrowthLine, allowed, growth_at
 from apc.vary.line import SAMPLES
 from apc.vary.margins import GROWTH, NOT_STABLE, Margin, Margins, coupler_parameters, not_looked
 from apc.vary.sensitivity import Sensitivities, Sensitivity, varied
@@ -101,7 +101,9 @@ def network_margins(
             if one.label in unscaled and len(samples) == 1:
                 rows.append(not_looked(system, one, "from 0 nothing says how far"))
                 continue
-            line = GrowthLine(system, one, prepared, np.array(samples), PLACE, known={samples[0]: here})
+            line = GrowthLine(
+                GrowthEvaluator(system, (one,), prepared, PLACE), np.array(samples), {samples[0]: here}
+            )
             found = search(line, first=True)
             looked += found.looked
             if not found.enters:
