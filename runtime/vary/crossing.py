@@ -387,9 +387,11 @@ def _crossing(
     width = HALF * (abs(value) or high - low)
     for _ in range(TRIES):
         left, right = max(value - width, low), min(value + width, high)
-        below, above = stretch.judge(Fraction(left)), stretch.judge(Fraction(right))
+        grows = stretch.judge(Fraction(right if rising else left))
+        # Where the one side is left open the other decides nothing, and its proof takes as long.
+        dies = grows if grows.stable is None else stretch.judge(Fraction(left if rising else right))
+        below, above = (dies, grows) if rising else (grows, dies)
         if below.stable is rising and above.stable is (not rising):
-            grows = above if rising else below
             bits = re.search(r"\d+ bits", f"{below.proof} {above.proof}")
             proof = f"proved with {bits[0]}" if bits else grows.proof or "bounded in floats"
             half = (right - left) / 2
@@ -407,8 +409,7 @@ def _crossing(
                 value = nearer
                 continue
         width *= WIDER
-    frequency = (above if rising else below).frequency_hz
-    return Crossing(value, min(width, high - low), side, frequency, "crossing", ESTIMATE)
+    return Crossing(value, min(width, high - low), side, grows.frequency_hz, "crossing", ESTIMATE)
 
 
 def _root(stretch: Stretch, ends: Sequence[float], growth: Sequence[float]) -> float:
