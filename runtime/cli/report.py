@@ -36,8 +36,8 @@ def report_command(
     One file that opens anywhere and loads nothing: the scene's picture and
     text, what was compiled, the verdict with its bound and proof, modes,
     margins, the stable region, what happens over time, how much may get lost,
-    what a hand feels; beside each picture its table and the command that makes
-    it, and what versions and texts made it. Several FILEs stand side by side.
+    what a hand feels; beside each picture what the command says that makes it,
+    and what versions and texts made it. Several FILEs stand side by side.
 
     \b
         apc report average.yaml mesh.yaml --out report.html

@@ -137,7 +137,7 @@ def report_page(found: Report) -> str:
         shown = _refused(found.refused)
         if found.comparison is not None:
             files = " ".join(one.path.name for one in found.scenes)
-            shown = f"<p>As by {_code(f'apc compare {files} --out compared.svg')}.</p>"
+            shown = f"<p>Produced by {_code(f'apc compare {files} --out compared.svg')}.</p>"
             shown += _picture(comparison_picture(found.comparison), "schemes side by side")
             shown += f"<pre>{escape(str(found.comparison))}</pre>"
         parts += _row("compared", "Side by side", [shown])
@@ -183,7 +183,7 @@ def _scene(one: SceneReport) -> str:
     texts = "".join(f"<h3>{escape(name)}</h3><pre>{escape(text)}</pre>" for name, text in one.texts)
     settings = "".join(f"<li>{_code(text)}</li>" for text in one.settings)
     told = f"<p>{escape(one.about)}</p>" + (f"<p>Set first:</p><ul>{settings}</ul>" if settings else "")
-    command = f"<p>As by {_code(f'apc show {one.path.name} --out scene.svg')}.</p>"
+    command = f"<p>Produced by {_code(f'apc show {one.path.name} --out scene.svg')}.</p>"
     return f"<h3>{escape(one.name)}</h3>{told}{_picture(graph_picture(diagram), title)}{command}{texts}"
 
 
@@ -196,7 +196,7 @@ def _section(one: SceneReport, key: str, several: bool) -> str:
     title = f"{one.name}: {TITLES[key]}"
     pictures = "".join(_picture(each.plot().figure, title) for each in section.drawn)
     texts = "".join(f"<pre>{escape(str(each))}</pre>" for each in section.results)
-    return f"{head}{told}{pictures}{texts}<p>As by {_code(section.command)}.</p>"
+    return f"{head}{told}{pictures}{texts}<p>Produced by {_code(section.command)}.</p>"
 
 
 def _made(one: SceneReport, found: Report) -> str:

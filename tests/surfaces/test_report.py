@@ -83,7 +83,7 @@ def test_every_section_is_there_with_its_picture_text_and_command() -> None:
         if key == "network":
             assert "no packet can get lost" in section
             continue
-        assert "<pre>" in section and "As by <code>apc " in section
+        assert "<pre>" in section and "Produced by <code>apc " in section
         assert ("data:image/svg" in section) == (key != "compiled")
     assert AVERAGE.splitlines()[0] in page()  # the scene's own text
     assert "prefers-color-scheme: dark" in page()
