@@ -208,7 +208,8 @@ _of_methods = False  # what was compiled last
 def _listen(event: str, arguments: tuple[object, ...]) -> None:
     """Note what no input may cause, and files opened to write."""
     global _of_methods
-    if not _listening or arguments[:1] == (_CYTHON,):
+    # A tree of what NumPy reads as a literal, the head of an array, is parsed and never run.
+    if not _listening or arguments[:1] == (_CYTHON,) or (event, *arguments[1:]) == ("compile", "<unknown>"):
         return
     if event == "compile":
         _of_methods = isinstance(arguments[0], bytes) and bool(_METHODS.match(arguments[0]))
