@@ -54,6 +54,9 @@ PLACES = 9
 # Half the bracket first tried, relative to the value; how much wider the next is where it decides nothing.
 HALF, WIDER, TRIES = 1e-13, 4.0, 24
 
+# The same where no more is wanted than where stability is first lost: floats mostly hold it.
+FIRST_HALF = 1e-10
+
 # Steps of Newton's method.
 NEWTON = 12
 
@@ -252,6 +255,7 @@ def search(line: Line, *, first: bool = False, told: Told | None = None) -> Sear
                     samples.points[place : place + 2].tolist(),
                     samples.growth[place : place + 2].tolist(),
                     rising=side[place],
+                    half=FIRST_HALF if first else HALF,
                 )
                 if found is not None:
                     edges.append(found)
@@ -375,16 +379,17 @@ def _cubic(t: Floats, start: Complexes, end: Complexes, slope: Complexes, end_sl
 
 
 def _crossing(
-    stretch: Stretch, ends: Sequence[float], growth: Sequence[float], *, rising: bool
+    stretch: Stretch, ends: Sequence[float], growth: Sequence[float], *, rising: bool, half: float
 ) -> Crossing | None:
     """Close in on the crossing between two values, and hold it; None where both sides are judged alike.
 
-    `growth` are the logarithms of the spectral radius at the ends.
+    `growth` are the logarithms of the spectral radius at the ends, `half` that of the bracket first tried,
+    relative to the value.
     """
     low, high = ends
     value = _root(stretch, ends, growth)
     side = "below" if rising else "above"
-    width = HALF * (abs(value) or high - low)
+    width = half * (abs(value) or high - low)
     for _ in range(TRIES):
         left, right = max(value - width, low), min(value + width, high)
         grows = stretch.judge(Fraction(right if rising else left))
@@ -394,8 +399,9 @@ def _crossing(
         if below.stable is rising and above.stable is (not rising):
             bits = re.search(r"\d+ bits", f"{below.proof} {above.proof}")
             proof = f"proved with {bits[0]}" if bits else grows.proof or "bounded in floats"
-            half = (right - left) / 2
-            return Crossing((left + right) / 2, half, side, grows.frequency_hz, "crossing", proof)
+            return Crossing(
+                (left + right) / 2, (right - left) / 2, side, grows.frequency_hz, "crossing", proof
+            )
         if None not in (below.stable, above.stable) and width > NOWHERE * abs(value):
             return None
         if (left, right) == (low, high):
