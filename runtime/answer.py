@@ -1,7 +1,7 @@
 """The whole answer of `apc analyze`: the verdict, and what stands beside it.
 
 Takes: a `CompiledSystem`.
-Gives: `Answer`, `NetworkAnswer`, `answer`, `judge`; `sensitivities_of`, `proved_box`.
+Gives: `Answer`, `NetworkAnswer`, `answer`, `judge`; `sensitivities_of`, `proved_box`, `proved_at`.
 Guarantees: what stands beside the verdict never changes it; what could not be had is said in a note.
 Does not: compute any of it itself.
 """
@@ -219,7 +219,12 @@ def _buzz(system: CompiledSystem, prepared: Prepared, modes: ContactModes | None
 
 
 def proved_box(
-    system: CompiledSystem, box: Sequence[Range], *, passive: bool = False, cells: int | None = None
+    system: CompiledSystem,
+    box: Sequence[Range],
+    *,
+    passive: bool = False,
+    cells: int | None = None,
+    inside: float = 1.0,
 ) -> BoxProof:
     """Return the proof over a box; imported here, as few analyses ask for one.
 
@@ -233,6 +238,8 @@ def proved_box(
         Whether every passive hand is meant, over the nominal network.
     cells
         How many cells are looked at at most; without it, as many as take some seconds.
+    inside
+        What the spectral radius has to be below, over a network on which every packet is on time.
 
     Raises
     ------
@@ -243,7 +250,7 @@ def proved_box(
     from apc.vary.delay_box import is_delay, prove_over_delay
 
     if any(is_delay(system, one.free) for one in box):
-        return prove_over_delay(system, box, partial(_proved_at, passive=passive, cells=cells))
+        return prove_over_delay(system, box, partial(proved_at, passive=passive, cells=cells, inside=inside))
     if passive:
         from apc.hands.passive_box import prove_box as prove_for_hands
 
@@ -256,13 +263,20 @@ def proved_box(
         from apc.moments.mean_square_box import prove_box as prove_over_network
 
         return prove_over_network(system, box, cells=cells)
-    return prove_box(system, box, cells=cells)
+    return prove_box(system, box, cells=cells, inside=inside)
 
 
-def _proved_at(system: CompiledSystem, box: Sequence[Range], *, passive: bool, cells: int | None) -> BoxProof:
-    """Return the proof over the other ranges at one delay; without any, the verdict there."""
+def proved_at(
+    system: CompiledSystem,
+    box: Sequence[Range],
+    *,
+    passive: bool = False,
+    cells: int | None = None,
+    inside: float = 1.0,
+) -> BoxProof:
+    """Return the proof over a box; without any range, the verdict as it is: see `proved_box`."""
     if box:
-        return proved_box(system, box, passive=passive, cells=cells)
+        return proved_box(system, box, passive=passive, cells=cells, inside=inside)
     from apc.analysis.box_proof import BoxProof
     from apc.network.nominal import left_out
 
@@ -279,6 +293,12 @@ def _proved_at(system: CompiledSystem, box: Sequence[Range], *, passive: bool, c
         found = network
     else:
         found = analyze(system)
+        if found.stable and inside != 1:
+            error = found.spectral_radius_error
+            sides = found.spectral_radius - error > inside, found.spectral_radius + error < inside
+            if not sides[1]:
+                stable = False if sides[0] else None
+                return BoxProof(system.name, (), found.verdict, stable, 1, float(stable is None), (), ())
     return BoxProof(system.name, (), found.verdict, found.stable, 1, float(found.stable is None), (), ())
 
 
