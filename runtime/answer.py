@@ -274,7 +274,13 @@ def proved_at(
     cells: int | None = None,
     inside: float = 1.0,
 ) -> BoxProof:
-    """Return the proof over a box; without any range, the verdict as it is: see `proved_box`."""
+    """Return the proof over a box; without any range, the verdict as it is.
+
+    Parameters
+    ----------
+    system, box, passive, cells, inside
+        As for `proved_box`.
+    """
     if box:
         return proved_box(system, box, passive=passive, cells=cells, inside=inside)
     from apc.analysis.box_proof import BoxProof
