@@ -63,6 +63,8 @@ def _sentence(found: Tuning) -> str:
     if not found.met:
         return f"{found.topology}: no gains were found in these ranges that are {stable}{over}"
     proved = "proved" if found.proved else "not proved"
+    if found.worst >= 0:
+        proved += ", and in some of it it is not so"
     best = "largest" if found.larger else "least"
     if found.unit == "1" and found.aim not in [one.parameter for one in found.gains]:
         least = f"a spectral radius below {found.value:.6g}, next to the least found{over},"
@@ -85,11 +87,14 @@ def _proof_lines(found: Tuning) -> list[str]:
         told = counted(cells, "cell" if found.over else "analysis", ",d").replace("analysiss", "analyses")
         many = f"for each of {len(proved)} numbers of peers, " if proved[0].counts else ""
         lines += labelled("proved", f"{many}{proved[0].proof.verdict} ({told})")
+    left: dict[str, list[str]] = {}
     for one in found.proofs:
         if not one.proof.stable:
-            where = ", ".join(f"{label} {number}" for label, number in one.counts)
-            said = f"{one.proof.verdict}, {100 * one.proof.open_share:.3g} % of the box is left open"
-            lines += labelled("not proved", ", ".join([*filter(None, [where]), said, *one.proof.notes]))
+            share = f"{100 * one.proof.open_share:.3g} % of the box is left open" if one.proof.cells else ""
+            said = ", ".join(filter(None, [one.proof.verdict, share, *one.proof.notes]))
+            left.setdefault(said, []).append(", ".join(f"{label} {number}" for label, number in one.counts))
+    for said, where in left.items():
+        lines += labelled("not proved", "; ".join([", ".join(filter(None, where)), said]).removeprefix("; "))
     if found.met and not found.proofs:
         lines += labelled("not proved", "the time was up before any proof")
     return lines

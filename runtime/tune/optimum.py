@@ -25,8 +25,11 @@ from apc.tune.limits import Limits, Rows, Scenario
 
 Floats = NDArray[np.float64]
 
-# Points looked at to begin with, of matrices and of one number that takes milliseconds; starts of a descent.
-POINTS, SLOW_POINTS, STARTS = 2048, 96, 2
+# Points looked at to begin with, of matrices and of one number that takes milliseconds.
+POINTS, SLOW_POINTS = 2048, 96
+
+# Of these so many at a time are looked at in all scenarios, and so often.
+LOOK, SLOW_LOOK, LOOKS = 64, 8, 4
 
 # The least error, of a value: floats know no more of where their eigenvalues cross.
 LEAST = 1e-9
@@ -47,12 +50,13 @@ SLOW_BESIDE = 8
 
 @dataclass(frozen=True, slots=True)
 class Optimum:
-    """The best gains (m,) found: the `value` of the aim, right to `error`, and what limits them.
+    """The best gains (m,) found in some scenarios: the `value` of the aim, right to `error`, what limits it.
 
     `worst` is the largest limit, above 0 where no gains meet them all. `multipliers` (n,) of `rows` say how
     much of the aim each costs, per unit of ln |λ|; `looked` points were looked at.
     """
 
+    scenarios: tuple[Scenario, ...]
     gains: Floats
     value: float
     error: float
@@ -101,16 +105,39 @@ class Search:
         """Return where one descent from shares of the ranges ends."""
         return self._descended(start)
 
-    def starts(self, present: Floats) -> list[Floats]:
-        """Return where to go downhill from (shares of the ranges): the best of points spread evenly."""
+    def start(self, present: Floats, every: Sequence[Scenario], than: Optimum | None = None) -> list[Floats]:
+        """Return where to go downhill from, shares of the ranges: the best of points spread evenly.
+
+        Parameters
+        ----------
+        present
+            Gains to look at as well.
+        every
+            All scenarios, in which a few of the points that are best in the search's own are looked at.
+        than
+            What is known: only a point that does better in all scenarios is returned then, if there is one.
+        """
         points = np.vstack([np.clip((present - self._low) / self._width, 0.0, 1.0), self._even])
         gains = self._gains(points)
         worst = np.max([self.limits.sampled(one, gains) for one in self.scenarios], axis=0)
+        order = np.argsort(self._order(points, worst), kind="stable")
+        if than is not None:
+            met = self.column is not None and than.worst <= BINDS
+            known = self._order(self.shares(than)[None], np.array([0.0 if met else than.worst]))[0]
+            order = order[self._order(points, worst)[order] < known - OPEN]
+        size, left = (SLOW_LOOK if self.limits.by_growth else LOOK), LOOKS
+        for begin in range(0, min(len(order), size * LOOKS), size):
+            some = order[begin : begin + size]
+            ranks = self._order(points[some], self.limits.worst(every, gains[some]).max(axis=1))
+            place, left = int(np.argmin(ranks)), left - 1
+            if ranks[place] < (known - OPEN if than is not None else 0.0 if left else np.inf):
+                return [points[some[place]]]
+        return []
+
+    def _order(self, points: Floats, worst: Floats) -> Floats:
+        """Return what the best of points (k, m) has least of, far below 0 where it meets the limits."""
         merit = self._merit(points, worst)
-        order = np.argsort(np.where(worst <= 0, merit - HUGE, worst), kind="stable")
-        return [
-            points[place] for place in (*order[: 1 if self.limits.by_growth else STARTS], np.argmin(worst))
-        ]
+        return merit if self.column is None else np.where(worst <= 0, merit - HUGE, worst)
 
     @cached_property
     def _even(self) -> Floats:
@@ -265,7 +292,7 @@ class Search:
             scale = 1.0 if self.column is None else float(self._width[self.column])
             error = scale * float(multipliers @ np.abs(rows.values - level))
         error = max(error, LEAST * abs(value))
-        return Optimum(self._gains(shares), value, error, worst, rows, multipliers, 0)
+        return Optimum(tuple(self.scenarios), self._gains(shares), value, error, worst, rows, multipliers, 0)
 
 
 def _same(found: Rows, here: Rows, one: int) -> int:

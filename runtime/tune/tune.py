@@ -13,6 +13,7 @@ step by step as long as the proof leaves anything open.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Sequence
@@ -46,20 +47,25 @@ Floats = NDArray[np.float64]
 # Significant digits that a person types.
 DIGITS = 4
 
-# How far gains may go back from the best to be proved; how much of the room beside them rounding may take.
-BACK, ROOM = 0.01, 0.5
+# How much of the room beside them rounding may take of gains.
+ROOM = 0.5
+
+# How far gains go back from the best until they are proved, as shares of the best; where there is a box to bear
+# they begin farther back: cells beside a limit are small, and there are very many.
+BACK = (0.0, 1e-4, 1e-3, 1e-2)
+BACK_IN_BOX = (3e-3, 6e-3, 1e-2)
 
 # Steps on the way to where there is most room: any room does.
 STEPS = 12
-
-# How far back gains begin that have a box to be proved over.
-ASIDE = 1e-3
 
 # What is said where only stability is proved.
 SLOWER = "stable is proved, how fast motions die out is not: it is so in the scenarios looked at"
 
 # Scenarios added at a time; how far above the others a limit is that counts.
 MORE, ABOVE = 3, 1e-9
+
+# Turns in which scenarios that limit nothing are left out.
+DROPPING = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,16 +216,23 @@ class _Work:
     def _borne(self, column: int | None, starts: list[Floats], present: Floats) -> Optimum:
         """Return the best of all scenarios, those added that limit it more than those there are."""
         sign = 1.0 if self.demands.aim.larger else -1.0
-        while True:
+        for turn in itertools.count():
             self.told(f"looking for gains in {len(self.scenarios)} of {len(self.every)} scenarios")
             search = Search(self.limits, self.scenarios, column, sign)
-            found = search.best([*starts, *search.starts(present)])
+            found = search.best(starts or search.start(present, self.every))
             self.looked += found.looked
-            if self.late or not self._added(
-                found.gains, max(found.worst, 0.0 if column is not None else -math.inf)
-            ):
-                return found
+            bound = found.rows.scenario[found.multipliers > 0]
+            if turn < DROPPING and len(bound):  # what limits nothing is looked at again with all others
+                self.scenarios = [one for place, one in enumerate(self.scenarios) if place in bound]
+            level = max(found.worst, 0.0 if column is not None else -math.inf)
             starts = [search.shares(found)]
+            if self._added(found.gains, level) and not self.late:
+                continue
+            ahead = search.start(present, self.every, than=found)
+            if self.late or not ahead:
+                return found
+            starts += ahead
+        raise AssertionError("turns never end")
 
     def _added(self, gains: Floats, level: float) -> bool:
         """Add the scenarios that limit gains by more than a level; say whether there were any."""
@@ -233,44 +246,32 @@ class _Work:
     def _settled(self, found: Optimum) -> tuple[list[Fraction], list[Proved], Scenario | None]:
         """Return gains as they are typed, what is proved of them, and a scenario that they don't bear."""
         column = self.demands.aim.gain
-        back = 0
-        middle: Floats | None = None
+        shares = [0.0] if column is None or self._unproved else BACK_IN_BOX if self.demands.over else BACK
+        place, middle = 0, None
         while True:
             gains = [_decimal(value, DIGITS) for value in found.gains.tolist()]
             if column is not None:
-                gains[column] = self._back(float(found.gains[column]), back)
+                gains[column] = self._back(float(found.gains[column]), shares[place])
             if column is None or len(gains) > 1:
                 middle = self._middle(gains, column, found) if middle is None else middle
                 gains = self._typed(gains, column, middle)
             point = np.array([float(one) for one in gains])
-            level = -ABOVE if column is not None else math.inf
-            if self._added(point, level) and not self.late:
+            if column is not None and not self.late and self._added(point, -ABOVE):
                 middle = None
                 continue
             held = column is None or float(self.limits.worst(self.every, point[None]).max()) < 0
-            last = (
-                self.late
-                or column is None
-                or self._unproved
-                or self._spent(float(found.gains[column]), 2 * back + 1)
-            )
+            last = self.late or place + 1 == len(shares)
             if held or last:
                 proofs, failed = self._proofs(gains)
                 if failed is not None or last or all(one.proof.stable for one in proofs):
                     return gains, proofs, failed
-            back = 2 * back or 1
+            place += 1
 
-    def _back(self, value: float, steps: int) -> Fraction:
-        """Return a gain rounded to the side where it does less, and so many steps of its last digit back."""
+    def _back(self, value: float, share: float) -> Fraction:
+        """Return a gain less a share of it, rounded to the side where it does less."""
         larger = self.demands.aim.larger
-        if self.demands.over:  # cells beside a limit are small, and there are very many
-            value *= 1 - ASIDE if larger == (value > 0) else 1 + ASIDE
-        number = _decimal(value, DIGITS, ROUND_FLOOR if larger else ROUND_CEILING)
-        step = Fraction(10) ** (Decimal(repr(value)).adjusted() - DIGITS + 1) * (-1 if larger else 1)
-        return number + steps * step
-
-    def _spent(self, value: float, steps: int) -> bool:
-        return abs(float(self._back(value, steps)) - value) > BACK * abs(value)
+        moved = value * (1 - share if larger == (value > 0) else 1 + share)
+        return _decimal(moved, DIGITS, ROUND_FLOOR if larger else ROUND_CEILING)
 
     def _rest(self, gains: Sequence[Fraction], column: int | None) -> Limits:
         """Return the limits of all other gains, the one in a column being as it is."""
@@ -349,7 +350,7 @@ class _Work:
             return math.exp(self.limits.allowed)
         point = np.array([[float(one) for one in gains]])
         least = 1 - math.exp(float(self.limits.worst(self.every, point).max()) + self.limits.allowed)
-        return float(1 - _decimal(least * (1 - BACK), DIGITS, ROUND_FLOOR))
+        return float(1 - _decimal(least * (1 - BACK[-1]), DIGITS, ROUND_FLOOR))
 
     def _failed(
         self, numbers: tuple[Override, ...], proof: BoxProof, ranges: Sequence[Range]
@@ -414,13 +415,13 @@ class _Work:
         """Return what binds: each mode with a multiplier, and what less of the ends that meet there buys."""
         listed = []
         aim = self.demands.aim.gain
-        rows = self.limits.rows(self.scenarios, found.gains, wide=True)
+        rows = self.limits.rows(found.scenarios, found.gains, wide=True)
         scale = 1.0
         if aim is not None and met:
             one = self.demands.free[aim]
             scale = float(one.high - one.low) * (1 if self.demands.aim.larger else -1)
         for place in np.flatnonzero(found.multipliers > 0):
-            scenario = self.scenarios[rows.scenario[place]]
+            scenario = found.scenarios[rows.scenario[place]]
             numbers, _ = self.limits.settings[scenario.setting]
             buys = []
             slopes = rows.slopes[place][len(self.demands.free) :]
