@@ -101,6 +101,10 @@ class Search:
         """Return what is to be small (k,), of points that meet the limits."""
         return worst if self.column is None else -self.sign * shares[:, self.column]
 
+    def at(self, start: Floats) -> Optimum:
+        """Return what there is at shares of the ranges, as if it were the best."""
+        return self._optimum(start, self._remembered(), 0.0)
+
     def rough(self, start: Floats) -> Optimum:
         """Return where one descent from shares of the ranges ends."""
         return self._descended(start)

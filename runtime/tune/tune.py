@@ -50,8 +50,8 @@ DIGITS = 4
 # How much of the room beside them rounding may take of gains.
 ROOM = 0.5
 
-# How far gains go back from the best until they are proved, as shares of the best; where there is a box to bear
-# they begin farther back: cells beside a limit are small, and there are very many.
+# How far gains go back from the best until they are proved, as shares of the best; where there is a box, they
+# begin farther back: cells beside a limit are small, and there are very many.
 BACK = (0.0, 1e-4, 1e-3, 1e-2)
 BACK_IN_BOX = (3e-3, 6e-3, 1e-2)
 
@@ -216,18 +216,23 @@ class _Work:
     def _borne(self, column: int | None, starts: list[Floats], present: Floats) -> Optimum:
         """Return the best of all scenarios, those added that limit it more than those there are."""
         sign = 1.0 if self.demands.aim.larger else -1.0
+        begun: list[Floats] = []
         for turn in itertools.count():
             self.told(f"looking for gains in {len(self.scenarios)} of {len(self.every)} scenarios")
             search = Search(self.limits, self.scenarios, column, sign)
-            found = search.best(starts or search.start(present, self.every))
+            if not starts:
+                starts = begun = search.start(present, self.every)
+            found = search.best(starts)
             self.looked += found.looked
             bound = found.rows.scenario[found.multipliers > 0]
             if turn < DROPPING and len(bound):  # what limits nothing is looked at again with all others
                 self.scenarios = [one for place, one in enumerate(self.scenarios) if place in bound]
             level = max(found.worst, 0.0 if column is not None else -math.inf)
             starts = [search.shares(found)]
-            if self._added(found.gains, level) and not self.late:
-                continue
+            if self._added(found.gains, level):
+                if not self.late:
+                    continue
+                return search.at(begun[0]) if begun else found
             ahead = search.start(present, self.every, than=found)
             if self.late or not ahead:
                 return found
