@@ -112,7 +112,7 @@ from .reports.contents import Report as Report
 from .simulation.buzz import Buzz as Buzz
 from .simulation.trajectory import Trajectory as Trajectory
 from .sweeps.sweep import Sweep as Sweep
-from .tune.tune import Tuning as Tuning
+from .tuning.tune import Tuning as Tuning
 from .vary.critical import Critical as Critical
 from .vary.many import Analyses as Analyses
 from .vary.margins import Margins as Margins

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from apc.simulation.buzz import Buzz
     from apc.simulation.trajectory import Trajectory
     from apc.sweeps.sweep import Sweep
-    from apc.tune.tune import Tuning
+    from apc.tuning.tune import Tuning
     from apc.vary.critical import Critical
     from apc.vary.many import Analyses
     from apc.vary.margins import Margins
@@ -618,7 +618,7 @@ def region(
 @checked
 def tune(
     model: Scene,
-    free: Mapping[str, str | Sequence[str | float]],
+    free: Mapping[str, str | Sequence[str | float]] | None = None,
     *,
     maximize: str = "",
     minimize: str = "",
@@ -657,8 +657,8 @@ def tune(
     ApcError
         The input is at fault.
     """
-    from apc.tune import tune as design
-    from apc.tune.demands import read_aim, read_demands
+    from apc.tuning import tune as design
+    from apc.tuning.demands import read_aim, read_demands
 
     system = _model(model, set)
     ranges, borne = (

@@ -8,8 +8,18 @@ Does not: compute.
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from apc.cli.options import command, criterion_with, note_aside, note_usual, option, print_result
 from apc.cli.progress import status_line
+from apc.compiler.errors import ApcError, Mistake, Place
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from apc.compiler.compiled import CompiledSystem
+    from apc.tuning.tune import Tuning
 
 
 @command
@@ -30,6 +40,7 @@ def tune_command(
     hands: str,
     time: str = option("End after this long, with the best found and what is not proved of it.", '"TIME"'),
     settings: tuple[str, ...],
+    write: Path | None = option("Write the topology with these gains in it, comments and all (.yaml)."),
     as_json: bool,
 ) -> None:
     """Find the gains that do best, and prove that they do.
@@ -47,11 +58,14 @@ def tune_command(
                  --over user.count=2:10 --over device.mass=±20%
     """
     from apc.inputs import open_scene
-    from apc.tune.demands import read_aim, read_demands, read_seconds
-    from apc.tune.tune import tune
+    from apc.tuning.demands import read_aim, read_demands, read_seconds
+    from apc.tuning.tune import tune
 
     note_usual(hands)
-    system = open_scene(file, settings, hands=hands, told=note_aside)
+    if write is not None and write.suffix not in (".yaml", ".yml"):
+        what, got = "the name of a topology", write.suffix or write.name
+        raise ApcError(Mistake("E996", Place("--write"), what, ".yaml at its end", got, f"{write.stem}.yaml"))
+    system = open_scene(file, settings, {"--write": write}, hands=hands, told=note_aside)
     demands = read_demands(
         system,
         free,
@@ -62,4 +76,22 @@ def tune_command(
     )
     with status_line() as told:
         found = tune(system, demands, seconds=read_seconds(time), told=told)
-    print_result(found, as_json=as_json)
+    if write is not None and found.met:
+        _write(system, found, settings, write)
+    print_result(found, as_json=as_json, written=[write if found.met else None])
+
+
+def _write(system: CompiledSystem, found: Tuning, settings: Sequence[str], path: Path) -> None:
+    """Write the topology with the gains, and with what else was set."""
+    from apc.compiler.files import write_text
+    from apc.compiler.words import with_unit
+    from apc.explore.written import with_values
+    from apc.frame.names import find
+    from apc.frame.overrides import parse_override
+
+    values = {parse_override(system, one).free: one.partition("=")[2].strip() for one in settings}
+    for gain in found.gains:
+        number = f"{float(gain.value):.12g}"
+        values[find(system, gain.parameter)] = with_unit(number, gain.unit).removesuffix(" 1")
+    (text,) = (text for name, text in system.origin.texts if name == system.origin.topology)
+    write_text(path, with_values(text.decode(), system, values))

@@ -17,7 +17,7 @@ from apc.present.forms import MEANT, labelled, notes, quantity, record, table
 
 if TYPE_CHECKING:
     from apc.frame.names import Range
-    from apc.tune.tune import Binding, Tuning
+    from apc.tuning.tune import Binding, Tuning
 
 # Digits of what is typed, and of what a limit buys.
 TYPED, BUYS = 12, 3

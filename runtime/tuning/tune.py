@@ -36,9 +36,9 @@ from apc.frame.overrides import Override, apply
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded
-from apc.tune.demands import Demands
-from apc.tune.limits import Limits, Scenario
-from apc.tune.optimum import BINDS, Optimum, Search
+from apc.tuning.demands import Demands
+from apc.tuning.limits import Limits, Scenario
+from apc.tuning.optimum import BINDS, Optimum, Search
 from apc.vary.crossing import Told
 from apc.vary.growth import MEAN_SQUARE, PASSIVE
 

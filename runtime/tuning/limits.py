@@ -26,7 +26,7 @@ from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.eigenpairs import eigenvalues
 from apc.frame.overrides import Override, apply
-from apc.tune.demands import PLACE, Demands
+from apc.tuning.demands import PLACE, Demands
 from apc.vary.batch import MatrixSource
 from apc.vary.delay_box import standing_delays
 from apc.vary.evaluator import evaluator_of_many

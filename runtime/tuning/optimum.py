@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.threads import load_pool
-from apc.tune.limits import Limits, Rows, Scenario
+from apc.tuning.limits import Limits, Rows, Scenario
 
 Floats = NDArray[np.float64]
 
