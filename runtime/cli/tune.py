@@ -64,7 +64,9 @@ def tune_command(
     note_usual(hands)
     if write is not None and write.suffix not in (".yaml", ".yml"):
         what, got = "the name of a topology", write.suffix or write.name
-        raise ApcError(Mistake("E996", Place("--write"), what, ".yaml at its end", got, f"{write.stem}.yaml"))
+        raise ApcError(
+            Mistake("E996", Place("--write"), what, ".yaml at its end", got, f"{write.stem}-tuned.yaml")
+        )
     system = open_scene(file, settings, {"--write": write}, hands=hands, told=note_aside)
     demands = read_demands(
         system,
@@ -94,4 +96,4 @@ def _write(system: CompiledSystem, found: Tuning, settings: Sequence[str], path:
         number = f"{float(gain.value):.12g}"
         values[find(system, gain.parameter)] = with_unit(number, gain.unit).removesuffix(" 1")
     (text,) = (text for name, text in system.origin.texts if name == system.origin.topology)
-    write_text(path, with_values(text.decode(), system, values))
+    write_text(path, with_values(text.decode(), system, values).removesuffix("\n"))
