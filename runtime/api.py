@@ -644,6 +644,7 @@ def tune(
         What has to be borne: {"user.count": "2:10", "device.mass": "±20%", "lan.delay": "8 ms:20 ms"}.
     criterion
         As for `critical`; over unreliable links stable means so in mean square.
+        What is left out of these is as the scene's `studies: tune:` says.
     seconds
         How long to go on at most.
 
@@ -657,16 +658,29 @@ def tune(
     ApcError
         The input is at fault.
     """
+    from apc.frame import devices
     from apc.tuning import tune as design
-    from apc.tuning.demands import read_aim, read_demands
+    from apc.tuning.demands import read_demands, study_hands
 
     system = _model(model, set)
+    hands = study_hands(system) if criterion is None else devices.FREE
+    if hands == devices.PASSIVE:
+        criterion = "passive"
+    else:
+        system = devices.with_hands(system, hands)
     ranges, borne = (
         [f"{name}={_range(system, name, value)}" for name, value in (asked or {}).items()]
         for asked in (free, over)
     )
-    aim = read_aim(maximize, minimize)
-    demands = read_demands(system, ranges, aim, subject=subject, over=borne, criterion=criterion)
+    demands = read_demands(
+        system,
+        ranges,
+        maximize=maximize,
+        minimize=minimize,
+        subject=subject,
+        over=borne,
+        criterion=criterion,
+    )
     return design.tune(system, demands, seconds=float("inf") if seconds is None else seconds)
 
 

@@ -49,7 +49,8 @@ def tune_command(
     be while the scene is stable in all that stands in --over. They are printed
     to four digits, and proved at these: in boxes, for every number of peers,
     over the network as it is. That no other gains are better is not proved:
-    the answer says how many points were looked at.
+    the answer says how many points were looked at. What is left out is as the
+    topology's studies: tune: says.
 
     \b
         apc tune --free "coordination.stiffness=10 N/m:5000 N/m" \\
@@ -57,8 +58,9 @@ def tune_command(
                  --maximize coordination.stiffness \\
                  --over user.count=2:10 --over device.mass=±20%
     """
+    from apc.frame.devices import FREE, with_hands
     from apc.inputs import open_scene
-    from apc.tuning.demands import read_aim, read_demands, read_seconds
+    from apc.tuning.demands import read_demands, read_seconds, study_hands
     from apc.tuning.tune import tune
 
     note_usual(hands)
@@ -68,10 +70,13 @@ def tune_command(
             Mistake("E996", Place("--write"), what, ".yaml at its end", got, f"{write.stem}-tuned.yaml")
         )
     system = open_scene(file, settings, {"--write": write}, hands=hands, told=note_aside)
+    if hands == FREE and (hands := study_hands(system)) != FREE:
+        system = with_hands(system, hands)
     demands = read_demands(
         system,
         free,
-        read_aim(maximize, minimize),
+        maximize=maximize,
+        minimize=minimize,
         subject=subject,
         over=over,
         criterion=criterion_with(hands, None),

@@ -1,7 +1,7 @@
 """What is asked of gains: which are free, what they are to do best, and all that they have to bear.
 
 Takes: a `CompiledSystem` and texts such as `coordination.stiffness=10 N/m:5000 N/m`.
-Gives: `Aim`, `Demands`, `read_demands`, `read_aim`, `read_seconds`; `PLACE`, `RADIUS`.
+Gives: `Aim`, `Demands`, `read_demands`, `study_hands`, `read_seconds`; `PLACE`, `RADIUS`.
 Guarantees: what can't be meant is refused before anything is computed.
 Does not: compute.
 """
@@ -16,6 +16,7 @@ from fractions import Fraction
 from apc.analysis.box import parse_range
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.frame.devices import FREE as FREE_HANDS
 from apc.frame.names import Free, Range, find
 from apc.moments.network import unreliable
 from apc.option_value import option_value
@@ -67,14 +68,15 @@ class Demands:
 
 def read_demands(
     system: CompiledSystem,
-    free: Sequence[str],
-    aim: tuple[str, bool],
+    free: Sequence[str] = (),
     *,
+    maximize: str = "",
+    minimize: str = "",
     subject: Sequence[str] = (),
     over: Sequence[str] = (),
     criterion: str | None = None,
 ) -> Demands:
-    """Read what is asked.
+    """Read what is asked; what is left out is as the scene's `studies: tune:` says.
 
     Parameters
     ----------
@@ -82,8 +84,8 @@ def read_demands(
         The compiled scene.
     free
         The gains: `NAME=LOW:HIGH` each.
-    aim
-        What is to be best, and whether it is to be large.
+    maximize, minimize
+        One of them: what is to be best.
     subject
         Demands beside stability: `decay=60 dB in 2 s`.
     over
@@ -97,6 +99,12 @@ def read_demands(
         E995 nothing is free, or a time or number of peers is; E996 no such aim, or demand; E842, and those of
         `box.parse_range`: a range that is none; E831 a number with two ranges.
     """
+    free, subject, over = (
+        given or [text for word, text in system.tune if word == key]
+        for key, given in (("free", free), ("subject", subject), ("over", over))
+    )
+    if not (maximize or minimize):
+        maximize, minimize = (dict(system.tune).get(key, "") for key in ("maximize", "minimize"))
     if not free:
         raise ApcError(Mistake("E995", FREE, "no number is free: which may be chosen?", hint=_FREE))
     gains = [_range(system, text, FREE) for text in free]
@@ -125,15 +133,20 @@ def read_demands(
     if decay < 1 and chosen == PASSIVE:
         what = "a decay and --hands passive don't go together: what hands can draw has no modes that decay"
         raise ApcError(Mistake("E930", SUBJECT, what, hint="--hands clamped"))
-    return Demands(tuple(gains), _aim(gains, *aim), counts, delays[0] if delays else None, box, decay, chosen)
+    return Demands(
+        tuple(gains),
+        _aim(gains, maximize, minimize),
+        counts,
+        delays[0] if delays else None,
+        box,
+        decay,
+        chosen,
+    )
 
 
-def read_aim(maximize: str, minimize: str) -> tuple[str, bool]:
-    """Return what is to be best and whether it is to be large, of two options. Raises ApcError E996."""
-    if bool(maximize) == bool(minimize):
-        what = "--maximize and --minimize both say what is best" if maximize else "nothing is to be best"
-        raise ApcError(Mistake("E996", PLACE, what, hint="--maximize coordination.stiffness"))
-    return (maximize or minimize).strip(), bool(maximize)
+def study_hands(system: CompiledSystem) -> str:
+    """Return what holds the devices where the scene's `studies: tune:` says so, "free" where it doesn't."""
+    return dict(system.tune).get("hands", FREE_HANDS)
 
 
 def read_seconds(text: str) -> float:
@@ -173,8 +186,12 @@ def _counted(system: CompiledSystem, free: Free, text: str, place: Place) -> Ran
     return Range(free, "1", Fraction(low), Fraction(high))
 
 
-def _aim(gains: Sequence[Range], text: str, larger: bool) -> Aim:
+def _aim(gains: Sequence[Range], maximize: str, minimize: str) -> Aim:
     """Return what is to be best."""
+    if bool(maximize) == bool(minimize):
+        what = "--maximize and --minimize both say what is best" if maximize else "nothing is to be best"
+        raise ApcError(Mistake("E996", PLACE, what, hint=f"--maximize {gains[0].free.label}"))
+    text, larger = (maximize or minimize).strip(), bool(maximize)
     names = [one.free.label for one in gains]
     if text in names:
         return Aim(text, names.index(text), larger)
