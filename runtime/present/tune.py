@@ -41,13 +41,7 @@ def tuning_text(found: Tuning) -> str:
     if found.met:
         best = f"{measured(found.best, found.error, found.unit)}, the best of {found.looked:,} points"
         lines += labelled("before rounding", best)
-    growth = f"spectral radius {math.exp(found.worst + found.allowed):.6g} in the worst scenario"
-    lines += labelled(
-        "room",
-        f"{growth}, {math.exp(found.allowed):.6g} allowed"
-        if found.criterion != "passive"
-        else f"{-found.worst:.3g}",
-    )
+    lines += labelled("room", _room(found))
     lines += _proof_lines(found)
     if found.binding:
         lines += ["", "  what binds" if found.met else "  what is in the way"]
@@ -59,6 +53,7 @@ def _sentence(found: Tuning) -> str:
     """Return the answer in a sentence."""
     decay = f"dying out by {-20 * math.log10(found.decay):.6g} dB a second"
     stable = "stable" if found.decay == 1 else decay
+    stable += " and felt as asked" if found.felt else ""
     over = f" for {enumerated([_span(one) for one in found.over])}" if found.over else ""
     if not found.met:
         return f"{found.topology}: no gains were found in these ranges that are {stable}{over}"
@@ -71,6 +66,16 @@ def _sentence(found: Tuning) -> str:
         return f"{found.topology}: {least} is {proved}"
     value = quantity(found.value, found.unit, TYPED)
     return f"{found.topology}: {value} is the {best} {found.aim} found to be {stable}{over}; it is {proved}"
+
+
+def _room(found: Tuning) -> str:
+    """Return how near the worst scenario is to what is allowed."""
+    if found.criterion == "passive":
+        return f"{-found.worst:.3g} of what hands can draw, as a logarithm"
+    if found.felt:
+        return f"{math.exp(found.worst):.6g} of what is allowed in the worst scenario"
+    radius, most = math.exp(found.worst + found.allowed), math.exp(found.allowed)
+    return f"spectral radius {radius:.6g} in the worst scenario, {most:.6g} allowed"
 
 
 def _span(one: Range) -> str:
@@ -103,7 +108,8 @@ def _proof_lines(found: Tuning) -> list[str]:
 def _binding_lines(found: Tuning, one: Binding) -> list[str]:
     where = ", ".join(f"{label} {quantity(value, unit)}" for label, value, unit in one.where)
     mode = f"{one.shape} mode at {in_hertz(one.frequency_hz)}" if one.shape else ""
-    lines = wrapped(": ".join(filter(None, [where, mode])) or "stability", "    ", "      ")
+    other = "" if where else "what is felt" if found.felt else "stability"
+    lines = wrapped(": ".join(filter(None, [where, mode])) or other, "    ", "      ")
     for label, value, unit, better in one.buys if found.met and found.unit != "1" else ():
         buys = quantity(better, found.unit, BUYS)
         lines += wrapped(f"1 % less of {label} = {quantity(value, unit)} buys {buys}", "      ", "        ")

@@ -1,7 +1,7 @@
 """What is asked of gains: which are free, what they are to do best, and all that they have to bear.
 
 Takes: a `CompiledSystem` and texts such as `coordination.stiffness=10 N/m:5000 N/m`.
-Gives: `Aim`, `Demands`, `read_demands`, `study_hands`, `read_seconds`; `PLACE`, `RADIUS`.
+Gives: `Aim`, `Felt`, `Demands`, `read_demands`, `study_hands`, `read_seconds`; `PLACE`, `RADIUS`.
 Guarantees: what can't be meant is refused before anything is computed.
 Does not: compute.
 """
@@ -31,6 +31,13 @@ FREE, AIM, SUBJECT, OVER = (Place(f"--{one}") for one in ("free", "maximize", "s
 # What may be minimized beside a gain.
 RADIUS = "spectral_radius"
 
+# What hands feel, as `Feel` has it, and its unit.
+FELT = {
+    "impedance": ("impedance", "N*s/m"),
+    "transmitted": ("transmitted_admittance", "m/s/N"),
+    "error": ("error_per_force", "m/N"),
+}
+
 _FREE = '--free "coordination.stiffness=10 N/m:5000 N/m"'
 
 
@@ -44,12 +51,22 @@ class Aim:
 
 
 @dataclass(frozen=True, slots=True)
+class Felt:
+    """A demand on what a hand feels: the size of a `quantity` of `Feel` at a frequency, at most so."""
+
+    quantity: str
+    frequency_hz: float
+    most: float
+
+
+@dataclass(frozen=True, slots=True)
 class Demands:
     """All that is asked: the free gains with their ranges, the aim, and what has to be borne.
 
     `counts` are numbers of peers, every one from the low end to the high one; `delay` is a link's, at every
     constant value; `box` are other numbers. `decay` is the factor by which motions have to die out in a
-    second, 1 where it is enough that they do. `criterion` is one of those of `vary.growth`.
+    second, 1 where it is enough that they do. `felt` is what hands may feel at most. `criterion` is one of
+    those of `vary.growth`.
     """
 
     free: tuple[Range, ...]
@@ -58,6 +75,7 @@ class Demands:
     delay: Range | None
     box: tuple[Range, ...]
     decay: float
+    felt: tuple[Felt, ...]
     criterion: str
 
     @property
@@ -87,7 +105,7 @@ def read_demands(
     maximize, minimize
         One of them: what is to be best.
     subject
-        Demands beside stability: `decay=60 dB in 2 s`.
+        Demands beside stability: `decay=60 dB in 2 s`, `feel.impedance at 5 Hz < 20 N*s/m`.
     over
         What has to be borne: `user.count=2:10`, `device.mass=±20%`, `lan.delay=8 ms:20 ms`.
     criterion
@@ -129,19 +147,14 @@ def read_demands(
     if chosen == PASSIVE:
         for one in (*gains, *box):
             refuse_time(system, one.free, PLACE, chosen)
-    decay = math.prod(_decay(text) for text in subject)
+    felt = tuple(_felt(text) for text in subject if text.strip().startswith("feel."))
+    decay = min((_decay(text) for text in subject if not text.strip().startswith("feel.")), default=1.0)
     if decay < 1 and chosen == PASSIVE:
         what = "a decay and --hands passive don't go together: what hands can draw has no modes that decay"
         raise ApcError(Mistake("E930", SUBJECT, what, hint="--hands clamped"))
-    return Demands(
-        tuple(gains),
-        _aim(gains, maximize, minimize),
-        counts,
-        delays[0] if delays else None,
-        box,
-        decay,
-        chosen,
-    )
+    best = _aim(gains, maximize, minimize)
+    delay = delays[0] if delays else None
+    return Demands(tuple(gains), best, counts, delay, box, decay, felt, chosen)
 
 
 def study_hands(system: CompiledSystem) -> str:
@@ -209,11 +222,28 @@ def _decay(text: str) -> float:
     name, _, value = (one.strip() for one in text.partition("="))
     size, within, time = (one.strip() for one in value.partition(" in "))
     if name != "decay" or not (within and size.lower().endswith("db")):
-        raise ApcError(
-            Mistake("E996", SUBJECT, "a demand", "decay=… dB in …", text[:80], '"decay=60 dB in 2 s"')
-        )
+        wants = "decay=… dB in … or feel.… at … < …"
+        raise ApcError(Mistake("E996", SUBJECT, "a demand", wants, text[:80], '"decay=60 dB in 2 s"'))
     decibels = option_value("--subject", size[:-2].strip(), what="decibels", unit="1")
     seconds = option_value("--subject", time, what="a time", unit="s")
     if not (decibels > 0 and seconds > 0):
         raise ApcError(Mistake("E996", SUBJECT, "a decay", "more than 0 dB in more than 0 s", value[:80]))
     return float(10 ** (-decibels / 20 / seconds))
+
+
+def _felt(text: str) -> Felt:
+    """Read `feel.impedance at 5 Hz < 20 N*s/m`, of a topology `feel.impedance at 5 Hz=< 20 N*s/m`."""
+    named, less, most = (one.strip() for one in text.replace("=<", "<").replace("= <", "<").partition("<"))
+    name, at, frequency = (one.strip() for one in named.removeprefix("feel.").partition(" at "))
+    if name not in FELT or not (at and less):
+        names = ", ".join(f"feel.{one}" for one in FELT)
+        example = '"feel.impedance at 5 Hz < 20 N*s/m"'
+        raise ApcError(
+            Mistake("E996", SUBJECT, "a demand on what is felt", f"one of {names}", text[:80], example)
+        )
+    quantity, unit = FELT[name]
+    hertz = option_value("--subject", frequency, what="a frequency", unit="Hz")
+    limit = option_value("--subject", most, what=f"feel.{name}", unit=unit)
+    if not (hertz > 0 and limit > 0):
+        raise ApcError(Mistake("E996", SUBJECT, "a demand on what is felt", "numbers above 0", text[:80]))
+    return Felt(quantity, float(hertz), float(limit))

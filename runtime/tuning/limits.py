@@ -7,11 +7,13 @@ Does not: choose scenarios, or prove (see `proof`).
 
 A scenario is a scene of its own, a number of peers and a delay (`settings`), and a point of the box. What
 limits gains there is how fast each of the largest modes grows, ln |λ| less what is allowed; over a lossy
-network or with passive hands it is the one number that the criterion has.
+network or with passive hands it is the one number that the criterion has. What is felt counts as the
+logarithm of what it is of the most it may be.
 """
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 from collections.abc import Sequence
@@ -24,8 +26,10 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
 from apc.eigen.eigenpairs import eigenvalues
 from apc.frame.overrides import Override, apply
+from apc.hands.feel import feel
 from apc.tuning.demands import PLACE, Demands
 from apc.vary.batch import MatrixSource
 from apc.vary.delay_box import standing_delays
@@ -40,6 +44,14 @@ MODES = 4
 
 # The step of a difference, of a range: what it cuts off and what rounding leaves of it are then alike.
 STEP = 1e-6
+
+# The bound of each response, as `Feel` has it; less than any size.
+BOUND_OF = {
+    "impedance": "bound",
+    "transmitted_admittance": "transmitted_bound",
+    "error_per_force": "error_bound",
+}
+TINY = 1e-300
 
 # What stands for ln |λ| where there is no matrix, and for one of a mode that is not there.
 BEYOND, NONE = 3.0, -30.0
@@ -59,7 +71,7 @@ class Rows:
 
     A slope is that over the whole range of a gain, or of a number of the box.
     `block` (n,) numbers the scenario and system that each is of, `eigenvalue` (n,) tells those of one block
-    apart, and `scenario` (n,) is the place of its scenario.
+    apart, NaN of what has none, and `scenario` (n,) is the place of its scenario.
     """
 
     values: Floats
@@ -108,6 +120,11 @@ class Limits:
         """Whether stable means one number below 1, and not eigenvalues inside the circle."""
         return self.demands.criterion in BY_GROWTH
 
+    @property
+    def slow(self) -> bool:
+        """Whether one point takes milliseconds."""
+        return self.by_growth or bool(self.demands.felt)
+
     def every(self) -> list[Scenario]:
         """Return the middle and the corners of the box in every setting."""
         ends = [(float(one.low), float(one.high)) for one in self.demands.box]
@@ -133,8 +150,27 @@ class Limits:
         for place, one in enumerate(scenarios):
             points = np.hstack([gains, np.tile(one.point, (len(gains), 1))])
             sizes = [_sizes(matrix) for matrix in self.family(one.setting).matrices(points)]
-            found[:, place] = np.max([np.full(len(gains), NONE), *sizes], axis=0)
-        return found - self.allowed
+            grown = np.max([np.full(len(gains), NONE), *sizes], axis=0) - self.allowed
+            found[:, place] = np.max([grown, *self.felt(one, points).T], axis=0)
+        return found
+
+    def felt(self, scenario: Scenario, points: Floats, *, bounded: bool = False) -> Floats:
+        """Return ln of what is felt by what may be at most (k, q) at points of gains and box (k, m + b)."""
+        asked = self.demands.felt
+        found = np.full((len(points), len(asked)), BEYOND)
+        _, scene = self.settings[scenario.setting]
+        free = [one.free for one in (*self.demands.free, *self.demands.box)]
+        for row, point in zip(found, points.tolist() if asked else (), strict=False):
+            changed = apply(scene, [Override(*pair) for pair in zip(free, map(Fraction, point), strict=True)])
+            for place, one in enumerate(asked):
+                with contextlib.suppress(ApcError):
+                    told = feel(
+                        changed, [one.frequency_hz], unstable=True, quick=True, prepared=self.prepared
+                    )
+                    size = abs(complex(getattr(told, one.quantity)[0]))
+                    share = float(getattr(told, BOUND_OF[one.quantity])[0]) if bounded else 0.0
+                    row[place] = math.log(max(size * (1 + share), TINY) / one.most)
+        return found
 
     def sampled(self, scenario: Scenario, gains: Floats) -> Floats:
         """Return the largest value in a scenario (k,) at gains (k, m), the same whenever it is asked."""
@@ -151,15 +187,20 @@ class Limits:
         for place, one in enumerate(scenarios):
             point = np.append(gains, one.point)
             family = self.family(one.setting)
+            inwards = along * np.where(point > [float(own.low + own.high) / 2 for own in ranges], -1, 1)
             if isinstance(family, GrowthEvaluator):
-                middle = [float(one.low + one.high) / 2 for one in ranges]
-                parts.append((*_differences(family, point, along * np.where(point > middle, -1, 1)), place))
-                continue
-            pairs = family.slopes(np.tile(point, (len(along), 1)), along)
-            parts += [(*_largest(*pair), place) for pair in pairs]
+                (roots,) = family.matrices(np.vstack([point, point + STEP * inwards]))
+                parts.append((*_differences(_sizes(roots)[:, None] - self.allowed, inwards), place))
+            else:
+                for pair in family.slopes(np.tile(point, (len(along), 1)), along):
+                    values, slopes, found = _largest(*pair)
+                    parts.append((values - self.allowed, slopes, found, place))
+            if self.demands.felt:
+                felt = self.felt(one, np.vstack([point, point + STEP * inwards]))
+                parts.append((*_differences(felt, inwards), place))
         counts = [len(values) for values, *_ in parts]
         return Rows(
-            np.concatenate([values for values, *_ in parts]) - self.allowed,
+            np.concatenate([values for values, *_ in parts]),
             np.concatenate([slopes for _, slopes, *_ in parts]),
             np.repeat(np.arange(len(parts)), counts),
             np.concatenate([found for *_, found, _ in parts]),
@@ -167,16 +208,14 @@ class Limits:
         )
 
 
-def _differences(family: GrowthEvaluator, point: Floats, along: Floats) -> tuple[Floats, Floats, Complexes]:
-    """Return half the logarithm of a growth (1,), how it moves along directions (1, m), and no eigenvalue.
+def _differences(values: Floats, along: Floats) -> tuple[Floats, Floats, Complexes]:
+    """Return the first of values (1 + m, q), how they move along directions (q, m), and no eigenvalues.
 
-    Differences are one-sided, into the ranges: of a number that takes milliseconds, half as many are wanted.
+    Differences are one-sided, into the ranges: of numbers that take milliseconds, half as many are wanted.
     """
-    (roots,) = family.matrices(np.vstack([point, point + STEP * along]))
-    values = _sizes(roots)
     # A direction goes up where its one entry is above 0.
-    slopes = (values[1:] - values[0]) / STEP * np.sign(along.sum(axis=1))
-    return values[:1], slopes[None], np.zeros(1, np.complex128)
+    slopes = (values[1:] - values[0]) / STEP * np.sign(along.sum(axis=1))[:, None]
+    return values[0], slopes.T, np.full(len(values[0]), np.nan, np.complex128)
 
 
 def _sizes(matrices: Floats) -> Floats:

@@ -129,7 +129,7 @@ class Search:
             met = self.column is not None and than.worst <= BINDS
             known = self._order(self.shares(than)[None], np.array([0.0 if met else than.worst]))[0]
             order = order[self._order(points, worst)[order] < known - OPEN]
-        size, left = (SLOW_LOOK if self.limits.by_growth else LOOK), LOOKS
+        size, left = (SLOW_LOOK if self.limits.slow else LOOK), LOOKS
         for begin in range(0, min(len(order), size * LOOKS), size):
             some = order[begin : begin + size]
             ranks = self._order(points[some], self.limits.worst(every, gains[some]).max(axis=1))
@@ -146,7 +146,7 @@ class Search:
     @cached_property
     def _even(self) -> Floats:
         """Points (k, m) spread evenly over the ranges, every other one by ratios."""
-        even = _spread(SLOW_POINTS if self.limits.by_growth else POINTS, len(self._low))
+        even = _spread(SLOW_POINTS if self.limits.slow else POINTS, len(self._low))
         top = self._low + self._width
         near = np.where(self._low > 0, self._low, SMALLEST * self._width)
         ratios = np.where(top > near, near * (np.maximum(top, near) / near) ** even[::2], top)
@@ -157,7 +157,7 @@ class Search:
         """Return the best that descents from starts (shares of the ranges) find."""
         found = [self._descended(start) for start in starts]
         chosen = min(found, key=self._rank)
-        count = SLOW_BESIDE if self.limits.by_growth else BESIDE
+        count = SLOW_BESIDE if self.limits.slow else BESIDE
         cloud = _spread(count, len(self._low)) - 0.5
         looked = 0
         for _ in range(AGAIN):
@@ -210,7 +210,7 @@ class Search:
             method="SLSQP",
             bounds=[(0.0, 1.0)] * size + [(None, None)] * spare,
             constraints=[{"type": "ineq", "fun": left, "jac": moves}],
-            options={"ftol": 1e-9 if self.limits.by_growth else 1e-14, "maxiter": self.steps},
+            options={"ftol": 1e-9 if self.limits.slow else 1e-14, "maxiter": self.steps},
         )
         rough = np.clip(np.nan_to_num(ended.x[:size], nan=0.5), 0.0, 1.0)
         rough = np.where(np.abs(rough - np.round(rough)) < OPEN, np.round(rough), rough)
@@ -236,7 +236,7 @@ class Search:
         inner = (rough > OPEN) & (rough < 1 - OPEN)
         active = np.flatnonzero(before.multipliers > 0).tolist()
         spare = self.column is None
-        if self.limits.by_growth or not len(active) or len(active) > inner.sum() + spare:
+        if self.limits.slow or not len(active) or len(active) > inner.sum() + spare:
             return before
 
         def unpacked(y: Floats) -> tuple[Floats, Floats]:

@@ -36,7 +36,7 @@ from apc.frame.overrides import Override, apply
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded
-from apc.tuning.demands import Demands
+from apc.tuning.demands import Demands, Felt
 from apc.tuning.limits import Limits, Scenario
 from apc.tuning.optimum import BINDS, Optimum, Search
 from apc.vary.crossing import Told
@@ -59,7 +59,7 @@ BACK_IN_BOX = (3e-3, 6e-3, 1e-2)
 STEPS = 12
 
 # What is said where only stability is proved.
-SLOWER = "stable is proved, how fast motions die out is not: it is so in the scenarios looked at"
+SLOWER = "stable is proved; how fast motions die out, or what is felt, is only looked at scenario by scenario"
 
 # Scenarios added at a time; how far above the others a limit is that counts.
 MORE, ABOVE = 3, 1e-9
@@ -130,6 +130,7 @@ class Tuning(Result):
     over: tuple[Range, ...]
     criterion: str
     decay: float
+    felt: tuple[Felt, ...]
     allowed: float
     proofs: tuple[Proved, ...]
     binding: tuple[Binding, ...]
@@ -186,8 +187,9 @@ class _Work:
 
     @property
     def _unproved(self) -> bool:
-        """Whether nothing proves what is asked."""
-        return self.limits.by_growth and self.demands.decay < 1
+        """Whether nothing proves what is asked, beside that it is stable."""
+        decays = self.limits.by_growth and self.demands.decay < 1
+        return decays or bool(self.demands.felt and (self.demands.box or self.demands.delay))
 
     @property
     def late(self) -> bool:
@@ -340,7 +342,7 @@ class _Work:
             scene = apply(self.system, [*changes, *numbers])
             passive = self.demands.criterion == PASSIVE
             proof = proved_at(scene, ranges, passive=passive, inside=1.0 if self.limits.by_growth else inside)
-            if proof.stable and inside < 1 and self.limits.by_growth:
+            if proof.stable and (self._unproved or not self._felt(numbers, point)):
                 proof = replace(proof, verdict=UNDECIDED, stable=None, notes=(*proof.notes, SLOWER))
             found.append(Proved(named, proof))
             if proof.stable is False:
@@ -348,6 +350,14 @@ class _Work:
             if not proof.stable:
                 break
         return found, None
+
+    def _felt(self, numbers: tuple[Override, ...], point: Floats) -> bool:
+        """Say whether it is proved that what is felt is as asked, where only numbers of peers vary."""
+        places = [place for place, (own, _) in enumerate(self.limits.settings) if own == numbers]
+        found = [
+            self.limits.felt(Scenario(place, ()), point, bounded=True).max(initial=-1.0) for place in places
+        ]
+        return max(found, default=-1.0) < 0
 
     def _inside(self, gains: Sequence[Fraction]) -> float:
         """Return what the spectral radius is to be proved below: of the least there is, a little above it."""
@@ -407,6 +417,7 @@ class _Work:
             over=demands.over,
             criterion=demands.criterion,
             decay=demands.decay,
+            felt=demands.felt,
             allowed=self.limits.allowed,
             proofs=tuple(proofs),
             binding=tuple(self._binding(found, met=met)),
@@ -448,7 +459,7 @@ class _Work:
 
     def _mode(self, found: Optimum, scenario: Scenario, eigenvalue: complex) -> tuple[str, float]:
         """Return the shape and the frequency of a mode, "" and NaN where there is none."""
-        if self.limits.by_growth:
+        if np.isnan(eigenvalue):
             return "", math.nan
         _, scene = self.limits.settings[scenario.setting]
         changes = [
