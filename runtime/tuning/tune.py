@@ -53,7 +53,7 @@ ROOM = 0.5
 # How far gains go back from the best until they are proved, as shares of the best; where there is a box, they
 # begin farther back: cells beside a limit are small, and there are very many.
 BACK = (0.0, 1e-4, 1e-3, 1e-2)
-BACK_IN_BOX = (3e-3, 6e-3, 1e-2)
+BACK_IN_BOX = (5e-3, 1e-2)
 
 # Steps on the way to where there is most room: any room does.
 STEPS = 12
