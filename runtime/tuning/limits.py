@@ -31,7 +31,7 @@ from apc.eigen.eigenpairs import eigenvalues
 from apc.frame.overrides import Override, apply
 from apc.hands.feel import feel
 from apc.tuning.demands import PLACE, Demands
-from apc.vary.batch import MatrixSource
+from apc.vary.batch import BatchEvaluator, MatrixSource
 from apc.vary.delay_box import standing_delays
 from apc.vary.evaluator import evaluator_of_many
 from apc.vary.growth import BY_GROWTH, GrowthEvaluator
@@ -123,7 +123,7 @@ class Limits:
     @property
     def slow(self) -> bool:
         """Whether one point takes milliseconds."""
-        return self.by_growth or bool(self.demands.felt)
+        return bool(self.demands.felt) or not isinstance(self.family(0), BatchEvaluator)
 
     def every(self) -> list[Scenario]:
         """Return the middle and the corners of the box in every setting."""

@@ -34,6 +34,9 @@ LOOK, SLOW_LOOK, LOOKS = 64, 8, 4
 # The least error, of a value: floats know no more of where their eigenvalues cross.
 LEAST = 1e-9
 
+# How nearly a descent is followed to its end where a point takes milliseconds, as a share of the range.
+ROUGH = 1e-9
+
 # More than any aim is worth.
 HUGE = 1e3
 
@@ -210,7 +213,7 @@ class Search:
             method="SLSQP",
             bounds=[(0.0, 1.0)] * size + [(None, None)] * spare,
             constraints=[{"type": "ineq", "fun": left, "jac": moves}],
-            options={"ftol": 1e-9 if self.limits.slow else 1e-14, "maxiter": self.steps},
+            options={"ftol": ROUGH if self.limits.slow else 1e-14, "maxiter": self.steps},
         )
         rough = np.clip(np.nan_to_num(ended.x[:size], nan=0.5), 0.0, 1.0)
         rough = np.where(np.abs(rough - np.round(rough)) < OPEN, np.round(rough), rough)
@@ -296,6 +299,8 @@ class Search:
             scale = 1.0 if self.column is None else float(self._width[self.column])
             error = scale * float(multipliers @ np.abs(rows.values - level))
         error = max(error, LEAST * abs(value))
+        if self.limits.slow and self.column is not None:
+            error = max(error, 10 * ROUGH * float(self._width[self.column]))
         return Optimum(tuple(self.scenarios), self._gains(shares), value, error, worst, rows, multipliers, 0)
 
 

@@ -258,7 +258,9 @@ class _Work:
         while True:
             gains = [_decimal(value, DIGITS) for value in found.gains.tolist()]
             if column is not None:
-                gains[column] = self._back(float(found.gains[column]), shares[place])
+                own = self.demands.free[column]
+                back = self._back(float(found.gains[column]), shares[place])
+                gains[column] = min(max(back, own.low), own.high)
             if column is None or len(gains) > 1:
                 middle = self._middle(gains, column, found) if middle is None else middle
                 gains = self._typed(gains, column, middle)

@@ -368,6 +368,10 @@ WRITING = {
     ("simulate", "--plot"): (SHORT, "new.svg"),
     ("simulate", "--still"): (SHORT, "new.svg"),
     ("sweep", "--out"): ("scene.yaml --over contact.stiffness=1N/m:2N/m:2 --jobs 1", "new.csv"),
+    ("tune", "--write"): (
+        "scene.yaml --free contact.stiffness=1N/m:9N/m --maximize contact.stiffness",
+        "a.yaml",
+    ),
 }
 # A folder, which has a test of its own; read and not written.
 OTHERS = {("play", "--out"), ("play", "--device"), ("play", "--secret-file"), ("bench", "--hard"),
