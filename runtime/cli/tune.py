@@ -31,7 +31,11 @@ def tune_command(
     ),
     maximize: str = option("The gain that is to be as large as can be.", "PATH"),
     minimize: str = option("The gain, or spectral_radius, that is to be as small as can be.", "PATH"),
-    subject: tuple[str, ...] = option('Beside stability: "decay=60 dB in 2 s".', "DEMAND"),
+    subject: tuple[str, ...] = option(
+        'Beside stability: "decay=60 dB in 2 s"; "feel.impedance at 5 Hz < 20 N*s/m", or feel.transmitted in '
+        "m/s/N, feel.error in m/N. May be repeated.",
+        "DEMAND",
+    ),
     over: tuple[str, ...] = option(
         "What the gains have to bear, all of it: user.count=2:10, device.mass=±20%, lan.loss=0:0.05, or "
         '"lan.delay=8 ms:20 ms", at every constant delay. May be repeated.',

@@ -46,6 +46,8 @@ def tuning_text(found: Tuning) -> str:
     if found.binding:
         lines += ["", "  what binds" if found.met else "  what is in the way"]
         lines += [line for one in found.binding for line in _binding_lines(found, one)]
+    elif found.met:
+        lines += ["", f"  nothing binds {found.aim} but the end of its range"]
     return "\n".join(lines)
 
 

@@ -33,6 +33,7 @@ from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
 from apc.frame.names import Range, value_now
 from apc.frame.overrides import Override, apply
+from apc.hands.passivity import passive_hands
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded
@@ -254,6 +255,8 @@ class _Work:
         """Return gains as they are typed, what is proved of them, and a scenario that they don't bear."""
         column = self.demands.aim.gain
         shares = [0.0] if column is None or self._unproved else BACK_IN_BOX if self.demands.over else BACK
+        if not found.multipliers.any():  # the end of a range, which leaves room
+            shares = [0.0, *shares]
         place, middle = 0, None
         while True:
             gains = [_decimal(value, DIGITS) for value in found.gains.tolist()]
@@ -271,7 +274,7 @@ class _Work:
             held = column is None or float(self.limits.worst(self.every, point[None]).max()) < 0
             last = self.late or place + 1 == len(shares)
             if held or last:
-                proofs, failed = self._proofs(gains)
+                proofs, failed = self._proofs(gains, whole=last)
                 if failed is not None or last or all(one.proof.stable for one in proofs):
                     return gains, proofs, failed
             place += 1
@@ -322,8 +325,11 @@ class _Work:
         others = iter(listed[int(fits[0]) if len(fits) else -1])
         return [one if place == column else next(others) for place, one in enumerate(gains)]
 
-    def _proofs(self, gains: Sequence[Fraction]) -> tuple[list[Proved], Scenario | None]:
-        """Return what is proved of gains with each number of peers, those first that limit them most."""
+    def _proofs(self, gains: Sequence[Fraction], *, whole: bool) -> tuple[list[Proved], Scenario | None]:
+        """Return what is proved of gains with each number of peers, those first that limit them most.
+
+        Without `whole` only as far as one that is left open.
+        """
         inside = self._inside(gains)
         delay, counts = self.demands.delay, self.demands.counts
         ranges = [*([delay] if delay else []), *self.demands.box]
@@ -349,7 +355,7 @@ class _Work:
             found.append(Proved(named, proof))
             if proof.stable is False:
                 return found, self._failed(numbers, proof, ranges)
-            if not proof.stable:
+            if not (proof.stable or whole):
                 break
         return found, None
 
@@ -461,7 +467,8 @@ class _Work:
 
     def _mode(self, found: Optimum, scenario: Scenario, eigenvalue: complex) -> tuple[str, float]:
         """Return the shape and the frequency of a mode, "" and NaN where there is none."""
-        if np.isnan(eigenvalue):
+        passive = self.demands.criterion == PASSIVE
+        if np.isnan(eigenvalue) and not (passive and not self.demands.felt):
             return "", math.nan
         _, scene = self.limits.settings[scenario.setting]
         changes = [
@@ -471,8 +478,12 @@ class _Work:
                 *zip(self.demands.box, scenario.point, strict=True),
             )
         ]
+        changed = apply(scene, changes)
+        if passive:
+            worst = passive_hands(changed).worst
+            return ("", math.nan) if worst is None else (worst.name, worst.frequency_hz or math.nan)
         try:
-            modes = analyze(apply(scene, changes)).modes
+            modes = analyze(changed).modes
         except ApcError:
             return "", math.nan
         if not len(modes):
