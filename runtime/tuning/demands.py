@@ -224,8 +224,8 @@ def _decay(text: str) -> float:
     if name != "decay" or not (within and size.lower().endswith("db")):
         wants = "decay=… dB in … or feel.… at … < …"
         raise ApcError(Mistake("E996", SUBJECT, "a demand", wants, text[:80], '"decay=60 dB in 2 s"'))
-    decibels = option_value("--subject", size[:-2].strip(), what="decibels", unit="1")
-    seconds = option_value("--subject", time, what="a time", unit="s")
+    decibels = _part(size[:-2].strip(), "decibels", "1", "decay=60 dB in 2 s")
+    seconds = _part(time, "a time", "s", "decay=60 dB in 2 s")
     if not (decibels > 0 and seconds > 0):
         raise ApcError(Mistake("E996", SUBJECT, "a decay", "more than 0 dB in more than 0 s", value[:80]))
     return float(10 ** (-decibels / 20 / seconds))
@@ -242,8 +242,17 @@ def _felt(text: str) -> Felt:
             Mistake("E996", SUBJECT, "a demand on what is felt", f"one of {names}", text[:80], example)
         )
     quantity, unit = FELT[name]
-    hertz = option_value("--subject", frequency, what="a frequency", unit="Hz")
-    limit = option_value("--subject", most, what=f"feel.{name}", unit=unit)
+    hint = f"feel.{name} at 5 Hz < 20 {unit}"
+    hertz = _part(frequency, "a frequency", "Hz", hint)
+    limit = _part(most, f"feel.{name}", unit, hint)
     if not (hertz > 0 and limit > 0):
         raise ApcError(Mistake("E996", SUBJECT, "a demand on what is felt", "numbers above 0", text[:80]))
     return Felt(quantity, float(hertz), float(limit))
+
+
+def _part(text: str, what: str, unit: str, example: str) -> Fraction:
+    """Read a quantity within a demand, of which an example is the line to write."""
+    try:
+        return option_value("--subject", text, what=what, unit=unit)
+    except ApcError as error:
+        raise ApcError(replace(one, hint=f'--subject "{example}"') for one in error.mistakes) from None

@@ -28,16 +28,17 @@ from apc.analysis.analysis import analyze, prepare
 from apc.analysis.box_proof import UNDECIDED, BoxProof
 from apc.answer import proved_at
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError
+from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
 from apc.frame.names import Range, value_now
 from apc.frame.overrides import Override, apply
+from apc.hands.feel import feel
 from apc.hands.passivity import passive_hands
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded
-from apc.tuning.demands import Demands, Felt
+from apc.tuning.demands import SUBJECT, Demands, Felt
 from apc.tuning.limits import Limits, Scenario
 from apc.tuning.optimum import BINDS, Optimum, Search
 from apc.vary.crossing import Told
@@ -163,9 +164,14 @@ def tune(
     Raises
     ------
     ApcError
-        Those of the analysis that the scene needs, such as E898 a network that can't be judged.
+        Those of the analysis that the scene needs, such as E898 a network that can't be judged; of `feel`.
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
+        for one in demands.felt:  # what can't be felt anywhere is refused here
+            told_of = feel(system, [one.frequency_hz], unstable=True, quick=True)
+            if not abs(getattr(told_of, one.quantity)[0]) > 0:
+                what = f"of {one.quantity.replace('_', ' ')} nothing is felt in this scene"
+                raise ApcError(Mistake("E996", SUBJECT, what))
         return _Work(system, demands, time.monotonic() + seconds, told or (lambda _: None)).done()
 
 
