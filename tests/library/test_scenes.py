@@ -16,6 +16,7 @@ VERDICTS = {
     "lifted-box": ("stable", 0),
     "lossy-average": (COMMON, 1),
     "mixed-clocks": (COMMON, 1),
+    "teleoperation-pair": (COMMON, 1),
     "template": (COMMON, 1),
     "three-users-average": (COMMON, 1),
     "three-users-predicted": (COMMON, 1),
