@@ -240,16 +240,17 @@ def proved_box(
         As `box_proof.prove_box`, or `moments.mean_square_box.prove_box` where links are, or may become,
         unreliable; as `hands.passive_box.prove_box`.
     """
+    from apc.network.nominal import channel_numbers, left_out
     from apc.vary.delay_box import is_delay, prove_over_delay
 
     if any(is_delay(system, one.free) for one in box):
-        return prove_over_delay(system, box, partial(_proved_at, passive=passive, cells=cells))
+        at_each = partial(_proved_at, passive=passive, cells=cells)
+        return prove_over_delay(system, box, at_each, nominal=not passive and not left_out(system))
     if passive:
         from apc.hands.passive_box import prove_box as prove_for_hands
 
         return prove_for_hands(system, box, cells=cells)
     from apc.analysis.box_proof import prove_box
-    from apc.network.nominal import channel_numbers, left_out
 
     numbers = channel_numbers(system)
     if left_out(system) or any(one.free.name in numbers for one in box):

@@ -42,7 +42,8 @@ def analyze_command(
     certify: bool = option("Prove the verdict in ball arithmetic, for the numbers as doubles."),
     box: tuple[str, ...] = option(
         "Prove stability for every value within, over the network as it is, e.g. "
-        '--box contact.stiffness=±1%, or --box "lan.delay=8 ms:20 ms", at every constant delay. '
+        '--box contact.stiffness=±1%, or --box "lan.delay=8 ms:20 ms", at every constant delay, and '
+        "as it changes from packet to packet. "
         "May be repeated.",
         "PATH=±P%",
     ),

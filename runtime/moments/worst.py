@@ -1,7 +1,8 @@
 """The worst that losses can do: how many in a row are harmless, and a pattern of them that shakes a scene.
 
 Takes: a `CompiledSystem` whose links lose packets, whose receivers hold what they heard last.
-Gives: `LossesInARow`, `worst_case`; `trace_of_worst`; for both, `held_parts`, `harmless`, `shaking`.
+Gives: `LossesInARow`, `worst_case`; `trace_of_worst`; for both, `held_parts`, `harmless`, `shaking`;
+`ratios_of`, `weight_of`.
 Guarantees: what is certified is proved for every pattern on every channel by itself; a pattern's growth above
 1 is proved. The cost does not grow with the number of equal peers on complete graphs.
 Does not: find the worst pattern of all: between the losses certified and those of the pattern it is open.
@@ -188,8 +189,8 @@ def held_parts(system: CompiledSystem, prepared: Prepared) -> HeldParts:
     if isinstance(loops, str):
         raise UnservedError(loops)
     lossy = scene.lossy
-    parts, ratios = [], _ratios(loops[0].sites, lossy)
-    weight, sizes = _weight(loops, lossy)
+    parts, ratios = [], ratios_of(loops[0].sites, lossy)
+    weight, sizes = weight_of(loops, lossy)
     for loop in loops:
         if loop.states > MOST_STATES:
             what = f"peers make one system of {loop.states:,} states"
@@ -254,7 +255,7 @@ def _scaled(value: float, by: float) -> tuple[float, float]:
     return value * by, 8 * UNIT * abs(value * by) if by != 1 or value != 1 else 0.0
 
 
-def _ratios(sites: Sequence[PeerGroup], lossy: frozenset[str]) -> Ratios:
+def ratios_of(sites: Sequence[PeerGroup], lossy: frozenset[str]) -> Ratios:
     """Find the links of which every tick of every site combines all channels into the same number.
 
     Those of other links are kept apart. The first channel that counts has the ratio 1.
@@ -289,7 +290,7 @@ def _ratios(sites: Sequence[PeerGroup], lossy: frozenset[str]) -> Ratios:
     return found
 
 
-def _weight(loops: Sequence[Loop], lossy: frozenset[str]) -> tuple[float, Sizes]:
+def weight_of(loops: Sequence[Loop], lossy: frozenset[str]) -> tuple[float, Sizes]:
     """Return ‖|W|‖₂, rounded up, and the sizes of peers by which it is as small as can be.
 
     Notes

@@ -31,7 +31,7 @@ from apc.present.forms import (
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
-    from apc.analysis.box_proof import BoxProof
+    from apc.analysis.box_proof import BoxProof, ChangingDelay
     from apc.analysis.contact_modes import ContactMode, ContactModes
     from apc.analysis.conventions import Conventions, Outcome
     from apc.analysis.needs import Needs, SiteNeeds
@@ -333,7 +333,23 @@ def box_proof_text(found: BoxProof) -> str:
             more += wrapped(f"more cells may decide it: --cells {MORE_CELLS * found.cells}")
     told = [line for text in (*found.left_out, said) for line in wrapped(text)]
     ranges = [f"  {_range(one)}" for one in found.ranges]
+    if found.changing is not None:
+        more += ["", *wrapped(_changing(found.changing, found.ranges[0]))]
     return "\n".join([f"{found.topology}:", *told, *ranges, *more, *notes(found.notes)])
+
+
+def _changing(found: ChangingDelay, over: Range) -> str:
+    """Return what is proved of a delay that changes from packet to packet, in a sentence."""
+    low, high = (quantity(float(one), over.unit, 9) for one in (over.low, over.high))
+    said = [found.note or "open whether it stays stable"]
+    if found.unstable is not None:
+        said = [f"unstable if by turns {found.unstable[0]} packets take {low} and {found.unstable[1]} {high}"]
+    if found.proved_to == float(over.high):
+        said = ["stable, proved by the small gain theorem"]
+    elif found.proved_to is not None:
+        to = quantity(found.proved_to, over.unit, 9)
+        said = [f"stable from {low} to {to}, proved by the small gain theorem", f"over all of it {said[0]}"]
+    return f"However the delay changes from packet to packet: {'; '.join(said)}."
 
 
 def _range(found: Range) -> str:
@@ -353,6 +369,7 @@ def box_proof_document(found: BoxProof) -> dict[str, Any]:
         "box": [range_document(one) for one in found.ranges],
         "unstable_at": list(found.point) if found.stable is False else None,
         "open_around": list(found.point) if found.stable is None and found.point else None,
+        "changing": found.changing and picked(found.changing, "proved_to", "unstable", "note"),
     }
 
 
