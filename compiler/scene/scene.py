@@ -26,7 +26,7 @@ from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.values import AlreadyReportedError, Value
 from apc.compiler.scene.groups import GroupReader, SceneGroup, read_counts
 from apc.compiler.scene.instances import Part, PartReader, settable_names
-from apc.compiler.scene.links import PROBABILITY, SceneLink, read_link
+from apc.compiler.scene.links import PROBABILITY, SceneLink, read_link, without_range
 from apc.compiler.scene.named_numbers import read_named_numbers
 from apc.compiler.scene.oddities import oddities
 from apc.compiler.scene.redeclarations import redeclared
@@ -144,7 +144,7 @@ def build_scene(source: Source, library: Library) -> Scene:
     reader = PartReader(scope, numbers)
     others_at = redeclared(bodies.values(), sections)
     for entry in entries.values():
-        reader.read(entry, others_at.get(entry.name, {}))
+        reader.read(without_range(entry), others_at.get(entry.name, {}))
     parts = reader.parts
     links: list[SceneLink] = []
     for part in parts:

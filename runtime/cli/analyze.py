@@ -20,6 +20,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
+    from apc.frame.names import Range
 
 # Of peers that all differ, by the thousand: 100,000 took 9 s on one core of 2026.
 SECONDS_A_PEER = 1e-4
@@ -99,11 +100,7 @@ def analyze_command(
         return
     if hands not in HANDS:  # one of the library: all that were measured
         box = (*box, *(f"{name}={low}:{high}" for name, (low, high, _) in published(hands).items()))
-    ranges = []
-    if box:
-        from apc.analysis.box import parse_range
-
-        ranges = [parse_range(system, text) for text in box]
+    ranges = _ranges(system, box)
     listed = sum(group.count for group in system.groups if group.columns)
     with at_work(f"analysing {system.peers:,} peers", about=SECONDS_A_PEER * listed):
         found = answer(
@@ -122,6 +119,14 @@ def analyze_command(
 
         write_picture(found.analysis.plot, plot)
     print_result(found, as_json=as_json, written=[plot])
+
+
+def _ranges(system: CompiledSystem, box: tuple[str, ...]) -> list[Range]:
+    """Return the ranges of a box as they are written, and those that the topology gives."""
+    from apc.analysis.box import parse_range
+    from apc.frame.names import given_ranges
+
+    return given_ranges(system, [parse_range(system, text) for text in box])
 
 
 def _judge_passive(
@@ -143,11 +148,9 @@ def _judge_passive(
     if box and certify:
         what = "--certify, --box and --hands passive don't go together: a box is proved by bounded floats"
         raise ApcError(Mistake("E930", Place("--certify"), what, hint="--box without --certify"))
-    if box:
-        from apc.analysis.box import parse_range
+    if ranges := _ranges(system, box):
         from apc.answer import proved_box
 
-        ranges = [parse_range(system, one) for one in box]
         print_result(proved_box(system, ranges, passive=True, cells=cells), as_json=as_json)
         return
     print_result(passive_hands(system, certify=certify), as_json=as_json)

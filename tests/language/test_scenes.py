@@ -282,6 +282,7 @@ links: {lan: {clock: tick, delay: 2 ms, graph: star}}
 
 # ---- what a topology seldom means ----
 
+RANGE = "is a range: analyze asks of all of it, other commands of its middle."
 UNSHARED = (
     "follows the other peers' by coordination and is not shared: its mass counts once a peer. "
     "Write: shared: true, or shared: false where each is a mass of its own"
@@ -297,6 +298,7 @@ ODD: list[tuple[tuple[tuple[str, str], ...], list[str]]] = [
     ((("  user: {count: 3}", "  left: {count: 2}\n  right: {count: 2}"),
       ("b: cube, ", "b: cube, at: [left], ")),
      ["10:3: W272 device of right is joined to nothing: no coupler, no hand and no other mass."]),
+    ((("delay: 8 ms}", "delay: [8 ms, 20 ms]}"),), [f"15:3: W275 lan.delay {RANGE}"]),
     ((("object: cube", "object: device"),), [f"9:3: W274 device {UNSHARED}"]),
     ((("object: cube", "object: device"), ("damping: 5 N*s/m}", "damping: 5 N*s/m, shared: false}")), []),
     ((("object: cube", "object: device"), ("a: device, b: cube", "a: ground, b: cube"),
