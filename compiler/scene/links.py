@@ -188,7 +188,7 @@ def read_link(part: Part, entry: PartEntry, numbers: NamedNumbers) -> SceneLink:
             raise fault("E262", node.place, what)
         ends = _range(node, part.name, component, numbers)
         within = ends[0].number, ends[1].number
-        delay = Value(sum(within) / 2, ends[0].dimension, None, node.place)
+        delay = Value((within[0] + within[1]) / 2, ends[0].dimension, None, node.place)
     if clock is None or delay is None:
         raise AlreadyReportedError
     return SceneLink(part.name, clock, delay, within, graph, delays, channel, part.place)
