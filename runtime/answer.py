@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from apc.analysis.box_proof import BoxProof
     from apc.analysis.switching import Switching
     from apc.frame.names import Range
-    from apc.hands.passivity import PassiveHands
     from apc.moments.network import NetworkVerdict
     from apc.simulation.buzz import Buzz
 
@@ -218,9 +217,7 @@ def _buzz(system: CompiledSystem, prepared: Prepared, modes: ContactModes | None
         return None, error.mistakes[0].reason
 
 
-def proved_box(
-    system: CompiledSystem, box: Sequence[Range], *, passive: bool = False, cells: int | None = None
-) -> BoxProof:
+def proved_box(system: CompiledSystem, box: Sequence[Range], *, cells: int | None = None) -> BoxProof:
     """Return the proof over a box; imported here, as few analyses ask for one.
 
     Parameters
@@ -229,8 +226,6 @@ def proved_box(
         The compiled scene.
     box
         Ranges of parameters.
-    passive
-        Whether every passive hand is meant, over the nominal network.
     cells
         How many cells are looked at at most; without it, as many as take some seconds.
 
@@ -238,18 +233,13 @@ def proved_box(
     ------
     ApcError
         As `box_proof.prove_box`, or `moments.mean_square_box.prove_box` where links are, or may become,
-        unreliable; as `hands.passive_box.prove_box`.
+        unreliable.
     """
     from apc.network.nominal import channel_numbers, left_out
     from apc.vary.delay_box import is_delay, prove_over_delay
 
     if any(is_delay(system, one.free) for one in box):
-        at_each = partial(_proved_at, passive=passive, cells=cells)
-        return prove_over_delay(system, box, at_each, nominal=not passive and not left_out(system))
-    if passive:
-        from apc.hands.passive_box import prove_box as prove_for_hands
-
-        return prove_for_hands(system, box, cells=cells)
+        return prove_over_delay(system, box, partial(_proved_at, cells=cells), nominal=not left_out(system))
     from apc.analysis.box_proof import prove_box
 
     numbers = channel_numbers(system)
@@ -260,19 +250,15 @@ def proved_box(
     return prove_box(system, box, cells=cells)
 
 
-def _proved_at(system: CompiledSystem, box: Sequence[Range], *, passive: bool, cells: int | None) -> BoxProof:
+def _proved_at(system: CompiledSystem, box: Sequence[Range], *, cells: int | None) -> BoxProof:
     """Return the proof over the other ranges at one delay; without any, the verdict there."""
     if box:
-        return proved_box(system, box, passive=passive, cells=cells)
+        return proved_box(system, box, cells=cells)
     from apc.analysis.box_proof import BoxProof
     from apc.network.nominal import left_out
 
-    found: Analysis | NetworkVerdict | PassiveHands
-    if passive:
-        from apc.hands.passivity import passive_hands
-
-        found = passive_hands(system)
-    elif left_out(system):
+    found: Analysis | NetworkVerdict
+    if left_out(system):
         from apc.moments.network import judge_network
 
         network = judge_network(system, prepare(system))
