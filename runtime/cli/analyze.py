@@ -96,7 +96,7 @@ def analyze_command(
         asked = {"--method": method != AUTO, "--conventions": every_convention, "--buzz": with_buzz}
         asked |= {"--margins": bool(margins), "--plot": plot is not None}
         refused = [name for name, given in asked.items() if given]
-        _judge_passive(system, refused, box, cells, certify=certify, as_json=as_json)
+        _judge_passive(system, refused, box, certify=certify, as_json=as_json)
         return
     if hands not in HANDS:  # one of the library: all that were measured
         box = (*box, *(f"{name}={low}:{high}" for name, (low, high, _) in published(hands).items()))
@@ -130,27 +130,18 @@ def _ranges(system: CompiledSystem, box: tuple[str, ...]) -> list[Range]:
 
 
 def _judge_passive(
-    system: CompiledSystem,
-    asked: list[str],
-    box: tuple[str, ...],
-    cells: int | None,
-    *,
-    certify: bool,
-    as_json: bool,
+    system: CompiledSystem, asked: list[str], box: tuple[str, ...], *, certify: bool, as_json: bool
 ) -> None:
-    """Say whether a scene is stable with any passive hands, in a box if asked; refuse anything else."""
+    """Say whether a scene is stable with any passive hands, at all delays if asked; refuse anything else."""
     from apc.hands.passivity import passive_hands
 
     if asked:
         options = " and ".join((*asked, "--hands passive"))
         what = f"{options} don't go together: what hands can draw has no modes of its own"
         raise ApcError(Mistake("E930", Place("--hands"), what, hint="--hands clamped"))
-    if box and certify:
-        what = "--certify, --box and --hands passive don't go together: a box is proved by bounded floats"
-        raise ApcError(Mistake("E930", Place("--certify"), what, hint="--box without --certify"))
     if ranges := _ranges(system, box):
         from apc.answer import proved_box
 
-        print_result(proved_box(system, ranges, passive=True, cells=cells), as_json=as_json)
+        print_result(proved_box(system, ranges, passive=True), as_json=as_json)
         return
     print_result(passive_hands(system, certify=certify), as_json=as_json)
