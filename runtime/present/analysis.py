@@ -112,11 +112,12 @@ def _pairwise(system: CompiledSystem) -> Iterator[str]:
 def analysis_text(result: Analysis) -> str:
     """Return what `apc analyze` prints: the verdict in words, the numbers, the modes as a table."""
     words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
-    motions = result.translations + result.rotations
-    if motions > 1 and result.verdict.startswith("stable up to"):
+    named = (("translation", result.translations), ("rotation", result.rotations))
+    free = " and ".join(counted(count, noun) for noun, count in named if count)
+    if result.translations + result.rotations > 1 and result.verdict.startswith("stable up to"):
         words = (
-            f"{motions} motions are held back by nothing, of all peers together or of some "
-            "beside others: moved so they stay where they are. Every other motion dies out."
+            f"{free} are held back by nothing, of all peers together or of some beside others: moved so, "
+            "they stay where they are. Every other motion dies out."
         )
     if result.linearized:
         words = f"To first order, {words[0].lower()}{words[1:]}"
@@ -124,13 +125,11 @@ def analysis_text(result: Analysis) -> str:
         words += "\nWhat it does in time is played: apc simulate"
     if not result.states_per_peer:
         words = "Nothing here is free to move."
-    named = (("translation", result.translations), ("rotation", result.rotations))
-    removed = " and ".join(counted(count, noun) for noun, count in named if count)
     radius = measured(result.spectral_radius, result.spectral_radius_error)
     facts = (
         ("spectral radius", f"{radius} per frame of {_time(result.frame_s)}"),
         ("peers", f"{result.peers}, {result.states_per_peer} states each"),
-        ("method", result.method + (f", {removed} left out" if removed else "")),
+        ("method", result.method + (f", {free} left out" if free else "")),
         ("proof", result.proof),
         (
             "left out",
