@@ -155,9 +155,11 @@ def bodies_of(
             for state, value in zip(kind.states, start, strict=True)
             if state.unit == "rad" and state.name.rpartition(".")[0] == part and len(places) == 2
         ]
-        at = tuple(float(start[place]) for place in places)
+        centre = tuple(float(start[place]) for place in places)
         states = tuple(kind.states[place].name for place in places)
-        bodies.append(Body(part, at, radii[name], states, *turning[0] if len(turning) == 1 else ("", 0.0)))
+        bodies.append(
+            Body(part, centre, radii[name], states, *turning[0] if len(turning) == 1 else ("", 0.0))
+        )
     return bodies, list(fixed)
 
 

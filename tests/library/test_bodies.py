@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import apc
 from apc.present.still import draw_actors
-from tests.topologies import compiled
+from tests.topologies import SCENES, compiled
 
 Floats = NDArray[np.float64]
 ALONE = "topology: body\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\nmasses:\n"
@@ -75,6 +75,14 @@ def spun(rotation: list[float], spin: list[float], inertia: str = "[2 kg*m^2, 2 
     return np.column_stack([found.time, *columns])
 
 
+def test_the_carried_beam_swings_and_turns_as_a_program_of_its_own_says() -> None:
+    """The largest of what moves across it and turns, tick by tick with expm of each peer's six states."""
+    found = apc.analyze(apc.compile(SCENES / "carried-beam.yaml"))
+    sizes = [abs(one.eigenvalue) for one in found.modes if one.eigenvalue.imag > 0]
+    assert sorted(sizes)[-4:] == pytest.approx([0.96580532, 0.9681205, 0.97181542, 0.98129976], abs=1e-8)
+    assert (found.translations, found.rotations) == (2, 1)
+
+
 def test_a_top_left_to_itself_precesses_about_its_axis() -> None:
     """ω₁ = a cos(Ωt), ω₂ = a sin(Ωt), Ω = (I₃ − I₁)/I₁ ω₃ (Euler, of two equal moments)."""
     time, *_, w1, w2, w3 = spun([0, 0, 0], [0.2, 0, 3]).T
@@ -94,9 +102,8 @@ def turn(sigma: Floats) -> Floats:
 
 
 def test_a_picture_shows_which_way_a_body_points() -> None:
-    text = (
-        f"{ALONE}  bar: {{type: PlanarBody, mass: 1 kg, inertia: 1 kg*m^2, x: [1 m, 2 m], angle: 30 deg}}\n"
-    )
+    bar = "{type: PlanarBody, mass: 1 kg, inertia: 1 kg*m^2, x: [1 m, 2 m], angle: 30 deg}"
+    text = f"{ALONE}  bar: {bar}\n"
     _, (actor,) = draw_actors(compiled(text))
     assert (actor.states, actor.angle) == (("user[1].bar.x[1]", "user[1].bar.x[2]"), "user[1].bar.angle")
     assert actor.shift.transform((1, 0)) - (1000, 2000) == pytest.approx([math.sqrt(0.75), 0.5])
