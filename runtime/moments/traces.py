@@ -102,7 +102,21 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
 def heard_packets(
     link: Link, delay: Fraction, sent: Sequence[Fraction], tick: Fraction, told: Hearing
 ) -> list[int]:
-    """Return which packet a tick hears, frame by frame over a period, counted from the first of its frame."""
+    """Return which packet a tick hears, frame by frame over a period, counted from the first of its frame.
+
+    Parameters
+    ----------
+    link
+        The link, whose channel may hold recorded delays.
+    delay
+        That of all packets, where none are recorded, in seconds.
+    sent
+        When its packets are sent in a frame (slots,), in seconds.
+    tick
+        When the tick is, in seconds from the frame's beginning.
+    told
+        What else is known of the scene.
+    """
     slots = len(sent)
     trace = None if link.channel is None else link.channel.trace
     delays = (
@@ -198,7 +212,21 @@ def hearing_packets(
     depth: Mapping[str, int],
     slots: Mapping[str, int],
 ) -> Loop:
-    """Return a loop whose ticks hear the packets of these numbers."""
+    """Return a loop whose ticks hear the packets of these numbers.
+
+    Parameters
+    ----------
+    loop
+        The loop.
+    rows
+        What each row of r of each site hears.
+    numbers
+        The packet that each row hears, row after row, counted from the first of the frame.
+    depth
+        How many frames of packets are states, by link.
+    slots
+        How many packets are sent in a frame, by link.
+    """
     sites = []
     for site, listed in zip(loop.sites, rows, strict=True):
         depths = tuple(depth[one.link] for one in site.schedule.sent)

@@ -47,7 +47,7 @@ def critical_text(found: Critical) -> str:
         said = found.verdict.replace(*wording)
     meant = [MEANT[found.criterion]] if found.criterion in MEANT else []
     lines = wrapped(f"{found.topology}: {said}")
-    lines += [*note(f"{found.parameter} is now {now}"), *notes([*meant, *found.left_out]), ""]
+    lines += [*notes([*meant, *found.left_out, f"{found.parameter} is now {now}"]), ""]
     if not found.enters:
         return "\n".join(lines)
     if found.counted:
