@@ -102,7 +102,17 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
 def heard_packets(
     link: Link, delay: Fraction, sent: Sequence[Fraction], tick: Fraction, told: Hearing
 ) -> list[int]:
-    """Return which packet a tick hears, frame by frame over a period, counted from the first of its frame."""
+    """Return which packet a tick hears, frame by frame over a period, counted from the first of its frame.
+
+    Parameters
+    ----------
+    link, delay
+        The link, and its nominal delay in seconds.
+    sent, tick
+        When in a frame packets are sent, and when the tick is, in seconds.
+    told
+        The peers of the scene.
+    """
     slots = len(sent)
     trace = None if link.channel is None else link.channel.trace
     delays = (
@@ -198,7 +208,17 @@ def hearing_packets(
     depth: Mapping[str, int],
     slots: Mapping[str, int],
 ) -> Loop:
-    """Return a loop whose ticks hear the packets of these numbers."""
+    """Return a loop whose ticks hear the packets of these numbers.
+
+    Parameters
+    ----------
+    loop, rows
+        The loop, and what each row of r of each site hears.
+    numbers
+        The packets, row after row, counted from the first of their frame.
+    depth, slots
+        How many frames a packet is kept for, and how many are sent in a frame, by the link's name.
+    """
     sites = []
     for site, listed in zip(loop.sites, rows, strict=True):
         depths = tuple(depth[one.link] for one in site.schedule.sent)

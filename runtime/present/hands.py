@@ -119,9 +119,7 @@ def feel_text(found: Feel) -> str:
         for name, unit, error in parts:
             lines += labelled(name, measured(getattr(slow, name), error, unit))
         if (network := found.network_viscosity) is not None:
-            share = measured(network.network, network.error, "N*s/m")
-            by = "" if network.formula is None else f"; K ((T_n − T_c)/2 + T_d): {network.formula:.5g}"
-            lines += labelled("of the network", share + by)
+            lines += labelled("of the network", measured(network.network, network.error, "N*s/m"))
         lines.append("")
     headings = ("frequency", "impedance", "phase", "arrives", "copies apart", "alias")
     units = ("Hz", "N*s/m", "degrees", "mm/s/N", "mm/N", "")
