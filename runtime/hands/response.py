@@ -1,8 +1,7 @@
 """What moves when a hand pushes: the steady motion under a force e^{st}, of each mode of a scene.
 
 Takes: peers with a device each, as loops.
-Gives: `Site`, `open_site`, `open_sites`; `Pushed`, `pushed_loop`, `pushed_alone`; `answer`, `motions`,
-`spectra`; `Carried`, `add`, `scaled`, `solved`, `exponential`; `force_lanes`.
+Gives: `Site`, `open_site`; `Pushed`, `pushed_loop`; `spectra`; `Carried`, `add`, `scaled`; `force_lanes`.
 Guarantees: no sampling of the force or of the motion: every tick, hold and packet acts when it does, and what
 comes back at s and at s + 2πjk/T, T a frame, is exact but for rounding, which is bounded.
 Does not: put modes together to peers (see `answers`).
@@ -30,11 +29,10 @@ from apc.eigen.closing import Loop, close_loop
 from apc.eigen.peers import PeerGroup
 from apc.frame.devices import Device
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize, exponential_rows
-from apc.frame.lift import FrameMap, bounded, check_packets, named, step_durations
+from apc.frame.lift import bounded, check_packets, named, step_durations
 from apc.frame.ports import Ports, with_holds, with_ports
 from apc.frame.radius import radius_of, value_of, with_radius
 from apc.frame.schedule import Propagate, Schedule
-from apc.frame.site import LinearSite
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -83,14 +81,11 @@ class Pushed:
 
     `kicks` and `reads` say for each site which of κ are its, interval by interval: what its states get as one
     ends, and what samples of its device's position are off by from its beginning on (r, n_x + 1); and
-    which of what is read are its states and holds as one begins (r, n_x + n_u), or its holds alone (r, n_u).
-    Of κ the last `heard` come from outside, and of what is read the last `sent` go there.
+    which of what is read are its states and holds as one begins (r, n_x + n_u).
     """
 
     name: str
-    multiplicity: int
     sites: tuple[Site, ...]
-    counts: tuple[int, ...]
     m: Matrix
     k: Matrix
     c: Matrix
@@ -98,14 +93,12 @@ class Pushed:
     kicks: tuple[NDArray[np.intp], ...]
     reads: tuple[NDArray[np.intp], ...]
     frame: Fraction
-    heard: int = 0
-    sent: int = 0
 
 
 def open_site(group: PeerGroup, device: Device | None) -> tuple[PeerGroup, Site]:
     """Return a group whose states may be kicked and whose holds are read, interval by interval."""
     schedule = group.schedule
-    at, _ = _intervals(schedule)
+    at, seconds = _intervals(schedule)
     n_x, n_u = group.site.b.shape
     sites, readings = [], []
     for one in (group.site, group.exact):
@@ -122,44 +115,20 @@ def open_site(group: PeerGroup, device: Device | None) -> tuple[PeerGroup, Site]
     found = discretize(group.exact.a, group.exact.b, [one * full.quantum for one in durations])
     kicked = [_with_kicks(step, n_x) for step in found]
     lifted = named(site.kind, full, *bounded(site, full, dict(zip(durations, kicked, strict=True))))
-    own = group.with_site(site, exact, full, lifted)
-    return own, _site(group, device, group.site.a, group.site.b, ports)
-
-
-def open_sites(group: PeerGroup, many: LinearSite) -> tuple[LinearSite, Schedule, list[Site]]:
-    """Return peers that nobody pushes, whose holds are read interval by interval, and their schedule.
-
-    Parameters
-    ----------
-    group
-        Peers that are like them but for their numbers.
-    many
-        Their equations (k, …).
-    """
-    at, _ = _intervals(group.schedule)
-    n_x, n_u = many.b.shape[-2:]
-    seen = np.zeros((len(many.b), n_u, n_x + n_u))
-    seen[:, range(n_u), range(n_x, n_x + n_u)] = 1.0
-    (opened,), full, ports = with_ports([many], group.schedule, 0, (), [seen], at)
-    return opened, full, [_site(group, None, a, b, ports) for a, b in zip(many.a, many.b, strict=True)]
-
-
-def _site(group: PeerGroup, device: Device | None, a: Floats, b: Floats, ports: Ports) -> Site:
-    """Return a peer with its continuous equations."""
     charge = COEFFICIENT_ROUNDINGS * UNIT
-    push = np.zeros((2, len(a)))
+    push = np.zeros((2, n_x))
     if device is not None:
         push[0, device.velocity] = float(device.inverse)
         push[1, device.velocity] = UNIT * abs(float(device.inverse))
-    at, seconds = _intervals(group.schedule)
-    return Site(
+    own = group.with_site(site, exact, full, lifted)
+    return own, Site(
         group=group,
         device=device,
-        a=with_radius(a, charge * np.abs(a)),
-        b=with_radius(b, charge * np.abs(b)),
+        a=with_radius(group.site.a, charge * np.abs(group.site.a)),
+        b=with_radius(group.site.b, charge * np.abs(group.site.b)),
         push=push,
-        seconds=tuple(one * group.schedule.quantum for one in seconds),
-        starts=tuple(one * group.schedule.quantum for one in at),
+        seconds=tuple(one * schedule.quantum for one in seconds),
+        starts=tuple(one * schedule.quantum for one in at),
         ports=ports,
     )
 
@@ -182,69 +151,37 @@ def _with_kicks(step: Step, n_x: int) -> Step:
     return Step(matrix, size, step.roundings)
 
 
-def pushed_loop(loop: Loop, sites: Mapping[int, Site], counts: Sequence[int]) -> Pushed:
-    """Close a loop of opened peers.
+def pushed_loop(loop: Loop, sites: Mapping[int, Site]) -> Pushed:
+    """Close a loop of opened peers, and take their ways in and out from its states.
 
     Parameters
     ----------
     loop, sites
         Its groups are those of `open_site`, whose sites are known by the schedule's id.
-    counts
-        How many peers each site stands for.
     """
     closed = close_loop(loop)
     own = [sites[id(group.schedule)] for group in loop.sites]
     whole = with_radius(closed.matrix, closed.error)
-    return _pushed(whole, own, closed.offsets, loop.name, loop.multiplicity, counts, len(closed.matrix))
-
-
-def pushed_alone(maps: FrameMap, site: Site) -> Pushed:
-    """Return an opened peer by itself, that hears what comes from outside.
-
-    Parameters
-    ----------
-    maps
-        What a frame makes of its state and of what it hears (2, …).
-    site
-        The peer.
-    """
-    p, q, s, d = maps.blocks
-    whole = np.concatenate([np.concatenate([p, q], axis=-1), np.concatenate([s, d], axis=-1)], axis=-2)
-    return _pushed(whole, [site], [0], site.group.name, 1, [1], p.shape[-1])
-
-
-def _pushed(
-    whole: Matrix,
-    own: Sequence[Site],
-    offsets: Sequence[int],
-    name: str,
-    multiplicity: int,
-    counts: Sequence[int],
-    states: int,
-) -> Pushed:
-    """Take ways in and out from the states of a map; what is heard and sent stands behind these."""
-    rows, columns = whole.shape[-2:]
-    kicked, read, added = [], [], []
-    for start, one in zip(offsets, own, strict=True):
-        kicked.append(start + one.ports.drawn)
-        read.append(start + one.ports.read)
-        added += [start + place for place in one.ports.added]
-    rest = np.delete(np.arange(states), added)
-    into = np.concatenate([*(one.ravel() for one in kicked), np.arange(states, columns)])
-    out = np.concatenate([*(one.ravel() for one in read), np.arange(states, rows)])
-    places = [np.cumsum([0, *(one.size for one in listed)]) for listed in (kicked, read)]
-    numbered = [
-        tuple(
-            np.arange(start, start + one.size).reshape(one.shape)
-            for start, one in zip(starts, listed, strict=False)
+    pairs = list(zip(closed.offsets, own, strict=True))
+    added = [start + place for start, one in pairs for place in one.ports.added]
+    rest = np.delete(np.arange(len(closed.matrix)), added)
+    ways, numbered = [], []
+    for listed in (
+        [start + one.ports.drawn for start, one in pairs],
+        [start + one.ports.read for start, one in pairs],
+    ):
+        ways.append(np.concatenate([one.ravel() for one in listed]))
+        starts = np.cumsum([0, *(one.size for one in listed)])
+        numbered.append(
+            tuple(
+                np.arange(start, start + one.size).reshape(one.shape)
+                for start, one in zip(starts, listed, strict=False)
+            )
         )
-        for starts, listed in zip(places, (kicked, read), strict=True)
-    ]
+    into, out = ways
     return Pushed(
-        name=name,
-        multiplicity=multiplicity,
+        name=loop.name,
         sites=tuple(own),
-        counts=tuple(counts),
         m=whole[:, rest[:, None], rest],
         k=whole[:, rest[:, None], into],
         c=whole[:, out[:, None], rest],
@@ -252,73 +189,34 @@ def _pushed(
         kicks=numbered[0],
         reads=numbered[1],
         frame=own[0].group.schedule.frame_s,
-        heard=columns - states,
-        sent=rows - states,
     )
 
 
-def spectra(
-    loop: Pushed,
-    pushed: int | None,
-    wanted: Sequence[tuple[int, int, int]],
-    s: Complex,
-    heard: Carried | None = None,
-) -> list[Carried]:
+def spectra(loop: Pushed, pushed: int, wanted: Sequence[tuple[int, int, int]], s: Complex) -> list[Carried]:
     """Return what some states of a mode do under a force e^{st} at all devices of one of its sites.
 
     Parameters
     ----------
     loop, pushed
-        The mode, and which of its sites is pushed with 1 N at each peer; None if none is.
+        The mode, and which of its sites is pushed with 1 N at each peer.
     wanted
         Which site and continuous state, each, and its motion at s + 2πjn/T for which n.
     s
         (k,), in 1/s.
-    heard
-        What comes from outside (k, n_r), nothing if not given.
 
     Returns
     -------
     For each (k,), in SI units a newton, and a bound on what it is off by.
     """
-    return motions(loop, answer(loop, pushed, s, heard), pushed, wanted, s)
-
-
-def answer(loop: Pushed, pushed: int | None, s: Complex, heard: Carried | None = None) -> Carried:
-    """Return what is read of a mode under a force e^{st} at all devices of one of its sites.
-
-    Parameters
-    ----------
-    loop, pushed, s, heard
-        As for `spectra`.
-    """
     kicks = np.zeros((len(s), loop.k.shape[-1]), dtype=np.complex128)
     doubt = np.zeros(kicks.shape)
-    if pushed is not None:
-        site = loop.sites[pushed]
-        of_length = {seconds: _kick(site, seconds, s) for seconds in set(site.seconds)}
-        for place, (seconds, start) in enumerate(zip(site.seconds, site.starts, strict=True)):
-            places = loop.kicks[pushed][place, :-1]
-            kicks[:, places], doubt[:, places] = _times(of_length[seconds], exponential(s, start))
-    if heard is not None:
-        outside = kicks.shape[1] - loop.heard
-        kicks[:, outside:], doubt[:, outside:] = heard
-    state = _steady(loop.m, exponential(s, loop.frame), _product((kicks, doubt), loop.k))
-    return add(_product(state, loop.c), _product((kicks, doubt), loop.d))
-
-
-def motions(
-    loop: Pushed, read: Carried, pushed: int | None, wanted: Sequence[tuple[int, int, int]], s: Complex
-) -> list[Carried]:
-    """Return what some states do, of what is read.
-
-    Parameters
-    ----------
-    loop, pushed, wanted, s
-        As for `answer` and `spectra`.
-    read
-        From `answer`.
-    """
+    site = loop.sites[pushed]
+    of_length = {seconds: _kick(site, seconds, s) for seconds in set(site.seconds)}
+    for place, (seconds, start) in enumerate(zip(site.seconds, site.starts, strict=True)):
+        places = loop.kicks[pushed][place, :-1]
+        kicks[:, places], doubt[:, places] = _times(of_length[seconds], _exponential(s, start))
+    state = _steady(loop.m, _exponential(s, loop.frame), _product((kicks, doubt), loop.k))
+    read = add(_product(state, loop.c), _product((kicks, doubt), loop.d))
     found = {
         (of, alias): _motion(loop, of, read, s, alias, pushed=of == pushed)
         for of, alias in {(of, alias) for of, _, alias in wanted}
@@ -330,11 +228,11 @@ def _motion(loop: Pushed, of: int, read: Carried, s: Complex, alias: int, *, pus
     """Return the continuous states (k, n_x) of a site at s + 2πjn/T."""
     site, frame = loop.sites[of], float(loop.frame)
     at = s + 2j * np.pi * alias / frame
-    held = loop.reads[of][:, loop.reads[of].shape[1] - site.b.shape[-1] :]
+    held = loop.reads[of][:, len(site.states) :]
     value, off = read[0][:, held], read[1][:, held]  # (k, intervals, holds)
     of_length = {seconds: _lasting(at, float(seconds)) for seconds in set(site.seconds)}
     weights = [
-        _times(exponential(-at, start), of_length[seconds])
+        _times(_exponential(-at, start), of_length[seconds])
         for seconds, start in zip(site.seconds, site.starts, strict=True)
     ]
     weight, loose = (np.stack([one[place] for one in weights], axis=1)[:, :, None] for place in range(2))
@@ -350,7 +248,7 @@ def _motion(loop: Pushed, of: int, read: Carried, s: Complex, alias: int, *, pus
     return _steady(site.a, (at, 4 * UNIT * np.abs(at)), driven)
 
 
-def exponential(s: Complex, time: Fraction) -> Carried:
+def _exponential(s: Complex, time: Fraction) -> Carried:
     """Return e^{st} (k,)."""
     exact = float(time)
     value = np.exp(s * exact)
@@ -425,8 +323,8 @@ def add(one: Carried, other: Carried) -> Carried:
 
 
 def scaled(one: Carried, share: float) -> Carried:
-    """Return so many times what there is."""
-    return one[0] * share, one[1] * abs(share) + 2 * UNIT * np.abs(one[0] * share)
+    """Return so many times what there is, a number that was rounded a few times."""
+    return one[0] * share, one[1] * abs(share) + 8 * UNIT * np.abs(one[0] * share)
 
 
 def _product(rows: Carried, matrix: Matrix) -> Carried:
@@ -444,37 +342,18 @@ def _steady(matrix: Matrix, at: Carried, driven: Carried) -> Carried:
 
     Notes
     -----
-    See `solved`.
+    With G = z − M, an inverse Y in floats and F = 1 − Y G, x in floats is off by e ≤ b + |F| e, b being
+    |Y| times residual and radii; with |F| b ≤ θ b, entry by entry, that is at most b/(1 − θ).
     """
     real, radius = value_of(matrix), radius_of(matrix)
-    unit = np.eye(len(real))
-    block = max(1, TOGETHER // max(real.size, 1))
-
-    def some(first: int) -> Carried:
-        own = slice(first, first + block)
-        system = at[0][own, None, None] * unit - real
-        return solved(system, at[1][own, None, None] * unit + radius, (driven[0][own], driven[1][own]))
-
-    found = [some(first) for first in range(0, max(len(at[0]), 1), block)]
-    return np.concatenate([value for value, _ in found]), np.concatenate([off for _, off in found])
-
-
-def solved(system: Complex, loose: Floats, driven: Carried) -> Carried:
-    """Return x (k, n) of G x = driven.
-
-    Parameters
-    ----------
-    system, loose
-        G (k, n, n), and what it may be off by, entry by entry, beside a rounding of each.
-    driven
-        (k, n).
-
-    Notes
-    -----
-    With an inverse Y in floats and F = 1 − Y G, x in floats is off by e ≤ b + |F| e, b being |Y| times
-    residual and radii; with |F| b ≤ θ b, entry by entry, that is at most b/(1 − θ).
-    """
-    n = system.shape[-1]
+    n = len(real)
+    block = TOGETHER // max(real.size, 1) or 1
+    if len(at[0]) > block:
+        places = [slice(first, first + block) for first in range(0, len(at[0]), block)]
+        parts = [_steady(matrix, (at[0][i], at[1][i]), (driven[0][i], driven[1][i])) for i in places]
+        return np.concatenate([value for value, _ in parts]), np.concatenate([off for _, off in parts])
+    system = at[0][:, None, None] * np.eye(n) - real
+    loose = at[1][:, None, None] * np.eye(n) + radius
     inverse = np.linalg.inv(system)
     value = np.matmul(inverse, driven[0][:, :, None])
     size, charge = np.abs(inverse), (n + 6) * UNIT

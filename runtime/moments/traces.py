@@ -106,16 +106,12 @@ def heard_packets(
 
     Parameters
     ----------
-    link
-        The link, whose channel may hold recorded delays.
-    delay
-        That of all packets, where none are recorded, in seconds.
-    sent
-        When its packets are sent in a frame (slots,), in seconds.
-    tick
-        When the tick is, in seconds from the frame's beginning.
+    link, delay
+        The link, and its nominal delay in seconds.
+    sent, tick
+        When in a frame packets are sent, and when the tick is, in seconds.
     told
-        What else is known of the scene.
+        The peers of the scene.
     """
     slots = len(sent)
     trace = None if link.channel is None else link.channel.trace
@@ -216,16 +212,12 @@ def hearing_packets(
 
     Parameters
     ----------
-    loop
-        The loop.
-    rows
-        What each row of r of each site hears.
+    loop, rows
+        The loop, and what each row of r of each site hears.
     numbers
-        The packet that each row hears, row after row, counted from the first of the frame.
-    depth
-        How many frames of packets are states, by link.
-    slots
-        How many packets are sent in a frame, by link.
+        The packets, row after row, counted from the first of their frame.
+    depth, slots
+        How many frames a packet is kept for, and how many are sent in a frame, by the link's name.
     """
     sites = []
     for site, listed in zip(loop.sites, rows, strict=True):

@@ -120,10 +120,7 @@ def feel_text(found: Feel) -> str:
             lines += labelled(name, measured(getattr(slow, name), error, unit))
         if (network := found.network_viscosity) is not None:
             share = measured(network.network, network.error, "N*s/m")
-            by = ", which the network adds"
-            if network.formula is not None:
-                by += f": stiffness times the mean age of what is heard is {network.formula:.5g} N*s/m"
-            lines += labelled("of that", share + by)
+            lines += labelled("of that", f"{share}, which the network adds")
         if slow.mass < 0:
             lines += note("a mass below 0: forces that come late push on what speeds up")
         lines.append("")
