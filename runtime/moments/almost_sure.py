@@ -24,8 +24,9 @@ from scipy.special import stdtrit
 
 from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
-from apc.frame.radius import value_of
-from apc.moments.held import Chance, every_channel, held_scene
+from apc.eigen.enclosure import enclose_eigenvalues
+from apc.frame.radius import RADII, radius_of, value_of
+from apc.moments.held import Chance, HeldLoop, every_channel, held_scene
 
 Floats = NDArray[np.float64]
 
@@ -68,6 +69,8 @@ def almost_sure(system: CompiledSystem, prepared: Prepared, *, seed: int = 0) ->
     """
     held, chances = every_channel(system, held_scene(system, prepared), MOST_STATES)
     held = held.relative()
+    if all(chance.law.mean_loss in (0, 1) for chance in chances):
+        return _without_chance(held, chances)
     f, g, s, e = (value_of(one) for one in (held.f, held.g, held.s, held.e))
     n = len(f)
     luck = np.random.Generator(np.random.Philox(seed))
@@ -101,6 +104,19 @@ def almost_sure(system: CompiledSystem, prepared: Prepared, *, seed: int = 0) ->
     middle = float(found.mean())
     half = float(stdtrit(COURSES - 1, QUANTILE)) * float(found.std(ddof=1)) / math.sqrt(COURSES)
     return AlmostSure(middle, (middle - half, middle + half))
+
+
+def _without_chance(held: HeldLoop, chances: Sequence[Chance]) -> AlmostSure:
+    """Return the exponent where every channel loses all packets or none: the log of a spectral radius."""
+    rows = held.s.copy()
+    for chance in chances:
+        if chance.law.mean_loss:
+            rows[:, list(chance.ears)] = held.e[:, list(chance.ears)]
+    matrix = RADII.add(held.f, RADII.multiply(held.g, rows))
+    pairs, found = enclose_eigenvalues(value_of(matrix), radius_of(matrix))
+    radius = float(np.abs(pairs.values).max(initial=0.0))
+    low, middle, high = (math.log(one) if one else -math.inf for one in (found.low, radius, found.high))
+    return AlmostSure(middle, (min(low, middle), max(middle, high)))
 
 
 def _heard(
