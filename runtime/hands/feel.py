@@ -24,7 +24,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
 from apc.frame.discretize import UNIT
-from apc.hands.answers import AROUND, Responses, Weights, responses
+from apc.hands.answers import AROUND, Responses, Weights, held_names, responses
 from apc.hands.asked import Port, check_frequencies, find_port, next_peer, ticks_in
 from apc.hands.norms import Peak, noise_variance, sampled_data_peak, tick_peak
 from apc.hands.viscosity import Viscosity, network_viscosity
@@ -158,8 +158,8 @@ def feel(
     frequencies
         (k,), in Hz, above 0 and at most half the rate of the fastest clock.
     at, between
-        The device that is pushed, and another whose motion is asked for: `left[1].device`. The first peer's,
-        and the next one's, if not given.
+        The device that is pushed, and another whose motion is asked for: `left[1].device`. That of the first
+        peer who has one, along the first of its directions, and the next peer's, if not given.
     unstable
         Whether the map of an unstable scene is wanted, which has no response in time.
     quick
@@ -174,10 +174,11 @@ def feel(
         or none above 0; E936 a name that means nothing; E933 a scene too large.
     """
     found = np.asarray(frequencies, dtype=np.float64).ravel()
-    port = find_port(system, at, "--at")
+    prepared = prepared or prepare(system)
+    named = [] if at else held_names(system, prepared)
+    port = find_port(system, at or next(iter(named), ""), "--at")
     other = find_port(system, between, "--between") if between else Port(next_peer(system, port), "")
     check_frequencies(system, found)
-    prepared = prepared or prepare(system)
     verdict = judge(system, prepared=prepared)
     if verdict.stable is False and not unstable:
         raise _unstable(system, verdict.spectral_radius)
@@ -199,7 +200,10 @@ def feel(
         f"{answers.exchange.peer_name(one.peer)}.{device.part}"
         for one, device in ((port, answers.device), (other, answers.other))
     )
+    directions = [one for one in named if one.partition(".")[0] == named[0].partition(".")[0]]
+    others = f"along one direction; along others: {', '.join(f'--at {one}' for one in directions[1:])}"
     notes = {
+        others: len(directions) > 1,
         "of the map: the scene is unstable": verdict.stable is False,
         "of slow motions nothing is told: something of the scene is slower still": not slow and not quick,
         "what noise does is not told: the fastest clock has a phase": steady and not h2,

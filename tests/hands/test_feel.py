@@ -220,13 +220,22 @@ def test_what_can_t_be_felt_is_refused(text: str, frequency: list[float], at: st
         assert apc.feel(compiled(text), frequency, at="user[1].cube").at == "user[1].cube"
 
 
-@pytest.mark.parametrize("name", ["planar-users", "god-object", "client-server"])
-def test_where_it_is_open_what_is_held_the_line_to_write_is_one_that_works(name: str) -> None:
-    scene = apc.compile(SCENES / f"{name}.yaml")
-    with pytest.raises(ApcError) as told:
-        feel(scene, [1.0], quick=True)
-    option, at = (told.value.mistakes[0].hint or "").split(" ", 1)
-    assert option == "--at" and feel(scene, [1.0], at=at.strip('"'), quick=True).at == at.strip('"')
+@pytest.mark.parametrize(
+    ("name", "at", "others"),
+    [
+        (
+            "planar-users",
+            "user[1].device.x[1]",
+            ("along one direction; along others: --at user[1].device.x[2]",),
+        ),
+        ("client-server", "client[1].device", ()),
+    ],
+)
+def test_the_first_device_is_held_along_its_first_direction_which_is_said(
+    name: str, at: str, others: tuple[str, ...]
+) -> None:
+    found = feel(apc.compile(SCENES / f"{name}.yaml"), [1.0], quick=True)
+    assert (found.at, found.notes) == (at, others)
 
 
 def test_in_a_plane_a_hand_feels_along_each_axis_what_it_feels_on_a_line() -> None:
