@@ -258,11 +258,7 @@ def _exponential(s: Complex, time: Fraction) -> Carried:
 def _lasting(s: Complex, seconds: float) -> Carried:
     """Return ∫ e^{−sσ} dσ over so many seconds (k,)."""
     x = -s * seconds
-    small = np.abs(x) < 1e-2
-    with np.errstate(all="ignore"):
-        direct = np.expm1(x) / x
-    series = 1 + x / 2 * (1 + x / 3 * (1 + x / 4 * (1 + x / 5 * (1 + x / 6 * (1 + x / 7)))))
-    value = np.asarray(seconds * np.where(small, series, direct), dtype=np.complex128)
+    value = np.asarray(seconds * np.divide(np.expm1(x), x, out=np.ones_like(x), where=x != 0), np.complex128)
     return value, 16 * UNIT * seconds * np.exp(np.maximum(x.real, 0.0))
 
 

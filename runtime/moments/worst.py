@@ -43,7 +43,7 @@ from apc.eigen.peers import PeerGroup
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, value_of
 from apc.frame.schedule import Way
-from apc.moments.held import Ear, HeldLoop, held_loop, held_scene, lossy_rows
+from apc.moments.held import Ear, HeldLoop, ears_of, held_loop, held_scene, lossy_rows
 from apc.moments.unserved import UnservedError
 
 Floats = NDArray[np.float64]
@@ -207,19 +207,9 @@ def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios, sizes: Sizes) -> He
         return math.sqrt(loop.sites[site].count) * sizes.get((link, loop.sites[site].name), 1.0)
 
     listened = [lossy_rows(site, lossy) for site in loop.sites]
-    ears: list[Ear] = []
+    ears = ears_of(loop, lossy, range(len(loop.sites)))
     outside: list[Ear] = []
     shares: list[float] = []
-    for h, site in enumerate(loop.sites):
-        for row, sent in enumerate(site.schedule.sent):
-            weights = {
-                (g, line): loop.coupling[one.way][g][h]
-                for g, rows in enumerate(listened)
-                for line, one in rows
-                if one.sent == sent and (loop.coupling[one.way][g][h] or loop.doubts.get(one.way))
-            }
-            if weights:
-                ears.append(Ear(weights, h, row))
     for g, rows in enumerate(listened):
         for way, sent in dict.fromkeys((one.way, one.sent) for _, one in rows):
             # Of several numbers that are heard as one, that which counts once is what the others add to.
