@@ -45,8 +45,8 @@ def test_exponents_are_those_of_the_reference(
 @pytest.mark.parametrize(("loss", "known"), [("0 %", math.log(0.9161770691168368) / 2), ("100 %", 0.0)])
 def test_without_chance_the_exponent_is_that_of_a_radius(loss: str, known: float) -> None:
     found = estimate(scene(3, 500.0, loss=loss))
-    assert found.exponent == pytest.approx(known, abs=3e-6)  # of 16,384 frames, ends and all
-    assert found.interval[1] - found.interval[0] < 1e-4
+    assert found.exponent == pytest.approx(known, abs=1e-9)
+    assert found.interval[1] - found.interval[0] < 1e-6
 
 
 def test_what_grows_in_mean_square_is_told_almost_surely_too() -> None:
