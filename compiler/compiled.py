@@ -358,6 +358,7 @@ class CompiledSystem:
     each stands behind what it follows from. `warnings` say what the topology seldom means, and where.
     `region` are the axes x and y of the study of that name, empty or one if the scene leaves them open.
     `within` are the delays that are given as a range, in whose middle they are.
+    `tune` is what the study of that name asks, each word with its text, as options take them.
     """
 
     name: str
@@ -372,6 +373,7 @@ class CompiledSystem:
     origin: Origin
     experiment: Experiment = Experiment()
     region: tuple[Axis, ...] = ()
+    tune: tuple[tuple[str, str], ...] = ()
     followers: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     within: tuple[Axis, ...] = ()

@@ -93,6 +93,9 @@ from .api import (
     switching as switching,
 )
 from .api import (
+    tune as tune,
+)
+from .api import (
     with_hands as with_hands,
 )
 from .benchmark.bench import Bench as Bench
@@ -109,6 +112,7 @@ from .reports.contents import Report as Report
 from .simulation.buzz import Buzz as Buzz
 from .simulation.trajectory import Trajectory as Trajectory
 from .sweeps.sweep import Sweep as Sweep
+from .tuning.tune import Tuning as Tuning
 from .vary.critical import Critical as Critical
 from .vary.many import Analyses as Analyses
 from .vary.margins import Margins as Margins

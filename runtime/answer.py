@@ -1,7 +1,7 @@
 """The whole answer of `apc analyze`: the verdict, and what stands beside it.
 
 Takes: a `CompiledSystem`.
-Gives: `Answer`, `NetworkAnswer`, `answer`, `judge`; `sensitivities_of`, `proved_box`.
+Gives: `Answer`, `NetworkAnswer`, `answer`, `judge`; `sensitivities_of`, `proved_box`, `proved_at`.
 Guarantees: what stands beside the verdict never changes it; what could not be had is said in a note.
 Does not: compute any of it itself.
 """
@@ -219,7 +219,12 @@ def _buzz(system: CompiledSystem, prepared: Prepared, modes: ContactModes | None
 
 
 def proved_box(
-    system: CompiledSystem, box: Sequence[Range], *, passive: bool = False, cells: int | None = None
+    system: CompiledSystem,
+    box: Sequence[Range],
+    *,
+    passive: bool = False,
+    cells: int | None = None,
+    inside: float = 1.0,
 ) -> BoxProof:
     """Return the proof over a box; imported here, as few analyses ask for one.
 
@@ -233,6 +238,8 @@ def proved_box(
         Whether every passive hand is meant, over the nominal network: at the delays of a link alone.
     cells
         How many cells are looked at at most; without it, as many as take some seconds.
+    inside
+        What the spectral radius has to be below, over a network on which every packet is on time.
 
     Raises
     ------
@@ -248,7 +255,7 @@ def proved_box(
         hint = "apc region --hands passive, or apc critical --hands passive"
         raise ApcError(Mistake("E930", Place("--box"), what, hint=hint))
     if any(is_delay(system, one.free) for one in box):
-        at_each = partial(_proved_at, passive=passive, cells=cells)
+        at_each = partial(proved_at, passive=passive, cells=cells, inside=inside)
         return prove_over_delay(system, box, at_each, nominal=not passive and not left_out(system))
     from apc.analysis.box_proof import prove_box
 
@@ -257,13 +264,26 @@ def proved_box(
         from apc.moments.mean_square_box import prove_box as prove_over_network
 
         return prove_over_network(system, box, cells=cells)
-    return prove_box(system, box, cells=cells)
+    return prove_box(system, box, cells=cells, inside=inside)
 
 
-def _proved_at(system: CompiledSystem, box: Sequence[Range], *, passive: bool, cells: int | None) -> BoxProof:
-    """Return the proof over the other ranges at one delay; without any, the verdict there."""
+def proved_at(
+    system: CompiledSystem,
+    box: Sequence[Range],
+    *,
+    passive: bool = False,
+    cells: int | None = None,
+    inside: float = 1.0,
+) -> BoxProof:
+    """Return the proof over a box; without any range, the verdict as it is.
+
+    Parameters
+    ----------
+    system, box, passive, cells, inside
+        As for `proved_box`.
+    """
     if box:
-        return proved_box(system, box, cells=cells)
+        return proved_box(system, box, passive=passive, cells=cells, inside=inside)
     from apc.analysis.box_proof import BoxProof
     from apc.network.nominal import left_out
 
@@ -280,6 +300,12 @@ def _proved_at(system: CompiledSystem, box: Sequence[Range], *, passive: bool, c
         found = network
     else:
         found = analyze(system)
+        if found.stable and inside != 1:
+            error = found.spectral_radius_error
+            sides = found.spectral_radius - error > inside, found.spectral_radius + error < inside
+            if not sides[1]:
+                stable = False if sides[0] else None
+                return BoxProof(system.name, (), found.verdict, stable, 1, float(stable is None), (), ())
     return BoxProof(system.name, (), found.verdict, found.stable, 1, float(found.stable is None), (), ())
 
 

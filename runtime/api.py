@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from apc.simulation.buzz import Buzz
     from apc.simulation.trajectory import Trajectory
     from apc.sweeps.sweep import Sweep
+    from apc.tuning.tune import Tuning
     from apc.vary.critical import Critical
     from apc.vary.many import Analyses
     from apc.vary.margins import Margins
@@ -612,6 +613,75 @@ def region(
         for axis in (x, y)
     )
     return stable_region.region(system, parse_axes(system, first, second), criterion=criterion)
+
+
+@checked
+def tune(
+    model: Scene,
+    free: Mapping[str, str | Sequence[str | float]] | None = None,
+    *,
+    maximize: str = "",
+    minimize: str = "",
+    subject: Sequence[str] = (),
+    over: Mapping[str, str | Sequence[str | float]] | None = None,
+    criterion: Criterion | None = None,
+    seconds: float | None = None,
+    set: Values | None = None,
+) -> Tuning:
+    """Find the gains that do best in all that they have to bear, and prove that they bear it.
+
+    Parameters
+    ----------
+    model, set
+        As for `analyze`.
+    free
+        Ranges of the gains by name: {"coordination.stiffness": "10 N/m:5000 N/m"} or, in SI, (10, 5000).
+    maximize, minimize
+        One of them: the gain that is to be large, or small; "spectral_radius" may be small, too.
+    subject
+        Demands beside stability, such as "decay=60 dB in 2 s".
+    over
+        What has to be borne: {"user.count": "2:10", "device.mass": "±20%", "lan.delay": "8 ms:20 ms"}.
+    criterion
+        As for `critical`; over unreliable links stable means so in mean square.
+        What is left out of these is as the scene's `studies: tune:` says.
+    seconds
+        How long to go on at most.
+
+    Returns
+    -------
+    Tuning
+        Its `.gains`, whether they are `.proved`, and what binds.
+
+    Raises
+    ------
+    ApcError
+        The input is at fault.
+    """
+    from apc.frame import devices
+    from apc.tuning import tune as design
+    from apc.tuning.demands import read_demands, study_hands
+
+    system = _model(model, set)
+    hands = study_hands(system) if criterion is None else devices.FREE
+    if hands == devices.PASSIVE:
+        criterion = "passive"
+    else:
+        system = devices.with_hands(system, hands)
+    ranges, borne = (
+        [f"{name}={_range(system, name, value)}" for name, value in (asked or {}).items()]
+        for asked in (free, over)
+    )
+    demands = read_demands(
+        system,
+        ranges,
+        maximize=maximize,
+        minimize=minimize,
+        subject=subject,
+        over=borne,
+        criterion=criterion,
+    )
+    return design.tune(system, demands, seconds=float("inf") if seconds is None else seconds)
 
 
 @checked

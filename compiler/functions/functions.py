@@ -97,6 +97,7 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
         origin,
         scene.experiment,
         scene.region,
+        scene.tune,
         followers_of(parameters, timings.found, groups),
         warning_texts(scene.warnings),
         tuple(

@@ -30,7 +30,7 @@ from apc.compiler.scene.links import PROBABILITY, SceneLink, read_link, without_
 from apc.compiler.scene.named_numbers import read_named_numbers
 from apc.compiler.scene.oddities import oddities
 from apc.compiler.scene.redeclarations import redeclared
-from apc.compiler.scene.studies import read_experiment, read_region
+from apc.compiler.scene.studies import read_experiment, read_studies
 from apc.compiler.scene.timebase import SceneClock, read_clocks
 from apc.compiler.source.nodes import Mapping, Sequence
 from apc.compiler.source.reading import Body, brief, fault, mapping_of, text_of
@@ -73,6 +73,7 @@ class Scene:
     links: tuple[SceneLink, ...]
     experiment: Experiment
     region: tuple[Axis, ...]
+    tune: tuple[tuple[str, str], ...]
     texts: tuple[str, ...]
     place: Place
     warnings: tuple[Mistake, ...]
@@ -159,10 +160,8 @@ def build_scene(source: Source, library: Library) -> Scene:
         for name, value in link.channel.loss if link.channel is not None else ():
             if value.expression is None:
                 settable[name] = PROBABILITY, [name]
-    experiment, region = (
-        read_experiment(root, numbers),
-        read_region(root, settable, numbers, names.is_reported),
-    )
+    experiment = read_experiment(root, numbers)
+    region, tune = read_studies(root, settable, numbers, names.is_reported)
     name, about = (visible(root.text(key)) for key in ("topology", "about"))
     mistakes.raise_if_any()  # before warnings, which would tell a second time what is missing for a mistake
     return Scene(
@@ -175,6 +174,7 @@ def build_scene(source: Source, library: Library) -> Scene:
         tuple(links),
         experiment,
         region,
+        tune,
         tuple(sorted(files.names)),
         root.place,
         oddities(parts, entries, groups),

@@ -1,6 +1,6 @@
 """What a topology asks to be done with its scene: the experiment, and ranges of parameters to study.
 
-Takes: the sections `experiment` and `studies`. Gives: an `Experiment`, `Axis`es.
+Takes: the sections `experiment` and `studies`. Gives: an `Experiment`, `Axis`es, what is asked of gains.
 Guarantees: a duration is more than nothing, a range has its lower end first and the parameter's unit.
 Does not: do it.
 """
@@ -12,14 +12,25 @@ from fractions import Fraction
 
 from apc.compiler.compiled import Axis, Experiment
 from apc.compiler.components.component import Number
-from apc.compiler.language.values import AlreadyReportedError
+from apc.compiler.language.unit_text import format_dimension
+from apc.compiler.language.values import AlreadyReportedError, Value
 from apc.compiler.scene.instances import SettableNames
 from apc.compiler.scene.named_numbers import NamedNumbers
-from apc.compiler.source.nodes import Mapping, Node, Sequence
-from apc.compiler.source.reading import Body, brief, fault, form, mapping_of, unknown, whole_number
+from apc.compiler.source.nodes import Mapping, Node, Scalar, Sequence
+from apc.compiler.source.reading import (
+    Body,
+    brief,
+    fault,
+    form,
+    mapping_of,
+    text_of,
+    unknown,
+    whole_number,
+)
 
 EXPERIMENT = ("duration", "seed")
 AXES = ("x", "y")
+TUNED = ("free", "maximize", "minimize", "subject", "over", "hands")
 
 
 def read_experiment(root: Body, numbers: NamedNumbers) -> Experiment:
@@ -47,10 +58,10 @@ def _section(around: Body, key: str, keys: tuple[str, ...], hint: str) -> Body:
     return Body(node or Mapping((), around.place), keys, key, around.mistakes)
 
 
-def read_region(
+def read_studies(
     root: Body, settable: SettableNames, numbers: NamedNumbers, is_reported: Callable[[str], bool]
-) -> tuple[Axis, ...]:
-    """Read `studies: {region: {x: {contact.stiffness: [0 N/m, 5000 N/m]}, y: …}}`.
+) -> tuple[tuple[Axis, ...], tuple[tuple[str, str], ...]]:
+    """Read `studies: {region: {x: {contact.stiffness: [0 N/m, 5000 N/m]}, y: …}, tune: {free: …}}`.
 
     Parameters
     ----------
@@ -62,14 +73,16 @@ def read_region(
         Reads a value of a parameter.
     is_reported
         Whether a name's part was reported as faulty, so that its absence needs no message.
+
+    Returns
+    -------
+    tuple of Axis
+        The axes of the region.
+    tuple of (str, str)
+        What is to be tuned, as `CompiledSystem.tune` has it.
     """
 
-    def axis(node: Node, key: str) -> Axis:
-        hint = f"{key}: {{contact.stiffness: [0 N/m, 5000 N/m]}}"
-        body = mapping_of(node, key, hint)
-        if len(body.entries) != 1:
-            raise fault("E203", body.place, key, "one parameter and its range", hint=hint)
-        name, span = body.entries[0]
+    def values(key: str, name: Scalar, span: Node, hint: str) -> tuple[Value, Value]:
         if not (isinstance(span, Sequence) and len(span.items) == 2):
             raise fault("E203", span.place, name.text, "a list of two values", form(span), hint)
         known = {known: item for known, (item, _) in settable.items() if isinstance(item, Number)}
@@ -82,9 +95,31 @@ def read_region(
         if low.number >= high.number:
             what = f"the range of {name.text}"
             raise fault("E207", span.place, what, "its lower end first", f"{low} to {high}")
+        return low, high
+
+    def axis(node: Node, key: str) -> Axis:
+        hint = f"{key}: {{contact.stiffness: [0 N/m, 5000 N/m]}}"
+        body = mapping_of(node, key, hint)
+        if len(body.entries) != 1:
+            raise fault("E203", body.place, key, "one parameter and its range", hint=hint)
+        name, span = body.entries[0]
+        low, high = values(key, name, span, hint)
         return Axis(name.text, low.number, high.number)
 
-    studies = _section(root, "studies", ("region",), "{region: {x: …, y: …}}")
+    def free(name: Scalar, span: Node) -> tuple[str, str]:
+        low, high = values("free", name, span, f"free: {{{name.text}: [10 N/m, 5000 N/m]}}")
+        unit = format_dimension(low.dimension)
+        return "free", f"{name.text}={float(low.number)!r} {unit}:{float(high.number)!r} {unit}"
+
+    def listed(key: str) -> Callable[[Scalar, Node], tuple[str, str]]:
+        return lambda name, node: (key, f"{name.text}={text_of(node, name.text)}")
+
+    studies = _section(root, "studies", ("region", "tune"), "{region: {x: …, y: …}}")
     region = _section(studies, "region", AXES, "{x: …, y: …}")
     axes = (region.read(key, axis, None) for key in AXES)
-    return tuple(axis for axis in axes if axis is not None)
+    tune = _section(studies, "tune", TUNED, "{free: …, maximize: …}")
+    asked = tune.each("free", "{coordination.stiffness: [10 N/m, 5000 N/m]}", free)
+    for key, hint in (("subject", "{decay: 60 dB in 2 s}"), ("over", "{user.count: 2:10}")):
+        asked += tune.each(key, hint, listed(key))
+    asked += [(key, tune.text(key)) for key in ("maximize", "minimize", "hands") if key in tune.nodes]
+    return tuple(axis for axis in axes if axis is not None), tuple(asked)

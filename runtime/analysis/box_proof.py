@@ -102,7 +102,9 @@ Look = Callable[[Sequence[Cell]], Iterator[Looked]]
 
 
 @part("box")
-def prove_box(system: CompiledSystem, ranges: Sequence[Range], *, cells: int | None = None) -> BoxProof:
+def prove_box(
+    system: CompiledSystem, ranges: Sequence[Range], *, cells: int | None = None, inside: float = 1.0
+) -> BoxProof:
     """Prove a scene stable in a whole box, or find a point of it where it is unstable.
 
     Parameters
@@ -113,6 +115,8 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range], *, cells: int | N
         The parameters left open, see `box.parse_range`.
     cells
         How many cells are looked at at most; without it, as many as take some seconds.
+    inside
+        What the spectral radius has to be below, in the place of 1.
 
     Raises
     ------
@@ -138,11 +142,12 @@ def prove_box(system: CompiledSystem, ranges: Sequence[Range], *, cells: int | N
                 standing = what_stands(closed, with_drifts=False)
                 translations += standing.translations
                 rotations += standing.rotations
-            questions.append(open_system(closed, sites, free))
+            questions.append(open_system(closed, sites, free, inside))
 
         def is_unstable(point: Sequence[Fraction]) -> bool:
             values = [Override(one.free, value) for one, value in zip(ranges, point, strict=True)]
-            return analyze(apply(system, values), prepared=prepared).verdict == UNSTABLE
+            one = analyze(apply(system, values), prepared=prepared)
+            return one.verdict == UNSTABLE or one.spectral_radius - one.spectral_radius_error > inside
 
         found = search_box(
             system.name,

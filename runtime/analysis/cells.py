@@ -87,10 +87,14 @@ class OpenLoop:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenSystem:
-    """A closed system over a box, and its relative coordinates, which serve all over it."""
+    """A closed system over a box, and its relative coordinates, which serve all over it.
+
+    Eigenvalues are wanted inside a circle of radius `inside`.
+    """
 
     loop: OpenLoop
     relative: Relative
+    inside: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +109,9 @@ class Looked:
     reach: Floats  # (k, m)
 
 
-def open_system(system: ClosedSystem, sites: Sequence[LinearSite], rigid: RigidModes) -> OpenSystem:
+def open_system(
+    system: ClosedSystem, sites: Sequence[LinearSite], rigid: RigidModes, inside: float = 1.0
+) -> OpenSystem:
     """Make a closed system ready to be looked at over cells.
 
     Parameters
@@ -114,8 +120,10 @@ def open_system(system: ClosedSystem, sites: Sequence[LinearSite], rigid: RigidM
         As for `open_loop`.
     rigid
         Its rigid motions, which are so all over the box.
+    inside
+        The radius of the circle that eigenvalues are wanted in.
     """
-    return OpenSystem(open_loop(system, sites), with_doubt(relative_coordinates(rigid.basis)))
+    return OpenSystem(open_loop(system, sites), with_doubt(relative_coordinates(rigid.basis)), inside)
 
 
 def open_loop(system: ClosedSystem, sites: Sequence[LinearSite], beside: Matrix | None = None) -> OpenLoop:
@@ -177,7 +185,7 @@ def open_frames(
 
 
 def look(asked: OpenSystem, cells: Sequence[Cell]) -> Looked:
-    """Say which cells are proved stable.
+    """Say which cells are proved stable, all eigenvalues inside the system's circle.
 
     Parameters
     ----------
@@ -295,7 +303,12 @@ def _matrices(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:
     closed, _ = closed_over(asked.loop, cells)
     count = closed.shape[1] - 2
     at = replace(asked.relative, weights=within(asked.relative.weights, count))
-    return relative(closed, at, taylor(count))
+    found = relative(closed, at, taylor(count))
+    if asked.inside == 1:
+        return found
+    larger = found / asked.inside
+    radius_of(larger)[...] = (radius_of(larger) + UNIT * np.abs(larger).sum(axis=1)) * (1 + 8 * UNIT)
+    return larger
 
 
 def closed_over(asked: OpenLoop, cells: Sequence[Cell]) -> tuple[Matrix, Matrix]:

@@ -22,5 +22,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "show": ["schema_command", "show_command"],
         "simulate": ["simulate_command"],
         "sweep": ["sweep_command"],
+        "tune": ["tune_command"],
     },
 )

@@ -23,6 +23,7 @@ LISTED = [
     "analyze",
     "critical",
     "region",
+    "tune",
     "sweep",
     "compare",
     "feel",

@@ -149,9 +149,9 @@ def _description(unit: Unit) -> str:
         elif own.given:
             xml.SubElement(row, "Real", start=repr(own.start), unit=own.unit)
         else:
-            start = {"start": repr(own.start)} if own.moving else {}
+            start = {"start": repr(own.start)} if own.moving else dict[str, str]()
             row.attrib |= {"initial": "exact"} if own.moving else {}
-            xml.SubElement(row, "Real", unit=own.unit, **start)
+            xml.SubElement(row, "Real", {"unit": own.unit} | start)
             for group in ("Outputs",) if own.moving else ("Outputs", "InitialUnknowns"):
                 xml.SubElement(part[group], "Unknown", index=str(place + 1))
     xml.indent(root)

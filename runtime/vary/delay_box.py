@@ -1,7 +1,7 @@
 """Proof that a scene is stable at every delay of a link in a range, whatever constant it is.
 
 Takes: a `CompiledSystem`, ranges of which one is a link's delay, and what proves the others at one delay.
-Gives: `is_delay`, `prove_over_delay`.
+Gives: `is_delay`, `prove_over_delay`, `standing_delays`.
 Guarantees: a packet is read at ticks, so that between two delays at which it is read a tick later nothing
 changes: each such piece is judged at one delay within, and each delay between two pieces by itself.
 Does not: serve delays drawn by chance (see `moments` for jitter).
@@ -70,7 +70,7 @@ def prove_over_delay(
     place, width = list(ranges).index(delay), delay.high - delay.low
     cells, left, verdict = 0, Fraction(0), UNDECIDED
     open_point: tuple[float, ...] = ()
-    for value, share in _values(system, delay):
+    for value, share in standing_delays(system, delay):
         found = prove(system_with_delay(system, delay.free, value), rest)
         cells += found.cells
         point = (*found.point[:place], float(value), *found.point[place:])
@@ -100,7 +100,7 @@ def changing(system: CompiledSystem, delay: Range) -> ChangingDelay:
     return ChangingDelay(None if proved is None else float(proved), beyond)
 
 
-def _values(system: CompiledSystem, delay: Range) -> Iterator[tuple[Fraction, Fraction]]:
+def standing_delays(system: CompiledSystem, delay: Range) -> Iterator[tuple[Fraction, Fraction]]:
     """Yield the delays that stand for all of a range, each with how much of the range it stands for."""
     pieces = delay_pieces(system, delay.free, delay.low, prepare(system), place=PLACE, high=delay.high)
     for piece in pieces:

@@ -13,13 +13,12 @@ from pathlib import Path
 import pytest
 
 import apc
-from apc.benchmark.bench import SAME, Bench, Measured, bench, bench_simulation, pareto_front
+from apc.benchmark.bench import SAME, Bench, Measured, bench, pareto_front
 from apc.benchmark.hard import compare, run_hard_cases
 from apc.benchmark.scale import scale
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.present.bench import bench_picture
-from apc.simulation.settings import EXACT, Method
 from tests.commands import Cli, write
 from tests.hard.truths import HERE, TRUTHS, truth_of
 from tests.topologies import AVERAGE, SCENES, compiled, replaced
@@ -52,62 +51,6 @@ def test_the_front_is_what_nothing_beats_in_both_ways(
     marked = {one.name: one.front for one in pareto_front(measured)}
     assert marked == front
     assert [*marked] == sorted(marked)
-
-
-PUSHED = """\
-topology: pushed
-clocks: {haptic: 1 ms}
-peers: {user: {count: 1}}
-masses: {device: {mass: 0.25 kg, damping: 2 N*s/m}}
-couplers:
-  idle: {type: SampledSpringDamper, a: device, b: ground, stiffness: 9 N/m, clock: haptic}
-"""
-
-
-BETWEEN = """\
-hands:
-  on: {type: StepForce, flange: device, force: 3 N, start: 10.25 ms}
-  off: {type: StepForce, flange: device, force: -3 N, start: 10.75 ms}
-"""
-
-
-@pytest.fixture
-def played_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave all other methods of simulation out: they say nothing of how a scene is set in motion."""
-    monkeypatch.setattr("apc.benchmark.bench._methods", lambda _: [Method(EXACT)])
-
-
-@pytest.mark.whole
-@pytest.mark.usefixtures("played_exactly")
-def test_a_push_between_two_ticks_is_no_rest() -> None:
-    assert "nothing moves" in bench_simulation(compiled(PUSHED), Fraction(1, 50), rounds=1).notes[0]
-    pushed = bench_simulation(compiled(PUSHED + BETWEEN), Fraction(1, 50), rounds=1)
-    assert pushed.notes == ()
-    assert pushed.chosen is not None
-    assert pushed.chosen.error is not None
-    assert pushed.chosen.error < 1e-12
-
-
-@pytest.mark.whole
-def test_a_method_that_cannot_serve_is_left_out_and_says_why() -> None:
-    text = replaced(
-        AVERAGE,
-        ("haptic: 1 ms", "haptic: 1 ms\n  slow: 2 ms"),
-        ("clock: haptic, delay: 1 ms, link", "clock: slow, delay: 1 ms, link"),
-    )
-    bench_of_two = apc.bench(compiled(text), set={"coordination.stiffness": "400 N/m"}, rounds=1)
-    assert isinstance(bench_of_two, apc.Bench)
-    [(name, reason)] = bench_of_two.comparisons[0].refused
-    assert name == "paper"
-    assert "one clock of forces (here are haptic and slow)" in reason
-
-
-@pytest.mark.whole
-def test_what_is_too_large_to_be_played_is_analysed_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("apc.simulation.simulation.NUMBER", 1e20)
-    text = str(apc.bench(compiled(AVERAGE), rounds=1))
-    assert "analyze chooses modes" in text
-    assert "every method left out: 3 peers hold" in text and "--signals" not in text
 
 
 @pytest.mark.whole

@@ -13,7 +13,7 @@ import apc
 from apc.compiler.view.listing import diagram_of
 from apc.present.graph import graph_picture
 from tests.commands import Cli, Ran, folder, write
-from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, replaced, told
+from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, replaced
 
 FILE = SCENES / "three-users-average.yaml"
 MANY = """\
@@ -122,15 +122,6 @@ def test_parts_are_joined_as_the_topology_says(tmp_path: Path) -> None:
     assert "40 of them" in words and "only at left" in words
 
 
-@pytest.mark.whole
-def test_peers_that_a_picture_leaves_out_are_counted(tmp_path: Path) -> None:
-    for count in (300, 1_000_000):
-        drawn = shown(replaced(TEXTS["star"], ("count: 300", f"count: {count}")), "svg", tmp_path)
-        assert len(drawn) < 40_000
-        assert "peers, star graph" in drawn and f"{count - 16} left out" in drawn.replace(",", "")
-    assert "left out" not in apc.show(FILE, format="svg")
-
-
 def test_the_text_tells_graph_equations_and_schedule() -> None:
     lines = apc.show(FILE).splitlines()
     for line in (
@@ -196,12 +187,6 @@ def test_graphviz_text_has_every_node_once_and_closes_every_quote() -> None:
     assert all(len(re.findall(r'(?<!\\)"', line)) % 2 == 0 for line in text.splitlines())
 
 
-def test_mermaids_text_joins_what_is_joined() -> None:
-    lines = apc.show(FILE, format="mermaid").splitlines()
-    assert lines[:2] == ["flowchart LR", '  n0["device<br>mass 0.1 kg<br>damping 5 N·s/m"]']
-    assert "  n0 --- n2" in lines and "  n3 -.- n4" in lines
-
-
 @pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("suffix", "start"),
@@ -238,14 +223,3 @@ def test_no_file_is_written_as_what_its_name_does_not_say(
     message = f"{name}: E878 the suffix of --out wants {wanted}\n"
     assert cli("show", str(FILE), *words, "--out", name) == Ran(1, "", message)
     assert folder() == []
-
-
-@pytest.mark.whole
-def test_the_command_prints_what_the_function_returns(cli: Cli) -> None:
-    for form in ("text", "json", "dot", "mermaid", "svg"):
-        printed = apc.show(FILE, format=form) + "\n"  # type: ignore[arg-type] # a word
-        assert cli(f"show '{FILE}' --format {form}") == Ran(0, printed, "")
-    assert told(apc.show, "scene.apc") == [
-        "scene.apc: E615 is a compiled model, and this reads the topology that it was made from. "
-        "Write: apc show scene.yaml"
-    ]

@@ -1,0 +1,104 @@
+"""The command `apc tune`.
+
+Takes: words of a command line. Gives: text on stdout.
+Guarantees: with --json, stdout holds one JSON document and nothing else; how far the search is goes to a
+terminal only.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from apc.cli.options import command, criterion_with, note_aside, note_usual, option, print_result
+from apc.cli.progress import status_line
+from apc.compiler.errors import ApcError, Mistake, Place
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from apc.compiler.compiled import CompiledSystem
+    from apc.tuning.tune import Tuning
+
+
+@command
+def tune_command(
+    *,
+    file: str | None,
+    free: tuple[str, ...] = option(
+        "A gain that may be chosen, and from where to where. Repeat it.", "PATH=LO:HI"
+    ),
+    maximize: str = option("The gain that is to be as large as can be.", "PATH"),
+    minimize: str = option("The gain, or spectral_radius, that is to be as small as can be.", "PATH"),
+    subject: tuple[str, ...] = option('Beside stability: "decay=60 dB in 2 s".', "DEMAND"),
+    over: tuple[str, ...] = option(
+        "What the gains have to bear, all of it: user.count=2:10, device.mass=±20%, lan.loss=0:0.05, or "
+        '"lan.delay=8 ms:20 ms", at every constant delay. May be repeated.',
+        "PATH=LO:HI",
+    ),
+    hands: str,
+    time: str = option("End after this long, with the best found and what is not proved of it.", '"TIME"'),
+    settings: tuple[str, ...],
+    write: Path | None = option("Write the topology with these gains in it, comments and all (.yaml)."),
+    as_json: bool,
+) -> None:
+    """Find the gains that do best, and prove that they do.
+
+    The free gains are chosen so that one of them is as large (or small) as can
+    be while the scene is stable in all that stands in --over. They are printed
+    to four digits, and proved at these: in boxes, for every number of peers,
+    over the network as it is. That no other gains are better is not proved:
+    the answer says how many points were looked at. What is left out is as the
+    topology's studies: tune: says.
+
+    \b
+        apc tune --free "coordination.stiffness=10 N/m:5000 N/m" \\
+                 --free "coordination.damping=0 N*s/m:50 N*s/m" \\
+                 --maximize coordination.stiffness \\
+                 --over user.count=2:10 --over device.mass=±20%
+    """
+    from apc.frame.devices import FREE, with_hands
+    from apc.inputs import open_scene
+    from apc.tuning.demands import read_demands, read_seconds, study_hands
+    from apc.tuning.tune import tune
+
+    note_usual(hands)
+    if write is not None and write.suffix not in (".yaml", ".yml"):
+        what, got = "the name of a topology", write.suffix or write.name
+        raise ApcError(
+            Mistake("E996", Place("--write"), what, ".yaml at its end", got, f"{write.stem}-tuned.yaml")
+        )
+    system = open_scene(file, settings, {"--write": write}, hands=hands, told=note_aside)
+    if hands == FREE and (hands := study_hands(system)) != FREE:
+        system = with_hands(system, hands)
+    demands = read_demands(
+        system,
+        free,
+        maximize=maximize,
+        minimize=minimize,
+        subject=subject,
+        over=over,
+        criterion=criterion_with(hands, None),
+    )
+    with status_line() as told:
+        found = tune(system, demands, seconds=read_seconds(time), told=told)
+    if write is not None and found.met:
+        _write(system, found, settings, write)
+    print_result(found, as_json=as_json, written=[write if found.met else None])
+
+
+def _write(system: CompiledSystem, found: Tuning, settings: Sequence[str], path: Path) -> None:
+    """Write the topology with the gains, and with what else was set."""
+    from apc.compiler.files import write_text
+    from apc.compiler.words import with_unit
+    from apc.explore.written import with_values
+    from apc.frame.names import find
+    from apc.frame.overrides import parse_override
+
+    values = {parse_override(system, one).free: one.partition("=")[2].strip() for one in settings}
+    for gain in found.gains:
+        number = f"{float(gain.value):.12g}"
+        values[find(system, gain.parameter)] = with_unit(number, gain.unit).removesuffix(" 1")
+    (text,) = (text for name, text in system.origin.texts if name == system.origin.topology)
+    write_text(path, with_values(text.decode(), system, values).removesuffix("\n"))

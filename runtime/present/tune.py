@@ -1,0 +1,126 @@
+"""The gains that do best, as text and plain data.
+
+Takes: a `Tuning`. Gives: its text and document.
+Guarantees: what is not proved is said in the first sentence; a number is shown to the digits that its error
+leaves known.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from apc.compiler.words import counted, enumerated, in_hertz, measured, with_unit, wrapped
+from apc.present.analysis import range_document
+from apc.present.forms import MEANT, labelled, notes, quantity, record, table
+
+if TYPE_CHECKING:
+    from apc.frame.names import Range
+    from apc.tuning.tune import Binding, Tuning
+
+# Digits of what is typed, and of what a limit buys.
+TYPED, BUYS = 12, 3
+
+
+def tuning_text(found: Tuning) -> str:
+    """Return the gains, what is proved of them and what binds, in at most 80 columns."""
+    meant = [MEANT[found.criterion]] if found.criterion in MEANT else []
+    lines = [*wrapped(_sentence(found), "", "  "), *notes([*meant, *found.left_out, *found.notes]), ""]
+    rows = [("gain", "value", "before rounding", "chosen from")]
+    rows += [
+        (
+            one.parameter,
+            quantity(float(one.value), one.unit, TYPED),
+            quantity(one.best, one.unit),
+            with_unit(f"{one.low:.6g} to {one.high:.6g}", one.unit),
+        )
+        for one in found.gains
+    ]
+    lines += [*table(rows), ""]
+    if found.met:
+        best = f"{measured(found.best, found.error, found.unit)}, the best of {found.looked:,} points"
+        lines += labelled("before rounding", best)
+    lines += labelled("room", _room(found))
+    lines += _proof_lines(found)
+    if found.binding:
+        lines += ["", "  what binds" if found.met else "  what is in the way"]
+        lines += [line for one in found.binding for line in _binding_lines(found, one)]
+    return "\n".join(lines)
+
+
+def _sentence(found: Tuning) -> str:
+    """Return the answer in a sentence."""
+    decay = f"dying out by {-20 * math.log10(found.decay):.6g} dB a second"
+    stable = "stable" if found.decay == 1 else decay
+    stable += " and felt as asked" if found.felt else ""
+    over = f" for {enumerated([_span(one) for one in found.over])}" if found.over else ""
+    if not found.met:
+        return f"{found.topology}: no gains were found in these ranges that are {stable}{over}"
+    proved = "proved" if found.proved else "not proved"
+    if found.worst >= 0:
+        proved += ", and in some of it it is not so"
+    best = "largest" if found.larger else "least"
+    if found.unit == "1" and found.aim not in [one.parameter for one in found.gains]:
+        least = f"a spectral radius below {found.value:.6g}, next to the least found{over},"
+        return f"{found.topology}: {least} is {proved}"
+    value = quantity(found.value, found.unit, TYPED)
+    return f"{found.topology}: {value} is the {best} {found.aim} found to be {stable}{over}; it is {proved}"
+
+
+def _room(found: Tuning) -> str:
+    """Return how near the worst scenario is to what is allowed."""
+    if found.criterion == "passive":
+        return f"{-found.worst:.3g} of what hands can draw, as a logarithm"
+    if found.felt:
+        return f"{math.exp(found.worst):.6g} of what is allowed in the worst scenario"
+    radius, most = math.exp(found.worst + found.allowed), math.exp(found.allowed)
+    return f"spectral radius {radius:.6g} in the worst scenario, {most:.6g} allowed"
+
+
+def _span(one: Range) -> str:
+    low, high = (f"{float(end):.6g}" for end in (one.low, one.high))
+    return f"{one.free.label} from {low} to {with_unit(high, one.unit)}"
+
+
+def _proof_lines(found: Tuning) -> list[str]:
+    """Return what was proved, and of what it was not."""
+    proved = [one for one in found.proofs if one.proof.stable]
+    cells = sum(one.proof.cells for one in proved)
+    lines = []
+    if proved:
+        told = counted(cells, "cell" if found.over else "analysis", ",d").replace("analysiss", "analyses")
+        many = f"for each of {len(proved)} numbers of peers, " if proved[0].counts else ""
+        lines += labelled("proved", f"{many}{proved[0].proof.verdict} ({told})")
+    left: dict[str, list[str]] = {}
+    for one in found.proofs:
+        if not one.proof.stable:
+            share = f"{100 * one.proof.open_share:.3g} % of the box is left open" if one.proof.cells else ""
+            said = ", ".join(filter(None, [one.proof.verdict, share, *one.proof.notes]))
+            left.setdefault(said, []).append(", ".join(f"{label} {number}" for label, number in one.counts))
+    for said, where in left.items():
+        lines += labelled("not proved", "; ".join([", ".join(filter(None, where)), said]).removeprefix("; "))
+    if found.met and not found.proofs:
+        lines += labelled("not proved", "the time was up before any proof")
+    return lines
+
+
+def _binding_lines(found: Tuning, one: Binding) -> list[str]:
+    where = ", ".join(f"{label} {quantity(value, unit)}" for label, value, unit in one.where)
+    mode = f"{one.shape} mode at {in_hertz(one.frequency_hz)}" if one.shape else ""
+    other = "" if where else "what is felt" if found.felt else "stability"
+    lines = wrapped(": ".join(filter(None, [where, mode])) or other, "    ", "      ")
+    for label, value, unit, better in one.buys if found.met and found.unit != "1" else ():
+        buys = quantity(better, found.unit, BUYS)
+        lines += wrapped(f"1 % less of {label} = {quantity(value, unit)} buys {buys}", "      ", "        ")
+    return lines
+
+
+def tuning_document(found: Tuning) -> dict[str, Any]:
+    """Return the gains, what is proved of them and what binds as plain data."""
+    proofs = [
+        {"counts": dict(one.counts), "verdict": one.proof.verdict, "stable": one.proof.stable}
+        | {"cells": one.proof.cells, "open_share": one.proof.open_share}
+        for one in found.proofs
+    ]
+    return record(found, {"over": [range_document(one) for one in found.over], "proofs": proofs})

@@ -1,0 +1,249 @@
+"""What is asked of gains: which are free, what they are to do best, and all that they have to bear.
+
+Takes: a `CompiledSystem` and texts such as `coordination.stiffness=10 N/m:5000 N/m`.
+Gives: `Aim`, `Felt`, `Demands`, `read_demands`, `study_hands`, `read_seconds`; `PLACE`, `RADIUS`.
+Guarantees: what can't be meant is refused before anything is computed.
+Does not: compute.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+from apc.analysis.box import parse_range
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.frame.devices import FREE as FREE_HANDS
+from apc.frame.names import Free, Range, find
+from apc.moments.network import unreliable
+from apc.option_value import option_value
+from apc.vary.counts import count_range
+from apc.vary.delay_box import is_delay
+from apc.vary.evaluator import reaches_count
+from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE, criterion_of, refuse_time
+
+PLACE = Place("tune")
+FREE, AIM, SUBJECT, OVER = (Place(f"--{one}") for one in ("free", "maximize", "subject", "over"))
+
+# What may be minimized beside a gain.
+RADIUS = "spectral_radius"
+
+# What hands feel, as `Feel` has it, and its unit.
+FELT = {
+    "impedance": ("impedance", "N*s/m"),
+    "transmitted": ("transmitted_admittance", "m/s/N"),
+    "error": ("error_per_force", "m/N"),
+}
+
+_FREE = '--free "coordination.stiffness=10 N/m:5000 N/m"'
+
+
+@dataclass(frozen=True, slots=True)
+class Aim:
+    """What is to be best: the gain in column `gain`, or the spectral radius (None), the larger or not."""
+
+    label: str
+    gain: int | None
+    larger: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Felt:
+    """A demand on what a hand feels: the size of a `quantity` of `Feel` at a frequency, at most so."""
+
+    quantity: str
+    frequency_hz: float
+    most: float
+
+
+@dataclass(frozen=True, slots=True)
+class Demands:
+    """All that is asked: the free gains with their ranges, the aim, and what has to be borne.
+
+    `counts` are numbers of peers, every one from the low end to the high one; `delay` is a link's, at every
+    constant value; `box` are other numbers. `decay` is the factor by which motions have to die out in a
+    second, 1 where it is enough that they do. `felt` is what hands may feel at most. `criterion` is one of
+    those of `vary.growth`.
+    """
+
+    free: tuple[Range, ...]
+    aim: Aim
+    counts: tuple[Range, ...]
+    delay: Range | None
+    box: tuple[Range, ...]
+    decay: float
+    felt: tuple[Felt, ...]
+    criterion: str
+
+    @property
+    def over(self) -> tuple[Range, ...]:
+        """All that has to be borne."""
+        return (*self.counts, *((self.delay,) if self.delay else ()), *self.box)
+
+
+def read_demands(
+    system: CompiledSystem,
+    free: Sequence[str] = (),
+    *,
+    maximize: str = "",
+    minimize: str = "",
+    subject: Sequence[str] = (),
+    over: Sequence[str] = (),
+    criterion: str | None = None,
+) -> Demands:
+    """Read what is asked; what is left out is as the scene's `studies: tune:` says.
+
+    Parameters
+    ----------
+    system
+        The compiled scene.
+    free
+        The gains: `NAME=LOW:HIGH` each.
+    maximize, minimize
+        One of them: what is to be best.
+    subject
+        Demands beside stability: `decay=60 dB in 2 s`, `feel.impedance at 5 Hz < 20 N*s/m`.
+    over
+        What has to be borne: `user.count=2:10`, `device.mass=±20%`, `lan.delay=8 ms:20 ms`.
+    criterion
+        What stable means, one of `vary.growth` or None.
+
+    Raises
+    ------
+    ApcError
+        E995 nothing is free, or a time or number of peers is; E996 no such aim, or demand; E842, and those of
+        `box.parse_range`: a range that is none; E831 a number with two ranges.
+    """
+    free, subject, over = (
+        given or [text for word, text in system.tune if word == key]
+        for key, given in (("free", free), ("subject", subject), ("over", over))
+    )
+    if not (maximize or minimize):
+        maximize, minimize = (dict(system.tune).get(key, "") for key in ("maximize", "minimize"))
+    if not free:
+        raise ApcError(Mistake("E995", FREE, "no number is free: which may be chosen?", hint=_FREE))
+    gains = [_range(system, text, FREE) for text in free]
+    for one in gains:
+        if reaches_count(system, one.free) or is_delay(system, one.free):
+            what = f"{one.free.label} is no gain that can be chosen by degrees"
+            raise ApcError(Mistake("E995", FREE, what, hint=f"--over {one.free.label}=…"))
+    borne = [_range(system, text, OVER) for text in over]
+    for place, one in enumerate((*gains, *borne)):
+        if any(other.free.meets(one.free) for other in (*gains, *borne)[:place]):
+            raise ApcError(Mistake("E831", PLACE, f"{one.free.label} has two ranges"))
+    delays = [one for one in borne if is_delay(system, one.free)]
+    if len(delays) > 1:
+        names = " and ".join(one.free.label for one in delays)
+        raise ApcError(Mistake("E831", OVER, f"one delay has a range, not more: {names}"))
+    counts = tuple(one for one in borne if reaches_count(system, one.free))
+    box = tuple(one for one in borne if one not in counts and one not in delays)
+    chosen = criterion_of(system, criterion, PLACE, [one.free for one in (*gains, *box)])
+    if chosen == NOMINAL and unreliable(system):
+        what = "gains are chosen for the network as it is, which loses or delays packets"
+        raise ApcError(Mistake("E996", PLACE, what, hint=f"{MEAN_SQUARE}, or another topology"))
+    if chosen == PASSIVE:
+        for one in (*gains, *box):
+            refuse_time(system, one.free, PLACE, chosen)
+    felt = tuple(_felt(text) for text in subject if text.strip().startswith("feel."))
+    decay = min((_decay(text) for text in subject if not text.strip().startswith("feel.")), default=1.0)
+    if decay < 1 and chosen == PASSIVE:
+        what = "a decay and --hands passive don't go together: what hands can draw has no modes that decay"
+        raise ApcError(Mistake("E930", SUBJECT, what, hint="--hands clamped"))
+    best = _aim(gains, maximize, minimize)
+    delay = delays[0] if delays else None
+    return Demands(tuple(gains), best, counts, delay, box, decay, felt, chosen)
+
+
+def study_hands(system: CompiledSystem) -> str:
+    """Return what holds the devices where the scene's `studies: tune:` says so, "free" where it doesn't."""
+    return dict(system.tune).get("hands", FREE_HANDS)
+
+
+def read_seconds(text: str) -> float:
+    """Return how long a search may take, without end if nothing is said. Raises ApcError E996."""
+    if not text:
+        return math.inf
+    found = option_value("--time", text, what="a time", unit="s")
+    if found <= 0:
+        raise ApcError(Mistake("E996", Place("--time"), "a time", "more than 0 s", text[:80]))
+    return float(found)
+
+
+def _range(system: CompiledSystem, text: str, place: Place) -> Range:
+    """Read a range, of a number of peers too, with what is wrong told at its option."""
+    name = text.partition("=")[0].strip()
+    try:
+        free = find(system, name, place, counts=True) if name else None
+        if free is not None and reaches_count(system, free):
+            return _counted(system, free, text, place)
+        return parse_range(system, text)
+    except ApcError as error:
+        raise ApcError(replace(one, place=place) for one in error.mistakes) from None
+
+
+def _counted(system: CompiledSystem, free: Free, text: str, place: Place) -> Range:
+    ends = [one.strip() for one in text.partition("=")[2].split(":")]
+    if len(ends) != 2 or not all(ends):
+        got = text[:80]
+        raise ApcError(Mistake("E830", place, "numbers of peers", "NAME=LOW:HIGH", got, f"{free.label}=2:10"))
+    limits = [option_value(place.file, one, what=free.label, unit="1") for one in ends]
+    low, high = count_range(system, free, limits, float(limits[0]), place)
+    if low > high:
+        what, got = f"the range of {free.label}", f"{low} to {high}"
+        raise ApcError(
+            Mistake("E842", place, what, "the lower number first", got, f"{free.label}={high}:{low}")
+        )
+    return Range(free, "1", Fraction(low), Fraction(high))
+
+
+def _aim(gains: Sequence[Range], maximize: str, minimize: str) -> Aim:
+    """Return what is to be best."""
+    if bool(maximize) == bool(minimize):
+        what = "--maximize and --minimize both say what is best" if maximize else "nothing is to be best"
+        raise ApcError(Mistake("E996", PLACE, what, hint=f"--maximize {gains[0].free.label}"))
+    text, larger = (maximize or minimize).strip(), bool(maximize)
+    names = [one.free.label for one in gains]
+    if text in names:
+        return Aim(text, names.index(text), larger)
+    if text == RADIUS and not larger:
+        return Aim(RADIUS, None, larger)
+    option = "--maximize" if larger else "--minimize"
+    what = f"{option} {text[:60] or 'nothing'}"
+    expected = f"one of the free numbers ({', '.join(names)})" + ("" if larger else f" or {RADIUS}")
+    hint = f"{option} {nearest(text, names) or names[0]}"
+    raise ApcError(Mistake("E996", Place(option), what, expected, hint=hint))
+
+
+def _decay(text: str) -> float:
+    """Read `decay=60 dB in 2 s`; return the factor of a second."""
+    name, _, value = (one.strip() for one in text.partition("="))
+    size, within, time = (one.strip() for one in value.partition(" in "))
+    if name != "decay" or not (within and size.lower().endswith("db")):
+        wants = "decay=… dB in … or feel.… at … < …"
+        raise ApcError(Mistake("E996", SUBJECT, "a demand", wants, text[:80], '"decay=60 dB in 2 s"'))
+    decibels = option_value("--subject", size[:-2].strip(), what="decibels", unit="1")
+    seconds = option_value("--subject", time, what="a time", unit="s")
+    if not (decibels > 0 and seconds > 0):
+        raise ApcError(Mistake("E996", SUBJECT, "a decay", "more than 0 dB in more than 0 s", value[:80]))
+    return float(10 ** (-decibels / 20 / seconds))
+
+
+def _felt(text: str) -> Felt:
+    """Read `feel.impedance at 5 Hz < 20 N*s/m`, of a topology `feel.impedance at 5 Hz=< 20 N*s/m`."""
+    named, less, most = (one.strip() for one in text.replace("=<", "<").replace("= <", "<").partition("<"))
+    name, at, frequency = (one.strip() for one in named.removeprefix("feel.").partition(" at "))
+    if name not in FELT or not (at and less):
+        names = ", ".join(f"feel.{one}" for one in FELT)
+        example = '"feel.impedance at 5 Hz < 20 N*s/m"'
+        raise ApcError(
+            Mistake("E996", SUBJECT, "a demand on what is felt", f"one of {names}", text[:80], example)
+        )
+    quantity, unit = FELT[name]
+    hertz = option_value("--subject", frequency, what="a frequency", unit="Hz")
+    limit = option_value("--subject", most, what=f"feel.{name}", unit=unit)
+    if not (hertz > 0 and limit > 0):
+        raise ApcError(Mistake("E996", SUBJECT, "a demand on what is felt", "numbers above 0", text[:80]))
+    return Felt(quantity, float(hertz), float(limit))

@@ -1,0 +1,242 @@
+"""How far gains are from what limits them, in scenarios of all else that they have to bear.
+
+Takes: a `CompiledSystem` and `Demands`.
+Gives: `Scenario`, `Rows`, `Limits`.
+Guarantees: a value below 0 is a demand that is met, in floats; slopes are those of the values.
+Does not: choose scenarios, or prove (see `proof`).
+
+A scenario is a scene of its own, a number of peers and a delay (`settings`), and a point of the box. What
+limits gains there is how fast each of the largest modes grows, ln |λ| less what is allowed; over a lossy
+network or with passive hands it is the one number that the criterion has. What is felt counts as the
+logarithm of what it is of the most it may be.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import Prepared
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.eigen.eigenpairs import eigenvalues
+from apc.frame.overrides import Override, apply
+from apc.hands.feel import feel
+from apc.tuning.demands import PLACE, Demands
+from apc.vary.batch import MatrixSource
+from apc.vary.delay_box import standing_delays
+from apc.vary.evaluator import evaluator_of_many
+from apc.vary.growth import BY_GROWTH, GrowthEvaluator
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+# Of each system the largest modes are looked at, so many: where one takes the place of another both count.
+MODES = 4
+
+# The step of a difference, of a range: what it cuts off and what rounding leaves of it are then alike.
+STEP = 1e-6
+
+# The bound of each response, as `Feel` has it; less than any size.
+BOUND_OF = {
+    "impedance": "bound",
+    "transmitted_admittance": "transmitted_bound",
+    "error_per_force": "error_bound",
+}
+TINY = 1e-300
+
+# What stands for ln |λ| where there is no matrix, and for one of a mode that is not there.
+BEYOND, NONE = 3.0, -30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """What is borne: the number of a setting, and the numbers of the box."""
+
+    setting: int
+    point: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Limits at one point of the gains: `values` (n,), below 0 where met, and `slopes` (n, m).
+
+    A slope is that over the whole range of a gain, or of a number of the box.
+    `block` (n,) numbers the scenario and system that each is of, `eigenvalue` (n,) tells those of one block
+    apart, NaN of what has none, and `scenario` (n,) is the place of its scenario.
+    """
+
+    values: Floats
+    slopes: Floats
+    block: NDArray[np.intp]
+    eigenvalue: Complexes
+    scenario: NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """What limits the gains of a scene."""
+
+    system: CompiledSystem
+    prepared: Prepared
+    demands: Demands
+    known: dict[int, MatrixSource] = field(default_factory=dict)
+    samples: dict[Scenario, Floats] = field(default_factory=dict)
+
+    @cached_property
+    def settings(self) -> list[tuple[tuple[Override, ...], CompiledSystem]]:
+        """Every number of peers with every delay that stands for others, and the scene with these."""
+        listed = [range(int(one.low), int(one.high) + 1) for one in self.demands.counts]
+        found = []
+        for counts in itertools.product(*listed):
+            numbers = tuple(
+                Override(one.free, Fraction(count))
+                for one, count in zip(self.demands.counts, counts, strict=True)
+            )
+            scene, delay = apply(self.system, numbers), self.demands.delay
+            if delay is None:
+                found.append((numbers, scene))
+                continue
+            for value in dict.fromkeys(one for one, _ in standing_delays(scene, delay)):
+                late = Override(delay.free, value)
+                found.append(((*numbers, late), apply(scene, [late])))
+        return found
+
+    @cached_property
+    def allowed(self) -> float:
+        """What ln |λ| of a frame may be at most."""
+        return math.log(self.demands.decay) * float(self.prepared.schedules[0].frame_s)
+
+    @property
+    def by_growth(self) -> bool:
+        """Whether stable means one number below 1, and not eigenvalues inside the circle."""
+        return self.demands.criterion in BY_GROWTH
+
+    @property
+    def slow(self) -> bool:
+        """Whether one point takes milliseconds."""
+        return self.by_growth or bool(self.demands.felt)
+
+    def every(self) -> list[Scenario]:
+        """Return the middle and the corners of the box in every setting."""
+        ends = [(float(one.low), float(one.high)) for one in self.demands.box]
+        middle = tuple((low + high) / 2 for low, high in ends)
+        points = dict.fromkeys((middle, *itertools.product(*ends)))
+        return [Scenario(place, point) for place in range(len(self.settings)) for point in points]
+
+    def family(self, setting: int) -> MatrixSource:
+        """Return what gives the matrices of a setting over the gains and the box."""
+        if setting not in self.known:
+            _, scene = self.settings[setting]
+            free = [one.free for one in (*self.demands.free, *self.demands.box)]
+            self.known[setting] = (
+                GrowthEvaluator(scene, tuple(free), self.prepared, PLACE, self.demands.criterion)
+                if self.by_growth
+                else evaluator_of_many(scene, free, PLACE, prepared=self.prepared)
+            )
+        return self.known[setting]
+
+    def worst(self, scenarios: Sequence[Scenario], gains: Floats) -> Floats:
+        """Return the largest value in each scenario (k, s) at gains (k, m)."""
+        found = np.empty((len(gains), len(scenarios)))
+        for place, one in enumerate(scenarios):
+            points = np.hstack([gains, np.tile(one.point, (len(gains), 1))])
+            sizes = [_sizes(matrix) for matrix in self.family(one.setting).matrices(points)]
+            grown = np.max([np.full(len(gains), NONE), *sizes], axis=0) - self.allowed
+            found[:, place] = np.max([grown, *self.felt(one, points).T], axis=0)
+        return found
+
+    def felt(self, scenario: Scenario, points: Floats, *, bounded: bool = False) -> Floats:
+        """Return ln of what is felt by what may be at most (k, q) at points of gains and box (k, m + b)."""
+        asked = self.demands.felt
+        found = np.full((len(points), len(asked)), BEYOND)
+        _, scene = self.settings[scenario.setting]
+        free = [one.free for one in (*self.demands.free, *self.demands.box)]
+        for row, point in zip(found, points.tolist() if asked else (), strict=False):
+            changed = apply(scene, [Override(*pair) for pair in zip(free, map(Fraction, point), strict=True)])
+            for place, one in enumerate(asked):
+                with contextlib.suppress(ApcError):
+                    told = feel(
+                        changed, [one.frequency_hz], unstable=True, quick=True, prepared=self.prepared
+                    )
+                    size = abs(complex(getattr(told, one.quantity)[0]))
+                    share = float(getattr(told, BOUND_OF[one.quantity])[0]) if bounded else 0.0
+                    row[place] = math.log(max(size * (1 + share), TINY) / one.most)
+        return found
+
+    def sampled(self, scenario: Scenario, gains: Floats) -> Floats:
+        """Return the largest value in a scenario (k,) at gains (k, m), the same whenever it is asked."""
+        if scenario not in self.samples:
+            self.samples[scenario] = self.worst([scenario], gains)[:, 0]
+        return self.samples[scenario]
+
+    def rows(self, scenarios: Sequence[Scenario], gains: Floats, *, wide: bool = False) -> Rows:
+        """Return all limits at gains (m,), their slopes along the numbers of the box, too, if `wide`."""
+        ranges = [*self.demands.free, *self.demands.box]
+        along = np.diag([float(one.high - one.low) for one in ranges])
+        along = along if wide else along[: len(gains)]
+        parts: list[tuple[Floats, Floats, Complexes, int]] = []
+        for place, one in enumerate(scenarios):
+            point = np.append(gains, one.point)
+            family = self.family(one.setting)
+            inwards = along * np.where(point > [float(own.low + own.high) / 2 for own in ranges], -1, 1)
+            if isinstance(family, GrowthEvaluator):
+                (roots,) = family.matrices(np.vstack([point, point + STEP * inwards]))
+                parts.append((*_differences(_sizes(roots)[:, None] - self.allowed, inwards), place))
+            else:
+                for pair in family.slopes(np.tile(point, (len(along), 1)), along):
+                    values, slopes, found = _largest(*pair)
+                    parts.append((values - self.allowed, slopes, found, place))
+            if self.demands.felt:
+                felt = self.felt(one, np.vstack([point, point + STEP * inwards]))
+                parts.append((*_differences(felt, inwards), place))
+        counts = [len(values) for values, *_ in parts]
+        return Rows(
+            np.concatenate([values for values, *_ in parts]),
+            np.concatenate([slopes for _, slopes, *_ in parts]),
+            np.repeat(np.arange(len(parts)), counts),
+            np.concatenate([found for *_, found, _ in parts]),
+            np.repeat([place for *_, place in parts], counts),
+        )
+
+
+def _differences(values: Floats, along: Floats) -> tuple[Floats, Floats, Complexes]:
+    """Return the first of values (1 + m, q), how they move along directions (q, m), and no eigenvalues.
+
+    Differences are one-sided, into the ranges: of numbers that take milliseconds, half as many are wanted.
+    """
+    # A direction goes up where its one entry is above 0.
+    slopes = (values[1:] - values[0]) / STEP * np.sign(along.sum(axis=1))[:, None]
+    return values[0], slopes.T, np.full(len(values[0]), np.nan, np.complex128)
+
+
+def _sizes(matrices: Floats) -> Floats:
+    """Return ln |λ| of the largest eigenvalue of each matrix (k, n, n)."""
+    known = np.isfinite(matrices).all(axis=(1, 2))
+    found = np.full(len(matrices), BEYOND)
+    if matrices.shape[-1] and known.any():
+        largest = np.abs(np.linalg.eigvals(matrices[known])).max(axis=1)
+        found[known] = np.log(np.clip(largest, math.exp(NONE), None))
+    return found if matrices.shape[-1] else np.full(len(matrices), NONE)
+
+
+def _largest(matrix: Floats, slope: Floats) -> tuple[Floats, Floats, Complexes]:
+    """Return ln |λ| of the largest modes (n,), how it follows each number (n, m), and λ (n,)."""
+    count = min(MODES, matrix.shape[-1])
+    if not (np.isfinite(matrix).all() and np.isfinite(slope).all()):
+        return np.full(count, BEYOND), np.zeros((count, len(slope))), np.zeros(count, np.complex128)
+    values, moves = eigenvalues(matrix, slope)
+    sizes = np.where(values[0].imag >= 0, np.abs(values[0]), 0.0)
+    chosen = np.argsort(-sizes, kind="stable")[:count]
+    there = sizes[chosen] > math.exp(NONE)
+    value = np.where(there, values[0, chosen], 1.0)
+    rates = np.where(there, (moves[:, chosen] / value).real, 0.0)
+    return np.where(there, np.log(np.abs(value)), NONE), rates.T, values[0, chosen]

@@ -1,0 +1,314 @@
+"""The best gains within limits, of a few scenarios at a time.
+
+Takes: `Limits`, scenarios.
+Gives: `Optimum`, `Search`.
+Guarantees: the same question, the same gains: what is drawn is drawn by a fixed rule.
+Does not: prove that nothing is better: so many points were looked at, and none was.
+
+Points spread evenly over the ranges say where to start. From there SciPy's SLSQP goes downhill; several modes
+that limit at once are limits each, so that a corner of the stable region is an ordinary optimum. Where
+limits i bind, v_i(x) = 0 and ∇f + Σ μ_i ∇v_i = 0 hold there, whose root (MINPACK's hybrd) is the answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.threads import load_pool
+from apc.tuning.limits import Limits, Rows, Scenario
+
+Floats = NDArray[np.float64]
+
+# Points looked at to begin with, of matrices and of one number that takes milliseconds.
+POINTS, SLOW_POINTS = 2048, 96
+
+# Of these so many at a time are looked at in all scenarios, and so often.
+LOOK, SLOW_LOOK, LOOKS = 64, 8, 4
+
+# The least error, of a value: floats know no more of where their eigenvalues cross.
+LEAST = 1e-9
+
+# More than any aim is worth.
+HUGE = 1e3
+
+# The least share of a range in which points are spread by ratios.
+SMALLEST = 1e-3
+
+# What a limit that binds may be off by; what is left open of the conditions of an optimum.
+BINDS, OPEN = 1e-6, 1e-8
+
+# Points beside an optimum, how far from it they lie, and how often one that is better is followed.
+BESIDE, SPREADS, AGAIN = 256, (0.1, 0.01, 1e-3), 4
+SLOW_BESIDE = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Optimum:
+    """The best gains (m,) found in some scenarios: the `value` of the aim, right to `error`, what limits it.
+
+    `worst` is the largest limit, above 0 where no gains meet them all. `multipliers` (n,) of `rows` say how
+    much of the aim each costs, per unit of ln |λ|; `looked` points were looked at.
+    """
+
+    scenarios: tuple[Scenario, ...]
+    gains: Floats
+    value: float
+    error: float
+    worst: float
+    rows: Rows
+    multipliers: Floats
+    looked: int
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """A search for the best gains in some scenarios.
+
+    The gain in `column` is to be large (`sign` 1) or small (−1); without a column the largest limit is to be
+    as small as can be. A descent takes so many `steps` at most.
+    Inside, ranges are 0 to 1; t stands for the largest limit, where that is the aim.
+    """
+
+    limits: Limits
+    scenarios: Sequence[Scenario]
+    column: int | None
+    sign: float = 1.0
+    steps: int = 200
+
+    @cached_property
+    def _low(self) -> Floats:
+        return np.array([float(one.low) for one in self.limits.demands.free])
+
+    @cached_property
+    def _width(self) -> Floats:
+        return np.array([float(one.high) for one in self.limits.demands.free]) - self._low
+
+    def _gains(self, shares: Floats) -> Floats:
+        """Return gains (…, m) of shares of their ranges."""
+        return np.asarray(self._low + self._width * np.clip(shares, 0.0, 1.0))
+
+    def _worst(self, shares: Floats) -> Floats:
+        """Return the largest limit at shares (k, m)."""
+        return np.asarray(self.limits.worst(self.scenarios, self._gains(shares)).max(axis=1))
+
+    def _merit(self, shares: Floats, worst: Floats) -> Floats:
+        """Return what is to be small (k,), of points that meet the limits."""
+        return worst if self.column is None else -self.sign * shares[:, self.column]
+
+    def at(self, start: Floats) -> Optimum:
+        """Return what there is at shares of the ranges, as if it were the best."""
+        return self._optimum(start, self._remembered(), 0.0)
+
+    def rough(self, start: Floats) -> Optimum:
+        """Return where one descent from shares of the ranges ends."""
+        return self._descended(start)
+
+    def start(self, present: Floats, every: Sequence[Scenario], than: Optimum | None = None) -> list[Floats]:
+        """Return where to go downhill from, shares of the ranges: the best of points spread evenly.
+
+        Parameters
+        ----------
+        present
+            Gains to look at as well.
+        every
+            All scenarios, in which a few of the points that are best in the search's own are looked at.
+        than
+            What is known: only a point that does better in all scenarios is returned then, if there is one.
+        """
+        points = np.vstack([np.clip((present - self._low) / self._width, 0.0, 1.0), self._even])
+        gains = self._gains(points)
+        worst = np.max([self.limits.sampled(one, gains) for one in self.scenarios], axis=0)
+        order = np.argsort(self._order(points, worst), kind="stable")
+        if than is not None:
+            met = self.column is not None and than.worst <= BINDS
+            known = self._order(self.shares(than)[None], np.array([0.0 if met else than.worst]))[0]
+            order = order[self._order(points, worst)[order] < known - OPEN]
+        size, left = (SLOW_LOOK if self.limits.slow else LOOK), LOOKS
+        for begin in range(0, min(len(order), size * LOOKS), size):
+            some = order[begin : begin + size]
+            ranks = self._order(points[some], self.limits.worst(every, gains[some]).max(axis=1))
+            place, left = int(np.argmin(ranks)), left - 1
+            if ranks[place] < (known - OPEN if than is not None else 0.0 if left else np.inf):
+                return [points[some[place]]]
+        return []
+
+    def _order(self, points: Floats, worst: Floats) -> Floats:
+        """Return what the best of points (k, m) has least of, far below 0 where it meets the limits."""
+        merit = self._merit(points, worst)
+        return merit if self.column is None else np.where(worst <= 0, merit - HUGE, worst)
+
+    @cached_property
+    def _even(self) -> Floats:
+        """Points (k, m) spread evenly over the ranges, every other one by ratios."""
+        even = _spread(SLOW_POINTS if self.limits.slow else POINTS, len(self._low))
+        top = self._low + self._width
+        near = np.where(self._low > 0, self._low, SMALLEST * self._width)
+        ratios = np.where(top > near, near * (np.maximum(top, near) / near) ** even[::2], top)
+        even[::2] = np.clip((ratios - self._low) / self._width, 0.0, 1.0)
+        return even
+
+    def best(self, starts: Sequence[Floats]) -> Optimum:
+        """Return the best that descents from starts (shares of the ranges) find."""
+        found = [self._descended(start) for start in starts]
+        chosen = min(found, key=self._rank)
+        count = SLOW_BESIDE if self.limits.slow else BESIDE
+        cloud = _spread(count, len(self._low)) - 0.5
+        looked = 0
+        for _ in range(AGAIN):
+            around = [np.clip(self.shares(chosen) + 2 * size * cloud, 0.0, 1.0) for size in SPREADS]
+            points = np.vstack(around)
+            worst = self._worst(points)
+            looked += len(points)
+            merit = np.where(worst <= max(chosen.worst, 0.0), self._merit(points, worst), np.inf)
+            place = int(np.argmin(merit))
+            if not merit[place] < self._own_merit(chosen) - OPEN:
+                break
+            again = self._descended(points[place])
+            if self._rank(again) >= self._rank(chosen):
+                break
+            chosen = again
+        return replace(chosen, looked=looked)
+
+    def shares(self, found: Optimum) -> Floats:
+        """Return the gains of an optimum as shares of their ranges."""
+        return np.asarray((found.gains - self._low) / self._width)
+
+    def _own_merit(self, found: Optimum) -> float:
+        return float(self._merit(self.shares(found)[None], np.array([found.worst]))[0])
+
+    def _rank(self, found: Optimum) -> tuple[bool, float]:
+        """Return what the best of several has least of."""
+        met = self.column is None or found.worst <= BINDS
+        return not met, self._own_merit(found) if met else found.worst
+
+    def _descended(self, start: Floats) -> Optimum:
+        """Return where a descent ends."""
+        optimize = load_pool("scipy.optimize")
+        rows_of = self._remembered()
+        size, spare = len(start), self.column is None
+        here = np.append(start, rows_of(start).values.max()) if spare else start
+        aim = np.zeros(len(here))
+        aim[-1 if spare else self.column] = 1.0 if spare else -self.sign
+
+        def left(z: Floats) -> Floats:
+            return np.asarray((z[-1] if spare else 0.0) - rows_of(z[:size]).values)
+
+        def moves(z: Floats) -> Floats:
+            slopes = -rows_of(z[:size]).slopes
+            return np.column_stack([slopes, np.ones(len(slopes))]) if spare else slopes
+
+        ended = optimize.minimize(
+            lambda z: float(aim @ z),
+            here,
+            jac=lambda z: aim,
+            method="SLSQP",
+            bounds=[(0.0, 1.0)] * size + [(None, None)] * spare,
+            constraints=[{"type": "ineq", "fun": left, "jac": moves}],
+            options={"ftol": 1e-9 if self.limits.slow else 1e-14, "maxiter": self.steps},
+        )
+        rough = np.clip(np.nan_to_num(ended.x[:size], nan=0.5), 0.0, 1.0)
+        rough = np.where(np.abs(rough - np.round(rough)) < OPEN, np.round(rough), rough)
+        begun, found = self._optimum(start, rows_of, 0.0), self._polished(rough, rows_of)
+        return begun if self._rank(begun) < self._rank(found) else found
+
+    def _remembered(self) -> Callable[[Floats], Rows]:
+        """Return what gives the limits at shares (m,), once each."""
+        known: dict[bytes, Rows] = {}
+
+        def rows_of(shares: Floats) -> Rows:
+            key = np.ascontiguousarray(shares).tobytes()
+            if key not in known:
+                known[key] = self.limits.rows(self.scenarios, self._gains(shares))
+            return known[key]
+
+        return rows_of
+
+    def _polished(self, rough: Floats, rows_of: Callable[[Floats], Rows]) -> Optimum:
+        """Return the root of the conditions of an optimum beside a rough one, or that itself."""
+        here = rows_of(rough)
+        before = self._optimum(rough, rows_of, 0.0)
+        inner = (rough > OPEN) & (rough < 1 - OPEN)
+        active = np.flatnonzero(before.multipliers > 0).tolist()
+        spare = self.column is None
+        if self.limits.slow or not len(active) or len(active) > inner.sum() + spare:
+            return before
+
+        def unpacked(y: Floats) -> tuple[Floats, Floats]:
+            shares = rough.copy()
+            shares[inner] = y[: inner.sum()]
+            return shares, y[inner.sum() :]
+
+        def conditions(y: Floats) -> Floats:
+            shares, rest = unpacked(y)
+            found = rows_of(shares)
+            same = [_same(found, here, one) for one in active]
+            values, slopes = found.values[same], found.slopes[same]
+            weights = rest[:-1] if spare else rest
+            along = self._aim() + weights @ slopes
+            last = [weights.sum() - 1] if spare else []
+            return np.concatenate([along[inner], values - (rest[-1] if spare else 0.0), last])
+
+        begin = np.concatenate([rough[inner], before.multipliers[active], [before.worst] if spare else []])
+        root = load_pool("scipy.optimize").root(conditions, begin, tol=1e-14)
+        shares, rest = unpacked(root.x)
+        near = np.abs(shares - rough).max() <= SPREADS[1] and (shares >= 0).all() and (shares <= 1).all()
+        weights = rest[:-1] if spare else rest
+        if not (near and np.abs(root.fun).max() <= OPEN and (weights >= 0).all()):
+            return before
+        after = self._optimum(shares, rows_of, abs(self._value(shares, rows_of) - before.value))
+        return after if after.worst <= max(before.worst, BINDS) else before
+
+    def _aim(self) -> Floats:
+        """Return how what is to be small follows the shares (m,)."""
+        found = np.zeros(len(self._low))
+        if self.column is not None:
+            found[self.column] = -self.sign
+        return found
+
+    def _value(self, shares: Floats, rows_of: Callable[[Floats], Rows]) -> float:
+        """Return the value of the aim: a gain, or the largest ln |λ| of a frame."""
+        if self.column is not None:
+            return float(self._gains(shares)[self.column])
+        return float(rows_of(shares).values.max()) + self.limits.allowed
+
+    def _optimum(self, shares: Floats, rows_of: Callable[[Floats], Rows], error: float) -> Optimum:
+        """Return an optimum with what its limits cost: the multipliers that best balance the aim."""
+        rows = rows_of(shares)
+        worst = float(rows.values.max(initial=-np.inf))
+        level = worst if self.column is None else 0.0
+        near = np.flatnonzero(rows.values >= level - BINDS * 100)
+        inner = (shares > OPEN) & (shares < 1 - OPEN)
+        slopes = rows.slopes[near][:, inner].T
+        balance: Any = (slopes, -self._aim()[inner])
+        if self.column is None:  # weights of one
+            balance = (np.vstack([slopes, np.ones(len(near))]), np.append(balance[1], 1.0))
+        multipliers = np.zeros(len(rows.values))
+        if len(near) and len(balance[1]):
+            multipliers[near] = load_pool("scipy.optimize").nnls(*balance)[0]
+        value = self._value(shares, rows_of)
+        if not error:  # what limits that don't quite bind leave open
+            scale = 1.0 if self.column is None else float(self._width[self.column])
+            error = scale * float(multipliers @ np.abs(rows.values - level))
+        error = max(error, LEAST * abs(value))
+        return Optimum(tuple(self.scenarios), self._gains(shares), value, error, worst, rows, multipliers, 0)
+
+
+def _same(found: Rows, here: Rows, one: int) -> int:
+    """Return the row that goes on a mode of another point: of its block, the nearest eigenvalue."""
+    own = np.flatnonzero(found.block == here.block[one])
+    return int(own[np.argmin(np.abs(found.eigenvalue[own] - here.eigenvalue[one]))])
+
+
+def _spread(count: int, size: int) -> Floats:
+    """Return points (count, size) evenly spread over 0 to 1, by the rule of the generalized golden ratio."""
+    ratio = 1.5
+    for _ in range(64):  # x^(size + 1) = x + 1
+        ratio = (1 + ratio) ** (1 / (size + 1))
+    steps = ratio ** -np.arange(1.0, size + 1)
+    return np.mod(0.5 + np.arange(1, count + 1)[:, None] * steps, 1.0)

@@ -1,0 +1,497 @@
+"""The gains that do best in all that they have to bear, as a person would type them, proved.
+
+Takes: a `CompiledSystem` and `Demands`.
+Gives: `Gain`, `Binding`, `Proved`, `Tuning`, `tune`.
+Guarantees: what is said to be proved is proved by the scene's own analysis at the gains as they are printed;
+what is not, is said not to be.
+Does not: prove that no other gains are better: so many points were looked at, and none was.
+
+Gains are first the best of a few scenarios. Where another corner, number of peers or delay limits them more,
+it is one of the scenarios from then on. They are rounded to where there is most room beside them, and go back
+step by step as long as the proof leaves anything open.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from decimal import ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Decimal
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import analyze, prepare
+from apc.analysis.box_proof import UNDECIDED, BoxProof
+from apc.answer import proved_at
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.compiler.timings import part
+from apc.finite_equations import finite_equations
+from apc.frame.names import Range, value_now
+from apc.frame.overrides import Override, apply
+from apc.network.nominal import left_out
+from apc.result import Result
+from apc.threads import single_threaded
+from apc.tuning.demands import Demands, Felt
+from apc.tuning.limits import Limits, Scenario
+from apc.tuning.optimum import BINDS, Optimum, Search
+from apc.vary.crossing import Told
+from apc.vary.growth import MEAN_SQUARE, PASSIVE
+
+Floats = NDArray[np.float64]
+
+# Significant digits that a person types.
+DIGITS = 4
+
+# How much of the room beside them rounding may take of gains.
+ROOM = 0.5
+
+# How far gains go back from the best until they are proved, as shares of the best; where there is a box, they
+# begin farther back: cells beside a limit are small, and there are very many.
+BACK = (0.0, 1e-4, 1e-3, 1e-2)
+BACK_IN_BOX = (5e-3, 1e-2)
+
+# Steps on the way to where there is most room: any room does.
+STEPS = 12
+
+# What is said where only stability is proved.
+SLOWER = "stable is proved; how fast motions die out, or what is felt, is only looked at scenario by scenario"
+
+# What is said where every passive hand is to be borne in a box.
+ONE_BY_ONE = "no box is proved with every passive hand: it is so in the scenarios looked at"
+
+# Scenarios added at a time; how far above the others a limit is that counts.
+MORE, ABOVE = 3, 1e-9
+
+# Turns in which scenarios that limit nothing are left out.
+DROPPING = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Gain:
+    """A free number: its `value` as it is typed, exact, and what was best before rounding, both in SI."""
+
+    parameter: str
+    unit: str
+    low: float
+    high: float
+    value: Fraction
+    best: float
+
+
+@dataclass(frozen=True, slots=True)
+class Binding:
+    """What keeps gains from doing better: a mode in a scenario, or an end of a gain's own range.
+
+    `where` are the scenario's numbers as (label, value, unit). `shape` and `frequency_hz` are the mode's, ""
+    and NaN where the criterion has none. `buys` are the ends of what has to be borne that meet there, as
+    (label, end, unit, how much better the aim is for 1 % less of it).
+    """
+
+    where: tuple[tuple[str, float, str], ...]
+    shape: str
+    frequency_hz: float
+    buys: tuple[tuple[str, float, str, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Proved:
+    """What was proved of the gains with some numbers of peers, as (label, number): of the rest, all of it."""
+
+    counts: tuple[tuple[str, int], ...]
+    proof: BoxProof
+
+
+@dataclass(frozen=True, slots=True)
+class Tuning(Result):
+    """The best gains, what was proved of them, and what binds.
+
+    `value` is that of the aim with the gains as they are typed, `best` before they were rounded, right to
+    `error`; both are a spectral radius where that is the aim. `met` says whether any gains meet all demands
+    in floats; `proved` whether all was proved of these. `worst` is how much faster than allowed the fastest
+    motion grows in a frame, ln |λ| less the `allowed`, below 0 if it is slower. `decay` is a factor a second.
+    `looked` points were looked at.
+    """
+
+    shown_by = "tune:tuning"
+
+    topology: str
+    aim: str
+    unit: str
+    larger: bool
+    met: bool
+    proved: bool
+    value: float
+    best: float
+    error: float
+    worst: float
+    gains: tuple[Gain, ...]
+    over: tuple[Range, ...]
+    criterion: str
+    decay: float
+    felt: tuple[Felt, ...]
+    allowed: float
+    proofs: tuple[Proved, ...]
+    binding: tuple[Binding, ...]
+    looked: int
+    notes: tuple[str, ...]
+    left_out: tuple[str, ...]
+    system: CompiledSystem = field(compare=False, repr=False)
+
+
+@part("tune")
+def tune(
+    system: CompiledSystem,
+    demands: Demands,
+    *,
+    seconds: float = math.inf,
+    told: Told | None = None,
+) -> Tuning:
+    """Find the best gains, and prove that they bear all that is asked.
+
+    Parameters
+    ----------
+    system, demands
+        The compiled scene, and what `read_demands` read for it.
+    seconds
+        How long to go on; the best found until then is the answer, with what is not proved of it.
+    told
+        Is told how far it is.
+
+    Raises
+    ------
+    ApcError
+        Those of the analysis that the scene needs, such as E898 a network that can't be judged.
+    """
+    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
+        return _Work(system, demands, time.monotonic() + seconds, told or (lambda _: None)).done()
+
+
+@dataclass(eq=False)
+class _Work:
+    """The work: its scenarios grow."""
+
+    system: CompiledSystem
+    demands: Demands
+    until: float
+    told: Told
+    scenarios: list[Scenario] = field(default_factory=list)
+    looked: int = 0
+
+    def __post_init__(self) -> None:
+        self.limits = Limits(self.system, prepare(self.system), self.demands)
+        self.every = self.limits.every()
+        first = len(self.every) // len(self.limits.settings)
+        self.scenarios = list(dict.fromkeys((self.every[0], self.every[-first])))
+
+    @property
+    def _unproved(self) -> bool:
+        """Whether nothing proves what is asked, beside that it is stable."""
+        decays = self.limits.by_growth and self.demands.decay < 1
+        return decays or bool(self.demands.felt and (self.demands.box or self.demands.delay))
+
+    @property
+    def late(self) -> bool:
+        return time.monotonic() > self.until
+
+    def done(self) -> Tuning:
+        aim = self.demands.aim
+        present = np.array([float(value_now(self.system, one.free)) for one in self.demands.free])
+        starts: list[Floats] = []
+        while True:
+            found = self._borne(aim.gain, starts, present)
+            if aim.gain is not None and found.worst > BINDS:  # perhaps they only were not found
+                least = self._borne(None, [], present)
+                if least.worst > 0:
+                    return self._unmet(least)
+                found = self._borne(aim.gain, [self._shares(least)], present)
+            gains, proofs, failed = self._settled(found)
+            if failed is None or self.late:
+                return self._answer(found, gains, proofs)
+            self.scenarios.append(failed)
+            starts = [self._shares(found)]
+
+    def _shares(self, found: Optimum) -> Floats:
+        return Search(self.limits, self.scenarios, None).shares(found)
+
+    def _borne(self, column: int | None, starts: list[Floats], present: Floats) -> Optimum:
+        """Return the best of all scenarios, those added that limit it more than those there are."""
+        sign = 1.0 if self.demands.aim.larger else -1.0
+        begun: list[Floats] = []
+        for turn in itertools.count():
+            self.told(f"looking for gains in {len(self.scenarios)} of {len(self.every)} scenarios")
+            search = Search(self.limits, self.scenarios, column, sign)
+            if not starts:
+                starts = begun = search.start(present, self.every)
+            found = search.best(starts)
+            self.looked += found.looked
+            bound = found.rows.scenario[found.multipliers > 0]
+            if turn < DROPPING and len(bound):  # what limits nothing is looked at again with all others
+                self.scenarios = [one for place, one in enumerate(self.scenarios) if place in bound]
+            level = max(found.worst, 0.0 if column is not None else -math.inf)
+            starts = [search.shares(found)]
+            if self._added(found.gains, level):
+                if not self.late:
+                    continue
+                return search.at(begun[0]) if begun else found
+            ahead = search.start(present, self.every, than=found)
+            if self.late or not ahead:
+                return found
+            starts += ahead
+        raise AssertionError("turns never end")
+
+    def _added(self, gains: Floats, level: float) -> bool:
+        """Add the scenarios that limit gains by more than a level; say whether there were any."""
+        worst = self.limits.worst(self.every, gains[None])[0]
+        order = np.argsort(-worst)
+        new = [self.every[place] for place in order[:MORE] if worst[place] > level + ABOVE]
+        new = [one for one in new if one not in self.scenarios]
+        self.scenarios += new
+        return bool(new)
+
+    def _settled(self, found: Optimum) -> tuple[list[Fraction], list[Proved], Scenario | None]:
+        """Return gains as they are typed, what is proved of them, and a scenario that they don't bear."""
+        column = self.demands.aim.gain
+        shares = [0.0] if column is None or self._unproved else BACK_IN_BOX if self.demands.over else BACK
+        place, middle = 0, None
+        while True:
+            gains = [_decimal(value, DIGITS) for value in found.gains.tolist()]
+            if column is not None:
+                gains[column] = self._back(float(found.gains[column]), shares[place])
+            if column is None or len(gains) > 1:
+                middle = self._middle(gains, column, found) if middle is None else middle
+                gains = self._typed(gains, column, middle)
+            point = np.array([float(one) for one in gains])
+            if column is not None and not self.late and self._added(point, -ABOVE):
+                middle = None
+                continue
+            held = column is None or float(self.limits.worst(self.every, point[None]).max()) < 0
+            last = self.late or place + 1 == len(shares)
+            if held or last:
+                proofs, failed = self._proofs(gains)
+                if failed is not None or last or all(one.proof.stable for one in proofs):
+                    return gains, proofs, failed
+            place += 1
+
+    def _back(self, value: float, share: float) -> Fraction:
+        """Return a gain less a share of it, rounded to the side where it does less."""
+        larger = self.demands.aim.larger
+        moved = value * (1 - share if larger == (value > 0) else 1 + share)
+        return _decimal(moved, DIGITS, ROUND_FLOOR if larger else ROUND_CEILING)
+
+    def _rest(self, gains: Sequence[Fraction], column: int | None) -> Limits:
+        """Return the limits of all other gains, the one in a column being as it is."""
+        free = self.demands.free
+        if column is None:
+            return self.limits
+        others = tuple(one for place, one in enumerate(free) if place != column)
+        fixed = apply(self.system, [Override(free[column].free, gains[column])])
+        return Limits(fixed, self.limits.prepared, replace(self.demands, free=others))
+
+    def _middle(self, gains: Sequence[Fraction], column: int | None, found: Optimum) -> Floats:
+        """Return the other gains where there is most room beside the one in a column."""
+        if column is None:
+            return found.gains
+        search = Search(self._rest(gains, column), self.scenarios, None, steps=STEPS)
+        begin = replace(found, gains=np.delete(found.gains, column))
+        return search.rough(search.shares(begin)).gains
+
+    def _typed(self, gains: list[Fraction], column: int | None, middle: Floats) -> list[Fraction]:
+        """Return gains of which all but one are their middle to as few digits as leave room."""
+        rest = self._rest(gains, column)
+        ranges = rest.demands.free
+        digits = range(1, DIGITS + 1)
+        listed = [
+            [
+                min(max(_decimal(value, count), one.low), one.high)
+                for value, one in zip(middle, ranges, strict=True)
+            ]
+            for count in digits
+        ]
+        points = np.array([*listed, middle], dtype=np.float64)
+        worst = rest.worst(self.scenarios, points).max(axis=1)
+        room = (
+            worst[-1] + (1 - ROOM) * abs(worst[-1])
+            if column is not None
+            else worst[-1] + 1e-4 * abs(worst[-1])
+        )
+        fits = np.flatnonzero(worst[:-1] <= room)
+        others = iter(listed[int(fits[0]) if len(fits) else -1])
+        return [one if place == column else next(others) for place, one in enumerate(gains)]
+
+    def _proofs(self, gains: Sequence[Fraction]) -> tuple[list[Proved], Scenario | None]:
+        """Return what is proved of gains with each number of peers, those first that limit them most."""
+        inside = self._inside(gains)
+        delay, counts = self.demands.delay, self.demands.counts
+        ranges = [*([delay] if delay else []), *self.demands.box]
+        changes = [Override(one.free, value) for one, value in zip(self.demands.free, gains, strict=True)]
+        point = np.array([[float(one) for one in gains]])
+        worst = self.limits.worst(self.every, point)[0]
+        order: dict[tuple[Override, ...], None] = {}
+        for place in np.argsort(-worst, kind="stable"):
+            numbers, _ = self.limits.settings[self.every[place].setting]
+            order[numbers[: len(counts)]] = None
+        found: list[Proved] = []
+        for numbers in order:
+            named = tuple((one.free.label, int(one.value)) for one in numbers)
+            if self.late:
+                found.append(Proved(named, _unlooked(self.system.name, ranges)))
+                continue
+            self.told(f"proving {len(found) + 1} of {len(order)}")
+            scene = apply(self.system, [*changes, *numbers])
+            passive = self.demands.criterion == PASSIVE
+            if passive and self.demands.box:
+                found.append(Proved(named, replace(_unlooked(self.system.name, ranges), notes=(ONE_BY_ONE,))))
+                break
+            proof = proved_at(scene, ranges, passive=passive, inside=1.0 if self.limits.by_growth else inside)
+            if proof.stable and (self._unproved or not self._felt(numbers, point)):
+                proof = replace(proof, verdict=UNDECIDED, stable=None, notes=(*proof.notes, SLOWER))
+            found.append(Proved(named, proof))
+            if proof.stable is False:
+                return found, self._failed(numbers, proof, ranges)
+            if not proof.stable:
+                break
+        return found, None
+
+    def _felt(self, numbers: tuple[Override, ...], point: Floats) -> bool:
+        """Say whether it is proved that what is felt is as asked, where only numbers of peers vary."""
+        places = [place for place, (own, _) in enumerate(self.limits.settings) if own == numbers]
+        found = [
+            self.limits.felt(Scenario(place, ()), point, bounded=True).max(initial=-1.0) for place in places
+        ]
+        return max(found, default=-1.0) < 0
+
+    def _inside(self, gains: Sequence[Fraction]) -> float:
+        """Return what the spectral radius is to be proved below: of the least there is, a little above it."""
+        if self.demands.aim.gain is not None or self.limits.by_growth:
+            return math.exp(self.limits.allowed)
+        point = np.array([[float(one) for one in gains]])
+        least = 1 - math.exp(float(self.limits.worst(self.every, point).max()) + self.limits.allowed)
+        return float(1 - _decimal(least * (1 - BACK[-1]), DIGITS, ROUND_FLOOR))
+
+    def _failed(
+        self, numbers: tuple[Override, ...], proof: BoxProof, ranges: Sequence[Range]
+    ) -> Scenario | None:
+        """Return the scenario in which gains are proved not to hold; None where it is one already."""
+        values = dict(zip([one.free for one in ranges], proof.point, strict=False))
+        late = self.demands.delay and values.get(self.demands.delay.free)
+        for place, (own, _) in enumerate(self.limits.settings):
+            here = len(own) == len(numbers) or float(own[-1].value) == late
+            if own[: len(numbers)] == numbers and here:
+                box = tuple(values[one.free] for one in self.demands.box)
+                found = Scenario(place, box)
+                return None if found in self.scenarios else found
+        return None
+
+    def _unmet(self, least: Optimum) -> Tuning:
+        """Return that no gains were found that meet all demands, and those that miss them least."""
+        gains = [_decimal(value, DIGITS) for value in least.gains.tolist()]
+        return self._answer(least, gains, [], met=False)
+
+    def _answer(
+        self, found: Optimum, gains: Sequence[Fraction], proofs: Sequence[Proved], *, met: bool = True
+    ) -> Tuning:
+        demands, column = self.demands, self.demands.aim.gain
+        worst = float(self.limits.worst(self.every, np.array([[float(one) for one in gains]])).max())
+        value = float(gains[column]) if column is not None else self._inside(gains)
+        if column is None and self.limits.by_growth:
+            value = math.exp(worst + self.limits.allowed)
+        best, error = (
+            (found.value, found.error) if column is not None else (math.exp(found.value), found.error)
+        )
+        if column is not None and not met:
+            best = float(found.gains[column])
+        return Tuning(
+            topology=self.system.name,
+            aim=demands.aim.label,
+            unit=demands.free[column].unit if column is not None else "1",
+            larger=demands.aim.larger,
+            met=met,
+            proved=met and bool(proofs) and all(one.proof.stable for one in proofs),
+            value=value,
+            best=best,
+            error=error,
+            worst=worst,
+            gains=tuple(
+                Gain(one.free.label, one.unit, float(one.low), float(one.high), typed, float(before))
+                for one, typed, before in zip(demands.free, gains, found.gains, strict=True)
+            ),
+            over=demands.over,
+            criterion=demands.criterion,
+            decay=demands.decay,
+            felt=demands.felt,
+            allowed=self.limits.allowed,
+            proofs=tuple(proofs),
+            binding=tuple(self._binding(found, met=met)),
+            looked=self.looked + sum(map(len, self.limits.samples.values())),
+            notes=(),
+            left_out=left_out(self.system, network=demands.criterion != MEAN_SQUARE),
+            system=self.system,
+        )
+
+    def _binding(self, found: Optimum, *, met: bool) -> list[Binding]:
+        """Return what binds: each mode with a multiplier, and what less of the ends that meet there buys."""
+        listed = []
+        aim = self.demands.aim.gain
+        rows = self.limits.rows(found.scenarios, found.gains, wide=True)
+        scale = 1.0
+        if aim is not None and met:
+            one = self.demands.free[aim]
+            scale = float(one.high - one.low) * (1 if self.demands.aim.larger else -1)
+        for place in np.flatnonzero(found.multipliers > 0):
+            scenario = found.scenarios[rows.scenario[place]]
+            numbers, _ = self.limits.settings[scenario.setting]
+            buys = []
+            slopes = rows.slopes[place][len(self.demands.free) :]
+            for own, value, slope in zip(self.demands.box, scenario.point, slopes, strict=True):
+                if value in (float(own.low), float(own.high)):
+                    share = 0.01 * abs(value) / float(own.high - own.low)
+                    change = -share if value == float(own.high) else share
+                    better = -scale * float(found.multipliers[place]) * float(slope) * change
+                    buys.append((own.free.label, value, own.unit, better))
+            where = [(one.free.label, float(one.value), "1") for one in numbers[: len(self.demands.counts)]]
+            where += [(one.free.label, float(one.value), "s") for one in numbers[len(self.demands.counts) :]]
+            where += [
+                (own.free.label, value, own.unit)
+                for own, value in zip(self.demands.box, scenario.point, strict=True)
+            ]
+            shape, frequency = self._mode(found, scenario, complex(rows.eigenvalue[place]))
+            listed.append(Binding(tuple(where), shape, frequency, tuple(buys)))
+        return listed
+
+    def _mode(self, found: Optimum, scenario: Scenario, eigenvalue: complex) -> tuple[str, float]:
+        """Return the shape and the frequency of a mode, "" and NaN where there is none."""
+        if np.isnan(eigenvalue):
+            return "", math.nan
+        _, scene = self.limits.settings[scenario.setting]
+        changes = [
+            Override(one.free, Fraction(value))
+            for one, value in (
+                *zip(self.demands.free, found.gains.tolist(), strict=True),
+                *zip(self.demands.box, scenario.point, strict=True),
+            )
+        ]
+        try:
+            modes = analyze(apply(scene, changes)).modes
+        except ApcError:
+            return "", math.nan
+        if not len(modes):
+            return "", math.nan
+        nearest = min(modes, key=lambda one: abs(one.eigenvalue - eigenvalue))
+        return nearest.shape, nearest.frequency_hz
+
+
+def _decimal(value: float, digits: int, rounding: str = ROUND_HALF_EVEN) -> Fraction:
+    """Return a number to so many digits, as the decimal that a person types."""
+    number = Decimal(repr(float(value)))
+    place = number.adjusted() - digits + 1
+    return Fraction(number.quantize(Decimal((0, (1,), place)), rounding=rounding)) if number else Fraction(0)
+
+
+def _unlooked(name: str, ranges: Sequence[Range]) -> BoxProof:
+    """Return what is proved where the time was up."""
+    return BoxProof(name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), ("the time was up",))

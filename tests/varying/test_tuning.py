@@ -1,0 +1,109 @@
+"""The gains that do best: one is the critical value, two the peak of the region; what is proved holds."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+import apc
+from tests.commands import Cli, write
+from tests.topologies import AVERAGE, MESH, compiled, replaced, told, wall
+
+K, B, CONTACT, MASS = "coordination.stiffness", "coordination.damping", "contact.stiffness", "device.mass"
+RANGE = {K: (10.0, 7000.0)}
+
+
+@pytest.mark.few(3)
+@pytest.mark.parametrize(
+    ("text", "peers", "damping"), [*itertools.product((AVERAGE, MESH), (2, 3, 5), (0, 2))]
+)
+def test_one_gain_is_the_critical_value_and_two_the_peak_of_the_region(
+    text: str, peers: int, damping: float
+) -> None:
+    values = {"user.count": peers, "contact.damping": damping, B: damping}
+    model = apc.set_parameters(compiled(text), values)
+    one, two = (apc.tune(model, free, maximize=K) for free in (RANGE, RANGE | {CONTACT: (10.0, 5000.0)}))
+    critical = apc.critical(model, K).value
+    assert critical is not None and abs(one.best - critical) <= one.error + 1e-10 * critical
+    assert one.proved and two.proved and 0 <= one.best - one.value <= 1e-3 * one.best
+    # A part in a million higher the scene is stable at no stiffness of the contact, as much lower at some.
+    apart = np.geomspace(1e-9, 1.0, 400)
+    beside = two.gains[1].best * (1 + np.concatenate([-apart, [0.0], apart]))
+    contact = np.concatenate([np.clip(beside, 10.0, 5000.0), np.linspace(10.0, 5000.0, 2000)])
+    for share in (-1e-6, 1e-6):
+        found = apc.analyze_many(model, {CONTACT: contact}, set={K: two.best * (1 + share)})
+        assert (found.stable == True).any() == (share < 0)  # noqa: E712 -- None where it is left open
+
+
+def test_gains_bear_all_that_they_have_to_and_none_on_a_grid_bear_it_better() -> None:
+    """What binds lies at ends of the ranges, and is on the boundary there."""
+    model = compiled(AVERAGE)
+    over = {"user.count": "2:6", MASS: "±20%"}
+    found = apc.tune(model, {K: (10.0, 5000.0), B: (0.0, 50.0)}, maximize=K, over=over)
+    typed = {one.parameter: float(one.value) for one in found.gains}
+    stiffness, damping = np.meshgrid(np.arange(1.01, 2.0, 0.1) * found.value, np.linspace(0, 50, 51))
+    bears = np.ones(stiffness.shape, dtype=bool)
+    assert found.proved and len(found.proofs) == 5
+    for peers, mass in itertools.product(range(2, 7), (0.08, 0.09, 0.12)):
+        at = {"user.count": peers, MASS: mass}
+        bears &= apc.analyze_many(model, {K: stiffness, B: damping}, set=at).stable.astype(bool)
+        assert apc.analyze(model, set=at | typed).stable
+    assert not bears.any()
+    for one in found.binding:
+        where = {label: value for label, value, _ in one.where}
+        best = {gain.parameter: gain.best for gain in found.gains}
+        assert where[MASS] in (0.08, 0.12)
+        assert apc.analyze(model, set=where | best).spectral_radius == pytest.approx(1, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("damping", "virtual", "delay"), [(0.2, 0.0, 0.0), (0.2, 0.05, 0.0), (0.2, 0.0, 1e-3)]
+)
+def test_with_passive_hands_the_limit_is_colgates(damping: float, virtual: float, delay: float) -> None:
+    """b > K T/2 + B, and a delay t of the force adds K t."""
+    model, free = wall(0.1, damping, delay, 100.0, virtual), {"it.stiffness": (1.0, 5000.0)}
+    found = apc.tune(model, free, maximize="it.stiffness", criterion="passive")
+    assert found.best == pytest.approx((damping - virtual) / (0.0005 + delay), rel=1e-8)
+    assert found.proved
+
+
+def test_what_is_asked_beside_stability_is_kept_and_what_time_leaves_open_is_said() -> None:
+    model = compiled(AVERAGE)
+    found = apc.tune(model, RANGE, maximize=K, subject=["decay=60 dB in 2 s"], over={MASS: "±20%"})
+    masses = {MASS: np.linspace(0.08, 0.12, 41)}
+    for value, kept in ((found.value, True), (1.01 * found.value, False)):
+        radii = apc.analyze_many(model, masses, set={K: value}).spectral_radius
+        assert found.proved and (radii.max() < 10 ** (-60 / 20 * 0.008 / 2)) == kept
+    felt = apc.tune(model, RANGE, maximize=K, subject=["feel.impedance at 5 Hz < 15 N*s/m"])
+    assert abs(apc.feel(model, 5.0, set={K: felt.best}).impedance[0]) == pytest.approx(15, rel=1e-6)
+    late = apc.tune(model, RANGE, maximize=K, over={"user.count": "2:9"}, seconds=0.0)
+    assert not late.proved and "it is not proved" in " ".join(str(late).split())
+
+
+def test_what_the_study_asks_is_written_into_the_topology(cli: Cli) -> None:
+    tune = f"  tune: {{free: {{{K}: [10 N/m, 5 N/mm]}}, maximize: {K}, over: {{lan.loss: '0:0.1'}}}}\n"
+    lossy = ("delay: 8 ms}", "delay: 8 ms, loss: 5 %}  # mine")
+    write("lossy.yaml", replaced(AVERAGE, lossy, ("studies:\n", f"studies:\n{tune}")))
+    ran = cli("tune lossy.yaml --write out.yaml")
+    assert ran.code == 0 and "it is proved" in " ".join(ran.out.split()), ran.err
+    model = apc.compile("out.yaml")
+    for loss in (0.01, 0.1):
+        verdict = apc.judge_network(model, set={"lan.loss": loss})
+        assert verdict is not None and verdict.stable
+    limit = apc.critical(model, K, criterion="nominal").value or 0.0
+    assert 0.99 * limit <= next(one.value for one in model.parameters if one.name == K) <= limit
+
+
+def test_what_cannot_be_asked_is_refused() -> None:
+    def refused(free: dict[str, str], **given: object) -> str:
+        return told(lambda: apc.tune(compiled(AVERAGE), free, **({"maximize": K} | given)))[0]  # type: ignore[arg-type]
+
+    good = {K: "10 N/m:5000 N/m"}
+    assert refused({}).startswith("--free: E995 no number is free")
+    assert refused({K: "5 N/m:1 N/m"}).startswith("--free: E833")
+    assert refused({"coordination.stifness": "1 N/m:5 N/m"}).endswith(f"Write: {K}")
+    assert refused(good, over={"user.count": "9:2"}).endswith("Write: user.count=2:9")
+    assert refused(good, maximize=MASS).endswith(f"Write: --maximize {K}")
+    assert refused(good, subject=["decay=fast"]).startswith("--subject: E996")
