@@ -38,6 +38,7 @@ PARTS = {
     "work_precision": ("Methods of simulation", "tests.bench.work_precision"),
     "play": ("Peers in real time", "tests.bench.play"),
     "simulate": ("Simulation", "tests.bench.simulate"),
+    "hands": ("Hands", "tests.bench.hands"),
 }
 
 
