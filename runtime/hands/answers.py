@@ -15,6 +15,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +32,16 @@ from apc.frame.devices import OWN_MASS, Device, coupled_directly, find_device, f
 from apc.frame.discretize import UNIT
 from apc.frame.exchange import Exchange
 from apc.frame.parameters import resolve
+from apc.frame.radius import RADII, with_radius
 from apc.hands.asked import Port
-from apc.hands.response import Carried, Pushed, add, open_site, pushed_loop, scaled, spectra
+from apc.hands.response import Pushed, open_site, pushed_loop, spectra
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+Matrix = NDArray[Any]
+
+# Numbers (k,) with what they may be off by.
+Carried = tuple[Complex, Floats]
 
 # Turns a frame, so near a whole number of which a scene that may rest anywhere is asked around a frequency,
 # how far around, in 1/s, and at how many points.
@@ -237,7 +243,7 @@ class Responses:
         turns = s.imag * self.frame / (2 * np.pi)
         near = (np.abs(turns - np.round(turns)) < NEAR) & (turns > 0.5)
         near = near & self.drifting if near.any() else near
-        found = [_nothing(s) for _ in range(len(aliases) + 2)]
+        found = [(np.zeros(len(s), np.complex128), np.zeros(len(s))) for _ in range(len(aliases) + 2)]
         if not near.all():
             for (value, off), (own, doubt) in zip(found, self.at(s[~near], aliases), strict=True):
                 value[~near], off[~near] = own, doubt
@@ -258,7 +264,7 @@ class Responses:
         """
         asked = [(self.velocity, alias) for alias in aliases]
         asked += [(self.arriving, 0), (self.error if apart else ({}, {}), 0)]
-        found = [_nothing(s) for _ in asked]
+        found: list[Matrix] = [np.zeros((len(s), 2, 1, 1), np.complex128) for _ in asked]
         for part, (number, site, share) in enumerate(self.parts):
             rows = [
                 (of, (*place, alias), weight)
@@ -267,8 +273,9 @@ class Responses:
             ]
             moved = spectra(self.loops[number], site, [row for _, row, _ in rows], s)
             for (of, _, weight), one in zip(rows, moved, strict=True):
-                found[of] = add(found[of], scaled(one, weight * share))
-        return found
+                by = np.array([[weight * share]])
+                found[of] = RADII.add(found[of], RADII.multiply(one, with_radius(by, 8 * UNIT * np.abs(by))))
+        return [(one[:, 0, 0, 0], one[:, 1, 0, 0].real) for one in found]
 
     @property
     def velocity(self) -> Weights:
@@ -315,8 +322,3 @@ def _copy_of(group: PeerGroup, device: Device) -> tuple[str, int] | None:
                 if whole_and_index(kind.states[place].name)[1] == axis:
                     return kind.states[place].name.rpartition(".")[0], place
     return None
-
-
-def _nothing(s: Complex) -> Carried:
-    """Return 0 at each s (k,)."""
-    return np.zeros(len(s), np.complex128), np.zeros(len(s))

@@ -356,25 +356,22 @@ def _draws(loop: PortLoop, angle: float) -> float:
 
     Notes
     -----
-    e^{jθ} is a rational point of the circle; complex numbers are pairs of real ones.
+    e^{jθ} is a rational point of the circle.
     """
     tangent = float(np.tan(angle / 2))
-    cosine, sine = (1 - tangent**2) / (1 + tangent**2), 2 * tangent / (1 + tangent**2)
-    direction = _worst(loop, complex(cosine, sine))
-    unit = np.eye(loop.a.shape[-1])
-    # Sine and cosine are quotients of sums about 1: off by roundings of 1, however small they are themselves.
-    turned = with_radius(
-        np.kron([[cosine, -sine], [sine, cosine]], unit), 8 * UNIT * np.kron(np.ones((2, 2)), unit)
-    )
-    a, b, c, d = (np.kron(np.eye(2), one) for one in (loop.a, loop.b, loop.c, RADII.add(loop.d, loop.weight)))
-    v = RADII.exact(np.concatenate([direction.real, direction.imag])[:, None])
-    states = solve(RADII.subtract(turned, a), RADII.multiply(b, v))
+    z = complex(1 - tangent**2, 2 * tangent) / (1 + tangent**2)
+    direction = _worst(loop, z)[:, None]
+    # Both parts are quotients of sums about 1: off by roundings of 1, however small they are themselves.
+    unit, v = np.eye(loop.a.shape[-1]), RADII.exact(direction)
+    states = solve(RADII.subtract(with_radius(z * unit, 16 * UNIT * unit), loop.a), RADII.multiply(loop.b, v))
     if states is None:
         return np.inf
-    pushed = RADII.add(RADII.multiply(c, states), RADII.multiply(d, v))
-    drawn = RADII.multiply(np.swapaxes(v, -1, -2), pushed)
-    size = float((direction.real**2 + direction.imag**2).sum())
-    top = float(drawn[0, 0, 0] + drawn[1, 0, 0])
+    through = RADII.multiply(RADII.add(loop.d, loop.weight), v)
+    drawn = RADII.multiply(
+        RADII.exact(direction.conj().T), RADII.add(RADII.multiply(loop.c, states), through)
+    )
+    size = float(np.vdot(direction, direction).real)
+    top = float(drawn[0, 0, 0].real + drawn[1, 0, 0].real)
     return top / size + 8 * UNIT * abs(top)
 
 

@@ -1,7 +1,7 @@
 """What moves when a hand pushes: the steady motion under a force e^{st}, of each mode of a scene.
 
 Takes: peers with a device each, as loops.
-Gives: `Site`, `open_site`; `Pushed`, `pushed_loop`; `spectra`; `Carried`, `add`, `scaled`; `force_lanes`.
+Gives: `Site`, `open_site`; `Pushed`, `pushed_loop`; `spectra`; `force_lanes`.
 Guarantees: no sampling of the force or of the motion: every tick, hold and packet acts when it does, and what
 comes back at s and at s + 2πjk/T, T a frame, is exact but for rounding, which is bounded.
 Does not: put modes together to peers (see `answers`).
@@ -31,18 +31,12 @@ from apc.frame.devices import Device
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize, exponential_rows
 from apc.frame.lift import bounded, check_packets, named, step_durations
 from apc.frame.ports import Ports, with_holds, with_ports
-from apc.frame.radius import radius_of, value_of, with_radius
+from apc.frame.radius import RADII, solve, value_of, with_radius
 from apc.frame.schedule import Propagate, Schedule
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Matrix = NDArray[Any]
-
-# Numbers with what they may be off by.
-Carried = tuple[Complex, Floats]
-
-# Less than any number of interest, in SI.
-LEAST = 1e-250
 
 # Entries of the matrices that are solved at once, each some hundred bytes at work.
 TOGETHER = 2**18
@@ -192,7 +186,7 @@ def pushed_loop(loop: Loop, sites: Mapping[int, Site]) -> Pushed:
     )
 
 
-def spectra(loop: Pushed, pushed: int, wanted: Sequence[tuple[int, int, int]], s: Complex) -> list[Carried]:
+def spectra(loop: Pushed, pushed: int, wanted: Sequence[tuple[int, int, int]], s: Complex) -> list[Matrix]:
     """Return what some states of a mode do under a force e^{st} at all devices of one of its sites.
 
     Parameters
@@ -206,64 +200,62 @@ def spectra(loop: Pushed, pushed: int, wanted: Sequence[tuple[int, int, int]], s
 
     Returns
     -------
-    For each (k,), in SI units a newton, and a bound on what it is off by.
+    For each (k, 2, 1, 1), in SI units a newton, with its radius.
     """
-    kicks = np.zeros((len(s), loop.k.shape[-1]), dtype=np.complex128)
-    doubt = np.zeros(kicks.shape)
+    kicks = np.zeros((len(s), 2, loop.k.shape[-1], 1), dtype=np.complex128)
     site = loop.sites[pushed]
     of_length = {seconds: _kick(site, seconds, s) for seconds in set(site.seconds)}
     for place, (seconds, start) in enumerate(zip(site.seconds, site.starts, strict=True)):
-        places = loop.kicks[pushed][place, :-1]
-        kicks[:, places], doubt[:, places] = _times(of_length[seconds], _exponential(s, start))
-    state = _steady(loop.m, _exponential(s, loop.frame), _product((kicks, doubt), loop.k))
-    read = add(_product(state, loop.c), _product((kicks, doubt), loop.d))
+        turned = RADII.multiply(of_length[seconds], _exponential(s, start))
+        kicks[:, :, loop.kicks[pushed][place, :-1]] = turned
+    state = _steady(loop.m, _exponential(s, loop.frame), RADII.multiply(loop.k, kicks))
+    read = RADII.add(RADII.multiply(loop.c, state), RADII.multiply(loop.d, kicks))
     found = {
         (of, alias): _motion(loop, of, read, s, alias, pushed=of == pushed)
         for of, alias in {(of, alias) for of, _, alias in wanted}
     }
-    return [(value[:, row], off[:, row]) for of, row, alias in wanted for value, off in [found[of, alias]]]
+    return [found[of, alias][:, :, row, None] for of, row, alias in wanted]
 
 
-def _motion(loop: Pushed, of: int, read: Carried, s: Complex, alias: int, *, pushed: bool) -> Carried:
-    """Return the continuous states (k, n_x) of a site at s + 2πjn/T."""
+def _motion(loop: Pushed, of: int, read: Matrix, s: Complex, alias: int, *, pushed: bool) -> Matrix:
+    """Return the continuous states (k, 2, n_x, 1) of a site at s + 2πjn/T."""
     site, frame = loop.sites[of], float(loop.frame)
     at = s + 2j * np.pi * alias / frame
-    held = loop.reads[of][:, len(site.states) :]
-    value, off = read[0][:, held], read[1][:, held]  # (k, intervals, holds)
+    held = read[:, :, loop.reads[of][:, len(site.states) :].T, 0]  # (k, 2, holds, intervals)
     of_length = {seconds: _lasting(at, float(seconds)) for seconds in set(site.seconds)}
     weights = [
-        _times(_exponential(-at, start), of_length[seconds])
+        RADII.multiply(_exponential(-at, start), of_length[seconds])
         for seconds, start in zip(site.seconds, site.starts, strict=True)
     ]
-    weight, loose = (np.stack([one[place] for one in weights], axis=1)[:, :, None] for place in range(2))
-    charge = (2 * len(weights) + 8) * UNIT
-    mean = (value * weight).sum(axis=1) / frame
-    doubt = (off * (np.abs(weight) + loose) + np.abs(value) * (loose + charge * np.abs(weight))).sum(axis=1)
-    driven = _product((mean, doubt / frame * (1 + charge)), site.b)
+    share = with_radius(np.array([[1 / frame]]), np.array([[2 * UNIT / frame]]))
+    mean = RADII.multiply(RADII.multiply(held, np.concatenate(weights, axis=-2)), share)
+    driven = RADII.multiply(site.b, mean)
     if pushed and alias == 0:
-        driven = (
-            driven[0] + site.push[0],
-            driven[1] + site.push[1] + 2 * UNIT * np.abs(driven[0] + site.push[0]),
-        )
-    return _steady(site.a, (at, 4 * UNIT * np.abs(at)), driven)
+        driven = RADII.add(driven, site.push[..., None])
+    return _steady(site.a, _numbers(at, 4 * UNIT * np.abs(at)), driven)
 
 
-def _exponential(s: Complex, time: Fraction) -> Carried:
-    """Return e^{st} (k,)."""
+def _numbers(value: Matrix, off: Floats) -> Matrix:
+    """Return numbers (k,) with what they may be off by as matrices (k, 2, 1, 1)."""
+    return with_radius(value[:, None, None], off[:, None, None])
+
+
+def _exponential(s: Complex, time: Fraction) -> Matrix:
+    """Return e^{st} (k, 2, 1, 1)."""
     exact = float(time)
     value = np.exp(s * exact)
-    return value, (3 * np.abs(s) * exact + 4) * UNIT * np.abs(value)
+    return _numbers(value, (3 * np.abs(s) * exact + 4) * UNIT * np.abs(value))
 
 
-def _lasting(s: Complex, seconds: float) -> Carried:
-    """Return ∫ e^{−sσ} dσ over so many seconds (k,)."""
+def _lasting(s: Complex, seconds: float) -> Matrix:
+    """Return ∫ e^{−sσ} dσ over so many seconds (k, 2, 1, 1)."""
     x = -s * seconds
-    value = np.asarray(seconds * np.divide(np.expm1(x), x, out=np.ones_like(x), where=x != 0), np.complex128)
-    return value, 16 * UNIT * seconds * np.exp(np.maximum(x.real, 0.0))
+    value = seconds * np.divide(np.expm1(x), x, out=np.ones_like(x), where=x != 0)
+    return _numbers(value, 16 * UNIT * seconds * np.exp(np.maximum(x.real, 0.0)))
 
 
-def _kick(site: Site, seconds: Fraction, s: Complex) -> Carried:
-    """Return γ(s) (k, n_x) of an interval, by its series in s."""
+def _kick(site: Site, seconds: Fraction, s: Complex) -> Matrix:
+    """Return γ(s) (k, 2, n_x, 1) of an interval, by its series in s."""
     time = float(seconds)
     size = float(np.abs(s).max(initial=0.0)) * time
     terms, term = 1, 1.0
@@ -271,13 +263,13 @@ def _kick(site: Site, seconds: Fraction, s: Complex) -> Carried:
         term *= size / terms
         terms += 1
     n, step = len(site.states), force_lanes(site, time, terms)
-    lanes, off = step.matrix[0, :n, n:], step.roundings * UNIT * step.size[0, :n, n:]
-    powers = (s * time)[:, None] ** np.arange(terms)
-    magnitudes = np.abs(powers)
-    value = powers @ lanes.T
-    bound = magnitudes @ (off + (3 * np.arange(terms) + terms + 4) * UNIT * np.abs(lanes)).T
-    left = term * np.exp(size) * np.abs(lanes[:, 0]) * (1 + np.abs(value_of(site.a) * time).sum())
-    return value, bound + left
+    lanes = with_radius(step.matrix[0, :n, n:], step.roundings * UNIT * step.size[0, :n, n:])
+    powers = ((s * time)[:, None] ** np.arange(terms))[..., None]
+    doubt = (3 * np.arange(terms)[:, None] + 4) * UNIT * np.abs(powers)
+    found = RADII.multiply(lanes, with_radius(powers, doubt))
+    left = term * np.exp(size) * np.abs(value_of(lanes)[:, 0]) * (1 + np.abs(value_of(site.a) * time).sum())
+    found[:, 1, :, 0] += left
+    return found
 
 
 def force_lanes(site: Site, seconds: float, count: int) -> Step:
@@ -302,66 +294,18 @@ def force_lanes(site: Site, seconds: float, count: int) -> Step:
     return exponential_rows(generator, np.zeros((1, n + count, 0)), 1.0)
 
 
-def _times(one: Carried, other: Carried) -> Carried:
-    """Return products entry by entry; a row (k,) goes with each column."""
-    a, off_a = one
-    b, off_b = other
-    if a.ndim > b.ndim:
-        b, off_b = b[:, None], off_b[:, None]
-    value = a * b
-    return value, off_a * (np.abs(b) + off_b) + np.abs(a) * off_b + 4 * UNIT * np.abs(value)
-
-
-def add(one: Carried, other: Carried) -> Carried:
-    """Return a sum, entry by entry."""
-    value = one[0] + other[0]
-    return value, one[1] + other[1] + 2 * UNIT * np.abs(value)
-
-
-def scaled(one: Carried, share: float) -> Carried:
-    """Return so many times what there is, a number that was rounded a few times."""
-    return one[0] * share, one[1] * abs(share) + 8 * UNIT * np.abs(one[0] * share)
-
-
-def _product(rows: Carried, matrix: Matrix) -> Carried:
-    """Return rows (k, n) times the transpose of a real matrix (2, m, n) with its radii."""
-    value, off = rows
-    real, radius = value_of(matrix), radius_of(matrix)
-    size = np.abs(value)
-    charge = (real.shape[1] + 4) * UNIT
-    bound = off @ (np.abs(real) + radius).T + size @ (radius + charge * np.abs(real)).T
-    return value @ real.T, bound * (1 + charge)
-
-
-def _steady(matrix: Matrix, at: Carried, driven: Carried) -> Carried:
-    """Return x (k, n) of (z − M) x = driven, for z (k,) and a real M (2, n, n) with its radii.
-
-    Notes
-    -----
-    With G = z − M, an inverse Y in floats and F = 1 − Y G, x in floats is off by e ≤ b + |F| e, b being
-    |Y| times residual and radii; with |F| b ≤ θ b, entry by entry, that is at most b/(1 − θ).
-    """
-    real, radius = value_of(matrix), radius_of(matrix)
-    n = len(real)
-    block = TOGETHER // max(real.size, 1) or 1
-    if len(at[0]) > block:
-        places = [slice(first, first + block) for first in range(0, len(at[0]), block)]
-        parts = [_steady(matrix, (at[0][i], at[1][i]), (driven[0][i], driven[1][i])) for i in places]
-        return np.concatenate([value for value, _ in parts]), np.concatenate([off for _, off in parts])
-    system = at[0][:, None, None] * np.eye(n) - real
-    loose = at[1][:, None, None] * np.eye(n) + radius
-    inverse = np.linalg.inv(system)
-    value = np.matmul(inverse, driven[0][:, :, None])
-    size, charge = np.abs(inverse), (n + 6) * UNIT
-    loose = loose + charge * np.abs(system)
-    wrong = np.abs(np.matmul(inverse, system) - np.eye(n)) + np.matmul(size, loose)
-    residual = np.abs(driven[0][:, :, None] - np.matmul(system, value)) + np.matmul(loose, np.abs(value))
-    residual += (driven[1] + charge * np.abs(driven[0]))[:, :, None]
-    bound = np.matmul(size, residual) + LEAST
-    share = (np.matmul(wrong, bound) / bound).max(axis=(1, 2))
-    if (share >= 0.5).any():  # entries of it are far apart: a little of the largest is added to all
-        norm = wrong.sum(axis=2).max(axis=1)
-        bound += np.where(share < 0.5, 0.0, 4 * norm * bound.max(axis=(1, 2)))[:, None, None]
-        share = (np.matmul(wrong, bound) / bound).max(axis=(1, 2))
-    bound *= np.where(share < 0.5, (1 + charge) / (1 - share), np.inf)[:, None, None]
-    return value[:, :, 0], bound[:, :, 0]
+def _steady(matrix: Matrix, at: Matrix, driven: Matrix) -> Matrix:
+    """Return x (k, 2, n, 1) of (z − M) x = driven, for z (k, 2, 1, 1) and M (2, n, n) with their radii."""
+    n = matrix.shape[-1]
+    found = None
+    if len(at) * n**2 <= TOGETHER or len(at) == 1:
+        found = solve(RADII.subtract(at * np.eye(n), matrix), driven)
+    if found is None and len(at) > 1:
+        half = len(at) // 2
+        found = np.concatenate(
+            [_steady(matrix, at[own], driven[own]) for own in (slice(half), slice(half, None))]
+        )
+    if found is None:  # z is an eigenvalue, for all that is known
+        found = np.full(driven.shape, np.nan + 0j)
+        found[:, 1] = np.inf
+    return np.asarray(found)
