@@ -32,6 +32,7 @@ from apc.exports.peer_step import (
     refused,
     sites_of,
 )
+from apc.exports.pushed import FORCE_ON
 from apc.exports.words import identifier, unique
 from apc.network.channel import luck_key
 from apc.network.timetable import Luck, luck_of
@@ -118,6 +119,7 @@ def one_peer(plan: Plan, number: int, method: Method) -> CScene:
         for entry in line.packet
     ]
     variables += _looked_at(peer, "peer0[0]", "")
+    variables.sort(key=lambda one: not one.given)
     return CScene(peer.identifier, peer.schedule.quantum, (peer,), ((0, 0),), (), tuple(variables))
 
 
@@ -125,10 +127,11 @@ def _looked_at(peer: Peer, member: str, prefix: str) -> list[Variable]:
     """Return what can be looked at of a peer that a member of `model` is."""
     found = []
     for signal in peer.signals:
-        moving = signal.role == "state"
+        moving, given = signal.role == "state", signal.name.startswith(FORCE_ON)
         start = peer.start[signal.place[0]] if moving else 0.0
         own = f"{member}.{memory(peer, signal)}"
-        found.append(Variable(prefix + signal.name, signal.unit, own, moving=moving, start=start))
+        name = f"{FORCE_ON}{prefix}{signal.name.removeprefix(FORCE_ON)}" if given else prefix + signal.name
+        found.append(Variable(name, signal.unit, own, given=given, moving=moving, start=start))
     return found
 
 
@@ -161,6 +164,7 @@ def c_scene(plan: Plan, method: Method) -> CScene:
         for k, (site, place) in enumerate(peers)
         for one in _looked_at(codes[site], f"peer{site}[{place}]", f"{exchange.peer_name(k)}.")
     ]
+    variables.sort(key=lambda one: not one.given)
     links = _links(plan, quantum)
     return CScene(identifier(system.name), quantum, codes, tuple(peers), links, tuple(variables))
 

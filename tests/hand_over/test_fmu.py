@@ -178,6 +178,23 @@ def test_peers_joined_by_a_network_of_ones_own_are_the_scene(
 
 
 @pytest.mark.whole
+def test_a_device_that_is_pushed_moves_as_by_a_hand(fmpy: Any, tmp_path: Path) -> None:
+    path, _ = written(AVERAGE, tmp_path)
+    push = "hands: {push: {type: StepForce, flange: device, force: 2 N, start: 0.01 s}}\nlinks:"
+    course = apc.simulate(compiled(replaced(AVERAGE, ("links:", push))), duration="0.1 s", jit=False)
+    one = Instance(path, tmp_path / "unzipped")
+    assert one.inputs == [f"force on user[{k}].device" for k in (1, 2, 3)]
+    names = [name for name in (signal.name for signal in course.signals) if name in one.references]
+    places = [place for place, signal in enumerate(course.signals) if signal.name in names]
+    assert len(names) > 12
+    for k in range(100):
+        assert one.read(*names) == pytest.approx(course.values[k, places].tolist(), abs=1e-9)
+        one.set(**dict.fromkeys(one.inputs, 2.0 * (k >= 10)))
+        one.step(k / 1000, 1 / 1000)
+    one.end()
+
+
+@pytest.mark.whole
 def test_a_scene_begins_where_its_states_are_set(fmpy: Any, tmp_path: Path) -> None:
     path, _ = written(PAPER, tmp_path)
     starts = {f"{one}.device.x": 0.0125 for one in ("left[1]", "left[2]", "right[1]")}
@@ -236,7 +253,7 @@ def test_a_peer_says_what_it_hears_and_sends(tmp_path: Path) -> None:
     causes = {one.get("name"): one.get("causality") for one in told.iter("ScalarVariable")}
     heard = {name for name, cause in causes.items() if cause == "input"}
     told_of = ("coordination.x", "coordination.v", "missing")
-    assert heard == {f"lan.user[{k}].{what}" for k in (1, 3) for what in told_of}
+    assert heard == {f"lan.user[{k}].{what}" for k in (1, 3) for what in told_of} | {"force on device"}
     assert causes["lan.coordination.x"] == "output"
     assert next(one for one in names if one.startswith("binaries/")).split("/")[1].endswith("64")
     assert all(f"sources/{one.get('name')}" in names for one in told.iter("File"))
