@@ -27,8 +27,7 @@ from apc.eigen.pseudospectrum import balance
 from apc.eigen.relative import Relative
 from apc.frame.discretize import UNIT
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
-from apc.frame.taylor import arithmetic_of, corners, hull
-from apc.moments.mean_loops import scaled
+from apc.frame.taylor import arithmetic_of, corners, entrywise, hull
 from apc.moments.unserved import UnservedError
 from apc.threads import load_pool
 
@@ -322,10 +321,11 @@ def gain(
     """
     result = numbers.exact(np.zeros(shape))
     shrink, root = number_of(1 / growth, numbers), number_of(growth**-0.5, numbers)
+    scaled = np.multiply if numbers is FLOATS else entrywise
     for drive in drives:
         units = numbers.exact(drive.units)
-        driven = scaled(around(of_kind(drive.into, numbers), units, numbers), shrink, numbers)
-        moments = stein(scaled(of_kind(drive.matrix, numbers), root, numbers), driven, numbers)
+        driven = scaled(around(of_kind(drive.into, numbers), units, numbers), shrink)
+        moments = stein(scaled(of_kind(drive.matrix, numbers), root), driven, numbers)
         if moments is None:
             return None
         n = moments.shape[-1]
@@ -339,7 +339,7 @@ def gain(
             total = weighted(around(left, over[:, None], numbers, right), answer.weights, numbers)
             total = (total + np.swapaxes(total, -1, -2)) / 2
             if answer.spread is not None:
-                total = scaled(total, of_kind(answer.spread, numbers), numbers)
+                total = scaled(total, of_kind(answer.spread, numbers))
             block = np.moveaxis(total[..., answer.entries[0], answer.entries[1]], 0, -1)
             place = np.s_[..., answer.place, drive.place]
             result[place] = numbers.add(result[place], block)

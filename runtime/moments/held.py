@@ -202,7 +202,11 @@ def held_loop(loop: Loop, ears: Sequence[Ear], lossy: frozenset[str]) -> HeldLoo
     deaf = _deaf(loop, lossy)
     layout = lay_out_loop(deaf)
     depths = [
-        max(1, *(loop.sites[site].schedule.heard[line].lag for site, line in ear.weights)) for ear in ears
+        max(
+            int(ear.sender is not None),
+            *(loop.sites[site].schedule.heard[line].lag for site, line in ear.weights),
+        )
+        for ear in ears
     ]
     starts = np.cumsum([len(layout.names), *depths]).tolist()
     states, n = starts[-1], starts[0]
@@ -227,7 +231,7 @@ def held_loop(loop: Loop, ears: Sequence[Ear], lossy: frozenset[str]) -> HeldLoo
     f, anew = np.zeros((2, states, states)), np.zeros((2, states, len(ears)))
     f[:, :n], anew[:, :n] = closed.matrix[..., :states], closed.matrix[..., states:]
     for place, (start, depth) in enumerate(zip(starts, depths, strict=False)):
-        anew[0, start, place] = 1.0
+        anew[0, start : start + min(depth, 1), place] = 1.0
         for lag in range(1, depth):
             f[0, start + lag, start + lag - 1] = 1.0
     before = np.zeros((2, len(senders), states))

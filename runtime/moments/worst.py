@@ -217,7 +217,7 @@ def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios, sizes: Sizes) -> He
                 places = [line for line, one in rows if (one.way, one.sent) == (way, sent)]
                 outside.append(Ear(dict.fromkeys(((g, line) for line in places), ONE)))
                 shares.append(1 / size(g, sent.link))
-    heard, whole = (held_loop(loop, some, lossy).relative() for some in (ears, [*ears, *outside]))
+    heard = held_loop(loop, [*ears, *outside], lossy).relative()
     roundings = [8 * UNIT * share if share != 1 else 0.0 for share in shares]
     sums: dict[tuple[int, str, str], Floats] = {}
     for place, ear in enumerate(ears):
@@ -232,9 +232,9 @@ def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios, sizes: Sizes) -> He
         loop.name,
         heard,
         (
-            whole.frame(lost=False),
-            RADII.multiply(whole.g[..., len(ears) :], np.stack([np.diag(shares), np.diag(roundings)])),
-            RADII.multiply(adding, whole.step),
+            heard.frame(lost=False),
+            RADII.multiply(heard.g[..., len(ears) :], np.stack([np.diag(shares), np.diag(roundings)])),
+            RADII.multiply(adding, heard.step),
             np.zeros((2, adding.shape[-2], len(outside))),
         ),
     )
