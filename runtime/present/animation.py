@@ -68,8 +68,6 @@ def save_animation(system: CompiledSystem, found: Trajectory, path: Path) -> Non
     figure, actors = draw_actors(system)
     columns = {signal.name: place for place, signal in enumerate(found.signals)}
     tracks = [MM * found.values[:, [columns[name] for name in actor.states]] for actor in actors]
-    still = np.zeros(len(found.time))
-    turns = [found.values[:, columns[actor.angle]] if actor.angle else still for actor in actors]
     for actor, track in zip(actors, tracks, strict=True):
         widen(actor, track)
     if actors:
@@ -93,8 +91,8 @@ def save_animation(system: CompiledSystem, found: Trajectory, path: Path) -> Non
             with writer.saving(figure, named, DPI):
                 for row in rows.tolist():
                     title.set_text(f"{system.name}: {found.time[row]:.3f} s{told}")
-                    for actor, track, turned in zip(actors, tracks, turns, strict=True):
-                        actor.move(track[row], turned[row])
+                    for actor, track in zip(actors, tracks, strict=True):
+                        actor.move(track[row])
                     writer.grab_frame()
             shutil.copyfile(named, temporary)
 

@@ -40,16 +40,13 @@ SAME = 1e-9  # relative: what is equal but for roundings
 class Body:
     """A body at the start: its place (d,) and its radius, 0 for a point, in m; `states` are its coordinates.
 
-    Of a body on an axis d is 1, and the radius half its width. `angle` is the state that says how far it has
-    turned in a plane, "" for a body that doesn't turn, or turns in space; `turned` its value in rad.
+    Of a body on an axis d is 1, and the radius half its width.
     """
 
     name: str
     place: tuple[float, ...]
     radius: float
     states: tuple[str, ...]
-    angle: str = ""
-    turned: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,19 +144,15 @@ def bodies_of(
             radii[wide] = max(radii[wide], abs(surface.offset))
         elif isinstance(surface, Disc) and _equal(surface.centre, 0):
             radii[wide] = max(radii[wide], surface.radius)
-    bodies = []
-    for name, places in positions.items():
-        part = name.rpartition(".")[0]
-        turning = [
-            (state.name, float(value))
-            for state, value in zip(kind.states, start, strict=True)
-            if state.unit == "rad" and state.name.rpartition(".")[0] == part and len(places) == 2
-        ]
-        centre = tuple(float(start[place]) for place in places)
-        states = tuple(kind.states[place].name for place in places)
-        bodies.append(
-            Body(part, centre, radii[name], states, *turning[0] if len(turning) == 1 else ("", 0.0))
+    bodies = [
+        Body(
+            name.rpartition(".")[0],
+            tuple(float(start[place]) for place in places),
+            radii[name],
+            tuple(kind.states[place].name for place in places),
         )
+        for name, places in positions.items()
+    ]
     return bodies, list(fixed)
 
 

@@ -9,7 +9,6 @@ Does not: play the scene, or find what there is to draw (see `bodies`).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -27,7 +26,6 @@ COLUMNS, PANEL, MARGIN = 4, 3.2, 1.0  # planes in a row; inches: of a plane, of 
 WIDTH, ROW = 7.0, 0.62  # inches: of a picture of rows, and of a row
 HALF = 0.36  # half of a body's height, of the distance of two rows
 LARGEST = 11  # mark of a body, in points
-BAR = 0.02  # m: half of a bar that reaches nothing
 ROOM = 0.12  # of what is drawn, around it
 
 
@@ -35,8 +33,7 @@ ROOM = 0.12  # of what is drawn, around it
 class Actor:
     """A body in a picture: its signals `states`, half its width in mm, and the `shift` that it is drawn at.
 
-    `shift` is a matplotlib Affine2D; `artists` are what is drawn. `angle` is the signal that says how far it
-    has turned, "" for one that doesn't.
+    `shift` is a matplotlib Affine2D; `artists` are what is drawn.
     """
 
     ax: Any
@@ -45,11 +42,10 @@ class Actor:
     row: int
     shift: Any
     artists: tuple[Any, ...]
-    angle: str = ""
 
-    def move(self, place: Sequence[float], turned: float = 0.0) -> None:
-        """Put it at (d,), in mm, turned by so many rad; along an axis it stays in its row."""
-        self.shift.clear().rotate(turned).translate(place[0], place[1] if len(place) > 1 else self.row)
+    def move(self, place: Sequence[float]) -> None:
+        """Put it at (d,), in mm; along an axis it stays in its row."""
+        self.shift.clear().translate(place[0], place[1] if len(place) > 1 else self.row)
 
 
 def draw_actors(system: CompiledSystem) -> tuple[Any, list[Actor]]:
@@ -71,8 +67,7 @@ def draw_actors(system: CompiledSystem) -> tuple[Any, list[Actor]]:
         bodies = sorted(view.bodies, key=lambda one: -one.radius)
         for place, body in enumerate(bodies):
             size = max(LARGEST - 2 * place, 7)  # what is covered is seen around what covers it
-            reach = max((math.dist(body.place, one.place) for one in bodies), default=0.0) or BAR
-            actors.append(_actor(ax, view.name, body, row, colours[body.name], size, reach))
+            actors.append(_actor(ax, view.name, body, row, colours[body.name], size))
     keep_in_sight(axes)
     figure = axes[0].figure
     handles = {actor.artists[0].get_label(): actor.artists[0] for actor in actors}
@@ -113,29 +108,21 @@ def _rows(views: Sequence[PeerView]) -> list[Any]:
     return [ax] * len(views)
 
 
-def _actor(ax: Any, peer: str, body: Body, row: int, colour: Any, size: int, reach: float) -> Actor:
-    """Draw a body around the origin, shifted to its place; `size` is that of its mark, in points.
-
-    One that turns is drawn as a bar, as long as it takes to reach the peer's others: `reach`, in m.
-    """
+def _actor(ax: Any, peer: str, body: Body, row: int, colour: Any, size: int) -> Actor:
+    """Draw a body around the origin, shifted to its place; `size` is that of its mark, in points."""
     patches = need("matplotlib.patches", "plot")
     shift = need("matplotlib.transforms", "plot").Affine2D()
     half, flat = MM * body.radius, len(body.place) == 1
     look = {"markersize": size, "markeredgecolor": "k", "transform": shift + ax.transData}
     x, y, *_ = (*(MM * value for value in body.place), row)
-    shift.rotate(body.turned).translate(x, y)
+    shift.translate(x, y)
     artists = ax.plot(0, 0, "s" if half else "o", color=colour, label=body.name, **look)
     if half:
         look = {"facecolor": colour, "alpha": 0.35, "edgecolor": "k", "transform": look["transform"]}
         corner, sides = (-half, -HALF), (2 * half, 2 * HALF)
         shape = patches.Rectangle(corner, *sides, **look) if flat else patches.Circle((0, 0), half, **look)
         artists.append(ax.add_patch(shape))
-    if body.angle:
-        bar = {"color": colour, "linewidth": 4, "alpha": 0.6, "solid_capstyle": "round"}
-        artists += ax.plot([-MM * reach, MM * reach], [0, 0], transform=look["transform"], **bar)
-        half = MM * reach
-    states, angle = (f"{peer}.{state}" for state in body.states[:2]), body.angle and f"{peer}.{body.angle}"
-    return Actor(ax, tuple(states), half, row, shift, tuple(artists), angle)
+    return Actor(ax, tuple(f"{peer}.{state}" for state in body.states[:2]), half, row, shift, tuple(artists))
 
 
 def _draw_surface(ax: Any, surface: Disc | Line, row: int, bodies: Sequence[Body]) -> None:
