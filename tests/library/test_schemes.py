@@ -243,3 +243,24 @@ def test_a_tool_in_two_hands_moves_as_its_middle_does() -> None:
     apart = (0.05, 2.5, 0.0)  # the hands against each other: half of one device
     bodies = [[(0.1 + 0.1 + 0.2, 5.0 + 5.0, 0.0), CUBE, apart]] * 2
     same(compiled(scene("two-handed-tool")), ByHand(bodies, everybody(2), law, told=1))
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.2])
+def test_a_beam_in_two_hands_is_pulled_and_turned_by_its_ends(damping: float) -> None:
+    """To first order an end moves by arm·angle across the beam, and what pulls there turns by arm·force."""
+
+    def law(i: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
+        arm = 0.3 if i else -0.3
+        along, across = (500 * (x[k][0] - x[k + 2][0] - k * arm * x[4][0]) for k in (0, 1))
+        behind = [
+            [x[k + 2][n] - mean(heard, 2 * k + n) for n in (0, 1)] for k in range(3)
+        ]  # x, y and angle, each with its rate
+        f, g, torque = (
+            stiff * far + damping * rate for stiff, (far, rate) in zip((200, 200, 4), behind, strict=True)
+        )
+        return [-along, -across, along - f, across - g, arm * across - torque], memory, []
+
+    bodies = [[DEVICE, DEVICE, (1.0, 5.0, 0.0), (1.0, 5.0, 0.0), (0.03, 0.15, 0.0)]] * 2
+    more = f"damping: {damping} N*s/m, turning_damping: {damping} N*m*s/rad, turning_stiffness"
+    text = replaced(scene("carried-beam"), ("turning_stiffness", more))
+    same(compiled(text), ByHand(bodies, everybody(2), law, told=2, many=3))
