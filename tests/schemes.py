@@ -34,8 +34,8 @@ class ByHand:
     """A scheme: force ticks every millisecond, packets every `ratio` of them, `late` and `comp` in ticks.
 
     `bodies` are by peer (mass, damping, springs to the ground). A packet holds the sampled (x, v) of `many`
-    bodies from `told` on, and what the law put out at the tick before. `hears` are by peer those it hears. Where a packet is
-    missing and `zero` is set, a peer hears its own motion in its place.
+    bodies from `told` on, and what the law put out at the tick before. `hears` are by peer those it hears.
+    Where a packet is missing and `zero` is set, a peer hears its own motion in its place.
     """
 
     bodies: Sequence[Sequence[tuple[float, float, float]]]
