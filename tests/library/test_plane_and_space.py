@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -63,24 +64,6 @@ def test_planar_mass_and_spatial_mass_swing_along_each_axis_as_a_mass_does(
     assert found.spectral_radius == pytest.approx(math.exp(-7 / 4), rel=1e-12)
     one, other = sizes(line), sizes(more)
     assert other == pytest.approx(np.repeat(one, size), rel=1e-12)
-
-
-def test_sampled_planar_spring_damper_pulls_along_the_line_between_its_ends() -> None:
-    system = compiled(
-        f"{PLANE}couplers:\n  it: {{type: SampledPlanarSpringDamper, a: device, b: ground, clock: tick, "
-        "stiffness: 70 N/m, damping: 4 N*s/m}\n"
-    )
-    at = {"device.x[1]": 0.3, "device.x[2]": -0.4, "device.v[1]": 0.5, "device.v[2]": 2.0}
-    assert ticked(system, at) == pytest.approx(
-        {"it.f[1]": 70 * 0.3 + 4 * 0.5, "it.f[2]": -70 * 0.4 + 4 * 2.0}, rel=EXACT
-    )
-
-
-def test_planar_constant_force_pushes_in_its_direction() -> None:
-    system = compiled(
-        f"{PLANE}hands: {{push: {{type: PlanarConstantForce, flange: device, force: [3 N, -4 N]}}}}\n"
-    )
-    assert pushed(system) == pytest.approx([3.0, -4.0], rel=EXACT)
 
 
 # ---- contacts ----
@@ -175,45 +158,6 @@ def test_a_group_gives_a_vector_one_value_for_all_or_a_list_of_lists_one_a_peer(
     assert starts(groups("table: users.csv"), tmp_path) == each
 
 
-# ---- several pairs at a connector; arrays inside a component ----
-
-MOUNT = """\
-component: Mount
-about: Holds a body, sampled, along and about its axes.
-connectors: {a: PlanarFrame, b: PlanarFrame}
-parameters: {stiffness: {unit: N/m}, twist: {unit: N*m}, clock: clock}
-variables: {f: {unit: N, size: 2}, torque: {unit: N*m}}
-equations:
-  - f = stiffness*sample(a.x - b.x)
-  - torque = twist*sample(a.angle - b.angle)
-  - a.f = hold(f)
-  - b.f = -a.f
-  - a.torque = hold(torque)
-  - b.torque = -a.torque
-"""
-
-
-def test_a_connector_may_have_several_pairs_vectors_among_them(tmp_path: Path) -> None:
-    """Two bodies on springs: what one pair does, no other feels, and each does the work of its own."""
-    text = (
-        "topology: slab\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\nmasses:\n"
-        "  one: {type: PlanarBody, mass: 2 kg, inertia: 0.1 kg*m^2, x: [1 mm, 0 m], angle: 0.2 rad}\n"
-        "  two: {type: PlanarBody, mass: 5 kg, inertia: 0.3 kg*m^2}\n"
-        "couplers: {tie: {type: Mount, a: one, b: two, stiffness: 70 N/m, twist: 9 N*m, clock: tick}}\n"
-    )
-    system = compiled(text, library(tmp_path, MOUNT))
-    found = ticked(system, {"one.x[1]": 0.5, "two.x[2]": 0.25, "one.angle": 0.125})
-    assert found == pytest.approx({"tie.f[1]": 35.0, "tie.f[2]": -17.5, "tie.torque": 1.125}, rel=EXACT)
-    run = apc.simulate(system, duration="20 ms", jit=False)
-    work = dict(run.summary.work)["tie"]
-    names = [signal.name for signal in run.signals]
-    kinetic = 0.0
-    for body, mass, inertia in (("one", 2.0, 0.1), ("two", 5.0, 0.3)):
-        v = {n: run.values[-1, names.index(f"user[1].{body}.{n}")] for n in ("v[1]", "v[2]", "rate")}
-        kinetic += mass * (v["v[1]"] ** 2 + v["v[2]"] ** 2) / 2 + inertia * v["rate"] ** 2 / 2
-    assert work == pytest.approx(kinetic, rel=1e-9)  # nothing else takes work up
-
-
 # ---- bodies that turn ----
 
 BAR = """\
@@ -246,6 +190,34 @@ hands: {weight: {type: SpatialConstantForce, flange: centre.point, force: [0 N, 
 def hertz(text: str) -> list[float]:
     """Return the frequencies of a scene's motions that swing."""
     return sorted(one.frequency_hz for one in apc.analyze(compiled(text)).modes if one.eigenvalue.imag > 0)
+
+
+def test_what_is_held_does_the_work_that_copies_move_by() -> None:
+    """Each pair of a connector does its own: ∫ f·dx + torque·dφ is the kinetic energy, without damping."""
+    text = (SCENES / "carried-beam.yaml").read_text(encoding="utf-8").replace("damping: 5 N*s/m, ", "")
+    start = "mass: 2 kg, v: [0.1 m/s, 0 m/s], rate: 0.3 rad/s"
+    text = replaced(text, ("turning_damping: 0.15 N*m*s/rad, ", ""), ("mass: 2 kg", start))
+    text = text.partition("hands:")[0].replace("damping: 5 N*s/m", "damping: 0 N*s/m")
+    text = re.sub(", carry.force: .*?]", "", text).replace(
+        "left:  {count: 1, set: {", "left:  {count: 1, set: {beam.angle: 0.1 rad, "
+    )
+    run = apc.simulate(compiled(text), duration="0.096 s", jit=False)
+
+    def kinetic(row: int) -> float:
+        parts = [
+            (0.1, "device.v[1]"),
+            (0.1, "device.v[2]"),
+            (1, "beam.v[1]"),
+            (1, "beam.v[2]"),
+            (0.03, "beam.rate"),
+        ]
+        return sum(
+            m * run[f"{side}[1].{name}"][row] ** 2 / 2 for side in ("left", "right") for m, name in parts
+        )
+
+    work = dict(run.summary.work)
+    assert abs(work["coordination"]) > 1e-4 and abs(work["contact"]) > 1e-4
+    assert sum(work.values()) == pytest.approx(kinetic(-1) - kinetic(0), rel=1e-6)
 
 
 def test_a_bar_with_a_bob_swings_about_its_hinge_as_a_compound_pendulum() -> None:
