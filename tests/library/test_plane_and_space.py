@@ -196,7 +196,7 @@ def test_what_is_held_does_the_work_that_copies_move_by() -> None:
     """Each pair of a connector does its own: ∫ f·dx + torque·dφ is the kinetic energy, without damping."""
     text = (SCENES / "carried-beam.yaml").read_text(encoding="utf-8").replace("damping: 5 N*s/m, ", "")
     start = "mass: 2 kg, v: [0.1 m/s, 0 m/s], rate: 0.3 rad/s"
-    text = replaced(text, ("turning_damping: 0.15 N*m*s/rad, ", ""), ("mass: 2 kg", start))
+    text = replaced(text, ("turn_damping: 0.15 N*m*s/rad, ", ""), ("mass: 2 kg", start))
     text = text.partition("hands:")[0].replace("damping: 5 N*s/m", "damping: 0 N*s/m")
     text = re.sub(", carry.force: .*?]", "", text).replace(
         "left:  {count: 1, set: {", "left:  {count: 1, set: {beam.angle: 0.1 rad, "
@@ -297,12 +297,12 @@ def test_copies_are_turned_to_their_mean_as_they_are_pulled(space: bool) -> None
     alone = "".join(one for one in lines if not one.startswith(("  device:", "  contact:")))
     size, kind = (3, "Spatial") if space else (1, "Planar")
     inertia = "[" + ", ".join(["0.6 kg*m^2"] * size) + "]" if space else "0.6 kg*m^2"
-    body = f"type: {kind}Body, inertia: {inertia}, turning_damping: 5 N*m*s/rad, mass"
+    body = f"type: {kind}Body, inertia: {inertia}, turn_damping: 5 N*m*s/rad, mass"
     turned = replaced(
         alone,
         ("cube:   {mass", f"cube:   {{{body}"),
         ("AveragePosition", f"{kind}AveragePose"),
-        ("stiffness: 500 N/m,", "stiffness: 500 N/m, turning_stiffness: 500 N*m/rad,"),
+        ("stiffness: 500 N/m,", "stiffness: 500 N/m, turn_stiffness: 500 N*m/rad,"),
     )
     one, many = sizes(alone), sizes(turned)
     several = one > 1e-6
@@ -311,7 +311,7 @@ def test_copies_are_turned_to_their_mean_as_they_are_pulled(space: bool) -> None
     assert many[: count * several.sum()] == pytest.approx(np.repeat(one[several], count), rel=1e-9)
     limits = [
         apc.critical(compiled(text), name).value
-        for text, name in ((alone, "coordination.stiffness"), (turned, "coordination.turning_stiffness"))
+        for text, name in ((alone, "coordination.stiffness"), (turned, "coordination.turn_stiffness"))
     ]
     assert limits[1] == pytest.approx(limits[0], rel=1e-8)
 

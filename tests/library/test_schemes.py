@@ -260,6 +260,6 @@ def test_a_beam_in_two_hands_is_pulled_and_turned_by_its_ends(damping: float) ->
         return [*-push, *push - pull[:2], arm * push[1] - pull[2]], memory, []
 
     bodies = [[DEVICE, DEVICE, (1.0, 5.0, 0.0), (1.0, 5.0, 0.0), (0.03, 0.15, 0.0)]] * 2
-    more = f"damping: {damping} N*s/m, turning_damping: {damping} N*m*s/rad, turning_stiffness"
-    both = (("turning_stiffness", more), ("500 N/m", f"500 N/m, damping: {damping} N*s/m"))
+    more = f"damping: {damping} N*s/m, turn_damping: {damping} N*m*s/rad, turn_stiffness"
+    both = (("turn_stiffness", more), ("500 N/m", f"500 N/m, damping: {damping} N*s/m"))
     same(compiled(replaced(scene("carried-beam"), *both)), ByHand(bodies, everybody(2), law, told=2, many=3))
