@@ -135,19 +135,23 @@ def margins_text(found: Margins) -> str:
     if not found.rows:
         return "\n".join(note(f"margins {found.note}"))
     width = max(len(one.parameter) for one in found.rows)
-    lines = [f"  {'may grow':<{width}}  from           to               times  at"]
-    for one in found.rows:
+    ends = [
+        "" if one.value is None else with_unit(known_digits(one.value, one.error or 0.0, 7), one.unit)
+        for one in found.rows
+    ]
+    wide = max(16, *map(len, ends))
+    lines = [f"  {'may grow':<{width}}  from           {'to':<{wide}} times  at"]
+    for one, end in zip(found.rows, ends, strict=True):
         start = f"  {one.parameter:<{width}}  {quantity(one.present, one.unit, 5):<14}"
         if one.note:
             lines.append(f"{start} not looked for: {one.note}")
         elif one.value is None:
             lines.append(f"{start} none found up to {quantity(one.scanned, one.unit, 5)}")
         else:
-            end = with_unit(known_digits(one.value, one.error or 0.0, 7), one.unit)
             times = "–" if one.factor is None else f"{one.factor:.4g}"
             at = in_hertz(math.nan if one.frequency_hz is None else one.frequency_hz)
             jump = ", jump" if one.kind == "jump" else ""
-            lines.append(f"{start} {end:<16} {times:>5}  {at}{jump}")
+            lines.append(f"{start} {end:<{wide}} {times:>5}  {at}{jump}")
     return "\n".join([*lines, *note(found.note)])
 
 

@@ -12,6 +12,7 @@ from tests.topologies import SCENES
 COMMON = "stable up to a common translation"
 # Verdict and rigid modes at the start values; what the paper has stands in its section IV and Fig. 6.
 VERDICTS = {
+    "carried-beam": (f"{COMMON} and rotation", 3),  # along both axes, and turned
     "finger": ("stable", 0),
     "lifted-box": ("stable", 0),
     "lossy-average": (COMMON, 1),
