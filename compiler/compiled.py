@@ -357,6 +357,7 @@ class CompiledSystem:
     `followers` are the names of all parameters and timings with a formula, of any group, in an order in which
     each stands behind what it follows from. `warnings` say what the topology seldom means, and where.
     `region` are the axes x and y of the study of that name, empty or one if the scene leaves them open.
+    `within` are the delays that are given as a range, in whose middle they are.
     `tune` is what the study of that name asks, each word with its text, as options take them.
     """
 
@@ -375,6 +376,7 @@ class CompiledSystem:
     tune: tuple[tuple[str, str], ...] = ()
     followers: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    within: tuple[Axis, ...] = ()
 
     def __repr__(self) -> str:
         """Return what it is in a line."""

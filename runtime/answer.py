@@ -235,7 +235,7 @@ def proved_box(
     box
         Ranges of parameters.
     passive
-        Whether every passive hand is meant, over the nominal network.
+        Whether every passive hand is meant, over the nominal network: at the delays of a link alone.
     cells
         How many cells are looked at at most; without it, as many as take some seconds.
     inside
@@ -245,18 +245,19 @@ def proved_box(
     ------
     ApcError
         As `box_proof.prove_box`, or `moments.mean_square_box.prove_box` where links are, or may become,
-        unreliable; as `hands.passive_box.prove_box`.
+        unreliable; E930 other ranges, with every passive hand.
     """
+    from apc.network.nominal import channel_numbers, left_out
     from apc.vary.delay_box import is_delay, prove_over_delay
 
+    if passive and not (len(box) == 1 and is_delay(system, box[0].free)):
+        what = "with every passive hand values are judged one by one, and of ranges that of a link's delay"
+        hint = "apc region --hands passive, or apc critical --hands passive"
+        raise ApcError(Mistake("E930", Place("--box"), what, hint=hint))
     if any(is_delay(system, one.free) for one in box):
-        return prove_over_delay(system, box, partial(proved_at, passive=passive, cells=cells, inside=inside))
-    if passive:
-        from apc.hands.passive_box import prove_box as prove_for_hands
-
-        return prove_for_hands(system, box, cells=cells)
+        at_each = partial(proved_at, passive=passive, cells=cells, inside=inside)
+        return prove_over_delay(system, box, at_each, nominal=not passive and not left_out(system))
     from apc.analysis.box_proof import prove_box
-    from apc.network.nominal import channel_numbers, left_out
 
     numbers = channel_numbers(system)
     if left_out(system) or any(one.free.name in numbers for one in box):

@@ -33,15 +33,16 @@ Late = Callable[[int, int, int], tuple[int, bool]]
 class ByHand:
     """A scheme: force ticks every millisecond, packets every `ratio` of them, `late` and `comp` in ticks.
 
-    `bodies` are by peer (mass, damping, springs to the ground). A packet holds the sampled (x, v) of body
-    `told` and what the law put out at the tick before. `hears` are by peer those it hears. Where a packet is
-    missing and `zero` is set, a peer hears its own motion in its place.
+    `bodies` are by peer (mass, damping, springs to the ground). A packet holds the sampled (x, v) of `many`
+    bodies from `told` on, and what the law put out at the tick before. `hears` are by peer those it hears.
+    Where a packet is missing and `zero` is set, a peer hears its own motion in its place.
     """
 
     bodies: Sequence[Sequence[tuple[float, float, float]]]
     hears: Sequence[Sequence[int]]
     law: Law
     told: int
+    many: int = 1
     memory: int = 0
     out: int = 0
     ratio: int = 8
@@ -49,6 +50,10 @@ class ByHand:
     comp: int = 1
     period: float = 1e-3
     zero: bool = False
+
+    def sampled(self, motion: Sequence[tuple[Any, Any]]) -> list[Any]:
+        """Return what is sent of a peer's motion."""
+        return [value for body in motion[self.told : self.told + self.many] for value in body]
 
     @property
     def kept(self) -> int:
@@ -78,7 +83,7 @@ def _tick(scheme: ByHand, now: Playing, tick: int) -> None:
     peers = range(len(scheme.bodies))
     if tick % scheme.ratio == 0:
         for i in peers:
-            now.packets[i] = [[*now.motion[i][scheme.told], *now.out[i]], *now.packets[i]]
+            now.packets[i] = [[*scheme.sampled(now.motion[i]), *now.out[i]], *now.packets[i]]
     acting: list[Any] = []
     for i in peers:
         heard = {}
@@ -86,7 +91,7 @@ def _tick(scheme: ByHand, now: Playing, tick: int) -> None:
             number, missing = scheme.counts(j, i, tick)
             packet = now.packets[j][tick // scheme.ratio - number]
             if missing and scheme.zero:
-                packet = now.motion[i][scheme.told]
+                packet = scheme.sampled(now.motion[i])
             heard[j] = [*packet, (tick - number * scheme.ratio) * scheme.period]
         new, now.memory[i], now.out[i] = scheme.law(i, now.motion[i], heard, now.memory[i])
         queue = [list(new), *now.forces[i]]
@@ -103,7 +108,11 @@ def frame_matrix(scheme: ByHand) -> NDArray[np.float64]:
     """Return the one-frame matrix of all peers."""
     kept = scheme.kept
     sizes = [
-        2 * len(own) + scheme.comp * len(own) + scheme.memory + scheme.out + kept * (2 + scheme.out)
+        2 * len(own)
+        + scheme.comp * len(own)
+        + scheme.memory
+        + scheme.out
+        + kept * (2 * scheme.many + scheme.out)
         for own in scheme.bodies
     ]
     rows = iter(np.eye(sum(sizes)))
@@ -113,7 +122,7 @@ def frame_matrix(scheme: ByHand) -> NDArray[np.float64]:
         now.forces.append([[next(rows) for _ in own] for _ in range(scheme.comp)])
         now.memory.append([next(rows) for _ in range(scheme.memory)])
         now.out.append([next(rows) for _ in range(scheme.out)])
-        now.packets.append([[next(rows) for _ in range(2 + scheme.out)] for _ in range(kept)])
+        now.packets.append([[next(rows) for _ in range(2 * scheme.many + scheme.out)] for _ in range(kept)])
     assert next(rows, None) is None
     for tick in range(scheme.ratio):
         _tick(scheme, now, tick)
@@ -145,7 +154,7 @@ def course(
         forces=[[[0.0] * len(own)] * scheme.comp for own in starts],
         memory=[list(own) for own in memory or [()] * len(starts)],
         out=[silent for _ in starts],
-        packets=[[[*own[scheme.told], *silent]] * scheme.kept for own in starts],
+        packets=[[[*scheme.sampled(own), *silent]] * scheme.kept for own in starts],
     )
     for tick in itertools.count():
         yield now

@@ -189,7 +189,7 @@ def flatten(scene: Scene) -> FlatSystem:
     mistakes = Mistakes(scene.names)
     structures: dict[object, list[SceneGroup]] = {}
     for group in scene.groups:
-        present = tuple(part.name for part in scene.parts if group.name in part.groups)
+        present = tuple((part.name, part.component.name) for part in scene.parts if group.name in part.groups)
         structures.setdefault((present, tuple(sorted(group.words))), []).append(group)
     kinds = []
     for groups in structures.values():

@@ -97,14 +97,14 @@ def sort(clocked: ClockedSystem) -> SortedSystem:
     """Sort and solve every partition. Raises ApcError naming the equations and unknowns left over."""
     scene = clocked.scene
     mistakes = Mistakes(scene.names)
-    nonzero = {symbol("peers")} | {  # the parameters that no number can make zero
-        symbol(f"{part.name}.{declared.name}")
-        for part in scene.parts
-        for declared in part.component.numbers
-        if declared.open_minimum and declared.minimum == 0
-    }
     kinds = []
     for kind in clocked.kinds:
+        nonzero = {symbol("peers")} | {  # the parameters that no number can make zero
+            symbol(f"{part.name}.{declared.name}")
+            for part in kind.flat.parts
+            for declared in part.component.numbers
+            if declared.open_minimum and declared.minimum == 0
+        }
         with mistakes:
             kinds.append(_sorted(kind, Divisors(nonzero, _numbers(scene, kind)), mistakes))
     mistakes.raise_if_any()

@@ -31,8 +31,8 @@ from apc.compiler.compiled import (
     count_of,
     group_count,
 )
-from apc.compiler.components.component import Component, Variable
 from apc.compiler.components.component import Number as NumberParameter
+from apc.compiler.components.component import Variable
 from apc.compiler.crowd import COUNT_ABOUT, heard_sums, with_heard
 from apc.compiler.equations.connections import ZERO
 from apc.compiler.equations.flatten import FlatKind, HoldCrossing
@@ -233,14 +233,14 @@ def compiled_groups(
         E215 a graph some of whose peers send nothing.
     """
     exact = {timing.name for timing in timings.found}
-    components = {part.name: part.component for part in scene.parts}
-    found = []
+    declared = _declared(scene)
+    found, declared = [], _declared(scene)
     for group, place in zip(scene.groups, places, strict=True):
         values = []
         for name, value in group.values:
             timing = f"{group.name}.{name}"
             own = replace(value, expression=Name(tuple(timing.split(".")))) if timing in exact else value
-            values.append(_of_part(name, own, components))
+            values.append(_of_part(name, own, declared))
         columns = tuple(Column(name, numbers) for name, numbers in group.columns)
         found.append(Group(group.name, group.count, place, tuple(values), columns))
     for link in (link for link in scene.links if link.graph.shape != "complete"):
@@ -293,13 +293,20 @@ def _named(
     )
 
 
-def _of_part(name: str, value: Value, components: Mapping[str, Component]) -> Parameter:
+def _declared(scene: Scene) -> dict[str, NumberParameter | Variable]:
+    """Return by whole name what declares each number and start value of the parts."""
+    found: dict[str, NumberParameter | Variable] = {}
+    for part in scene.parts:
+        for declared in (part.component.variables, part.component.numbers):
+            found |= {f"{part.name}.{one.name}": one for one in declared}
+    return found
+
+
+def _of_part(name: str, value: Value, all_declared: Mapping[str, NumberParameter | Variable]) -> Parameter:
     """Return a number or start value of a part, with its bounds and what it is about."""
-    part, _, own = name.rpartition(".")
-    declared = components[part].parameter(own) or components[part].variable(own)
+    declared = all_declared[name]
     if isinstance(declared, Variable):
         return _named(name, value, f"start value: {declared.about}")
-    assert isinstance(declared, NumberParameter)
     least, most = declared.minimum, declared.maximum
     return _named(name, value, declared.about, least, most, open_minimum=declared.open_minimum)
 
@@ -314,20 +321,15 @@ def all_parameters(scene: Scene, kinds: Sequence[Kind], links: Sequence[Link]) -
     kinds, links
         What is compiled: whose start values and counts are in use, and which links.
     """
-    components = {part.name: part.component for part in scene.parts}
+    declared = _declared(scene)
     needed = {name for kind in kinds for name in kind.parameters}
     used = {link.name for link in links}
     found = [_named(name, value) for name, value in scene.parameters]
     for part in scene.parts:
-        starts = {
-            one.name: Value(one.start, one.unit.dimension, None, part.place)
-            for one in part.component.variables
-            if one.start is not None
-        } | dict(part.starts)
         numbers = dict(part.values) | {
-            own: value for own, value in starts.items() if f"{part.name}.{own}" in needed
+            own: value for own, value in part.all_starts if f"{part.name}.{own}" in needed
         }
-        found += [_of_part(f"{part.name}.{own}", value, components) for own, value in numbers.items()]
+        found += [_of_part(f"{part.name}.{own}", value, declared) for own, value in numbers.items()]
     for link in scene.links:
         if count_of(link.name) in needed:  # every group has its own value
             found.append(Parameter(count_of(link.name), "1", float(scene.peers - 1), about=COUNT_ABOUT))

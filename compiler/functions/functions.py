@@ -16,6 +16,7 @@ import casadi
 
 from apc.compiler.cache import Origin
 from apc.compiler.compiled import (
+    Axis,
     ClockPartition,
     CompiledSystem,
     Hold,
@@ -99,6 +100,9 @@ def build_functions(system: SortedSystem, origin: Origin) -> CompiledSystem:
         scene.tune,
         followers_of(parameters, timings.found, groups),
         warning_texts(scene.warnings),
+        tuple(
+            Axis(f"{one.name}.delay", *one.within) for one in scene.links if one.within and one.name in used
+        ),
     )
 
 

@@ -21,13 +21,17 @@ FORMS = (
     *("m/s", "m/s^2", "m/s^3", "m^2", "m^3", "1/s", "1/s^2", "1/m", "W", "V", "N*m/A", "kg*m^2"),
 )
 # How the same units are written where a quantity counts cycles or radians: of each, by its other form.
-TURNING = {"Hz": {"1/s": "Hz"}, "rad": {"1": "rad", "1/s": "rad/s", "1/s^2": "rad/s^2"}}
+TURNING = {
+    "Hz": {"1/s": "Hz"},
+    "rad": {"1": "rad", "1/s": "rad/s", "1/s^2": "rad/s^2", "N*m": "N*m/rad", "N*m*s": "N*m*s/rad"},
+}
 
 
 def format_dimension(dimension: Dimension) -> str:
     """Return the dimension as an SI unit `parse_unit` reads: `N*s/m`, `1`, or a product of base units.
 
-    What counts cycles is in Hz, what counts radians in rad, rad/s or rad/s^2.
+    What counts cycles is in Hz, what counts radians in rad, rad/s or rad/s^2; a torque per
+    radian in N*m/rad or N*m*s/rad.
     """
     text = _forms().get(dimension)
     if text is None:

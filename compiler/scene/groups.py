@@ -12,7 +12,7 @@ columns computes what depends on them.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
@@ -29,7 +29,7 @@ from apc.compiler.language.expression import names
 from apc.compiler.language.tables import Column, NamedFiles, Table, read_table
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import AlreadyReportedError, Value
-from apc.compiler.language.vectors import SIZES, entries, entry
+from apc.compiler.language.vectors import SIZES, entries, entry, whole_and_index
 from apc.compiler.scene.instances import Part, SettableNames
 from apc.compiler.scene.named_numbers import NamedNumbers, read_count_by_names
 from apc.compiler.source.nodes import Mapping as MappingNode
@@ -80,7 +80,8 @@ class SceneGroup:
 
     `values` are the group's own settings by whole name (`contact.stiffness`) and what follows from them
     inside parts, `words` its own options and clocks, `columns` settings that differ from peer to peer,
-    `counted` its count where that follows from named numbers.
+    `counted` its count where that follows from named numbers, `types` the parts of another type, all of whose
+    numbers are the group's own.
     """
 
     name: str
@@ -90,6 +91,7 @@ class SceneGroup:
     columns: Columns
     place: Place
     counted: Value | None = None
+    types: Named[str] = ()
 
 
 def read_counts(root: Body, files: NamedFiles) -> dict[str, GroupBody]:
@@ -161,12 +163,14 @@ class GroupReader:
     """Reads what groups set for themselves.
 
     `settable` is what can be set, by the name a person writes; `parts` are all parts of the scene, each
-    before the parts inside it; `explain` raises, of a name that can't be set and its place, a better message
+    before the parts inside it; `redeclared` names parts that are of another type at a group, by group;
+    `explain` raises, of a name that can't be set and its place, a better message
     than ours, or that one was given.
     """
 
     settable: SettableNames
     parts: Collection[Part]
+    redeclared: Mapping[str, Collection[str]]
     clocks: Collection[str]
     numbers: NamedNumbers
     explain: Callable[[str, Place], None]
@@ -197,9 +201,22 @@ class GroupReader:
                 columns |= dict.fromkeys(wholes, column.numbers)
                 assert table is not None and isinstance(item, Number | Variable)
                 _check_column(column, table.lines, item, mistakes)
-        self._add_followers(values, words, columns, group.body.place)
+        self._add_followers(values, words, columns, group)
+        types = {}
+        for part in self._parts_at(group):
+            if group.name in self.redeclared.get(whole_and_index(part.name.partition(".")[0])[0], ()):
+                if "." not in part.name:
+                    types[part.name] = part.component.name
+                for name, value in (*part.values, *part.all_starts):
+                    if (whole := f"{part.name}.{name}") not in columns:
+                        values.setdefault(whole, value)
         settings = tuple(values.items()), tuple(words.items()), tuple(columns.items())
-        return SceneGroup(group.name, group.count, *settings, group.body.place, group.counted)
+        place, own_types = group.body.place, tuple(types.items())
+        return SceneGroup(group.name, group.count, *settings, place, group.counted, own_types)
+
+    def _parts_at(self, group: GroupBody) -> list[Part]:
+        """Return the parts that a group's peers have."""
+        return [part for part in self.parts if group.name in part.groups]
 
     def _settable(
         self, name: str, place: Place, group: str, code: str, what: str
@@ -210,9 +227,10 @@ class GroupReader:
         if not isinstance(item, kinds):
             self.explain(name, place)
             known = [known for known, (other, _) in self.settable.items() if isinstance(other, kinds)]
+            known += [f"{part.name}.type" for part in self.parts if code == "E206" and "." not in part.name]
             raise unknown(code, place, what, name, known)
         part = wholes[0].rpartition(".")[0]
-        at = next(one.groups for one in self.parts if one.name == part)
+        at = [name for one in self.parts if one.name == part for name in one.groups]
         if at and group not in at:
             what = f"{group} sets {name} and has no {part}, which is at {', '.join(at)}"
             raise fault("E211", place, what, hint=f"at: [{', '.join((*at, group))}]")
@@ -224,6 +242,8 @@ class GroupReader:
         A list of a vector's entries is that vector at each peer; a list of such lists has one a peer.
         """
         for key, node in group.body.section("set", "{device.mass: 0.2 kg}"):
+            if group.name in self.redeclared.get(key.text.removesuffix(".type"), ()):
+                continue  # it was read before the parts
             size = next((k for k in reversed(SIZES) if entry(key.text, k) in self.settable), 0)
             if not size:
                 yield key, node
@@ -255,11 +275,12 @@ class GroupReader:
         return np.array([float(self.numbers.read_for(one, what, item).number) for one in node.items])
 
     def _add_followers(
-        self, values: dict[str, Value], words: dict[str, str], columns: Collection[str], place: Place
+        self, values: dict[str, Value], words: dict[str, str], columns: Collection[str], group: GroupBody
     ) -> None:
         """Add what follows from a group's settings, inside the parts that they set."""
         known: dict[str, Value] = {}
-        for part in self.parts:
+        place = group.body.place
+        for part in self._parts_at(group):
             known |= {f"{part.name}.{name}": value for name, value in (*part.values, *part.starts)}
             for inner in part.component.inner:  # which takes its clocks over from the outer part
                 for own, outer in inner.entry.references:

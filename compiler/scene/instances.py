@@ -54,6 +54,16 @@ class Part:
     groups: tuple[str, ...]
     place: Place
 
+    @property
+    def all_starts(self) -> Named[Value]:
+        """The start values of all its variables that have one: those given here, else the component's own."""
+        own = {
+            one.name: Value(one.start, one.unit.dimension, None, self.place)
+            for one in self.component.variables
+            if one.start is not None
+        }
+        return tuple((own | dict(self.starts)).items())
+
     def reference(self, role: str) -> str | None:
         """Return the clock or link this part names, when it names exactly one."""
         names = {p.name for p in self.component.parameters if isinstance(p, Reference) and p.role == role}
@@ -69,15 +79,34 @@ class PartReader:
     numbers: NamedNumbers
     parts: list[Part] = field(default_factory=list)
 
-    def read(self, entry: PartEntry) -> None:
-        """Read a part's entry, once for each element of an array, and write out the parts inside."""
+    def read(self, entry: PartEntry, redeclared: Mapping[str, PartEntry]) -> None:
+        """Read a part's entry, once for each element of an array, and write out the parts inside.
+
+        Parameters
+        ----------
+        entry
+            The entry.
+        redeclared
+            By group, the entry that the part has there instead, of another type.
+        """
+        groups = tuple(self.numbers.counts)
+        with self.numbers.mistakes:
+            groups = self._groups_of(entry)
+        others = {group: redeclared[group] for group in groups if redeclared.get(group, entry) is not entry}
+        for group, other in others.items():
+            self._read(other, (group,))
+        # What a name stands for elsewhere comes last: it is what a table of names keeps.
+        rest = tuple(group for group in groups if group not in others)
+        if rest or not others:
+            self._read(entry, rest)
+
+    def _read(self, entry: PartEntry, groups: tuple[str, ...]) -> None:
+        """Read an entry as it is at some groups."""
         name, component = entry.name, entry.component
         counts, mistakes = self.numbers.counts, self.numbers.mistakes
-        shared, groups = False, tuple(counts)
+        shared = False
         with mistakes:
             shared = _shared(entry)
-        with mistakes:
-            groups = self._groups_of(entry)
         roles = [p.name for p in component.parameters if isinstance(p, Reference) and p.role in LINK_ROLES]
         if roles and entry.section != "links":
             what = f"{name} is a {component.name}, whose {roles[0]} only a link has"

@@ -15,7 +15,7 @@ one turns bad with the probability p, a bad one good with r. Its defaults are ne
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Graph
-from apc.compiler.components.component import Named, Reference
+from apc.compiler.components.component import Component, Named, Reference
 from apc.compiler.components.component import Number as Parameter
 from apc.compiler.components.parts import PartEntry
 from apc.compiler.errors import Place
@@ -36,8 +36,8 @@ from apc.compiler.scene.graphs import COMPLETE, SceneDelay, read_delays, read_gr
 from apc.compiler.scene.instances import Part
 from apc.compiler.scene.named_numbers import NamedNumbers
 from apc.compiler.source.nodes import Mapping as MappingNode
-from apc.compiler.source.nodes import Node, Scalar
-from apc.compiler.source.reading import Body, brief, fault, text_of
+from apc.compiler.source.nodes import Node, Scalar, Sequence
+from apc.compiler.source.reading import Body, brief, fault, form, text_of
 
 OBEYED = ("delay", "jitter", "distribution", "reorder", "on_loss")  # a link's numbers and words
 # Those of netem, in its order.
@@ -105,15 +105,44 @@ class SceneChannel:
 
 @dataclass(frozen=True, slots=True)
 class SceneLink:
-    """Who hears whom over a link, how late, and how unreliably (`channel`, None for a reliable one)."""
+    """Who hears whom over a link, how late, and how unreliably (`channel`, None for a reliable one).
+
+    `within` are the ends of a range of delays, whose middle `delay` is, in seconds; None of one delay.
+    """
 
     name: str
     clock: str
     delay: Value
+    within: tuple[Fraction, Fraction] | None
     graph: Graph
     delays: tuple[SceneDelay, ...]
     channel: SceneChannel | None
     place: Place
+
+
+def without_range(entry: PartEntry) -> PartEntry:
+    """Return an entry without its delay, if that is a range, which `read_link` reads."""
+    body = entry.body
+    if entry.section != "links" or not isinstance(body.get("delay"), Sequence):
+        return entry
+    rest = tuple((key, node) for key, node in body.entries if key.text != "delay")
+    return replace(entry, body=replace(body, entries=rest))
+
+
+def _range(node: Sequence, link: str, component: Component, numbers: NamedNumbers) -> tuple[Value, Value]:
+    """Read `[20 ms, 60 ms]`, the ends of a range of delays."""
+    declared = component.parameter("delay")
+    assert isinstance(declared, Parameter), "a link has a delay"
+    if len(node.items) != 2:
+        expected, hint = "one delay or a list of two", "delay: [20 ms, 60 ms]"
+        raise fault("E203", node.place, "delay", expected, form(node), hint)
+    low, high = (numbers.read_for(item, "delay", declared) for item in node.items)
+    if low.number >= high.number:
+        what = f"the range of {link}.delay"
+        raise fault("E207", node.place, what, "its lower end first", f"{low} to {high}")
+    if low.expression is not None or high.expression is not None:
+        raise fault("E203", node.place, "a range of delays", "two quantities", form(node), "[20 ms, 60 ms]")
+    return low, high
 
 
 def read_link(part: Part, entry: PartEntry, numbers: NamedNumbers) -> SceneLink:
@@ -152,10 +181,17 @@ def read_link(part: Part, entry: PartEntry, numbers: NamedNumbers) -> SceneLink:
     idle += ["equations"] * bool(component.equations or component.inner)
     if idle:
         raise fault("E210", part.place, f"{told} a link has no {idle[0]}", hint="type: Link")
-    channel = _read_channel(part, nodes, numbers)
+    channel, within = _read_channel(part, nodes, numbers), None
+    if isinstance(node := nodes.get("delay"), Sequence):
+        if channel is not None and (channel.jitter or channel.trace is not None):
+            what = f"{part.name} has a range of delays: it can't have jitter or a trace as well"
+            raise fault("E262", node.place, what)
+        ends = _range(node, part.name, component, numbers)
+        within = ends[0].number, ends[1].number
+        delay = Value((within[0] + within[1]) / 2, ends[0].dimension, None, node.place)
     if clock is None or delay is None:
         raise AlreadyReportedError
-    return SceneLink(part.name, clock, delay, graph, delays, channel, part.place)
+    return SceneLink(part.name, clock, delay, within, graph, delays, channel, part.place)
 
 
 def _read_channel(part: Part, nodes: Mapping[str, Node], numbers: NamedNumbers) -> SceneChannel | None:

@@ -16,6 +16,7 @@ from apc.compiler.components.parts import PartEntry
 from apc.compiler.errors import Mistake, Mistakes
 from apc.compiler.scene.groups import SceneGroup
 from apc.compiler.scene.instances import Part
+from apc.compiler.source.nodes import Sequence as ListNode
 
 
 def oddities(
@@ -37,6 +38,9 @@ def oddities(
     for name, entry in entries.items():
         if entry.section == "links" and name not in used:
             warnings.add("W271", entry.place, f"nobody uses the link {name}")
+        if entry.section == "links" and isinstance(entry.body.get("delay"), ListNode):
+            what = f"{name}.delay is a range: analyze asks of all of it, other commands of its middle"
+            warnings.add("W275", entry.place, what)
     outer = [part for part in parts if part.name.partition("[")[0] in entries and "." not in part.name]
     counts = {group.name: group.count for group in groups}
     joined = {group: _joined([part for part in outer if group in part.groups]) for group in counts}

@@ -26,9 +26,10 @@ from apc.compiler.language.tables import NamedFiles
 from apc.compiler.language.values import AlreadyReportedError, Value
 from apc.compiler.scene.groups import GroupReader, SceneGroup, read_counts
 from apc.compiler.scene.instances import Part, PartReader, settable_names
-from apc.compiler.scene.links import PROBABILITY, SceneLink, read_link
+from apc.compiler.scene.links import PROBABILITY, SceneLink, read_link, without_range
 from apc.compiler.scene.named_numbers import read_named_numbers
 from apc.compiler.scene.oddities import oddities
+from apc.compiler.scene.redeclarations import redeclared
 from apc.compiler.scene.studies import read_experiment, read_studies
 from apc.compiler.scene.timebase import SceneClock, read_clocks
 from apc.compiler.source.nodes import Mapping, Sequence
@@ -142,8 +143,9 @@ def build_scene(source: Source, library: Library) -> Scene:
     entries = sections.entries
     scope = Scope(numbers.dimension, numbers.names, names.of_role, sections, "this topology", names.complete)
     reader = PartReader(scope, numbers)
+    others_at = redeclared(bodies.values(), sections)
     for entry in entries.values():
-        reader.read(entry)
+        reader.read(without_range(entry), others_at.get(entry.name, {}))
     parts = reader.parts
     links: list[SceneLink] = []
     for part in parts:
@@ -151,7 +153,7 @@ def build_scene(source: Source, library: Library) -> Scene:
             with mistakes:
                 links.append(read_link(part, entries[part.name], numbers))
     others = tuple(part for part in parts if part.section != "links")
-    group_reader = GroupReader(settable_names(others), others, clocks, numbers, names.explain)
+    group_reader = GroupReader(settable_names(others), others, others_at, clocks, numbers, names.explain)
     groups = tuple(group_reader.read(group) for group in bodies.values())
     settable = settable_names(parts)
     for link in links:  # what one loses by can vary where it follows from no other number

@@ -66,7 +66,8 @@ class Diagram:
 
 def build_diagram(scene: Scene) -> Diagram:
     """Return the graph of a scene."""
-    parts = [part for part in scene.parts if "." not in part.name]
+    by_name = {part.name: part for part in scene.parts if "." not in part.name}  # the last: as it usually is
+    parts = [*by_name.values()]
     sizes = Counter(_array(part.name) for part in parts)
     boxes: dict[str, Box] = {}
     joined: dict[Edge, None] = {}
@@ -179,7 +180,7 @@ def _link_box(link: SceneLink) -> Box:
 
 def _group_boxes(scene: Scene) -> Iterator[Box]:
     for group in scene.groups[:MOST_GROUPS]:
-        lines = []
+        lines = [f"{name}.type {word}" for name, word in group.types]
         for name, value in group.values:
             part, _, own = name.rpartition(".")
             lines.append(f"{name} {_quantities(scene.part(part), [(own, value)])}")

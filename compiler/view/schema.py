@@ -119,6 +119,10 @@ def _part(component: Component, quantities: dict[str, Schema]) -> Schema:
         size, about = len(schemas), schemas[0].get("description", "")
         vector = {"type": "array", "description": about, "prefixItems": schemas}
         properties[name] = schemas[0] if size == 1 else vector | {"minItems": size, "maxItems": size}
+    if any(isinstance(one, Reference) and one.role == "delays" for one in component.parameters):
+        delay = properties["delay"]  # which of a link may be a range
+        ends = {"type": "array", "prefixItems": [delay, delay], "minItems": 2, "maxItems": 2}
+        properties["delay"] = {"anyOf": [delay, ends]}
     required = dict.fromkeys(whole_and_index(p.name)[0] for p in component.parameters if is_required(p))
     return {
         "description": component.about,

@@ -1,7 +1,8 @@
 """Proof that a scene is stable for every value of some parameters in a box.
 
 Takes: a `CompiledSystem` and ranges.
-Gives: `BoxProof`, `prove_box`; `search_box`, `Look`, `Looked`, `middle`; `TOGETHER`, `UNDECIDED`.
+Gives: `BoxProof`, `ChangingDelay`, `prove_box`; `search_box`, `Look`, `Looked`, `middle`; `TOGETHER`,
+`UNDECIDED`.
 Guarantees: stable means proved for every point of the box, unstable proved at the point that is named.
 Does not: find the boundary (see the share that is left open).
 
@@ -47,12 +48,26 @@ TOGETHER = 128
 
 
 @dataclass(frozen=True, slots=True)
+class ChangingDelay:
+    """What was proved of a delay that changes from packet to packet within a range, each way by itself.
+
+    From the range's lower end to `proved_to` seconds the scene is stable however it changes; None where that
+    is proved of no part of it. `unstable` is a number of packets with the least delay and one with the
+    largest which, by turns, make it unstable. `note` says why nothing is said.
+    """
+
+    proved_to: float | None
+    unstable: tuple[int, int] | None
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class BoxProof(Result):
     """What was proved of a box; `stable` is None when neither was.
 
     `cells` were looked at; `open_share` of the box's volume is left open. `point`, SI values in the order of
     `ranges`, is where it is unstable, or the middle of the largest cell left open. `left_out` says what the
-    verdict is without.
+    verdict is without. `changing`, of a box over a delay alone, is for one that doesn't stay constant.
     """
 
     shown_by = "analysis:box_proof"
@@ -66,6 +81,7 @@ class BoxProof(Result):
     point: tuple[float, ...]
     notes: tuple[str, ...]
     left_out: tuple[str, ...] = ()
+    changing: ChangingDelay | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -44,8 +44,8 @@ from apc.eigen.closing import ClosedSystem, Feedback, StateLayout, close
 from apc.eigen.modes import dense
 from apc.eigen.peers import PeerGroup
 from apc.eigen.relative import relative_bounded, relative_coordinates, relative_places
-from apc.eigen.rigid import RigidModes, find_rigid_modes
-from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, Spectrum, solve_spectrum
+from apc.eigen.rigid import RigidModes, find_rigid_modes, what_stands
+from apc.eigen.spectrum import STABLE, Spectrum, solve_spectrum, up_to
 from apc.finite_equations import finite_equations
 from apc.frame.discretize import UNIT, discretize
 from apc.frame.lift import FrameMap
@@ -151,8 +151,8 @@ def analyze_paper(system: CompiledSystem) -> Analysis:
         if rigid.drifts:
             raise _not_of_the_form(system, ["a scene in which nothing drifts"])
         spectrum = _with_turns(solve_spectrum([_without_rigid(loop, whole, rigid)]), solve_spectrum([whole]))
-    translations = len(rigid.names)
-    translates = bool(translations) and spectrum.verdict == STABLE
+    stands = what_stands(whole)
+    told = up_to(stands.translations, stands.rotations)
     zero, size = (loop.ratio - 1) * len(loop.states), loop.starts[-1]
     return Analysis(
         topology=system.name,
@@ -160,12 +160,14 @@ def analyze_paper(system: CompiledSystem) -> Analysis:
         frame_s=loop.frame_s,
         states_per_peer=-(-(size - zero) // system.peers),
         method=PAPER,
-        verdict=STABLE_TRANSLATING if translates else spectrum.verdict,
+        verdict=told if spectrum.verdict == STABLE else spectrum.verdict,
         stable=spectrum.stable,
         spectral_radius=spectrum.spectral_radius,
         spectral_radius_error=spectrum.spectral_radius_error,
-        rigid_modes=translations,
-        translations=translations,
+        rigid_modes=len(rigid.names),
+        translations=stands.translations,
+        rotations=stands.rotations,
+        unfelt=stands.names,
         modes=spectrum.modes,
         linearized=False,
         notes=(

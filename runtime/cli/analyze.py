@@ -20,6 +20,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import CompiledSystem
+    from apc.frame.names import Range
 
 # Of peers that all differ, by the thousand: 100,000 took 9 s on one core of 2026.
 SECONDS_A_PEER = 1e-4
@@ -42,7 +43,8 @@ def analyze_command(
     certify: bool = option("Prove the verdict in ball arithmetic, for the numbers as doubles."),
     box: tuple[str, ...] = option(
         "Prove stability for every value within, over the network as it is, e.g. "
-        '--box contact.stiffness=±1%, or --box "lan.delay=8 ms:20 ms", at every constant delay. '
+        '--box contact.stiffness=±1%, or --box "lan.delay=8 ms:20 ms", at every constant delay, and '
+        "as it changes from packet to packet. "
         "May be repeated.",
         "PATH=±P%",
     ),
@@ -94,15 +96,11 @@ def analyze_command(
         asked = {"--method": method != AUTO, "--conventions": every_convention, "--buzz": with_buzz}
         asked |= {"--margins": bool(margins), "--plot": plot is not None}
         refused = [name for name, given in asked.items() if given]
-        _judge_passive(system, refused, box, cells, certify=certify, as_json=as_json)
+        _judge_passive(system, refused, box, certify=certify, as_json=as_json)
         return
     if hands not in HANDS:  # one of the library: all that were measured
         box = (*box, *(f"{name}={low}:{high}" for name, (low, high, _) in published(hands).items()))
-    ranges = []
-    if box:
-        from apc.analysis.box import parse_range
-
-        ranges = [parse_range(system, text) for text in box]
+    ranges = _ranges(system, box)
     listed = sum(group.count for group in system.groups if group.columns)
     with at_work(f"analysing {system.peers:,} peers", about=SECONDS_A_PEER * listed):
         found = answer(
@@ -123,30 +121,27 @@ def analyze_command(
     print_result(found, as_json=as_json, written=[plot])
 
 
+def _ranges(system: CompiledSystem, box: tuple[str, ...]) -> list[Range]:
+    """Return the ranges of a box as they are written, and those that the topology gives."""
+    from apc.analysis.box import parse_range
+    from apc.frame.names import given_ranges
+
+    return given_ranges(system, [parse_range(system, text) for text in box])
+
+
 def _judge_passive(
-    system: CompiledSystem,
-    asked: list[str],
-    box: tuple[str, ...],
-    cells: int | None,
-    *,
-    certify: bool,
-    as_json: bool,
+    system: CompiledSystem, asked: list[str], box: tuple[str, ...], *, certify: bool, as_json: bool
 ) -> None:
-    """Say whether a scene is stable with any passive hands, in a box if asked; refuse anything else."""
+    """Say whether a scene is stable with any passive hands, at all delays if asked; refuse anything else."""
     from apc.hands.passivity import passive_hands
 
     if asked:
         options = " and ".join((*asked, "--hands passive"))
         what = f"{options} don't go together: what hands can draw has no modes of its own"
         raise ApcError(Mistake("E930", Place("--hands"), what, hint="--hands clamped"))
-    if box and certify:
-        what = "--certify, --box and --hands passive don't go together: a box is proved by bounded floats"
-        raise ApcError(Mistake("E930", Place("--certify"), what, hint="--box without --certify"))
-    if box:
-        from apc.analysis.box import parse_range
+    if ranges := _ranges(system, box):
         from apc.answer import proved_box
 
-        ranges = [parse_range(system, one) for one in box]
-        print_result(proved_box(system, ranges, passive=True, cells=cells), as_json=as_json)
+        print_result(proved_box(system, ranges, passive=True), as_json=as_json)
         return
     print_result(passive_hands(system, certify=certify), as_json=as_json)

@@ -14,6 +14,7 @@ from pathlib import Path
 import click
 
 from apc.cli.options import argument, command, option, tell
+from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import unwritable
 from apc.present.forms import json_text
@@ -49,7 +50,8 @@ def new_command(
     *,
     name: str | None = argument(required=False),
     like: str | None = option("Copy this scene of the library, and the tables it names.", "SCENE"),
-    listing: bool = option("Name the scenes of the library; write nothing.", name="--list"),
+    listing: bool = option("Name the scenes of the library; write no topology.", name="--list"),
+    out: Path | None = option("With --list, write a page of them (.html): pictures, topologies, verdicts."),
 ) -> None:
     """Write NAME.yaml, a commented topology to start from.
 
@@ -61,8 +63,10 @@ def new_command(
     if listing:
         if name is not None or like is not None:
             raise click.UsageError("--list names the scenes and writes none: no NAME or --like with it")
-        tell("\n".join(catalogue.scene_lines()))
+        tell("\n".join(catalogue.scene_lines()) if out is None else _gallery(out))
         return
+    if out is not None:
+        raise click.UsageError("--out is of --list")
     source = catalogue.scene_named(catalogue.TEMPLATE if like is None else like)
     name = name if name is not None else like or "topology"
     if not NAME.match(name):
@@ -81,6 +85,23 @@ def new_command(
         f"{' and '.join([str(path), *(one.name for one in tables)])} {'are' if tables else 'is'} written"
     )
     tell(f"{written}. Next: apc compile {path}")
+
+
+def _gallery(out: Path) -> str:
+    """Write the page of the library's scenes; return what was written."""
+    from apc.compiler.files import check_target, write_text
+    from apc.compiler.view.catalogue import scenes
+    from apc.optional import need
+    from apc.present.gallery import gallery_page
+    from apc.suffixes import check_suffix
+
+    check_suffix(out, (".html",), "--out")
+    check_target(out)
+    need("matplotlib", "plot")
+    listed = list(scenes().values())
+    with at_work(f"analysing {len(listed)} scenes"):
+        write_text(out, gallery_page(listed))
+    return f"{out} is written"
 
 
 def _is_there(table: Path) -> bool:

@@ -1,13 +1,13 @@
 """What a loop gives back of what it is given, at the worst frequency: its H∞ norm, its least real part.
 
 Takes: x⁺ = A x + B r, d = C x + D r, of floats or of floats with their radii.
-Gives: `peak_gain`, `least_real`; `dissipates`, with it `proves_gain`, `proves_positive` and
-`proves_positive_between`; `is_positive`.
+Gives: `peak_gain`, `least_real`; `proves_gain`, `proves_positive`; `is_positive`.
 Guarantees: what is proved holds for all matrices within the radii. No grid of frequencies decides anything.
 Does not: take out rigid motions, or weigh what comes in.
 
-With G(z) = C (zI − A)⁻¹ B + D and He G = (G + G*)/2, both questions are of one kind: is there a storage
-xᵀP x, P ≻ 0, that no input fills faster than it is supplied?
+With G(z) = C (zI − A)⁻¹ B + D and He G = (G + G*)/2, both questions are one, as half the gain is the depth of
+the Hermitian part of [[0, G], [0, 0]]. Is there a storage xᵀP x, P ≻ 0, that no input fills faster than it is
+supplied?
 
     xᵀPx − x⁺ᵀPx⁺ + [x; r]ᵀ S [x; r] > 0        gain below γ: S(x, r) = γ²|r|² − |d|²
                                                 He G + W ≻ 0: S(x, r) = 2 rᵀ(d + W r)
@@ -15,7 +15,7 @@ xᵀP x, P ≻ 0, that no input fills faster than it is supplied?
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,9 @@ Matrix = NDArray[Any]
 
 # Levels tried on the way to the extreme: each step squares the distance, so some four are needed.
 LEVELS = 40
+
+# Eigenvalues nearest to the circle, at whose angles a response is looked at first: it is large there.
+FIRST = 8
 
 # How far above what is known a level is tried, relatively, and how near the axis, relatively, an eigenvalue
 # may be on it: two that meet there are off by the square root of their rounding.
@@ -50,28 +53,26 @@ def peak_gain(a: Floats, b: Floats, c: Floats, d: Floats) -> tuple[float, float]
 
     Notes
     -----
-    With z = (1 + s)/(1 − s) the unit circle becomes the imaginary axis, and the gain is γ at jω exactly where
-    the Hamiltonian matrix of γ has the eigenvalue jω (Boyd, Balakrishnan and Kabamba, 1989).
+    Of [[0, G], [0, 0]] the Hermitian part has the least eigenvalue −‖G‖₂/2.
     """
-    if not b.size or not c.size:
+    if not d.size:
         return 0.0, 0.0
-    values = np.linalg.eigvals(a)
-    if len(a) and np.abs(values).max() >= 1:
-        return np.inf, 0.0
-    a_c, b_c, c_c, d_c = _on_axis(a, b, c, d)
 
-    def gains(angles: Floats) -> Floats:
-        return np.asarray(np.linalg.svd(_response(a, b, c, d, angles), compute_uv=False).max(axis=1))
+    def least(a: Floats, b: Floats, angles: Floats) -> Floats:
+        gains = np.linalg.svd(_response(a, b, c, d, angles), compute_uv=False)[:, 0]
+        return np.asarray(-gains / 2)
 
-    def hamiltonian(best: float) -> Floats:
-        if not best:
-            return np.zeros((0, 0))
-        r = np.linalg.inv((best * (1 + ABOVE)) ** 2 * np.eye(b.shape[1]) - d_c.T @ d_c)
-        a_h = a_c + b_c @ r @ d_c.T @ c_c
-        lower = c_c.T @ (np.eye(len(c)) + d_c @ r @ d_c.T) @ c_c
-        return np.block([[a_h, b_c @ r @ b_c.T], [-lower, -a_h.T]])
-
-    return _highest(gains, hamiltonian, values)
+    # The other outputs and inputs are none.
+    p, m = d.shape
+    wide_b, wide_c, wide_d = (
+        np.pad(b, [(0, 0), (p, 0)]),
+        np.pad(c, [(0, m), (0, 0)]),
+        np.pad(d, [(0, m), (p, 0)]),
+    )
+    lowest, angle = _lowest(
+        a, wide_b, wide_c, wide_d, np.zeros((p + m, p + m)), lambda a, b, at: least(a, b[:, p:], at)
+    )
+    return -2 * lowest, angle
 
 
 def least_real(a: Floats, b: Floats, c: Floats, d: Floats, weight: Floats) -> tuple[float, float]:
@@ -85,41 +86,64 @@ def least_real(a: Floats, b: Floats, c: Floats, d: Floats, weight: Floats) -> tu
         The loop's matrices, as many inputs as outputs.
     weight
         W (m, m), symmetric.
+    """
+    if not weight.size:
+        return np.inf, 0.0
+
+    def least(a: Floats, b: Floats, angles: Floats) -> Floats:
+        response = _response(a, b, c, d, angles)
+        adjoint = np.swapaxes(response, -1, -2).conj()
+        return np.asarray(np.linalg.eigvalsh((response + adjoint) / 2 + weight)[:, 0])
+
+    return _lowest(a, b, c, d, weight, least)
+
+
+def _lowest(
+    a: Floats,
+    b: Floats,
+    c: Floats,
+    d: Floats,
+    weight: Floats,
+    least: Callable[[Floats, Floats, Floats], Floats],
+) -> tuple[float, float]:
+    """Return `least_real`, where of A and B at angles (k,) the least eigenvalues (k,) are given.
 
     Notes
     -----
     The least eigenvalue is s at θ exactly where the pencil of D + Dᵀ + 2 (W − s I) has the eigenvalue e^{jθ}.
-    On the axis it becomes a Hamiltonian matrix, whose point at infinity must not be the least: that is
-    θ = π, or θ = 0 of −A and −B.
+    With z = (1 + s)/(1 − s) that is a Hamiltonian matrix with an imaginary eigenvalue, whose point at
+    infinity must not be the least: θ = π, or θ = 0 of −A and −B. Between two frequencies at which the least
+    eigenvalue is a level just below all that are known it is lower: the lowest at their middles is the next
+    level (Bruinsma and Steinbuch, 1990).
     """
-    if not weight.size:
-        return np.inf, 0.0
-    if not b.size or not c.size:  # nothing is remembered: the same at every frequency
-        return float(np.linalg.eigvalsh((d + d.T) / 2 + weight)[0]), 0.0
     values = np.linalg.eigvals(a)
-    if len(a) and np.abs(values).max() >= 1:
+    if np.abs(values).max(initial=0.0) >= 1:
         return -np.inf, 0.0
-    still, fastest = (
-        float(_least(_response(a, b, c, d, np.array([angle])), weight)[0]) for angle in (0.0, np.pi)
-    )
+    still, fastest = map(float, least(a, b, np.array([0.0, np.pi])))
     turn = still > fastest
     turned = (-a, -b) if turn else (a, b)
     a_c, b_c, c_c, d_c = _on_axis(*turned, c, d)
     scale = max(float(np.abs(d_c + weight).max()), abs(still), abs(fastest))
 
-    def depths(angles: Floats) -> Floats:
-        return -_least(_response(*turned, c, d, angles), weight)
-
-    def hamiltonian(best: float) -> Floats:
+    best, where = -float(np.finfo(np.float64).max), 0.0
+    first = values[np.argsort(-np.abs(values))[:FIRST]]
+    angles = np.concatenate([[0.0, np.pi], np.abs(np.angle(-first if turn else first))])
+    for _ in range(LEVELS):
+        depths = -least(*turned, angles)
+        place = int(np.argmax(depths))
+        rises = depths[place] > best + ABOVE * abs(best)
+        if depths[place] > best:
+            best, where = float(depths[place]), float(angles[place])
         level = best + ABOVE * max(abs(best), scale)
-        if not level:  # nothing is given nor taken at any frequency looked at
-            return np.zeros((0, 0))
+        if not rises or not level:
+            break
         r = np.linalg.inv(d_c + d_c.T + 2 * weight + 2 * level * np.eye(len(weight)))
         a_h = a_c - b_c @ r @ c_c
-        return np.block([[a_h, -b_c @ r @ b_c.T], [c_c.T @ r @ c_c, -a_h.T]])
-
-    depth, angle = _highest(depths, hamiltonian, -values if turn else values)
-    return -depth, np.pi - angle if turn else angle
+        at = np.linalg.eigvals(np.block([[a_h, -b_c @ r @ b_c.T], [c_c.T @ r @ c_c, -a_h.T]]))
+        near = np.sort(at.imag[(np.abs(at.real) <= ON_AXIS * np.abs(at)) & (at.imag >= 0)])
+        near = np.concatenate([[0.0], near])
+        angles = 2 * np.arctan(np.concatenate([near, (near[1:] + near[:-1]) / 2]))
+    return -best, np.pi - where if turn else where
 
 
 def _on_axis(a: Floats, b: Floats, c: Floats, d: Floats) -> tuple[Floats, Floats, Floats, Floats]:
@@ -136,40 +160,6 @@ def _response(a: Floats, b: Floats, c: Floats, d: Floats, angles: Floats) -> NDA
     return np.asarray(c @ inner + d)
 
 
-def _least(response: NDArray[np.complex128], weight: Floats) -> Floats:
-    """Return the least eigenvalue of He G + W for many G (k, m, m)."""
-    adjoint = np.swapaxes(response, -1, -2).conj()
-    return np.asarray(np.linalg.eigvalsh((response + adjoint) / 2 + weight)[:, 0])
-
-
-def _highest(
-    heights: Callable[[Floats], Floats],
-    hamiltonian: Callable[[float], Floats],
-    eigenvalues: NDArray[Any],
-) -> tuple[float, float]:
-    """Return the largest height over θ in [0, π], and where it is.
-
-    Notes
-    -----
-    At a level just above the largest that is known, the imaginary eigenvalues of the Hamiltonian matrix are
-    the frequencies where the height is the level. Between two of them it is higher: the highest at their
-    middles is the next level (Bruinsma and Steinbuch, 1990).
-    """
-    best, where = -np.inf, 0.0
-    angles = np.concatenate([[0.0, np.pi], np.abs(np.angle(eigenvalues))])
-    for _ in range(LEVELS):
-        found = heights(angles)
-        place = int(np.argmax(found))
-        if found[place] <= best + ABOVE * abs(best):
-            return max((float(found[place]), float(angles[place])), (best, where))
-        best, where = float(found[place]), float(angles[place])
-        at = np.linalg.eigvals(hamiltonian(best))
-        near = np.sort(at.imag[(np.abs(at.real) <= ON_AXIS * np.abs(at)) & (at.imag >= 0)])
-        near = np.concatenate([[0.0], near])
-        angles = 2 * np.arctan(np.concatenate([near, (near[1:] + near[:-1]) / 2]))
-    return best, where
-
-
 def proves_gain(a: Matrix, b: Matrix, c: Matrix, d: Matrix, level: float) -> bool:
     """Say whether a loop is proved stable and its gain proved smaller than a level.
 
@@ -180,12 +170,12 @@ def proves_gain(a: Matrix, b: Matrix, c: Matrix, d: Matrix, level: float) -> boo
     level
         More than the gain.
     """
-    n, m = a.shape[-1], b.shape[-1]
+    n, m = b.shape[-2:]
     given = np.zeros((2, n + m, n + m))
     given[0, n:, n:] = level**2 * (1 - 4 * UNIT) * np.eye(m)
     output = np.concatenate([c, d], axis=-1)
     lost = RADII.multiply(np.swapaxes(output, -1, -2), output)
-    return dissipates(a, b, RADII.subtract(given, lost))
+    return _dissipates(a, b, RADII.subtract(given, lost), SPARED)
 
 
 def proves_positive(
@@ -198,49 +188,18 @@ def proves_positive(
     a, b, c, d, weight
         The loop's matrices and W (2, …) with their radii.
     spared
-        As for `dissipates`.
+        Parts of the storage that are left over for rounding, one after the other: less than the supply is
+        above what is lost, relatively.
+
     """
-    return dissipates(a, b, _popov(a, b, c, RADII.add(d, weight)), spared=spared)
-
-
-def proves_positive_between(
-    middle: Sequence[Matrix], corners: Sequence[Sequence[Matrix]], *, spared: Sequence[float] = SPARED
-) -> bool:
-    """Say whether `proves_positive` for all loops whose matrices are mixtures of those at corners.
-
-    Parameters
-    ----------
-    middle, corners
-        A, B, C and D + W (2, …) with their radii, of a loop about the middle and at each corner.
-    spared
-        As for `dissipates`.
-
-    Notes
-    -----
-    Of one storage P ≻ 0 what is supplied less what is stored is concave in (A, B, C, D): it is least at a
-    corner.
-    """
-    first, *rest = ((a, b, _popov(a, b, c, e)) for a, b, c, e in (middle, *corners))
-    return dissipates(*first, spared=spared, others=rest)
-
-
-def _popov(a: Matrix, b: Matrix, c: Matrix, e: Matrix) -> Matrix:
-    """Return the supply 2 rᵀ (C x + E r) (2, n + m, n + m) with its radii."""
-    n, m = a.shape[-1], b.shape[-1]
-    supply = np.zeros((2, n + m, n + m))
+    n, m = b.shape[-2:]
+    supply, whole = np.zeros((2, n + m, n + m)), RADII.add(d, weight)
     supply[:, n:, :n], supply[:, :n, n:] = c, np.swapaxes(c, -1, -2)
-    supply[:, n:, n:] = RADII.add(e, np.swapaxes(e, -1, -2))
-    return supply
+    supply[:, n:, n:] = RADII.add(whole, np.swapaxes(whole, -1, -2))
+    return _dissipates(a, b, supply, spared)
 
 
-def dissipates(
-    a: Matrix,
-    b: Matrix,
-    supply: Matrix,
-    *,
-    spared: Sequence[float] = SPARED,
-    others: Sequence[tuple[Matrix, Matrix, Matrix]] = (),
-) -> bool:
+def _dissipates(a: Matrix, b: Matrix, supply: Matrix, spared: Sequence[float]) -> bool:
     """Say whether a loop is proved stable and proved to store less than it is supplied, whatever comes in.
 
     Parameters
@@ -249,12 +208,9 @@ def dissipates(
         The loop's matrices (2, n, n) and (2, n, m) with their radii.
     supply
         S (2, n + m, n + m), symmetric, with its radii; its first block must not be above 0 (nothing is
-        supplied to a loop that is left alone), or nothing is said of stability.
+        supplied to a loop that is left alone).
     spared
-        Parts of the storage that are left over for rounding, one after the other: less than the supply is
-        above what is lost, relatively.
-    others
-        Other loops with their supply that the same storage is to serve.
+        As for `proves_positive`.
 
     Notes
     -----
@@ -263,28 +219,14 @@ def dissipates(
     if not all(np.isfinite(one).all() for one in (a, b, supply)):
         return False
     plain = value_of(a), value_of(b), value_of(supply)
-    loops = ((a, b, supply), *others)
-    return any(all(_serves(*one, p) for one in loops) for p in storages(*plain, spared))
-
-
-def storages(a: Floats, b: Floats, supply: Floats, spared: Sequence[float]) -> Iterator[Floats]:
-    """Yield storages P (n, n) that prove what `dissipates` does, but for rounding, which is to be checked.
-
-    Parameters
-    ----------
-    a, b, supply, spared
-        As for `dissipates`, without radii.
-    """
-    first = _storage(a, b, supply, np.zeros(a.shape[-1]))
+    first = _storage(*plain, np.zeros(len(plain[0])))
     if first is None:
-        return
+        return False
     # What nothing comes of needs some storage, too, for that of all to be positive.
     sizes = np.diag(first)
     sizes = np.maximum(sizes, UNSEEN * sizes.max(initial=0.0) or 1.0)
-    for part in spared:
-        p = _storage(a, b, supply, part * sizes)
-        if p is not None:
-            yield (p + p.T) / 2
+    found = (_storage(*plain, part * sizes) for part in spared)
+    return any(_serves(a, b, supply, (p + p.T) / 2) for p in found if p is not None)
 
 
 def _storage(a: Floats, b: Floats, supply: Floats, more: Floats) -> Floats | None:

@@ -42,6 +42,7 @@ Matrix = NDArray[Any]  # float64 or complex128
 STABLE = "stable"
 STABLE_TRANSLATING = "stable up to a common translation"
 STABLE_TURNING = "stable up to a common rotation"
+STABLE_MOVING = "stable up to a common translation and rotation"
 DRIFTS = "drifts"
 UNSTABLE = "unstable"
 UNDECIDED = "undecided: |ρ−1| below the error bound"
@@ -274,7 +275,7 @@ def judge(inside: Sequence[bool | None], rigid: int, drifts: int) -> tuple[str, 
 def up_to(translations: int, rotations: int = 0) -> str:
     """Return the verdict of what is stable up to so many motions."""
     if translations:
-        return STABLE_TRANSLATING
+        return STABLE_MOVING if rotations else STABLE_TRANSLATING
     return STABLE_TURNING if rotations else STABLE
 
 

@@ -31,6 +31,7 @@ from apc.explore.figures import FOCUS, FeelFigure, MotionFigure, RegionFigure, R
 from apc.explore.sections import Task, Told
 from apc.explore.server import TOKEN
 from apc.explore.sliders import (
+    PEOPLE,
     Slider,
     axes_of,
     is_number,
@@ -250,7 +251,8 @@ class Page:
         if any(link.channel is not None for link in self.system.links):
             controls.append(self.meant)
         controls.append(row(*self._buttons(), sizing_mode="stretch_width"))
-        for kind in dict.fromkeys(one.kind for one in self.sliders):
+        kinds = dict.fromkeys(one.kind for one in self.sliders)
+        for kind in sorted(kinds, key=lambda kind: kind != PEOPLE):  # how many there are comes first
             heading = Div(text=f"<h2 style='font-size:15px;margin:10px 0 0'>{kind.capitalize()}</h2>")
             own = [handle for handle, one in zip(self.handles, self.sliders, strict=True) if one.kind == kind]
             controls += [heading, *own]

@@ -18,6 +18,7 @@ from apc.compiler.files import write_texts
 from apc.exports.c_text import driver, header, source
 from apc.exports.fmu import Unit, unit_of
 from apc.exports.peer_step import Peer, peer_of, refused, sites_of
+from apc.exports.pushed import pushed
 from apc.exports.scene_text import c_scene, one_peer
 from apc.finite_equations import finite_equations
 from apc.loop.peer import number_of
@@ -67,7 +68,7 @@ def peer_code(system: CompiledSystem, *, peer: str = "", device: str = "", metho
 
 def scene_unit(system: CompiledSystem, *, peer: str = "", method: str = "") -> Unit:
     """Make an FMU of a scene, or of one peer of it; parameters, and what is raised, as for `peer_code`."""
-    how, plan = _plan(system, method)
+    how, plan = _plan(pushed(system), method)
     scene = one_peer(plan, number_of(plan.exchange, peer, "--peer"), how) if peer else c_scene(plan, how)
     return unit_of(system, scene, peer=peer)
 

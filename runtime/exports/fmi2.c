@@ -1,6 +1,6 @@
 /* How a simulator calls it: FMI 2.0 for co-simulation (fmi-standard.org).
 
-Before this text stand `model`, `begin`, `run`, `real`, `flag`, `given`, QUANTA and SECONDS (a quantum is SECONDS/QUANTA
+Before this text stand `model`, `begin`, `run`, `real`, `flag`, `given`, `moving`, QUANTA and SECONDS (a quantum is SECONDS/QUANTA
 s), and GUID. An instant is over when a step that begins with it has begun: what is heard at it can be set
 until then. A time between two instants shows what was last.
 */
@@ -38,6 +38,7 @@ typedef struct {
 typedef struct {
   model model;
   double begun, time; /* in s: of the experiment's start, and now */
+  int running; /* once the scene has begun, states can't be set */
   char name[256];
   const fmi2CallbackFunctions *functions;
 } Instance;
@@ -102,6 +103,7 @@ FMI fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
 
 FMI fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
   Instance *own = c;
+  own->running = 1;
   run(&own->model, 0);
   return fmi2OK;
 }
@@ -115,6 +117,7 @@ FMI fmi2Status fmi2Reset(fmi2Component c) {
   Instance *own = c;
   begin(&own->model);
   own->begun = own->time = 0;
+  own->running = 0;
   return fmi2OK;
 }
 
@@ -131,7 +134,8 @@ FMI fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference which[], si
 FMI fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference which[], size_t count, const fmi2Real values[]) {
   Instance *own = c;
   for (size_t i = 0; i < count; i++) {
-    double *value = given(which[i]) ? real(&own->model, which[i]) : 0;
+    const int settable = given(which[i]) || (!own->running && moving(which[i]));
+    double *value = settable ? real(&own->model, which[i]) : 0;
     if (!value) return complain(own, "no number that can be set has this value reference");
     *value = values[i];
   }

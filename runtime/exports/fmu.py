@@ -98,6 +98,7 @@ static {type_} *{what}(model *m, unsigned which) {{
 }}
 
 """
+    states = "".join(f"    case {k}: return 1;\n" for k, one in numbers if one.moving)
     engine = Path(__file__).with_name("fmi2.c").read_text(encoding="utf-8")
     return f"""\
 {scene_source(scene)}
@@ -105,6 +106,13 @@ static {type_} *{what}(model *m, unsigned which) {{
 static int given(unsigned which) {{
   (void)which;
   return {f"which < {inputs}u" if inputs else "0"};
+}}
+
+/* Whether it is a state, which can be set until the scene begins. */
+static int moving(unsigned which) {{
+  switch (which) {{
+{states}    default: return 0;
+  }}
 }}
 
 #define QUANTA {float(scene.quantum.denominator)!r}
@@ -141,8 +149,10 @@ def _description(unit: Unit) -> str:
         elif own.given:
             xml.SubElement(row, "Real", start=repr(own.start), unit=own.unit)
         else:
-            xml.SubElement(row, "Real", unit=own.unit)
-            for group in ("Outputs", "InitialUnknowns"):
+            start = {"start": repr(own.start)} if own.moving else dict[str, str]()
+            row.attrib |= {"initial": "exact"} if own.moving else {}
+            xml.SubElement(row, "Real", {"unit": own.unit} | start)
+            for group in ("Outputs",) if own.moving else ("Outputs", "InitialUnknowns"):
                 xml.SubElement(part[group], "Unknown", index=str(place + 1))
     xml.indent(root)
     return xml.tostring(root, encoding="unicode", xml_declaration=True) + "\n"

@@ -32,6 +32,7 @@ from apc.exports.peer_step import (
     refused,
     sites_of,
 )
+from apc.exports.pushed import FORCE_ON
 from apc.exports.words import identifier, unique
 from apc.network.channel import luck_key
 from apc.network.timetable import Luck, luck_of
@@ -46,7 +47,8 @@ MOST_WAYS = 20_000  # from peer to peer in one text: each is a number of a table
 class Variable:
     """What can be looked at: its name as `simulate` has it, unit, and the member of `model` that holds it.
 
-    `given` says that it comes from outside, and is `start` until something does; `flag` that it is 0 or 1.
+    `given` says that it comes from outside, and is `start` until something does; `flag` that it is 0 or 1;
+    `moving` that it is a state, which is `start` as the scene begins, if nothing else is set.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Variable:
     member: str
     given: bool = False
     flag: bool = False
+    moving: bool = False
     start: float = 0.0
 
 
@@ -115,10 +118,21 @@ def one_peer(plan: Plan, number: int, method: Method) -> CScene:
         for line in peer.sending
         for entry in line.packet
     ]
-    variables += [
-        Variable(signal.name, signal.unit, f"peer0[0].{memory(peer, signal)}") for signal in peer.signals
-    ]
+    variables += _looked_at(peer, "peer0[0]", "")
+    variables.sort(key=lambda one: not one.given)
     return CScene(peer.identifier, peer.schedule.quantum, (peer,), ((0, 0),), (), tuple(variables))
+
+
+def _looked_at(peer: Peer, member: str, prefix: str) -> list[Variable]:
+    """Return what can be looked at of a peer that a member of `model` is."""
+    found = []
+    for signal in peer.signals:
+        moving, given = signal.role == "state", signal.name.startswith(FORCE_ON)
+        start = peer.start[signal.place[0]] if moving else 0.0
+        own = f"{member}.{memory(peer, signal)}"
+        name = f"{FORCE_ON}{prefix}{signal.name.removeprefix(FORCE_ON)}" if given else prefix + signal.name
+        found.append(Variable(name, signal.unit, own, given=given, moving=moving, start=start))
+    return found
 
 
 def c_scene(plan: Plan, method: Method) -> CScene:
@@ -146,14 +160,11 @@ def c_scene(plan: Plan, method: Method) -> CScene:
         placed[one] += 1
     quantum = codes[0].schedule.quantum
     variables = [
-        Variable(
-            f"{exchange.peer_name(k)}.{signal.name}",
-            signal.unit,
-            f"peer{site}[{place}].{memory(codes[site], signal)}",
-        )
+        one
         for k, (site, place) in enumerate(peers)
-        for signal in codes[site].signals
+        for one in _looked_at(codes[site], f"peer{site}[{place}]", f"{exchange.peer_name(k)}.")
     ]
+    variables.sort(key=lambda one: not one.given)
     links = _links(plan, quantum)
     return CScene(identifier(system.name), quantum, codes, tuple(peers), links, tuple(variables))
 

@@ -10,7 +10,7 @@ Does not: read or change values.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -67,6 +67,13 @@ class Range:
     unit: str
     low: Fraction
     high: Fraction
+
+
+def given_ranges(system: CompiledSystem, others: Collection[Range] = ()) -> list[Range]:
+    """Return the ranges that a topology gives in the place of a number, but those of `others`, and these."""
+    taken = {one.free.name for one in others}
+    axes = (axis for axis in system.within if axis.parameter not in taken)
+    return [*(Range(Free(axis.parameter), "s", axis.low, axis.high) for axis in axes), *others]
 
 
 # Numbers of a link that may be left out, and what they are then.

@@ -118,6 +118,7 @@ def apply(system: CompiledSystem, overrides: Sequence[Override]) -> CompiledSyst
         parameters=tuple(_renewed(one, common, everywhere) for one in system.parameters),
         timings=tuple(_renewed(one, common, everywhere) for one in system.timings),
         groups=tuple(groups),
+        within=tuple(axis for axis in system.within if axis.parameter not in everywhere),
     )
     if counts:
         found = recounted(found, counts, OVERRIDE)

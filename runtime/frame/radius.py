@@ -1,6 +1,6 @@
 """What the kernel computes with: floats, or floats that carry their radius.
 
-Takes: matrices of real floats, and bounds on what their entries are off by.
+Takes: matrices of floats, real or complex, and bounds on what their entries are off by.
 Gives: `Arithmetic`, `FLOATS`, `RADII`; `with_radius`, `rounded`, `value_of`, `radius_of`; `solve`;
 `common_shape`.
 Guarantees: a sum or product in `RADII` holds that of all matrices within the radii of its operands, its own
@@ -83,13 +83,16 @@ def radius_of(matrix: Matrix) -> Matrix:
 
 def _multiply(left: Matrix, right: Matrix) -> Matrix:
     """Return the product of matrices with their radii; NaN or infinite where a bound is."""
-    a, b, off_a, off_b = value_of(left), value_of(right), radius_of(left), radius_of(right)
+    a, b, off_a, off_b = value_of(left), value_of(right), radius_of(left).real, radius_of(right).real
     terms = a.shape[-1]
     if terms > FEW:  # a term is none where its factor is exactly 0
         terms = int(np.count_nonzero(left.any(axis=-3), axis=-1).max(initial=0))
+    kind = np.complex128 if "c" in (left.dtype.kind, right.dtype.kind) else np.float64
+    if kind is np.complex128:  # of either part twice as many products, and √2 times as far together
+        terms = 3 * terms + 2
     charge = (terms + 2) * UNIT / (1 - (terms + 2) * UNIT)
     many = common_shape(a.shape[:-2], b.shape[:-2])
-    found = np.empty((*many, 2, a.shape[-2], b.shape[-1]), dtype=np.float64)
+    found = np.empty((*many, 2, a.shape[-2], b.shape[-1]), dtype=kind)
     np.matmul(a, b, out=value_of(found))
     # Each radius is as much larger as adding it up may have rounded it down. Of many matrices writing and
     # fetching their numbers takes longer than computing them: nothing is written twice.
@@ -161,7 +164,7 @@ def solve(matrix: Matrix, right: Matrix, numbers: Arithmetic | None = None) -> M
 def _most(matrix: Matrix) -> Matrix:
     """Return the largest magnitudes of entries (…, n, m) within their radii, wherever in a cell."""
     sides = np.abs(matrix[..., 2:, :, :]).sum(axis=-3)
-    found = np.abs(value_of(matrix)) + radius_of(matrix) + sides
+    found = np.abs(value_of(matrix)) + radius_of(matrix).real + sides
     return np.asarray(found * (1 + matrix.shape[-3] * UNIT))
 
 

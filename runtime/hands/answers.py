@@ -1,8 +1,7 @@
 """How peers answer a push at one of them, put together from the answers of modes.
 
 Takes: a `CompiledSystem` with what `analysis.prepare` made of it, and two devices.
-Gives: `AbstractResponses`; `many_differ`; `Modes`, `open_modes`; `Responses`, `Weights`; `held_device`,
-`held_names`, `check_kicks`, `copy_of`, `nothing`.
+Gives: `Responses`, `responses`; `Weights`; `held_names`.
 Guarantees: an answer is exact for the sampled, held and sent signals of the scene, with a bound on its
 rounding.
 Does not: ask whether the scene is stable.
@@ -14,32 +13,35 @@ mean, a push at one of them is 1/n of the first and 1 − 1/n of the second.
 from __future__ import annotations
 
 import functools
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Prepared, lifted_groups, timed
-from apc.analysis.plan import not_populations
+from apc.analysis.analysis import Prepared, lifted_groups
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.language.vectors import whole_and_index
 from apc.eigen.closing import Loop
 from apc.eigen.modes import arrange, dense_loop
-from apc.eigen.peers import MOST_STATES, PeerGroup, more_differ, states_of, used_ways
+from apc.eigen.peers import MOST_STATES, PeerGroup
 from apc.eigen.rigid import find_rigid_modes
 from apc.frame.devices import OWN_MASS, Device, coupled_directly, find_device, find_devices
 from apc.frame.discretize import UNIT
-from apc.frame.exchange import Exchange, build_exchange
+from apc.frame.exchange import Exchange
 from apc.frame.parameters import resolve
-from apc.frame.schedule import Propagate
+from apc.frame.radius import RADII, with_radius
 from apc.hands.asked import Port
-from apc.hands.response import Carried, Pushed, add, open_site, pushed_loop, scaled, spectra
+from apc.hands.response import Pushed, open_site, pushed_loop, spectra
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+Matrix = NDArray[Any]
+
+# Numbers (k,) with what they may be off by.
+Carried = tuple[Complex, Floats]
 
 # Turns a frame, so near a whole number of which a scene that may rest anywhere is asked around a frequency,
 # how far around, in 1/s, and at how many points.
@@ -52,49 +54,21 @@ MOST_TOGETHER = 2000
 MOST_KICKS = 4000
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Modes:
-    """A scene as modes of which any device may be pushed: that of all classes first, then each class apart.
-
-    `plain` are the modes of the scene as it is. A class is a site of the first: `apart` gives its own mode,
-    `members` how many peers it stands for, `class_of` the class of a peer. `device` is what is pushed,
-    `other` what else is looked at.
-    """
-
-    loops: tuple[Pushed, ...]
-    plain: tuple[Loop, ...]
-    apart: dict[int, int]
-    class_of: dict[int, int]
-    members: tuple[int, ...]
-    device: Device
-    other: Device
-
-
-def many_differ(system: CompiledSystem, prepared: Prepared) -> bool:
-    """Say whether more peers differ than one system holds, and all are linear and hear all others.
+def responses(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) -> Responses:
+    """Return the answers to a push of one device, at it and at another.
 
     Parameters
     ----------
     system, prepared
         The compiled scene, and what `analysis.prepare` made of it.
+    port, other
+        The two devices.
+
+    Raises
+    ------
+    ApcError
+        E931 a peer without a device; E933 a scene too large.
     """
-    numbers = resolve(system)
-    prepared = timed(system, prepared, numbers)
-    exchange = build_exchange(system, numbers.timings)
-    ways = used_ways(prepared.schedules)
-    if not_populations(system, prepared.jacobians) or not all(exchange.is_complete(one.link) for one in ways):
-        return False
-    largest = 1
-    for group, schedule in zip(system.groups, prepared.schedules, strict=True):
-        kind = system.kinds[group.kind]
-        each = 2 * len(kind.states) + 1 + len(kind.holds)  # what is kicked and read of an interval
-        intervals = sum(isinstance(event, Propagate) for event in schedule.events)
-        largest = max(largest, states_of(schedule, prepared.jacobians[group.kind]) + each * intervals)
-    return more_differ(system, prepared.jacobians, numbers, exchange, max(1, MOST_TOGETHER // largest))
-
-
-def open_modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) -> tuple[Modes, Exchange]:
-    """Open all peers of a scene, and put them together to modes."""
     groups, exchange = lifted_groups(system, prepared=prepared)
     unit_of = {one.name: one.unit for one in system.parameters}
     direct = coupled_directly(system.kinds)
@@ -106,11 +80,11 @@ def open_modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Po
                 continue
             along = port.peer in group.peers or whole_and_index(port.part)[1]
             named = one.part or (port.part if along else "")
-            held[one] = device = held_device(system, prepared, group, named, unit_of)
+            held[one] = device = _held_device(system, prepared, group, named, unit_of)
         if device is None:
             found = find_device(group.jacobians, group.parameters, unit_of, group.listening, direct=direct)
             device = found if isinstance(found, Device) else None
-        check_kicks(system, group)
+        _check_kicks(system, group)
         own, site = open_site(group, device)
         opened.append(own)
         sites[id(own.schedule)] = site
@@ -120,45 +94,30 @@ def open_modes(system: CompiledSystem, prepared: Prepared, port: Port, other: Po
         what = f"{len(common.sites):,} peers that differ have {states:,} states and readings in a frame"
         hint = f"fewer peers that differ: {MOST_TOGETHER:,} at most"
         raise ApcError(Mistake("E933", Place(system.origin.topology), f"apc feel: {what}", hint=hint))
-    class_of = {
-        peer: place
-        for place, site in enumerate(common.sites)
-        for peer in (port.peer, other.peer)
-        if peer in site.peers
-    }
-    counts = tuple(site.count if common.name == "common" else 1 for site in common.sites)
-    loops = tuple(
-        pushed_loop(loop, sites, counts if number == 0 else (1,)) for number, loop in enumerate(wide)
+    here, there = (
+        next(place for place, site in enumerate(common.sites) if one.peer in site.peers)
+        for one in (port, other)
     )
-    apart = {}
-    for number, loop in enumerate(wide[1:], 1):
-        for place, alike in enumerate(common.sites):
-            if loop.sites[0].name == alike.name:
-                apart[place] = number
-    return Modes(loops, plain, apart, class_of, counts, held[port], held[other]), exchange
+    name = common.sites[here].name
+    apart = [number for number, loop in enumerate(wide) if number and loop.sites[0].name == name]
+    return Responses(
+        exchange=exchange,
+        device=held[port],
+        other=held[other],
+        loops=tuple(pushed_loop(loop, sites) for loop in wide),
+        plain=plain,
+        members=tuple(site.count if common.name == "common" else 1 for site in common.sites),
+        own=here,
+        to=there,
+        alone=apart[0] if apart else None,
+        same=port.peer == other.peer,
+    )
 
 
-def held_device(
+def _held_device(
     system: CompiledSystem, prepared: Prepared, group: PeerGroup, part: str, unit_of: Mapping[str, str]
 ) -> Device:
-    """Return the device of a group that a hand holds, or refuse it.
-
-    Parameters
-    ----------
-    system, prepared
-        The compiled scene, and what `analysis.prepare` made of it.
-    group
-        The group, lifted.
-    part
-        What is held of its peers; the only device there is, if not given.
-    unit_of
-        Units of the parameters.
-
-    Raises
-    ------
-    ApcError
-        E931 no device, or none that can be told.
-    """
+    """Return the device of a group that a hand holds, the only one if no part is named; or refuse it."""
     direct = coupled_directly(system.kinds)
     device = find_device(
         group.jacobians, group.parameters, unit_of, group.listening, part=part, direct=direct
@@ -186,7 +145,7 @@ def held_names(system: CompiledSystem, prepared: Prepared) -> list[str]:
     ]
 
 
-def check_kicks(system: CompiledSystem, group: PeerGroup) -> None:
+def _check_kicks(system: CompiledSystem, group: PeerGroup) -> None:
     """Refuse a peer of too many events and states in a frame: ApcError E933."""
     kicks = len(group.schedule.events) * len(group.site.a)
     if kicks > MOST_KICKS:
@@ -214,34 +173,63 @@ def _by_classes(common: Loop, apart: Sequence[Loop]) -> bool:
     return all(len(loop.sites) == 1 and loop.multiplicity == many.get(loop.sites[0].name) for loop in apart)
 
 
-@dataclass(frozen=True, slots=True)
-class Weights:
-    """What a quantity of the pushed peer is over (site, state): of classes' means, and of its own apart."""
-
-    common: dict[tuple[int, int], float]
-    apart: dict[tuple[int, int], float]
+# What a quantity of a peer is over (site, state): of classes' means, and of how it differs from its own's.
+Weights = tuple[Mapping[tuple[int, int], float], Mapping[tuple[int, int], float]]
 
 
-class AbstractResponses(ABC):
+@dataclass(frozen=True, eq=False)
+class Responses:
     """The answers to a push of one peer's `device`: its own, and what of it arrives at the `other` device.
 
-    `copy` is what of the peer others are told of, "" if nothing; `exchange` are the links, `frame` is in s;
-    `drifting` says that the scene may rest anywhere.
+    They are put together from those of modes: `loops`, that of all classes first, then each class apart;
+    `plain` are the same of the scene as it is. A class is a site of the first, of which `members` says how
+    many peers it stands for; `own` is that of the pushed peer, `alone` its mode apart, if there is one, `to`
+    that of the other, `same` whether both are one peer. `exchange` are the links.
     """
 
     exchange: Exchange
     device: Device
     other: Device
-    copy: str
-    frame: float
-    drifting: bool
+    loops: tuple[Pushed, ...]
+    plain: tuple[Loop, ...]
+    members: tuple[int, ...]
+    own: int
+    to: int
+    alone: int | None
+    same: bool
 
-    @abstractmethod
-    def at(self, s: Complex, aliases: Sequence[int] = (0,), *, apart: bool = True) -> list[Carried]:
-        """Return the velocity here at each alias, the velocity there, and the copy's error (k,).
+    @functools.cached_property
+    def copies(self) -> list[tuple[str, int] | None]:
+        """What a peer of each class tells others the position of, and which state that is."""
+        return [_copy_of(site.group, self.device) for site in self.loops[0].sites]
 
-        The last is 0 unless it is asked how far copies are `apart`.
-        """
+    @property
+    def copy(self) -> str:
+        """What of the pushed peer others are told of, "" if nothing."""
+        own = self.copies[self.own]
+        return own[0] if own else ""
+
+    @property
+    def frame(self) -> float:
+        """How long a frame is, in s."""
+        return float(self.loops[0].frame)
+
+    @property
+    def parts(self) -> list[tuple[int, int, float]]:
+        """The modes of the pushed peer: which, at which site, and how much of a push at it each gets."""
+        n = self.members[self.own]
+        common = (0, self.own, 1 / n)
+        return [common] if self.alone is None else [common, (self.alone, 0, 1 - 1 / n)]
+
+    @functools.cached_property
+    def bases(self) -> tuple[Floats, ...]:
+        """The rigid motions of each mode."""
+        return tuple(find_rigid_modes(loop).basis for loop in self.plain)
+
+    @functools.cached_property
+    def drifting(self) -> bool:
+        """Whether the scene may rest anywhere."""
+        return any(basis.size for basis in self.bases)
 
     def steady(self, s: Complex, aliases: Sequence[int]) -> list[Carried]:
         """Return the same on the imaginary axis, at multiples of the frame rate too.
@@ -255,7 +243,7 @@ class AbstractResponses(ABC):
         turns = s.imag * self.frame / (2 * np.pi)
         near = (np.abs(turns - np.round(turns)) < NEAR) & (turns > 0.5)
         near = near & self.drifting if near.any() else near
-        found = [nothing(s) for _ in range(len(aliases) + 2)]
+        found = [(np.zeros(len(s), np.complex128), np.zeros(len(s))) for _ in range(len(aliases) + 2)]
         if not near.all():
             for (value, off), (own, doubt) in zip(found, self.at(s[~near], aliases), strict=True):
                 value[~near], off[~near] = own, doubt
@@ -269,104 +257,57 @@ class AbstractResponses(ABC):
                 off[place] = abs(own[:AROUND].mean() - value[place]) + pole + doubt.max()
         return found
 
-
-class Responses(AbstractResponses):
-    """The answers to a push of one peer, put together from those of modes."""
-
-    def __init__(self, modes: Modes, exchange: Exchange, peer: int, other: int) -> None:
-        self.modes, self.exchange = modes, exchange
-        self.peer, self.across = peer, other
-        self.own, self.to = modes.class_of[peer], modes.class_of[other]
-        self.device, self.other = modes.device, modes.other
-        self.copies = [copy_of(site.group, modes.device) for site in modes.loops[0].sites]
-        named = self.copies[self.own]
-        self.copy = named[0] if named else ""
-        self.frame = float(modes.loops[0].frame)
-
-    @functools.cached_property
-    def bases(self) -> tuple[Floats, ...]:
-        """The rigid motions of each mode."""
-        return tuple(find_rigid_modes(loop).basis for loop in self.modes.plain)
-
-    @functools.cached_property
-    def drifting(self) -> bool:  # type: ignore[override]  # asked for only at multiples of the frame rate
-        """Whether the scene may rest anywhere."""
-        return any(basis.size for basis in self.bases)
-
     def at(self, s: Complex, aliases: Sequence[int] = (0,), *, apart: bool = True) -> list[Carried]:
-        """Return the velocity here at each alias, the velocity there, and the copy's error (k,)."""
-        common = self.modes.loops[0]
-        n = self.modes.members[self.own]
-        copies = [(place, one[1], 0) for place, one in enumerate(self.copies) if one and apart]
-        here, there, own = self.device.velocity, self.other.velocity, self.copies[self.own]
-        wanted = [(self.own, here, alias) for alias in aliases]
-        wanted = [*wanted, (self.to, there, 0), *copies]
-        together = [scaled(one, 1 / n) for one in spectra(common, self.own, wanted, s)]
-        velocity, (across, *rest) = together[: len(aliases)], together[len(aliases) :]
-        parts = dict(zip([place for place, _, _ in copies], rest, strict=True))
-        alone: list[Carried] = []
-        if n > 1:
-            loop = self.modes.loops[self.modes.apart[self.own]]
-            rows = [(0, here, alias) for alias in aliases]
-            rows += [(0, there, 0)] if self.own == self.to else []
-            rows += [(0, own[1], 0)] if own and apart else []
-            alone = spectra(loop, 0, rows, s)
-            velocity = [add(a, scaled(b, 1 - 1 / n)) for a, b in zip(velocity, alone, strict=False)]
-            if self.own == self.to:
-                share = 1 - 1 / n if self.peer == self.across else -1 / n
-                across = add(across, scaled(alone[len(aliases)], share))
-        error = self._error(parts, alone[-1] if own and n > 1 else None, s) if apart else nothing(s)
-        return [*velocity, across, error]
+        """Return the velocity here at each alias, the velocity there, and the copy's error (k,).
+
+        The last is 0 unless it is asked how far copies are `apart`.
+        """
+        asked = [(self.velocity, alias) for alias in aliases]
+        asked += [(self.arriving, 0), (self.error if apart else ({}, {}), 0)]
+        found: list[Matrix] = [np.zeros((len(s), 2, 1, 1), np.complex128) for _ in asked]
+        for part, (number, site, share) in enumerate(self.parts):
+            rows = [
+                (of, (*place, alias), weight)
+                for of, (weights, alias) in enumerate(asked)
+                for place, weight in weights[part].items()
+            ]
+            moved = spectra(self.loops[number], site, [row for _, row, _ in rows], s)
+            for (of, _, weight), one in zip(rows, moved, strict=True):
+                by = np.array([[weight * share]])
+                found[of] = RADII.add(found[of], RADII.multiply(one, with_radius(by, 8 * UNIT * np.abs(by))))
+        return [(one[:, 0, 0, 0], one[:, 1, 0, 0].real) for one in found]
 
     @property
-    def velocity_weights(self) -> Weights:
-        """What the velocity of the pushed peer is, in the modes."""
-        one = {(self.own, self.device.velocity): 1.0}
-        return Weights(one, {(0, self.device.velocity): 1.0})
+    def velocity(self) -> Weights:
+        """What the velocity of the pushed device is."""
+        return {(self.own, self.device.velocity): 1.0}, {(0, self.device.velocity): 1.0}
 
     @property
-    def error_weights(self) -> Weights | None:
-        """What the error of the pushed peer's copy is, in the modes; None without any."""
-        others = self._others()
-        total = sum(others.values())
+    def arriving(self) -> Weights:
+        """What the velocity of the other device is: peers of a class differ from their mean by 0 in all."""
+        share = 1.0 if self.same else 1 / (1 - self.members[self.own]) if self.own == self.to else 0.0
+        apart = {(0, self.other.velocity): share} if share else {}
+        return {(self.to, self.other.velocity): 1.0}, apart
+
+    @property
+    def error(self) -> Weights:
+        """How far the pushed peer's copy is from the mean of all others' of its name; nothing if none."""
         own = self.copies[self.own]
-        if own is None or not total:
-            return None
-        common = {(self.own, own[1]): 1.0}
-        for place, many in others.items():
-            copy = self.copies[place]
-            assert copy is not None
-            common[place, copy[1]] = common.get((place, copy[1]), 0.0) - many / total
-        return Weights(
-            {key: weight for key, weight in common.items() if abs(weight) > UNIT},
-            {(0, own[1]): 1 + 1 / total},
-        )
-
-    def _others(self) -> dict[int, int]:
-        """Return how many others have a copy of the pushed peer's, class by class."""
-        return {
-            place: self.modes.members[place] - (place == self.own)
+        others = {
+            (place, one[1]): self.members[place] - (place == self.own)
             for place, one in enumerate(self.copies)
-            if one and one[0] == self.copy
+            if own and one and one[0] == own[0]
+        }
+        total = sum(others.values())
+        if own is None or not total:
+            return {}, {}
+        common = {place: (place[0] == self.own) - many / total for place, many in others.items()}
+        return {place: weight for place, weight in common.items() if abs(weight) > UNIT}, {
+            (0, own[1]): 1 + 1 / total
         }
 
-    def _error(self, parts: dict[int, Carried], apart: Carried | None, s: Complex) -> Carried:
-        """Return how far the copy here is from the mean of all others' of its name."""
-        others = self._others()
-        total = sum(others.values())
-        if not total:
-            return nothing(s)
-        found = parts[self.own]
-        for place, many in others.items():
-            found = add(found, scaled(parts[place], -many / total))
-        if apart is not None:
-            # One peer less the mean of its class moves by 1 − 1/n here, and by −1/n at each of the others.
-            n = self.modes.members[self.own]
-            found = add(found, scaled(apart, (1 - 1 / n) * (1 + 1 / total)))
-        return found
 
-
-def copy_of(group: PeerGroup, device: Device) -> tuple[str, int] | None:
+def _copy_of(group: PeerGroup, device: Device) -> tuple[str, int] | None:
     """Return what a peer tells others the position of, and which state that is; None if nothing.
 
     Of a position with several axes it is the one along that of the device that is pushed.
@@ -381,8 +322,3 @@ def copy_of(group: PeerGroup, device: Device) -> tuple[str, int] | None:
                 if whole_and_index(kind.states[place].name)[1] == axis:
                     return kind.states[place].name.rpartition(".")[0], place
     return None
-
-
-def nothing(s: Complex) -> Carried:
-    """Return 0 at each s (k,)."""
-    return np.zeros(len(s), np.complex128), np.zeros(len(s))

@@ -24,16 +24,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
 from apc.frame.discretize import UNIT
-from apc.hands.answers import (
-    AROUND,
-    MOST_TOGETHER,
-    AbstractResponses,
-    Modes,
-    Responses,
-    Weights,
-    many_differ,
-    open_modes,
-)
+from apc.hands.answers import AROUND, Responses, Weights, held_names, responses
 from apc.hands.asked import Port, check_frequencies, find_port, next_peer, ticks_in
 from apc.hands.norms import Peak, noise_variance, sampled_data_peak, tick_peak
 from apc.hands.viscosity import Viscosity, network_viscosity
@@ -52,15 +43,6 @@ RADIUS, HALVINGS = 4.0, 14
 
 # By how much more than rounding means against negative powers may tell of a pole within a circle.
 DOUBTED = 10.0
-
-# A speed in 1/s of the slowest motions, and how nearly alike two devices move then.
-SLOWLY, ALIKE = 1e-3, 1e-2
-
-# What is left out where more peers differ than one system holds.
-NO_NORMS = (
-    "left out: the largest gain at any frequency (H∞) and what noise does (H2), which need one system of all "
-    f"peers, and so many that differ have more than {MOST_TOGETHER:,} states and readings in a frame"
-)
 
 # What of slow motions two circles may tell differently, beside the largest.
 SETTLED = 1e-3
@@ -176,8 +158,8 @@ def feel(
     frequencies
         (k,), in Hz, above 0 and at most half the rate of the fastest clock.
     at, between
-        The device that is pushed, and another whose motion is asked for: `left[1].device`. The first peer's,
-        and the next one's, if not given.
+        The device that is pushed, and another whose motion is asked for: `left[1].device`. That of the first
+        peer who has one, along the first of its directions, and the next peer's, if not given.
     unstable
         Whether the map of an unstable scene is wanted, which has no response in time.
     quick
@@ -192,43 +174,45 @@ def feel(
         or none above 0; E936 a name that means nothing; E933 a scene too large.
     """
     found = np.asarray(frequencies, dtype=np.float64).ravel()
-    port = find_port(system, at, "--at")
+    prepared = prepared or prepare(system)
+    named = [] if at else held_names(system, prepared)
+    port = find_port(system, at or next(iter(named), ""), "--at")
     other = find_port(system, between, "--between") if between else Port(next_peer(system, port), "")
     check_frequencies(system, found)
-    prepared = prepared or prepare(system)
     verdict = judge(system, prepared=prepared)
     if verdict.stable is False and not unstable:
         raise _unstable(system, verdict.spectral_radius)
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        responses = _responses(system, prepared, port, other)
+        answers = responses(system, prepared, port, other)
         s = np.asarray(2j * np.pi * found, dtype=np.complex128)
-        own, *aliases, across, error = responses.steady(s, ALIASES)
+        own, *aliases, across, error = answers.steady(s, ALIASES)
         one = 1 / own[0]
         alias = np.max([np.abs(value) for value, _ in aliases], axis=0) / np.abs(own[0])
         bounds = [
             1.01 * off / np.where(value == 0, np.inf, np.abs(value)) for value, off in (own, across, error)
         ]
         steady = verdict.stable is not False and not quick
-        slow, viscosity = (None, None) if quick else _slowly(system, responses, port, other)
-        modal = responses if steady and isinstance(responses, Responses) else None
-        hinf = _extremes(modal) if modal else ()
-        h2 = _noise(system, modal) if modal else ()
+        slow, viscosity = (None, None) if quick else _slowly(system, answers, port, other)
+        hinf = _extremes(answers) if steady else ()
+        h2 = _noise(system, answers) if steady else ()
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     here, there = (
-        f"{responses.exchange.peer_name(one.peer)}.{device.part}"
-        for one, device in ((port, responses.device), (other, responses.other))
+        f"{answers.exchange.peer_name(one.peer)}.{device.part}"
+        for one, device in ((port, answers.device), (other, answers.other))
     )
+    directions = [one for one in named if one.partition(".")[0] == named[0].partition(".")[0]]
+    others = f"along one direction; along others: {', '.join(f'--at {one}' for one in directions[1:])}"
     notes = {
+        others: len(directions) > 1,
         "of the map: the scene is unstable": verdict.stable is False,
         "of slow motions nothing is told: something of the scene is slower still": not slow and not quick,
-        "what noise does is not told: the fastest clock has a phase": bool(modal) and not h2,
-        NO_NORMS: steady and not modal,
+        "what noise does is not told: the fastest clock has a phase": steady and not h2,
     }
     return Feel(
         topology=system.name,
         at=here,
         between="" if there == here else there,
-        copy=responses.copy,
+        copy=answers.copy,
         frequency_hz=found,
         impedance=one,
         transmitted_admittance=across[0],
@@ -248,37 +232,19 @@ def feel(
     )
 
 
-def _responses(system: CompiledSystem, prepared: Prepared, port: Port, other: Port) -> AbstractResponses:
-    """Return the answers to a push: of modes, or of peers of which more differ than one system holds."""
-    if many_differ(system, prepared):
-        from apc.hands.different_peers import PopulationResponses
-
-        return PopulationResponses(system, prepared, port, other)
-    modes, exchange = open_modes(system, prepared, port, other)
-    return Responses(modes, exchange, port.peer, other.peer)
-
-
 def _slowly(
-    system: CompiledSystem, responses: AbstractResponses, port: Port, other: Port
+    system: CompiledSystem, felt: Responses, port: Port, other: Port
 ) -> tuple[Slow | None, Viscosity | None]:
     """Return what is felt of slow motions, and what of its damping comes of the network."""
-    slow = _slow(responses)
+    slow = _slow(felt)
     if slow is None:
         return None, None
 
     def damping_of(changed: CompiledSystem) -> tuple[float, float] | None:
-        own = _slow(_responses(changed, prepare(changed), port, other))
+        own = _slow(responses(changed, prepare(changed), port, other))
         return None if own is None else (own.damping, own.errors[1])
 
-    # Of slow motions all move alike: none holds back, and none stays behind.
-    together = abs(slow.stiffness) <= slow.errors[2] and _alike(responses)
-    return slow, network_viscosity(system, (slow.damping, slow.errors[1]), together, damping_of)
-
-
-def _alike(responses: AbstractResponses) -> bool:
-    """Say whether the other device moves as this one does as slowly as can be told."""
-    (own, _), (across, _), _ = responses.at(np.array([SLOWLY * 1j]), apart=False)
-    return bool(abs(across[0] - own[0]) < ALIKE * abs(own[0]))
+    return slow, network_viscosity(system, (slow.damping, slow.errors[1]), damping_of)
 
 
 def _unstable(system: CompiledSystem, radius: float) -> ApcError:
@@ -290,7 +256,7 @@ def _unstable(system: CompiledSystem, radius: float) -> ApcError:
     return ApcError(Mistake("E934", Place(system.origin.topology), what, hint=hint))
 
 
-def _slow(responses: AbstractResponses) -> Slow | None:
+def _slow(felt: Responses) -> Slow | None:
     """Return mass, damping and stiffness at low frequency, None where they can't be told.
 
     Notes
@@ -304,7 +270,7 @@ def _slow(responses: AbstractResponses) -> Slow | None:
     least = SETTLED
     for _ in range(HALVINGS):
         s = radius * np.exp(2j * np.pi * (np.arange(AROUND) + 0.5) / AROUND)
-        (velocity, off), *_ = responses.at(s, apart=False)
+        (velocity, off), *_ = felt.at(s, apart=False)
         values, powers = s / velocity, radius ** np.arange(3)
         doubt = float((np.abs(values) * off / np.abs(velocity)).max())
         found = np.array([(values / s**power).mean().real for power in range(3)])
@@ -320,16 +286,12 @@ def _slow(responses: AbstractResponses) -> Slow | None:
     return best
 
 
-def _extremes(responses: Responses) -> tuple[Extremes, ...]:
+def _extremes(felt: Responses) -> tuple[Extremes, ...]:
     """Return the H∞ norms of the modes that the pushed peer is in."""
-    modes, found = responses.modes, []
-    for number in (0, modes.apart.get(responses.own)):
-        if number is None:
-            continue
-        loop, basis = modes.loops[number], responses.bases[number]
-        site = 0 if number else responses.own
-        rows = [("velocity", responses.device.velocity)]
-        copy = responses.copies[responses.own]
+    found, copy = [], felt.copies[felt.own]
+    for number, site, _ in felt.parts:
+        loop, basis = felt.loops[number], felt.bases[number]
+        rows = [("velocity", felt.device.velocity)]
         if number and copy is not None:
             rows.append(("error", copy[1]))
         for name, row in rows:
@@ -338,15 +300,15 @@ def _extremes(responses: Responses) -> tuple[Extremes, ...]:
     return tuple(found)
 
 
-def _noise(system: CompiledSystem, responses: Responses) -> tuple[Noise, ...]:
+def _noise(system: CompiledSystem, felt: Responses) -> tuple[Noise, ...]:
     """Return what white noise at all peers does to the pushed peer."""
-    modes, ticks = responses.modes, ticks_in(system, responses.frame)
+    ticks = ticks_in(system, felt.frame)
     if ticks is None:
         return ()
     found = []
     for source, sensors in (("hands", False), ("sensors", True)):
-        velocity = _variance(modes, responses, ticks, responses.velocity_weights, sensors=sensors)
-        error = _variance(modes, responses, ticks, responses.error_weights, sensors=sensors)
+        velocity = _variance(felt, ticks, felt.velocity, sensors=sensors)
+        error = _variance(felt, ticks, felt.error, sensors=sensors)
         (error_m, error_off), (velocity_m_s, velocity_off) = map(_rms, (error, velocity))
         found.append(Noise(source, error_m, velocity_m_s, (error_off, velocity_off)))
     return tuple(found)
@@ -362,30 +324,22 @@ def _rms(variance: tuple[float, float] | None) -> tuple[float, float] | tuple[No
 
 
 def _variance(
-    modes: Modes, responses: Responses, ticks: list[Fraction], weights: Weights | None, *, sensors: bool
+    felt: Responses, ticks: list[Fraction], weights: Weights, *, sensors: bool
 ) -> tuple[float, float] | None:
     """Return the variance of states of the pushed peer, each class's noise its own at each of its peers.
 
     With a bound on what it is off by.
     """
-    if weights is None:
+    if not any(weights):
         return None
     total = off = 0.0
-    loop, basis = modes.loops[0], responses.bases[0]
-    held = [place for place, site in enumerate(loop.sites) if site.device is not None]
-    if weights.common:
-        sources = {place: 1 / modes.members[place] for place in held}
-        found = noise_variance(loop, ticks, sources, weights.common, basis, sensors=sensors)
-        if found is None:
-            return None
-        total, off = total + found[0], off + found[1]
-    number = modes.apart.get(responses.own)
-    if number is not None and weights.apart:
-        sources = {0: 1 - 1 / modes.members[responses.own]}
-        found = noise_variance(
-            modes.loops[number], ticks, sources, weights.apart, responses.bases[number], sensors=sensors
-        )
-        if found is None:
-            return None
-        total, off = total + found[0], off + found[1]
+    held = [place for place, site in enumerate(felt.loops[0].sites) if site.device is not None]
+    for (number, site, share), outputs in zip(felt.parts, weights, strict=False):
+        sources = {site: share} if number else {place: 1 / felt.members[place] for place in held}
+        if outputs:
+            loop, basis = felt.loops[number], felt.bases[number]
+            found = noise_variance(loop, ticks, sources, outputs, basis, sensors=sensors)
+            if found is None:
+                return None
+            total, off = total + found[0], off + found[1]
     return total, off + 2 * UNIT * total

@@ -3,20 +3,21 @@
 Takes: a mode whose peers may be pushed (`response.Pushed`), and its rigid motions.
 Gives: `Peak`, `tick_peak`, `sampled_data_peak`; `noise_variance`.
 Guarantees: no grid of frequencies decides anything; an output that a rigid motion shows in has no norm.
-Does not: prove H∞: such norms are right to what rounding leaves, some 1e-12 of them, and to `error`; a
-variance has a bound.
+Does not: prove H∞: such norms are right to `error`, what roundings make of them to first order; a variance
+has a bound.
 
 On ticks, a force is held from one instant at which anything happens to the next, and what comes of it is read
-at these. Of the motion in between, force and motion are taken at Gauss nodes of each interval, as polynomials
-whose norms these give exactly: what is left out falls faster than any power of their number (Bamieh and
-Pearson, IEEE Trans. Autom. Control 37 (1992) 418, reduce the same operator; its H∞ norm is that of this map).
+at these: one node at the beginning of each interval. Of the motion in between, force and motion are taken at
+Gauss nodes of each interval, as polynomials whose norms these give exactly: what is left out falls faster
+than any power of their number (Bamieh and Pearson, IEEE Trans. Autom. Control 37 (1992) 418, reduce the same
+operator; its H∞ norm is that of this map).
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -36,6 +37,9 @@ NODES, MORE = 4, 2
 
 # What counts as none of a rigid motion in an output, relatively.
 UNSEEN = 1e-9
+
+# What a norm is off by at least, relatively.
+ROUNDED = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,15 +61,7 @@ def tick_peak(loop: Pushed, pushed: int, of: int, row: int, basis: Floats) -> Pe
     basis
         The rigid motions (n, d) of the mode.
     """
-    site, other = loop.sites[pushed], loop.sites[of]
-    inputs = np.zeros((loop.k.shape[-1], len(site.seconds)))
-    for place, seconds in enumerate(site.seconds):
-        kick = _lanes(site, float(seconds), 1)[:, 0] / float(seconds) ** 0.5
-        inputs[loop.kicks[pushed][place, :-1], place] = kick
-    reads = loop.reads[of][:, row]
-    outputs = np.zeros((len(reads), loop.c.shape[-2]))
-    outputs[range(len(reads)), reads] = [float(one) ** 0.5 for one in other.seconds]
-    return _peak(loop, inputs, outputs, np.zeros((len(reads), inputs.shape[1])), basis)
+    return _peak(loop, pushed, of, row, basis, np.zeros(1), np.ones(1))
 
 
 def sampled_data_peak(loop: Pushed, pushed: int, of: int, row: int, basis: Floats) -> Peak:
@@ -76,16 +72,16 @@ def sampled_data_peak(loop: Pushed, pushed: int, of: int, row: int, basis: Float
     loop, pushed, of, row, basis
         As for `tick_peak`.
     """
-    few, many = (_with_nodes(loop, pushed, of, row, basis, nodes) for nodes in (NODES, NODES + MORE))
-    error = abs(many.norm - few.norm) + 1e-12 * many.norm
-    return Peak(many.norm, error if np.isfinite(many.norm) else 0.0, many.frequency_hz)
+    gauss = (np.polynomial.legendre.leggauss(nodes) for nodes in (NODES, NODES + MORE))
+    few, many = (_peak(loop, pushed, of, row, basis, (at + 1) / 2, share / 2) for at, share in gauss)
+    if not np.isfinite(many.norm):
+        return many
+    return replace(many, error=abs(many.norm - few.norm) + many.error)
 
 
-def _with_nodes(loop: Pushed, pushed: int, of: int, row: int, basis: Floats, nodes: int) -> Peak:
-    """Return the norm with so many Gauss nodes an interval."""
-    site, other = loop.sites[pushed], loop.sites[of]
-    at, weights = np.polynomial.legendre.leggauss(nodes)
-    at, weights = (at + 1) / 2, weights / 2
+def _peak(loop: Pushed, pushed: int, of: int, row: int, basis: Floats, at: Floats, weights: Floats) -> Peak:
+    """Return the norm with forces and motions taken at nodes (q,) of each interval, 0 to 1, by weight."""
+    site, other, nodes = loop.sites[pushed], loop.sites[of], len(at)
     # A force of one value at its node and none at the others, as coefficients of σ^i/i!, σ from 0 to 1.
     powers = at[:, None] ** np.arange(nodes) / np.cumprod([1, *range(1, nodes)])
     forces = np.linalg.inv(powers) / np.sqrt(weights)
@@ -97,17 +93,28 @@ def _with_nodes(loop: Pushed, pushed: int, of: int, row: int, basis: Floats, nod
         inputs[loop.kicks[pushed][place, :-1], own] = lanes
     rows = nodes * len(other.seconds)
     outputs, through = np.zeros((rows, loop.c.shape[-2])), np.zeros((rows, columns))
-    known: dict[Fraction, tuple[Floats, Floats]] = {}
+    known = {seconds: _within(other, float(seconds), at, row, forces) for seconds in set(other.seconds)}
     for place, seconds in enumerate(other.seconds):
-        if seconds not in known:
-            known[seconds] = _within(other, float(seconds), at, row, forces)
         own = slice(place * nodes, (place + 1) * nodes)
         seen, pushes = known[seconds]
         scale = np.sqrt(weights * float(seconds))[:, None]
         outputs[own, loop.reads[of][place]] = scale * seen
         if pushed == of:
             through[own, own] = scale * pushes / float(seconds) ** 0.5
-    return _peak(loop, inputs, outputs, through, basis)
+    c = outputs @ value_of(loop.c)
+    if _shows(basis, c):
+        return Peak(np.inf, 0.0, 0.0)
+    to = relative_coordinates(basis)
+    b, c = relative_rows(value_of(loop.k) @ inputs, to), c[:, to.rest]
+    a = relative(loop.m, with_doubt(to), RADII)
+    gain, angle = peak_gain(value_of(a), b, c, outputs @ value_of(loop.d) @ inputs + through)
+    if not np.isfinite(gain):
+        return Peak(np.inf, 0.0, 0.0)
+    # What the state's matrix is off by moves the gain there, to first order, by so much.
+    still = np.exp(1j * angle) * np.eye(len(b)) - value_of(a)
+    left, right = np.abs(np.linalg.solve(still.T, c.T)).T, np.abs(np.linalg.solve(still, b))
+    off = float(np.linalg.norm(left @ radius_of(a) @ right, 2)) + ROUNDED * gain
+    return Peak(gain, off, angle / (2 * np.pi * float(loop.frame)))
 
 
 def _lanes(site: Site, seconds: float, count: int) -> Floats:
@@ -127,19 +134,6 @@ def _within(site: Site, seconds: float, at: Floats, row: int, forces: Floats) ->
         lanes = _lanes(site, seconds * share, count) * share ** np.arange(count)
         pushed.append(lanes[row] @ forces)
     return np.array(seen).reshape(count, n + value_of(site.b).shape[1]), np.array(pushed)
-
-
-def _peak(loop: Pushed, inputs: Floats, outputs: Floats, through: Floats, basis: Floats) -> Peak:
-    """Return the norm of a map from inputs over kicks to outputs over what is read."""
-    m, k, c, d = map(value_of, (loop.m, loop.k, loop.c, loop.d))
-    b, c_y = k @ inputs, outputs @ c
-    at = relative_coordinates(basis)
-    if _shows(basis, c_y):
-        return Peak(np.inf, 0.0, 0.0)
-    gain, angle = peak_gain(
-        relative(m, at), relative_rows(b, at), c_y[:, at.rest], outputs @ d @ inputs + through
-    )
-    return Peak(gain, 1e-12 * gain, angle / (2 * np.pi * float(loop.frame)))
 
 
 def _shows(basis: Floats, outputs: Floats) -> bool:

@@ -27,9 +27,8 @@ from apc.eigen.modes import split
 from apc.finite_equations import finite_equations
 from apc.frame.devices import clamped, directions_of, replaced_hands, without_hands
 from apc.frame.discretize import UNIT
-from apc.frame.radius import RADII, radius_of, solve, value_of
-from apc.hands.passivity_in_balls import certified
-from apc.hands.port import PortLoop, open_ports, port_loop, port_loops
+from apc.frame.radius import RADII, radius_of, solve, value_of, with_radius
+from apc.hands.port import PortLoop, port_loops
 from apc.moments.network import Growth
 from apc.network.nominal import left_out
 from apc.result import Result
@@ -42,9 +41,6 @@ STABLE, UNSTABLE = "stable with any passive hands", "unstable with some passive 
 UNDECIDED, NEVER = "undecided", "unstable with some passive hands, however much damping there is"
 
 PROVED = "proved by floats whose every rounding is bounded"
-NOT_IN_BALLS = (
-    "in ball arithmetic it can't be: its equations are no rational numbers, or 512 bits are too few"
-)
 
 CIRCULATES = (
     "What devices feel of one another at rest is not what springs give: moved slowly round, they give back "
@@ -134,7 +130,7 @@ def passive_hands(
     prepared
         From `analysis.prepare`, of this system with any numbers.
     certify
-        Whether the verdict is to be proved in ball arithmetic, too.
+        Whether what is said of clamped devices is to be proved in ball arithmetic, where they decide.
 
     Raises
     ------
@@ -155,16 +151,12 @@ def passive_hands(
         return _together(parts, replaced_hands(of_scene))
     fixed = analyze(clamped(system, option=OPTION), certify=certify)
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        opened = open_ports(system, *lifted_groups(system, prepared=prepared), option=OPTION)
-        cuts = (
-            [] if isinstance(opened, str) else [port_loop(opened, one, option=OPTION) for one in opened.loops]
-        )
-        loops = opened if isinstance(opened, str) else tuple(loop for loop, _ in cuts)
+        loops = port_loops(system, prepared, option=OPTION)
         modes = () if isinstance(loops, str) else tuple(_judge(loop) for loop in loops)
         why = loops if isinstance(loops, str) else CIRCULATES if any(map(circulates, loops)) else ""
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     stable: bool | None = None
-    joined = not isinstance(loops, str) and all(loop.maps.joined for loop in loops)
+    joined = not isinstance(loops, str) and all(loop.joined for loop in loops)
     drawn = [one.passive is False and (joined or one.more is None) for one in modes]
     if isinstance(loops, str) or fixed.stable is False or any(drawn):
         stable = False
@@ -173,24 +165,8 @@ def passive_hands(
     verdict = {True: STABLE, False: UNSTABLE, None: UNDECIDED}[stable]
     of = ", of the linearization" if not linear else ""
     proof = "" if stable is None else f"{PROVED}{of}"
-    if certify and stable is not None and not why:
-        bits = 0
-        if fixed.stable and not isinstance(opened, str):
-            asked = [
-                certified(
-                    loop,
-                    cut,
-                    np.array([float(one.touched.damping) for one in opened.of(loop)]),
-                    passive=stable,
-                    angle=_least(own)[1],
-                )
-                for loop, (own, cut), mode in zip(opened.loops, cuts, modes, strict=True)
-                if stable or mode.passive is False
-            ]
-            bits = (min if stable else max)(asked)
-        proof = f"proved in ball arithmetic, {bits} bits{of}" if bits else f"{proof}; {NOT_IN_BALLS}"
-        if fixed.stable is False:
-            proof = f"with its devices clamped it is unstable: {fixed.proof or PROVED}{of}"
+    if certify and fixed.stable is False and not why:
+        proof = f"with its devices clamped it is unstable: {fixed.proof or PROVED}{of}"
     return PassiveHands(
         topology=system.name,
         verdict=NEVER if why else verdict,
@@ -319,7 +295,7 @@ def _judge(loop: PortLoop) -> PassiveMode:
         more=-least if known else None,
         error=max(high - least, least - low) if known else None,
         frequency_hz=frequency_of(loop, angle) if known else None,
-        stiffness=float(loop.maps.static[0, 0, 0]) if loop.maps.static.shape[-1] == 1 else None,
+        stiffness=float(loop.static[0, 0, 0]) if loop.static.shape[-1] == 1 else None,
     )
 
 
@@ -333,27 +309,27 @@ def _bounds(loop: PortLoop, widths: Sequence[float] = WIDTHS) -> tuple[float, fl
     """
     if circulates(loop):
         return -np.inf, -np.inf, -np.inf, 0.0
-    matrices = loop.maps.a, loop.maps.b, loop.maps.c, loop.maps.d
+    matrices = loop.a, loop.b, loop.c, loop.d
     least, angle = _least(loop)
     if not np.isfinite(least):
         return least, -np.inf, np.inf, angle
-    scale = max(abs(least), float(np.abs(value_of(loop.maps.weight)).max()))
+    scale = max(abs(least), float(np.abs(value_of(loop.weight)).max()))
     low = -np.inf
     for width in widths:
         shift = least - width * scale
-        less = RADII.subtract(loop.maps.weight, RADII.exact(shift * np.eye(len(loop.maps.weight[0]))))
+        less = RADII.subtract(loop.weight, RADII.exact(shift * np.eye(len(loop.weight[0]))))
         if proves_positive(*matrices, less, spared=[share * width for share in SPARED]):
             low = shift
             break
     else:
-        if least > 0 and proves_positive(*matrices, loop.maps.weight):
+        if least > 0 and proves_positive(*matrices, loop.weight):
             low = 0.0
     return least, low, _draws(loop, angle), angle
 
 
 def _least(loop: PortLoop) -> tuple[float, float]:
     """Return the least eigenvalue of He H + diag(b/τ) over all angles, and its angle, in floats."""
-    return least_real(*map(value_of, (loop.maps.a, loop.maps.b, loop.maps.c, loop.maps.d, loop.maps.weight)))
+    return least_real(*map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight)))
 
 
 def circulates(loop: PortLoop) -> bool:
@@ -369,7 +345,7 @@ def circulates(loop: PortLoop) -> bool:
     The residue at z = 1 has to be symmetric and not negative, or hands that move devices slowly round draw
     energy from it. What rounding leaves of one that vanishes counts as none.
     """
-    value, off = value_of(loop.maps.static), radius_of(loop.maps.static)
+    value, off = value_of(loop.static), radius_of(loop.static)
     turned = np.abs(value - value.T) > off + off.T
     least = float(np.linalg.eigvalsh((value + value.T) / 2).min())
     return bool(turned.any()) or least < -2 * float((off + off.T).sum())
@@ -380,44 +356,30 @@ def _draws(loop: PortLoop, angle: float) -> float:
 
     Notes
     -----
-    e^{jθ} is a rational point of the circle; complex numbers are pairs of real ones.
+    e^{jθ} is a rational point of the circle.
     """
-    n = len(loop.maps.b[0])
-    tangent = np.tan(angle / 2) if angle < 3.0 else None
-    cosine, sine = (
-        ((1 - tangent**2) / (1 + tangent**2), 2 * tangent / (1 + tangent**2))
-        if tangent is not None
-        else (-1.0, 0.0)
-    )
-    z = complex(cosine, sine)
-    a, b, c, d, weight = map(value_of, (loop.maps.a, loop.maps.b, loop.maps.c, loop.maps.d, loop.maps.weight))
-    response = c @ np.linalg.solve(z * np.eye(n) - a, b + 0j) + d
-    direction = np.linalg.eigh((response + response.conj().T) / 2 + weight)[1][:, 0]
-    turned = np.zeros((2, 2 * n, 2 * n))
-    turned[0] = np.block([[cosine * np.eye(n), -sine * np.eye(n)], [sine * np.eye(n), cosine * np.eye(n)]])
-    # Sine and cosine are quotients of sums about 1: off by roundings of 1, however small they are themselves.
-    turned[1] = 8 * UNIT * np.kron(np.ones((2, 2)), np.eye(n))
-    twice = np.zeros((2, 2 * n, 2 * n))
-    twice[:, :n, :n] = twice[:, n:, n:] = loop.maps.a
-    v = RADII.exact(np.concatenate([direction.real, direction.imag])[:, None])
-
-    def both(matrix: np.ndarray) -> np.ndarray:
-        rows, columns = matrix.shape[-2:]
-        found = np.zeros((2, 2 * rows, 2 * columns))
-        found[:, :rows, :columns] = found[:, rows:, columns:] = matrix
-        return found
-
-    states = solve(RADII.subtract(turned, twice), RADII.multiply(both(loop.maps.b), v))
+    tangent = float(np.tan(angle / 2))
+    z = complex(1 - tangent**2, 2 * tangent) / (1 + tangent**2)
+    direction = _worst(loop, z)[:, None]
+    # Both parts are quotients of sums about 1: off by roundings of 1, however small they are themselves.
+    unit, v = np.eye(loop.a.shape[-1]), RADII.exact(direction)
+    states = solve(RADII.subtract(with_radius(z * unit, 16 * UNIT * unit), loop.a), RADII.multiply(loop.b, v))
     if states is None:
         return np.inf
-    pushed = RADII.add(
-        RADII.multiply(both(loop.maps.c), states),
-        RADII.multiply(both(RADII.add(loop.maps.d, loop.maps.weight)), v),
+    through = RADII.multiply(RADII.add(loop.d, loop.weight), v)
+    drawn = RADII.multiply(
+        RADII.exact(direction.conj().T), RADII.add(RADII.multiply(loop.c, states), through)
     )
-    drawn = RADII.multiply(np.swapaxes(v, -1, -2), pushed)
-    size = float((direction.real**2 + direction.imag**2).sum())
-    top = float(drawn[0, 0, 0] + drawn[1, 0, 0])
+    size = float(np.vdot(direction, direction).real)
+    top = float(drawn[0, 0, 0].real + drawn[1, 0, 0].real)
     return top / size + 8 * UNIT * abs(top)
+
+
+def _worst(loop: PortLoop, z: complex) -> Complexes:
+    """Return the vector of the least eigenvalue of He H + diag(b/τ) at a point of the circle."""
+    a, b, c, d, weight = map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight))
+    response = c @ np.linalg.solve(z * np.eye(len(a)) - a, b + 0j) + d
+    return np.asarray(np.linalg.eigh((response + response.conj().T) / 2 + weight)[1][:, 0])
 
 
 def frequency_of(loop: PortLoop, angle: float) -> float:
@@ -435,11 +397,7 @@ def frequency_of(loop: PortLoop, angle: float) -> float:
     Frequencies that differ by a multiple of the frame rate have one angle: which of them it is, its course
     within a frame says: the one that most of it is at.
     """
-    maps = loop.maps
-    a, b, c, d, weight = map(value_of, (maps.a, maps.b, maps.c, maps.d, maps.weight))
-    response = c @ np.linalg.solve(np.exp(1j * angle) * np.eye(len(a)) - a, b + 0j) + d
-    # The vector of the least eigenvalue of He H + diag(b/τ).
-    moved = np.linalg.eigh((response + response.conj().T) / 2 + weight)[1][:, 0] * np.sqrt(loop.seconds)
+    moved = _worst(loop, complex(np.exp(1j * angle))) * np.sqrt(loop.seconds)
     most = round(loop.frame_s / float(loop.seconds.min()) / 2) + 1
     found = sorted(angle + 2 * np.pi * turn for turn in range(-most, most + 1))
     found.sort(key=abs)  # of two that can't be told apart, the slower

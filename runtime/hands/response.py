@@ -1,8 +1,7 @@
 """What moves when a hand pushes: the steady motion under a force e^{st}, of each mode of a scene.
 
 Takes: peers with a device each, as loops.
-Gives: `Site`, `open_site`, `open_sites`; `Pushed`, `pushed_loop`, `pushed_alone`; `answer`, `motions`,
-`spectra`; `Carried`, `add`, `scaled`, `solved`, `exponential`; `force_lanes`.
+Gives: `Site`, `open_site`; `Pushed`, `pushed_loop`; `spectra`; `force_lanes`.
 Guarantees: no sampling of the force or of the motion: every tick, hold and packet acts when it does, and what
 comes back at s and at s + 2πjk/T, T a frame, is exact but for rounding, which is bounded.
 Does not: put modes together to peers (see `answers`).
@@ -30,21 +29,14 @@ from apc.eigen.closing import Loop, close_loop
 from apc.eigen.peers import PeerGroup
 from apc.frame.devices import Device
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize, exponential_rows
-from apc.frame.lift import FrameMap, bounded, check_packets, named, step_durations
+from apc.frame.lift import bounded, check_packets, named, step_durations
 from apc.frame.ports import Ports, with_holds, with_ports
-from apc.frame.radius import radius_of, value_of, with_radius
+from apc.frame.radius import RADII, solve, value_of, with_radius
 from apc.frame.schedule import Propagate, Schedule
-from apc.frame.site import LinearSite
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Matrix = NDArray[Any]
-
-# Numbers with what they may be off by.
-Carried = tuple[Complex, Floats]
-
-# Less than any number of interest, in SI.
-LEAST = 1e-250
 
 # Entries of the matrices that are solved at once, each some hundred bytes at work.
 TOGETHER = 2**18
@@ -83,14 +75,11 @@ class Pushed:
 
     `kicks` and `reads` say for each site which of κ are its, interval by interval: what its states get as one
     ends, and what samples of its device's position are off by from its beginning on (r, n_x + 1); and
-    which of what is read are its states and holds as one begins (r, n_x + n_u), or its holds alone (r, n_u).
-    Of κ the last `heard` come from outside, and of what is read the last `sent` go there.
+    which of what is read are its states and holds as one begins (r, n_x + n_u).
     """
 
     name: str
-    multiplicity: int
     sites: tuple[Site, ...]
-    counts: tuple[int, ...]
     m: Matrix
     k: Matrix
     c: Matrix
@@ -98,14 +87,12 @@ class Pushed:
     kicks: tuple[NDArray[np.intp], ...]
     reads: tuple[NDArray[np.intp], ...]
     frame: Fraction
-    heard: int = 0
-    sent: int = 0
 
 
 def open_site(group: PeerGroup, device: Device | None) -> tuple[PeerGroup, Site]:
     """Return a group whose states may be kicked and whose holds are read, interval by interval."""
     schedule = group.schedule
-    at, _ = _intervals(schedule)
+    at, seconds = _intervals(schedule)
     n_x, n_u = group.site.b.shape
     sites, readings = [], []
     for one in (group.site, group.exact):
@@ -122,44 +109,20 @@ def open_site(group: PeerGroup, device: Device | None) -> tuple[PeerGroup, Site]
     found = discretize(group.exact.a, group.exact.b, [one * full.quantum for one in durations])
     kicked = [_with_kicks(step, n_x) for step in found]
     lifted = named(site.kind, full, *bounded(site, full, dict(zip(durations, kicked, strict=True))))
-    own = group.with_site(site, exact, full, lifted)
-    return own, _site(group, device, group.site.a, group.site.b, ports)
-
-
-def open_sites(group: PeerGroup, many: LinearSite) -> tuple[LinearSite, Schedule, list[Site]]:
-    """Return peers that nobody pushes, whose holds are read interval by interval, and their schedule.
-
-    Parameters
-    ----------
-    group
-        Peers that are like them but for their numbers.
-    many
-        Their equations (k, …).
-    """
-    at, _ = _intervals(group.schedule)
-    n_x, n_u = many.b.shape[-2:]
-    seen = np.zeros((len(many.b), n_u, n_x + n_u))
-    seen[:, range(n_u), range(n_x, n_x + n_u)] = 1.0
-    (opened,), full, ports = with_ports([many], group.schedule, 0, (), [seen], at)
-    return opened, full, [_site(group, None, a, b, ports) for a, b in zip(many.a, many.b, strict=True)]
-
-
-def _site(group: PeerGroup, device: Device | None, a: Floats, b: Floats, ports: Ports) -> Site:
-    """Return a peer with its continuous equations."""
     charge = COEFFICIENT_ROUNDINGS * UNIT
-    push = np.zeros((2, len(a)))
+    push = np.zeros((2, n_x))
     if device is not None:
         push[0, device.velocity] = float(device.inverse)
         push[1, device.velocity] = UNIT * abs(float(device.inverse))
-    at, seconds = _intervals(group.schedule)
-    return Site(
+    own = group.with_site(site, exact, full, lifted)
+    return own, Site(
         group=group,
         device=device,
-        a=with_radius(a, charge * np.abs(a)),
-        b=with_radius(b, charge * np.abs(b)),
+        a=with_radius(group.site.a, charge * np.abs(group.site.a)),
+        b=with_radius(group.site.b, charge * np.abs(group.site.b)),
         push=push,
-        seconds=tuple(one * group.schedule.quantum for one in seconds),
-        starts=tuple(one * group.schedule.quantum for one in at),
+        seconds=tuple(one * schedule.quantum for one in seconds),
+        starts=tuple(one * schedule.quantum for one in at),
         ports=ports,
     )
 
@@ -182,69 +145,37 @@ def _with_kicks(step: Step, n_x: int) -> Step:
     return Step(matrix, size, step.roundings)
 
 
-def pushed_loop(loop: Loop, sites: Mapping[int, Site], counts: Sequence[int]) -> Pushed:
-    """Close a loop of opened peers.
+def pushed_loop(loop: Loop, sites: Mapping[int, Site]) -> Pushed:
+    """Close a loop of opened peers, and take their ways in and out from its states.
 
     Parameters
     ----------
     loop, sites
         Its groups are those of `open_site`, whose sites are known by the schedule's id.
-    counts
-        How many peers each site stands for.
     """
     closed = close_loop(loop)
     own = [sites[id(group.schedule)] for group in loop.sites]
     whole = with_radius(closed.matrix, closed.error)
-    return _pushed(whole, own, closed.offsets, loop.name, loop.multiplicity, counts, len(closed.matrix))
-
-
-def pushed_alone(maps: FrameMap, site: Site) -> Pushed:
-    """Return an opened peer by itself, that hears what comes from outside.
-
-    Parameters
-    ----------
-    maps
-        What a frame makes of its state and of what it hears (2, …).
-    site
-        The peer.
-    """
-    p, q, s, d = maps.blocks
-    whole = np.concatenate([np.concatenate([p, q], axis=-1), np.concatenate([s, d], axis=-1)], axis=-2)
-    return _pushed(whole, [site], [0], site.group.name, 1, [1], p.shape[-1])
-
-
-def _pushed(
-    whole: Matrix,
-    own: Sequence[Site],
-    offsets: Sequence[int],
-    name: str,
-    multiplicity: int,
-    counts: Sequence[int],
-    states: int,
-) -> Pushed:
-    """Take ways in and out from the states of a map; what is heard and sent stands behind these."""
-    rows, columns = whole.shape[-2:]
-    kicked, read, added = [], [], []
-    for start, one in zip(offsets, own, strict=True):
-        kicked.append(start + one.ports.drawn)
-        read.append(start + one.ports.read)
-        added += [start + place for place in one.ports.added]
-    rest = np.delete(np.arange(states), added)
-    into = np.concatenate([*(one.ravel() for one in kicked), np.arange(states, columns)])
-    out = np.concatenate([*(one.ravel() for one in read), np.arange(states, rows)])
-    places = [np.cumsum([0, *(one.size for one in listed)]) for listed in (kicked, read)]
-    numbered = [
-        tuple(
-            np.arange(start, start + one.size).reshape(one.shape)
-            for start, one in zip(starts, listed, strict=False)
+    pairs = list(zip(closed.offsets, own, strict=True))
+    added = [start + place for start, one in pairs for place in one.ports.added]
+    rest = np.delete(np.arange(len(closed.matrix)), added)
+    ways, numbered = [], []
+    for listed in (
+        [start + one.ports.drawn for start, one in pairs],
+        [start + one.ports.read for start, one in pairs],
+    ):
+        ways.append(np.concatenate([one.ravel() for one in listed]))
+        starts = np.cumsum([0, *(one.size for one in listed)])
+        numbered.append(
+            tuple(
+                np.arange(start, start + one.size).reshape(one.shape)
+                for start, one in zip(starts, listed, strict=False)
+            )
         )
-        for starts, listed in zip(places, (kicked, read), strict=True)
-    ]
+    into, out = ways
     return Pushed(
-        name=name,
-        multiplicity=multiplicity,
+        name=loop.name,
         sites=tuple(own),
-        counts=tuple(counts),
         m=whole[:, rest[:, None], rest],
         k=whole[:, rest[:, None], into],
         c=whole[:, out[:, None], rest],
@@ -252,124 +183,79 @@ def _pushed(
         kicks=numbered[0],
         reads=numbered[1],
         frame=own[0].group.schedule.frame_s,
-        heard=columns - states,
-        sent=rows - states,
     )
 
 
-def spectra(
-    loop: Pushed,
-    pushed: int | None,
-    wanted: Sequence[tuple[int, int, int]],
-    s: Complex,
-    heard: Carried | None = None,
-) -> list[Carried]:
+def spectra(loop: Pushed, pushed: int, wanted: Sequence[tuple[int, int, int]], s: Complex) -> list[Matrix]:
     """Return what some states of a mode do under a force e^{st} at all devices of one of its sites.
 
     Parameters
     ----------
     loop, pushed
-        The mode, and which of its sites is pushed with 1 N at each peer; None if none is.
+        The mode, and which of its sites is pushed with 1 N at each peer.
     wanted
         Which site and continuous state, each, and its motion at s + 2πjn/T for which n.
     s
         (k,), in 1/s.
-    heard
-        What comes from outside (k, n_r), nothing if not given.
 
     Returns
     -------
-    For each (k,), in SI units a newton, and a bound on what it is off by.
+    For each (k, 2, 1, 1), in SI units a newton, with its radius.
     """
-    return motions(loop, answer(loop, pushed, s, heard), pushed, wanted, s)
-
-
-def answer(loop: Pushed, pushed: int | None, s: Complex, heard: Carried | None = None) -> Carried:
-    """Return what is read of a mode under a force e^{st} at all devices of one of its sites.
-
-    Parameters
-    ----------
-    loop, pushed, s, heard
-        As for `spectra`.
-    """
-    kicks = np.zeros((len(s), loop.k.shape[-1]), dtype=np.complex128)
-    doubt = np.zeros(kicks.shape)
-    if pushed is not None:
-        site = loop.sites[pushed]
-        of_length = {seconds: _kick(site, seconds, s) for seconds in set(site.seconds)}
-        for place, (seconds, start) in enumerate(zip(site.seconds, site.starts, strict=True)):
-            places = loop.kicks[pushed][place, :-1]
-            kicks[:, places], doubt[:, places] = _times(of_length[seconds], exponential(s, start))
-    if heard is not None:
-        outside = kicks.shape[1] - loop.heard
-        kicks[:, outside:], doubt[:, outside:] = heard
-    state = _steady(loop.m, exponential(s, loop.frame), _product((kicks, doubt), loop.k))
-    return add(_product(state, loop.c), _product((kicks, doubt), loop.d))
-
-
-def motions(
-    loop: Pushed, read: Carried, pushed: int | None, wanted: Sequence[tuple[int, int, int]], s: Complex
-) -> list[Carried]:
-    """Return what some states do, of what is read.
-
-    Parameters
-    ----------
-    loop, pushed, wanted, s
-        As for `answer` and `spectra`.
-    read
-        From `answer`.
-    """
+    kicks = np.zeros((len(s), 2, loop.k.shape[-1], 1), dtype=np.complex128)
+    site = loop.sites[pushed]
+    of_length = {seconds: _kick(site, seconds, s) for seconds in set(site.seconds)}
+    for place, (seconds, start) in enumerate(zip(site.seconds, site.starts, strict=True)):
+        turned = RADII.multiply(of_length[seconds], _exponential(s, start))
+        kicks[:, :, loop.kicks[pushed][place, :-1]] = turned
+    state = _steady(loop.m, _exponential(s, loop.frame), RADII.multiply(loop.k, kicks))
+    read = RADII.add(RADII.multiply(loop.c, state), RADII.multiply(loop.d, kicks))
     found = {
         (of, alias): _motion(loop, of, read, s, alias, pushed=of == pushed)
         for of, alias in {(of, alias) for of, _, alias in wanted}
     }
-    return [(value[:, row], off[:, row]) for of, row, alias in wanted for value, off in [found[of, alias]]]
+    return [found[of, alias][:, :, row, None] for of, row, alias in wanted]
 
 
-def _motion(loop: Pushed, of: int, read: Carried, s: Complex, alias: int, *, pushed: bool) -> Carried:
-    """Return the continuous states (k, n_x) of a site at s + 2πjn/T."""
+def _motion(loop: Pushed, of: int, read: Matrix, s: Complex, alias: int, *, pushed: bool) -> Matrix:
+    """Return the continuous states (k, 2, n_x, 1) of a site at s + 2πjn/T."""
     site, frame = loop.sites[of], float(loop.frame)
     at = s + 2j * np.pi * alias / frame
-    held = loop.reads[of][:, loop.reads[of].shape[1] - site.b.shape[-1] :]
-    value, off = read[0][:, held], read[1][:, held]  # (k, intervals, holds)
+    held = read[:, :, loop.reads[of][:, len(site.states) :].T, 0]  # (k, 2, holds, intervals)
     of_length = {seconds: _lasting(at, float(seconds)) for seconds in set(site.seconds)}
     weights = [
-        _times(exponential(-at, start), of_length[seconds])
+        RADII.multiply(_exponential(-at, start), of_length[seconds])
         for seconds, start in zip(site.seconds, site.starts, strict=True)
     ]
-    weight, loose = (np.stack([one[place] for one in weights], axis=1)[:, :, None] for place in range(2))
-    charge = (2 * len(weights) + 8) * UNIT
-    mean = (value * weight).sum(axis=1) / frame
-    doubt = (off * (np.abs(weight) + loose) + np.abs(value) * (loose + charge * np.abs(weight))).sum(axis=1)
-    driven = _product((mean, doubt / frame * (1 + charge)), site.b)
+    share = with_radius(np.array([[1 / frame]]), np.array([[2 * UNIT / frame]]))
+    mean = RADII.multiply(RADII.multiply(held, np.concatenate(weights, axis=-2)), share)
+    driven = RADII.multiply(site.b, mean)
     if pushed and alias == 0:
-        driven = (
-            driven[0] + site.push[0],
-            driven[1] + site.push[1] + 2 * UNIT * np.abs(driven[0] + site.push[0]),
-        )
-    return _steady(site.a, (at, 4 * UNIT * np.abs(at)), driven)
+        driven = RADII.add(driven, site.push[..., None])
+    return _steady(site.a, _numbers(at, 4 * UNIT * np.abs(at)), driven)
 
 
-def exponential(s: Complex, time: Fraction) -> Carried:
-    """Return e^{st} (k,)."""
+def _numbers(value: Matrix, off: Floats) -> Matrix:
+    """Return numbers (k,) with what they may be off by as matrices (k, 2, 1, 1)."""
+    return with_radius(value[:, None, None], off[:, None, None])
+
+
+def _exponential(s: Complex, time: Fraction) -> Matrix:
+    """Return e^{st} (k, 2, 1, 1)."""
     exact = float(time)
     value = np.exp(s * exact)
-    return value, (3 * np.abs(s) * exact + 4) * UNIT * np.abs(value)
+    return _numbers(value, (3 * np.abs(s) * exact + 4) * UNIT * np.abs(value))
 
 
-def _lasting(s: Complex, seconds: float) -> Carried:
-    """Return ∫ e^{−sσ} dσ over so many seconds (k,)."""
+def _lasting(s: Complex, seconds: float) -> Matrix:
+    """Return ∫ e^{−sσ} dσ over so many seconds (k, 2, 1, 1)."""
     x = -s * seconds
-    small = np.abs(x) < 1e-2
-    with np.errstate(all="ignore"):
-        direct = np.expm1(x) / x
-    series = 1 + x / 2 * (1 + x / 3 * (1 + x / 4 * (1 + x / 5 * (1 + x / 6 * (1 + x / 7)))))
-    value = np.asarray(seconds * np.where(small, series, direct), dtype=np.complex128)
-    return value, 16 * UNIT * seconds * np.exp(np.maximum(x.real, 0.0))
+    value = seconds * np.divide(np.expm1(x), x, out=np.ones_like(x), where=x != 0)
+    return _numbers(value, 16 * UNIT * seconds * np.exp(np.maximum(x.real, 0.0)))
 
 
-def _kick(site: Site, seconds: Fraction, s: Complex) -> Carried:
-    """Return γ(s) (k, n_x) of an interval, by its series in s."""
+def _kick(site: Site, seconds: Fraction, s: Complex) -> Matrix:
+    """Return γ(s) (k, 2, n_x, 1) of an interval, by its series in s."""
     time = float(seconds)
     size = float(np.abs(s).max(initial=0.0)) * time
     terms, term = 1, 1.0
@@ -377,13 +263,13 @@ def _kick(site: Site, seconds: Fraction, s: Complex) -> Carried:
         term *= size / terms
         terms += 1
     n, step = len(site.states), force_lanes(site, time, terms)
-    lanes, off = step.matrix[0, :n, n:], step.roundings * UNIT * step.size[0, :n, n:]
-    powers = (s * time)[:, None] ** np.arange(terms)
-    magnitudes = np.abs(powers)
-    value = powers @ lanes.T
-    bound = magnitudes @ (off + (3 * np.arange(terms) + terms + 4) * UNIT * np.abs(lanes)).T
-    left = term * np.exp(size) * np.abs(lanes[:, 0]) * (1 + np.abs(value_of(site.a) * time).sum())
-    return value, bound + left
+    lanes = with_radius(step.matrix[0, :n, n:], step.roundings * UNIT * step.size[0, :n, n:])
+    powers = ((s * time)[:, None] ** np.arange(terms))[..., None]
+    doubt = (3 * np.arange(terms)[:, None] + 4) * UNIT * np.abs(powers)
+    found = RADII.multiply(lanes, with_radius(powers, doubt))
+    left = term * np.exp(size) * np.abs(value_of(lanes)[:, 0]) * (1 + np.abs(value_of(site.a) * time).sum())
+    found[:, 1, :, 0] += left
+    return found
 
 
 def force_lanes(site: Site, seconds: float, count: int) -> Step:
@@ -408,85 +294,18 @@ def force_lanes(site: Site, seconds: float, count: int) -> Step:
     return exponential_rows(generator, np.zeros((1, n + count, 0)), 1.0)
 
 
-def _times(one: Carried, other: Carried) -> Carried:
-    """Return products entry by entry; a row (k,) goes with each column."""
-    a, off_a = one
-    b, off_b = other
-    if a.ndim > b.ndim:
-        b, off_b = b[:, None], off_b[:, None]
-    value = a * b
-    return value, off_a * (np.abs(b) + off_b) + np.abs(a) * off_b + 4 * UNIT * np.abs(value)
-
-
-def add(one: Carried, other: Carried) -> Carried:
-    """Return a sum, entry by entry."""
-    value = one[0] + other[0]
-    return value, one[1] + other[1] + 2 * UNIT * np.abs(value)
-
-
-def scaled(one: Carried, share: float) -> Carried:
-    """Return so many times what there is."""
-    return one[0] * share, one[1] * abs(share) + 2 * UNIT * np.abs(one[0] * share)
-
-
-def _product(rows: Carried, matrix: Matrix) -> Carried:
-    """Return rows (k, n) times the transpose of a real matrix (2, m, n) with its radii."""
-    value, off = rows
-    real, radius = value_of(matrix), radius_of(matrix)
-    size = np.abs(value)
-    charge = (real.shape[1] + 4) * UNIT
-    bound = off @ (np.abs(real) + radius).T + size @ (radius + charge * np.abs(real)).T
-    return value @ real.T, bound * (1 + charge)
-
-
-def _steady(matrix: Matrix, at: Carried, driven: Carried) -> Carried:
-    """Return x (k, n) of (z − M) x = driven, for z (k,) and a real M (2, n, n) with its radii.
-
-    Notes
-    -----
-    See `solved`.
-    """
-    real, radius = value_of(matrix), radius_of(matrix)
-    unit = np.eye(len(real))
-    block = max(1, TOGETHER // max(real.size, 1))
-
-    def some(first: int) -> Carried:
-        own = slice(first, first + block)
-        system = at[0][own, None, None] * unit - real
-        return solved(system, at[1][own, None, None] * unit + radius, (driven[0][own], driven[1][own]))
-
-    found = [some(first) for first in range(0, max(len(at[0]), 1), block)]
-    return np.concatenate([value for value, _ in found]), np.concatenate([off for _, off in found])
-
-
-def solved(system: Complex, loose: Floats, driven: Carried) -> Carried:
-    """Return x (k, n) of G x = driven.
-
-    Parameters
-    ----------
-    system, loose
-        G (k, n, n), and what it may be off by, entry by entry, beside a rounding of each.
-    driven
-        (k, n).
-
-    Notes
-    -----
-    With an inverse Y in floats and F = 1 − Y G, x in floats is off by e ≤ b + |F| e, b being |Y| times
-    residual and radii; with |F| b ≤ θ b, entry by entry, that is at most b/(1 − θ).
-    """
-    n = system.shape[-1]
-    inverse = np.linalg.inv(system)
-    value = np.matmul(inverse, driven[0][:, :, None])
-    size, charge = np.abs(inverse), (n + 6) * UNIT
-    loose = loose + charge * np.abs(system)
-    wrong = np.abs(np.matmul(inverse, system) - np.eye(n)) + np.matmul(size, loose)
-    residual = np.abs(driven[0][:, :, None] - np.matmul(system, value)) + np.matmul(loose, np.abs(value))
-    residual += (driven[1] + charge * np.abs(driven[0]))[:, :, None]
-    bound = np.matmul(size, residual) + LEAST
-    share = (np.matmul(wrong, bound) / bound).max(axis=(1, 2))
-    if (share >= 0.5).any():  # entries of it are far apart: a little of the largest is added to all
-        norm = wrong.sum(axis=2).max(axis=1)
-        bound += np.where(share < 0.5, 0.0, 4 * norm * bound.max(axis=(1, 2)))[:, None, None]
-        share = (np.matmul(wrong, bound) / bound).max(axis=(1, 2))
-    bound *= np.where(share < 0.5, (1 + charge) / (1 - share), np.inf)[:, None, None]
-    return value[:, :, 0], bound[:, :, 0]
+def _steady(matrix: Matrix, at: Matrix, driven: Matrix) -> Matrix:
+    """Return x (k, 2, n, 1) of (z − M) x = driven, for z (k, 2, 1, 1) and M (2, n, n) with their radii."""
+    n = matrix.shape[-1]
+    found = None
+    if len(at) * n**2 <= TOGETHER or len(at) == 1:
+        found = solve(RADII.subtract(at * np.eye(n), matrix), driven)
+    if found is None and len(at) > 1:
+        half = len(at) // 2
+        found = np.concatenate(
+            [_steady(matrix, at[own], driven[own]) for own in (slice(half), slice(half, None))]
+        )
+    if found is None:  # z is an eigenvalue, for all that is known
+        found = np.full(driven.shape, np.nan + 0j)
+        found[:, 1] = np.inf
+    return np.asarray(found)

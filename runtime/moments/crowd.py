@@ -29,9 +29,9 @@ from apc.frame.lift import FrameMap
 from apc.frame.parameters import resolve
 from apc.frame.schedule import Event, Schedule, Selected, Send, Sent, Tick, Way, tick_by_tick
 from apc.frame.scheduling import build_schedules
-from apc.frame.taylor import arithmetic_of
+from apc.frame.taylor import arithmetic_of, entrywise
 from apc.moments.gains import Answer, Drive, Moments, Part, number_of
-from apc.moments.mean_loops import Listened, Remembered, Route, mean_loop, remember, scaled
+from apc.moments.mean_loops import Listened, Remembered, Route, mean_loop, remember
 from apc.moments.packet_memory import memory_of
 from apc.network.channel import ChannelLaw, channel_law
 
@@ -253,7 +253,7 @@ def _answers(
             if kind is driving:
                 # by (m oᵀ + o mᵀ), and o oᵀ itself once, in the loop of all.
                 numbers = arithmetic_of(miss)
-                more = scaled(miss, number_of(2 * by, numbers), numbers)
+                more = entrywise(miss, number_of(2 * by, numbers))
                 more = numbers.add(more, own[slot]) if by > 0 else more
                 left, right = np.stack([miss, more]), np.stack([miss, own[slot]])
                 weights = np.array([share, 1.0])

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -28,15 +27,12 @@ from apc.eigen.pseudospectrum import balance
 from apc.eigen.relative import Relative
 from apc.frame.discretize import UNIT
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
-from apc.frame.taylor import arithmetic_of, corners, hull
-from apc.moments.mean_loops import scaled
+from apc.frame.taylor import arithmetic_of, corners, entrywise, hull
 from apc.moments.unserved import UnservedError
 from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
-
-# G(λ) in numbers of a kind, None where the means grow faster.
 
 # What is left of a sum that is doubled, relative to the whole: far below any rounding.
 NOTHING = 1e-24
@@ -47,6 +43,9 @@ DOUBLINGS, ENDLESS = 60, 1e100
 # Where φ is not small, these are tried at the corners of a cell of at most so many parameters.
 LARGE, SHARES, MOST_SIDES = 0.5, (0.1, 0.5, 0.9), 6
 
+# How much smaller than others a state moves, in units in which all are alike, to count as at rest.
+RESTS = 1e-6
+
 TINY = float(np.finfo(np.float64).tiny)
 
 # G is looked at so near above the means' own growth, where it has its pole; and so many times farther from it
@@ -56,11 +55,8 @@ NEAR, WIDER = 1e-9, 4.0
 # How near the radius is near enough, relatively.
 CLOSE = 1e-14
 
-# The step over which the slope of G at the radius is taken, relatively.
-STEP = 1e-6
-
-# How near the radius is enclosed at first, relatively, and how much farther at last.
-FIRST_WIDTH, LAST_WIDTH = 1e-12, 1e-3
+# How near the radius is enclosed at first, relatively, how much farther each time and how far at last.
+FIRST_WIDTH, WIDER_BOUNDS, LAST_WIDTH = 1e-12, 8.0, 1e-3
 
 # Covariances of luck times cubes of the means' states: as much takes some ten seconds.
 MOST_WORK = 20_000_000
@@ -276,11 +272,12 @@ def _held_at_corners(matrix: Matrix, seed: Floats, numbers: Arithmetic) -> tuple
 def _weights(found: Matrix, matrix: Matrix) -> Floats:
     """Return how large states are where moments (b, n, n) are found; those that rest, beside the others."""
     weights = np.sqrt(np.abs(np.diagonal(found, axis1=-2, axis2=-1)).sum(axis=0))
-    if not weights.all():
-        alike = balance(np.abs(matrix))
-        least = (weights[weights > 0] / alike[weights > 0]).min(initial=np.inf)
-        weights = np.where(weights > 0, weights, alike * (least if np.isfinite(least) else 1.0))
-    return np.asarray(weights)
+    alike = balance(np.abs(matrix))
+    shares = weights / alike
+    moves = shares > RESTS * shares.max(initial=0.0)  # what is less is what rounding leaves of none
+    return np.asarray(
+        np.where(moves, weights, alike * shares[moves].min(initial=np.inf)) if moves.any() else alike
+    )
 
 
 def _doubled(matrix: Matrix, driven: Matrix) -> Matrix | None:
@@ -324,10 +321,11 @@ def gain(
     """
     result = numbers.exact(np.zeros(shape))
     shrink, root = number_of(1 / growth, numbers), number_of(growth**-0.5, numbers)
+    scaled = np.multiply if numbers is FLOATS else entrywise
     for drive in drives:
         units = numbers.exact(drive.units)
-        driven = scaled(around(of_kind(drive.into, numbers), units, numbers), shrink, numbers)
-        moments = stein(scaled(of_kind(drive.matrix, numbers), root, numbers), driven, numbers)
+        driven = scaled(around(of_kind(drive.into, numbers), units, numbers), shrink)
+        moments = stein(scaled(of_kind(drive.matrix, numbers), root), driven, numbers)
         if moments is None:
             return None
         n = moments.shape[-1]
@@ -341,7 +339,7 @@ def gain(
             total = weighted(around(left, over[:, None], numbers, right), answer.weights, numbers)
             total = (total + np.swapaxes(total, -1, -2)) / 2
             if answer.spread is not None:
-                total = scaled(total, of_kind(answer.spread, numbers), numbers)
+                total = scaled(total, of_kind(answer.spread, numbers))
             block = np.moveaxis(total[..., answer.entries[0], answer.entries[1]], 0, -1)
             place = np.s_[..., answer.place, drive.place]
             result[place] = numbers.add(result[place], block)
@@ -405,7 +403,7 @@ def mean_square_radius(of: Moments, *, bounded: bool = True) -> Enclosed:
     largest_driven, largest_undriven = _growth(driven), _growth(undriven)
     if not np.isfinite(largest_driven + largest_undriven):
         return Enclosed(np.nan, 0.0, np.inf)
-    root, steep = _radius(of, max(largest_driven, TINY)) if driven else (None, 1.0)
+    root = _radius(of, max(largest_driven, TINY)) if driven else None
     radius = max(largest_undriven, largest_driven if root is None else root)
     if not bounded:
         return Enclosed(radius, radius, radius)
@@ -413,21 +411,17 @@ def mean_square_radius(of: Moments, *, bounded: bool = True) -> Enclosed:
         return Enclosed(radius, *_square(undriven))
     # Bounds on G at λ prove that the means it comes from grow by less.
     square = _square([*driven, *undriven] if root is None else undriven)
-    above, wide = np.inf, None
-    start, width = (max(square[1], TINY), NEAR) if root is None else (root, FIRST_WIDTH)
+    start, least = (max(square[1], TINY), NEAR) if root is None else (root, FIRST_WIDTH)
+    above, width = np.inf, least
     while width <= LAST_WIDTH and above > start * (1 + width):
-        bounds = _bounds(of, start * (1 + width))
-        if bounds is not None:
+        if bounds := _bounds(of, start * (1 + width)):
             above = min(above, start * (1 + width) * max(bounds[1], 1.0) * (1 + 2 * UNIT))
-            wide = (bounds[1] - bounds[0]) / steep if wide is None else wide
-        # What bounds say near a pole says little of farther on.
-        width = min(max(8 * width, 0.0 if wide is None else wide), 64 * width)
-    below, width = square[0], FIRST_WIDTH if wide is None else max(wide, FIRST_WIDTH / 8)
+        width *= WIDER_BOUNDS
+    below, width = square[0], FIRST_WIDTH
     while root is not None and width <= LAST_WIDTH and below < root * (1 - width):
-        bounds = _bounds(of, root * (1 - width))
-        if bounds is not None:
+        if bounds := _bounds(of, root * (1 - width)):
             below = max(below, root * (1 - width) * min(bounds[0], 1.0) * (1 - 2 * UNIT))
-        width *= 8
+        width *= WIDER_BOUNDS
     if not below:  # so near the growth of the means, G has no bounds
         below = _square(driven)[0]
     return Enclosed(radius, min(below, radius), max(above, square[1], radius))
@@ -487,21 +481,19 @@ def _largest(of: Moments, growth: float) -> float:
     return _size(matrix if len(matrix) == 1 else np.linalg.eigvals(matrix))
 
 
-def _radius(of: Moments, least: float) -> tuple[float | None, float]:
+def _radius(of: Moments, least: float) -> float | None:
     """Return the λ above `least` at which the largest eigenvalue of G is 1 in floats, None if there is none.
 
-    Beside it, how steeply G falls there: d log ρ/d log λ, 1 or more. The root is that of 1/ρ − 1, which is
-    nearly straight from −1 at the means' own growth, where G has its pole.
+    The root is that of 1/ρ − 1, which is nearly straight from −1 at the means' own growth, where G has its
+    pole.
     """
 
-    @cache
     def over(growth: float) -> float:
         return 1 / max(_largest(of, growth), TINY) - 1
 
     low, gap = least * (1 + NEAR), max(1 - least, 0.1 * least)
     if over(low) > 0:
-        return None, 1.0
+        return None
     while over(high := least + gap) < 0:
         low, gap = high, WIDER * gap
-    root = float(load_pool("scipy.optimize").brentq(over, low, high, xtol=1e-300, rtol=CLOSE))
-    return root, max(1.0, over(root * (1 + STEP)) / STEP)
+    return float(load_pool("scipy.optimize").brentq(over, low, high, xtol=1e-300, rtol=CLOSE))

@@ -1,7 +1,8 @@
 """A loop whose receivers go on with what they heard last: what a frame does where packets get lost.
 
 Takes: a scene whose links lose packets, and a loop of its peers.
-Gives: `Ear`, `HeldLoop`, `held_loop`; `lossy_rows`; `HeldScene`, `held_scene`; `Chance`, `every_channel`.
+Gives: `Ear`, `ears_of`, `HeldLoop`, `held_loop`; `lossy_rows`; `HeldScene`, `held_scene`; `Chance`,
+`every_channel`.
 Guarantees: every matrix comes with the radius of its rounding, those of the sites' frames included.
 Does not: say which packets get lost (see `worst`, `almost_sure`, `patterns`, `bursts`); serve delays that
 vary, or receivers that take no difference for a lost packet.
@@ -16,7 +17,7 @@ and every tick hears the η of the packet that it would hear if none got lost.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -157,6 +158,30 @@ def lossy_rows(group: PeerGroup, lossy: frozenset[str]) -> list[tuple[int, Heard
     ]
 
 
+def ears_of(loop: Loop, lossy: frozenset[str], receivers: Iterable[int]) -> list[Ear]:
+    """Return what some sites of a loop hear over some links, sender by sender.
+
+    Parameters
+    ----------
+    loop, lossy
+        The loop and the links.
+    receivers
+        The sites that hear.
+    """
+    rows = [(g, line, one) for g in receivers for line, one in lossy_rows(loop.sites[g], lossy)]
+    found = []
+    for h, sender in enumerate(loop.sites):
+        for row, sent in enumerate(sender.schedule.sent):
+            weights = {
+                (g, line): loop.coupling[one.way][g][h]
+                for g, line, one in rows
+                if one.sent == sent and (loop.coupling[one.way][g][h] or loop.doubts.get(one.way))
+            }
+            if weights:
+                found.append(Ear(weights, h, row))
+    return found
+
+
 def held_loop(loop: Loop, ears: Sequence[Ear], lossy: frozenset[str]) -> HeldLoop:
     """Close a loop with what its ears hold.
 
@@ -177,7 +202,11 @@ def held_loop(loop: Loop, ears: Sequence[Ear], lossy: frozenset[str]) -> HeldLoo
     deaf = _deaf(loop, lossy)
     layout = lay_out_loop(deaf)
     depths = [
-        max(1, *(loop.sites[site].schedule.heard[line].lag for site, line in ear.weights)) for ear in ears
+        max(
+            int(ear.sender is not None),
+            *(loop.sites[site].schedule.heard[line].lag for site, line in ear.weights),
+        )
+        for ear in ears
     ]
     starts = np.cumsum([len(layout.names), *depths]).tolist()
     states, n = starts[-1], starts[0]
@@ -202,7 +231,7 @@ def held_loop(loop: Loop, ears: Sequence[Ear], lossy: frozenset[str]) -> HeldLoo
     f, anew = np.zeros((2, states, states)), np.zeros((2, states, len(ears)))
     f[:, :n], anew[:, :n] = closed.matrix[..., :states], closed.matrix[..., states:]
     for place, (start, depth) in enumerate(zip(starts, depths, strict=False)):
-        anew[0, start, place] = 1.0
+        anew[0, start : start + min(depth, 1), place] = 1.0
         for lag in range(1, depth):
             f[0, start + lag, start + lag - 1] = 1.0
     before = np.zeros((2, len(senders), states))
@@ -265,18 +294,12 @@ def every_channel(
     loop = dense_loop(scene.told.groups, scene.told.exchange)
     ears: list[Ear] = []
     of_way: dict[tuple[str, int, int], list[int]] = {}
-    for g, receiver in enumerate(loop.sites):
-        rows = lossy_rows(receiver, scene.lossy)
-        for h, sender in enumerate(loop.sites):
-            for row, sent in enumerate(sender.schedule.sent):
-                weights = {
-                    (g, line): loop.coupling[heard.way][g][h]
-                    for line, heard in rows
-                    if heard.sent == sent and loop.coupling[heard.way][g][h]
-                }
-                if weights:
-                    of_way.setdefault((sent.link, g, h), []).append(len(ears))
-                    ears.append(Ear(weights, h, row))
+    for g in range(len(loop.sites)):
+        for ear in ears_of(loop, scene.lossy, [g]):
+            assert ear.sender is not None
+            link = loop.sites[ear.sender].schedule.sent[ear.row].link
+            of_way.setdefault((link, g, ear.sender), []).append(len(ears))
+            ears.append(ear)
     states = sum(len(site.lifted.z_names) for site in loop.sites) + len(ears)
     if most is not None and states > most:
         what = f"{peers:,} peers and their channels have {states:,} states"

@@ -2,7 +2,7 @@
 
 Takes: the loops of a scene whose ticks each hear by themselves, and what channels remember.
 Gives: `Remembered`, `remember`; `Site`, `with_memory`, `standing_state`; `Listened`, `Channel`, `MeanLoop`,
-`mean_loop`; `scaled`.
+`mean_loop`.
 Guarantees: each matrix comes with the radius of its rounding, those of the sites' frames included; rigid
 motions are taken out, which no luck moves.
 Does not: compute second moments (see `gains`).
@@ -31,7 +31,7 @@ from apc.eigen.peers import PeerGroup
 from apc.eigen.relative import Relative, relative_coordinates, relative_rows, with_doubt
 from apc.frame.discretize import UNIT
 from apc.frame.lift import FrameMap
-from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
+from apc.frame.radius import radius_of, value_of
 from apc.frame.schedule import Selected, Sent, Way
 from apc.frame.taylor import arithmetic_of, entrywise, hull, over_as_many
 from apc.moments.packet_memory import Memory
@@ -115,18 +115,6 @@ class MeanLoop:
     misses: Mapping[tuple[int, Route, int], Matrix]
 
 
-def scaled(matrix: Matrix, by: Matrix, numbers: Arithmetic) -> Matrix:
-    """Return matrices entry by entry times others, or times numbers."""
-    if numbers is FLOATS:
-        return np.asarray(matrix * by)
-    if max(matrix.shape[-3], by.shape[-3]) > 2:
-        return entrywise(matrix, by)
-    value, factor, off = value_of(matrix), value_of(by), radius_of(by)
-    product = value * factor
-    radius = radius_of(matrix) * (np.abs(factor) + off) + np.abs(value) * off + UNIT * np.abs(product)
-    return with_radius(product, radius * (1 + 8 * UNIT))
-
-
 def remember(route: Route, memory: Memory, channels: Sequence[str]) -> Remembered:
     """Follow what is remembered on a route through a frame."""
     count, slots = memory.count, memory.slots
@@ -146,7 +134,7 @@ def remember(route: Route, memory: Memory, channels: Sequence[str]) -> Remembere
         missed = -chance[..., None]
         missed[0] += 1
         missed[1] = chance[1, :, None] + UNIT
-        after[:, uncertain] = scaled(after[:, uncertain], missed, RADII)
+        after[:, uncertain] = entrywise(after[:, uncertain], missed)
         after[:, uncertain, count + slot] = chance
         after[0, uncertain, first + np.arange(size)] = 1.0
         first += size
@@ -289,7 +277,7 @@ def mean_loop(
             for channel, own, first in zip(listened, values, firsts, strict=False):
                 if channel.site == g and channel.route == one.route and channel.weights.get(row.way):
                     by = np.array(bounded_weight(channel.weights[row.way], 0.0)).reshape(2, 1, 1)
-                    weighed = scaled(own[:, place, None], by, RADII)
+                    weighed = entrywise(own[:, place, None], by)
                     before[:, line, first : first + own.shape[-1]] = over_as_many(weighed, like)[:, 0]
         feedback.append(Feedback(now, before))
     closed = close([one.map for one in sites], feedback, layout, numbers=numbers)

@@ -44,7 +44,7 @@ from apc.frame.taylor import hull, within
 from apc.moments.crowd import Classes, classes_of, hearing, moments_of, peer_classes, remembered_of
 from apc.moments.gains import below_1
 from apc.moments.mean_loops import Remembered
-from apc.moments.network import STABLE, UNSTABLE, Growth, growth, unreliable
+from apc.moments.network import STABLE, UNSTABLE, growth, unreliable
 from apc.moments.packet_memory import is_memoryless
 from apc.network.channel import channel_law
 from apc.network.nominal import channel_numbers
@@ -172,10 +172,6 @@ def _changed(
     """Return the scene at a point of the box, or with some of its numbers."""
     chosen = places or range(len(ranges))
     return apply(system, [Override(ranges[place].free, point[place]) for place in chosen])
-
-
-def _growth_at(asked: _Question, point: Sequence[Fraction], *, bounded: bool) -> Growth:
-    return growth(_changed(asked.system, asked.ranges, point), asked.prepared, bounded=bounded)
 
 
 def _is_unstable(asked: _Question, point: Sequence[Fraction]) -> bool:

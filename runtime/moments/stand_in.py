@@ -33,9 +33,10 @@ from apc.eigen.relative import relative_coordinates, relative_rows, with_doubt
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII
 from apc.frame.schedule import Selected, Way
+from apc.frame.taylor import entrywise
 from apc.moments.crowd import Hearing, own_value, peer_classes, remembered_of, standing_motions
 from apc.moments.gains import Answer, Drive, Moments, Part, number_of, weighted
-from apc.moments.mean_loops import Remembered, Site, scaled, standing_state, with_memory
+from apc.moments.mean_loops import Remembered, Site, standing_state, with_memory
 from apc.moments.unserved import UnservedError
 from apc.network.channel import ChannelLaw, channel_law
 
@@ -239,9 +240,9 @@ def _receiver(
     for g, (felt_of, rows_of) in enumerate(zip(from_class, values, strict=True)):
         block = RADII.multiply(RADII.multiply(reached, felt_of), rows_of)
         counts = np.stack([heard[:, g], NODE_ROUNDINGS * UNIT * np.abs(heard[:, g])], axis=-1)
-        alike = scaled(block, counts[..., None, None], RADII)
+        alike = entrywise(block, counts[..., None, None])
         shared = averaged(alike)
-        shares.append(scaled(shared, number_of(1 / max(others[g], 1), RADII), RADII))
+        shares.append(entrywise(shared, number_of(1 / max(others[g], 1), RADII)))
         varies.append(RADII.subtract(alike, shared))
         per_peer.append(RADII.subtract(block, shares[g]))
     return Receiver(heard, weight, mean, tuple(shares), np.concatenate(varies, axis=-1), tuple(per_peer))
@@ -256,7 +257,7 @@ def _closed(
     whole = np.zeros((2, n, n))
     for h, one in enumerate(receivers):
         for g, count in enumerate(counts):
-            block = scaled(one.shares[g], number_of(float(count - (g == h)), RADII), RADII)
+            block = entrywise(one.shares[g], number_of(float(count - (g == h)), RADII))
             whole[:, states[h], states[g]] = RADII.add(one.mean, block) if h == g else block
     loops_of: list[tuple[int | None, Matrix]] = [(None, whole)]
     names = [site.name for site in common.sites]
@@ -287,7 +288,7 @@ def _closed(
             units[np.arange(len(a)), a, b] = units[np.arange(len(a)), b, a] = 1.0
             columns = states[d] if only is None else slice(None)
             into = relative_rows(RADII.exact(np.eye(matrix.shape[-1])[:, columns]), bounded, RADII)
-            into = scaled(into, number_of(share**0.5, RADII), RADII)
+            into = entrywise(into, number_of(share**0.5, RADII))
             drives.append(Drive(part.matrix, into, units, places[d], answers, number, 1.0))
     return Moments(tuple(parts), tuple(drives), ends[-1])
 

@@ -1,7 +1,7 @@
 """A scene over recorded delays, played again and again: frames that come back after a period.
 
 Takes: a scene all of whose unreliable links say `trace`.
-Gives: `trace_radius`, `Found`.
+Gives: `trace_radius`, `Found`; `heard_packets`, `hearing_packets`.
 Guarantees: nothing is left to chance: each frame hears what `simulate` hears, once the first packets are
 gone.
 Does not: serve values that stand in for missed ones, or a trace of losses only.
@@ -77,7 +77,9 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
         what = f"the recorded delays come again after {frames:,} frames"
         raise UnservedError(f"{what}, and {MOST_FRAMES:,} are the most")
     heard = {
-        row: _heard(link, told.timings[row.way.delay], times[link.clock], times[row.clock][row.tick], told)
+        row: heard_packets(
+            link, told.timings[row.way.delay], times[link.clock], times[row.clock][row.tick], told
+        )
         for row in rows
         for link in [links[row.way.link]]
     }
@@ -97,8 +99,20 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
     return Found(low, high, radius, doubt, frames)
 
 
-def _heard(link: Link, delay: Fraction, sent: Sequence[Fraction], tick: Fraction, told: Hearing) -> list[int]:
-    """Return which packet a tick hears, frame by frame over a period, counted from the first of its frame."""
+def heard_packets(
+    link: Link, delay: Fraction, sent: Sequence[Fraction], tick: Fraction, told: Hearing
+) -> list[int]:
+    """Return which packet a tick hears, frame by frame over a period, counted from the first of its frame.
+
+    Parameters
+    ----------
+    link, delay
+        The link, and its nominal delay in seconds.
+    sent, tick
+        When in a frame packets are sent, and when the tick is, in seconds.
+    told
+        The peers of the scene.
+    """
     slots = len(sent)
     trace = None if link.channel is None else link.channel.trace
     delays = (
@@ -150,7 +164,7 @@ def _period(
     for frame in range(frames):
         numbers = tuple(heard[row][frame % len(heard[row])] for listed in rows for row in listed)
         if numbers not in known:
-            now = _hearing_so(loop, rows, iter(numbers), depth, slots)
+            now = hearing_packets(loop, rows, iter(numbers), depth, slots)
             layout = lay_out_loop(now)
             maps = [site.lifted.bounded for site in now.sites]
             matrix = close(maps, feedback_of(now, layout), layout, numbers=RADII).matrix
@@ -187,14 +201,24 @@ def _scaled(matrix: Balls, near: float) -> tuple[Balls, int]:
     return with_radius(value, radius), exponent
 
 
-def _hearing_so(
+def hearing_packets(
     loop: Loop,
     rows: Sequence[Sequence[Selected]],
     numbers: Iterator[int],
     depth: Mapping[str, int],
     slots: Mapping[str, int],
 ) -> Loop:
-    """Return a loop whose ticks hear the packets of these numbers."""
+    """Return a loop whose ticks hear the packets of these numbers.
+
+    Parameters
+    ----------
+    loop, rows
+        The loop, and what each row of r of each site hears.
+    numbers
+        The packets, row after row, counted from the first of their frame.
+    depth, slots
+        How many frames a packet is kept for, and how many are sent in a frame, by the link's name.
+    """
     sites = []
     for site, listed in zip(loop.sites, rows, strict=True):
         depths = tuple(depth[one.link] for one in site.schedule.sent)

@@ -1,7 +1,8 @@
 """The worst that losses can do: how many in a row are harmless, and a pattern of them that shakes a scene.
 
 Takes: a `CompiledSystem` whose links lose packets, whose receivers hold what they heard last.
-Gives: `LossesInARow`, `worst_case`; `trace_of_worst`; for both, `held_parts`, `harmless`, `shaking`.
+Gives: `LossesInARow`, `worst_case`; `trace_of_worst`; for both, `held_parts`, `harmless`, `shaking`;
+`ratios_of`, `weight_of`.
 Guarantees: what is certified is proved for every pattern on every channel by itself; a pattern's growth above
 1 is proved. The cost does not grow with the number of equal peers on complete graphs.
 Does not: find the worst pattern of all: between the losses certified and those of the pattern it is open.
@@ -42,7 +43,7 @@ from apc.eigen.peers import PeerGroup
 from apc.frame.discretize import UNIT
 from apc.frame.radius import RADII, radius_of, value_of
 from apc.frame.schedule import Way
-from apc.moments.held import Ear, HeldLoop, held_loop, held_scene, lossy_rows
+from apc.moments.held import Ear, HeldLoop, ears_of, held_loop, held_scene, lossy_rows
 from apc.moments.unserved import UnservedError
 
 Floats = NDArray[np.float64]
@@ -188,8 +189,8 @@ def held_parts(system: CompiledSystem, prepared: Prepared) -> HeldParts:
     if isinstance(loops, str):
         raise UnservedError(loops)
     lossy = scene.lossy
-    parts, ratios = [], _ratios(loops[0].sites, lossy)
-    weight, sizes = _weight(loops, lossy)
+    parts, ratios = [], ratios_of(loops[0].sites, lossy)
+    weight, sizes = weight_of(loops, lossy)
     for loop in loops:
         if loop.states > MOST_STATES:
             what = f"peers make one system of {loop.states:,} states"
@@ -206,19 +207,9 @@ def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios, sizes: Sizes) -> He
         return math.sqrt(loop.sites[site].count) * sizes.get((link, loop.sites[site].name), 1.0)
 
     listened = [lossy_rows(site, lossy) for site in loop.sites]
-    ears: list[Ear] = []
+    ears = ears_of(loop, lossy, range(len(loop.sites)))
     outside: list[Ear] = []
     shares: list[float] = []
-    for h, site in enumerate(loop.sites):
-        for row, sent in enumerate(site.schedule.sent):
-            weights = {
-                (g, line): loop.coupling[one.way][g][h]
-                for g, rows in enumerate(listened)
-                for line, one in rows
-                if one.sent == sent and (loop.coupling[one.way][g][h] or loop.doubts.get(one.way))
-            }
-            if weights:
-                ears.append(Ear(weights, h, row))
     for g, rows in enumerate(listened):
         for way, sent in dict.fromkeys((one.way, one.sent) for _, one in rows):
             # Of several numbers that are heard as one, that which counts once is what the others add to.
@@ -226,7 +217,7 @@ def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios, sizes: Sizes) -> He
                 places = [line for line, one in rows if (one.way, one.sent) == (way, sent)]
                 outside.append(Ear(dict.fromkeys(((g, line) for line in places), ONE)))
                 shares.append(1 / size(g, sent.link))
-    heard, whole = (held_loop(loop, some, lossy).relative() for some in (ears, [*ears, *outside]))
+    heard = held_loop(loop, [*ears, *outside], lossy).relative()
     roundings = [8 * UNIT * share if share != 1 else 0.0 for share in shares]
     sums: dict[tuple[int, str, str], Floats] = {}
     for place, ear in enumerate(ears):
@@ -241,9 +232,9 @@ def _part(loop: Loop, lossy: frozenset[str], ratios: Ratios, sizes: Sizes) -> He
         loop.name,
         heard,
         (
-            whole.frame(lost=False),
-            RADII.multiply(whole.g[..., len(ears) :], np.stack([np.diag(shares), np.diag(roundings)])),
-            RADII.multiply(adding, whole.step),
+            heard.frame(lost=False),
+            RADII.multiply(heard.g[..., len(ears) :], np.stack([np.diag(shares), np.diag(roundings)])),
+            RADII.multiply(adding, heard.step),
             np.zeros((2, adding.shape[-2], len(outside))),
         ),
     )
@@ -254,7 +245,7 @@ def _scaled(value: float, by: float) -> tuple[float, float]:
     return value * by, 8 * UNIT * abs(value * by) if by != 1 or value != 1 else 0.0
 
 
-def _ratios(sites: Sequence[PeerGroup], lossy: frozenset[str]) -> Ratios:
+def ratios_of(sites: Sequence[PeerGroup], lossy: frozenset[str]) -> Ratios:
     """Find the links of which every tick of every site combines all channels into the same number.
 
     Those of other links are kept apart. The first channel that counts has the ratio 1.
@@ -289,7 +280,7 @@ def _ratios(sites: Sequence[PeerGroup], lossy: frozenset[str]) -> Ratios:
     return found
 
 
-def _weight(loops: Sequence[Loop], lossy: frozenset[str]) -> tuple[float, Sizes]:
+def weight_of(loops: Sequence[Loop], lossy: frozenset[str]) -> tuple[float, Sizes]:
     """Return ‖|W|‖₂, rounded up, and the sizes of peers by which it is as small as can be.
 
     Notes

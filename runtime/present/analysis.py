@@ -31,7 +31,7 @@ from apc.present.forms import (
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
-    from apc.analysis.box_proof import BoxProof
+    from apc.analysis.box_proof import BoxProof, ChangingDelay
     from apc.analysis.contact_modes import ContactMode, ContactModes
     from apc.analysis.conventions import Conventions, Outcome
     from apc.analysis.needs import Needs, SiteNeeds
@@ -112,11 +112,12 @@ def _pairwise(system: CompiledSystem) -> Iterator[str]:
 def analysis_text(result: Analysis) -> str:
     """Return what `apc analyze` prints: the verdict in words, the numbers, the modes as a table."""
     words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
-    motions = result.translations + result.rotations
-    if motions > 1 and result.verdict.startswith("stable up to"):
+    named = (("translation", result.translations), ("rotation", result.rotations))
+    free = " and ".join(counted(count, noun) for noun, count in named if count)
+    if result.translations + result.rotations > 1 and result.verdict.startswith("stable up to"):
         words = (
-            f"{motions} motions are held back by nothing, of all peers together or of some "
-            "beside others: moved so they stay where they are. Every other motion dies out."
+            f"{free} are held back by nothing, of all peers together or of some beside others: moved so, "
+            "they stay where they are. Every other motion dies out."
         )
     if result.linearized:
         words = f"To first order, {words[0].lower()}{words[1:]}"
@@ -124,13 +125,11 @@ def analysis_text(result: Analysis) -> str:
         words += "\nWhat it does in time is played: apc simulate"
     if not result.states_per_peer:
         words = "Nothing here is free to move."
-    named = (("translation", result.translations), ("rotation", result.rotations))
-    removed = " and ".join(counted(count, noun) for noun, count in named if count)
     radius = measured(result.spectral_radius, result.spectral_radius_error)
     facts = (
         ("spectral radius", f"{radius} per frame of {_time(result.frame_s)}"),
         ("peers", f"{result.peers}, {result.states_per_peer} states each"),
-        ("method", result.method + (f", {removed} left out" if removed else "")),
+        ("method", result.method + (f", {free} left out" if free else "")),
         ("proof", result.proof),
         (
             "left out",
@@ -333,7 +332,23 @@ def box_proof_text(found: BoxProof) -> str:
             more += wrapped(f"more cells may decide it: --cells {MORE_CELLS * found.cells}")
     told = [line for text in (*found.left_out, said) for line in wrapped(text)]
     ranges = [f"  {_range(one)}" for one in found.ranges]
+    if found.changing is not None:
+        more += ["", *wrapped(_changing(found.changing, found.ranges[0]))]
     return "\n".join([f"{found.topology}:", *told, *ranges, *more, *notes(found.notes)])
+
+
+def _changing(found: ChangingDelay, over: Range) -> str:
+    """Return what is proved of a delay that changes from packet to packet, in a sentence."""
+    low, high = (quantity(float(one), over.unit, 9) for one in (over.low, over.high))
+    said = [found.note or "open whether it stays stable"]
+    if found.unstable is not None:
+        said = [f"unstable if by turns {found.unstable[0]} packets take {low} and {found.unstable[1]} {high}"]
+    if found.proved_to == float(over.high):
+        said = ["stable, proved by the small gain theorem"]
+    elif found.proved_to is not None:
+        to = quantity(found.proved_to, over.unit, 9)
+        said = [f"stable from {low} to {to}, proved by the small gain theorem", f"over all of it {said[0]}"]
+    return f"However the delay changes from packet to packet: {'; '.join(said)}."
 
 
 def _range(found: Range) -> str:
@@ -353,6 +368,7 @@ def box_proof_document(found: BoxProof) -> dict[str, Any]:
         "box": [range_document(one) for one in found.ranges],
         "unstable_at": list(found.point) if found.stable is False else None,
         "open_around": list(found.point) if found.stable is None and found.point else None,
+        "changing": found.changing and picked(found.changing, "proved_to", "unstable", "note"),
     }
 
 

@@ -68,6 +68,7 @@ def save_animation(system: CompiledSystem, found: Trajectory, path: Path) -> Non
     figure, actors = draw_actors(system)
     columns = {signal.name: place for place, signal in enumerate(found.signals)}
     tracks = [MM * found.values[:, [columns[name] for name in actor.states]] for actor in actors]
+    turns = [found.values[:, columns[actor.turning]] if actor.turning else None for actor in actors]
     for actor, track in zip(actors, tracks, strict=True):
         widen(actor, track)
     if actors:
@@ -91,8 +92,8 @@ def save_animation(system: CompiledSystem, found: Trajectory, path: Path) -> Non
             with writer.saving(figure, named, DPI):
                 for row in rows.tolist():
                     title.set_text(f"{system.name}: {found.time[row]:.3f} s{told}")
-                    for actor, track in zip(actors, tracks, strict=True):
-                        actor.move(track[row])
+                    for actor, track, turn in zip(actors, tracks, turns, strict=True):
+                        actor.move(track[row], 0.0 if turn is None else turn[row])
                     writer.grab_frame()
             shutil.copyfile(named, temporary)
 

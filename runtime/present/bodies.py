@@ -2,7 +2,8 @@
 
 Takes: a `CompiledSystem`.
 Gives: `Body`, `Disc`, `Line`, `PeerView`, `moves_in_plane`, `bodies_of`, `views_of`.
-Guarantees: a body is a position, a number or a vector of numbers in metres; where something is decided by the
+Guarantees: a body is a position, a number or a vector of numbers in metres, and the angle of the part whose
+position it is; where something is decided by the
 distance of two of them, or of one from a fixed point, in metres, there is a disc; where by the distance from
 a line or plane, or on an axis from a point, there is a line.
 Does not: play the scene, draw it, or know what a part is called.
@@ -40,13 +41,16 @@ SAME = 1e-9  # relative: what is equal but for roundings
 class Body:
     """A body at the start: its place (d,) and its radius, 0 for a point, in m; `states` are its coordinates.
 
-    Of a body on an axis d is 1, and the radius half its width.
+    Of a body on an axis d is 1, and the radius half its width. `turning` is the state that is the angle of a
+    body of a plane, "" of one that has none, and `angle` its value in rad.
     """
 
     name: str
     place: tuple[float, ...]
     radius: float
     states: tuple[str, ...]
+    turning: str = ""
+    angle: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +85,15 @@ def positions_of(kind: Kind) -> dict[str, list[int]]:
         if state.unit == "m":
             found.setdefault(whole_and_index(state.name)[0], []).append(place)
     return found
+
+
+def angles_of(kind: Kind) -> dict[str, int]:
+    """Return of each part that turns by one angle the place of that among the states."""
+    found: dict[str, list[int]] = {}
+    for place, state in enumerate(kind.states):
+        if state.unit == "rad":
+            found.setdefault(state.name.rpartition(".")[0], []).append(place)
+    return {part: places[0] for part, places in found.items() if len(places) == 1}
 
 
 def moves_in_plane(system: CompiledSystem) -> bool:
@@ -144,14 +157,17 @@ def bodies_of(
             radii[wide] = max(radii[wide], abs(surface.offset))
         elif isinstance(surface, Disc) and _equal(surface.centre, 0):
             radii[wide] = max(radii[wide], surface.radius)
+    turns = angles_of(kind)
     bodies = [
         Body(
-            name.rpartition(".")[0],
+            part,
             tuple(float(start[place]) for place in places),
             radii[name],
             tuple(kind.states[place].name for place in places),
+            *((kind.states[turns[part]].name, float(start[turns[part]])) if part in turns else ()),
         )
         for name, places in positions.items()
+        for part in [name.rpartition(".")[0]]
     ]
     return bodies, list(fixed)
 

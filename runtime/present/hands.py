@@ -120,29 +120,32 @@ def feel_text(found: Feel) -> str:
             lines += labelled(name, measured(getattr(slow, name), error, unit))
         if (network := found.network_viscosity) is not None:
             share = measured(network.network, network.error, "N*s/m")
-            by = "" if network.formula is None else f"; K ((T_n − T_c)/2 + T_d): {network.formula:.5g}"
-            lines += labelled("of the network", share + by)
+            lines += labelled("of that", f"{share}, which the network adds")
+        if slow.mass < 0:
+            lines += note("a mass below 0: forces that come late push on what speeds up")
         lines.append("")
     headings = ("frequency", "impedance", "phase", "arrives", "copies apart", "alias")
     units = ("Hz", "N*s/m", "degrees", "mm/s/N", "mm/N", "")
     lines += table([headings, units, *_rows_shown(found)], ">>>>>>")
     told = [f"arrives: at {found.between}"] if found.between else []
-    told += [f"copies: of {found.copy}"] if found.copy else []
-    if told:
-        lines += ["", *wrapped("; ".join(told), "  ", "  ")]
+    told += [f"copies: of {found.copy}, from the mean of the others'"] if found.copy else []
+    told += ["alias: the largest part that sampling moves to another frequency, beside that at this one"]
+    lines += ["", *wrapped("; ".join(told), "  ", "  ")]
     if found.hinf:
         lines += ["", "  Largest gain at any frequency (H∞), forces of any course:"]
         lines += table([_extreme(one) for one in found.hinf])
-    for one in found.h2:
+    for one in found.h2:  # of a sample that is off by a mm, a µm is what a mm is of 1 N
+        what, small = ("1 N rms of every hand", "m")
+        if one.source != "hands":
+            what, small = "1 mm rms of every device's samples", "µ"
         values = [
             f"{what} {measured(value * 1e3, off * 1e3, unit)}"
             for what, value, off, unit in (
-                ("copies apart", one.error_m, one.errors[0], "mm"),
-                ("velocity", one.velocity_m_s, one.errors[1], "mm/s"),
+                ("copies apart", one.error_m, one.errors[0], f"{small}m"),
+                ("velocity", one.velocity_m_s, one.errors[1], f"{small}m/s"),
             )
             if value is not None and off is not None
         ]
-        what = "1 N rms of every hand" if one.source == "hands" else "1 m rms of every device's samples"
         lines += ["", *note(f"{', '.join(values) or 'it drifts'} (rms) for {what}, new at each tick")]
     return "\n".join(lines)
 

@@ -52,7 +52,9 @@ TITLES = {
 # What differs from run to run, from machine to machine, or with which of equal motions is named first.
 UNLIKE = {"provenance", "origin", "points", "handles", "participation"}
 _KEPT = re.compile(r'<script type="application/json" id="apc-report">(.*?)</script>', re.DOTALL)
-_STYLE = """
+# Of a page that loads nothing.
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+STYLE = """
 :root { color-scheme: light dark; --ink: #1f2933; --faint: #52606d; --page: #fff; --line: #cbd2d9;
   --tint: #f5f7fa; --link: #0b5cad; }
 @media (prefers-color-scheme: dark) { :root { --ink: #e4e7eb; --faint: #9fb0c0; --page: #15191e;
@@ -121,12 +123,11 @@ def report_page(found: Report) -> str:
     """Return a report as one HTML document."""
     named = ", ".join(one.name for one in found.scenes)
     kept = json_text(report_document(found), indent=None).replace("<", "\\u003c")
-    policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
     parts = [
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>{escape(named)}: a report of apc</title><style>{_STYLE}</style></head><body>",
+        f"<title>{escape(named)}: a report of apc</title><style>{STYLE}</style></head><body>",
         f"<header><h1>{escape(named)}</h1>",
         '<p class="faint">Every number here is that of the command beside it; '
         "<code>apc report --check FILE</code> computes this page anew and says what differs.</p>",

@@ -2,13 +2,15 @@
 
 Takes: a `CompiledSystem`.
 Gives: `draw_actors`; `Actor`, `keep_in_sight` and `widen`, for what moves in it (see `animation`).
-Guarantees: bodies on an axis stand in a row a peer; those of a plane have a plane a peer, all to one scale.
+Guarantees: bodies on an axis stand in a row a peer; those of a plane have a plane a peer, all to one scale,
+and a bar along the axis of each that turns.
 Of space the first two coordinates are drawn, and beside bodies of a plane none that move along one axis.
 Does not: play the scene, or find what there is to draw (see `bodies`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +28,7 @@ COLUMNS, PANEL, MARGIN = 4, 3.2, 1.0  # planes in a row; inches: of a plane, of 
 WIDTH, ROW = 7.0, 0.62  # inches: of a picture of rows, and of a row
 HALF = 0.36  # half of a body's height, of the distance of two rows
 LARGEST = 11  # mark of a body, in points
+BAR = 48  # length of the bar along the axis of a body that turns, in points
 ROOM = 0.12  # of what is drawn, around it
 
 
@@ -33,7 +36,8 @@ ROOM = 0.12  # of what is drawn, around it
 class Actor:
     """A body in a picture: its signals `states`, half its width in mm, and the `shift` that it is drawn at.
 
-    `shift` is a matplotlib Affine2D; `artists` are what is drawn.
+    `shift` is a matplotlib Affine2D; `artists` are what is drawn, the last one the bar along its axis if it
+    has an angle, the signal `turning`.
     """
 
     ax: Any
@@ -42,10 +46,18 @@ class Actor:
     row: int
     shift: Any
     artists: tuple[Any, ...]
+    turning: str
 
-    def move(self, place: Sequence[float]) -> None:
-        """Put it at (d,), in mm; along an axis it stays in its row."""
+    def move(self, place: Sequence[float], angle: float = 0.0) -> None:
+        """Put it at (d,), in mm, turned by an angle in rad; along an axis it stays in its row."""
         self.shift.clear().translate(place[0], place[1] if len(place) > 1 else self.row)
+        if self.turning:
+            self.artists[-1].set_marker(_bar(angle))
+
+
+def _bar(angle: float) -> tuple[int, int, float]:
+    """Return the mark that is a line at an angle in rad from the first axis: rays up and down, turned."""
+    return 2, 2, math.degrees(angle) - 90
 
 
 def draw_actors(system: CompiledSystem) -> tuple[Any, list[Actor]]:
@@ -122,7 +134,12 @@ def _actor(ax: Any, peer: str, body: Body, row: int, colour: Any, size: int) -> 
         corner, sides = (-half, -HALF), (2 * half, 2 * HALF)
         shape = patches.Rectangle(corner, *sides, **look) if flat else patches.Circle((0, 0), half, **look)
         artists.append(ax.add_patch(shape))
-    return Actor(ax, tuple(f"{peer}.{state}" for state in body.states[:2]), half, row, shift, tuple(artists))
+    turning = f"{peer}.{body.turning}" if body.turning and not flat else ""
+    if turning:
+        bar = {"markersize": BAR, "markeredgewidth": 3, "transform": shift + ax.transData, "zorder": 1.5}
+        artists += ax.plot(0, 0, color=colour, marker=_bar(body.angle), **bar)
+    states = tuple(f"{peer}.{state}" for state in body.states[:2])
+    return Actor(ax, states, half, row, shift, tuple(artists), turning)
 
 
 def _draw_surface(ax: Any, surface: Disc | Line, row: int, bodies: Sequence[Body]) -> None:

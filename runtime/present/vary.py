@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from apc.vary.margins import Margins
     from apc.vary.sensitivity import Sensitivities
 
-SHOWN = 6  # rows of the table of what moves the radius most
+SHOWN = 6  # rows of the table of what moves the radius most; digits of a value in a sentence
 DIGITS = 3  # of a change
 
 NONE_TOLD = "what moves the radius most: no change of it can be told from rounding"
@@ -35,18 +36,18 @@ NONE_TOLD = "what moves the radius most: no change of it can be told from roundi
 def critical_text(found: Critical) -> str:
     """Return where a scene's verdict changes with a parameter."""
     unit = found.unit
-    title = [f"{found.topology}: {found.parameter} is {quantity(found.present, unit)}"]
+    now = quantity(found.present, unit)
     if found.groups:
         values = ["several values" if value is None else quantity(value, unit) for _, value in found.groups]
-        named = [f"{value} at {group}" for value, (group, _) in zip(values, found.groups, strict=True)]
-        whom = "groups" if len(found.groups) > 1 else "its peers"
-        title = [f"{found.topology}: {found.parameter}, one value for all {whom}"]
-        title += note(f"now {', '.join(named)}")
-    meant = [MEANT[found.criterion]] if found.criterion in MEANT else []
-    lines = [*title, *notes([*meant, *found.left_out]), ""]
-    if found.value is None:
+        now = ", ".join(f"{value} at {group}" for value, (group, _) in zip(values, found.groups, strict=True))
+        now += f", to be one value for all {'groups' if len(found.groups) > 1 else 'its peers'}"
+    said = _stable_ranges(found)
+    if not said:
         wording = ("value scanned", "number looked at") if found.counted else ("", "")
-        lines += wrapped(found.verdict.replace(*wording), "  ", "  ")
+        said = found.verdict.replace(*wording)
+    meant = [MEANT[found.criterion]] if found.criterion in MEANT else []
+    lines = wrapped(f"{found.topology}: {said}")
+    lines += [*notes([*meant, *found.left_out, f"{found.parameter} is now {now}"]), ""]
     if not found.enters:
         return "\n".join(lines)
     if found.counted:
@@ -54,7 +55,7 @@ def critical_text(found: Critical) -> str:
     for one in found.crossings:
         exact = f"{quantity(one.value, unit, 15)}, exact"
         value = measured(one.value, one.error, unit) if one.error else exact
-        lines.append(f"{'→' if one.value == found.value else ' '} {value}")
+        lines.append(f"  {value}")
         kind = "jump, " if one.kind == "jump" else ""
         turns = "" if math.isnan(one.frequency_hz) else f", {in_hertz(one.frequency_hz)}"
         lines.append(f"    {kind}stable {one.stable_side} it{turns}, {one.proof}")
@@ -67,6 +68,25 @@ def critical_text(found: Critical) -> str:
     if not found.whole:
         lines.append("  an eigenvalue keeps near to the boundary: more crossings could hide")
     return "\n".join(lines)
+
+
+def _stable_ranges(found: Critical) -> str:
+    """Return where a scene is stable in a sentence; nothing where no crossing was found."""
+    ranges, begin = [], ""
+    for one in found.crossings:
+        if found.counted:
+            value = f"{math.floor(one.boundary) + (one.stable_side == 'above'):,d}"
+        else:  # rounded to the side that is stable
+            rounding = ROUND_FLOOR if one.stable_side == "below" else ROUND_CEILING
+            value = quantity(float(Context(SHOWN, rounding).create_decimal_from_float(one.value)), found.unit)
+        if one.stable_side == "above":
+            begin = value
+            continue
+        most = f"up to {value}" if found.counted else f"below {value}"
+        ranges.append(f"from {begin} {most}" if begin else most)
+        begin = ""
+    ranges += [f"from {begin} on" if found.counted else f"above {begin}"] if begin else []
+    return f"stable with {found.parameter} {', and '.join(ranges)}" if ranges else ""
 
 
 def _span(ends: tuple[float, float], unit: str) -> str:
@@ -85,16 +105,16 @@ def _count_lines(found: Critical) -> list[str]:
         rows.append((begin, last, not rows[-1][-1]))
     lines = []
     for low, high, stable in rows:
-        mark = "→" if stable and found.value in (low, high) else " "
         name = f"{low:,d}" if low == high else f"{low:,d} to {high:,d}"
-        lines.append((f"{mark} {name}", "stable" if stable else "unstable"))
+        lines.append((name, "stable" if stable else "unstable"))
     looked = (
         f"every number from {first:,d} to {last:,d} was looked at"
         if found.looked == last - first + 1
         else f"{found.looked} numbers from {first:,d} to {last:,d} were looked at, those on either side of a "
         "change among them; a change and back between two could hide"
     )
-    return [*(line[2:] for line in table(lines)), "", *wrapped(looked, "  ", "  ")]
+    listed = [*table(lines), ""] if lines else []
+    return [*listed, *wrapped(looked, "  ", "  ")]
 
 
 def critical_picture(found: Critical, ax: Any) -> Any:
@@ -115,19 +135,23 @@ def margins_text(found: Margins) -> str:
     if not found.rows:
         return "\n".join(note(f"margins {found.note}"))
     width = max(len(one.parameter) for one in found.rows)
-    lines = [f"  {'may grow':<{width}}  from           to               times  at"]
-    for one in found.rows:
+    ends = [
+        "" if one.value is None else with_unit(known_digits(one.value, one.error or 0.0, 7), one.unit)
+        for one in found.rows
+    ]
+    wide = max(16, *map(len, ends))
+    lines = [f"  {'may grow':<{width}}  from           {'to':<{wide}} times  at"]
+    for one, end in zip(found.rows, ends, strict=True):
         start = f"  {one.parameter:<{width}}  {quantity(one.present, one.unit, 5):<14}"
         if one.note:
             lines.append(f"{start} not looked for: {one.note}")
         elif one.value is None:
             lines.append(f"{start} none found up to {quantity(one.scanned, one.unit, 5)}")
         else:
-            end = with_unit(known_digits(one.value, one.error or 0.0, 7), one.unit)
             times = "–" if one.factor is None else f"{one.factor:.4g}"
             at = in_hertz(math.nan if one.frequency_hz is None else one.frequency_hz)
             jump = ", jump" if one.kind == "jump" else ""
-            lines.append(f"{start} {end:<16} {times:>5}  {at}{jump}")
+            lines.append(f"{start} {end:<{wide}} {times:>5}  {at}{jump}")
     return "\n".join([*lines, *note(found.note)])
 
 

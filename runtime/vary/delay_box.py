@@ -4,7 +4,7 @@ Takes: a `CompiledSystem`, ranges of which one is a link's delay, and what prove
 Gives: `is_delay`, `prove_over_delay`, `standing_delays`.
 Guarantees: a packet is read at ticks, so that between two delays at which it is read a tick later nothing
 changes: each such piece is judged at one delay within, and each delay between two pieces by itself.
-Does not: say anything of delays that change from packet to packet (see `moments` for jitter).
+Does not: serve delays drawn by chance (see `moments` for jitter).
 """
 
 from __future__ import annotations
@@ -14,15 +14,20 @@ from dataclasses import replace
 from fractions import Fraction
 
 from apc.analysis.analysis import prepare
-from apc.analysis.box_proof import UNDECIDED, BoxProof
+from apc.analysis.box_proof import UNDECIDED, BoxProof, ChangingDelay
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.names import Free, Range
+from apc.moments.changing_delay import small_gain, unstable_delays
+from apc.moments.unserved import UnservedError
 from apc.vary.delays import delay_pieces, system_with_delay
 
 PLACE = Place("box")
 
-CONSTANT = "at every constant delay: one that changes from packet to packet is jitter, and not among these"
+CONSTANT = "at every constant delay: one that changes from packet to packet is not among these"
+
+# Parts of a range, from its least delay on, for which stability is looked for however the delay changes.
+PARTS = tuple(Fraction(part, 8) for part in range(8, 0, -1))
 
 
 def is_delay(system: CompiledSystem, free: Free) -> bool:
@@ -31,7 +36,11 @@ def is_delay(system: CompiledSystem, free: Free) -> bool:
 
 
 def prove_over_delay(
-    system: CompiledSystem, ranges: Sequence[Range], prove: Callable[[CompiledSystem, list[Range]], BoxProof]
+    system: CompiledSystem,
+    ranges: Sequence[Range],
+    prove: Callable[[CompiledSystem, list[Range]], BoxProof],
+    *,
+    nominal: bool,
 ) -> BoxProof:
     """Prove a scene stable in a box of which one range is a link's delay.
 
@@ -43,6 +52,9 @@ def prove_over_delay(
         The parameters left open, the delay among them.
     prove
         Proves a scene with one delay stable in the box of the other ranges, of which there may be none.
+    nominal
+        Whether the scene's own verdict is meant, and no packet is lost: then it is said, too, what is proved
+        where the delay changes from packet to packet and no other range is given.
 
     Raises
     ------
@@ -70,9 +82,22 @@ def prove_over_delay(
         else:
             verdict = found.verdict
     stable = None if left else True
-    notes = (*found.notes, CONSTANT)
-    whole = replace(found, ranges=tuple(ranges), cells=cells, notes=notes, stable=stable)
+    told = changing(system, delay) if nominal and stable and not rest else None
+    notes = (*found.notes, *[CONSTANT] * (told is None))
+    whole = replace(found, ranges=tuple(ranges), cells=cells, notes=notes, stable=stable, changing=told)
     return replace(whole, verdict=UNDECIDED if left else verdict, open_share=float(left), point=open_point)
+
+
+def changing(system: CompiledSystem, delay: Range) -> ChangingDelay:
+    """Return what is proved of a delay that changes from packet to packet within a range."""
+    low, width = delay.low, delay.high - delay.low
+    try:
+        ends = (low + part * width for part in PARTS)
+        proved = next((end for end in ends if small_gain(system, delay.free, low, end) < 1), None)
+    except UnservedError as why:
+        return ChangingDelay(None, None, f"left open, as {why}")
+    beyond = None if proved == delay.high else unstable_delays(system, delay.free, low, delay.high)
+    return ChangingDelay(None if proved is None else float(proved), beyond)
 
 
 def standing_delays(system: CompiledSystem, delay: Range) -> Iterator[tuple[Fraction, Fraction]]:

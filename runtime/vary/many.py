@@ -28,7 +28,14 @@ from apc.compiler.compiled import CompiledSystem, Parameter
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.peers import PeerGroup
 from apc.eigen.rigid import what_stands
-from apc.eigen.spectrum import STABLE, STABLE_TRANSLATING, UNSTABLE, judge
+from apc.eigen.spectrum import (
+    STABLE,
+    STABLE_MOVING,
+    STABLE_TRANSLATING,
+    STABLE_TURNING,
+    UNSTABLE,
+    judge,
+)
 from apc.finite_equations import finite_equations
 from apc.frame.ages import linear_sites
 from apc.frame.exchange import build_exchange
@@ -220,8 +227,8 @@ class Analyses(Result):
 
     @property
     def stable(self) -> Truths:
-        """Where it is stable, up to a common translation or without; neither drifts, nor is left open."""
-        return np.isin(self.verdict, [STABLE, STABLE_TRANSLATING])
+        """Where it is stable, up to a common motion or without; neither drifts, nor is left open."""
+        return np.isin(self.verdict, [STABLE, STABLE_TRANSLATING, STABLE_TURNING, STABLE_MOVING])
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return a pandas table, a row a point: the values first, then the answers."""

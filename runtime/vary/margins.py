@@ -34,9 +34,9 @@ from apc.vary.delays import delay_now
 from apc.vary.evaluator import evaluator, free_parameters, many_packets
 from apc.vary.line import AnalysedLine, DelayLine, MatrixLine, delay_reach
 
-# Units of a stiffness and of a damping, as components write them.
+# Units of a stiffness and of a damping, along an axis or about one, as components write them.
 STIFFNESSES = ("N/m", "kg/s^2")
-UNITS = (*STIFFNESSES, "N*s/m", "kg/s")
+UNITS = (*STIFFNESSES, "N*s/m", "kg/s", "N*m/rad", "N*m*s/rad")
 
 # How many times the present value is looked at (or the change that would move an eigenvalue by 1).
 GROWTH = 1e3

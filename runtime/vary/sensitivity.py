@@ -128,10 +128,15 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
             """Say whether something that is rigid in the scene as it is moves where these vary."""
             return any(np.abs(one.values).max() > most for one in clusters_of(together) or ())
 
+        def bends(together: Sequence[Free]) -> bool:
+            """Say whether what is rigid follows these: nothing bounds what rounding does to it then."""
+            return not all(np.isfinite(one.rounding).all() for one in clusters_of(together) or ())
+
         zero = [one for one in free if not parameter_of(system, one).value]
         rest = [one for one in free if one not in zero]
         loose = [one for one in zero if frees([one])]
-        loose += [one for one in rest if frees([one])] if frees(rest) else []
+        for moves in (frees, bends):
+            loose += [one for one in rest if one not in loose and moves([one])] if moves(rest) else []
         listed = [[one for one in rest if one not in loose], *([one] for one in zero if one not in loose)]
         rows: list[Sensitivity] = []
         clusters: list[_Cluster] = []

@@ -38,7 +38,6 @@ PARTS = {
     "work_precision": ("Methods of simulation", "tests.bench.work_precision"),
     "play": ("Peers in real time", "tests.bench.play"),
     "simulate": ("Simulation", "tests.bench.simulate"),
-    "region": ("Regions", "tests.bench.region"),
     "hands": ("Hands", "tests.bench.hands"),
 }
 

@@ -71,13 +71,6 @@ def radius(damping: float) -> float:
     return float(np.abs(np.delete(values, np.argmin(np.abs(values - 1)))).max())
 
 
-def stable_grid(low: float, high: float, count: int) -> NDArray[np.bool_]:
-    """Return max |λ| < 1, as one would write it, on a grid of K_C (columns) and K_T (rows)."""
-    values = np.linspace(low, high, count).tolist()
-    frames = np.array([[whole_frame(*user(x, y)) for x in values] for y in values])
-    return np.asarray(np.abs(np.linalg.eigvals(frames)).max(axis=-1) < 1)
-
-
 def mode_frames(contact: Floats, coordination: Floats, damping: float) -> Floats:
     """Return a frame (2, k, 7, 7) of each of two modes at many points (k,), as an expert writes it.
 

@@ -1,4 +1,4 @@
-"""What a person waits for: whole processes, their memory, growth: `python -m tests.bench.process`.
+"""What a person waits for: whole processes and their memory: `python -m tests.bench.process`.
 
 A time is that of a processor, from the start of the process to its end, after one that compiles Python's own
 files; memory is the most it held. This program loads nothing large itself, as a process begins as a copy.
@@ -7,7 +7,6 @@ files; memory is the most it held. This program loads nothing large itself, as a
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import resource
 import shutil
@@ -15,13 +14,12 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 from apc.benchmark.timing import spread_of, waited
-from tests.bench.growing import SCENES, equations, flat, kinds, table
 from tests.bench.judge import Judge, parser_of
 
+SCENES = Path(__file__).resolve().parents[2] / "models" / "scenes"
 RUNS = 7
 SCENE, STAR = "three-users-average", "client-server"
 # A command and its target in seconds.
@@ -35,15 +33,6 @@ COMMANDS: tuple[tuple[str, str, float | None], ...] = (
     ("simulate", f"-m apc simulate --duration 1s {SCENE}.apc", None),
     ("feel", f"-m apc feel {SCENE}.apc", None),
     ("region", f"-m apc region {SCENE}.apc", None),
-)
-# What grows: how many of it, the scene of so many, the command and how many may take how
-# many seconds in `compile` and in the command beyond those of the smallest.
-Growing = tuple[str, tuple[int, ...], Callable[[int, Path], str], str, tuple[int, float, float] | None]
-GROWTH: tuple[Growing, ...] = (
-    ("equations", (10, 30, 100, 300, 1000), equations, "analyze scene.apc", (1000, 1.0, 3.0)),
-    ("kinds", (1, 2, 4, 8, 16, 32, 100), kinds, "analyze scene.apc", (32, 0.1, 0.1)),
-    ("equal peers", (3, 3000, 1_000_000), flat, "analyze scene.apc", None),
-    ("different peers", (1000, 10_000, 100_000), table, "analyze scene.apc", None),
 )
 
 
@@ -86,57 +75,15 @@ def commands(judge: Judge, folder: Path, runs: int) -> None:
         print(f"{title:<12} {spread} {used:8.3f} s {max(memory):5.0f} MiB{target}")
 
 
-def growth(judge: Judge, folder: Path, growing: Growing, quick: bool) -> None:
-    """Measure `compile` and a command of ever more of something, and print the exponents.
-
-    An exponent is that of the time beyond the smallest scene's, over the last step.
-    """
-    title, numbers, write, command, target = growing
-    print(f"\n{title:>16}  {'compile':>17}  {command.split()[0]:>17}")
-    rows = []
-    numbers = numbers[:2] if quick else numbers
-    for number in numbers:
-        scene = folder / title.replace(" ", "-") / str(number)
-        scene.mkdir(parents=True)
-        (scene / "scene.yaml").write_text(write(number, scene), encoding="utf-8")
-        (_, first, size, _), (_, second, other, said) = (
-            once(f"-m apc {one}", folder, scene) for one in ("compile --force scene.yaml", command)
-        )
-        radius = next(
-            (line.split("radius")[1] for line in said.splitlines() if "spectral radius" in line), ""
-        )
-        rows.append((first, second))
-        print(f"{number:>16}  {first:6.2f} s {size:4.0f} MiB  {second:6.2f} s {other:4.0f} MiB  {radius}")
-    for place, name in enumerate(("compile", command.split()[0])):
-        times = [one[place] for one in rows]
-        told = f"{name}: exponent {exponent_of(numbers, times):.1f}"
-        if target is not None and target[0] in numbers:
-            beyond, most = times[numbers.index(target[0])] - times[0], target[place + 1]
-            kept = judge.in_time(f"{name}, {target[0]} {title}", beyond, most)
-            told += f"; target of {target[0]} {most:g} s beyond the first {kept}"
-        print(told)
-
-
-def exponent_of(numbers: tuple[int, ...], times: list[float]) -> float:
-    """Return the exponent of the time beyond the first, over the last step."""
-    before = max(times[-2] - times[0], 0.01)
-    return math.log(max(times[-1] - times[0], 0.01) / before) / math.log(numbers[-1] / numbers[-2])
-
-
 def main() -> None:
     """Print the tables."""
     parser = parser_of("process", __doc__)
     parser.add_argument("--runs", type=int, default=RUNS)
-    parser.add_argument("--only", choices=["commands", *(one[0] for one in GROWTH)], help="one table")
     given: argparse.Namespace = parser.parse_args()
     judge = Judge(given.strict)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        if given.only in (None, "commands"):
-            commands(judge, folder, given.runs)
-        for growing in GROWTH:
-            if given.only in (None, growing[0]):
-                growth(judge, folder, growing, given.quick)
+        commands(judge, folder, given.runs)
     judge.end()
 
 

@@ -114,10 +114,11 @@ class Instance:
             instanceName="one",
         )
         self.unit.instantiate()
-        self.begin()
+        self.begin({})
 
-    def begin(self) -> None:
+    def begin(self, starts: dict[str, float]) -> None:
         self.unit.setupExperiment(startTime=0.0)
+        self.set(**starts)
         self.unit.enterInitializationMode()
         self.unit.exitInitializationMode()
 
@@ -177,6 +178,40 @@ def test_peers_joined_by_a_network_of_ones_own_are_the_scene(
 
 
 @pytest.mark.whole
+def test_a_device_that_is_pushed_moves_as_by_a_hand(fmpy: Any, tmp_path: Path) -> None:
+    path, _ = written(AVERAGE, tmp_path)
+    push = "hands: {push: {type: StepForce, flange: device, force: 2 N, start: 0.01 s}}\nlinks:"
+    course = apc.simulate(compiled(replaced(AVERAGE, ("links:", push))), duration="0.1 s", jit=False)
+    one = Instance(path, tmp_path / "unzipped")
+    assert one.inputs == [f"force on user[{k}].device" for k in (1, 2, 3)]
+    names = [name for name in (signal.name for signal in course.signals) if name in one.references]
+    places = [place for place, signal in enumerate(course.signals) if signal.name in names]
+    assert len(names) > 12
+    for k in range(100):
+        assert one.read(*names) == pytest.approx(course.values[k, places].tolist(), abs=1e-9)
+        one.set(**dict.fromkeys(one.inputs, 2.0 * (k >= 10)))
+        one.step(k / 1000, 1 / 1000)
+    one.end()
+
+
+@pytest.mark.whole
+def test_a_scene_begins_where_its_states_are_set(fmpy: Any, tmp_path: Path) -> None:
+    path, _ = written(PAPER, tmp_path)
+    starts = {f"{one}.device.x": 0.0125 for one in ("left[1]", "left[2]", "right[1]")}
+    course = apc.simulate(compiled(PAPER), set={"device.x": 0.0125}, duration="0.1 s", jit=False)
+    one = Instance(path, tmp_path / "unzipped")
+    one.unit.reset()
+    one.begin(starts)
+    names = [one.name for one in course.signals]
+    for k in range(100):
+        assert one.read(*names) == pytest.approx(course.values[k].tolist(), abs=1e-9)
+        one.step(k / 1000, 1 / 1000)
+    with pytest.raises(Exception, match="fmi2SetReal"):
+        one.set(**starts)  # too late
+    one.end()
+
+
+@pytest.mark.whole
 def test_a_step_may_be_of_any_length_and_a_state_can_be_had_back(fmpy: Any, tmp_path: Path) -> None:
     path, _ = written(PAPER, tmp_path)
     course = apc.simulate(compiled(PAPER), duration="0.2 s", jit=False)
@@ -203,7 +238,7 @@ def test_a_step_may_be_of_any_length_and_a_state_can_be_had_back(fmpy: Any, tmp_
     walk(begun)
     assert one.read(*names) == end
     one.unit.reset()
-    one.begin()
+    one.begin({})
     assert one.read(*names) == course.values[0].tolist()
     one.end()
 
@@ -218,7 +253,7 @@ def test_a_peer_says_what_it_hears_and_sends(tmp_path: Path) -> None:
     causes = {one.get("name"): one.get("causality") for one in told.iter("ScalarVariable")}
     heard = {name for name, cause in causes.items() if cause == "input"}
     told_of = ("coordination.x", "coordination.v", "missing")
-    assert heard == {f"lan.user[{k}].{what}" for k in (1, 3) for what in told_of}
+    assert heard == {f"lan.user[{k}].{what}" for k in (1, 3) for what in told_of} | {"force on device"}
     assert causes["lan.coordination.x"] == "output"
     assert next(one for one in names if one.startswith("binaries/")).split("/")[1].endswith("64")
     assert all(f"sources/{one.get('name')}" in names for one in told.iter("File"))

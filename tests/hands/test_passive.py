@@ -14,10 +14,8 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.analysis.box import parse_range
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.hands.passive_box import prove_box
 from apc.hands.passivity import STABLE, UNSTABLE, PassiveHands, passive_hands
 from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced, wall
 from tests.truths import LIBRARY
@@ -176,19 +174,12 @@ def by_certificate(system: CompiledSystem, limit: float) -> None:
     for value, stable in ((limit - 1e-3, True), (limit + 1e-3, False)):
         at = apc.set_parameters(system, {PULL: f"{value!r} N/m"})
         found = passive_hands(at, certify=True)
-        assert (found.stable, found.proof) == (stable, "proved in ball arithmetic, 128 bits")
+        assert (found.stable, found.proof) == (stable, "proved by floats whose every rounding is bounded")
 
 
 def by_sweep(system: CompiledSystem, limit: float) -> None:
     found = apc.sweep(system, {PULL: f"{limit - 1e-3},{limit + 1e-3} N/m"}, criterion="passive", jobs=1)
     assert found.column("verdict").tolist() == [STABLE, UNSTABLE]
-
-
-def by_box(system: CompiledSystem, limit: float) -> None:
-    for low, high, verdict in ((limit - 30, limit - 20, STABLE), (limit - 9, limit + 0.1, UNSTABLE)):
-        found = prove_box(system, [parse_range(system, f"{PULL}={low} N/m:{high} N/m")])
-        assert found.verdict == verdict and found.stable is (verdict == STABLE)
-        assert verdict == STABLE or found.point[0] > limit - 1e-3
 
 
 def by_region(system: CompiledSystem, limit: float) -> None:
@@ -203,7 +194,7 @@ def by_region(system: CompiledSystem, limit: float) -> None:
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
     "way",
-    [by_critical, by_certificate, by_sweep, by_box, pytest.param(by_region, marks=pytest.mark.whole)],
+    [by_critical, by_certificate, by_sweep, pytest.param(by_region, marks=pytest.mark.whole)],
 )
 def test_every_way_to_ask_finds_what_an_independent_program_found(
     way: Callable[[CompiledSystem, float], None],
@@ -217,18 +208,6 @@ def test_two_and_five_users_bear_what_an_independent_program_found(count: int, l
     for part in (1 - 1e-6, 1 + 1e-6):
         found = apc.passive_hands(users(count, 200), set={PULL: f"{part * limit!r} N/m"})
         assert found.stable is (part < 1)
-
-
-def test_what_a_box_of_hands_leaves_out_or_cannot_prove_is_said() -> None:
-    lossy = users(3, 200, AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 10 %}"))
-    found = prove_box(lossy, [parse_range(lossy, "contact.stiffness=±1%")])
-    assert found.stable
-    assert str(found).splitlines()[1].startswith("left out: packet loss (10 %) of lan")
-    with pytest.raises(ApcError, match=r'E896 .* Write: apc analyze --box "lan.loss=0:0.2"'):
-        prove_box(lossy, [parse_range(lossy, "lan.loss=0:20 %")])
-    star = users(4, 100, AVERAGE, ("delay: 8 ms}", "delay: 8 ms, graph: star}"))
-    with pytest.raises(ApcError, match=r"E930.*unevenly"):
-        prove_box(star, [parse_range(star, "contact.stiffness=±1%")])
 
 
 @pytest.mark.parametrize(("count", "limit"), [(2, 276.5935041841296), (3, 539.93), (5, 1052.17)])
@@ -256,12 +235,9 @@ def test_held_is_a_mass_a_damper_and_a_spring_and_clamped_a_very_heavy_hand() ->
 
 def test_no_damping_helps_where_a_velocity_is_sampled() -> None:
     text = replaced(AVERAGE, ("stiffness: 1000 N/m, clock", "stiffness: 1000 N/m, damping: 2 N*s/m, clock"))
-    for found in (
-        passive_hands(compiled(text)),
-        prove_box(compiled(text), [parse_range(compiled(text), "contact.stiffness=±1%")]),
-    ):
-        assert found.stable is False
-        assert "samples the velocity of device" in " ".join(str(found).split())
+    found = passive_hands(compiled(text))
+    assert found.stable is False
+    assert "samples the velocity of device" in " ".join(str(found).split())
 
 
 def test_no_damping_helps_where_peers_feel_each_other_otherwise_than_springs_do() -> None:
@@ -296,9 +272,9 @@ def test_where_one_is_pulled_harder_than_it_pulls_hands_by_themselves_do_no_harm
 
 
 @pytest.mark.whole
-@pytest.mark.parametrize("file", [*LIBRARY, *(ROOT / "tests" / "hard").glob("[!v]*.yaml")], ids=str)
+@pytest.mark.parametrize("file", [*LIBRARY, *(ROOT / "tests" / "hard").glob("*.yaml")], ids=str)
 def test_every_scene_has_a_verdict_or_a_reason_why_not(file: Path) -> None:
-    try:  # of 2,007 states at once there are none: very-long-delay takes 24 GB
+    try:
         assert apc.passive_hands(apc.compile(file)).verdict
     except ApcError as error:
         assert error.mistakes[0].code in {"E931", "E932", "E933"}
@@ -397,12 +373,9 @@ def test_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert (document["hands"], document["stable"]) == ("passive", False)
     assert document["modes"][1]["damping_needed"] == pytest.approx(8.540418397892944, rel=1e-11)
     assert "devices clamped: stable" in said("analyze", "--hands", "clamped")
-    box = ("--box", "contact.stiffness=±1%")
-    gentle = said("analyze", "--hands", "passive", "--set", f"{PULL}=200 N/m", *box)
-    assert "proved stable with any passive hands for every value in the box" in gentle
     for words, why in (
         (["passive", "--buzz"], "E930"),
-        (["passive", "--certify", *box], "E930 --certify, --box and --hands passive don't go together"),
+        (["passive", "--box", "contact.stiffness=±1%"], "E930 with every passive hand values are judged one"),
         ([""], "E930 no hands are named (free, clamped,"),
         (["claped"], "clamped"),
     ):

@@ -197,6 +197,27 @@ links: {{lan: {{clock: network, delay: 8 ms}}}}
     assert exact(system)["two.coordination.lag"] == 5 * MS
 
 
+def test_a_part_of_another_type_at_a_group_has_the_numbers_of_that_type() -> None:
+    text = (SCENES / "teleoperation-pair.yaml").read_text("utf-8")
+    system = compiled(text)
+    own = {one.name: one.value for one in system.groups[1].values}
+    known = values(system)
+    assert (known["device.force_limit"], own["device.force_limit"]) == (3.3, 12.0)
+    assert (known["device.mass"], own["device.mass"]) == (0.1, 0.25)
+    # The same as masses, and with the two groups' types changed over.
+    plain = apc.analyze(compiled(replaced(text, ("device.type: Omega3, ", ""), ("type: Touch, ", ""))))
+    leader = "count: 1, set: {device.type: Touch}}"
+    over = replaced(
+        text, ("count: 1}", leader), ("device.type: Omega3, ", ""), ("type: Touch", "type: Omega3")
+    )
+    for other in (system, compiled(over)):
+        assert apc.analyze(other).spectral_radius == pytest.approx(plain.spectral_radius, rel=1e-12)
+    with pytest.raises(
+        apc.ApcError, match=r"HapticDevice has no force_limit, .* Write: device.force_limit: 1 N"
+    ):
+        compiled(replaced(text, ("type: Omega3", "type: HapticDevice")))
+
+
 def test_what_nobody_reads_or_hears_is_left_out_and_said(tmp_path: Path) -> None:
     system = changed(
         ("  network: 8 ms", "  network: 8 ms\n  spare: 3 ms"),
@@ -261,6 +282,7 @@ links: {lan: {clock: tick, delay: 2 ms, graph: star}}
 
 # ---- what a topology seldom means ----
 
+RANGE = "is a range: analyze asks of all of it, other commands of its middle."
 UNSHARED = (
     "follows the other peers' by coordination and is not shared: its mass counts once a peer. "
     "Write: shared: true, or shared: false where each is a mass of its own"
@@ -276,6 +298,7 @@ ODD: list[tuple[tuple[tuple[str, str], ...], list[str]]] = [
     ((("  user: {count: 3}", "  left: {count: 2}\n  right: {count: 2}"),
       ("b: cube, ", "b: cube, at: [left], ")),
      ["10:3: W272 device of right is joined to nothing: no coupler, no hand and no other mass."]),
+    ((("delay: 8 ms}", "delay: [8 ms, 20 ms]}"),), [f"15:3: W275 lan.delay {RANGE}"]),
     ((("object: cube", "object: device"),), [f"9:3: W274 device {UNSHARED}"]),
     ((("object: cube", "object: device"), ("damping: 5 N*s/m}", "damping: 5 N*s/m, shared: false}")), []),
     ((("object: cube", "object: device"), ("a: device, b: cube", "a: ground, b: cube"),

@@ -26,18 +26,6 @@ def only(text: str, speed: float) -> tuple[list[str], dict[str, float]]:
     return states, rates(system, velocity)
 
 
-@pytest.mark.parametrize("masses", [2, 3])
-def test_rigidly_joined_masses_are_one_of_the_summed_mass_and_damping(masses: int) -> None:
-    more = "".join(
-        f"  m{i}: {{mass: {i} kg, damping: {i} N*s/m, flange: device}}\n" for i in range(2, 1 + masses)
-    )
-    push = "hands: {push: {type: ConstantForce, flange: device, force: 4 N}}\n"
-    states, found = only(f"{ONE_MASS}{more}{push}", 0.5)
-    total = sum(range(2, 1 + masses))
-    assert len(states) == 2
-    assert found[states[1]] == pytest.approx((4 - (3 + total) * 0.5) / (2 + total), rel=1e-14)
-
-
 def test_masses_joined_the_other_way_round_have_opposite_velocities(tmp_path: Path) -> None:
     reversed_ = "component: Lever\nconnectors: {a: Flange, b: Flange}\nequations: [a.x = -b.x, a.f = b.f]\n"
     text = f"{ONE_MASS}{ROW}}}\ncouplers: {{lever: {{type: Lever, a: device, b: load}}}}\n"
@@ -56,15 +44,6 @@ def test_what_is_told_where_to_be_has_no_state_and_plays(position: str, tmp_path
     found = apc.analyze(system)
     assert (found.verdict, found.spectral_radius) == ("stable", 0)
     assert apc.simulate(system, duration="20 ms", jit=False).time[-1] == pytest.approx(0.02)
-
-
-def test_a_pendulum_in_its_angle_swings_by_the_textbook_equation(tmp_path: Path) -> None:
-    equations = ["der(angle) = rate", "x = L*sin(angle)", "y = -L*cos(angle)", "u = der(x)", "v = der(y)"]
-    equations += ["K*T^2*der(u) = -tension*x/L", "K*T^2*der(v) = -tension*y/L - F", "flange.f = 0"]
-    system = model(tmp_path, *equations, variables="x y u=m/s v=m/s tension=N angle=1: rate=1/s:")
-    found = rates(system, {"own.angle": 0.4, "own.rate": 1.2})
-    assert found["own.angle"] == 1.2
-    assert found["own.rate"] == pytest.approx(-1 / 100 * math.sin(0.4), rel=1e-12)
 
 
 def test_a_second_derivative_takes_the_velocity_that_is_named_as_its_state(tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ SHOWN = {
     "kHz": "Hz",
     "rpm": "rad/s",
     "deg": "rad",
-    "N*m/rad": "N*m",
+    "N*m/rad": "N*m/rad",
     "%": "1",
     "N/(m/s)": "N*s/m",
     "N·s/m": "N*s/m",

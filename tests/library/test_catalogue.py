@@ -85,6 +85,10 @@ def test_every_scene_of_the_library_is_listed_and_copied_so_that_it_is_sound(cal
         assert call("new", "--like", name)[0] == 0
         assert call("compile", f"{name}.yaml", "--until", "scene")[0] == 0
         assert Path(f"{name}.yaml").read_text(encoding="utf-8").count(f"topology: {name}") == 1
+    assert call("new", "--list", "--out", "scenes.html")[0] == 0
+    page = Path("scenes.html").read_text(encoding="utf-8")
+    assert page.count("data:image/svg+xml") == page.count("topology: ") == len(listed)
+    assert "<pre>three-users-average: stable up to a common translation</pre>" in page
 
 
 def test_a_copy_takes_another_name_and_brings_the_tables_it_names(call: Call) -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import apc
 from tests.library.parts import rates, ticked
@@ -62,24 +64,6 @@ def test_planar_mass_and_spatial_mass_swing_along_each_axis_as_a_mass_does(
     assert found.spectral_radius == pytest.approx(math.exp(-7 / 4), rel=1e-12)
     one, other = sizes(line), sizes(more)
     assert other == pytest.approx(np.repeat(one, size), rel=1e-12)
-
-
-def test_sampled_planar_spring_damper_pulls_along_the_line_between_its_ends() -> None:
-    system = compiled(
-        f"{PLANE}couplers:\n  it: {{type: SampledPlanarSpringDamper, a: device, b: ground, clock: tick, "
-        "stiffness: 70 N/m, damping: 4 N*s/m}\n"
-    )
-    at = {"device.x[1]": 0.3, "device.x[2]": -0.4, "device.v[1]": 0.5, "device.v[2]": 2.0}
-    assert ticked(system, at) == pytest.approx(
-        {"it.f[1]": 70 * 0.3 + 4 * 0.5, "it.f[2]": -70 * 0.4 + 4 * 2.0}, rel=EXACT
-    )
-
-
-def test_planar_constant_force_pushes_in_its_direction() -> None:
-    system = compiled(
-        f"{PLANE}hands: {{push: {{type: PlanarConstantForce, flange: device, force: [3 N, -4 N]}}}}\n"
-    )
-    assert pushed(system) == pytest.approx([3.0, -4.0], rel=EXACT)
 
 
 # ---- contacts ----
@@ -174,69 +158,162 @@ def test_a_group_gives_a_vector_one_value_for_all_or_a_list_of_lists_one_a_peer(
     assert starts(groups("table: users.csv"), tmp_path) == each
 
 
-# ---- several pairs at a connector; arrays inside a component ----
+# ---- bodies that turn ----
 
-SLAB = (
-    """\
-connector: Pose
-about: A body of a plane that turns as well.
-potentials: {x: {unit: m, size: 2}, angle: {unit: rad}}
-flows: {f: {unit: N, size: 2}, torque: {unit: N*m}}
-""",
-    """\
-component: Slab
-about: A body that moves and turns in a plane.
-connectors: {centre: Pose}
-parameters: {mass: {unit: kg, above: 0}, inertia: {unit: kg*m^2, above: 0}}
-variables:
-  x: {unit: m, size: 2, start: [0 m, 0 m]}
-  v: {unit: m/s, size: 2, start: [0 m/s, 0 m/s]}
-  angle: {unit: rad, start: 0 rad}
-  rate: {unit: rad/s, start: 0 rad/s}
-equations:
-  - der(x) = v
-  - mass*der(v) = centre.f
-  - der(angle) = rate
-  - inertia*der(rate) = centre.torque
-  - centre.x = x
-  - centre.angle = angle
-""",
-    """\
-component: Mount
-about: Holds a body, sampled, along and about its axes.
-connectors: {a: Pose, b: Pose}
-parameters: {stiffness: {unit: N/m}, twist: {unit: N*m}, clock: clock}
-variables: {f: {unit: N, size: 2}, torque: {unit: N*m}}
-equations:
-  - f = stiffness*sample(a.x - b.x)
-  - torque = twist*sample(a.angle - b.angle)
-  - a.f = hold(f)
-  - b.f = -a.f
-  - a.torque = hold(torque)
-  - b.torque = -a.torque
-""",
-)
+BAR = """\
+topology: bar
+peers: {user: {count: 1}}
+masses:
+  bar: {type: PlanarBody, mass: 2 kg, inertia: 0.05 kg*m^2, x: [0 m, -0.3 m]}
+  bob: {type: PlanarMass, mass: 0.5 kg}
+couplers:
+  hinge: {type: PlanarGraspPoint, frame: bar, offset: [0 m, 0.3 m], point: ground}
+  centre: {type: PlanarGraspPoint, frame: bar, offset: [0 m, 0 m]}
+  end: {type: PlanarGraspPoint, frame: bar, offset: [0 m, -0.2 m], point: bob}
+hands:
+  weight: {type: PlanarConstantForce, flange: centre.point, force: [0 N, -20 N]}
+"""
+TOP = """\
+topology: top
+peers: {user: {count: 1}}
+masses:
+  top:
+    {type: SpatialBody, mass: 2 kg, inertia: [0.05 kg*m^2, 0.05 kg*m^2, 0.02 kg*m^2], x: [0 m, 0 m, 0.3 m],
+     momentum: [0 N*m*s, 0 N*m*s, 5 N*m*s]}
+couplers:
+  foot: {type: SpatialGraspPoint, frame: top, offset: [0 m, 0 m, -0.3 m], point: ground}
+  centre: {type: SpatialGraspPoint, frame: top, offset: [0 m, 0 m, 0 m]}
+hands: {weight: {type: SpatialConstantForce, flange: centre.point, force: [0 N, 0 N, -20 N]}}
+"""
 
 
-def test_a_connector_may_have_several_pairs_vectors_among_them(tmp_path: Path) -> None:
-    """Two bodies on springs: what one pair does, no other feels, and each does the work of its own."""
-    text = (
-        "topology: slab\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\nmasses:\n"
-        "  one: {type: Slab, mass: 2 kg, inertia: 0.1 kg*m^2, x: [1 mm, 0 m], angle: 0.2 rad}\n"
-        "  two: {type: Slab, mass: 5 kg, inertia: 0.3 kg*m^2}\n"
-        "couplers: {tie: {type: Mount, a: one, b: two, stiffness: 70 N/m, twist: 9 N*m, clock: tick}}\n"
+def hertz(text: str) -> list[float]:
+    """Return the frequencies of a scene's motions that swing."""
+    return sorted(one.frequency_hz for one in apc.analyze(compiled(text)).modes if one.eigenvalue.imag > 0)
+
+
+def test_what_is_held_does_the_work_that_copies_move_by() -> None:
+    """Each pair of a connector does its own: ∫ f·dx + torque·dφ is the kinetic energy, without damping."""
+    text = (SCENES / "carried-beam.yaml").read_text(encoding="utf-8").replace("damping: 5 N*s/m, ", "")
+    start = "mass: 2 kg, v: [0.1 m/s, 0 m/s], rate: 0.3 rad/s"
+    text = replaced(text, ("turn_damping: 0.15 N*m*s/rad, ", ""), ("mass: 2 kg", start))
+    text = text.partition("hands:")[0].replace("damping: 5 N*s/m", "damping: 0 N*s/m")
+    text = re.sub(", carry.force: .*?]", "", text).replace(
+        "left:  {count: 1, set: {", "left:  {count: 1, set: {beam.angle: 0.1 rad, "
     )
-    system = compiled(text, library(tmp_path, *SLAB))
-    found = ticked(system, {"one.x[1]": 0.5, "two.x[2]": 0.25, "one.angle": 0.125})
-    assert found == pytest.approx({"tie.f[1]": 35.0, "tie.f[2]": -17.5, "tie.torque": 1.125}, rel=EXACT)
-    run = apc.simulate(system, duration="20 ms", jit=False)
-    work = dict(run.summary.work)["tie"]
-    names = [signal.name for signal in run.signals]
-    kinetic = 0.0
-    for body, mass, inertia in (("one", 2.0, 0.1), ("two", 5.0, 0.3)):
-        v = {n: run.values[-1, names.index(f"user[1].{body}.{n}")] for n in ("v[1]", "v[2]", "rate")}
-        kinetic += mass * (v["v[1]"] ** 2 + v["v[2]"] ** 2) / 2 + inertia * v["rate"] ** 2 / 2
-    assert work == pytest.approx(kinetic, rel=1e-9)  # nothing else takes work up
+    run = apc.simulate(compiled(text), duration="0.096 s", jit=False)
+
+    def kinetic(row: int) -> float:
+        parts = [
+            (0.1, "device.v[1]"),
+            (0.1, "device.v[2]"),
+            (1, "beam.v[1]"),
+            (1, "beam.v[2]"),
+            (0.03, "beam.rate"),
+        ]
+        return sum(
+            m * run[f"{side}[1].{name}"][row] ** 2 / 2 for side in ("left", "right") for m, name in parts
+        )
+
+    work = dict(run.summary.work)
+    assert abs(work["coordination"]) > 1e-4 and abs(work["contact"]) > 1e-4
+    assert sum(work.values()) == pytest.approx(kinetic(-1) - kinetic(0), rel=1e-6)
+
+
+def test_a_bar_with_a_bob_swings_about_its_hinge_as_a_compound_pendulum() -> None:
+    """Steiner: w² = F l/(J + m l² + M (l + a)²), the weight F at the centre, the bob weightless."""
+    about_hinge = 0.05 + 2 * 0.3**2 + 0.5 * 0.5**2
+    assert hertz(BAR) == pytest.approx([math.sqrt(20 * 0.3 / about_hinge) / (2 * math.pi)], rel=1e-9)
+
+
+def test_an_upright_top_nods_and_goes_round() -> None:
+    """J λ² − i h λ − F l = 0 about its foot, J = I₁ + m l²; going round is near F l/h where it spins fast."""
+    about_foot, h, tip = 0.05 + 2 * 0.3**2, 5.0, 20 * 0.3
+    root = math.sqrt(h**2 - 4 * about_foot * tip)
+    both = [(h - root) / (2 * about_foot), (h + root) / (2 * about_foot)]
+    assert hertz(TOP) == pytest.approx([rate / (2 * math.pi) for rate in both], rel=1e-9)
+    assert both[0] == pytest.approx(tip / h, rel=0.1)
+
+
+FREE = """\
+topology: free
+peers: {user: {count: 1}}
+masses:
+  body:
+    {type: SpatialBody, mass: 2 kg, inertia: [0.2 kg*m^2, 0.2 kg*m^2, 0.3 kg*m^2],
+     rotation: [0.3 rad, 0 rad, -1 rad], rate: [0.4 rad/s, 0 rad/s, 2 rad/s]}
+"""
+
+
+def axes(rotation: np.ndarray) -> np.ndarray:
+    """Return the axes of a body as columns, by its quaternion: (cos φ/2, n sin φ/2) of n 2 tan φ/2."""
+    quaternion = np.array([1.0, *rotation / 2]) / math.hypot(1.0, *rotation / 2)
+    return np.array(Rotation.from_quat([*quaternion[1:], quaternion[0]]).as_matrix())
+
+
+def test_a_free_body_wobbles_at_its_rate_and_keeps_its_angular_momentum() -> None:
+    """Euler: of I₁ = I₂ w₁ turns at w₃ (I₃ − I₁)/I₁ along its axes; R I w stands still in space."""
+    run = apc.simulate(compiled(FREE), duration="1 s", method="cvodes:1e-11", jit=False)
+    rate, turned = (
+        np.column_stack([run[f"user[1].body.{name}[{k}]"] for k in (1, 2, 3)])
+        for name in ("rate", "rotation")
+    )
+    wobble = 2 * (0.3 - 0.2) / 0.2 * np.asarray(run.time)
+    known = np.column_stack([0.4 * np.cos(wobble), 0.4 * np.sin(wobble), np.full(len(wobble), 2.0)])
+    assert rate == pytest.approx(known, abs=1e-6)
+    kept = [axes(one) @ (np.array([0.2, 0.2, 0.3]) * w) for one, w in zip(turned, rate, strict=True)]
+    assert np.ptp(kept, axis=0).max() < 1e-6
+    assert np.abs(turned[-1] - turned[0]).max() > 1  # far from small
+
+
+def test_what_pulls_at_a_point_of_a_turned_body_does_its_work_there() -> None:
+    """A point moves by axes·offset, and a force does on the body what it does at the point: dE/dt = 0."""
+    text = FREE.replace(
+        "body:\n", "mass: {type: SpatialMass, mass: 0.5 kg, x: [0.1 m, 0.5 m, 0 m]}\n  body:\n"
+    ) + (
+        "couplers:\n  grasp: {type: SpatialGraspPoint, frame: body, offset: [0.3 m, 0 m, 0.2 m]}\n"
+        "  tie: {type: SpatialSpringDamper, a: mass, b: grasp.point, stiffness: 40 N/m}\n"
+    )
+    run = apc.simulate(compiled(text), duration="0.5 s", method="cvodes:1e-11", jit=False)
+
+    def all_of(name: str) -> np.ndarray:
+        return np.column_stack([run[f"user[1].{name}[{k}]"] for k in (1, 2, 3)])
+
+    point = all_of("body.x") + [axes(one) @ [0.3, 0, 0.2] for one in all_of("body.rotation")]
+    energy = (
+        40 * (point - all_of("mass.x")) ** 2
+        + 2 * all_of("body.v") ** 2
+        + 0.5 * all_of("mass.v") ** 2
+        + np.array([0.2, 0.2, 0.3]) * all_of("body.rate") ** 2
+    ).sum(axis=1) / 2
+    assert energy == pytest.approx(np.full(len(energy), energy[0]), rel=1e-6)
+    assert np.ptp((all_of("mass.v") ** 2).sum(axis=1)) > 0.1 * energy[0]  # it is given to and fro
+
+
+@pytest.mark.parametrize("space", [False, True])
+def test_copies_are_turned_to_their_mean_as_they_are_pulled(space: bool) -> None:
+    """With J for m, and N*m/rad for N/m, each eigenvalue is that of a mass on a line, and so is the limit."""
+    lines = AVERAGE.partition("studies:")[0].splitlines(keepends=True)
+    alone = "".join(one for one in lines if not one.startswith(("  device:", "  contact:")))
+    size, kind = (3, "Spatial") if space else (1, "Planar")
+    inertia = "[" + ", ".join(["0.6 kg*m^2"] * size) + "]" if space else "0.6 kg*m^2"
+    body = f"type: {kind}Body, inertia: {inertia}, turn_damping: 5 N*m*s/rad, mass"
+    turned = replaced(
+        alone,
+        ("cube:   {mass", f"cube:   {{{body}"),
+        ("AveragePosition", f"{kind}AveragePose"),
+        ("stiffness: 500 N/m,", "stiffness: 500 N/m, turn_stiffness: 500 N*m/rad,"),
+    )
+    one, many = sizes(alone), sizes(turned)
+    several = one > 1e-6
+    assert several.sum() >= 4
+    count = 6 if space else 3
+    assert many[: count * several.sum()] == pytest.approx(np.repeat(one[several], count), rel=1e-9)
+    limits = [
+        apc.critical(compiled(text), name).value
+        for text, name in ((alone, "coordination.stiffness"), (turned, "coordination.turn_stiffness"))
+    ]
+    assert limits[1] == pytest.approx(limits[0], rel=1e-8)
 
 
 CHAIN = """\

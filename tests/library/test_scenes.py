@@ -12,10 +12,12 @@ from tests.topologies import SCENES
 COMMON = "stable up to a common translation"
 # Verdict and rigid modes at the start values; what the paper has stands in its section IV and Fig. 6.
 VERDICTS = {
+    "carried-beam": (f"{COMMON} and rotation", 3),  # along both axes, and turned
     "finger": ("stable", 0),
     "lifted-box": ("stable", 0),
     "lossy-average": (COMMON, 1),
     "mixed-clocks": (COMMON, 1),
+    "teleoperation-pair": (COMMON, 1),
     "template": (COMMON, 1),
     "three-users-average": (COMMON, 1),
     "three-users-predicted": (COMMON, 1),

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import pytest
 
 import apc
@@ -243,3 +244,22 @@ def test_a_tool_in_two_hands_moves_as_its_middle_does() -> None:
     apart = (0.05, 2.5, 0.0)  # the hands against each other: half of one device
     bodies = [[(0.1 + 0.1 + 0.2, 5.0 + 5.0, 0.0), CUBE, apart]] * 2
     same(compiled(scene("two-handed-tool")), ByHand(bodies, everybody(2), law, told=1))
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.2])
+def test_a_beam_in_two_hands_is_pulled_and_turned_by_its_ends(damping: float) -> None:
+    """To first order an end moves by arm·angle across the beam, and what pulls there turns by arm·force."""
+
+    def law(i: int, x: Sequence[tuple[Any, Any]], heard: Packets, memory: Sequence[Any]) -> Any:
+        arm = 0.3 if i else -0.3
+        own = np.array(x)  # device and beam along either axis, angle; each with its rate
+        end = own[2:4] + np.array([0, arm])[:, None, None] * own[4]
+        push = np.tensordot([500, damping], own[:2] - end, (0, 1))
+        behind = own[2:] - np.reshape([mean(heard, place) for place in range(6)], own[2:].shape)
+        pull = behind[:, 0] * np.array([[200], [200], [4]]) + damping * behind[:, 1]
+        return [*-push, *push - pull[:2], arm * push[1] - pull[2]], memory, []
+
+    bodies = [[DEVICE, DEVICE, (1.0, 5.0, 0.0), (1.0, 5.0, 0.0), (0.03, 0.15, 0.0)]] * 2
+    more = f"damping: {damping} N*s/m, turn_damping: {damping} N*m*s/rad, turn_stiffness"
+    both = (("turn_stiffness", more), ("500 N/m", f"500 N/m, damping: {damping} N*s/m"))
+    same(compiled(replaced(scene("carried-beam"), *both)), ByHand(bodies, everybody(2), law, told=2, many=3))

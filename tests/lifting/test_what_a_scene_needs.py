@@ -13,6 +13,7 @@ from tests.topologies import AVERAGE, SCENES, compiled, replaced
 # device with a finger move in one axis (4); a force with a delay of one tick is remembered (one each); a
 # packet of a delay of k frames is kept k times, for position and velocity each.
 KEPT = {
+    "carried-beam": [(10, 5, 6)],  # a point and a body of a plane; of the body all is sent
     "client-server": [(2, 2, 3), (4, 3, 3)],  # forces are held to be sent, and sent as well
     "experiment-average": [(4, 0, 2)],
     "experiment-mesh": [(4, 0, 2)],

@@ -357,6 +357,7 @@ WRITING = {
     ("export", "--out"): ("scene.yaml", "new.npz"),
     ("feel", "--out"): ("scene.yaml", "new.csv"),
     ("network", "--out"): ("delays.csv", "new.csv"),
+    ("new", "--out"): ("--list", "new.html"),
     ("region", "--out"): (
         "scene.yaml --x contact.stiffness=1N/m:2N/m --y coordination.stiffness=1N/m:2N/m",
         "new.csv",
@@ -410,7 +411,7 @@ def test_a_link_to_what_a_command_reads_is_refused_and_a_file_that_is_read_only_
     before = [Path(one).read_bytes() for one in INPUTS]
     words, name = WRITING[command]
     line, target = f"{command[0]} {words} {command[1]} {name}", Path(name)
-    for read in {"network": INPUTS[3:], "schema": ()}.get(command[0], INPUTS[:3]):
+    for read in {"network": INPUTS[3:], "schema": (), "new": ()}.get(command[0], INPUTS[:3]):
         for link in (target.symlink_to, target.hardlink_to):
             link(read)
             assert inputs(line).err.startswith(f"{target}: E616 is read by this command")

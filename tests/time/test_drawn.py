@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
+from matplotlib.markers import MarkerStyle
 
 import apc
 from apc.compiler.compiled import CompiledSystem
@@ -63,6 +65,16 @@ def test_every_peer_has_a_plane_of_its_own_to_one_scale(tmp_path: Path) -> None:
     assert right - left == pytest.approx(high - low)
     assert left < -30 < 82 < right
     assert low < -62 < 23 < high
+
+
+def test_what_turns_has_a_bar_along_its_axis_and_what_does_not_none() -> None:
+    device, beam = sorted(draw_actors(scene("carried-beam"))[1][:2], key=lambda one: one.turning)
+    assert (device.turning, beam.turning, len(device.artists)) == ("", "left[1].beam.angle", 1)
+    beam.move([0.0, 0.0], math.pi / 3)
+    bar = beam.artists[-1]
+    mark = MarkerStyle(bar.get_marker())
+    ends = mark.get_transform().transform(mark.get_path().vertices)
+    assert {round(math.degrees(math.atan2(y, x))) for x, y in ends if x or y} == {60, -120}
 
 
 def test_a_run_in_a_plane_is_drawn_as_paths_as_well(tmp_path: Path) -> None:

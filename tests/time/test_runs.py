@@ -63,24 +63,6 @@ def test_copies_differ_at_rest_by_what_holds_the_pushing_apart() -> None:
     assert (name, apart) == ("cube.x", pytest.approx(4 / 2000, rel=1e-2))
 
 
-def test_without_damping_the_kinetic_energy_is_the_work_of_the_couplers() -> None:
-    start = "{count: 3, set: {device.x: [10 mm, 0 mm, -5 mm], cube.v: 0.1 m/s}}"
-    text = AVERAGE.replace("damping: 5 N*s/m", "damping: 0 N*s/m")
-    text = replaced(text, ("{count: 3}", start)).replace("stiffness: 1000", "stiffness: 100")
-    found = simulate(compiled(text), duration=Fraction(16, 100), jit=False)
-
-    def kinetic(row: int) -> float:
-        speeds = [(mass, found[f"user[{i}].{p}.v"][row]) for p, mass in MASSES for i in (1, 2, 3)]
-        return float(sum(mass * v**2 / 2 for mass, v in speeds))
-
-    put_in = sum(work for _, work in found.summary.work)
-    assert abs(put_in) > 1e-3
-    assert put_in == pytest.approx(kinetic(-1) - kinetic(0), rel=1e-12)
-
-
-MASSES = (("device", 0.1), ("cube", 0.2))
-
-
 @pytest.mark.parametrize("arm", [False, True])
 def test_a_mass_that_is_pushed_moves_on_and_one_that_stops_settles(arm: bool) -> None:
     text = ONE_MASS + "hands: {hand: {type: ConstantForce, flange: device, force: 1 N}}\n"

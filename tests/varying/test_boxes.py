@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +14,10 @@ from hypothesis import strategies as st
 
 import apc
 from apc.__main__ import run
+from apc.analysis.analysis import prepare
+from apc.compiler.compiled import Channel
 from apc.compiler.errors import ApcError
+from apc.moments.traces import trace_radius
 from tests.bruteforce import Scene
 from tests.topologies import AVERAGE, MESH, ONE_MASS, SCENES, compiled, library, replaced
 from tests.truths import text_of
@@ -148,6 +153,41 @@ def test_a_box_over_a_delay_is_stable_where_every_delay_in_it_is() -> None:
         stable = [apc.analyze(system, set={"lan.delay": one}).stable for one in grid]
         assert found.stable is all(stable)
         assert found.stable or not apc.analyze(system, set={"lan.delay": found.point[0]}).stable
+
+
+def changing(system: apc.CompiledSystem, low: float, high: float) -> Any:
+    return apc.prove_box(system, {"lan.delay": (low, high)}).changing
+
+
+def with_delays(system: apc.CompiledSystem, delays: list[float]) -> float:
+    """Return the least that a scene grows by a frame if its packets have these delays again and again."""
+    channel = Channel(None, None, "uniform", "newest", "hold", np.array(delays))
+    recorded = replace(system, links=tuple(replace(link, channel=channel) for link in system.links))
+    return trace_radius(recorded, prepare(recorded)).low
+
+
+def test_where_a_changing_delay_is_proved_harmless_no_delays_met_are_unstable() -> None:
+    luck, proved = np.random.default_rng(3), 0
+    for _ in range(8):
+        numbers = {"coordination.stiffness": luck.uniform(200, 700), "user.count": int(luck.integers(2, 5))}
+        system = apc.set_parameters(compiled(AVERAGE), numbers)
+        if (found := changing(system, 0.008, 0.02)) is not None and found.proved_to is not None:
+            proved += found.proved_to == 0.02
+            ends = [0.008, found.proved_to]
+            assert max(with_delays(system, luck.choice(ends, k).tolist()) for k in range(1, 9)) < 1
+    assert 3 <= proved < 8
+
+
+def test_delays_that_are_harmless_while_constant_are_unstable_by_turns() -> None:
+    # By a program of its own, tick by tick: 0.99976 at most at constant delays, 1.0049 by turns.
+    numbers = {"contact.stiffness": 320.589, "device.damping": 5.8966, "coordination.stiffness": 481.175}
+    system = apc.set_parameters(compiled(AVERAGE), {**numbers, "user.count": 2})
+    found = changing(system, 0.008, 0.046)
+    assert found.unstable == (2, 5)
+    assert with_delays(system, [0.008] * 2 + [0.046] * 5) == pytest.approx(1.004925, rel=1e-6)
+    assert "unstable if by turns 2 packets take 0.008 s and 5 0.046 s" in " ".join(
+        str(apc.prove_box(system, {"lan.delay": (0.008, 0.046)})).split()
+    )
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,10 @@ from apc.__main__ import run
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
 from apc.present.region_picture import stable_outlines
+from apc.regions.boundary import relative_to
+from apc.regions.curves import between, tangents
 from apc.regions.region import Region
-from tests.bench.region import true_error
+from tests.paper_limit import limit as limit_of
 from tests.reference import CONTACT_LIMITS
 from tests.topologies import AVERAGE, MESH, ROOT, SCENES, compiled, replaced
 
@@ -49,6 +51,23 @@ def stable(system: CompiledSystem, found: Region, x: float, y: float) -> bool | 
     values = zip((found.x, found.y), (x, y), strict=True)
     settings = {axis.free.label: f"{value!r} {axis.unit}".removesuffix(" 1") for axis, value in values}
     return apc.analyze(system, set=settings).stable
+
+
+def true_error(found: Region, every: int) -> float:
+    """Return the curves' largest distance from the boundary in 50 digits, relative as their `error` is."""
+    worst = 0.0
+    low, width = found.rectangle.low, found.rectangle.width
+    for curve in found.curves:
+        knots = (curve.points - low) / width
+        handles = (curve.handles - low) / width
+        normal = tangents(knots, handles)[:-1, ::-1] * [1, -1]
+        for share in (0.0, 0.25, 0.5, 0.75):
+            places = between(knots, handles, share)[1::every]
+            values = found.rectangle.values(places)
+            away = values[:, 1] - [limit_of(float(x), float(y)) for x, y in values]
+            away = np.abs(away) / width[1] * np.abs(normal[1::every, 1])
+            worst = max(worst, float((away / relative_to(places, normal[1::every], low / width)).max()))
+    return worst
 
 
 # ---- boundaries known by construction ----

@@ -1,0 +1,87 @@
+"""Parts that are of another type in one group of peers: `set: {device.type: Omega3}`.
+
+Takes: the groups of peers and the parts' entries. Gives: the entry of a part at a group, by both names.
+Guarantees: the other type has the same connectors and sends nothing; the entry says what the part's own entry
+says as far as the other type has it, and what else the group sets.
+Does not: read the numbers of an entry (see `components.parts`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+from apc.compiler.components.component import Component
+from apc.compiler.components.parts import PART_KEYS, PartEntry, Parts, component_named
+from apc.compiler.scene.groups import GroupBody
+from apc.compiler.source.nodes import Mapping as MappingNode
+from apc.compiler.source.nodes import Node, Scalar, Sequence
+from apc.compiler.source.reading import fault, text_of
+from apc.compiler.words import enumerated
+
+TYPE = ".type"
+
+
+def redeclared(groups: Iterable[GroupBody], parts: Parts) -> dict[str, dict[str, PartEntry]]:
+    """Return the entries of parts whose type a group sets, by the part's name and the group's.
+
+    Parameters
+    ----------
+    groups
+        The groups, with what each sets.
+    parts
+        The parts of the topology; its mistakes get what is wrong with a type.
+    """
+    found: dict[str, dict[str, PartEntry]] = {}
+    for group in groups:
+        settings = list(_settings(group))
+        for key, node in settings:
+            entry = parts.entries.get(key.text.removesuffix(TYPE))
+            if key.text.endswith(TYPE) and entry is not None:
+                at = found.setdefault(entry.name, {})
+                at[group.name] = entry  # if there is a mistake in it
+                with parts.mistakes:
+                    at[group.name] = _entry(entry, key, node, settings, parts)
+    return found
+
+
+def _settings(group: GroupBody) -> Iterator[tuple[Scalar, Node]]:
+    node = group.body.nodes.get("set")
+    return iter(node.entries if isinstance(node, MappingNode) else ())
+
+
+def _entry(
+    entry: PartEntry, key: Scalar, node: Node, settings: list[tuple[Scalar, Node]], parts: Parts
+) -> PartEntry:
+    """Return a part's entry with the type that a group sets. Raises ApcError for one that doesn't fit."""
+    old, hint = entry.component, f"{key.text}: {entry.component.name}"
+    new = component_named(text_of(node, key.text, hint), node.place, parts.library, hint)
+    if entry.section == "links" or any(one.sends or one.hears_others for one in (old, new)):
+        what = f"{entry.name} sends or hears over a link, and is of one type at all peers"
+        raise fault("E210", node.place, what)
+    if _connectors(new) != _connectors(old):
+        what = f"{key.text}, to take the place of {old.name},"
+        raise fault("E210", node.place, what, *(f"the connectors {_connectors(one)}" for one in (old, new)))
+    known = {*PART_KEYS, "type", *dict(new.connectors)}
+    known |= {one.name.partition("[")[0] for one in (*new.parameters, *new.variables)}
+    body = {name.text: (name, value) for name, value in entry.body.entries if name.text in known}
+    for name, value in settings:
+        part, _, own = name.text.rpartition(".")
+        if part == entry.name and own in known and not isinstance(value, Sequence):
+            body.setdefault(own, (replace(name, text=own), value))
+    body.pop("type", None)
+    due = {f"{entry.name}.{one.name}": one.unit.text for one in new.numbers if one.default is None}
+    if missing := {name: unit for name, unit in due.items() if name.rpartition(".")[2] not in body}:
+        what = (
+            f"{entry.name} as {new.name} has no {enumerated([name.rpartition('.')[2] for name in missing])}"
+        )
+        hint = ", ".join(f"{name}: 1 {unit}".removesuffix(" 1") for name, unit in missing.items())
+        raise fault("E201", node.place, what, hint=hint)
+    return replace(entry, component=new, body=replace(entry.body, entries=tuple(body.values())))
+
+
+def _connectors(component: Component) -> str:
+    """Return the connectors of a component in words, those for hands too."""
+    named = (f"{name} ({kind.name})" for name, kind in component.connectors)
+    hands = f", for hands: {', '.join(component.grips)}" if component.grips else ""
+    return (", ".join(named) or "none") + hands
