@@ -199,7 +199,9 @@ class _Work:
     def _unproved(self) -> bool:
         """Whether nothing proves what is asked, beside that it is stable."""
         decays = self.limits.by_growth and self.demands.decay < 1
-        return decays or bool(self.demands.felt and (self.demands.box or self.demands.delay))
+        boxed = self.demands.criterion == PASSIVE and self.demands.box
+        felt = self.demands.felt and (self.demands.box or self.demands.delay)
+        return decays or bool(boxed or felt)
 
     @property
     def late(self) -> bool:
@@ -360,7 +362,7 @@ class _Work:
             passive = self.demands.criterion == PASSIVE
             if passive and self.demands.box:
                 found.append(Proved(named, replace(_unlooked(self.system.name, ranges), notes=(ONE_BY_ONE,))))
-                break
+                continue
             proof = proved_at(scene, ranges, passive=passive, inside=1.0 if self.limits.by_growth else inside)
             if proof.stable and (self._unproved or not self._felt(numbers, point)):
                 proof = replace(proof, verdict=UNDECIDED, stable=None, notes=(*proof.notes, SLOWER))
