@@ -218,6 +218,8 @@ class _Work:
                 if least.worst > 0:
                     return self._unmet(least)
                 found = self._borne(aim.gain, [self._shares(least)], present)
+            if aim.gain is None and self.demands.decay < 1 and found.worst > BINDS:
+                return self._unmet(found)
             gains, proofs, failed = self._settled(found)
             if failed is None or self.late:
                 return self._answer(found, gains, proofs)
