@@ -27,7 +27,7 @@ from apc.eigen.pseudospectrum import balance
 from apc.eigen.relative import Relative
 from apc.frame.discretize import UNIT
 from apc.frame.radius import FLOATS, RADII, Arithmetic, radius_of, value_of, with_radius
-from apc.frame.taylor import arithmetic_of, corners, entrywise, hull
+from apc.frame.taylor import arithmetic_of, corners, entrywise, hull, over_as_many
 from apc.moments.unserved import UnservedError
 from apc.threads import load_pool
 
@@ -61,7 +61,7 @@ FIRST_WIDTH, WIDER_BOUNDS, LAST_WIDTH = 1e-12, 8.0, 1e-3
 # Covariances of luck times cubes of the means' states: as much takes some ten seconds.
 MOST_WORK = 20_000_000
 
-# Roundings of a weight, of a product with it and of a symmetric part.
+# Roundings of a weight and of a symmetric part.
 WEIGHT_ROUNDINGS = 18
 
 
@@ -356,14 +356,12 @@ def weighted(blocks: Matrix, weights: Floats, numbers: Arithmetic) -> Matrix:
     numbers
         What X are of.
     """
-    if numbers is FLOATS:
-        return np.asarray(np.einsum("k,bkij->bij", weights, blocks))
-    size = np.abs(weights)
-    result = np.einsum("k,bklij->blij", weights, blocks)
-    radius = np.einsum("k,bkij->bij", size, radius_of(blocks))
-    rounding = np.einsum("k,bklij->bij", size, np.abs(blocks)) - radius
-    radius_of(result)[...] = (radius + (WEIGHT_ROUNDINGS + len(weights)) * UNIT * rounding) * (1 + 16 * UNIT)
-    return np.asarray(result)
+    rows = weights[None]
+    *many, count, n, m = np.moveaxis(blocks, 1, -3).shape
+    flat = np.moveaxis(blocks, 1, -3).reshape(*many, count, n * m)
+    if numbers is not FLOATS:
+        rows = over_as_many(with_radius(rows, WEIGHT_ROUNDINGS * UNIT * np.abs(rows)), flat)
+    return numbers.multiply(rows, flat).reshape(*many, n, m)
 
 
 def of_kind(matrix: Matrix, numbers: Arithmetic) -> Matrix:
