@@ -30,6 +30,7 @@ from apc.compiler.errors import ApcError
 from apc.eigen.eigenpairs import eigenvalues
 from apc.frame.overrides import Override, apply
 from apc.hands.feel import feel
+from apc.threads import load_pool
 from apc.tuning.demands import PLACE, Demands
 from apc.vary.batch import BatchEvaluator, MatrixSource
 from apc.vary.delay_box import standing_delays
@@ -52,6 +53,9 @@ BOUND_OF = {
     "error_per_force": "error_bound",
 }
 TINY = 1e-300
+
+# Points of a grid along each range of a box; how near to the top of what limits gains there it is followed.
+GRID, POWELL = 5, {"xtol": 1e-5, "ftol": 1e-12}
 
 # What stands for ln |λ| where there is no matrix, and for one of a mode that is not there.
 BEYOND, NONE = 3.0, -30.0
@@ -153,6 +157,29 @@ class Limits:
             grown = np.max([np.full(len(gains), NONE), *sizes], axis=0) - self.allowed
             found[:, place] = np.max([grown, *self.felt(one, points).T], axis=0)
         return found
+
+    def worst_within(self, setting: int, gains: Floats) -> tuple[Scenario, float]:
+        """Return the point of the box that limits gains (m,) most in a setting, and its value.
+
+        The worst of a grid is followed to the top by Powell's method, which takes no slopes: where modes take
+        turns there is a ridge.
+        """
+        low, high = np.array([(float(one.low), float(one.high)) for one in self.demands.box]).T
+
+        def value(shares: Floats) -> Floats:
+            """Return the values at points of the box (k, b), each from 0 to 1 along every range."""
+            points = np.hstack([np.tile(gains, (len(shares), 1)), low + shares * (high - low)])
+            return np.max([_sizes(matrix) for matrix in self.family(setting).matrices(points)], axis=0)
+
+        grid = np.array(list(itertools.product(np.linspace(0, 1, GRID), repeat=len(low))))
+        begin = grid[int(np.argmax(value(grid)))]
+        minimize = load_pool("scipy.optimize").minimize
+        bounds = [(0.0, 1.0)] * len(low)
+        top = minimize(
+            lambda one: -float(value(one[None])[0]), begin, method="Powell", bounds=bounds, options=POWELL
+        )
+        point = low + np.clip(top.x, 0, 1) * (high - low)
+        return Scenario(setting, tuple(point.tolist())), -float(top.fun) - self.allowed
 
     def felt(self, scenario: Scenario, points: Floats, *, bounded: bool = False) -> Floats:
         """Return ln of what is felt by what may be at most (k, q) at points of gains and box (k, m + b)."""

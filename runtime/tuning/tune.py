@@ -69,6 +69,9 @@ ONE_BY_ONE = "no box is proved with every passive hand: it is so in the scenario
 # Scenarios added at a time; how far above the others a limit is that counts.
 MORE, ABOVE = 3, 1e-9
 
+# Settings in which the worst point inside a box is looked for, those first whose corners limit gains most.
+NEAREST = 8
+
 # Turns in which scenarios that limit nothing are left out.
 DROPPING = 6
 
@@ -261,6 +264,10 @@ class _Work:
         order = np.argsort(-worst)
         new = [self.every[place] for place in order[:MORE] if worst[place] > level + ABOVE]
         new = [one for one in new if one not in self.scenarios]
+        if not new and self.demands.box and not self.limits.slow:
+            nearest = dict.fromkeys(self.every[place].setting for place in order.tolist())
+            within = (self.limits.worst_within(one, gains) for one in list(nearest)[:NEAREST])
+            new = [one for one, value in within if value > level + ABOVE and one not in self.scenarios]
         self.scenarios += new
         return bool(new)
 

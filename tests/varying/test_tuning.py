@@ -58,6 +58,16 @@ def test_gains_bear_all_that_they_have_to_and_none_on_a_grid_bear_it_better() ->
         assert apc.analyze(model, set=where | best).spectral_radius == pytest.approx(1, abs=1e-9)
 
 
+def test_what_binds_may_lie_inside_a_range() -> None:
+    model, over = compiled(AVERAGE), {"user.count": "2:5", MASS: "±20%"}
+    found = apc.tune(model, {K: (10.0, 5000.0), B: (0.0, 50.0)}, maximize=K, over=over)
+    best = {gain.parameter: gain.best for gain in found.gains}
+    masses = {MASS: np.linspace(0.08, 0.12, 81)}
+    radii = apc.analyze_many(model, masses, set=best | {"user.count": 2}).spectral_radius
+    assert 0 < int(np.argmax(radii)) < 80
+    assert radii.max() == pytest.approx(1, abs=1e-6)  # of a grid, beside the worst point
+
+
 @pytest.mark.parametrize(
     ("damping", "virtual", "delay"), [(0.2, 0.0, 0.0), (0.2, 0.05, 0.0), (0.2, 0.0, 1e-3)]
 )
