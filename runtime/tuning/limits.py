@@ -169,7 +169,8 @@ class Limits:
         def value(shares: Floats) -> Floats:
             """Return the values at points of the box (k, b), each from 0 to 1 along every range."""
             points = np.hstack([np.tile(gains, (len(shares), 1)), low + shares * (high - low)])
-            return np.max([_sizes(matrix) for matrix in self.family(setting).matrices(points)], axis=0)
+            sizes = [_sizes(matrix) for matrix in self.family(setting).matrices(points)]
+            return np.asarray(np.max(sizes, axis=0))
 
         grid = np.array(list(itertools.product(np.linspace(0, 1, GRID), repeat=len(low))))
         begin = grid[int(np.argmax(value(grid)))]
