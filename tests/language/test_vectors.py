@@ -83,11 +83,6 @@ def test_what_is_written_out_comes_to_what_numpy_says(text: str, size: int, tmp_
         assert value(text, u, v, folder) == pytest.approx(expected, rel=1e-12, abs=1e-9), (u, v)
 
 
-def test_the_cross_of_two_vectors_of_a_plane_is_a_number(tmp_path: Path) -> None:
-    u, v = np.array([2.0, -3.0]), np.array([5.0, 7.0])
-    assert value("cross(u, v)*v", u, v, tmp_path) == [29 * 5, 29 * 7]
-
-
 def test_what_doubles_at_each_level_is_refused_before_it_fills_the_memory(tmp_path: Path) -> None:
     nested = "cross(u, v)"
     for _ in range(30):

@@ -70,26 +70,10 @@ def test_what_ties_two_masses_pulls_both_by_its_law(name: str, x: float, v: floa
         assert pushes(system, moving) == pytest.approx([-force, force], rel=1e-11, abs=1e-12)
 
 
-BAR = replaced(TWO, ("masses:\n", "masses:\n  pin: {mass: 4 kg}\n")) + (
-    "couplers:\n  bar: {type: RigidBar, a: device, b: load, middle: pin}\n"
-)
-
-
 def test_a_rigid_bar_halves_the_force_on_its_middle() -> None:
-    """With y = (x + z)/2 and R what the bar carries: 4 y'' = 7 − R, 2 x'' = R/2 − 3 x', 5 z'' = R/2 − z'."""
-    x, z = 0.5, -1.0
-    carried = (7 + 2 * (3 * x / 2 + z / 5)) / (1 + 2 * (1 / 4 + 1 / 10))
-    device, load = (carried / 2 - 3 * x) / 2, (carried / 2 - z) / 5
-    speeds = {"device.v": x, "load.v": z, "pin.v": (x + z) / 2}
-    expected = {"device.v": device, "load.v": load, "pin.v": (device + load) / 2}
-    system = compiled(BAR + "hands:\n  hand: {type: ConstantForce, flange: pin, force: 7 N}\n")
-    kept = [state.name for state in system.kinds[0].states if state.name in speeds]
-    assert len(kept) == 2, "three velocities, one constraint"
-    found = rates(system, {name: speeds[name] for name in kept})
-    assert [found[name] for name in kept] == pytest.approx([expected[name] for name in kept], rel=EXACT)
-    without = TWO + "couplers:\n  bar: {type: RigidBar, a: device, b: load}\n"
-    without += "hands:\n  hand: {type: ConstantForce, flange: bar.middle, force: 7 N}\n"
-    assert pushes(compiled(without), {}) == pytest.approx([3.5, 3.5], rel=EXACT)
+    text = TWO + "couplers:\n  bar: {type: RigidBar, a: device, b: load}\n"
+    text += "hands:\n  hand: {type: ConstantForce, flange: bar.middle, force: 7 N}\n"
+    assert pushes(compiled(text), {}) == pytest.approx([3.5, 3.5], rel=EXACT)
 
 
 def test_a_gear_multiplies_displacement_and_divides_force() -> None:
@@ -194,9 +178,6 @@ def test_encoder_quantization_rounds_down_to_whole_steps_and_passes_forces(x: fl
     assert found == pytest.approx({"wall.x": seen, "wall.push": 900 * (seen + 1)}, rel=EXACT)
     assert pushes(system, {}, [6.0]) == pytest.approx([-6], rel=EXACT)
     assert apc.analyze(system).linearized
-
-
-# ---- coordination ----
 
 
 # ---- hands ----

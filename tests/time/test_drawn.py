@@ -71,8 +71,7 @@ def test_what_turns_has_a_bar_along_its_axis_and_what_does_not_none() -> None:
     device, beam = sorted(draw_actors(scene("carried-beam"))[1][:2], key=lambda one: one.turning)
     assert (device.turning, beam.turning, len(device.artists)) == ("", "left[1].beam.angle", 1)
     beam.move([0.0, 0.0], math.pi / 3)
-    bar = beam.artists[-1]
-    mark = MarkerStyle(bar.get_marker())
+    mark = MarkerStyle(beam.artists[-1].get_marker())
     ends = mark.get_transform().transform(mark.get_path().vertices)
     assert {round(math.degrees(math.atan2(y, x))) for x, y in ends if x or y} == {60, -120}
 
