@@ -9,6 +9,9 @@ Does not: compute.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
 
 from apc.cli.options import (
     argument,
@@ -23,6 +26,10 @@ from apc.cli.options import (
 from apc.cli.progress import status_line
 from apc.compiler.errors import ApcError, Mistake, Place
 
+if TYPE_CHECKING:
+    from apc.compiler.compiled import CompiledSystem
+    from apc.tuning.tune import Tuning
+
 # What the name of a scene ends in.
 SCENES = (".yaml", ".yml", ".apc")
 
@@ -35,6 +42,11 @@ def critical_command(
     settings: tuple[str, ...],
     upper: str | None = option("Look no further up than this.", '"VALUE UNIT"'),
     lower: str | None = option("Look no further down than this.", '"VALUE UNIT"'),
+    over: tuple[str, ...] = option(
+        "The largest value that is stable in all of this: user.count=2:10, device.mass=±20%, as for apc tune. "
+        "May be repeated.",
+        "PATH=LO:HI",
+    ),
     criterion: str | None,
     hands: str,
     plot: Path | None = picture_option(
@@ -60,6 +72,11 @@ def critical_command(
         what = "--plot and --hands passive don't go together: what hands can draw has no eigenvalues"
         raise ApcError(Mistake("E930", Place("--hands"), what, hint="--hands clamped"))
     system = open_scene(file, settings, {"--plot": plot}, hands=hands, told=note_aside)
+    if over:
+        if plot is not None:
+            raise click.UsageError("--plot and --over don't go together: there are as many loci as scenes")
+        print_result(_over(system, path, (lower, upper), over, asked), as_json=as_json)
+        return
     with status_line() as told:
         found = critical(system, path, lower=lower, upper=upper, criterion=asked, told=told)
     if plot is not None:
@@ -67,6 +84,31 @@ def critical_command(
 
         write_picture(found.plot, plot)
     print_result(found, as_json=as_json, written=[plot])
+
+
+def _over(
+    system: CompiledSystem,
+    path: str,
+    ends: tuple[str | None, str | None],
+    over: tuple[str, ...],
+    criterion: str | None,
+) -> Tuning:
+    """Return the largest value that is stable in all that is given: the best of one gain."""
+    from apc.frame.names import find, unit_of, value_now
+    from apc.tuning.demands import read_demands
+    from apc.tuning.tune import tune
+    from apc.vary.margins import GROWTH
+
+    free = find(system, path)
+    present, unit = value_now(system, free), unit_of(system, free.name)
+    if not present and ends[1] is None:
+        raise click.UsageError(
+            f"--upper is needed: {path} is 0 now, which says nothing of how large it may be"
+        )
+    low, high = ends[0] or f"0 {unit}", ends[1] or f"{GROWTH * abs(present):.12g} {unit}"
+    demands = read_demands(system, [f"{path}={low}:{high}"], maximize=path, over=over, criterion=criterion)
+    with status_line() as told:
+        return tune(system, demands, told=told)
 
 
 def _check_order(path: str, file: str | None) -> None:
