@@ -43,8 +43,8 @@ def critical_command(
     upper: str | None = option("Look no further up than this.", '"VALUE UNIT"'),
     lower: str | None = option("Look no further down than this.", '"VALUE UNIT"'),
     over: tuple[str, ...] = option(
-        "The largest value that is stable in all of this: user.count=2:10, device.mass=±20%, as for apc tune. "
-        "May be repeated.",
+        "Find the largest value that is stable in all of this: user.count=2:10, device.mass=±20%, as for apc "
+        "tune. May be repeated.",
         "PATH=LO:HI",
     ),
     criterion: str | None,
@@ -102,9 +102,7 @@ def _over(
     free = find(system, path)
     present, unit = value_now(system, free), unit_of(system, free.name)
     if not present and ends[1] is None:
-        raise click.UsageError(
-            f"--upper is needed: {path} is 0 now, which says nothing of how large it may be"
-        )
+        raise click.UsageError(f"{path} is 0 now, which says nothing of how large it may be: give --upper")
     low, high = ends[0] or f"0 {unit}", ends[1] or f"{GROWTH * abs(present):.12g} {unit}"
     demands = read_demands(system, [f"{path}={low}:{high}"], maximize=path, over=over, criterion=criterion)
     with status_line() as told:
