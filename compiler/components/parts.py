@@ -359,10 +359,10 @@ def _joined(
         fitting = (part.name for part in free if part.connectors(kind))
         what = f"{name} does not say what its {connector} is joined to"
         hint = f"{connector}: {next(fitting, GROUND)}"
-        for other in parts.values():  # who joins the part without saying which of its connectors is meant
-            for key, value in other.body.entries:
-                if isinstance(value, Scalar) and value.text == name and key.text in other.connectors(kind):
-                    hint = f"{other.name}: {{{key.text}: {name}.{connector}}}"
+        for one in parts.values():  # who joins the part without saying which of its connectors is meant
+            for key, value in one.body.entries:
+                if isinstance(value, Scalar) and value.text == name and key.text in one.connectors(kind):
+                    hint = f"{one.name}: {{{key.text}: {name}.{connector}}}"
         raise fault("E210", entry.place, what, hint=hint)
     text = text_of(node, connector, f"{connector}: device")
     if text == GROUND:

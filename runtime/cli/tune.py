@@ -11,7 +11,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apc.cli.options import command, criterion_with, note_aside, note_usual, option, print_result
+import click
+
+from apc.cli.options import (
+    command,
+    criterion_with,
+    note_aside,
+    note_usual,
+    option,
+    picture_option,
+    print_result,
+)
 from apc.cli.progress import status_line
 from apc.compiler.errors import ApcError, Mistake, Place
 
@@ -36,6 +46,11 @@ def tune_command(
         "m/s/N, feel.error in m/N. May be repeated.",
         "DEMAND",
     ),
+    against: str = option(
+        "Weigh the aim against what a hand feels, feel.impedance at 5 Hz: the best for each of 20 bounds "
+        "(Pareto front).",
+        "QUANTITY",
+    ),
     over: tuple[str, ...] = option(
         "What the gains have to bear, all of it: user.count=2:10, device.mass=±20%, lan.loss=0:0.05, or "
         '"lan.delay=8 ms:20 ms", at every constant delay. May be repeated.',
@@ -45,6 +60,7 @@ def tune_command(
     time: str = option("End after this long, with the best found and what is not proved of it.", '"TIME"'),
     settings: tuple[str, ...],
     write: Path | None = option("Write the topology with these gains in it, comments and all (.yaml)."),
+    plot: Path | None = picture_option("With --against, draw the front: .png, .svg or .pdf."),
     as_json: bool,
 ) -> None:
     """Find the gains that do best, and prove that they do.
@@ -64,7 +80,9 @@ def tune_command(
     """
     from apc.frame.devices import FREE, with_hands
     from apc.inputs import open_scene
-    from apc.tuning.demands import read_demands, read_seconds, study_hands
+    from apc.present.pictures import write_picture
+    from apc.tuning.demands import read_against, read_demands, read_seconds, study_hands
+    from apc.tuning.front import front
     from apc.tuning.tune import tune
 
     note_usual(hands)
@@ -73,7 +91,9 @@ def tune_command(
         raise ApcError(
             Mistake("E996", Place("--write"), what, ".yaml at its end", got, f"{write.stem}-tuned.yaml")
         )
-    system = open_scene(file, settings, {"--write": write}, hands=hands, told=note_aside)
+    if (plot is not None or write is not None) and bool(against) != (plot is not None):
+        raise click.UsageError("--plot is of --against, and --write of one design")
+    system = open_scene(file, settings, {"--write": write, "--plot": plot}, hands=hands, told=note_aside)
     if hands == FREE and (hands := study_hands(system)) != FREE:
         system = with_hands(system, hands)
     demands = read_demands(
@@ -85,6 +105,13 @@ def tune_command(
         over=over,
         criterion=criterion_with(hands, None),
     )
+    if against:
+        with status_line() as told:
+            weighed = front(system, demands, read_against(against), seconds=read_seconds(time), told=told)
+        if plot is not None:
+            write_picture(weighed.plot, plot)
+        print_result(weighed, as_json=as_json, written=[plot])
+        return
     with status_line() as told:
         found = tune(system, demands, seconds=read_seconds(time), told=told)
     if write is not None and found.met:

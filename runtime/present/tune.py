@@ -11,12 +11,16 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from apc.compiler.words import counted, enumerated, in_hertz, measured, with_unit, wrapped
 from apc.present.analysis import range_document
 from apc.present.forms import MEANT, labelled, notes, quantity, record, table
+from apc.present.pictures import COLOURS, new_figure
 
 if TYPE_CHECKING:
     from apc.frame.names import Range
+    from apc.tuning.front import Front
     from apc.tuning.tune import Binding, Tuning
 
 # Digits of what is typed, and of what a limit buys.
@@ -116,6 +120,36 @@ def _binding_lines(found: Tuning, one: Binding) -> list[str]:
         buys = quantity(better, found.unit, BUYS)
         lines += wrapped(f"1 % less of {label} = {quantity(value, unit)} buys {buys}", "      ", "        ")
     return lines
+
+
+def front_text(found: Front) -> str:
+    """Return the designs as a table, those at the ends and at the knee named, in at most 80 columns."""
+    last = len(found.designs) - 1
+    best = "largest" if found.larger else "least"
+    title = f"{found.topology}: the {best} {found.aim} for each bound on {found.against}"
+    names = {0: "least felt", found.knee: "knee", last: best}
+    rows = [(found.against, *(name for name, _, _ in found.designs[0].gains), "", "")]
+    for place, one in enumerate(found.designs):
+        gains = (quantity(value, unit, TYPED) for _, value, unit in one.gains)
+        proved = "" if one.proved else "not proved"
+        rows.append((quantity(one.felt, found.against_unit, 5), *gains, names.get(place, ""), proved))
+    return "\n".join([*wrapped(title, "", "  "), "", *table(rows)])
+
+
+def front_picture(found: Front, ax: Any = None) -> Any:
+    """Draw the front, three designs named; return the matplotlib Axes."""
+    ax = new_figure((5.2, 3.8)).subplots() if ax is None else ax
+    x, y = (np.array([getattr(one, name) for one in found.designs]) for name in ("felt", "value"))
+    ax.plot(x, y, "o-", markersize=4, color=COLOURS[0])
+    ax.set(xlabel=f"{found.against} ({found.against_unit})", ylabel=f"{found.aim} ({found.unit})")
+    ax.set_title(found.topology, fontsize=9)
+    end = "largest" if found.larger else "least"
+    for place, name in {0: "least felt", found.knee: "knee", len(x) - 1: end}.items():
+        at = (float(x[place]), float(y[place]))
+        ax.annotate(name, at, xytext=(6, -12), textcoords="offset points", fontsize=8)
+    ax.margins(0.12)  # room for the names
+    ax.grid(linewidth=0.4, alpha=0.5)
+    return ax
 
 
 def tuning_document(found: Tuning) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """What is asked of gains: which are free, what they are to do best, and all that they have to bear.
 
 Takes: a `CompiledSystem` and texts such as `coordination.stiffness=10 N/m:5000 N/m`.
-Gives: `Aim`, `Felt`, `Demands`, `read_demands`, `study_hands`, `read_seconds`; `PLACE`, `RADIUS`.
+Gives: `Aim`, `Felt`, `Demands`, `read_demands`, `read_against`, `study_hands`, `read_seconds`; `PLACE`,
+`RADIUS`.
 Guarantees: what can't be meant is refused before anything is computed.
 Does not: compute.
 """
@@ -26,7 +27,9 @@ from apc.vary.evaluator import reaches_count
 from apc.vary.growth import MEAN_SQUARE, NOMINAL, PASSIVE, criterion_of, refuse_time
 
 PLACE = Place("tune")
-FREE, AIM, SUBJECT, OVER = (Place(f"--{one}") for one in ("free", "maximize", "subject", "over"))
+FREE, AIM, SUBJECT, OVER, AGAINST = (
+    Place(f"--{one}") for one in ("free", "maximize", "subject", "over", "against")
+)
 
 # What may be minimized beside a gain.
 RADIUS = "spectral_radius"
@@ -37,6 +40,9 @@ FELT = {
     "transmitted": ("transmitted_admittance", "m/s/N"),
     "error": ("error_per_force", "m/N"),
 }
+
+# By a quantity of `Feel` its name in a demand, and its unit.
+UNIT_OF = {quantity: (name, unit) for name, (quantity, unit) in FELT.items()}
 
 _FREE = '--free "coordination.stiffness=10 N/m:5000 N/m"'
 
@@ -248,6 +254,13 @@ def _felt(text: str) -> Felt:
     if not (hertz > 0 and limit > 0):
         raise ApcError(Mistake("E996", SUBJECT, "a demand on what is felt", "numbers above 0", text[:80]))
     return Felt(quantity, float(hertz), float(limit))
+
+
+def read_against(text: str) -> Felt:
+    """Read what a gain is weighed against, `feel.impedance at 5 Hz`. Raises ApcError E996."""
+    name = text.strip().removeprefix("feel.").partition(" at ")[0].strip()
+    unit = FELT[name][1] if name in FELT else ""
+    return _felt(f"{text} < 1 {unit}")
 
 
 def _part(text: str, what: str, unit: str, example: str) -> Fraction:

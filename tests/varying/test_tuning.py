@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import apc
+from apc.tuning.demands import read_against, read_demands
+from apc.tuning.front import front
 from tests.commands import Cli, write
 from tests.topologies import AVERAGE, MESH, compiled, replaced, told, wall
 
@@ -77,6 +79,20 @@ def test_with_passive_hands_the_limit_is_colgates(damping: float, virtual: float
     found = apc.tune(model, free, maximize="it.stiffness", criterion="passive")
     assert found.best == pytest.approx((damping - virtual) / (0.0005 + delay), rel=1e-8)
     assert found.proved
+
+
+def test_a_front_is_the_best_of_a_gain_for_each_bound_on_what_is_felt() -> None:
+    model = compiled(AVERAGE)
+    demands = read_demands(model, [f"{K}=10 N/m:7000 N/m"], maximize=K)
+    found = front(model, demands, read_against("feel.impedance at 5 Hz"), points=3)
+    felt = [abs(apc.feel(model, 5.0, set={K: one.value}).impedance[0]) for one in found.designs]
+    assert [one.felt for one in found.designs] == pytest.approx(felt, rel=1e-9)
+    assert all(np.diff([(one.felt, one.value) for one in found.designs], axis=0).ravel() > 0)
+    assert found.designs[-1].value == apc.tune(model, RANGE, maximize=K).value
+    asked = apc.tune(model, RANGE, maximize=K, subject=[f"feel.impedance at 5 Hz < {felt[1] * 1.001} N*s/m"])
+    assert asked.value == pytest.approx(found.designs[1].value, rel=5e-3)
+    with pytest.raises(apc.ApcError, match="E996"):
+        front(model, demands, read_against("feel.error at 1 Hz"))  # which is least where it is stiffest
 
 
 def test_what_is_asked_beside_stability_is_kept_and_what_time_leaves_open_is_said() -> None:

@@ -1,0 +1,143 @@
+"""A gain against what a hand feels: the best of the one for every bound on the other (a Pareto front).
+
+Takes: a `CompiledSystem`, `Demands` whose aim is a gain, and the quantity it is weighed against.
+Gives: `Design`, `Front`, `front`.
+Guarantees: each design is that of `tune` with its bound as a demand, proved or not as there.
+Does not: say that no designs lie beyond.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.analysis.analysis import prepare
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError, Mistake
+from apc.result import Result
+from apc.tuning.demands import AGAINST, UNIT_OF, Demands, Felt
+from apc.tuning.limits import Limits
+from apc.tuning.tune import Tuning, tune
+from apc.vary.crossing import Told
+
+Floats = NDArray[np.float64]
+
+POINTS = 20  # designs of a front
+LEAST = 1 + 1e-3  # how far above the least that is felt the last bound is
+SCANNED = 40  # values of the gain among which the least that is felt is looked for
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """Gains as they are typed, in SI; the aim with them, what is felt, and whether it is proved."""
+
+    gains: tuple[tuple[str, float, str], ...]
+    value: float
+    felt: float
+    proved: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Front(Result):
+    """Designs from the least that is felt to the best of the aim; `knee` is the place of the one between.
+
+    The knee is farthest from the straight line between the ends, each axis counted from one end to the other.
+    """
+
+    shown_by = "tune:front"
+
+    topology: str
+    aim: str
+    unit: str
+    larger: bool
+    against: str
+    against_unit: str
+    designs: tuple[Design, ...]
+    knee: int
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the front; return the matplotlib Axes. Raises ApcError (E875) without matplotlib."""
+        return self._shown("picture", ax)
+
+
+def front(
+    system: CompiledSystem,
+    demands: Demands,
+    against: Felt,
+    *,
+    points: int = POINTS,
+    seconds: float = float("inf"),
+    told: Told | None = None,
+) -> Front:
+    """Return the best of a gain for each of several bounds on what a hand feels.
+
+    Parameters
+    ----------
+    system, demands
+        As for `tune`; the aim is a gain.
+    against
+        What is felt, its `most` of no meaning.
+    points
+        How many designs.
+    seconds, told
+        As for `tune`; the time is that of all.
+
+    Raises
+    ------
+    ApcError
+        E996 the aim is no gain, or what is felt doesn't get worse as it grows.
+    """
+    column, until = demands.aim.gain, time.monotonic() + seconds
+    if column is None:
+        raise ApcError(Mistake("E996", AGAINST, f"{demands.aim.label} is no gain to be weighed against it"))
+    limits = Limits(system, prepare(system), replace(demands, felt=(replace(against, most=1.0),)))
+
+    def felt(gains: Floats) -> float:
+        """Return the largest that is felt in any scenario at gains (m,)."""
+        return max(float(np.exp(limits.felt(one, np.append(gains, one.point)[None]))[0, 0]) for one in every)
+
+    every = limits.every()
+    best = tune(system, demands, seconds=seconds, told=told)
+    at_best = np.array([float(one.value) for one in best.gains])
+    end = demands.free[column].low if demands.aim.larger else demands.free[column].high
+    others = np.tile(at_best, (SCANNED, 1))
+    others[:, column] = np.linspace(float(end), at_best[column], SCANNED)
+    low, high = min(map(felt, others)), felt(at_best)
+    if not (best.met and low < high * (1 - 1e-6)):
+        what = f"the best {demands.aim.label} is the best for feel.{UNIT_OF[against.quantity][0]}, too"
+        raise ApcError(Mistake("E996", AGAINST, what))
+    designs = [_design(best, high)]
+    for bound in np.geomspace(high, low * LEAST, points)[1:].tolist():
+        asked = replace(demands, felt=(*demands.felt, replace(against, most=bound)))
+        found = tune(system, asked, seconds=max(until - time.monotonic(), 0.0), told=told)
+        if found.met:
+            designs.append(_design(found, felt(np.array([float(one.value) for one in found.gains]))))
+    designs.sort(key=lambda one: one.felt)
+    name, unit = UNIT_OF[against.quantity]
+    return Front(
+        topology=system.name,
+        aim=demands.aim.label,
+        unit=best.unit,
+        larger=demands.aim.larger,
+        against=f"feel.{name} at {against.frequency_hz:.6g} Hz",
+        against_unit=unit,
+        designs=tuple(designs),
+        knee=_knee(designs),
+    )
+
+
+def _design(found: Tuning, felt: float) -> Design:
+    gains = tuple((one.parameter, float(one.value), one.unit) for one in found.gains)
+    return Design(gains, found.value, felt, found.proved)
+
+
+def _knee(designs: list[Design]) -> int:
+    """Return the place of the design farthest from the line between the ends."""
+    points = np.array([(one.felt, one.value) for one in designs])
+    size = np.ptp(points, axis=0)
+    shares = (points - points[0]) / np.where(size == 0, 1.0, size) * np.sign(points[-1] - points[0])
+    return int(np.argmax(shares[:, 1] - shares[:, 0]))
