@@ -39,7 +39,7 @@ MOST_LISTED = 20  # peers whose values are written out
 HELD = ("hand.mass", "hand.damping", "hand.stiffness")
 
 # Where a mistake in an override stands, when it came from no line of a file.
-OVERRIDE = Place("override")
+OVERRIDE = Place("--set")
 
 
 @dataclass(frozen=True, slots=True)

@@ -87,8 +87,14 @@ def json_text(found: Any, *, indent: int | None = 2) -> str:
 
 
 def quantity(value: float, unit: str, digits: int = 6) -> str:
-    """Return a number to so many digits with its unit."""
-    return with_unit(f"{value:.{digits}g}", unit)
+    """Return a number to so many digits with its unit, a time below a second in ms."""
+    by, shown = as_shown(value, unit)
+    return with_unit(f"{value * by:.{digits}g}", shown)
+
+
+def as_shown(value: float, unit: str) -> tuple[float, str]:
+    """Return what a number is multiplied by to be shown, and the unit it then has: ms of a time below 1 s."""
+    return (1e3, "ms") if unit == "s" and 0 < abs(value) < 1 else (1.0, unit)
 
 
 def listed(names: Sequence[str], most: int = 6) -> str:
