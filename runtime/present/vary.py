@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.words import counted, in_hertz, known_digits, measured, with_unit, wrapped
 from apc.optional import need
-from apc.present.forms import MEANT, document, note, notes, quantity, record, table
+from apc.present.forms import MEANT, as_shown, document, note, notes, quantity, record, table
 
 if TYPE_CHECKING:
     import pandas
@@ -54,7 +54,8 @@ def critical_text(found: Critical) -> str:
         return "\n".join([*lines, *_count_lines(found)])
     for one in found.crossings:
         exact = f"{quantity(one.value, unit, 15)}, exact"
-        value = measured(one.value, one.error, unit) if one.error else exact
+        by, shown = as_shown(one.value, unit)
+        value = measured(one.value * by, one.error * by, shown) if one.error else exact
         lines.append(f"  {value}")
         kind = "jump, " if one.kind == "jump" else ""
         turns = "" if math.isnan(one.frequency_hz) else f", {in_hertz(one.frequency_hz)}"
@@ -135,10 +136,11 @@ def margins_text(found: Margins) -> str:
     if not found.rows:
         return "\n".join(note(f"margins {found.note}"))
     width = max(len(one.parameter) for one in found.rows)
-    ends = [
-        "" if one.value is None else with_unit(known_digits(one.value, one.error or 0.0, 7), one.unit)
-        for one in found.rows
-    ]
+    ends = []
+    for one in found.rows:
+        value, error = one.value or 0.0, one.error or 0.0
+        by, shown = as_shown(value, one.unit)
+        ends.append("" if one.value is None else with_unit(known_digits(value * by, error * by, 7), shown))
     wide = max(16, *map(len, ends))
     lines = [f"  {'may grow':<{width}}  from           {'to':<{wide}} times  at"]
     for one, end in zip(found.rows, ends, strict=True):

@@ -44,7 +44,7 @@ def test_the_mean_settles_and_the_mesh_shakes() -> None:
     assert size == pytest.approx(np.ptp(tail), rel=0.02) and size > 1e-3
     turns = np.count_nonzero(np.diff(np.sign(np.diff(tail))))
     assert rate == pytest.approx(turns / 2 / 0.6, rel=0.03)
-    assert str(AVERAGE_RUN).startswith("experiment-average: settles\n\n  From 0.8")
+    assert str(AVERAGE_RUN).startswith("experiment-average: settles\n\n  From 8")
 
 
 @pytest.mark.parametrize("found", [AVERAGE_RUN, MESH_RUN], ids=["average", "mesh"])

@@ -185,7 +185,7 @@ def test_delays_that_are_harmless_while_constant_are_unstable_by_turns() -> None
     found = changing(system, 0.008, 0.046)
     assert found.unstable == (2, 5)
     assert with_delays(system, [0.008] * 2 + [0.046] * 5) == pytest.approx(1.004925, rel=1e-6)
-    assert "unstable if by turns 2 packets take 0.008 s and 5 0.046 s" in " ".join(
+    assert "unstable if by turns 2 packets take 8 ms and 5 46 ms" in " ".join(
         str(apc.prove_box(system, {"lan.delay": (0.008, 0.046)})).split()
     )
 
