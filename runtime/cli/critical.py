@@ -99,7 +99,7 @@ def _over(
     from apc.tuning.tune import tune
     from apc.vary.margins import GROWTH
 
-    free = find(system, path)
+    free = find(system, path, Place("critical value"))
     present, unit = value_now(system, free), unit_of(system, free.name)
     if not present and ends[1] is None:
         raise click.UsageError(f"{path} is 0 now, which says nothing of how large it may be: give --upper")

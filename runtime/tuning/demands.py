@@ -18,7 +18,8 @@ from apc.analysis.box import parse_range
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.frame.devices import FREE as FREE_HANDS
-from apc.frame.names import Free, Range, find
+from apc.frame.names import Free, Range, find, given_ranges
+from apc.frame.overrides import Override, apply
 from apc.moments.network import unreliable
 from apc.option_value import option_value
 from apc.vary.counts import count_range
@@ -136,7 +137,7 @@ def read_demands(
         if reaches_count(system, one.free) or is_delay(system, one.free):
             what = f"{one.free.label} is no gain that can be chosen by degrees"
             raise ApcError(Mistake("E995", FREE, what, hint=f"--over {one.free.label}=…"))
-    borne = [_range(system, text, OVER) for text in over]
+    borne = given_ranges(system, [_range(system, text, OVER) for text in over])
     for place, one in enumerate((*gains, *borne)):
         if any(other.free.meets(one.free) for other in (*gains, *borne)[:place]):
             raise ApcError(Mistake("E831", PLACE, f"{one.free.label} has two ranges"))
@@ -197,11 +198,18 @@ def _counted(system: CompiledSystem, free: Free, text: str, place: Place) -> Ran
         raise ApcError(Mistake("E830", place, "numbers of peers", "NAME=LOW:HIGH", got, f"{free.label}=2:10"))
     limits = [option_value(place.file, one, what=free.label, unit="1") for one in ends]
     low, high = count_range(system, free, limits, float(limits[0]), place)
+    if low < 1:
+        what, hint = f"the range of {free.label}", f"{free.label}=2:{max(high, 2)}"
+        raise ApcError(Mistake("E842", place, what, "1 peer or more", f"{low}", hint))
     if low > high:
         what, got = f"the range of {free.label}", f"{low} to {high}"
         raise ApcError(
             Mistake("E842", place, what, "the lower number first", got, f"{free.label}={high}:{low}")
         )
+    try:
+        apply(system, [Override(free, Fraction(low))])
+    except ApcError as error:  # too few for what follows the others
+        raise ApcError(replace(one, place=place) for one in error.mistakes) from None
     return Range(free, "1", Fraction(low), Fraction(high))
 
 
@@ -258,9 +266,12 @@ def _felt(text: str) -> Felt:
 
 def read_against(text: str) -> Felt:
     """Read what a gain is weighed against, `feel.impedance at 5 Hz`. Raises ApcError E996."""
-    name = text.strip().removeprefix("feel.").partition(" at ")[0].strip()
-    unit = FELT[name][1] if name in FELT else ""
-    return _felt(f"{text} < 1 {unit}")
+    name, at, _ = text.strip().removeprefix("feel.").partition(" at ")
+    if name.strip() not in FELT or not at or "<" in text:
+        names, example = ", ".join(f"feel.{one}" for one in FELT), '--against "feel.impedance at 5 Hz"'
+        wants = f"one of {names}, at a frequency"
+        raise ApcError(Mistake("E996", AGAINST, "what a gain is weighed against", wants, text[:80], example))
+    return _felt(f"{text} < 1 {FELT[name.strip()][1]}")
 
 
 def _part(text: str, what: str, unit: str, example: str) -> Fraction:
