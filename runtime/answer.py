@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from apc.analysis.analysis import Analysis, Prepared, analyze, prepare
+from apc.analysis.analysis import Analysis, Prepared, analyze, near_start, prepare
 from apc.analysis.contact_modes import ContactModes, contact_modes
 from apc.analysis.conventions import Conventions, conventions
 from apc.analysis.methods import PAPER
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from apc.analysis.box_proof import BoxProof
     from apc.analysis.switching import Switching
     from apc.frame.names import Range
-    from apc.hands.passivity import PassiveHands
     from apc.moments.network import NetworkVerdict
     from apc.simulation.buzz import Buzz
 
@@ -247,7 +246,7 @@ def proved_box(
         As `box_proof.prove_box`, or `moments.mean_square_box.prove_box` where links are, or may become,
         unreliable; E930 other ranges, with every passive hand.
     """
-    from apc.network.nominal import channel_numbers, left_out
+    from apc.network.nominal import channel_numbers, unreliable
     from apc.vary.delay_box import is_delay, prove_over_delay
 
     if passive and not (len(box) == 1 and is_delay(system, box[0].free)):
@@ -256,11 +255,11 @@ def proved_box(
         raise ApcError(Mistake("E930", Place("--box"), what, hint=hint))
     if any(is_delay(system, one.free) for one in box):
         at_each = partial(proved_at, passive=passive, cells=cells, inside=inside)
-        return prove_over_delay(system, box, at_each, nominal=not passive and not left_out(system))
+        return prove_over_delay(system, box, at_each, nominal=not passive and not unreliable(system))
     from apc.analysis.box_proof import prove_box
 
     numbers = channel_numbers(system)
-    if left_out(system) or any(one.free.name in numbers for one in box):
+    if unreliable(system) or any(one.free.name in numbers for one in box):
         from apc.moments.mean_square_box import prove_box as prove_over_network
 
         return prove_over_network(system, box, cells=cells)
@@ -285,28 +284,26 @@ def proved_at(
     if box:
         return proved_box(system, box, passive=passive, cells=cells, inside=inside)
     from apc.analysis.box_proof import BoxProof
-    from apc.network.nominal import left_out
+    from apc.network.nominal import unreliable
 
-    found: Analysis | NetworkVerdict | PassiveHands
     if passive:
         from apc.hands.passivity import passive_hands
 
-        found = passive_hands(system)
-    elif left_out(system):
+        hands = passive_hands(system)
+        verdict, stable, left = hands.verdict, hands.stable, hands.left_out
+    elif unreliable(system):
         from apc.moments.network import judge_network
 
-        network = judge_network(system, prepare(system))
+        prepared = prepare(system)
+        network = judge_network(system, prepared)
         assert network is not None, "a link is unreliable"
-        found = network
+        verdict, stable, left = network.verdict, network.stable, near_start(system, prepared)
     else:
         found = analyze(system)
-        if found.stable and inside != 1:
-            error = found.spectral_radius_error
-            sides = found.spectral_radius - error > inside, found.spectral_radius + error < inside
-            if not sides[1]:
-                stable = False if sides[0] else None
-                return BoxProof(system.name, (), found.verdict, stable, 1, float(stable is None), (), ())
-    return BoxProof(system.name, (), found.verdict, found.stable, 1, float(found.stable is None), (), ())
+        verdict, stable, left = found.verdict, found.stable, found.left_out
+        if stable and inside != 1 and not found.spectral_radius + found.spectral_radius_error < inside:
+            stable = False if found.spectral_radius - found.spectral_radius_error >= inside else None
+    return BoxProof(system.name, (), verdict, stable, 1, float(stable is None), (), (), left)
 
 
 def sensitivities_of(system: CompiledSystem, prepared: Prepared, found: Analysis) -> Sensitivities:

@@ -39,7 +39,9 @@ def oddities(
         if entry.section == "links" and name not in used:
             warnings.add("W271", entry.place, f"nobody uses the link {name}")
         if entry.section == "links" and isinstance(entry.body.get("delay"), ListNode):
-            what = f"{name}.delay is a range: analyze asks of all of it, other commands of its middle"
+            what = (
+                f"{name}.delay is a range: analyze and tune are for all of it, other answers for its middle"
+            )
             warnings.add("W275", entry.place, what)
     outer = [part for part in parts if part.name.partition("[")[0] in entries and "." not in part.name]
     counts = {group.name: group.count for group in groups}

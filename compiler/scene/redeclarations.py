@@ -1,8 +1,8 @@
 """Parts that are of another type in one group of peers: `set: {device.type: Omega3}`.
 
 Takes: the groups of peers and the parts' entries. Gives: the entry of a part at a group, by both names.
-Guarantees: the other type has the same connectors and sends nothing; the entry says what the part's own entry
-says as far as the other type has it, and what else the group sets.
+Guarantees: the other type has the same connectors, numbers of one name in one unit, and sends nothing; the
+entry says what the part's own entry says as far as the other type has it, and what else the group sets.
 Does not: read the numbers of an entry (see `components.parts`).
 """
 
@@ -62,6 +62,13 @@ def _entry(
     if _connectors(new) != _connectors(old):
         what = f"{key.text}, to take the place of {old.name},"
         raise fault("E210", node.place, what, *(f"the connectors {_connectors(one)}" for one in (old, new)))
+    units = {one.name: one.unit for one in old.numbers}
+    for one in new.numbers:
+        before = units.get(one.name, one.unit)
+        if before.dimension != one.unit.dimension:
+            what = f"{key.text}, to take the place of {old.name},"
+            expected, got = (f"{one.name} in {unit.text}" for unit in (before, one.unit))
+            raise fault("E210", node.place, what, expected, got)
     known = {*PART_KEYS, "type", *dict(new.connectors)}
     known |= {one.name.partition("[")[0] for one in (*new.parameters, *new.variables)}
     body = {name.text: (name, value) for name, value in entry.body.entries if name.text in known}

@@ -46,7 +46,7 @@ from apc.frame.names import Free
 from apc.frame.parameters import Numbers, resolve
 from apc.frame.schedule import ORDER, Schedule
 from apc.frame.scheduling import build_schedules
-from apc.network.nominal import left_out
+from apc.network.nominal import left_out, unreliable
 from apc.result import Look, Result
 from apc.threads import single_threaded
 
@@ -258,7 +258,7 @@ def analyze(
             told = up_to(stands.translations, stands.rotations)
             verdict, stable = (DRIFTS, False) if stands.drifts else (told, True)
         proof = spectrum.proof if verdict == DRIFTS else spectrum.proof.replace(TO_DRIFT, "stable")
-        of = (("linearization", linearized), ("nominal network", bool(left_out(system))))
+        of = (("linearization", linearized), ("nominal network", bool(unreliable(system))))
         if proof and any(is_so for _, is_so in of):
             proof += f", of the {' on the '.join(name for name, is_so in of if is_so)}"
     return Analysis(

@@ -19,6 +19,7 @@ from typing import Any
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
+from apc.network.nominal import refuse_range
 from apc.result import Result
 from apc.suffixes import check_suffix
 
@@ -132,13 +133,15 @@ def export(system: CompiledSystem, chosen: Format, asked: Asked, out: Path | Non
     Raises
     ------
     ApcError
-        E953 an option that means nothing to the format; E601 the file can't be written; and the maker's.
+        E953 an option that means nothing to the format; E899 a delay that is a range; E601 the file can't
+        be written; and the maker's.
     """
     for name in Asked.__slots__:
         if getattr(asked, name) and name not in chosen.takes:
             able = ", ".join(one.name for one in FORMATS if name in one.takes)
             what = f"--{name} means nothing to the format {chosen.name}"
             raise ApcError(Mistake("E953", Place(f"--{name}"), what, hint=f"--to {able}" if able else ""))
+    refuse_range(system)
     make, write = _makers(chosen.name)
     found = make(system, **{name: getattr(asked, name) for name in chosen.takes})
     if out is not None:

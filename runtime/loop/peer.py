@@ -80,7 +80,7 @@ def live_scene(system: CompiledSystem) -> CompiledSystem:
             trace=np.array([float(max(Fraction(GIVEN_UP), TIMES * usual))]),
         )
         links.append(replace(link, channel=channel))
-    return replace(system, links=tuple(links))
+    return replace(system, links=tuple(links), within=())
 
 
 class StoppedError(RuntimeError):

@@ -44,10 +44,10 @@ from apc.frame.taylor import hull, within
 from apc.moments.crowd import Classes, classes_of, hearing, moments_of, peer_classes, remembered_of
 from apc.moments.gains import below_1
 from apc.moments.mean_loops import Remembered
-from apc.moments.network import STABLE, UNSTABLE, growth, unreliable
+from apc.moments.network import STABLE, UNSTABLE, growth
 from apc.moments.packet_memory import is_memoryless
 from apc.network.channel import channel_law
-from apc.network.nominal import channel_numbers
+from apc.network.nominal import channel_numbers, unreliable
 from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]

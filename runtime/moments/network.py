@@ -38,7 +38,8 @@ from apc.moments.stand_in import stand_in
 from apc.moments.traces import trace_radius
 from apc.moments.unserved import UnservedError
 from apc.moments.worst import LossesInARow, worst_case
-from apc.network.channel import LATEST, ChannelLaw, channel_law
+from apc.network.channel import LATEST, ChannelLaw
+from apc.network.nominal import unreliable
 from apc.result import Result
 from apc.threads import single_threaded
 
@@ -126,17 +127,6 @@ class Growth:
     def stable(self) -> bool | None:
         """Whether it is below 1, None where bounds leave it open."""
         return True if self.high < 1 else False if self.low > 1 else None
-
-
-def unreliable(system: CompiledSystem) -> list[tuple[Link, ChannelLaw]]:
-    """Return the links that lose packets or delay them by chance, with their laws."""
-    timings = resolve(system).timings
-    laws = [
-        (link, channel_law(system, link, timings[link.delay]))
-        for link in system.links
-        if link.channel is not None
-    ]
-    return [(link, law) for link, law in laws if law.mean_loss or law.jitter or law.trace is not None]
 
 
 @np.errstate(all="ignore")

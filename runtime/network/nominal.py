@@ -1,23 +1,36 @@
-"""What an answer about the nominal network leaves out: lost packets, jitter, recorded delays.
+"""What an answer about the nominal network leaves out: loss, jitter, recorded delays, ranges of delay.
 
 Takes: a `CompiledSystem`.
-Gives: `left_out`, `channel_numbers`, `refuse_channel_number`.
+Gives: `unreliable`, `left_out`, `refuse_range`, `channel_numbers`, `refuse_channel_number`.
 Guarantees: a question about a number that only lost or late packets depend on is refused by name, as its
 answer would be about a network without them.
-Does not: answer for an unreliable network (see `moments`).
+Does not: answer for an unreliable network (see `moments`), or for all of a range (see `vary.delay_box`).
 """
 
 from __future__ import annotations
 
-from apc.compiler.compiled import CompiledSystem
+from collections.abc import Collection
+from fractions import Fraction
+
+from apc.compiler.compiled import CompiledSystem, Link
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.frame.names import Free, unit_of
-from apc.frame.parameters import scope_of
-from apc.network.channel import channel_law
+from apc.frame.names import Free, given_ranges, unit_of
+from apc.frame.parameters import resolve, scope_of
+from apc.network.channel import ChannelLaw, channel_law
 
 
-def left_out(system: CompiledSystem, *, network: bool = True) -> tuple[str, ...]:
-    """Return what an analysis of the nominal network leaves out, for each unreliable link.
+def unreliable(system: CompiledSystem) -> list[tuple[Link, ChannelLaw]]:
+    """Return the links that lose packets or delay them by chance, with their laws."""
+    links = [link for link in system.links if link.channel is not None]
+    timings = resolve(system).timings if links else {}
+    laws = [(link, channel_law(system, link, timings[link.delay])) for link in links]
+    return [(link, law) for link, law in laws if law.mean_loss or law.jitter or law.trace is not None]
+
+
+def left_out(
+    system: CompiledSystem, *, network: bool = True, varied: Collection[Free] = ()
+) -> tuple[str, ...]:
+    """Return what an analysis leaves out of each unreliable link, and of each delay that is given as a range.
 
     Parameters
     ----------
@@ -25,26 +38,36 @@ def left_out(system: CompiledSystem, *, network: bool = True) -> tuple[str, ...]
         The compiled scene.
     network
         Whether the answer is of the nominal network.
+    varied
+        What the answer varies: a range of it is not left out.
     """
-    timings = {timing.name: timing.value for timing in system.timings}
     notes = []
-    for link in system.links:
-        if link.channel is None or not network:
-            continue
-        law = channel_law(system, link, timings[link.delay])
-        named = []
-        if law.mean_loss:
-            named.append(f"packet loss ({100 * law.mean_loss:.3g} %)")
-        if law.jitter:
-            named.append("jitter")
-        if law.trace is not None:
-            named.append("recorded delays")
-        if named:
-            delay = f"{float(timings[link.delay]) * 1e3:.6g} ms"
-            notes.append(
-                f"left out: {' and '.join(named)} of {link.name}; here every packet takes the nominal {delay}"
-            )
+    for link, law in unreliable(system) if network else ():
+        named = [f"packet loss ({100 * law.mean_loss:.3g} %)"] * bool(law.mean_loss)
+        named += ["jitter"] * bool(law.jitter) + ["recorded delays"] * (law.trace is not None)
+        delay = _ms(resolve(system).timings[link.delay])
+        notes.append(
+            f"left out: {' and '.join(named)} of {link.name}; here every packet takes the nominal {delay}"
+        )
+    names = {free.name for free in varied}
+    for one in given_ranges(system):
+        if one.free.name not in names:
+            low, middle, high = (_ms(value) for value in (one.low, (one.low + one.high) / 2, one.high))
+            notes.append(f"left out: {one.free.label} from {low} to {high} but for its middle, {middle}")
     return tuple(notes)
+
+
+def refuse_range(system: CompiledSystem) -> None:
+    """Refuse to play or write out a scene with a range in the place of a delay: ApcError E899."""
+    for one in given_ranges(system):
+        low, middle, high = (_ms(value) for value in (one.low, (one.low + one.high) / 2, one.high))
+        what = f"{one.free.label} is a range, {low} to {high}, of which this takes one"
+        hint = f'--set "{one.free.label}={middle}"'
+        raise ApcError(Mistake("E899", Place(system.origin.topology), what, hint=hint))
+
+
+def _ms(seconds: Fraction) -> str:
+    return f"{float(seconds) * 1e3:.6g} ms"
 
 
 def channel_numbers(system: CompiledSystem) -> frozenset[str]:

@@ -331,7 +331,7 @@ def box_proof_text(found: BoxProof) -> str:
             more = ["among others around", *where]
             more += wrapped(f"more cells may decide it: --cells {MORE_CELLS * found.cells}")
     told = [line for text in (*found.left_out, said) for line in wrapped(text)]
-    ranges = [f"  {_range(one)}" for one in found.ranges]
+    ranges = [f"  {range_text(one)}" for one in found.ranges]
     if found.changing is not None:
         more += ["", *wrapped(_changing(found.changing, found.ranges[0]))]
     return "\n".join([f"{found.topology}:", *told, *ranges, *more, *notes(found.notes)])
@@ -351,7 +351,8 @@ def _changing(found: ChangingDelay, over: Range) -> str:
     return f"However the delay changes from packet to packet: {'; '.join(said)}."
 
 
-def _range(found: Range) -> str:
+def range_text(found: Range) -> str:
+    """Return a parameter and its range in words."""
     low, high = (quantity(float(one), found.unit, 9) for one in (found.low, found.high))
     return f"{found.free.label} from {low} to {high}"
 

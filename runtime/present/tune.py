@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apc.compiler.words import counted, enumerated, in_hertz, measured, with_unit, wrapped
-from apc.present.analysis import range_document
+from apc.present.analysis import range_document, range_text
 from apc.present.forms import MEANT, labelled, notes, quantity, record, table
 from apc.present.pictures import COLOURS, new_figure
 
 if TYPE_CHECKING:
-    from apc.frame.names import Range
     from apc.tuning.front import Front
     from apc.tuning.tune import Binding, Tuning
 
@@ -57,12 +56,13 @@ def tuning_text(found: Tuning) -> str:
 
 def _sentence(found: Tuning) -> str:
     """Return the answer in a sentence."""
-    decay = f"dying out by {-20 * math.log10(found.decay):.6g} dB a second"
-    stable = "stable" if found.decay == 1 else decay
-    stable += " and felt as asked" if found.felt else ""
-    over = f" for {enumerated([_span(one) for one in found.over])}" if found.over else ""
+    stable = "the scene is stable"
+    if found.decay != 1:
+        stable = f"motions die out by {-20 * math.log10(found.decay):.6g} dB a second"
+    stable += " and what is felt is as asked" if found.felt else ""
+    over = f" for {enumerated([range_text(one) for one in found.over])}" if found.over else ""
     if not found.met:
-        return f"{found.topology}: no gains were found in these ranges that are {stable}{over}"
+        return f"{found.topology}: no gains were found in these ranges with which {stable}{over}"
     proved = "proved" if found.proved else "not proved"
     if found.worst >= 0:
         proved += ", and in some of it it is not so"
@@ -70,8 +70,8 @@ def _sentence(found: Tuning) -> str:
     if found.unit == "1" and found.aim not in [one.parameter for one in found.gains]:
         least = f"a spectral radius below {found.value:.6g}, next to the least found{over},"
         return f"{found.topology}: {least} is {proved}"
-    value = quantity(found.value, found.unit, TYPED)
-    return f"{found.topology}: {value} is the {best} {found.aim} found to be {stable}{over}; it is {proved}"
+    value = f"{quantity(found.value, found.unit, TYPED)} is the {best} {found.aim}"
+    return f"{found.topology}: {value} found with which {stable}{over}; it is {proved}"
 
 
 def _room(found: Tuning) -> str:
@@ -82,11 +82,6 @@ def _room(found: Tuning) -> str:
         return f"{math.exp(found.worst):.6g} of what is allowed in the worst scenario"
     radius, most = math.exp(found.worst + found.allowed), math.exp(found.allowed)
     return f"spectral radius {radius:.6g} in the worst scenario, {most:.6g} allowed"
-
-
-def _span(one: Range) -> str:
-    low, high = (f"{float(end):.6g}" for end in (one.low, one.high))
-    return f"{one.free.label} from {low} to {with_unit(high, one.unit)}"
 
 
 def _proof_lines(found: Tuning) -> list[str]:
@@ -133,7 +128,9 @@ def front_text(found: Front) -> str:
         gains = (quantity(value, unit, TYPED) for _, value, unit in one.gains)
         proved = "" if one.proved else "not proved"
         rows.append((quantity(one.felt, found.against_unit, 5), *gains, names.get(place, ""), proved))
-    return "\n".join([*wrapped(title, "", "  "), "", *table(rows)])
+    meant = [MEANT[found.criterion]] if found.criterion in MEANT else []
+    said = notes([*meant, *found.left_out, *found.notes])
+    return "\n".join([*wrapped(title, "", "  "), *said, "", *table(rows)])
 
 
 def front_picture(found: Front, ax: Any = None) -> Any:

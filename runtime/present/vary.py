@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from decimal import ROUND_CEILING, ROUND_FLOOR, Context
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from apc.sweeps.sweep import Sweep
     from apc.vary.critical import Critical
+    from apc.vary.crossing import Crossing
     from apc.vary.many import Analyses
     from apc.vary.margins import Margins
     from apc.vary.sensitivity import Sensitivities
@@ -77,9 +78,8 @@ def _stable_ranges(found: Critical) -> str:
     for one in found.crossings:
         if found.counted:
             value = f"{math.floor(one.boundary) + (one.stable_side == 'above'):,d}"
-        else:  # rounded to the side that is stable
-            rounding = ROUND_FLOOR if one.stable_side == "below" else ROUND_CEILING
-            value = quantity(float(Context(SHOWN, rounding).create_decimal_from_float(one.value)), found.unit)
+        else:
+            value = quantity(_on_stable_side(one), found.unit)
         if one.stable_side == "above":
             begin = value
             continue
@@ -88,6 +88,15 @@ def _stable_ranges(found: Critical) -> str:
         begin = ""
     ranges += [f"from {begin} on" if found.counted else f"above {begin}"] if begin else []
     return f"stable with {found.parameter} {', and '.join(ranges)}" if ranges else ""
+
+
+def _on_stable_side(crossing: Crossing) -> float:
+    """Return a crossing as far inside as its error, to no digit that the error hides."""
+    inward = -crossing.error if crossing.stable_side == "below" else crossing.error
+    known = Decimal(crossing.value).adjusted() - Decimal(crossing.error).adjusted() if inward else SHOWN
+    rounding = ROUND_FLOOR if crossing.stable_side == "below" else ROUND_CEILING
+    context = Context(min(max(known, 1), SHOWN), rounding)
+    return float(context.create_decimal_from_float(crossing.value + inward))
 
 
 def _span(ends: tuple[float, float], unit: str) -> str:

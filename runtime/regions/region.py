@@ -332,7 +332,7 @@ def region(
         criterion=meant,
         left_out=(
             *near_start(system, prepared),
-            *left_out(system, network=meant != MEAN_SQUARE),
+            *left_out(system, network=meant != MEAN_SQUARE, varied=free),
             *(replaced_hands(system) if meant == PASSIVE else ()),
             *notes_for_all_groups(system, free),
         ),

@@ -26,7 +26,8 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
 from apc.memory import refuse_beyond
-from apc.moments.network import growth, unreliable, verdict_of
+from apc.moments.network import growth, verdict_of
+from apc.network.nominal import unreliable
 from apc.processes import (
     Patience,
     Workers,

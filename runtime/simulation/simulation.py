@@ -28,6 +28,7 @@ from apc.frame.parameters import Numbers, resolve
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.scheduling import build_schedules
 from apc.memory import refuse_beyond
+from apc.network.nominal import refuse_range
 from apc.network.timetable import Luck, Route, Timetable, luck_of, routes_of
 from apc.simulation.flow import Flow, Tolerance, flow_of, rows_to_move, state_scales
 from apc.simulation.forcing import Kernel, SiteForcing, site_forcing
@@ -154,10 +155,12 @@ def prepare(
     ------
     ApcError
         E870 a continuous equation is not linear and the method is exact, E873 a pattern fits nothing, E874
-        the peers are too many, E893 a peer has nothing of its own to stand in for a missing packet, E913 a
-        step that does not fit; and those of `build_schedules`, `build_population` and `routes_of`.
+        the peers are too many, E893 a peer has nothing of its own to stand in for a missing packet, E899 a
+        delay is a range, E913 a step that does not fit; and those of `build_schedules`, `build_population`
+        and `routes_of`.
     """
     refuse_unheard_of(system)
+    refuse_range(system)
     with finite_equations(system.origin.topology):
         plan = plan_of(system, settings.method)
         system = plan.system

@@ -230,6 +230,7 @@ def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
     """Return what a sweep is, as plain data: two with the same description have the same rows."""
     parameters = {one.name: one.value for one in system.parameters}
     parameters |= {one.name: float(one.value) for one in system.timings}
+    varied = [axis.free for axis in work.grid.axes]
     parameters |= {f"{group.name}.{one.name}": one.value for group in system.groups for one in group.values}
     return {
         "topology": system.name,
@@ -237,8 +238,8 @@ def _description(system: CompiledSystem, work: Work) -> dict[str, Any]:
         "of": work.of,
         "left_out": [
             *near_start(system),
-            *left_out(system, network=not work.of.startswith(BEGINNINGS[MEAN_SQUARE])),
-            *notes_for_all_groups(system, [axis.free for axis in work.grid.axes]),
+            *left_out(system, network=not work.of.startswith(BEGINNINGS[MEAN_SQUARE]), varied=varied),
+            *notes_for_all_groups(system, varied),
         ],
         "points": work.grid.points,
         "over": [

@@ -20,7 +20,7 @@ from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.frame.devices import FREE as FREE_HANDS
 from apc.frame.names import Free, Range, find, given_ranges
 from apc.frame.overrides import Override, apply
-from apc.moments.network import unreliable
+from apc.network.nominal import unreliable
 from apc.option_value import option_value
 from apc.vary.counts import count_range
 from apc.vary.delay_box import is_delay

@@ -46,6 +46,8 @@ class Front(Result):
     """Designs from the least that is felt to the best of the aim; `knee` is the place of the one between.
 
     The knee is farthest from the straight line between the ends, each axis counted from one end to the other.
+    `criterion` is what stable means, one of `vary.growth`; `left_out` says what of the scene the designs do
+    not look at, `notes` how far the search came.
     """
 
     shown_by = "tune:front"
@@ -58,6 +60,9 @@ class Front(Result):
     against_unit: str
     designs: tuple[Design, ...]
     knee: int
+    criterion: str
+    left_out: tuple[str, ...]
+    notes: tuple[str, ...]
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the front; return the matplotlib Axes. Raises ApcError (E875) without matplotlib."""
@@ -110,10 +115,14 @@ def front(
     if not (best.met and low < high * (1 - 1e-6)):
         what = f"the best {demands.aim.label} is the best for feel.{UNIT_OF[against.quantity][0]}, too"
         raise ApcError(Mistake("E996", AGAINST, what))
-    designs = [_design(best, high)]
-    for bound in np.geomspace(high, low * LEAST, points)[1:].tolist():
+    designs, notes = [_design(best, high)], best.notes
+    for place, bound in enumerate(np.geomspace(high, low * LEAST, points)[1:].tolist(), 1):
+        left = until - time.monotonic()
+        if left <= 0:
+            notes = (*notes, f"the time was up after {place} of {points} bounds, the largest first")
+            break
         asked = replace(demands, felt=(*demands.felt, replace(against, most=bound)))
-        found = tune(system, asked, seconds=max(until - time.monotonic(), 0.0), told=told)
+        found = tune(system, asked, seconds=left, told=told)
         if found.met:
             designs.append(_design(found, felt(np.array([float(one.value) for one in found.gains]))))
     designs.sort(key=lambda one: one.felt)
@@ -127,6 +136,9 @@ def front(
         against_unit=unit,
         designs=tuple(designs),
         knee=_knee(designs),
+        criterion=demands.criterion,
+        left_out=best.left_out,
+        notes=notes,
     )
 
 

@@ -149,7 +149,7 @@ class Search:
     @cached_property
     def _even(self) -> Floats:
         """Points (k, m) spread evenly over the ranges, every other one by ratios."""
-        even = _spread(SLOW_POINTS if self.limits.slow else POINTS, len(self._low))
+        even = _even(SLOW_POINTS if self.limits.slow else POINTS, len(self._low))
         top = self._low + self._width
         near = np.where(self._low > 0, self._low, SMALLEST * self._width)
         ratios = np.where(top > near, near * (np.maximum(top, near) / near) ** even[::2], top)
@@ -161,7 +161,7 @@ class Search:
         found = [self._descended(start) for start in starts]
         chosen = min(found, key=self._rank)
         count = SLOW_BESIDE if self.limits.slow else BESIDE
-        cloud = _spread(count, len(self._low)) - 0.5
+        cloud = _even(count, len(self._low)) - 0.5
         looked = 0
         for _ in range(AGAIN):
             around = [np.clip(self.shares(chosen) + 2 * size * cloud, 0.0, 1.0) for size in SPREADS]
@@ -310,10 +310,7 @@ def _same(found: Rows, here: Rows, one: int) -> int:
     return int(own[np.argmin(np.abs(found.eigenvalue[own] - here.eigenvalue[one]))])
 
 
-def _spread(count: int, size: int) -> Floats:
-    """Return points (count, size) evenly spread over 0 to 1, by the rule of the generalized golden ratio."""
-    ratio = 1.5
-    for _ in range(64):  # x^(size + 1) = x + 1
-        ratio = (1 + ratio) ** (1 / (size + 1))
-    steps = ratio ** -np.arange(1.0, size + 1)
-    return np.mod(0.5 + np.arange(1, count + 1)[:, None] * steps, 1.0)
+def _even(count: int, size: int) -> Floats:
+    """Return points (count, size) evenly spread over 0 to 1: Halton's sequence, the same at every call."""
+    halton = load_pool("scipy.stats.qmc").Halton(size, scramble=False)
+    return np.asarray(halton.random(count + 1)[1:])  # the first is the corner at 0

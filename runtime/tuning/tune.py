@@ -24,7 +24,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import analyze, prepare
+from apc.analysis.analysis import analyze, near_start, prepare
 from apc.analysis.box_proof import UNDECIDED, BoxProof
 from apc.answer import proved_at
 from apc.compiler.compiled import CompiledSystem
@@ -65,6 +65,11 @@ SLOWER = "stable is proved; how fast motions die out, or what is felt, is only l
 
 # What is said where every passive hand is to be borne in a box.
 ONE_BY_ONE = "no box is proved with every passive hand: it is so in the scenarios looked at"
+
+# What is said where one point takes too long to look for the worst of a box.
+CORNERS = (
+    "before rounding: the ends and the middle of each range in a box were looked at, and no point between"
+)
 
 # Scenarios added at a time; how far above the others a limit is that counts.
 MORE, ABOVE = 3, 1e-9
@@ -453,8 +458,15 @@ class _Work:
             proofs=tuple(proofs),
             binding=tuple(self._binding(found, met=met)),
             looked=self.looked + sum(map(len, self.limits.samples.values())),
-            notes=(),
-            left_out=left_out(self.system, network=demands.criterion != MEAN_SQUARE),
+            notes=(CORNERS,) if demands.box and self.limits.slow else (),
+            left_out=(
+                *near_start(self.system, self.limits.prepared),
+                *left_out(
+                    self.system,
+                    network=demands.criterion != MEAN_SQUARE,
+                    varied=[one.free for one in demands.over],
+                ),
+            ),
             system=self.system,
         )
 

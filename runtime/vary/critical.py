@@ -222,7 +222,7 @@ def critical(
         system=system,
         left_out=(
             *near_start(system, prepared),
-            *left_out(system, network=chosen_criterion != MEAN_SQUARE),
+            *left_out(system, network=chosen_criterion != MEAN_SQUARE, varied=[free]),
             *(replaced_hands(system) if chosen_criterion == PASSIVE else ()),
         ),
         criterion=chosen_criterion,

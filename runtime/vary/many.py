@@ -285,7 +285,7 @@ def analyze_many(system: CompiledSystem, values: Mapping[str, Any]) -> Analyses:
         ),
         values=tuple(arrays),
         **{one.name: getattr(found, one.name).reshape(shape) for one in fields(found)},
-        left_out=(*near_start(system), *left_out(system), *notes_for_all_groups(system, frees)),
+        left_out=(*near_start(system), *left_out(system, varied=frees), *notes_for_all_groups(system, frees)),
     )
 
 

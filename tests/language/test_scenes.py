@@ -218,6 +218,20 @@ def test_a_part_of_another_type_at_a_group_has_the_numbers_of_that_type() -> Non
         compiled(replaced(text, ("type: Omega3", "type: HapticDevice")))
 
 
+def test_a_number_of_another_type_at_a_group_has_the_unit_it_has_elsewhere(tmp_path: Path) -> None:
+    device = (SCENES.parent / "devices" / "haptic-device.yaml").read_text("utf-8")
+    changed = replaced(
+        device,
+        ("component: HapticDevice", "component: RateMass"),
+        ("damping:         {unit: N*s/m", "damping: {unit: 1/s"),
+        ("- damping*v", "- mass*damping*v"),
+    )
+    folder = library(tmp_path, changed)
+    text = (SCENES / "teleoperation-pair.yaml").read_text("utf-8").replace("Omega3", "RateMass")
+    with pytest.raises(apc.ApcError, match="wants damping in N\\*s/m, got damping in 1/s"):
+        compiled(text, folder)
+
+
 def test_what_nobody_reads_or_hears_is_left_out_and_said(tmp_path: Path) -> None:
     system = changed(
         ("  network: 8 ms", "  network: 8 ms\n  spare: 3 ms"),
@@ -282,7 +296,7 @@ links: {lan: {clock: tick, delay: 2 ms, graph: star}}
 
 # ---- what a topology seldom means ----
 
-RANGE = "is a range: analyze asks of all of it, other commands of its middle."
+RANGE = "is a range: analyze and tune are for all of it, other answers for its middle."
 UNSHARED = (
     "follows the other peers' by coordination and is not shared: its mass counts once a peer. "
     "Write: shared: true, or shared: false where each is a mass of its own"

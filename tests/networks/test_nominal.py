@@ -10,7 +10,7 @@ import pytest
 import apc
 from apc.__main__ import run
 from tests.lossy import unreliable
-from tests.topologies import compiled
+from tests.topologies import AVERAGE, compiled
 
 LEFT_OUT = "left out: packet loss (30 %) and jitter of lan; here every packet takes the nominal 8 ms"
 
@@ -55,6 +55,41 @@ def test_other_questions_say_in_their_second_line_what_is_left_out(
     assert capsys.readouterr().out.splitlines()[1].startswith(f"  {LEFT_OUT[:55]}")
     assert run([*words, "--in", "nominal", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["left_out"] == [LEFT_OUT]
+
+
+MIDDLE = "left out: lan.delay from 8 ms to 20 ms but for its middle, 14 ms"
+
+
+@pytest.mark.parametrize(
+    ("words", "place"),
+    [
+        (["feel"], 1),
+        (["critical", "contact.stiffness"], 1),
+        (["region", "--cells", "4"], 1),
+        (["region", "--x", "lan.delay=0 ms:20 ms", "--cells", "4"], None),
+        (["critical", "lan.delay"], None),
+    ],
+)
+def test_an_answer_for_the_middle_of_a_delay_that_is_a_range_says_so(
+    words: list[str], place: int | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("s.yaml").write_text(AVERAGE.replace("delay: 8 ms}", "delay: [8 ms, 20 ms]}"), encoding="utf-8")
+    assert run([*words, "s.yaml"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [at for at, line in enumerate(lines) if line.strip() == MIDDLE] == [place] * (place is not None)
+
+
+@pytest.mark.parametrize("words", [["simulate", "--duration", "1 s"], ["export", "--out", "s.mat"]])
+def test_a_scene_is_played_and_written_out_with_one_delay(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("s.yaml").write_text(AVERAGE.replace("delay: 8 ms}", "delay: [8 ms, 20 ms]}"), encoding="utf-8")
+    assert run([*words, "s.yaml"]) == 1
+    assert (
+        'E899 lan.delay is a range, 8 ms to 20 ms, of which this takes one. Write: --set "lan.delay=14 ms"'
+        in (capsys.readouterr().err)
+    )
+    assert run([*words, "s.yaml", "--set", "lan.delay=14 ms"]) == 0
 
 
 @pytest.mark.whole
