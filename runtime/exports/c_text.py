@@ -68,6 +68,12 @@ def memory(peer: Peer, signal: LocalSignal) -> str:
     return f"{'x' if signal.role == 'state' else 'u'}[{signal.place[0]}]"
 
 
+def unit_of(peer: Peer) -> dict[str, str]:
+    """Return the unit of each of a peer's parameters."""
+    known = {parameter.name: parameter.unit for parameter in peer.system.parameters}
+    return {name: known.get(name, "1") for name in peer.kind.parameters}
+
+
 def _output(peer: Peer, partition: int, output: int) -> str:
     first = [*accumulate((len(clock.outputs) for clock in peer.kind.clocks), initial=0)]
     return f"y[{first[partition] + output}]"
@@ -127,6 +133,8 @@ def header(peer: Peer) -> str:
     computed = [
         one for partition in kind.clocks for one in zip(partition.outputs, partition.units, strict=True)
     ]
+    units = unit_of(peer)
+    settings = [f"{own} [{units[own]}]" for own in (kind.parameters[place] for place in peer.settable)]
     inside = [(one.name, one.unit) if i not in peer.outside else ("", "") for i, one in enumerate(states)]
     listed = [
         (
@@ -136,6 +144,7 @@ def header(peer: Peer) -> str:
         (f"double y[{len(computed) or 1}]", ", ".join(f"{own} [{unit}]" for own, unit in computed)),
         (f"double u[{len(holds) or 1}]", f"what acts of {', '.join(holds)}"),
         (f"double late[{len(holds) or 1}][{_kept(peer)}]", "what was computed of these, the newest first"),
+        (f"double p[{len(settings) or 1}]", f"parameters that ticks read: {', '.join(settings)}"),
     ]
     return filled(
         "peer.h",
@@ -163,7 +172,7 @@ def source(peer: Peer, include: str) -> str:
     """Return the code; `include` is the name of the header."""
     kind, name = peer.kind, peer.identifier
     kinds = tuple(dict.fromkeys(peer.instants))
-    units = {parameter.name: parameter.unit for parameter in peer.system.parameters}
+    units = unit_of(peer)
     named = zip(_parameters(peer), kind.parameters, peer.parameters.tolist(), strict=True)
     over = {line.sending: line.name for line in peer.sending}
     begin = [
@@ -210,8 +219,9 @@ def source(peer: Peer, include: str) -> str:
         include=include,
         name=name,
         parameters="".join(
-            f"#define {own} {number(value)} /* {comment(label)} [{comment(units.get(label, '1'))}] */\n"
+            f"#define {own} {number(value)} /* {comment(label)} [{comment(units[label])}] */\n"
             for own, label, value in named
+            if own.startswith("P_")
         ),
         instants=len(peer.instants),
         kinds=row(map(kinds.index, peer.instants)),
@@ -222,6 +232,7 @@ def source(peer: Peer, include: str) -> str:
         outputs=row(map(number, begin)),
         holds=row("0" for _ in kind.holds),
         late=row("{0}" for _ in kind.holds or "0"),
+        settings=row(number(peer.parameters[place]) for place in peer.settable),
         unheard=block(unheard),
         lengths=row(peer.moves[one.move].quanta for one in kinds),
         unsent=block(f"out->{own}_sent = 0;" for own in over.values()),
@@ -238,7 +249,10 @@ def _cases(bodies: Iterable[Sequence[str]]) -> str:
 
 
 def _parameters(peer: Peer) -> list[str]:
-    return [f"P_{own}" for own in unique(map(identifier, peer.kind.parameters))]
+    names = [f"P_{own}" for own in unique(map(identifier, peer.kind.parameters))]
+    for k, place in enumerate(peer.settable):
+        names[place] = f"peer->p[{k}]"
+    return names
 
 
 def _moving(peer: Peer) -> list[str]:

@@ -98,7 +98,7 @@ static {type_} *{what}(model *m, unsigned which) {{
 }}
 
 """
-    states = "".join(f"    case {k}: return 1;\n" for k, one in numbers if one.moving)
+    states = "".join(f"    case {k}: return 1;\n" for k, one in numbers if one.moving or one.fixed)
     engine = Path(__file__).with_name("fmi2.c").read_text(encoding="utf-8")
     return f"""\
 {scene_source(scene)}
@@ -108,7 +108,7 @@ static int given(unsigned which) {{
   return {f"which < {inputs}u" if inputs else "0"};
 }}
 
-/* Whether it is a state, which can be set until the scene begins. */
+/* Whether it is a state or a parameter, which can be set until the scene begins. */
 static int moving(unsigned which) {{
   switch (which) {{
 {states}    default: return 0;
@@ -141,12 +141,12 @@ def _description(unit: Unit) -> str:
     for one in dict.fromkeys(own.unit for own in scene.variables if not own.flag):
         xml.SubElement(part["UnitDefinitions"], "Unit", name=one)
     for place, own in enumerate(scene.variables):
-        causality = "input" if own.given else "output"
+        causality = "input" if own.given else "parameter" if own.fixed else "output"
         row = xml.SubElement(part["ModelVariables"], "ScalarVariable", name=own.name, causality=causality)
-        row.attrib |= {"valueReference": str(place), "variability": "discrete"}
+        row.attrib |= {"valueReference": str(place), "variability": "fixed" if own.fixed else "discrete"}
         if own.flag:
             xml.SubElement(row, "Boolean", start="false")
-        elif own.given:
+        elif own.given or own.fixed:
             xml.SubElement(row, "Real", start=repr(own.start), unit=own.unit)
         else:
             start = {"start": repr(own.start)} if own.moving else dict[str, str]()

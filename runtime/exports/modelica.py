@@ -47,7 +47,7 @@ from apc.frame.exchange import Exchange, build_exchange, check_mean
 from apc.frame.jacobians import jacobians
 from apc.frame.linearize import start_sends
 from apc.frame.parameters import resolve
-from apc.network.nominal import unreliable
+from apc.network.nominal import chance, unreliable
 from apc.result import Result
 from apc.simulation.trajectory import texts_of
 
@@ -456,8 +456,8 @@ class _Peer:
 
 def _refuse_what_has_no_words(system: CompiledSystem, exchange: Exchange) -> None:
     """Refuse what the equations of a model can't say: ApcError E955."""
-    for link, _ in unreliable(system):
-        what = f"packets lost or late on {link.name}: luck that is drawn packet by packet"
+    for link, law in unreliable(system):
+        what = f"{chance(link, law)}: luck that is drawn packet by packet"
         raise _refused(system, what, "a link without it, or apc simulate")
     for kind in system.kinds:
         functions = [(kind.derivative, "what moves")]

@@ -20,7 +20,7 @@ static double ${name}_now(const $name *peer) {
 
 $functions
 void ${name}_start($name *peer) {
-  static const $name begin = {0, 0, {$states}, {$outputs}, {$holds}, {$late}};
+  static const $name begin = {0, 0, {$states}, {$outputs}, {$holds}, {$late}, {$settings}};
   *peer = begin;
 }
 

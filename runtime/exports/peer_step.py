@@ -141,6 +141,7 @@ class Peer:
     of them that it looks at, by what they are called in C, and `forces` likewise. `channels` are, by clock
     partition and receive, the places of what is heard among those of its line; a receive that nothing reads
     has none. `start` are the states', `memories` those of each clock partition's remembered outputs.
+    `settable` are the places of the parameters that only ticks read, see `_settable`.
     """
 
     system: CompiledSystem
@@ -159,6 +160,7 @@ class Peer:
     moves: tuple[Move, ...]
     start: tuple[float, ...]
     memories: tuple[tuple[float, ...], ...]
+    settable: tuple[int, ...]
 
     @property
     def signals(self) -> tuple[LocalSignal, ...]:
@@ -233,6 +235,7 @@ def peer_of(
         moves=_moves(plan, label, group, outside, lengths, method, vector),
         start=tuple(x),
         memories=tuple(map(tuple, memories)),
+        settable=_settable(kind),
     )
 
 
@@ -246,6 +249,24 @@ def _parameters(plan: Plan, number: int) -> Any:
     group = group_of(plan, number)
     row = plan.numbers.rows[group][number - int(plan.exchange.starts[group])]
     return plan.numbers.parameters[group][int(row)]
+
+
+def _settable(kind: Kind) -> tuple[int, ...]:
+    """Return the places of the parameters that only ticks read: how states move, what they and packets start
+    with, is the same whatever these are."""
+    ticks = [
+        one for clock in kind.clocks for one in (clock.tick, *(each.edge for each in clock.receives)) if one
+    ]
+    others = [kind.derivative, *(sending.send for sending in kind.sends)]
+    fixed = {state.start for state in kind.states} | {one for clock in kind.clocks for one in clock.starts}
+    read, moves = (
+        np.any(
+            [structural_pattern(one.jac_sparsity(0, one.n_in() - 2)).any(axis=0) for one in functions], axis=0
+        )
+        for functions in (ticks, others)
+    )
+    places = np.flatnonzero(read & ~moves).tolist()
+    return tuple(place for place in places if kind.parameters[place] not in fixed)
 
 
 def sites_of(plan: Plan) -> tuple[int, ...]:

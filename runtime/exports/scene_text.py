@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from apc.exports.c_text import block, filled, memory, number, row
+from apc.exports.c_text import block, filled, memory, number, row, unit_of
 from apc.exports.peer_step import (
     MOST_HEARD,
     Peer,
@@ -48,7 +48,8 @@ class Variable:
     """What can be looked at: its name as `simulate` has it, unit, and the member of `model` that holds it.
 
     `given` says that it comes from outside, and is `start` until something does; `flag` that it is 0 or 1;
-    `moving` that it is a state, which is `start` as the scene begins, if nothing else is set.
+    `moving` that it is a state, which is `start` as the scene begins, if nothing else is set; `fixed` that it
+    is a parameter, which is `start` if nothing else is set until then.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Variable:
     given: bool = False
     flag: bool = False
     moving: bool = False
+    fixed: bool = False
     start: float = 0.0
 
 
@@ -132,6 +134,10 @@ def _looked_at(peer: Peer, member: str, prefix: str) -> list[Variable]:
         own = f"{member}.{memory(peer, signal)}"
         name = f"{FORCE_ON}{prefix}{signal.name.removeprefix(FORCE_ON)}" if given else prefix + signal.name
         found.append(Variable(name, signal.unit, own, given=given, moving=moving, start=start))
+    units, names = unit_of(peer), peer.kind.parameters
+    for k, place in enumerate(peer.settable):
+        name, start = names[place], float(peer.parameters[place])
+        found.append(Variable(prefix + name, units[name], f"{member}.p[{k}]", fixed=True, start=start))
     return found
 
 

@@ -1,7 +1,7 @@
 """What an answer about the nominal network leaves out: loss, jitter, recorded delays, ranges of delay.
 
 Takes: a `CompiledSystem`.
-Gives: `unreliable`, `left_out`, `refuse_range`, `channel_numbers`, `refuse_channel_number`.
+Gives: `unreliable`, `chance`, `left_out`, `refuse_range`, `channel_numbers`, `refuse_channel_number`.
 Guarantees: a question about a number that only lost or late packets depend on is refused by name, as its
 answer would be about a network without them.
 Does not: answer for an unreliable network (see `moments`), or for all of a range (see `vary.delay_box`).
@@ -27,6 +27,13 @@ def unreliable(system: CompiledSystem) -> list[tuple[Link, ChannelLaw]]:
     return [(link, law) for link, law in laws if law.mean_loss or law.jitter or law.trace is not None]
 
 
+def chance(link: Link, law: ChannelLaw) -> str:
+    """Return what chance does to a link's packets, in words."""
+    named = [f"packet loss ({100 * law.mean_loss:.3g} %)"] * bool(law.mean_loss)
+    named += ["jitter"] * bool(law.jitter) + ["recorded delays"] * (law.trace is not None)
+    return f"{' and '.join(named)} of {link.name}"
+
+
 def left_out(
     system: CompiledSystem, *, network: bool = True, varied: Collection[Free] = ()
 ) -> tuple[str, ...]:
@@ -43,12 +50,8 @@ def left_out(
     """
     notes = []
     for link, law in unreliable(system) if network else ():
-        named = [f"packet loss ({100 * law.mean_loss:.3g} %)"] * bool(law.mean_loss)
-        named += ["jitter"] * bool(law.jitter) + ["recorded delays"] * (law.trace is not None)
         delay = _ms(resolve(system).timings[link.delay])
-        notes.append(
-            f"left out: {' and '.join(named)} of {link.name}; here every packet takes the nominal {delay}"
-        )
+        notes.append(f"left out: {chance(link, law)}; here every packet takes the nominal {delay}")
     names = {free.name for free in varied}
     for one in given_ranges(system):
         if one.free.name not in names:

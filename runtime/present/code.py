@@ -61,11 +61,14 @@ def code_document(found: Code) -> dict[str, Any]:
 def unit_text(found: Unit) -> str:
     """Return what an FMU takes and gives."""
     inputs = [one.name for one in found.scene.variables if one.given]
-    outputs = [one.name for one in found.scene.variables if not one.given]
+    fixed = [one.name for one in found.scene.variables if one.fixed]
+    outputs = [one.name for one in found.scene.variables if not (one.given or one.fixed)]
     what = found.peer or counted(len(found.scene.peers), "peer")
     lines = [f"{found.system.name}: {what} for co-simulation, FMI 2.0", ""]
     lines += wrapped(f"{counted(len(inputs), 'input')}: {listed(inputs)}", "  ", "    ")
     lines += wrapped(f"{counted(len(outputs), 'output')}: {listed(outputs)}", "  ", "    ")
+    if fixed:
+        lines += wrapped(f"{counted(len(fixed), 'parameter')}: {listed(fixed)}", "  ", "    ")
     told = f"steps of {found.step * 1e3:.6g} ms show every tick of the fastest clock, values before the tick"
     if found.peer:
         told += "; what it hears is set when it has arrived: delays and losses are the network's"
@@ -74,7 +77,7 @@ def unit_text(found: Unit) -> str:
 
 def unit_document(found: Unit) -> dict[str, Any]:
     """Return an FMU as plain data."""
-    variables = [{**picked(one, "name", "unit"), "input": bool(one.given)} for one in found.scene.variables]
+    variables = [{**picked(one, "name", "unit"), "input": bool(one.given), "parameter": one.fixed} for one in found.scene.variables]
     return {
         "topology": found.system.name,
         "peer": found.peer or None,

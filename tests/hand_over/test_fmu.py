@@ -195,19 +195,21 @@ def test_a_device_that_is_pushed_moves_as_by_a_hand(fmpy: Any, tmp_path: Path) -
 
 
 @pytest.mark.whole
-def test_a_scene_begins_where_its_states_are_set(fmpy: Any, tmp_path: Path) -> None:
+def test_a_scene_begins_where_its_states_and_parameters_are_set(fmpy: Any, tmp_path: Path) -> None:
     path, _ = written(PAPER, tmp_path)
     starts = {f"{one}.device.x": 0.0125 for one in ("left[1]", "left[2]", "right[1]")}
-    course = apc.simulate(compiled(PAPER), set={"device.x": 0.0125}, duration="0.1 s", jit=False)
+    numbers = {"device.x": 0.0125, "contact.stiffness": 800.0}
+    course = apc.simulate(compiled(PAPER), set=numbers, duration="0.1 s", jit=False)
     one = Instance(path, tmp_path / "unzipped")
     one.unit.reset()
-    one.begin(starts)
+    softer = {f"{one.removesuffix('device.x')}contact.stiffness": 800.0 for one in starts}
+    one.begin(starts | softer)
     names = [one.name for one in course.signals]
     for k in range(100):
         assert one.read(*names) == pytest.approx(course.values[k].tolist(), abs=1e-9)
         one.step(k / 1000, 1 / 1000)
     with pytest.raises(Exception, match="fmi2SetReal"):
-        one.set(**starts)  # too late
+        one.set(**softer)  # too late
     one.end()
 
 
