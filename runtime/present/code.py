@@ -77,7 +77,10 @@ def unit_text(found: Unit) -> str:
 
 def unit_document(found: Unit) -> dict[str, Any]:
     """Return an FMU as plain data."""
-    variables = [{**picked(one, "name", "unit"), "input": bool(one.given), "parameter": one.fixed} for one in found.scene.variables]
+    variables = [
+        {**picked(one, "name", "unit"), "input": bool(one.given), "parameter": one.fixed}
+        for one in found.scene.variables
+    ]
     return {
         "topology": found.system.name,
         "peer": found.peer or None,
