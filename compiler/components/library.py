@@ -54,12 +54,12 @@ class Library:
                     what = f"{brief(name)} is defined in {own[name]} already"
                     raise fault("E218", source.root.place, what, hint="another name in one of the two")
                 self._sources[name] = source
-        self._files = builtin_files() | own
+        self.files = builtin_files() | own  # by the name of what each defines
 
     @property
     def names(self) -> tuple[str, ...]:
         """The names of everything that can be asked for."""
-        return tuple(sorted(self._files))
+        return tuple(sorted(self.files))
 
     @property
     def component_names(self) -> tuple[str, ...]:
@@ -76,7 +76,7 @@ class Library:
 
     def _definition(self, name: str, kind: str, read: Callable[[Source], T]) -> T | None:
         """Return what is called so and is of a kind, read once, even if a hundred parts are of it."""
-        if name not in self._files or definition_of(source := self._source(name))[0] != kind:
+        if name not in self.files or definition_of(source := self._source(name))[0] != kind:
             return None
         if name not in self._read:
             what = "components contain or extend"
@@ -99,7 +99,7 @@ class Library:
 
     def _source(self, name: str) -> Source:
         if name not in self._sources:
-            path = self._files[name]
+            path = self.files[name]
             self._sources[name] = read_source(path, shown=path.name)
         return self._sources[name]
 

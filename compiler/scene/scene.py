@@ -101,16 +101,19 @@ def library_folders(source: Source) -> tuple[Path, ...]:
     for item in node.items if isinstance(node, Sequence) else () if node is None else (node,):
         with mistakes:
             text = text_of(item, "library", "library: ./parts")
-            folder = _folder_of(source) / text
-            try:
-                files_below(folder, SUFFIX)
-            except RefusedError as refused:
-                what = f"the library folder {brief(text)} {refused.words}"
-                hint = "library: ./parts" if refused.why == "large" else ""
-                raise fault("E214", item.place, what, hint=hint) from None
-            found.append(folder)
+            found.append(readable_library(_folder_of(source) / text, text, item.place))
     mistakes.raise_if_any()
     return tuple(found)
+
+
+def readable_library(folder: Path, text: str, place: Place) -> Path:
+    """Return a folder of components. Raises ApcError (E214), at a place, for one that can't be read."""
+    try:
+        files_below(folder, SUFFIX)
+    except RefusedError as refused:
+        hint = "library: ./parts" if refused.why == "large" else ""
+        raise fault("E214", place, f"the library folder {brief(text)} {refused.words}", hint=hint) from None
+    return folder
 
 
 def _folder_of(source: Source) -> Path:

@@ -1,12 +1,12 @@
 """The library as a person looks through it: its components and scenes, a line each, and one component whole.
 
-Takes: a name.
+Takes: a `Library`, a name.
 Gives: `library_lines` and `library_document`; `component_text` and `component_document` of a component or
 connector; `scenes`, `scene_lines`, `scene_named`, `tables_of` of the topologies that come with the
 program.
 Guarantees: a component is told with what it takes over from those it extends; its definition is shown as it
-is written; nothing outside the installed package is read.
-Does not: read a topology's own folders of components.
+is written.
+Does not: look for the folders of a topology.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from apc.compiler.words import beside, wrapped
 TEMPLATE = "template"  # the scene that `apc new` writes where no other is asked for
 
 
-def library_lines() -> Iterator[str]:
-    """Yield the components and connectors of the library, a line each, by folder."""
-    for room, rows in library_document().items():
+def library_lines(library: Library) -> Iterator[str]:
+    """Yield the components and connectors of a library, a line each, by folder."""
+    for room, rows in library_document(library).items():
         yield room
         yield from _lines({row["name"]: row["about"] for row in rows})
     yield "apc library NAME shows one: its parameters with units and limits, its equations."
@@ -46,12 +46,12 @@ def _lines(abouts: dict[str, str]) -> Iterator[str]:
     yield ""
 
 
-def library_document() -> dict[str, Any]:
+def library_document(library: Library) -> dict[str, Any]:
     """Return the same as plain data, what each is about in full."""
-    library, rooms = Library(), dict[str, list[dict[str, str]]]()
-    for name, path in builtin_files().items():
+    rooms: dict[str, list[dict[str, str]]] = {}
+    for name, path in library.files.items():
         row = {"name": name, "about": _found(library, name).about}
-        rooms.setdefault(path.parent.name, []).append(row)
+        rooms.setdefault(path.resolve().parent.name, []).append(row)
     return rooms
 
 
@@ -65,15 +65,15 @@ def _found(library: Library, name: str) -> Component | Connector:
     return found
 
 
-def component_text(name: str) -> str:
-    """Return a component of the library, or a connector, for a person to read.
+def component_text(library: Library, name: str) -> str:
+    """Return a component of a library, or a connector, for a person to read.
 
     Raises
     ------
     ApcError
         E206 there is none of that name.
     """
-    facts = component_document(name)
+    facts = component_document(library, name)
     lines = [name, *wrapped(facts["about"], "  ", "  ")]
     lines += wrapped(f"Source: {facts['source']}", "  ", "    ") if facts["source"] else []
     lines += [f"  File: {facts['file']}", ""]
@@ -90,9 +90,9 @@ def component_text(name: str) -> str:
     return "\n".join(lines).rstrip()
 
 
-def component_document(name: str) -> dict[str, Any]:
-    """Return a component of the library, or a connector, as plain data: see `component_text`."""
-    found = _found(Library(), name)
+def component_document(library: Library, name: str) -> dict[str, Any]:
+    """Return a component of a library, or a connector, as plain data: see `component_text`."""
+    found = _found(library, name)
     kind, whole = "component", found
     if isinstance(whole, Connector):  # it has no parts of its own to tell of
         kind, whole = "connector", Component(name, found.about, "", Place(""))
@@ -102,11 +102,11 @@ def component_document(name: str) -> dict[str, Any]:
         "kind": kind,
         "about": whole.about,
         "source": whole.source,
-        "file": str(builtin_files()[name]),
+        "file": str(library.files[name]),
         "connectors": {own: its.name for own, its in whole.connectors},
         "parameters": [_parameter(own, entries) for own, entries in vectors.items()],
         "equations": [*dict.fromkeys(one.text for one in whole.equations)],
-        "definitions": _definitions(name),
+        "definitions": _definitions(library, name),
     }
 
 
@@ -125,11 +125,11 @@ def _parameter(name: str, entries: list[Parameter]) -> dict[str, str]:
     return {"name": name, "unit": unit, "value": value, "limits": limits, "about": one.about}
 
 
-def _definitions(name: str) -> dict[str, str]:
+def _definitions(library: Library, name: str) -> dict[str, str]:
     """Return the texts that define something: its own, then that of what it extends, by name."""
     texts: dict[str, str] = {}
     while name:
-        source = read_source(builtin_files()[name])
+        source = read_source(library.files[name])
         texts[name], name = source.text.rstrip(), _text(source, "extends")
     return texts
 

@@ -29,6 +29,9 @@ _TOPOLOGY = re.compile(r"^topology:\s*[^\s#]+", re.MULTILINE)
 def library_command(
     *,
     name: str | None = argument(required=False),
+    folder: Path | None = option(
+        "A folder of components of your own, as a topology's library: names one.", "DIR"
+    ),
     as_json: bool,
 ) -> None:
     """List the components of the library, or show one.
@@ -37,12 +40,19 @@ def library_command(
     units, defaults and limits, where it is from, and its definition, equations
     and all, as it is written.
     """
+    from apc.compiler.components.library import Library
+    from apc.compiler.scene.scene import readable_library
     from apc.compiler.view import catalogue
 
+    place = Place("--folder")
+    library = Library(() if folder is None else (readable_library(folder, str(folder), place),))
     if name is None:
-        tell(json_text(catalogue.library_document()) if as_json else "\n".join(catalogue.library_lines()))
+        document, lines = catalogue.library_document(library), catalogue.library_lines(library)
+        tell(json_text(document) if as_json else "\n".join(lines))
+    elif as_json:
+        tell(json_text(catalogue.component_document(library, name)))
     else:
-        tell(json_text(catalogue.component_document(name)) if as_json else catalogue.component_text(name))
+        tell(catalogue.component_text(library, name))
 
 
 @command

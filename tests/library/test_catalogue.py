@@ -64,6 +64,16 @@ def test_a_parameter_is_told_with_unit_default_and_limits(call: Call) -> None:
     assert (force["unit"], force["value"], force["limits"]) == ("N", "3.3", "> 0")
 
 
+def test_components_of_ones_own_folder_are_listed_and_shown(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "part.yaml").write_text(
+        "component: Own\nabout: Mine.\nconnectors: {a: Flange}\nequations: [a.f = 0]\n", "utf-8"
+    )
+    own = ("--folder", str(tmp_path))
+    assert "  Own  Mine" in call("library", *own)[1]
+    assert json.loads(call("library", "Own", *own, "--json")[1])["connectors"] == {"a": "Flange"}
+    assert "--folder: E214" in call("library", *own, "--folder", "none")[2]
+
+
 def test_a_misspelt_component_or_scene_is_told_with_the_nearest(call: Call) -> None:
     assert call("library", "AveragePositon") == (
         1,
