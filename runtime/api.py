@@ -658,16 +658,12 @@ def tune(
     ApcError
         The input is at fault.
     """
-    from apc.frame import devices
     from apc.tuning import tune as design
-    from apc.tuning.demands import read_demands, study_hands
+    from apc.tuning.demands import held_as_studied, read_demands
 
-    system = _model(model, set)
-    hands = study_hands(system) if criterion is None else devices.FREE
-    if hands == devices.PASSIVE:
-        criterion = "passive"
-    else:
-        system = devices.with_hands(system, hands)
+    system, means = _model(model, set), criterion
+    if criterion is None:
+        system, means = held_as_studied(system)
     ranges, borne = (
         [f"{name}={_range(system, name, value)}" for name, value in (asked or {}).items()]
         for asked in (free, over)
@@ -679,7 +675,7 @@ def tune(
         minimize=minimize,
         subject=subject,
         over=borne,
-        criterion=criterion,
+        criterion=means,
     )
     return design.tune(system, demands, seconds=float("inf") if seconds is None else seconds)
 

@@ -78,10 +78,10 @@ def tune_command(
                  --maximize coordination.stiffness \\
                  --over user.count=2:10 --over device.mass=±20%
     """
-    from apc.frame.devices import FREE, with_hands
+    from apc.frame.devices import FREE
     from apc.inputs import open_scene
     from apc.present.pictures import write_picture
-    from apc.tuning.demands import read_against, read_demands, read_seconds, study_hands
+    from apc.tuning.demands import held_as_studied, read_against, read_demands, read_seconds
     from apc.tuning.front import front
     from apc.tuning.tune import tune
 
@@ -94,8 +94,9 @@ def tune_command(
     if (plot is not None or write is not None) and bool(against) != (plot is not None):
         raise click.UsageError("--plot is of --against, and --write of one design")
     system = open_scene(file, settings, {"--write": write, "--plot": plot}, hands=hands, told=note_aside)
-    if hands == FREE and (hands := study_hands(system)) != FREE:
-        system = with_hands(system, hands)
+    criterion = criterion_with(hands, None)
+    if hands == FREE:
+        system, criterion = held_as_studied(system)
     demands = read_demands(
         system,
         free,
@@ -103,7 +104,7 @@ def tune_command(
         minimize=minimize,
         subject=subject,
         over=over,
-        criterion=criterion_with(hands, None),
+        criterion=criterion,
     )
     if against:
         with status_line() as told:

@@ -91,6 +91,7 @@ STYLE = """
     :host { font: 14px/1.45 system-ui, sans-serif; color: #1a1a1a; }
     .bk-clearfix { display: block; min-width: 0; } /* a wide table scrolls, the page does not */
     p { margin: 0 0 6px; } pre { font-size: 12px; overflow-x: auto; margin: 6px 0; }
+    @media (max-width: 1000px) { pre { font-size: 10.5px; } } /* 80 columns at 800 pixels */
     strong.unstable { color: #A03C00; } strong.stable { color: #00587A; }
     .old { opacity: .55; } .why { color: #5a2a00; }
     summary { cursor: pointer; } summary:focus-visible { outline: 2px solid #0072B2; }

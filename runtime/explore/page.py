@@ -54,11 +54,12 @@ from apc.vary.growth import MEAN_SQUARE, NOMINAL
 
 # Who computes what, first things first: what is redrawn while a slider moves waits for nothing else. A region
 # whose points are analysed one by one takes many seconds, and comes last.
-VERDICT, REGION, LATER = 0, 1, 2
+VERDICT, REGION, LATER, TUNED = 0, 1, 2, 3
 DESKS = (
     ("verdict",),
     ("region",),
     ("numbers", "roots", "motion", "feel", "margins", "network", "region"),
+    ("tune",),
 )
 # Seconds, a few frames of a browser, after which eigenvalues are drawn beside a region that is drawn already.
 FRAMES = 0.05
@@ -66,6 +67,10 @@ FRAMES = 0.05
 X, Y = "x-axis", "y-axis"
 STRUCK, BEGINS = "the first peer is struck", "as the scene begins"
 SAME_AXES = "A region has two different parameters: choose another one for an axis."
+TUNES = (
+    "The button looks for the largest {} with which the scene is stable, {} chosen with it, and proves it."
+)
+STUDIED = "The button looks for the gains that the topology's studies: tune: asks for, and proves them."
 NO_AXES = "A region has two parameters, and this scene has fewer that are numbers of a range."
 LIVE, SLOW = "every packet is on time", "packets as they are lost and late (takes long)"
 
@@ -178,6 +183,7 @@ class Page:
             self._start_at(one)
         self._take_link(document.session_context.request.arguments)
         self.verdict, self.margins, self.network = Words("verdict"), Words("margins"), Words("network")
+        self.tuned = Words("tuned")
         self.region, self.roots = RegionFigure(), RootsFigure()
         self.motion, self.feel = MotionFigure(), FeelFigure()
         self.modes: Mapping[str, Any] | None = None  # of the newest verdict
@@ -256,6 +262,8 @@ class Page:
             heading = Div(text=f"<h2 style='font-size:15px;margin:10px 0 0'>{kind.capitalize()}</h2>")
             own = [handle for handle, one in zip(self.handles, self.sliders, strict=True) if one.kind == kind]
             controls += [heading, *own]
+        self.tune = Button(label="Tune", stylesheets=[FOCUS], name="tune", width=120)
+        self.tune.on_click(self._ask_tune)
         motion, feel = self.motion, self.feel
         played = row(motion.play, motion.time, sizing_mode="stretch_width")
         # Words stand by themselves: in one layout with a figure, they have it drawn again when they change.
@@ -263,6 +271,8 @@ class Page:
             _below("controls", *controls, tags=[self.link, self.out]),
             self.region.plot,
             self.roots.plot,
+            self.tune,
+            self.tuned.model,
             _below("motion", self.begins, motion.stage, played, motion.plot),
             _below("feel", self.at, feel.plot, feel.phase),
             *(one.model for one in (self.verdict, self.margins, self.region.words, self.network)),
@@ -307,6 +317,32 @@ class Page:
         overrides = tuple(overrides_of(self.sliders, self.places))
         self.desks[LATER].forget("numbers")  # who asks twice wants two files
         self._ask("numbers", overrides, self._region_asked())
+
+    def _tuning_asked(self) -> tuple[tuple[str, ...], str] | None:
+        """Return the gains on the axes and the one to be large; nothing of both where a study says it."""
+        if self.system.tune:
+            return (), ""
+        if (axes := self._region_asked()) is None:
+            return None
+        spans = (
+            f"{one.free.label}={float(one.low)!r} {one.unit}:{float(one.high)!r} {one.unit}"
+            for one in axes[:2]
+        )
+        return tuple(spans), axes[1].free.label
+
+    def _ask_tune(self) -> None:
+        """Have the gains looked for, from where all other sliders are."""
+        if (asked := self._tuning_asked()) is not None:
+            self.tuned.say("Computing …")
+            self._ask("tune", tuple(overrides_of(self.sliders, self.places)), asked)
+
+    def _untuned(self) -> None:
+        """Say what the button looks for, in the place of gains for other sliders."""
+        self.desks[TUNED].forget("tune")
+        asked = self._tuning_asked()
+        names = [self.sliders[one].label for one in self.chosen]
+        self.tune.disabled = asked is None
+        self.tuned.say(NO_AXES if asked is None else TUNES.format(*reversed(names)) if asked[0] else STUDIED)
 
     def _save_numbers(self, found: Mapping[str, Any]) -> None:
         values = {one.label: one.texts[place] for one, place in self._pairs()}
@@ -396,6 +432,7 @@ class Page:
         self._ask_region(overrides)
         self._ask("motion", overrides, self.begins.value == STRUCK)
         self._ask_feel()
+        self._untuned()
         for section in ("margins", "network"):
             self._ask(section, overrides)
         self.link.data = {"query": [self._query()]}
@@ -505,7 +542,8 @@ class Page:
 
     def _words(self, section: str) -> Words:
         words = {"verdict": self.verdict, "roots": self.roots.way_words}
-        return (words | {"margins": self.margins, "network": self.network}).get(section, self.message)
+        words |= {"margins": self.margins, "network": self.network, "tune": self.tuned}
+        return words.get(section, self.message)
 
 
 def _below(name: str, *models: Any, tags: Sequence[Any] = ()) -> Any:

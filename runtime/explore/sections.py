@@ -37,6 +37,8 @@ from apc.present.region_picture import drawn_points, stable_outlines
 from apc.processes import model_of_bytes
 from apc.regions.region import region
 from apc.threads import single_threaded
+from apc.tuning.demands import held_as_studied, read_demands
+from apc.tuning.tune import tune
 from apc.vary.critical import critical
 from apc.vary.evaluator import evaluator, reaches_count, reaches_time
 from apc.vary.growth import MEAN_SQUARE
@@ -196,6 +198,14 @@ def _margins(system: CompiledSystem, prepared: Prepared, _: None) -> dict[str, A
     return {"text": str(margins(system, prepared=prepared, quick=True))}
 
 
+def _tune(system: CompiledSystem, _: Prepared, asked: tuple[tuple[str, ...], str]) -> dict[str, Any]:
+    """Return the best of the gains that the scene's `studies: tune:` frees, or else of those asked for."""
+    free, best = asked
+    held, criterion = held_as_studied(system)
+    demands = read_demands(held, free, maximize=best, criterion=criterion)
+    return {"text": str(tune(held, demands))}
+
+
 def _motion(system: CompiledSystem, _: Prepared, struck: bool) -> dict[str, Any]:
     return {"motion": motion_of(system, struck=struck)}
 
@@ -256,6 +266,7 @@ SECTIONS: dict[str, Callable[[CompiledSystem, Prepared, Any], dict[str, Any]]] =
     "region": _region,
     "roots": _roots,
     "margins": _margins,
+    "tune": _tune,
     "motion": _motion,
     "feel": _feel,
     "network": _network,

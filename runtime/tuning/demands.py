@@ -1,7 +1,7 @@
 """What is asked of gains: which are free, what they are to do best, and all that they have to bear.
 
 Takes: a `CompiledSystem` and texts such as `coordination.stiffness=10 N/m:5000 N/m`.
-Gives: `Aim`, `Felt`, `Demands`, `read_demands`, `read_against`, `study_hands`, `read_seconds`; `PLACE`,
+Gives: `Aim`, `Felt`, `Demands`, `read_demands`, `read_against`, `held_as_studied`, `read_seconds`; `PLACE`,
 `RADIUS`.
 Guarantees: what can't be meant is refused before anything is computed.
 Does not: compute.
@@ -18,6 +18,7 @@ from apc.analysis.box import parse_range
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.frame.devices import FREE as FREE_HANDS
+from apc.frame.devices import with_hands
 from apc.frame.names import Free, Range, find, given_ranges
 from apc.frame.overrides import Override, apply
 from apc.network.nominal import unreliable
@@ -164,9 +165,10 @@ def read_demands(
     return Demands(tuple(gains), best, counts, delay, box, decay, felt, chosen)
 
 
-def study_hands(system: CompiledSystem) -> str:
-    """Return what holds the devices where the scene's `studies: tune:` says so, "free" where it doesn't."""
-    return dict(system.tune).get("hands", FREE_HANDS)
+def held_as_studied(system: CompiledSystem) -> tuple[CompiledSystem, str | None]:
+    """Return a scene held as its `studies: tune:` says, and the criterion; None is the scene's own."""
+    hands = dict(system.tune).get("hands", FREE_HANDS)
+    return (system, PASSIVE) if hands == PASSIVE else (with_hands(system, hands), None)
 
 
 def read_seconds(text: str) -> float:

@@ -145,6 +145,10 @@ def test_sections_tell_what_the_api_tells(tmp_path: Path) -> None:
     assert region["share"] == pytest.approx(whole.stable_area / (5000 * 1500), rel=1e-4)  # drawn to 1e-5
     felt = apc.feel(system, feel["frequency"], set=setting)
     assert np.array_equal(feel["magnitude"], np.abs(felt.impedance))
+    best = apc.tune(
+        system, {"contact.stiffness": "0 N/m:5000 N/m"}, maximize="contact.stiffness", set=setting
+    )
+    assert told("tune", (("contact.stiffness=0 N/m:5000 N/m",), "contact.stiffness"))["text"] == str(best)
 
 
 def test_a_section_that_a_scene_has_nothing_for_says_so(tmp_path: Path) -> None:
@@ -566,6 +570,9 @@ def test_what_the_browser_may_say_is_computed(page: Page) -> None:
     tapped(page, 1500, 300)
     moved = {one.label: one.values[at] for one, at in zip(page.sliders, page.places, strict=True)}
     assert moved["contact.stiffness"] == 1500 and moved["coordination.stiffness"] == 300
+    page._ask_tune()
+    free, best = Asked.asked[-1].asked
+    assert best == "coordination.stiffness" and free[0] == "contact.stiffness=0.0 N/m:5000.0 N/m"
 
 
 UPGRADE = {
