@@ -42,6 +42,9 @@ from .api import (
     feel as feel,
 )
 from .api import (
+    front as front,
+)
+from .api import (
     judge_network as judge_network,
 )
 from .api import (
@@ -112,6 +115,8 @@ from .reports.contents import Report as Report
 from .simulation.buzz import Buzz as Buzz
 from .simulation.trajectory import Trajectory as Trajectory
 from .sweeps.sweep import Sweep as Sweep
+from .tuning.front import Design as Design
+from .tuning.front import Front as Front
 from .tuning.tune import Tuning as Tuning
 from .vary.critical import Critical as Critical
 from .vary.many import Analyses as Analyses

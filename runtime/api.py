@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from apc.simulation.buzz import Buzz
     from apc.simulation.trajectory import Trajectory
     from apc.sweeps.sweep import Sweep
+    from apc.tuning.demands import Demands
+    from apc.tuning.front import Front
     from apc.tuning.tune import Tuning
     from apc.vary.critical import Critical
     from apc.vary.many import Analyses
@@ -659,9 +661,71 @@ def tune(
         The input is at fault.
     """
     from apc.tuning import tune as design
+
+    system, demands = _demands(model, set, free, over, criterion, maximize, minimize, subject)
+    return design.tune(system, demands, seconds=float("inf") if seconds is None else seconds)
+
+
+@checked
+def front(
+    model: Scene,
+    free: Mapping[str, str | Sequence[str | float]],
+    against: str,
+    *,
+    maximize: str = "",
+    minimize: str = "",
+    subject: Sequence[str] = (),
+    over: Mapping[str, str | Sequence[str | float]] | None = None,
+    criterion: Criterion | None = None,
+    points: int = 20,
+    seconds: float | None = None,
+    set: Values | None = None,
+) -> Front:
+    """Weigh a gain against what a hand feels: the best of the one for each of several bounds on the other.
+
+    Parameters
+    ----------
+    model, free, maximize, minimize, subject, over, criterion, set
+        As for `tune`.
+    against
+        What is felt: "feel.impedance at 5 Hz", or transmitted, or error.
+    points
+        How many bounds, from the least that is felt to what the best gain is felt like.
+    seconds
+        How long to go on at most, with all of them.
+
+    Returns
+    -------
+    Front
+        Its `.designs`; `.plot()` draws it.
+
+    Raises
+    ------
+    ApcError
+        The input is at fault.
+    """
+    from apc.tuning.demands import read_against
+    from apc.tuning.front import front as pareto
+
+    system, demands = _demands(model, set, free, over, criterion, maximize, minimize, subject)
+    until = float("inf") if seconds is None else seconds
+    return pareto(system, demands, read_against(against), points=points, seconds=until)
+
+
+def _demands(
+    model: Scene,
+    values: Values | None,
+    free: Mapping[str, Any] | None,
+    over: Mapping[str, Any] | None,
+    criterion: Criterion | None,
+    maximize: str,
+    minimize: str,
+    subject: Sequence[str],
+) -> tuple[CompiledSystem, Demands]:
+    """Return a scene as its study or a criterion has its devices held, and what is asked of gains."""
     from apc.tuning.demands import held_as_studied, read_demands
 
-    system, means = _model(model, set), criterion
+    system, means = _model(model, values), criterion
     if criterion is None:
         system, means = held_as_studied(system)
     ranges, borne = (
@@ -677,7 +741,7 @@ def tune(
         over=borne,
         criterion=means,
     )
-    return design.tune(system, demands, seconds=float("inf") if seconds is None else seconds)
+    return system, demands
 
 
 @checked

@@ -1,8 +1,8 @@
 """Proof that a scene is stable for every value of some parameters in a box.
 
 Takes: a `CompiledSystem` and ranges.
-Gives: `BoxProof`, `ChangingDelay`, `prove_box`; `search_box`, `Look`, `Looked`, `middle`; `TOGETHER`,
-`UNDECIDED`.
+Gives: `BoxProof`, `ChangingDelay`, `prove_box`; `search_box`, `Look`, `Looked`, `middle`; `Opened`,
+`open_questions`; `TOGETHER`, `UNDECIDED`.
 Guarantees: stable means proved for every point of the box, unstable proved at the point that is named.
 Does not: find the boundary (see the share that is left open).
 
@@ -23,7 +23,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import analyze, prepare
+from apc.analysis.analysis import Prepared, analyze, prepare
 from apc.analysis.box import open_systems
 from apc.analysis.cells import Cell, OpenSystem, look, open_system
 from apc.compiler.compiled import CompiledSystem
@@ -125,24 +125,7 @@ def prove_box(
     """
     with single_threaded(), np.errstate(all="ignore"):
         prepared = prepare(system)
-        questions: list[OpenSystem] = []
-        notes: list[str] = []
-        translations = rotations = 0
-        for closed, sites in open_systems(system, ranges, prepared):
-            free = find_rigid_modes(closed)
-            if free.drifts or (free.names and not stays_rigid(closed, sites)):
-                what = (
-                    "drifts"
-                    if free.drifts
-                    else "moves freely in a direction that changes with the parameters"
-                )
-                notes.append(f"{closed.name} {what}: nothing can be proved for a whole box")
-                continue
-            if free.names:
-                standing = what_stands(closed, with_drifts=False)
-                translations += standing.translations
-                rotations += standing.rotations
-            questions.append(open_system(closed, sites, free, inside))
+        opened = open_questions(system, ranges, prepared, inside)
 
         def is_unstable(point: Sequence[Fraction]) -> bool:
             values = [Override(one.free, value) for one, value in zip(ranges, point, strict=True)]
@@ -152,15 +135,57 @@ def prove_box(
         found = search_box(
             system.name,
             ranges,
-            partial(_looked, questions, is_unstable),
+            partial(_looked, opened.questions, is_unstable),
             is_unstable,
-            stable=up_to(translations, rotations),
+            stable=up_to(opened.translations, opened.rotations),
             unstable=UNSTABLE,
-            cells=0 if notes else cells,
+            cells=0 if opened.notes else cells,
         )
-        if notes and found.stable is None:
-            return replace(found, point=(), notes=tuple(notes))
+        if opened.notes and found.stable is None:
+            return replace(found, point=(), notes=opened.notes)
         return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Opened:
+    """The closed systems of a scene over a box, without their rigid motions, and how many these are.
+
+    `notes` say of which systems nothing can be proved for a whole box; those are not among the `questions`.
+    """
+
+    questions: tuple[OpenSystem, ...]
+    translations: int
+    rotations: int
+    notes: tuple[str, ...]
+
+
+def open_questions(
+    system: CompiledSystem, ranges: Sequence[Range], prepared: Prepared, inside: float
+) -> Opened:
+    """Return what is to be proved of a scene all over a box.
+
+    Parameters
+    ----------
+    system, ranges, inside
+        As for `prove_box`.
+    prepared
+        From `analysis.prepare`.
+    """
+    questions: list[OpenSystem] = []
+    notes: list[str] = []
+    translations = rotations = 0
+    for closed, sites in open_systems(system, ranges, prepared):
+        free = find_rigid_modes(closed)
+        if free.drifts or (free.names and not stays_rigid(closed, sites)):
+            what = "drifts" if free.drifts else "moves freely in a direction that changes with the parameters"
+            notes.append(f"{closed.name} {what}: nothing can be proved for a whole box")
+            continue
+        if free.names:
+            standing = what_stands(closed, with_drifts=False)
+            translations += standing.translations
+            rotations += standing.rotations
+        questions.append(open_system(closed, sites, free, inside))
+    return Opened(tuple(questions), translations, rotations, tuple(notes))
 
 
 def search_box(

@@ -2,7 +2,7 @@
 
 Takes: a `ClosedSystem`, its sites over `Fraction` and `Ratio`, its rigid motions; cells.
 Gives: `OpenFrames`, `open_frames`, `frames_over`; `OpenLoop`, `open_loop`, `closed_over`; `OpenSystem`,
-`open_system`; `Cell`; `Looked`, `look`, `contracted`.
+`open_system`, `matrices_over`; `Cell`; `Looked`, `look`, `contracted`.
 Guarantees: a cell that is said to be stable is proved so, at every point of it; rounding is charged.
 Does not: divide cells, or decide what floats leave open (see `box_proof`).
 
@@ -194,7 +194,7 @@ def look(asked: OpenSystem, cells: Sequence[Cell]) -> Looked:
     cells
         Of all its parameters, k of them; points, where low and high are the same.
     """
-    return contracted(_matrices(asked, cells))
+    return contracted(matrices_over(asked, cells))
 
 
 def contracted(matrix: Matrix) -> Looked:
@@ -298,8 +298,14 @@ def _change_of_basis(matrix: Floats) -> Floats:
     return found
 
 
-def _matrices(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:
-    """Return the matrices in relative coordinates over cells (k, 2 + m, n, n), or of points (k, 2, n, n)."""
+def matrices_over(asked: OpenSystem, cells: Sequence[Cell]) -> Matrix:
+    """Return the matrices in relative coordinates over cells (k, 2 + m, n, n), or of points (k, 2, n, n).
+
+    Parameters
+    ----------
+    asked, cells
+        As for `look`; what the circle's radius is by, the matrices are smaller by.
+    """
     closed, _ = closed_over(asked.loop, cells)
     count = closed.shape[1] - 2
     at = replace(asked.relative, weights=within(asked.relative.weights, count))

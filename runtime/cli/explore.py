@@ -29,13 +29,14 @@ def explore_command(
     """Open a page in the browser: sliders, and what follows from them.
 
     Sliders of the scene's parameters, delays, periods and number of users;
-    beside them the stable region of two of them, the verdict and what limits
-    it, eigenvalues, the response to a push, what a hand feels, how much loss
-    and jitter the network may have, redrawn as a slider moves. A click in the
-    region sets both its sliders, a button looks for the best gains. The link holds the values; buttons download
-    the topology with them, the picture and the numbers. FILE is a topology or
-    a compiled model. The page is this machine's own, for whoever has the link
-    that is printed; Ctrl-C ends it.
+    beside them the stable region of two of them, the verdict and what
+    limits it, eigenvalues, the response to a push, what a hand feels, how
+    much loss and jitter the network may have, redrawn as a slider moves. A
+    click in the region sets both its sliders, a button looks for the best
+    gains. The link holds the values; buttons download the topology with
+    them, the picture and the numbers. FILE is a topology or a compiled
+    model. The page is this machine's own, for whoever has the link that is
+    printed; Ctrl-C ends it.
 
     \b
         apc explore three-users.yaml --set "lan.delay=16 ms" --no-browser

@@ -1,7 +1,7 @@
 """Eigenvalues of matrices known up to an error, each with a bound.
 
 Takes: square matrices, and a bound on what each entry may be off by.
-Gives: `Enclosure`, `enclose_stack`, `enclose_eigenvalues`, `discs`; `misses_one`.
+Gives: `Enclosure`, `enclose_stack`, `enclose_eigenvalues`, `discs`; `enclose_moving`; `misses_one`.
 Guarantees: the bounds hold for every matrix within the error, whatever their conditioning; rounding in the
 bounds themselves is charged. LAPACK's results are checked by their residuals, not believed.
 Does not: know where a matrix comes from, or what is rigid (see `spectrum`).
@@ -19,7 +19,7 @@ taken together as T, and the split between large and small is looked for at the 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,9 @@ Matrix = NDArray[Any]  # float64 or complex128
 # Eigenvalues smaller than this decide nothing (e-folding in a fifth of a frame) and are often one defective
 # cluster at zero; the first split between large and small is here.
 SMALL = 1e-2
+
+# Where what moves matrices matters more than rounding: the split, and what `GROWN` is. Measured: flat about.
+SPLIT, GROWN_MOVING = 0.3, 8.0
 
 # A spectral radius less certain than the first, relative to itself or to 1, has the split at `SMALL` tried;
 # less certain than the second, so many other splits.
@@ -122,6 +125,28 @@ def enclose_stack(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]
     return pairs, bounds
 
 
+def enclose_moving(matrix: Floats, slopes: Floats, error: Floats) -> Enclosure:
+    """Enclose the eigenvalues of M + Σ ε_k S_k + E for all |ε_k| ≤ 1, by one split of large from small ones.
+
+    Parameters
+    ----------
+    matrix, slopes, error
+        M (k, n, n), S (k, m, n, n) and a bound on what each entry of E (k, n, n) is.
+    """
+    with np.errstate(all="ignore"):
+        scale = balance(np.abs(matrix).max(axis=0) + np.abs(slopes).max(axis=(0, 1)) + TINY)
+        units = scale / scale[:, None]
+        matrix, slopes, error = matrix * units, slopes * units, error * units
+        pairs = eigenpairs(matrix)
+        order = descending(pairs.values)
+        pairs = Eigenpairs(
+            np.take_along_axis(pairs.values, order, axis=1),
+            np.take_along_axis(pairs.right, order[:, None], axis=2),
+            np.take_along_axis(pairs.left, order[:, :, None], axis=1),
+        )
+        return _bounds(matrix, error, pairs, np.abs(pairs.values) >= SPLIT, slopes)
+
+
 def _enclose_split(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]:
     """Enclose the eigenvalues of one matrix (1, n, n) by as many splits as it needs, all of which hold."""
     n = matrix.shape[-1]
@@ -154,8 +179,12 @@ def _splits(sizes: Floats) -> Iterator[int]:
     yield 0
 
 
-def _bounds(matrix: Matrix, error: Floats, pairs: Eigenpairs, large: Truths) -> Enclosure:
+def _bounds(
+    matrix: Matrix, error: Floats, pairs: Eigenpairs, large: Truths, slopes: Floats | None = None
+) -> Enclosure:
     """Enclose the eigenvalues of a stack, of each matrix the first so many as large ones (k, n).
+
+    With `slopes` (k, m, n, n), of all that each adds, times a number between −1 and 1.
 
     Notes
     -----
@@ -188,7 +217,15 @@ def _bounds(matrix: Matrix, error: Floats, pairs: Eigenpairs, large: Truths) -> 
         residual = residual - basis @ block
         doubt += charge * (size @ np.abs(block))
     doubt += charge * np.abs(residual)
-    over = (np.abs(inverse @ residual) + weight @ doubt) * (1 + charge)  # |G|, but for the inverse
+    over = np.abs(inverse @ residual) + weight @ doubt
+    turned, grows = 0.0, GROWN
+    if slopes is not None:
+        along = inverse[:, None] @ slopes @ basis[:, None]
+        over += np.abs(along).sum(axis=1) + charge * (weight @ np.abs(slopes).sum(axis=1) @ size)
+        own, outwards = np.einsum("kmii->kmi", along), np.exp(-1j * np.angle(values))[:, None]
+        grows = GROWN_MOVING
+        turned = (np.abs(own) - np.abs((outwards * own).real)).sum(axis=1)
+    over *= 1 + charge  # |G|, but for the inverse
     # The computed inverse Y is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
     wrong = (np.abs(np.eye(n) - inverse @ basis) + charge * (weight @ size)).sum(axis=2)
     defect = wrong.max(axis=1)
@@ -205,9 +242,9 @@ def _bounds(matrix: Matrix, error: Floats, pairs: Eigenpairs, large: Truths) -> 
         total = (total + across) * (1 + charge)
         nearest = np.abs(np.where(small, pairs.values, 0.0)).max(axis=1)
         inner, outer = (
-            pseudospectral_radius(block, part * off * (1 + charge), nearest)[:, None] for part in (1.0, GROWN)
+            pseudospectral_radius(block, part * off * (1 + charge), nearest)[:, None] for part in (1.0, grows)
         )
-        radii, grown, least = np.where(large, total, inner), np.where(large, total, outer), 1 / (GROWN - 1)
+        radii, grown, least = np.where(large, total, inner), np.where(large, total, outer), 1 / (grows - 1)
         into = np.where(large[:, :, None], over, 0.0)
     gap = np.abs(values[:, :, None] - values[:, None]) * (1 - 8 * UNIT) - grown[:, :, None] - radii[:, None]
     np.einsum("kii->ki", gap)[:] = np.inf
@@ -215,7 +252,15 @@ def _bounds(matrix: Matrix, error: Floats, pairs: Eigenpairs, large: Truths) -> 
     less = (first + share * (total - first)) * (1 + 8 * UNIT)
     radii = np.where(large & (share < 1), np.minimum(less, radii), radii) * (1 + charge)
     known = (defect < 0.5) & np.isfinite(radii).all(axis=1)
-    return discs(pairs.values, values, np.where(known[:, None], radii, np.inf))
+    found = discs(pairs.values, values, np.where(known[:, None], radii, np.inf))
+    if slopes is not None:
+        # A disc that holds one eigenvalue goes along with its centre: to first order only what moves it
+        # inwards brings it nearer to zero.
+        least = np.where(known[:, None] & large & (share < 1), np.abs(values) - radii + turned, 0.0).max(
+            axis=1
+        )
+        found = replace(found, low=np.maximum(found.low, least - charge))
+    return found
 
 
 def discs(values: Complexes, centres: Complexes, radii: Floats) -> Enclosure:

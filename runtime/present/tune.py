@@ -17,6 +17,7 @@ from apc.compiler.words import counted, enumerated, in_hertz, measured, with_uni
 from apc.present.analysis import range_document, range_text
 from apc.present.forms import MEANT, labelled, notes, quantity, record, table
 from apc.present.pictures import COLOURS, new_figure
+from apc.tuning.bound import SHARE
 
 if TYPE_CHECKING:
     from apc.tuning.front import Front
@@ -44,6 +45,9 @@ def tuning_text(found: Tuning) -> str:
     if found.met:
         best = f"{measured(found.best, found.error, found.unit)}, the best of {found.looked:,} points"
         lines += labelled("before rounding", best)
+    if found.bounded:
+        better = f"no gains in these ranges do better by {100 * float(SHARE):.3g} %"
+        lines += labelled("no others", f"{better}, proved in {found.bounded:,} cells")
     lines += labelled("room", _room(found))
     lines += _proof_lines(found)
     if found.binding:
@@ -122,7 +126,7 @@ def front_text(found: Front) -> str:
     last = len(found.designs) - 1
     best = "largest" if found.larger else "least"
     title = f"{found.topology}: the {best} {found.aim} for each bound on {found.against}"
-    names = {0: "least felt", found.knee: "knee", last: best}
+    names = {found.knee: "knee", 0: "least felt", last: best}  # an end is no knee
     rows = [(found.against, *(name for name, _, _ in found.designs[0].gains), "", "")]
     for place, one in enumerate(found.designs):
         gains = (quantity(value, unit, TYPED) for _, value, unit in one.gains)
@@ -141,7 +145,7 @@ def front_picture(found: Front, ax: Any = None) -> Any:
     ax.set(xlabel=f"{found.against} ({found.against_unit})", ylabel=f"{found.aim} ({found.unit})")
     ax.set_title(found.topology, fontsize=9)
     end = "largest" if found.larger else "least"
-    for place, name in {0: "least felt", found.knee: "knee", len(x) - 1: end}.items():
+    for place, name in {found.knee: "knee", 0: "least felt", len(x) - 1: end}.items():
         at = (float(x[place]), float(y[place]))
         ax.annotate(name, at, xytext=(6, -12), textcoords="offset points", fontsize=8)
     ax.margins(0.12)  # room for the names

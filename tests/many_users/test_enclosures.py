@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.balls import precision
 from apc.eigen.certify import schur_cohn
-from apc.eigen.enclosure import enclose_eigenvalues, enclose_stack
+from apc.eigen.enclosure import enclose_eigenvalues, enclose_moving, enclose_stack
 from apc.eigen.pseudospectrum import pseudospectral_radius
 
 Floats = NDArray[Any]
@@ -134,6 +134,22 @@ def test_every_matrix_within_the_error_has_its_eigenvalues_within_the_bounds(way
             for value, bound in zip(values, errors, strict=True):
                 assert np.abs(true - value).min() <= bound + 1e-15 * abs(value) + 1e-25, name
     assert told >= 3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_wherever_slopes_lead_the_radius_is_within_the_bounds(seed: int) -> None:
+    generator, near = np.random.default_rng(seed), 0
+    for name, matrix in _drawn(generator).items():
+        slopes = (
+            10.0 ** generator.integers(-6, -1) * np.abs(matrix) * generator.normal(size=(2, *matrix.shape))
+        )
+        found = enclose_moving(matrix[None], slopes[None], 1e-9 * np.abs(matrix)[None])
+        sizes = [np.abs(np.linalg.eigvals(matrix)).max()]
+        for share in [[1, 1], [-1, -1], [1, -1], [-1, 1], *generator.uniform(-1, 1, (4, 2))]:
+            sizes.append(np.abs(_true(matrix + np.tensordot(share, slopes, 1))).max())
+            assert found.low[0] * (1 - 1e-15) <= sizes[-1] <= found.high[0] * (1 + 1e-15), name
+        near += min(sizes) - found.low[0] < 3 * np.ptp(sizes)
+    assert near >= 3
 
 
 def _rational(n: int) -> st.SearchStrategy[list[list[int]]]:

@@ -84,7 +84,7 @@ def test_what_tells_of_texts_refuses_a_compiled_model(model: apc.CompiledSystem)
 
 FUNCTIONS = [name for name in apc.__all__ if inspect.isfunction(getattr(apc, name))]
 GIVEN = {"values": {"contact.stiffness": [1.0]}, "parameter": "contact.stiffness", "hands": "held"}
-GIVEN |= {"over": {"contact.stiffness": ["1 N/m"]}, "ranges": {"contact.stiffness": "±1%"}}
+GIVEN |= {"over": {"contact.stiffness": ["1 N/m"]}, "ranges": {"contact.stiffness": "±1%"}, "free": {}}
 GIVEN |= {"frequencies": [1.0], "box": {"contact.stiffness": "±1%"}, "to": "json", "file": str(PATH)}
 WRONG = [None, 7, ("contact.stiffness", "10 N/m", "3000 N/m"), {"a": 1}, [3], object(), b"x"]
 

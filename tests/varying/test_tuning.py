@@ -47,7 +47,7 @@ def test_gains_bear_all_that_they_have_to_and_none_on_a_grid_bear_it_better() ->
     typed = {one.parameter: float(one.value) for one in found.gains}
     stiffness, damping = np.meshgrid(np.arange(1.01, 2.0, 0.1) * found.value, np.linspace(0, 50, 51))
     bears = np.ones(stiffness.shape, dtype=bool)
-    assert found.proved and len(found.proofs) == 5
+    assert found.proved and len(found.proofs) == 5 and found.bounded
     for peers, mass in itertools.product(range(2, 7), (0.08, 0.09, 0.12)):
         at = {"user.count": peers, MASS: mass}
         bears &= apc.analyze_many(model, {K: stiffness, B: damping}, set=at).stable.astype(bool)
@@ -84,7 +84,7 @@ def test_with_passive_hands_the_limit_is_colgates(damping: float, virtual: float
 def test_a_front_is_the_best_of_a_gain_for_each_bound_on_what_is_felt() -> None:
     model = compiled(AVERAGE)
     demands = read_demands(model, [f"{K}=10 N/m:7000 N/m"], maximize=K)
-    found = front(model, demands, read_against("feel.impedance at 5 Hz"), points=3)
+    found = apc.front(model, RANGE, "feel.impedance at 5 Hz", maximize=K, points=3)
     felt = [abs(apc.feel(model, 5.0, set={K: one.value}).impedance[0]) for one in found.designs]
     assert [one.felt for one in found.designs] == pytest.approx(felt, rel=1e-9)
     assert all(np.diff([(one.felt, one.value) for one in found.designs], axis=0).ravel() > 0)

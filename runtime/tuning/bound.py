@@ -1,0 +1,96 @@
+"""How much better gains could be than those that were found: none are by more than a share, proved.
+
+Takes: scenes that limit the gains, the gains' ranges, and what was found.
+Gives: `SHARE`, `none_better`.
+Guarantees: all over each cell of the gains that would do better, an eigenvalue is proved to be outside the
+circle in one of the scenes.
+Does not: say that gains can do better where it proves nothing.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from fractions import Fraction
+
+import numpy as np
+
+from apc.analysis.analysis import Prepared
+from apc.analysis.box_proof import TOGETHER, open_questions
+from apc.analysis.cells import Cell, OpenSystem, matrices_over
+from apc.compiler.compiled import CompiledSystem
+from apc.compiler.errors import ApcError
+from apc.eigen.enclosure import enclose_moving
+from apc.frame.names import Range
+from apc.frame.radius import radius_of, value_of
+
+# What nobody would tune further for; the most gains, and the most cells, at a millisecond each or so.
+SHARE = Fraction(2, 100)
+GAINS, CELLS = 3, 5_000
+
+
+def none_better(
+    scenes: Sequence[CompiledSystem],
+    prepared: Prepared,
+    gains: Sequence[Range],
+    aim: int,
+    *,
+    value: Fraction,
+    larger: bool,
+    inside: float,
+    until: float,
+) -> int | None:
+    """Return in how many cells it is proved that no gains do better by `SHARE`; None where it is not.
+
+    Parameters
+    ----------
+    scenes, prepared
+        The scenes that limit the gains most, and what `analysis.prepare` made of one.
+    gains, aim
+        The gains' ranges, and the place of that which is to be large, or small.
+    value, larger
+        What it is with the gains that were found; whether it is to be large.
+    inside
+        The radius of the circle that eigenvalues are wanted in.
+    until
+        When to give up, of `time.monotonic`.
+    """
+    beyond = value + (1 if larger else -1) * SHARE * abs(value)
+    spans = [(one.low, one.high) for one in gains]
+    spans[aim] = (beyond, gains[aim].high) if larger else (gains[aim].low, beyond)
+    if not spans[aim][0] < spans[aim][1] or len(gains) > GAINS:
+        return None
+    try:
+        opened = [open_questions(scene, gains, prepared, inside) for scene in scenes]
+    except ApcError:  # a scene that is no rational function of the gains
+        return None
+    questions = [question for one in opened for question in one.questions]
+    cells: list[Cell] = [tuple(spans)]
+    looked = 0
+    while cells:
+        if not questions or looked > CELLS or time.monotonic() > until:
+            return None
+        some, cells = cells[:TOGETHER], cells[TOGETHER:]
+        looked += len(some)
+        for cell, (unstable, widest) in zip(some, _looked(questions, some), strict=True):
+            low, high = cell[widest]
+            halves = () if unstable else ((low, (low + high) / 2), ((low + high) / 2, high))
+            cells += [(*cell[:widest], half, *cell[widest + 1 :]) for half in halves]
+    return looked
+
+
+def _looked(questions: Sequence[OpenSystem], cells: Sequence[Cell]) -> list[tuple[bool, int]]:
+    """Return of each cell whether it is proved unstable, and along which gain its matrices move most."""
+    unstable = np.zeros(len(cells), dtype=np.bool_)
+    reach = np.zeros((len(cells), len(cells[0])))
+    for question in questions:
+        left = np.flatnonzero(~unstable)
+        if not len(left):
+            break
+        matrix = matrices_over(question, [cells[place] for place in left.tolist()])
+        reach[left] = np.maximum(reach[left], np.abs(matrix[:, 2:]).sum(axis=(2, 3)))
+        outside = np.abs(np.linalg.eigvals(value_of(matrix))).max(axis=1, initial=0.0) > 1
+        if outside.any():
+            some = matrix[outside]
+            unstable[left[outside]] = enclose_moving(value_of(some), some[:, 2:], radius_of(some)).low > 1
+    return list(zip(unstable.tolist(), reach.argmax(axis=1).tolist(), strict=True))
