@@ -40,7 +40,10 @@ def tune_command(
         "A gain that may be chosen, and from where to where. Repeat it.", "PATH=LO:HI"
     ),
     maximize: str = option("The gain that is to be as large as can be.", "PATH"),
-    minimize: str = option("The gain, or spectral_radius, that is to be as small as can be.", "PATH"),
+    minimize: str = option(
+        "The gain, or settling_time or spectral_radius (the same gains), that is to be as small as can be.",
+        "PATH",
+    ),
     subject: tuple[str, ...] = option(
         'Beside stability: "decay=60 dB in 2 s"; "feel.impedance at 5 Hz < 20 N*s/m", or feel.transmitted in '
         "m/s/N, feel.error in m/N. May be repeated.",

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 # Digits of what is typed, and of what a limit buys.
 TYPED, BUYS = 12, 3
 
+# Of a motion, when it counts as died out.
+SETTLED = 0.02
+
 
 def tuning_text(found: Tuning) -> str:
     """Return the gains, what is proved of them and what binds, in at most 80 columns."""
@@ -53,7 +56,7 @@ def tuning_text(found: Tuning) -> str:
     if found.binding:
         lines += ["", "  what binds" if found.met else "  what is in the way"]
         lines += [line for one in found.binding for line in _binding_lines(found, one)]
-    elif found.met:
+    elif any(one.parameter == found.aim and one.value in (one.low, one.high) for one in found.gains):
         lines += ["", f"  nothing binds {found.aim} but the end of its range"]
     return "\n".join(lines)
 
@@ -72,8 +75,11 @@ def _sentence(found: Tuning) -> str:
         proved += ", and in some of it it is not so"
     best = "largest" if found.larger else "least"
     if found.unit == "1" and found.aim not in [one.parameter for one in found.gains]:
-        least = f"a spectral radius below {found.value:.6g}, next to the least found{over},"
-        return f"{found.topology}: {least} is {proved}"
+        power = 2 if found.criterion == "mean-square" else 1  # of what a frame multiplies
+        settled = found.frame_s * power * math.log(SETTLED) / math.log(found.value)
+        least = f"{_multiplied(found)} below {found.value:.6g}, next to the least found{over}, is {proved}"
+        time = f"within {quantity(settled, 's', 3)} all motions die out but for {100 * SETTLED:.0f} %"
+        return f"{found.topology}: {least}; {time}"
     value = f"{quantity(found.value, found.unit, TYPED)} is the {best} {found.aim}"
     return f"{found.topology}: {value} found with which {stable}{over}; it is {proved}"
 
@@ -85,7 +91,11 @@ def _room(found: Tuning) -> str:
     if found.felt:
         return f"{math.exp(found.worst):.6g} of what is allowed in the worst scenario"
     radius, most = math.exp(found.worst + found.allowed), math.exp(found.allowed)
-    return f"spectral radius {radius:.6g} in the worst scenario, {most:.6g} allowed"
+    return f"{_multiplied(found)} of {radius:.6g} in the worst scenario, {most:.6g} allowed"
+
+
+def _multiplied(found: Tuning) -> str:
+    return "a frame's factor of mean squares" if found.criterion == "mean-square" else "a spectral radius"
 
 
 def _proof_lines(found: Tuning) -> list[str]:
@@ -100,8 +110,11 @@ def _proof_lines(found: Tuning) -> list[str]:
     left: dict[str, list[str]] = {}
     for one in found.proofs:
         if not one.proof.stable:
-            share = f"{100 * one.proof.open_share:.3g} % of the box is left open" if one.proof.cells else ""
-            said = ", ".join(filter(None, [one.proof.verdict, share, *one.proof.notes]))
+            share = (
+                f"{100 * one.proof.open_share:.3g} % of the box is left open" if one.proof.open_share else ""
+            )
+            open_verdict = [] if one.proof.notes else [one.proof.verdict]
+            said = ", ".join([*open_verdict, *filter(None, [share]), *one.proof.notes])
             left.setdefault(said, []).append(", ".join(f"{label} {number}" for label, number in one.counts))
     for said, where in left.items():
         lines += labelled("not proved", "; ".join([", ".join(filter(None, where)), said]).removeprefix("; "))

@@ -2,7 +2,7 @@
 
 Takes: a `CompiledSystem` and texts such as `coordination.stiffness=10 N/m:5000 N/m`.
 Gives: `Aim`, `Felt`, `Demands`, `read_demands`, `read_against`, `held_as_studied`, `read_seconds`; `PLACE`,
-`RADIUS`.
+`RADIUS`, `SETTLING`.
 Guarantees: what can't be meant is refused before anything is computed.
 Does not: compute.
 """
@@ -34,7 +34,7 @@ FREE, AIM, SUBJECT, OVER, AGAINST = (
 )
 
 # What may be minimized beside a gain.
-RADIUS = "spectral_radius"
+RADIUS, SETTLING = "spectral_radius", "settling_time"
 
 # What hands feel, as `Feel` has it, and its unit.
 FELT = {
@@ -51,7 +51,10 @@ _FREE = '--free "coordination.stiffness=10 N/m:5000 N/m"'
 
 @dataclass(frozen=True, slots=True)
 class Aim:
-    """What is to be best: the gain in column `gain`, or the spectral radius (None), the larger or not."""
+    """What is to be best: the gain in column `gain`, large or not; None is how fast all motions die out.
+
+    That is the spectral radius, or the time after which none is left but for 2 %: the same gains.
+    """
 
     label: str
     gain: int | None
@@ -157,10 +160,11 @@ def read_demands(
             refuse_time(system, one.free, PLACE, chosen)
     felt = tuple(_felt(text) for text in subject if text.strip().startswith("feel."))
     decay = min((_decay(text) for text in subject if not text.strip().startswith("feel.")), default=1.0)
-    if decay < 1 and chosen == PASSIVE:
-        what = "a decay and --hands passive don't go together: what hands can draw has no modes that decay"
-        raise ApcError(Mistake("E930", SUBJECT, what, hint="--hands clamped"))
     best = _aim(gains, maximize, minimize)
+    if chosen == PASSIVE and (decay < 1 or best.gain is None):
+        asked = "a decay" if decay < 1 else best.label
+        what = f"{asked} and --hands passive don't go together: what hands can draw has no modes that decay"
+        raise ApcError(Mistake("E930", SUBJECT if decay < 1 else PLACE, what, hint="--hands clamped"))
     delay = delays[0] if delays else None
     return Demands(tuple(gains), best, counts, delay, box, decay, felt, chosen)
 
@@ -224,11 +228,13 @@ def _aim(gains: Sequence[Range], maximize: str, minimize: str) -> Aim:
     names = [one.free.label for one in gains]
     if text in names:
         return Aim(text, names.index(text), larger)
-    if text == RADIUS and not larger:
-        return Aim(RADIUS, None, larger)
+    if text in (RADIUS, SETTLING) and not larger:
+        return Aim(text, None, larger)
     option = "--maximize" if larger else "--minimize"
     what = f"{option} {text[:60] or 'nothing'}"
-    expected = f"one of the free numbers ({', '.join(names)})" + ("" if larger else f" or {RADIUS}")
+    expected = f"one of the free numbers ({', '.join(names)})" + (
+        "" if larger else f", {RADIUS} or {SETTLING}"
+    )
     hint = f"{option} {nearest(text, names) or names[0]}"
     raise ApcError(Mistake("E996", Place(option), what, expected, hint=hint))
 

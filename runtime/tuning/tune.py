@@ -149,6 +149,7 @@ class Tuning(Result):
     criterion: str
     decay: float
     felt: tuple[Felt, ...]
+    frame_s: float
     allowed: float
     proofs: tuple[Proved, ...]
     binding: tuple[Binding, ...]
@@ -212,7 +213,7 @@ class _Work:
     @property
     def _unproved(self) -> bool:
         """Whether nothing proves what is asked, beside that it is stable."""
-        decays = self.limits.by_growth and self.demands.decay < 1
+        decays = self.limits.by_growth and (self.demands.decay < 1 or self.demands.aim.gain is None)
         boxed = self.demands.criterion == PASSIVE and self.demands.box
         felt = self.demands.felt and (self.demands.box or self.demands.delay)
         return decays or bool(boxed or felt)
@@ -460,6 +461,7 @@ class _Work:
             criterion=demands.criterion,
             decay=demands.decay,
             felt=demands.felt,
+            frame_s=float(self.limits.prepared.schedules[0].frame_s),
             allowed=self.limits.allowed,
             proofs=tuple(proofs),
             binding=tuple(self._binding(found, met=met)),

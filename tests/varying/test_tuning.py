@@ -95,6 +95,17 @@ def test_a_front_is_the_best_of_a_gain_for_each_bound_on_what_is_felt() -> None:
         front(model, demands, read_against("feel.error at 1 Hz"))  # which is least where it is stiffest
 
 
+def test_motions_die_out_no_faster_with_any_gains_of_a_grid() -> None:
+    free = {K: (10.0, 5000.0), B: (0.0, 50.0)}
+    found = apc.tune(compiled(AVERAGE), free, minimize="settling_time")
+    assert found.proved and found.value == apc.tune(compiled(AVERAGE), free, minimize="spectral_radius").value
+    stiffness, damping = np.meshgrid(np.linspace(10, 5000, 200), np.linspace(0, 50, 100))
+    radii = apc.analyze_many(compiled(AVERAGE), {K: stiffness, B: damping}).spectral_radius
+    assert found.best < radii.min() < found.best * 1.01  # a grid that is this coarse
+    typed = {one.parameter: float(one.value) for one in found.gains}
+    assert apc.analyze(compiled(AVERAGE), set=typed).spectral_radius < found.value
+
+
 def test_what_is_asked_beside_stability_is_kept_and_what_time_leaves_open_is_said() -> None:
     model = compiled(AVERAGE)
     found = apc.tune(model, RANGE, maximize=K, subject=["decay=60 dB in 2 s"], over={MASS: "±20%"})
