@@ -46,7 +46,7 @@ CIRCLE = np.exp(1j * np.linspace(0, 2 * np.pi, 241))
 # How far below each other the bodies of a peer stand that move along a line, of the distance of two peers.
 STAGGER = 0.3
 # Height of a line of names, in pixels.
-LINE = 13
+LINE, BAR = 13, 48
 # Seconds that a whole motion is played in.
 SECONDS = 10
 INSTANT = """
@@ -55,13 +55,14 @@ return time.length ? time[Math.min(Math.round(tick), time.length - 1)].toFixed(3
 """
 # Changed in place: what is shown at an instant is this tab's, and not sent anywhere.
 SHOWING = """
-const {time, x, y} = frames.data // x and y by time, then by body, one row behind the other
+const {time, x, y, angle} = frames.data // by time, then by body, one row behind the other
 if (time.length) {
   const k = Math.min(Math.round(slider.value), time.length - 1)
   const count = x.length / time.length
   for (let body = 0; body < count; body++) {
     bodies.data.x[body] = x[k * count + body]
     bodies.data.y[body] = y[k * count + body]
+    bodies.data.angle[body] = angle[k * count + body]
   }
   instant.data.x[0] = time[k]
   bodies.change.emit()
@@ -287,8 +288,10 @@ class MotionFigure:
     def __init__(self) -> None:
         self.lines = ColumnDataSource(columns("xs", "ys", "colour", "dash", "name"))
         self.instant = ColumnDataSource({"x": [0.0]})
-        self.frames = ColumnDataSource(columns("time", "x", "y"))
-        self.bodies = ColumnDataSource(columns("x", "y", "width", "height", "name", "above", "colour"))
+        self.frames = ColumnDataSource(columns("time", "x", "y", "angle"))
+        self.bodies = ColumnDataSource(
+            columns("x", "y", "angle", "width", "height", "bar", "name", "above", "colour")
+        )
         self.walls = ColumnDataSource(columns("x", "top", "bottom"))
         self.discs = ColumnDataSource(columns("x", "y", "radius"))
         self.plot = _plot(
@@ -321,6 +324,8 @@ class MotionFigure:
             fill_alpha=0.3,
             line_color="#000000",
         )
+        bar = {"marker": "dash", "size": "bar", "angle": "angle", "line_color": "colour", "line_width": 3}
+        self.stage.scatter("x", "y", source=self.bodies, **bar)  # along the axis of what turns
         self.stage.scatter("x", "y", source=self.bodies, size=9, fill_color="colour", line_color="#000000")
         self.stage.text(
             "x",
@@ -384,10 +389,14 @@ class MotionFigure:
             for one in motion.bodies
         ]
         x, y = np.stack([one.x for one in motion.bodies], axis=1), np.stack(heights, axis=1)
+        still = np.zeros(len(motion.time))
+        angle = np.stack([still if one.angle is None else one.angle for one in motion.bodies], axis=1)
         sizes = [one.size for one in motion.bodies]
         self.bodies.data = {
             "x": x[0],
             "y": y[0],
+            "angle": angle[0],
+            "bar": [0 if one.angle is None else BAR for one in motion.bodies],
             "width": [2 * one for one in sizes],
             "height": [2 * one if planar else 0.5 * (one > 0) for one in sizes],
             "name": labels if planar else [one.name for one in motion.bodies],
@@ -404,7 +413,7 @@ class MotionFigure:
         self.discs.data = {
             name: [one[n] for one in motion.discs] for n, name in enumerate(("x", "y", "radius"))
         }
-        self.frames.data = {"time": motion.time, "x": x, "y": y}
+        self.frames.data = {"time": motion.time, "x": x, "y": y, "angle": angle}
         reach = max(sizes)
         fixed = [at for _, at in motion.walls]
         low, high = min([x.min() - reach, *fixed]), max([x.max() + reach, *fixed])

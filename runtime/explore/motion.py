@@ -33,7 +33,7 @@ MM = 1e3
 class Body:
     """A body of a peer: where it is (rows,) in mm, along its line or in its plane; `size` is half its width.
 
-    `row` counts the peers that are shown.
+    `row` counts the peers that are shown. `angle` (rows,) in rad is that of a body of a plane that turns.
     """
 
     peer: str
@@ -42,6 +42,7 @@ class Body:
     x: Floats
     y: Floats | None
     size: float
+    angle: Floats | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,24 +81,33 @@ def motion_of(system: CompiledSystem, *, struck: bool) -> Motion:
     if struck:
         system, what = strike(system)
         told.append(f"{what} is struck: it starts at {SPEED * MM:g} mm/s.")
-    names = [f"{view.name}.{state}" for view in views for body in view.bodies for state in body.states[:2]]
+    names = [
+        f"{view.name}.{state}"
+        for view in views
+        for body in view.bodies
+        for state in (*body.states[:2], *filter(None, [body.turning]))
+    ]
     if not names:
         raise ApcError(Mistake("E983", Place(system.name), "nothing here has a position that could be shown"))
     duration = system.experiment.duration or WATCHED
     played = simulate(system, duration=duration, signals=names)
     values, time = played.values, played.time
-    apart = np.abs(values - values[0]).max(axis=1) > FAR
+    places = [number for number, one in enumerate(played.signals) if one.unit == "m"]
+    apart = np.abs(values - values[0])[:, places].max(axis=1) > FAR
     if apart.any():
         last = max(int(np.argmax(apart)), 2)
         values, time = values[:last], time[:last]
         told.append(f"Shown until something is {FAR:g} m from where it began.")
     some = np.unique(np.linspace(0, len(time) - 1, min(ROWS, len(time))).astype(int))
-    columns = {one.name: MM * values[some, place] for place, one in enumerate(played.signals)}
+    columns = {one.name: values[some, place] for place, one in enumerate(played.signals)}
     found = []
     for row, view in enumerate(views):
         for body in view.bodies:
-            x, *rest = (columns[f"{view.name}.{state}"] for state in body.states[:2])
-            found.append(Body(view.name, body.name, row, x, rest[0] if rest else None, MM * body.radius))
+            x, *rest = (MM * columns[f"{view.name}.{state}"] for state in body.states[:2])
+            angle = columns.get(f"{view.name}.{body.turning}")
+            found.append(
+                Body(view.name, body.name, row, x, rest[0] if rest else None, MM * body.radius, angle)
+            )
     fixed = [(row, surface) for row, view in enumerate(views) for surface in view.surfaces]
     told.append(f"It {played.summary.verdict}.")
     return Motion(
