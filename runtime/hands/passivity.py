@@ -1,7 +1,7 @@
 """Is a scene stable with every passive hand at every device?
 
 Takes: a `CompiledSystem`.
-Gives: `PassiveHands`, `PassiveMode`, `passive_hands`; `passive_growth`; `circulates`,
+Gives: `PassiveHands`, `PassiveMode`, `passive_hands`; `passive_growth`, `loop_growths`; `circulates`,
 `frequency_of`.
 Guarantees: no grid of frequencies decides anything; a verdict is proved, or it is undecided. Hands may be
 anything that gives back no more energy than it was given, each by itself, or, where devices feel each other
@@ -251,12 +251,24 @@ def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool 
     bounded
         Whether bounds are asked for.
     """
+    each = loop_growths(system, prepared, bounded=bounded)
+    radius, low, high = (max(getattr(one, name) for one in each) for name in ("radius", "low", "high"))
+    return Growth(radius, low, high, exact=True, proved=True)
+
+
+def loop_growths(system: CompiledSystem, prepared: Prepared, *, bounded: bool = True) -> list[Growth]:
+    """Return the same of each closed loop by itself: the largest is that of the scene.
+
+    Parameters
+    ----------
+    system, prepared, bounded
+        As for `passive_growth`.
+    """
     of_scene, system = system, without_hands(system, OPTION)
     prepared = prepared if system is of_scene else prepare(system)
     if along := _directions(system, prepared):
-        each = [passive_growth(one, prepare(one), bounded=bounded) for one in along.values()]
-        radius, low, high = (max(getattr(one, name) for one in each) for name in ("radius", "low", "high"))
-        return Growth(radius, low, high, exact=True, proved=True)
+        parts = (loop_growths(one, prepare(one), bounded=bounded) for one in along.values())
+        return [one for part in parts for one in part]
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         loops = port_loops(system, prepared, option=OPTION)
         found, scale = [(-np.inf, -np.inf, -np.inf)], 1.0
@@ -266,15 +278,20 @@ def passive_growth(system: CompiledSystem, prepared: Prepared, *, bounded: bool 
                 for loop in loops
             ]
             scale = max(float(one) for loop in loops for one in loop.dampings) or 1.0
-    spare, least, most = (min(one[place] for one in found) for place in range(3))
+    worst = min(found)
     if (
         bounded
-        and np.isneginf(spare)
-        and not np.isneginf(most)
+        and np.isneginf(worst[0])
+        and not np.isneginf(min(most for *_, most in found))
         and analyze(clamped(system, option=OPTION)).stable is False
     ):
-        most = -np.inf  # floats alone said so
-    needed = [scale - one for one in (spare, least, most)]
+        found.append((-np.inf, -np.inf, -np.inf))  # floats alone said so
+    return [_growth(scale, *one) for one in found]
+
+
+def _growth(scale: float, *spare: float) -> Growth:
+    """Return e^{2 (n − b)/(n + b)}, b the largest damping and b − n what is spare, at least, at most."""
+    needed = [scale - one for one in spare]
     logs = [np.sign(one) if np.isinf(one) else (one - scale) / (abs(one) + scale) for one in needed]
     radius, high, low = (float(np.exp(2 * one)) for one in logs)
     return Growth(radius, low, high, exact=True, proved=True)

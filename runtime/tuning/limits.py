@@ -217,8 +217,9 @@ class Limits:
             family = self.family(one.setting)
             inwards = along * np.where(point > [float(own.low + own.high) / 2 for own in ranges], -1, 1)
             if isinstance(family, GrowthEvaluator):
-                (roots,) = family.matrices(np.vstack([point, point + STEP * inwards]))
-                parts.append((*_differences(_sizes(roots)[:, None] - self.allowed, inwards), place))
+                moved = np.vstack([point, point + STEP * inwards]).tolist()
+                roots = np.array([family.parts(one) for one in moved])
+                parts.append((*_differences(np.log(np.maximum(roots, TINY)) - self.allowed, inwards), place))
             else:
                 for pair in family.slopes(np.tile(point, (len(along), 1)), along):
                     values, slopes, found = _largest(*pair)

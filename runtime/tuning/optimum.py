@@ -25,8 +25,9 @@ from apc.tuning.limits import Limits, Rows, Scenario
 
 Floats = NDArray[np.float64]
 
-# Points looked at to begin with, of matrices and of one number that takes milliseconds.
-POINTS, SLOW_POINTS = 2048, 96
+# Points looked at to begin with: of matrices, of one number that takes milliseconds, and of what is felt.
+# For each end of a range there are so much fewer.
+POINTS, SLOW_POINTS, FELT_POINTS, FACES = 2048, 256, 96, 8
 
 # Of these so many at a time are looked at in all scenarios, and so often.
 LOOK, SLOW_LOOK, LOOKS = 64, 8, 4
@@ -36,6 +37,10 @@ LEAST = 1e-9
 
 # How nearly a descent is followed to its end where a point takes milliseconds, as a share of the range.
 ROUGH = 1e-9
+
+# How far a descent goes at most before limits are linear again, shorter each time that it leads to nothing,
+# as far beyond them limits say nothing of where they are; and how far at last.
+SHORTER, NEAREST = 0.25, 1e-3
 
 # More than any aim is worth.
 HUGE = 1e3
@@ -148,13 +153,17 @@ class Search:
 
     @cached_property
     def _even(self) -> Floats:
-        """Points (k, m) spread evenly over the ranges, every other one by ratios."""
-        even = _even(SLOW_POINTS if self.limits.slow else POINTS, len(self._low))
+        """Points (k, m) spread evenly over the ranges, every other one by ratios, and over their ends."""
+        count = FELT_POINTS if self.limits.demands.felt else SLOW_POINTS if self.limits.slow else POINTS
+        even = _even(count, len(self._low))
         top = self._low + self._width
         near = np.where(self._low > 0, self._low, SMALLEST * self._width)
         ratios = np.where(top > near, near * (np.maximum(top, near) / near) ** even[::2], top)
         even[::2] = np.clip((ratios - self._low) / self._width, 0.0, 1.0)
-        return even
+        ends = [even[: len(even) // FACES].copy() for _ in range(2 * len(top))]
+        for place, points in enumerate(ends):
+            points[:, place // 2] = place % 2
+        return np.vstack([even, *ends])
 
     def best(self, starts: Sequence[Floats]) -> Optimum:
         """Return the best that descents from starts (shares of the ranges) find."""
@@ -206,19 +215,28 @@ class Search:
             slopes = -rows_of(z[:size]).slopes
             return np.column_stack([slopes, np.ones(len(slopes))]) if spare else slopes
 
-        ended = optimize.minimize(
-            lambda z: float(aim @ z),
-            here,
-            jac=lambda z: aim,
-            method="SLSQP",
-            bounds=[(0.0, 1.0)] * size + [(None, None)] * spare,
-            constraints=[{"type": "ineq", "fun": left, "jac": moves}],
-            options={"ftol": ROUGH if self.limits.slow else 1e-14, "maxiter": self.steps},
-        )
-        rough = np.clip(np.nan_to_num(ended.x[:size], nan=0.5), 0.0, 1.0)
-        rough = np.where(np.abs(rough - np.round(rough)) < OPEN, np.round(rough), rough)
-        begun, found = self._optimum(start, rows_of, 0.0), self._polished(rough, rows_of)
-        return begun if self._rank(begun) < self._rank(found) else found
+        best, reach = self._optimum(start, rows_of, 0.0), 1.0
+        while reach > NEAREST:
+            near = np.clip([here[:size] - reach, here[:size] + reach], 0.0, 1.0).T.tolist()
+            ended = optimize.minimize(
+                lambda z: float(aim @ z),
+                here,
+                jac=lambda z: aim,
+                method="SLSQP",
+                bounds=[*near, *[(None, None)] * spare],
+                constraints=[{"type": "ineq", "fun": left, "jac": moves}],
+                options={"ftol": ROUGH if self.limits.slow else 1e-14, "maxiter": self.steps},
+            )
+            rough = np.clip(np.nan_to_num(ended.x[:size], nan=0.5), 0.0, 1.0)
+            rough = np.where(np.abs(rough - np.round(rough)) < OPEN, np.round(rough), rough)
+            found = self._polished(rough, rows_of)
+            better = self._rank(found) < self._rank(best)
+            if better:
+                best, here = found, np.append(rough, ended.x[size:])
+            if better and ended.success and reach == 1:
+                break
+            reach *= 1.0 if better and reach < 1 else SHORTER
+        return best
 
     def _remembered(self) -> Callable[[Floats], Rows]:
         """Return what gives the limits at shares (m,), once each."""

@@ -25,7 +25,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.ages import aged
 from apc.frame.names import Free, parameter_of, unit_of
 from apc.frame.overrides import Override, apply
-from apc.hands.passivity import passive_growth
+from apc.hands.passivity import loop_growths, passive_growth
 from apc.moments.network import Growth, growth
 from apc.network.nominal import channel_numbers, unreliable
 from apc.vary.crossing import OneStretch, Stretch, Verdict
@@ -173,6 +173,14 @@ class GrowthEvaluator:
         return growth_at(
             *(self.system, self.prepared, overrides, self.place), bounded=bounded, criterion=self.criterion
         )
+
+    def parts(self, value: Sequence[float]) -> list[float]:
+        """Return the roots at a point (m,), of which the largest counts: one of each loop of hands."""
+        if self.criterion != PASSIVE:
+            return [math.sqrt(self.growth(value).radius)]
+        changes = [Override(*one) for one in zip(self.free, map(Fraction, value), strict=True)]
+        found = loop_growths(apply(self.system, changes), self.prepared, bounded=False)
+        return [math.sqrt(one.radius) for one in found]
 
     def matrices(self, values: Floats) -> tuple[Floats, ...]:
         """Return the root (k, 1, 1) at values (k, m)."""
