@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared
 from apc.analysis.box_proof import TOGETHER, open_questions
@@ -66,32 +67,36 @@ def none_better(
         return None
     questions = [question for one in opened for question in one.questions]
     cells: list[Cell] = [tuple(spans)]
-    size = sum(len(question.loop.system.layout.names) ** 2 for question in questions)
-    looked = 0
+    looked = entries = 0
     while cells:
-        if not size or looked * size > ENTRIES or time.monotonic() > until:
+        if not questions or entries > ENTRIES or time.monotonic() > until:
             return None
         some, cells = cells[:TOGETHER], cells[TOGETHER:]
         looked += len(some)
-        for cell, (unstable, widest) in zip(some, _looked(questions, some), strict=True):
-            low, high = cell[widest]
-            halves = () if unstable else ((low, (low + high) / 2), ((low + high) / 2, high))
-            cells += [(*cell[:widest], half, *cell[widest + 1 :]) for half in halves]
+        unstable, widest, size = _looked(questions, some)
+        entries += size
+        for cell, place in ((some[one], int(widest[one])) for one in np.flatnonzero(~unstable)):
+            low, high = cell[place]
+            halves = ((low, (low + high) / 2), ((low + high) / 2, high))
+            cells += [(*cell[:place], half, *cell[place + 1 :]) for half in halves]
     return looked
 
 
-def _looked(questions: Sequence[OpenSystem], cells: Sequence[Cell]) -> list[tuple[bool, int]]:
-    """Return of each cell whether it is proved unstable, and along which gain its matrices move most."""
-    unstable = np.zeros(len(cells), dtype=np.bool_)
+def _looked(
+    questions: Sequence[OpenSystem], cells: Sequence[Cell]
+) -> tuple[NDArray[np.bool_], NDArray[np.intp], int]:
+    """Return which cells are proved unstable, along which gain each varies most, and entries looked at."""
+    unstable, size = np.zeros(len(cells), dtype=np.bool_), 0
     reach = np.zeros((len(cells), len(cells[0])))
     for question in questions:
         left = np.flatnonzero(~unstable)
         if not len(left):
             break
         matrix = matrices_over(question, [cells[place] for place in left.tolist()])
+        size += matrix[:, 0].size
         reach[left] = np.maximum(reach[left], np.abs(matrix[:, 2:]).sum(axis=(2, 3)))
         outside = np.abs(np.linalg.eigvals(value_of(matrix))).max(axis=1, initial=0.0) > 1
         if outside.any():
             some = matrix[outside]
             unstable[left[outside]] = enclose_moving(value_of(some), some[:, 2:], radius_of(some)).low > 1
-    return list(zip(unstable.tolist(), reach.argmax(axis=1).tolist(), strict=True))
+    return unstable, reach.argmax(axis=1), size
