@@ -106,13 +106,13 @@ def library_folders(source: Source) -> tuple[Path, ...]:
     return tuple(found)
 
 
-def readable_library(folder: Path, text: str, place: Place) -> Path:
+def readable_library(folder: Path, text: str, place: Place, hint: str = "library: ./parts") -> Path:
     """Return a folder of components. Raises ApcError (E214), at a place, for one that can't be read."""
     try:
         files_below(folder, SUFFIX)
     except RefusedError as refused:
-        hint = "library: ./parts" if refused.why == "large" else ""
-        raise fault("E214", place, f"the library folder {brief(text)} {refused.words}", hint=hint) from None
+        what, hint = f"the library folder {brief(text)} {refused.words}", hint * (refused.why == "large")
+        raise fault("E214", place, what, hint=hint) from None
     return folder
 
 

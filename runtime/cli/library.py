@@ -44,8 +44,10 @@ def library_command(
     from apc.compiler.scene.scene import readable_library
     from apc.compiler.view import catalogue
 
-    place = Place("--folder")
-    library = Library(() if folder is None else (readable_library(folder, str(folder), place),))
+    own = () if folder is None else (folder,)
+    library = Library(
+        tuple(readable_library(one, str(one), Place("--folder"), "--folder parts") for one in own)
+    )
     if name is None:
         document, lines = catalogue.library_document(library), catalogue.library_lines(library)
         tell(json_text(document) if as_json else "\n".join(lines))

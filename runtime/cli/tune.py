@@ -63,7 +63,10 @@ def tune_command(
     time: str = option("End after this long, with the best found and what is not proved of it.", '"TIME"'),
     settings: tuple[str, ...],
     write: Path | None = option("Write the topology with these gains in it, comments and all (.yaml)."),
-    plot: Path | None = picture_option("With --against, draw the front: .png, .svg or .pdf."),
+    plot: Path | None = picture_option(
+        "Draw two gains, now and then, over the stable regions of what limits them, or with --against the "
+        "front: .png, .svg or .pdf."
+    ),
     as_json: bool,
 ) -> None:
     """Find the gains that do best, and prove that they do.
@@ -84,6 +87,7 @@ def tune_command(
     from apc.frame.devices import FREE
     from apc.inputs import open_scene
     from apc.present.pictures import write_picture
+    from apc.present.tune import refuse_picture
     from apc.tuning.demands import held_as_studied, read_against, read_demands, read_seconds
     from apc.tuning.front import front
     from apc.tuning.tune import tune
@@ -94,8 +98,8 @@ def tune_command(
         raise ApcError(
             Mistake("E996", Place("--write"), what, ".yaml at its end", got, f"{write.stem}-tuned.yaml")
         )
-    if (plot is not None or write is not None) and bool(against) != (plot is not None):
-        raise click.UsageError("--plot is of --against, and --write of one design")
+    if write is not None and against:
+        raise click.UsageError("--write is of one design, and --against finds several")
     system = open_scene(file, settings, {"--write": write, "--plot": plot}, hands=hands, told=note_aside)
     criterion = criterion_with(hands, None)
     if hands == FREE:
@@ -116,11 +120,15 @@ def tune_command(
             write_picture(weighed.plot, plot)
         print_result(weighed, as_json=as_json, written=[plot])
         return
+    if plot is not None:
+        refuse_picture(demands.free)
     with status_line() as told:
         found = tune(system, demands, seconds=read_seconds(time), told=told)
     if write is not None and found.met:
         _write(system, found, settings, write)
-    print_result(found, as_json=as_json, written=[write if found.met else None])
+    if plot is not None:
+        write_picture(found.plot, plot)
+    print_result(found, as_json=as_json, written=[write if found.met else None, plot])
 
 
 def _write(system: CompiledSystem, found: Tuning, settings: Sequence[str], path: Path) -> None:

@@ -1,7 +1,7 @@
 """Pictures of stable regions as papers print them: curves, the stable side hatched, panels side by side.
 
 Takes: a `Region`, or `Panels` of them.
-Gives: `region_picture`, `panels_picture`; `panel_letter`; `drawn_points`, `stable_outlines`.
+Gives: `region_picture`, `panels_picture`, `draw_panel`; `panel_letter`; `drawn_points`, `stable_outlines`.
 Guarantees: curves can be told apart without colour; the stable side is hatched, and the title says so; the
 legend stands below the axes, over nothing.
 Does not: compute, or need a display.
@@ -58,7 +58,7 @@ def region_picture(found: Region, ax: Any = None) -> Any:
     """
     if ax is None:
         ax = new_figure((PANEL + 0.6, PANEL)).subplots()
-    _draw_panel(ax, "", (found,), (1,))
+    draw_panel(ax, "", (found,), (1,))
     return ax
 
 
@@ -78,7 +78,7 @@ def panels_picture(found: Panels) -> Any:
     for place, (ax, panel) in enumerate(zip(axes, found.panels, strict=False)):
         letter = f"({panel_letter(place)}) " if count > 1 else ""
         title = f"{letter}{_unbroken(panel.title)}".strip()
-        _draw_panel(ax, title, panel.regions, panel.gains, panel)
+        draw_panel(ax, title, panel.regions, panel.gains, panel)
         if found.normalized:
             ax.set_ylabel(f"effective gain of\n{ax.get_ylabel()}")
         ax.label_outer(remove_inner_ticks=False)
@@ -97,7 +97,7 @@ def _unbroken(settings: str) -> str:
     return ", ".join(parts)
 
 
-def _draw_panel(
+def draw_panel(
     ax: Any, title: str, regions: Sequence[Region], gains: Sequence[int], panel: Panel | None = None
 ) -> None:
     """Draw regions and overlays; below the title stands what stable means, and what curves do not say."""

@@ -9,17 +9,24 @@ Does not: compute.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted, enumerated, in_hertz, measured, with_unit, wrapped
 from apc.present.analysis import range_document, range_text
 from apc.present.forms import MEANT, labelled, notes, quantity, record, table
 from apc.present.pictures import COLOURS, new_figure
+from apc.present.region_picture import draw_panel
+from apc.regions.region import region
 from apc.tuning.bound import SHARE
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from apc.frame.names import Range
     from apc.tuning.front import Front
     from apc.tuning.tune import Binding, Tuning
 
@@ -123,8 +130,12 @@ def _proof_lines(found: Tuning) -> list[str]:
     return lines
 
 
+def _where(one: Binding) -> str:
+    return ", ".join(f"{label} {quantity(value, unit)}" for label, value, unit in one.where)
+
+
 def _binding_lines(found: Tuning, one: Binding) -> list[str]:
-    where = ", ".join(f"{label} {quantity(value, unit)}" for label, value, unit in one.where)
+    where = _where(one)
     mode = f"{one.shape} mode at {in_hertz(one.frequency_hz)}" if one.shape else ""
     other = "" if where else "what is felt" if found.felt else "stability"
     lines = wrapped(": ".join(filter(None, [where, mode])) or other, "    ", "      ")
@@ -132,6 +143,33 @@ def _binding_lines(found: Tuning, one: Binding) -> list[str]:
         buys = quantity(better, found.unit, BUYS)
         lines += wrapped(f"1 % less of {label} = {quantity(value, unit)} buys {buys}", "      ", "        ")
     return lines
+
+
+def refuse_picture(gains: Sequence[Range]) -> None:
+    """Refuse a picture of other than two gains: ApcError E996."""
+    if len(gains) != 2:
+        got = ", ".join(one.free.label for one in gains)
+        raise ApcError(Mistake("E996", Place("--plot"), "a picture", "two gains that are free", got))
+
+
+def tuning_picture(found: Tuning, ax: Any = None) -> Any:
+    """Draw two gains now and then, over the stable regions of the scenes that limit them; return the Axes."""
+    refuse_picture(found.ranges)
+    regions, ranges = [], (found.ranges[0], found.ranges[1])
+    for one, scene in zip(found.binding, found.scenes, strict=True):
+        name = _where(one) or found.topology
+        if name not in [known.topology for known in regions]:
+            regions.append(replace(region(scene, ranges, criterion=found.criterion), topology=name))
+    if ax is None:
+        ax = new_figure((5.2, 4.4)).subplots()
+    more = "; what is asked beside stability is not drawn" if found.felt or found.decay < 1 else ""
+    draw_panel(ax, f"{found.topology}{more}", regions, (1,) * len(regions))
+    (now, best) = np.array([(one.now, float(one.value)) for one in found.gains]).T
+    ax.annotate("", best, now, arrowprops={"arrowstyle": "->", "color": "0.3"})
+    ax.plot(*now, "o", color="0.3", label="now")
+    ax.plot(*best, "*", color="black", markersize=11, label="found")
+    ax.figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
+    return ax
 
 
 def front_text(found: Front) -> str:

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Decimal
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +88,7 @@ DROPPING = 6
 
 @dataclass(frozen=True, slots=True)
 class Gain:
-    """A free number: its `value` as it is typed, exact, and what was best before rounding, both in SI."""
+    """A free number: its `value` as it is typed, exact, what was best before rounding, what it is `now`."""
 
     parameter: str
     unit: str
@@ -95,6 +96,7 @@ class Gain:
     high: float
     value: Fraction
     best: float
+    now: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +130,9 @@ class Tuning(Result):
     `error`; both are a spectral radius where that is the aim. `met` says whether any gains meet all demands
     in floats; `proved` whether all was proved of these. `worst` is how much faster than allowed the fastest
     motion grows in a frame, ln |λ| less the `allowed`, below 0 if it is slower. `decay` is a factor a second.
-    `looked` points were looked at. `bounded` is in how many cells it is proved that no gains of these ranges
-    do better by `bound.SHARE`, None where it is not.
+    `scenes` are those in which something binds, in the order of `binding`. `looked` points were looked at.
+    `bounded` is in how many cells it is proved that no gains of these ranges do better by `bound.SHARE`, None
+    where it is not.
     """
 
     shown_by = "tune:tuning"
@@ -157,7 +160,18 @@ class Tuning(Result):
     bounded: int | None
     notes: tuple[str, ...]
     left_out: tuple[str, ...]
-    system: CompiledSystem = field(compare=False, repr=False)
+    ranges: tuple[Range, ...] = field(compare=False, repr=False)
+    scenes: tuple[CompiledSystem, ...] = field(compare=False, repr=False)
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw two gains now and then, over the stable regions of what limits them; return the Axes.
+
+        Raises
+        ------
+        ApcError
+            E875 matplotlib is not installed; E996 not two gains are free; those of `regions.region`.
+        """
+        return self._shown("picture", ax)
 
 
 @part("tune")
@@ -207,6 +221,7 @@ class _Work:
     def __post_init__(self) -> None:
         self.limits = Limits(self.system, prepare(self.system), self.demands)
         self.every = self.limits.every()
+        self.present = np.array([float(value_now(self.system, one.free)) for one in self.demands.free])
         first = len(self.every) // len(self.limits.settings)
         self.scenarios = list(dict.fromkeys((self.every[0], self.every[-first])))
 
@@ -224,15 +239,14 @@ class _Work:
 
     def done(self) -> Tuning:
         aim = self.demands.aim
-        present = np.array([float(value_now(self.system, one.free)) for one in self.demands.free])
         starts: list[Floats] = []
         while True:
-            found = self._borne(aim.gain, starts, present)
+            found = self._borne(aim.gain, starts)
             if aim.gain is not None and found.worst > BINDS:  # perhaps they only were not found
-                least = self._borne(None, [], present)
+                least = self._borne(None, [])
                 if least.worst > 0:
                     return self._unmet(least)
-                found = self._borne(aim.gain, [self._shares(least)], present)
+                found = self._borne(aim.gain, [self._shares(least)])
             if aim.gain is None and self.demands.decay < 1 and found.worst > BINDS:
                 return self._unmet(found)
             gains, proofs, failed = self._settled(found)
@@ -244,7 +258,7 @@ class _Work:
     def _shares(self, found: Optimum) -> Floats:
         return Search(self.limits, self.scenarios, None).shares(found)
 
-    def _borne(self, column: int | None, starts: list[Floats], present: Floats) -> Optimum:
+    def _borne(self, column: int | None, starts: list[Floats]) -> Optimum:
         """Return the best of all scenarios, those added that limit it more than those there are."""
         sign = 1.0 if self.demands.aim.larger else -1.0
         begun: list[Floats] = []
@@ -252,7 +266,7 @@ class _Work:
             self.told(f"looking for gains in {len(self.scenarios)} of {len(self.every)} scenarios")
             search = Search(self.limits, self.scenarios, column, sign)
             if not starts:
-                starts = begun = search.start(present, self.every)
+                starts = begun = search.start(self.present, self.every)
             found = search.best(starts)
             self.looked += found.looked
             bound = found.rows.scenario[found.multipliers > 0]
@@ -264,7 +278,7 @@ class _Work:
                 if not self.late:
                     continue
                 return search.at(begun[0]) if begun else found
-            ahead = search.start(present, self.every, than=found)
+            ahead = search.start(self.present, self.every, than=found)
             if self.late or not ahead:
                 return found
             starts += ahead
@@ -454,8 +468,18 @@ class _Work:
             error=error,
             worst=worst,
             gains=tuple(
-                Gain(one.free.label, one.unit, float(one.low), float(one.high), typed, float(before))
-                for one, typed, before in zip(demands.free, gains, found.gains, strict=True)
+                Gain(
+                    one.free.label,
+                    one.unit,
+                    float(one.low),
+                    float(one.high),
+                    typed,
+                    float(before),
+                    float(now),
+                )
+                for one, typed, before, now in zip(
+                    demands.free, gains, found.gains, self.present, strict=True
+                )
             ),
             over=demands.over,
             criterion=demands.criterion,
@@ -476,7 +500,11 @@ class _Work:
                     varied=[one.free for one in demands.over],
                 ),
             ),
-            system=self.system,
+            ranges=demands.free,
+            scenes=tuple(
+                self._scene(found.scenarios[found.rows.scenario[place]])
+                for place in np.flatnonzero(found.multipliers > 0)
+            ),
         )
 
     def _bounded(self, found: Optimum, gains: Sequence[Fraction]) -> int | None:

@@ -376,7 +376,7 @@ WRITING = {
 }
 # A folder, which has a test of its own; read and not written; a picture whose command takes half a minute.
 OTHERS = {("play", "--out"), ("play", "--device"), ("play", "--secret-file"), ("bench", "--hard"),
-          ("report", "--check"), ("tune", "--plot")}  # fmt: skip
+          ("report", "--check"), ("tune", "--plot"), ("library", "--folder")}  # fmt: skip
 
 
 def test_every_option_that_names_a_file_to_write_is_known_here() -> None:
