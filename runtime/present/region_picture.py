@@ -23,10 +23,11 @@ from apc.optional import need
 from apc.present.forms import MEANT
 from apc.present.pictures import COLOURS, LINES, new_figure
 from apc.regions.curves import between
+from apc.regions.panels import Panel
 
 if TYPE_CHECKING:
     from apc.frame.names import Range
-    from apc.regions.panels import Panel, Panels
+    from apc.regions.panels import Panels
     from apc.regions.region import Region
 
 Floats = NDArray[np.float64]
@@ -58,7 +59,7 @@ def region_picture(found: Region, ax: Any = None) -> Any:
     """
     if ax is None:
         ax = new_figure((PANEL + 0.6, PANEL)).subplots()
-    draw_panel(ax, "", (found,), (1,))
+    draw_panel(ax, "", Panel("", (found,), (1,), ()))
     return ax
 
 
@@ -78,7 +79,7 @@ def panels_picture(found: Panels) -> Any:
     for place, (ax, panel) in enumerate(zip(axes, found.panels, strict=False)):
         letter = f"({panel_letter(place)}) " if count > 1 else ""
         title = f"{letter}{_unbroken(panel.title)}".strip()
-        draw_panel(ax, title, panel.regions, panel.gains, panel)
+        draw_panel(ax, title, panel)
         if found.normalized:
             ax.set_ylabel(f"effective gain of\n{ax.get_ylabel()}")
         ax.label_outer(remove_inner_ticks=False)
@@ -97,10 +98,9 @@ def _unbroken(settings: str) -> str:
     return ", ".join(parts)
 
 
-def draw_panel(
-    ax: Any, title: str, regions: Sequence[Region], gains: Sequence[int], panel: Panel | None = None
-) -> None:
+def draw_panel(ax: Any, title: str, panel: Panel) -> None:
     """Draw regions and overlays; below the title stands what stable means, and what curves do not say."""
+    regions, gains = panel.regions, panel.gains
     x, y = regions[0].x, regions[0].y
     ax.set(xlim=(float(x.low), float(x.high)), ylim=(float(y.low) * gains[0], float(y.high) * gains[0]))
     ax.set(xlabel=_label(x), ylabel=_label(y))
@@ -119,8 +119,7 @@ def draw_panel(
         same = next((other for other, theirs in drawn if _are_one(points, theirs)), None)
         said += [] if same is None else [f"{name}: identical to {same}"]
         drawn.append((name, points))
-    overlays = panel.overlays if panel is not None else ()
-    for place, (label, points) in enumerate(overlays):
+    for place, (label, points) in enumerate(panel.overlays):
         if not len(points):
             said.append(f"{label}: no boundary here")
         line = OVERLAY_LINES[place % len(OVERLAY_LINES)]

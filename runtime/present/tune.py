@@ -20,6 +20,7 @@ from apc.present.analysis import range_document, range_text
 from apc.present.forms import MEANT, labelled, notes, quantity, record, table
 from apc.present.pictures import COLOURS, new_figure
 from apc.present.region_picture import draw_panel
+from apc.regions.panels import Panel
 from apc.regions.region import region
 from apc.tuning.bound import SHARE
 
@@ -163,7 +164,7 @@ def tuning_picture(found: Tuning, ax: Any = None) -> Any:
     if ax is None:
         ax = new_figure((5.2, 4.4)).subplots()
     more = "; what is asked beside stability is not drawn" if found.felt or found.decay < 1 else ""
-    draw_panel(ax, f"{found.topology}{more}", regions, (1,) * len(regions))
+    draw_panel(ax, f"{found.topology}{more}", Panel("", tuple(regions), (1,) * len(regions), ()))
     (now, best) = np.array([(one.now, float(one.value)) for one in found.gains]).T
     ax.annotate("", best, now, arrowprops={"arrowstyle": "->", "color": "0.3"})
     ax.plot(*now, "o", color="0.3", label="now")
