@@ -12,6 +12,8 @@ by itself. Smith's discs about the roots of a polynomial beside it enclose its r
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -73,6 +75,26 @@ class Proof:
     radii: Floats
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Discs:
+    """Discs about `centres` (n,) with `radii` (n,) that hold n roots: k that hang together hold k of them.
+
+    `least` and `most` (n,) are how much larger than 1 a point of each is at least and at most.
+    """
+
+    centres: Complexes
+    radii: Floats
+    least: Floats
+    most: Floats
+
+    @property
+    def inside(self) -> bool | None:
+        """Say whether all roots are inside the unit circle, None if that is open."""
+        if (self.most < 0).all():
+            return True
+        return False if discs(self.centres, self.centres, self.radii, self.least).low > 0 else None
+
+
 def prove(system: ClosedSystem, free: RigidModes) -> Proof:
     """Prove a closed system stable or unstable, in rising precision.
 
@@ -92,13 +114,13 @@ def prove(system: ClosedSystem, free: RigidModes) -> Proof:
             if not searched and any(map(_may_vanish_at_one, polynomials)):
                 free, searched = find_rigid_modes(system), True
                 polynomials = _polynomials(matrix, free)
-            found = [(np.empty(0), np.empty(0)), *map(root_discs, polynomials)]
-            standing = _stands_still(matrix, free)
-        centres, radii = map(np.concatenate, zip(*found, strict=True))
-        bounds = discs(centres, centres, radii)
-        inside = None
-        if standing:
-            inside = True if bounds.high < 1 else False if bounds.low > 1 else None
+            found = [root_discs(one) for one in polynomials]
+            verdicts = [one.inside for one in found] if _stands_still(matrix, free) else [None]
+        centres, radii = (
+            np.concatenate([np.empty(0), *(getattr(one, name) for one in found)])
+            for name in ("centres", "radii")
+        )
+        inside = False if False in verdicts else None if None in verdicts else True
         settled = settled or (bits if inside is not None else 0)
         if best is None or inside is not None or bits == PRECISIONS[-1]:
             best = Proof(inside, settled or bits, free, centres, radii)
@@ -124,18 +146,13 @@ def _may_vanish_at_one(polynomial: Any) -> bool:
     return bool(at_one.contains(0)) and float(at_one.rad()) < SETTLED
 
 
-def root_discs(polynomial: Any) -> tuple[Complexes, Floats]:
+def root_discs(polynomial: Any) -> Discs:
     """Enclose the roots of a polynomial whose coefficients are balls in discs.
 
     Parameters
     ----------
     polynomial
         A `flint.arb_poly`, monic, of degree n.
-
-    Returns
-    -------
-    Centres and radii (n,), the rounding of the centres to floats included. All roots are in the discs; k
-    discs that hang together hold k of them.
 
     Notes
     -----
@@ -150,24 +167,29 @@ def root_discs(polynomial: Any) -> tuple[Complexes, Floats]:
     gone = len(polynomial) - len(coefficients)
     *lower, _ = coefficients
     n, tiny = len(lower), flint.arb(2) ** (SPARE - flint.ctx.prec)
-    unknown = np.zeros(n + gone, dtype=np.complex128), np.full(n + gone, np.inf)  # more bits may tell
-    if not all(one.is_finite() for one in lower):
-        return unknown
-    nudges = [math.cos(k) * (one.rad() + tiny * (abs(one.mid()) + tiny)) for k, one in enumerate(lower)]
-    beside = [(one.mid() + by).mid() for one, by in zip(lower, nudges, strict=True)]
-    try:
-        points = [
-            root.mid() for root in flint.acb_poly([*beside, 1]).roots(tol=tiny, maxprec=4 * flint.ctx.prec)
-        ]
-    except ValueError:
-        return unknown
-    exact, radii = flint.acb_poly(coefficients), np.zeros(n + gone)
-    for i, point in enumerate(points):
-        apart = math.prod((point - other for other in points[:i] + points[i + 1 :]), start=flint.acb(1))
-        radius = abs(exact(point) / apart) * n
-        radii[i] = float(radius.upper()) * (1 + 4 * UNIT) if radius.is_finite() else np.inf
-    centres = np.array([*map(complex, points), *[0.0] * gone], dtype=np.complex128)
-    return centres, radii + 2 * UNIT * np.abs(centres)
+    points, radii = [flint.acb(0)] * n, [flint.arb("inf")] * n  # more bits may tell
+    if all(one.is_finite() for one in lower):
+        nudges = [math.cos(k) * (one.rad() + tiny * (abs(one.mid()) + tiny)) for k, one in enumerate(lower)]
+        beside = [(one.mid() + by).mid() for one, by in zip(lower, nudges, strict=True)]
+        with contextlib.suppress(ValueError):
+            roots = flint.acb_poly([*beside, 1]).roots(tol=tiny, maxprec=4 * flint.ctx.prec)
+            points = [root.mid() for root in roots]
+            exact = flint.acb_poly(coefficients)
+            others = (points[:i] + points[i + 1 :] for i in range(n))
+            radii = [
+                abs(exact(point) / math.prod((point - other for other in rest), start=flint.acb(1))) * n
+                for point, rest in zip(points, others, strict=True)
+            ]
+    known = [*zip(points, radii, strict=True), *[(flint.acb(0), flint.arb(0))] * gone]
+    centres = np.array([complex(point) for point, _ in known], dtype=np.complex128)
+    within = [(radius, radius - (abs(point) - 1), radius + (abs(point) - 1)) for point, radius in known]
+    widths, less, most = np.array([*map(_above, itertools.chain(*within))]).reshape(-1, 3).T
+    return Discs(centres, widths + 2 * UNIT * np.abs(centres), -less, most)
+
+
+def _above(value: Any) -> float:
+    """Return a float that is not below a ball."""
+    return float(np.nextafter(float(value.upper()), np.inf)) if value.is_finite() else np.inf
 
 
 def _stands_still(matrix: Balls, free: RigidModes) -> bool:

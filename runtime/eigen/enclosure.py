@@ -218,11 +218,12 @@ def _bounds(matrix: Matrix, error: Floats, pairs: Eigenpairs, large: Truths) -> 
     return discs(pairs.values, values, np.where(known[:, None], radii, np.inf))
 
 
-def discs(values: Complexes, centres: Complexes, radii: Floats) -> Enclosure:
+def discs(values: Complexes, centres: Complexes, radii: Floats, inner: Floats | None = None) -> Enclosure:
     """Return bounds on the spectral radius (…) and how far each estimate (…, n) is from its eigenvalue.
 
     k discs that hang together hold k eigenvalues, nobody knows which in which: each estimate is then off by
-    at most the distance to the far side of any of them.
+    at most the distance to the far side of any of them. `inner` (…, n) is what of each disc is not below the
+    bound that is wanted, without it the least magnitude.
     """
     n = values.shape[-1]
     touching = (
@@ -234,7 +235,7 @@ def discs(values: Complexes, centres: Complexes, radii: Floats) -> Enclosure:
         spread = np.where(touching, label[..., None, :], n).min(axis=-1, initial=n)
     together = label[..., :, None] == label[..., None, :]
     reach = np.abs(values[..., :, None] - centres[..., None, :]) + radii[..., None, :]
-    inner = np.abs(centres) * (1 - 4 * UNIT) - radii
+    inner = np.abs(centres) * (1 - 4 * UNIT) - radii if inner is None else inner
     least = np.where(together, inner[..., None, :], np.inf).min(axis=-1, initial=np.inf)
     return Enclosure(
         low=np.maximum(least.max(axis=-1, initial=0.0), 0.0),

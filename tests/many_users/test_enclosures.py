@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.balls import precision
 from apc.eigen.certify import root_discs
-from apc.eigen.enclosure import discs, enclose_eigenvalues, enclose_stack
+from apc.eigen.enclosure import enclose_eigenvalues, enclose_stack
 from apc.eigen.pseudospectrum import pseudospectral_radius
 
 Floats = NDArray[Any]
@@ -136,13 +136,6 @@ def test_every_matrix_within_the_error_has_its_eigenvalues_within_the_bounds(way
     assert told >= 3
 
 
-def _inside(polynomial: Any) -> bool | None:
-    """Say whether the roots of a polynomial are inside the unit circle by the discs about them."""
-    centres, radii = root_discs(polynomial)
-    found = discs(centres, centres, radii)
-    return True if found.high < 1 else False if found.low > 1 else None
-
-
 def _rational(n: int) -> st.SearchStrategy[list[list[int]]]:
     row = st.lists(st.integers(-64, 64), min_size=n, max_size=n)
     return st.lists(row, min_size=n, max_size=n)
@@ -168,7 +161,7 @@ def test_the_exact_eigenvalues_of_small_rational_matrices_are_within_every_bound
             assert np.abs(roots - value).min() <= bound + 1e-14 * abs(value) + 1e-20, name
     with precision(256):
         scaled = flint.fmpq_poly(polynomial)(flint.fmpq_poly([0, 64]))
-        inside = _inside(flint.arb_poly(scaled / scaled.leading_coefficient()))
+        inside = root_discs(flint.arb_poly(scaled / scaled.leading_coefficient())).inside
         assert inside is None or inside is bool(radius < 1)
         assert inside is not None or np.abs(np.abs(roots) - 1).min() < 1e-12
 
@@ -215,4 +208,6 @@ def test_two_that_hardly_differ_keep_their_common_disc() -> None:
 def test_discs_tell_where_the_roots_are(roots: tuple[complex, ...], inside: bool | None) -> None:
     with precision(256):
         exact = flint.acb_poly.from_roots([flint.acb(root.real, root.imag) for root in map(complex, roots)])
-        assert _inside(flint.arb_poly([coefficient.real for coefficient in exact.coeffs()])) is inside
+        assert (
+            root_discs(flint.arb_poly([coefficient.real for coefficient in exact.coeffs()])).inside is inside
+        )
