@@ -6,28 +6,28 @@ Guarantees: the bounds hold for every matrix within the error, whatever their co
 bounds themselves is charged. LAPACK's results are checked by their residuals, not believed.
 Does not: know where a matrix comes from, or what is rigid (see `spectrum`).
 
-X⁻¹(M + E)X = diag(Λ, T) + G, where X = [X₁ X₂] holds the right vectors of the large eigenvalues Λ, and in
-X₂ a basis of what their left vectors annihilate, on which M acts as T. Every eigenvalue is in one of
-Gershgorin's discs about Λ, or within the pseudospectral radius of T about zero (Feingold and Varga, Block
-diagonally dominant matrices, 1962). Discs that touch hold together as many eigenvalues as there are of them.
+X⁻¹(M + E)X = T + G, where X holds the right vectors and T = diag(Λ). Every eigenvalue is in one of
+Gershgorin's discs of D⁻¹(T + G)D, whatever the positive diagonal D. Discs that touch hold together as many
+eigenvalues as there are of them.
 
-All eigenvalues count as large at first. A queue that runs empty is nearly a Jordan block at zero, whose
-vectors are hardly several: where it leaves the spectral radius uncertain, the eigenvalues that are small are
-taken together as T, and the split between large and small is looked for at the widest gaps.
+A queue that runs empty is nearly a Jordan block at zero, whose vectors are hardly several. Where it leaves
+the spectral radius uncertain, X takes an orthonormal basis of what small eigenvalues span, or all, in the
+place of their vectors; T is Schur's triangular form there, and D makes what is above its diagonal small.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import functools
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.eigenpairs import Eigenpairs, components, eigenpairs, inverses
-from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance, norms, pseudospectral_radius
+from apc.eigen.norms import PRODUCT_ROUNDINGS, balance, norms
 from apc.frame.discretize import UNIT
+from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -35,21 +35,15 @@ Truths = NDArray[np.bool_]
 Matrix = NDArray[Any]  # float64 or complex128
 
 # Eigenvalues smaller than this decide nothing (e-folding in a fifth of a frame) and are often one defective
-# cluster at zero; the first split between large and small is here.
+# cluster at zero, which is taken together.
 SMALL = 1e-2
 
-# A spectral radius less certain than the first, relative to itself or to 1, has the split at `SMALL` tried;
-# less certain than the second, so many other splits.
-SHARP, WIDE, SPLITS = 2e-12, 1e-9, 8
+# How much larger than the largest of a cluster's discs must be those of a scaling that all can have.
+FARTHER = 1.25
 
-# Eigenvalues nearer to one another than this, relatively, are not split from each other.
-CLOSE = 1e-6
-
-# How much larger what drives the block of small ones may become where a disc beside it is scaled.
-GROWN = 1024.0
-
-# What squares hide that leave the range of floats.
-TINY = 1e-150
+# A spectral radius less certain than the first, relative to itself or to 1, has small ones taken together;
+# what is less certain than the second is open.
+SHARP, WIDE = 2e-12, 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +107,7 @@ def enclose_stack(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]
         right = np.take_along_axis(right, order[:, None], axis=2).astype(np.complex128)
         values = np.take_along_axis(values, order, axis=1).astype(np.complex128)
         pairs = Eigenpairs(values, right, inverses(right))
-        bounds = _bounds(matrix, error, pairs, np.ones((k, n), dtype=np.bool_))
+        bounds = _bounds(matrix, error, pairs, pairs.left, values)
         wide = bounds.high - bounds.low
         for row in np.flatnonzero(~(wide <= SHARP * np.maximum(bounds.low, 1.0))).tolist():
             again, closer = _enclose_split(matrix[row : row + 1], error[row : row + 1])
@@ -123,70 +117,72 @@ def enclose_stack(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]
 
 
 def _enclose_split(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]:
-    """Enclose the eigenvalues of one matrix (1, n, n) by as many splits as it needs, all of which hold."""
-    n = matrix.shape[-1]
+    """Enclose the eigenvalues of one matrix (1, n, n) by their vectors, those below a limit together."""
     scale = balance(np.abs(matrix[0]) + error[0])
     units = scale / scale[:, None]
     matrix, error = matrix * units, error * units
     pairs = eigenpairs(matrix)
     pairs = pairs.at(descending(pairs.values)[0])
     sizes = np.abs(pairs.values[0])
-    low, high, errors = 0.0, np.inf, np.full(n, np.inf)
-    for count, large in enumerate(_splits(sizes)):
-        if count > 1 and high - low <= WIDE * max(low, 1.0):
+    low, high, errors = 0.0, np.inf, np.full(len(sizes), np.inf)
+    for limit in (0.0, SMALL, np.inf):
+        if high - low <= SHARP * max(low, 1.0):
             break
-        found = _bounds(matrix, error, pairs, np.arange(n)[None] < large)
+        form, basis, small = load_pool("scipy.linalg").schur(
+            matrix[0], output="complex", sort=functools.partial(_below, limit), check_finite=False
+        )
+        large = len(sizes) - small
+        together = np.hstack([pairs.right[0, :, :large], basis[:, :small]])[None]
+        values = np.concatenate([pairs.values[0, :large], np.diag(form)[:small]])[None]
+        above = np.pad(np.triu(form[:small, :small], 1), [(large, 0)] * 2)
+        found = _bounds(matrix, error, replace(pairs, right=together), inverses(together), values, above)
         low, high = max(low, float(found.low[0])), min(high, float(found.high[0]))
         errors = np.minimum(errors, found.errors[0])
-    # No estimate is farther from its eigenvalue than both are from zero.
     vectors = Eigenpairs(pairs.values, pairs.right * scale[:, None], pairs.left / scale)
+    # No estimate is farther from its eigenvalue than both are from zero.
     return vectors, Enclosure(min(low, high), high, np.minimum(errors, sizes + high))
 
 
-def _splits(sizes: Floats) -> Iterator[int]:
-    """Yield how many eigenvalues of falling magnitudes (n,) to count as large; conjugates stay together."""
-    first = int((sizes >= SMALL).sum())
-    yield len(sizes)
-    yield first
-    ratios = np.append(sizes[1:], 0.0) / np.maximum(sizes, np.finfo(np.float64).tiny)
-    gaps = [int(k) + 1 for k in np.argsort(ratios[:-1], kind="stable") if ratios[k] < 1 - CLOSE]
-    yield from [count for count in gaps if count != first and sizes[count - 1] > SMALL][:SPLITS]
-    yield 0
+def _below(limit: float, value: complex) -> bool:
+    return abs(value) < limit
 
 
-def _bounds(matrix: Matrix, error: Floats, pairs: Eigenpairs, large: Truths) -> Enclosure:
-    """Enclose the eigenvalues of a stack, of each matrix the first so many as large ones (k, n).
+def _bounds(
+    matrix: Matrix,
+    error: Floats,
+    estimate: Eigenpairs,
+    inverse: Matrix,
+    values: Complexes,
+    above: Complexes | None = None,
+) -> Enclosure:
+    """Enclose the eigenvalues of a stack.
+
+    Parameters
+    ----------
+    matrix, error
+        The matrices (k, n, n) and what they are off by.
+    estimate, inverse
+        What the eigenvalues may be, beside X, and about X⁻¹ (k, n, n).
+    values, above
+        The diagonal of T (k, n), and what is above it (n, n), None if nothing is.
 
     Notes
     -----
-    With the block of a large eigenvalue c scaled by 1/α > 1, the discs are those of G_cb α, and of G_bc / α
-    for the others b: the first shrinks to |G_cc| + α Σ_b ‖G_cb‖, and the others grow. As long as these keep
-    clear of it, it holds one eigenvalue (Wilkinson, The Algebraic Eigenvalue Problem, 1965, chapter 2).
+    With the row and column of an eigenvalue c scaled by 1/α > 1, its disc shrinks to |G_cc| + α Σ_b |G_cb|,
+    and those of others b grow by |G_bc| / α. As long as these keep clear of it, it holds one eigenvalue
+    (Wilkinson, The Algebraic Eigenvalue Problem, 1965, chapter 2). For what is above the diagonal D = diag(d)
+    with d = (r − N)⁻¹ 1, r larger than N's eigenvalues: then N d < r d.
     """
     n = matrix.shape[-1]
     charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
     fine = (n + 4) * UNIT if np.isrealobj(matrix) else charge  # a real matrix makes sums of n real products
-    values, small = np.where(large, pairs.values, 0.0), ~large
-    split = bool(small.any())
-    basis, inverse = pairs.right, pairs.left
-    if split:
-        # At right angles to the large ones' right vectors, less what their left vectors see of it.
-        aside = np.linalg.qr(pairs.right)[0]
-        scale = np.einsum("kij,kji->ki", pairs.left, pairs.right)
-        seen = np.where(large[:, :, None], pairs.left / scale[:, :, None], 0.0)
-        basis = np.where(large[:, None], pairs.right, aside - pairs.right @ (seen @ aside))
-        inverse = inverses(basis)
-    elif not np.allclose(np.einsum("kij,kji->ki", inverse, basis), 1.0):
-        inverse = inverses(basis)
-    moved = matrix @ basis
-    # T, in the places of the small ones.
-    block = np.where(small[:, :, None] & small[:, None], inverse @ moved, 0.0) if split else None
-    residual = moved - basis * values[:, None]
+    basis = estimate.right
+    residual = matrix @ basis - basis * values[:, None]
     size, weight = np.abs(basis), np.abs(inverse)
     doubt = (error + fine * np.abs(matrix)) @ size + 4 * UNIT * size * np.abs(values)[:, None]
-    if block is not None:
-        residual = residual - basis @ block
-        doubt += charge * (size @ np.abs(block))
+    if above is not None:
+        residual = residual - basis @ above
+        doubt += charge * (size @ np.abs(above))
     doubt += charge * np.abs(residual)
     over = (np.abs(inverse @ residual) + weight @ doubt) * (1 + charge)  # |G|, but for the inverse
     # The computed inverse Y is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
@@ -194,28 +190,31 @@ def _bounds(matrix: Matrix, error: Floats, pairs: Eigenpairs, large: Truths) -> 
     defect = wrong.max(axis=1)
     over += (wrong / (1 - defect)[:, None])[:, :, None] * over.max(axis=1, keepdims=True)
 
-    first, into = np.einsum("kii->ki", over), over
-    total = np.where(large[:, None], over, 0.0).sum(axis=2)
-    radii, grown, least = total, total, 0.0
-    if block is not None:
-        squares = np.square(over)
-        across = np.sqrt(np.where(small[:, None], squares, 0.0).sum(axis=2)) + TINY
-        driving = np.sqrt(np.where(small[:, :, None], squares, 0.0).sum(axis=1)) + TINY
-        off = np.sqrt(np.where(small, np.square(across), 0.0).sum(axis=1)) + (driving * large).sum(axis=1)
-        total = (total + across) * (1 + charge)
-        nearest = np.abs(np.where(small, pairs.values, 0.0)).max(axis=1)
-        inner, outer = (
-            pseudospectral_radius(block, part * off * (1 + charge), nearest)[:, None] for part in (1.0, GROWN)
-        )
-        radii, grown, least = np.where(large, total, inner), np.where(large, total, outer), 1 / (GROWN - 1)
-        into = np.where(large[:, :, None], over, 0.0)
-    gap = np.abs(values[:, :, None] - values[:, None]) * (1 - 8 * UNIT) - grown[:, :, None] - radii[:, None]
+    if above is not None:
+        over = over + np.abs(above) * (1 + 4 * UNIT)
+        over = over * _scaling(over[0], above)
+    total = over.sum(axis=2) * (1 + charge)
+    gap = np.abs(values[:, :, None] - values[:, None]) * (1 - 8 * UNIT) - total[:, :, None] - total[:, None]
     np.einsum("kii->ki", gap)[:] = np.inf
-    share = np.maximum(np.where(gap > 0, into / gap, np.inf).max(axis=1), least) * (1 + 8 * UNIT)
+    share = np.where(gap > 0, over / gap, np.inf).max(axis=1) * (1 + 8 * UNIT)
+    first = np.einsum("kii->ki", over)
     less = (first + share * (total - first)) * (1 + 8 * UNIT)
-    radii = np.where(large & (share < 1), np.minimum(less, radii), radii) * (1 + charge)
+    radii = np.where(share < 1, np.minimum(less, total), total) * (1 + charge)
     known = (defect < 0.5) & np.isfinite(radii).all(axis=1)
-    return discs(pairs.values, values, np.where(known[:, None], radii, np.inf))
+    return discs(estimate.values, values, np.where(known[:, None], radii, np.inf))
+
+
+def _scaling(over: Floats, above: Complexes) -> Floats:
+    """Return d_j / d_i (n, n) of a D that makes small what stands above the diagonal."""
+    scale = np.ones(len(over))
+    part = np.flatnonzero(above.any(axis=0) | above.any(axis=1))
+    within = over[np.ix_(part, part)]
+    if np.isfinite(within).all() and len(part):
+        most = FARTHER * float(np.abs(np.linalg.eigvals(within)).max())
+        found = inverses(most * np.eye(len(part)) - within).sum(axis=1)
+        if (found > 0).all():
+            scale[part] = found / found.max()
+    return scale / scale[:, None]
 
 
 def discs(values: Complexes, centres: Complexes, radii: Floats, inner: Floats | None = None) -> Enclosure:
