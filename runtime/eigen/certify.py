@@ -1,21 +1,20 @@
 """Proof in ball arithmetic that a closed system is stable, or that it is not.
 
 Takes: a `ClosedSystem` and its rigid modes.
-Gives: `Proof`, `prove`; `schur_cohn`; `MOST_PROVED`.
+Gives: `Proof`, `prove`; `root_discs`; `MOST_PROVED`.
 Guarantees: a verdict True or False is proved: every rounding since the sites' exact numbers is inside a ball.
 What is too near the circle for the last precision is left open, and so is what lies on it.
 Does not: prove what its numbers can't be had exactly for (see `balls.unprovable`); give vectors.
 
 The characteristic polynomial of the relative coordinates comes in balls, that of each strongly connected part
-by itself. Smith's discs enclose its roots; where one reaches over the circle, Schur and Cohn's recursion
-decides without an eigenvalue being known.
+by itself. Smith's discs about the roots of a polynomial beside it enclose its roots.
 """
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +28,7 @@ from apc.eigen.eigenpairs import components
 from apc.eigen.enclosure import discs
 from apc.eigen.relative import independent_places
 from apc.eigen.rigid import RigidModes, find_rigid_modes
-from apc.eigen.roots import approach_roots, root_discs
+from apc.frame.discretize import UNIT
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -52,6 +51,9 @@ SHARP = 2.0**-50
 # A verdict that is proved isn't followed by more than so many times its bits, for a sharper radius.
 SHARPENING = 4
 
+# Bits by which a root is moved from one that it is equal to: the last ones are rounded.
+SPARE = 8
+
 # What the characteristic polynomial at 1 is known to before its vanishing is taken for a drift to look for.
 SETTLED = 2.0**-40
 
@@ -62,17 +64,35 @@ class Proof:
 
     `inside` says whether all eigenvalues but the rigid ones lie inside the unit circle, None if that is left
     open; `bits` with how many bits it was decided, or left open. `free` are the rigid modes, drifts included
-    if there are any. Of the matrix in relative coordinates, `values` (m,) estimate the eigenvalues, and
-    discs about `centres` (m,) with `radii` (m,) hold them: k discs that hang together hold k eigenvalues. The
-    centres of roots that are one within the precision are spread, the estimates are not.
+    if there are any. Discs about `centres` (m,) with `radii` (m,) hold the eigenvalues of the matrix in
+    relative coordinates: k discs that hang together hold k of them.
     """
 
     inside: bool | None
     bits: int
     free: RigidModes
-    values: Complexes
     centres: Complexes
     radii: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Discs:
+    """Discs about `centres` (n,) with `radii` (n,) that hold n roots: k that hang together hold k of them.
+
+    `least` and `most` (n,) are how much larger than 1 a point of each is at least and at most.
+    """
+
+    centres: Complexes
+    radii: Floats
+    least: Floats
+    most: Floats
+
+    @property
+    def inside(self) -> bool | None:
+        """Say whether all roots are inside the unit circle, None if that is open."""
+        if (self.most < 0).all():
+            return True
+        return False if discs(self.centres, self.centres, self.radii, self.least).low > 0 else None
 
 
 def prove(system: ClosedSystem, free: RigidModes) -> Proof:
@@ -91,21 +111,19 @@ def prove(system: ClosedSystem, free: RigidModes) -> Proof:
         with precision(bits):
             matrix = frame_balls(system)
             polynomials = _polynomials(matrix, free)
-            if not searched and any(_may_vanish_at_one(one) for one, _ in polynomials):
+            if not searched and any(map(_may_vanish_at_one, polynomials)):
                 free, searched = find_rigid_modes(system), True
                 polynomials = _polynomials(matrix, free)
-            values, centres, wide = np.concatenate(
-                [np.empty((3, 0)), *itertools.starmap(_root_discs, polynomials)], axis=1
-            )
-            radii = wide.real
-            inside = (
-                _inside([one for one, _ in polynomials], centres, radii)
-                if _stands_still(matrix, free)
-                else None
-            )
+            found = [root_discs(one) for one in polynomials]
+            verdicts = [one.inside for one in found] if _stands_still(matrix, free) else [None]
+        centres, radii = (
+            np.concatenate([np.empty(0), *(getattr(one, name) for one in found)])
+            for name in ("centres", "radii")
+        )
+        inside = False if False in verdicts else None if None in verdicts else True
         settled = settled or (bits if inside is not None else 0)
         if best is None or inside is not None or bits == PRECISIONS[-1]:
-            best = Proof(inside, settled or bits, free, values, centres, radii)
+            best = Proof(inside, settled or bits, free, centres, radii)
         if inside is not None and (_sharp(best) or bits >= SHARPENING * settled):
             break
         if any(doubt for way, doubt in system.doubts.items() if way not in system.surds) and bits >= DOUBTFUL:
@@ -114,24 +132,12 @@ def prove(system: ClosedSystem, free: RigidModes) -> Proof:
     return best
 
 
-def _polynomials(matrix: Balls, free: RigidModes) -> list[tuple[Any, Complexes]]:
-    """Return the characteristic polynomials of the parts of the matrix in relative coordinates.
-
-    Each comes with what its roots are in floats.
-    """
+def _polynomials(matrix: Balls, free: RigidModes) -> list[Any]:
+    """Return the characteristic polynomials of the parts of the matrix in relative coordinates."""
     reduced = reduced_balls(matrix, free.exact, independent_places(free.basis.T))
     vanishing = [bool(entry == 0) for entry in reduced.ravel()]  # exactly
     driven = ~np.array(vanishing, dtype=np.bool_).reshape(reduced.shape)
-    blocks = [reduced[np.ix_(part, part)] for part in components(driven)]
-    return [(square(block).charpoly(), _eigenvalues(block)) for block in blocks]
-
-
-def _eigenvalues(block: Balls) -> Complexes:
-    """Return the eigenvalues (n,) of the middles of balls (n, n), in floats."""
-    middles = np.array([float(flint.arb(one).mid()) for one in block.ravel()]).reshape(block.shape)
-    if not np.isfinite(middles).all():
-        return np.zeros(len(block), dtype=np.complex128)
-    return np.linalg.eigvals(middles).astype(np.complex128)
+    return [square(reduced[np.ix_(part, part)]).charpoly() for part in components(driven)]
 
 
 def _may_vanish_at_one(polynomial: Any) -> bool:
@@ -140,37 +146,50 @@ def _may_vanish_at_one(polynomial: Any) -> bool:
     return bool(at_one.contains(0)) and float(at_one.rad()) < SETTLED
 
 
-def _root_discs(polynomial: Any, guesses: Complexes) -> Complexes:
-    """Estimate and enclose the roots of a monic polynomial of degree n, from guesses (n,).
+def root_discs(polynomial: Any) -> Discs:
+    """Enclose the roots of a polynomial whose coefficients are balls in discs.
 
-    Returns
-    -------
-    The estimates, then the centres and the radii of discs (3, n). All roots are in the discs; k discs
-    that hang together hold k of them.
+    Parameters
+    ----------
+    polynomial
+        A `flint.arb_poly`, monic, of degree n.
+
+    Notes
+    -----
+    |z − z_i| ≤ n |p(z_i)| / Π_{j≠i} |z_i − z_j| (Smith, Error bounds for zeros of a polynomial based upon
+    Gerschgorin's theorems, J. ACM 17, 1970), for any n different z_i. They are the roots of a polynomial
+    beside p, each coefficient off by as much as p's is not known, or rounded: what is a multiple root of p
+    is there so many as far from each other as makes the discs small.
     """
     coefficients = polynomial.coeffs()
-    if not all(math.isfinite(float(one.abs_upper())) for one in coefficients):  # more bits may tell
-        nothing = np.zeros(len(coefficients) - 1, dtype=np.complex128)
-        return np.stack([nothing, nothing, nothing + np.inf])
-    bits = flint.ctx.prec
-    roots = approach_roots(polynomial, guesses, bits)
-    centres, radii = root_discs(polynomial, roots, bits)
-    return np.stack([np.array([complex(root) for root in roots], dtype=np.complex128), centres, radii])
+    while len(coefficients) > 1 and coefficients[0] == 0:  # an eigenvalue that is exactly 0
+        coefficients.pop(0)
+    gone = len(polynomial) - len(coefficients)
+    *lower, _ = coefficients
+    n, tiny = len(lower), flint.arb(2) ** (SPARE - flint.ctx.prec)
+    points, radii = [flint.acb(0)] * n, [flint.arb("inf")] * n  # more bits may tell
+    if all(one.is_finite() for one in lower):
+        nudges = [math.cos(k) * (one.rad() + tiny * (abs(one.mid()) + tiny)) for k, one in enumerate(lower)]
+        beside = [(one.mid() + by).mid() for one, by in zip(lower, nudges, strict=True)]
+        with contextlib.suppress(ValueError):
+            roots = flint.acb_poly([*beside, 1]).roots(tol=tiny, maxprec=4 * flint.ctx.prec)
+            points = [root.mid() for root in roots]
+            exact = flint.acb_poly(coefficients)
+            others = (points[:i] + points[i + 1 :] for i in range(n))
+            radii = [
+                abs(exact(point) / math.prod((point - other for other in rest), start=flint.acb(1))) * n
+                for point, rest in zip(points, others, strict=True)
+            ]
+    known = [*zip(points, radii, strict=True), *[(flint.acb(0), flint.arb(0))] * gone]
+    centres = np.array([complex(point) for point, _ in known], dtype=np.complex128)
+    within = [(radius, radius - (abs(point) - 1), radius + (abs(point) - 1)) for point, radius in known]
+    widths, less, most = np.array([*map(_above, itertools.chain(*within))]).reshape(-1, 3).T
+    return Discs(centres, widths + 2 * UNIT * np.abs(centres), -less, most)
 
 
-def _inside(polynomials: Sequence[Any], centres: Complexes, radii: Floats) -> bool | None:
-    """Say whether all eigenvalues of all parts lie inside the unit circle, None if that is open.
-
-    The discs tell, unless one reaches over the circle; then Schur and Cohn, who need more bits where there
-    are many eigenvalues, but come as near to the circle as the balls allow.
-    """
-    found = discs(centres, centres, radii)
-    if found.high < 1:
-        return True
-    if found.low > 1:
-        return False
-    verdicts = [schur_cohn(one.coeffs()) for one in polynomials]
-    return False if False in verdicts else None if None in verdicts else True
+def _above(value: Any) -> float:
+    """Return a float that is not below a ball."""
+    return float(np.nextafter(float(value.upper()), np.inf)) if value.is_finite() else np.inf
 
 
 def _stands_still(matrix: Balls, free: RigidModes) -> bool:
@@ -184,33 +203,6 @@ def _stands_still(matrix: Balls, free: RigidModes) -> bool:
             moved = sum((a * b for a, b in zip(row, exact, strict=True) if not isinstance(b, int) or b), 0)
             if not flint.arb(moved - own).contains(0):
                 return False
-    return True
-
-
-def schur_cohn(coefficients: Sequence[Any]) -> bool | None:
-    """Say whether all roots of a real polynomial lie inside the unit circle, None if the balls don't tell.
-
-    Parameters
-    ----------
-    coefficients
-        a₀ … a_n as balls, a_n ≠ 0.
-
-    Notes
-    -----
-    With p*(z) = zⁿ p(1/z) and k = a₀/a_n, the next polynomial is (p − k p*)/z. While |k| < 1 it has as many
-    roots outside as p (Rouché: |p| = |p*| on the circle). |k| is the product of all roots' magnitudes: one
-    above 1 shows a root outside, and all below 1 leave none, on the circle neither.
-    """
-    a = list(coefficients)
-    while len(a) > 1:
-        k = a[0] / a[-1]
-        size = abs(k)
-        if size > 1:
-            return False
-        if not size < 1:
-            return None
-        a = [one - k * other for one, other in zip(a[1:], a[-2::-1], strict=True)]
-        a = [one / a[-1] for one in a[:-1]] + [flint.arb(1)]
     return True
 
 

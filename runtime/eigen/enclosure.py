@@ -1,24 +1,23 @@
 """Eigenvalues of matrices known up to an error, each with a bound.
 
 Takes: square matrices, and a bound on what each entry may be off by.
-Gives: `Enclosure`, `enclose_stack`, `enclose_eigenvalues`, `discs`; `enclose_moving`; `misses_one`.
+Gives: `Enclosure`, `enclose_stack`, `enclose_eigenvalues`, `discs`; `least_radius`; `misses_one`.
 Guarantees: the bounds hold for every matrix within the error, whatever their conditioning; rounding in the
 bounds themselves is charged. LAPACK's results are checked by their residuals, not believed.
 Does not: know where a matrix comes from, or what is rigid (see `spectrum`).
 
-X⁻¹(M + E)X = diag(Λ, T) + G, where X = [X₁ X₂] holds the right vectors of the large eigenvalues Λ, and in
-X₂ a basis of what their left vectors annihilate, on which M acts as T. Every eigenvalue is in one of
-Gershgorin's discs about Λ, or within the pseudospectral radius of T about zero (Feingold and Varga, Block
-diagonally dominant matrices, 1962). Discs that touch hold together as many eigenvalues as there are of them.
+X⁻¹(M + E)X = T + G, where X holds the right vectors and T = diag(Λ). Every eigenvalue is in one of
+Gershgorin's discs of D⁻¹(T + G)D, whatever the positive diagonal D. Discs that touch hold together as many
+eigenvalues as there are of them.
 
-All eigenvalues count as large at first. A queue that runs empty is nearly a Jordan block at zero, whose
-vectors are hardly several: where it leaves the spectral radius uncertain, the eigenvalues that are small are
-taken together as T, and the split between large and small is looked for at the widest gaps.
+A queue that runs empty is nearly a Jordan block at zero, whose vectors are hardly several. Where it leaves
+the spectral radius uncertain, X takes an orthonormal basis of what small eigenvalues span, or all, in the
+place of their vectors; T is Schur's triangular form there, and D makes what is above its diagonal small.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.eigenpairs import Eigenpairs, components, eigenpairs, inverses
-from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance, norms, pseudospectral_radius
+from apc.eigen.norms import PRODUCT_ROUNDINGS, balance, norms
 from apc.frame.discretize import UNIT
+from apc.threads import load_pool
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -35,24 +35,15 @@ Truths = NDArray[np.bool_]
 Matrix = NDArray[Any]  # float64 or complex128
 
 # Eigenvalues smaller than this decide nothing (e-folding in a fifth of a frame) and are often one defective
-# cluster at zero; the first split between large and small is here.
+# cluster at zero, which is taken together.
 SMALL = 1e-2
 
-# Where what moves matrices matters more than rounding: the split, and what `GROWN` is. Measured: flat about.
-SPLIT, GROWN_MOVING = 0.3, 8.0
+# How much larger than the largest of a cluster's discs must be those of a scaling that all can have.
+FARTHER = 1.25
 
-# A spectral radius less certain than the first, relative to itself or to 1, has the split at `SMALL` tried;
-# less certain than the second, so many other splits.
-SHARP, WIDE, SPLITS = 2e-12, 1e-9, 8
-
-# Eigenvalues nearer to one another than this, relatively, are not split from each other.
-CLOSE = 1e-6
-
-# How much larger what drives the block of small ones may become where a disc beside it is scaled.
-GROWN = 1024.0
-
-# What squares hide that leave the range of floats.
-TINY = 1e-150
+# A spectral radius less certain than the first, relative to itself or to 1, has small ones taken together;
+# what is less certain than the second is open.
+SHARP, WIDE = 2e-12, 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +107,7 @@ def enclose_stack(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]
         right = np.take_along_axis(right, order[:, None], axis=2).astype(np.complex128)
         values = np.take_along_axis(values, order, axis=1).astype(np.complex128)
         pairs = Eigenpairs(values, right, inverses(right))
-        bounds = _bounds(matrix, error, pairs, np.ones((k, n), dtype=np.bool_))
+        bounds = _bounds(matrix, error, pairs, pairs.left, values)
         wide = bounds.high - bounds.low
         for row in np.flatnonzero(~(wide <= SHARP * np.maximum(bounds.low, 1.0))).tolist():
             again, closer = _enclose_split(matrix[row : row + 1], error[row : row + 1])
@@ -125,149 +116,113 @@ def enclose_stack(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]
     return pairs, bounds
 
 
-def enclose_moving(matrix: Floats, slopes: Floats, error: Floats) -> Enclosure:
-    """Enclose the eigenvalues of M + Σ ε_k S_k + E for all |ε_k| ≤ 1, by one split of large from small ones.
-
-    Parameters
-    ----------
-    matrix, slopes, error
-        M (k, n, n), S (k, m, n, n) and a bound on what each entry of E (k, n, n) is.
-    """
-    with np.errstate(all="ignore"):
-        scale = balance(np.abs(matrix).max(axis=0) + np.abs(slopes).max(axis=(0, 1)) + TINY)
-        units = scale / scale[:, None]
-        matrix, slopes, error = matrix * units, slopes * units, error * units
-        pairs = eigenpairs(matrix)
-        order = descending(pairs.values)
-        pairs = Eigenpairs(
-            np.take_along_axis(pairs.values, order, axis=1),
-            np.take_along_axis(pairs.right, order[:, None], axis=2),
-            np.take_along_axis(pairs.left, order[:, :, None], axis=1),
-        )
-        return _bounds(matrix, error, pairs, np.abs(pairs.values) >= SPLIT, slopes)
-
-
 def _enclose_split(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]:
-    """Enclose the eigenvalues of one matrix (1, n, n) by as many splits as it needs, all of which hold."""
-    n = matrix.shape[-1]
+    """Enclose the eigenvalues of one matrix (1, n, n) by their vectors, those below a limit together."""
     scale = balance(np.abs(matrix[0]) + error[0])
     units = scale / scale[:, None]
     matrix, error = matrix * units, error * units
     pairs = eigenpairs(matrix)
     pairs = pairs.at(descending(pairs.values)[0])
     sizes = np.abs(pairs.values[0])
-    low, high, errors = 0.0, np.inf, np.full(n, np.inf)
-    for count, large in enumerate(_splits(sizes)):
-        if count > 1 and high - low <= WIDE * max(low, 1.0):
+    low, high, errors = 0.0, np.inf, np.full(len(sizes), np.inf)
+    for limit in (0.0, SMALL, np.inf):
+        if high - low <= SHARP * max(low, 1.0):
             break
-        found = _bounds(matrix, error, pairs, np.arange(n)[None] < large)
+        form, basis, small = load_pool("scipy.linalg").schur(
+            matrix[0], output="complex", sort=functools.partial(_below, limit), check_finite=False
+        )
+        large = len(sizes) - small
+        together = np.hstack([pairs.right[0, :, :large], basis[:, :small]])[None]
+        values = np.concatenate([pairs.values[0, :large], np.diag(form)[:small]])[None]
+        above = np.pad(np.triu(form[:small, :small], 1), [(large, 0)] * 2)
+        found = _bounds(matrix, error, replace(pairs, right=together), inverses(together), values, above)
         low, high = max(low, float(found.low[0])), min(high, float(found.high[0]))
         errors = np.minimum(errors, found.errors[0])
-    # No estimate is farther from its eigenvalue than both are from zero.
     vectors = Eigenpairs(pairs.values, pairs.right * scale[:, None], pairs.left / scale)
+    # No estimate is farther from its eigenvalue than both are from zero.
     return vectors, Enclosure(min(low, high), high, np.minimum(errors, sizes + high))
 
 
-def _splits(sizes: Floats) -> Iterator[int]:
-    """Yield how many eigenvalues of falling magnitudes (n,) to count as large; conjugates stay together."""
-    first = int((sizes >= SMALL).sum())
-    yield len(sizes)
-    yield first
-    ratios = np.append(sizes[1:], 0.0) / np.maximum(sizes, np.finfo(np.float64).tiny)
-    gaps = [int(k) + 1 for k in np.argsort(ratios[:-1], kind="stable") if ratios[k] < 1 - CLOSE]
-    yield from [count for count in gaps if count != first and sizes[count - 1] > SMALL][:SPLITS]
-    yield 0
+def _below(limit: float, value: complex) -> bool:
+    return abs(value) < limit
 
 
 def _bounds(
-    matrix: Matrix, error: Floats, pairs: Eigenpairs, large: Truths, slopes: Floats | None = None
+    matrix: Matrix,
+    error: Floats,
+    estimate: Eigenpairs,
+    inverse: Matrix,
+    values: Complexes,
+    above: Complexes | None = None,
 ) -> Enclosure:
-    """Enclose the eigenvalues of a stack, of each matrix the first so many as large ones (k, n).
+    """Enclose the eigenvalues of a stack.
 
-    With `slopes` (k, m, n, n), of all that each adds, times a number between −1 and 1.
+    Parameters
+    ----------
+    matrix, error
+        The matrices (k, n, n) and what they are off by.
+    estimate, inverse
+        What the eigenvalues may be, beside X, and about X⁻¹ (k, n, n).
+    values, above
+        The diagonal of T (k, n), and what is above it (n, n), None if nothing is.
 
     Notes
     -----
-    With the block of a large eigenvalue c scaled by 1/α > 1, the discs are those of G_cb α, and of G_bc / α
-    for the others b: the first shrinks to |G_cc| + α Σ_b ‖G_cb‖, and the others grow. As long as these keep
-    clear of it, it holds one eigenvalue (Wilkinson, The Algebraic Eigenvalue Problem, 1965, chapter 2).
+    With the row and column of an eigenvalue c scaled by 1/α > 1, its disc shrinks to |G_cc| + α Σ_b |G_cb|,
+    and those of others b grow by |G_bc| / α. As long as these keep clear of it, it holds one eigenvalue
+    (Wilkinson, The Algebraic Eigenvalue Problem, 1965, chapter 2). For what is above the diagonal D = diag(d)
+    with d = (r − N)⁻¹ 1, r larger than N's eigenvalues: then N d < r d.
     """
     n = matrix.shape[-1]
     charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
     fine = (n + 4) * UNIT if np.isrealobj(matrix) else charge  # a real matrix makes sums of n real products
-    values, small = np.where(large, pairs.values, 0.0), ~large
-    split = bool(small.any())
-    basis, inverse = pairs.right, pairs.left
-    if split:
-        # At right angles to the large ones' right vectors, less what their left vectors see of it.
-        aside = np.linalg.qr(pairs.right)[0]
-        scale = np.einsum("kij,kji->ki", pairs.left, pairs.right)
-        seen = np.where(large[:, :, None], pairs.left / scale[:, :, None], 0.0)
-        basis = np.where(large[:, None], pairs.right, aside - pairs.right @ (seen @ aside))
-        inverse = inverses(basis)
-    elif not np.allclose(np.einsum("kij,kji->ki", inverse, basis), 1.0):
-        inverse = inverses(basis)
-    moved = matrix @ basis
-    # T, in the places of the small ones.
-    block = np.where(small[:, :, None] & small[:, None], inverse @ moved, 0.0) if split else None
-    residual = moved - basis * values[:, None]
+    basis = estimate.right
+    residual = matrix @ basis - basis * values[:, None]
     size, weight = np.abs(basis), np.abs(inverse)
     doubt = (error + fine * np.abs(matrix)) @ size + 4 * UNIT * size * np.abs(values)[:, None]
-    if block is not None:
-        residual = residual - basis @ block
-        doubt += charge * (size @ np.abs(block))
+    if above is not None:
+        residual = residual - basis @ above
+        doubt += charge * (size @ np.abs(above))
     doubt += charge * np.abs(residual)
-    over = np.abs(inverse @ residual) + weight @ doubt
-    turned, grows = 0.0, GROWN
-    if slopes is not None:
-        along = inverse[:, None] @ slopes @ basis[:, None]
-        over += np.abs(along).sum(axis=1) + charge * (weight @ np.abs(slopes).sum(axis=1) @ size)
-        own, outwards = np.einsum("kmii->kmi", along), np.exp(-1j * np.angle(values))[:, None]
-        grows = GROWN_MOVING
-        turned = (np.abs(own) - np.abs((outwards * own).real)).sum(axis=1)
-    over *= 1 + charge  # |G|, but for the inverse
+    over = (np.abs(inverse @ residual) + weight @ doubt) * (1 + charge)  # |G|, but for the inverse
     # The computed inverse Y is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
     wrong = (np.abs(np.eye(n) - inverse @ basis) + charge * (weight @ size)).sum(axis=2)
     defect = wrong.max(axis=1)
     over += (wrong / (1 - defect)[:, None])[:, :, None] * over.max(axis=1, keepdims=True)
 
-    first, into = np.einsum("kii->ki", over), over
-    total = np.where(large[:, None], over, 0.0).sum(axis=2)
-    radii, grown, least = total, total, 0.0
-    if block is not None:
-        squares = np.square(over)
-        across = np.sqrt(np.where(small[:, None], squares, 0.0).sum(axis=2)) + TINY
-        driving = np.sqrt(np.where(small[:, :, None], squares, 0.0).sum(axis=1)) + TINY
-        off = np.sqrt(np.where(small, np.square(across), 0.0).sum(axis=1)) + (driving * large).sum(axis=1)
-        total = (total + across) * (1 + charge)
-        nearest = np.abs(np.where(small, pairs.values, 0.0)).max(axis=1)
-        inner, outer = (
-            pseudospectral_radius(block, part * off * (1 + charge), nearest)[:, None] for part in (1.0, grows)
-        )
-        radii, grown, least = np.where(large, total, inner), np.where(large, total, outer), 1 / (grows - 1)
-        into = np.where(large[:, :, None], over, 0.0)
-    gap = np.abs(values[:, :, None] - values[:, None]) * (1 - 8 * UNIT) - grown[:, :, None] - radii[:, None]
+    if above is not None:
+        over = over + np.abs(above) * (1 + 4 * UNIT)
+        over = over * _scaling(over[0], above)
+    total = over.sum(axis=2) * (1 + charge)
+    gap = np.abs(values[:, :, None] - values[:, None]) * (1 - 8 * UNIT) - total[:, :, None] - total[:, None]
     np.einsum("kii->ki", gap)[:] = np.inf
-    share = np.maximum(np.where(gap > 0, into / gap, np.inf).max(axis=1), least) * (1 + 8 * UNIT)
+    share = np.where(gap > 0, over / gap, np.inf).max(axis=1) * (1 + 8 * UNIT)
+    first = np.einsum("kii->ki", over)
     less = (first + share * (total - first)) * (1 + 8 * UNIT)
-    radii = np.where(large & (share < 1), np.minimum(less, radii), radii) * (1 + charge)
+    radii = np.where(share < 1, np.minimum(less, total), total) * (1 + charge)
     known = (defect < 0.5) & np.isfinite(radii).all(axis=1)
-    found = discs(pairs.values, values, np.where(known[:, None], radii, np.inf))
-    if slopes is not None:
-        # A disc that holds one eigenvalue goes along with its centre: to first order only what moves it
-        # inwards brings it nearer to zero.
-        least = np.where(known[:, None] & large & (share < 1), np.abs(values) - radii + turned, 0.0).max(
-            axis=1
-        )
-        found = replace(found, low=np.maximum(found.low, least - charge))
-    return found
+    return discs(estimate.values, values, np.where(known[:, None], radii, np.inf))
 
 
-def discs(values: Complexes, centres: Complexes, radii: Floats) -> Enclosure:
+def _scaling(over: Floats, above: Complexes) -> Floats:
+    """Return d_j / d_i (n, n) of a D that makes small what stands above the diagonal."""
+    scale = np.ones(len(over))
+    part = np.flatnonzero(above.any(axis=0) | above.any(axis=1))
+    within = over[np.ix_(part, part)]
+    if np.isfinite(within).all() and len(part):
+        most = FARTHER * float(np.abs(np.linalg.eigvals(within)).max())
+        found = inverses(most * np.eye(len(part)) - within).sum(axis=1)
+        if (found > 0).all():
+            scale[part] = found / found.max()
+    return scale / scale[:, None]
+
+
+def discs(values: Complexes, centres: Complexes, radii: Floats, inner: Floats | None = None) -> Enclosure:
     """Return bounds on the spectral radius (…) and how far each estimate (…, n) is from its eigenvalue.
 
     k discs that hang together hold k eigenvalues, nobody knows which in which: each estimate is then off by
-    at most the distance to the far side of any of them.
+    at most the distance to the far side of any of them. `inner` (…, n) is what of each disc is not below the
+    bound that is wanted, without it the least magnitude.
     """
     n = values.shape[-1]
     touching = (
@@ -279,13 +234,70 @@ def discs(values: Complexes, centres: Complexes, radii: Floats) -> Enclosure:
         spread = np.where(touching, label[..., None, :], n).min(axis=-1, initial=n)
     together = label[..., :, None] == label[..., None, :]
     reach = np.abs(values[..., :, None] - centres[..., None, :]) + radii[..., None, :]
-    inner = np.abs(centres) * (1 - 4 * UNIT) - radii
+    inner = np.abs(centres) * (1 - 4 * UNIT) - radii if inner is None else inner
     least = np.where(together, inner[..., None, :], np.inf).min(axis=-1, initial=np.inf)
     return Enclosure(
         low=np.maximum(least.max(axis=-1, initial=0.0), 0.0),
         high=((np.abs(centres) + radii) * (1 + 4 * UNIT)).max(axis=-1, initial=0.0),
         errors=np.where(together, reach, 0.0).max(axis=-1, initial=0.0) * (1 + 4 * UNIT),
     )
+
+
+def least_radius(matrix: Floats, slopes: Floats, error: Floats) -> float:
+    """Return a lower bound on the spectral radius of M + Σ ε_k S_k + E for all |ε_k| ≤ 1, or 0 for none.
+
+    Parameters
+    ----------
+    matrix, slopes, error
+        M (n, n), S (m, n, n) and a bound on what each entry of E is.
+
+    Notes
+    -----
+    X⁻¹(M + …)X = [λ + g, c; r, T + H], λ being the largest eigenvalue, alone, and T that of all others. A z
+    near λ is an eigenvalue if z − λ − g = c (z − T − H)⁻¹ r, whose right side is at most ‖c‖‖r‖/(s − ρ), as
+    long as |z − λ − g| ≤ ρ < s = σ_min(λ − T) − |g| − ‖H‖. By Rouché's theorem one is within the ρ at which
+    both are equal. It goes along with λ + g, which only what moves it inwards brings nearer to zero.
+    """
+    with np.errstate(all="ignore"):
+        n, linalg = len(matrix), load_pool("scipy.linalg")
+        scale = balance(np.abs(matrix) + np.abs(slopes).sum(axis=0))
+        units = scale / scale[:, None]
+        matrix, slopes, error = matrix * units, slopes * units, error * units
+        pairs = eigenpairs(matrix)
+        pairs = pairs.at(descending(pairs.values))
+        first = pairs.values[0]
+        apart = np.abs(pairs.values[1:] - first).min(initial=np.inf) / 2
+        form, basis, count = linalg.schur(
+            matrix, output="complex", sort=lambda value: abs(value - first) > apart, check_finite=False
+        )
+        if count != n - 1:
+            return 0.0
+        right = np.hstack([pairs.right[:, :1], basis[:, :count]])
+        left, centre = inverses(right), linalg.block_diag(first, form[:count, :count])
+        moves = left @ slopes @ right
+        charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
+        size, weight = np.abs(right), np.abs(left)
+        off = np.abs(left @ matrix @ right - centre)
+        off += weight @ (error + 2 * charge * (np.abs(matrix) + np.abs(slopes).sum(axis=0))) @ size
+        # The computed inverse Y is off: X⁻¹ = (I − F)⁻¹ Y with F = I − Y X.
+        wrong = norms(np.abs(np.eye(n) - left @ right) + charge * (weight @ size))
+        doubt = float(wrong / (1 - wrong) * (norms(centre) + norms(off) + norms(moves).sum()))
+
+        def most(rows: slice, columns: slice) -> float:
+            """Return a bound on the norm of a block of what moves."""
+            block = norms(moves[:, rows, columns]).sum() + norms(off[rows, columns]) + doubt
+            return float(block) * (1 + charge)
+
+        one, rest = slice(0, 1), slice(1, n)
+        others = np.linalg.svd(first * np.eye(count) - centre[1:, 1:], compute_uv=False)
+        away = (others - charge * others.max(initial=0.0)).min(initial=np.inf)
+        spare = away - most(one, one) - most(rest, rest)
+        square = spare**2 - 4 * most(one, rest) * most(rest, one)
+        if not (wrong < 1 and spare > 0 and square > 0):
+            return 0.0
+        near = 2 * most(one, rest) * most(rest, one) / (spare + np.sqrt(square))
+        inwards = np.abs((np.exp(-1j * np.angle(first)) * moves[:, 0, 0]).real).sum() + off[0, 0] + doubt
+        return float(abs(first) - (inwards + near) * (1 + charge) - charge)
 
 
 def misses_one(matrix: Floats, error: Floats) -> bool:

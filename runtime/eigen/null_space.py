@@ -28,24 +28,11 @@ def null_space(matrix: Matrix) -> list[list[Fraction]]:
     """Return a basis of the vectors that a matrix (m, n) takes to zero.
 
     Each vector begins with a 1, at a place where all others are 0; those that begin first come first.
-
-    Notes
-    -----
-    What is found modulo a prime solves the equations, or they are solved over the rationals.
     """
     m, n = matrix.shape
-    entries = [(i, j, Fraction(matrix[i, j])) for i, j in np.argwhere(matrix != 0).tolist()]
-    try:
-        residues = np.zeros((m, n), dtype=object)
-        for i, j, entry in entries:
-            residues[i, j] = residue(entry)
-        vectors = null_space_modulo(residues)
-        if all(_solves(entries, m, vector) for vector in vectors):
-            return vectors
-    except ValueError:  # the prime divides a denominator, or a residue has no simple fraction
-        pass
     exact = flint.fmpq_mat(max(m, 1), n)
-    for i, j, entry in entries:
+    for i, j in np.argwhere(matrix != 0).tolist():
+        entry = Fraction(matrix[i, j])
         exact[i, n - 1 - j] = flint.fmpq(entry.numerator, entry.denominator)
     return _kernel(exact, lambda one: Fraction(int(one.p), int(one.q)))
 
@@ -105,12 +92,3 @@ def _simplest(residue: Any) -> Fraction:
     if abs(v) > most:
         raise ValueError("no simple fraction")
     return Fraction(b, v)
-
-
-def _solves(entries: list[tuple[int, int, Fraction]], rows: int, vector: list[Fraction]) -> bool:
-    """Say whether a matrix, given by its entries other than 0, takes a vector to zero."""
-    total = [Fraction(0)] * rows
-    for row, column, entry in entries:
-        if vector[column]:
-            total[row] += entry * vector[column]
-    return not any(total)

@@ -297,14 +297,14 @@ def _prove(system: ClosedSystem, estimate: _Solved) -> _Solved:
     if inside is None and not estimate.free.names:
         # Weights known as floats only can cost balls more than floats: their bound counts these, too.
         inside, bits = estimate.inside, 0 if estimate.inside is not None else bits
-    found = discs(proof.values, proof.centres, proof.radii)
+    found = discs(proof.centres, proof.centres, proof.radii)
     low, high = max(estimate.low, float(found.low)), min(estimate.high, float(found.high))
     proved = replace(estimate, low=low, high=high, inside=inside, bits=bits)
     # A radius that floats know as well: the other eigenvalues a proof knows far better.
     if found.high - found.low > AS_SHARP * (estimate.high - estimate.low):
         return proved
-    order = descending(proof.values)
-    pairs = pairs_to(estimate.matrix, proof.values[order])
+    order = descending(proof.centres)
+    pairs = pairs_to(estimate.matrix, proof.centres[order])
     return replace(proved, pairs=pairs, bounds=Enclosure(found.low, found.high, found.errors[order]))
 
 

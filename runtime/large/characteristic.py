@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS
+from apc.eigen.norms import PRODUCT_ROUNDINGS
 from apc.eigen.winding import Ball, determinant_ball, wind
 from apc.frame.discretize import UNIT
 from apc.large.transfer import Transfer, differentiate, respond

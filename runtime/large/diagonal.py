@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, norms
+from apc.eigen.norms import PRODUCT_ROUNDINGS, norms
 from apc.frame.discretize import UNIT
 
 Floats = NDArray[np.float64]

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.pseudospectrum import PRODUCT_ROUNDINGS, balance
+from apc.eigen.norms import PRODUCT_ROUNDINGS, balance
 from apc.frame.discretize import UNIT
 from apc.frame.lift import BoundedMap, FrameMap
 from apc.large.diagonal import block_diagonal, block_norms, block_norms_along, block_resolvent

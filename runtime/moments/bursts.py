@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.pseudospectrum import balance
+from apc.eigen.norms import balance
 from apc.eigen.relative import Relative, relative_places, relative_rows
 from apc.frame.radius import value_of
 from apc.moments.errors import Peer, largest_error

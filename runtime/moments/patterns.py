@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.eigen.modes import dense_loop
-from apc.eigen.pseudospectrum import balance
+from apc.eigen.norms import balance
 from apc.eigen.relative import Relative, relative, relative_coordinates
 from apc.frame.radius import value_of
 from apc.moments.crowd import Hearing, standing_motions

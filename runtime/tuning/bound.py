@@ -21,9 +21,9 @@ from apc.analysis.box_proof import TOGETHER, open_questions
 from apc.analysis.cells import Cell, OpenSystem, matrices_over
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError
-from apc.eigen.enclosure import enclose_moving
+from apc.eigen.enclosure import least_radius
 from apc.frame.names import Range
-from apc.frame.radius import radius_of, value_of
+from apc.frame.radius import value_of
 
 # What nobody would tune further for; the most gains, and entries of the matrices of all cells: some seconds.
 SHARE = Fraction(2, 100)
@@ -96,7 +96,6 @@ def _looked(
         size += matrix[:, 0].size
         reach[left] = np.maximum(reach[left], np.abs(matrix[:, 2:]).sum(axis=(2, 3)))
         outside = np.abs(np.linalg.eigvals(value_of(matrix))).max(axis=1, initial=0.0) > 1
-        if outside.any():
-            some = matrix[outside]
-            unstable[left[outside]] = enclose_moving(value_of(some), some[:, 2:], radius_of(some)).low > 1
+        low = [least_radius(one[0], one[2:], one[1]) for one in matrix[outside]]
+        unstable[left[outside]] = np.array(low) > 1
     return unstable, reach.argmax(axis=1), size
