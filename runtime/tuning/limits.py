@@ -259,6 +259,8 @@ def _sizes(matrices: Floats) -> Floats:
 
 def _largest(matrix: Floats, slope: Floats) -> tuple[Floats, Floats, Complexes]:
     """Return ln |λ| of the largest modes (n,), how it follows each number (n, m), and λ (n,)."""
+    if not matrix.shape[-1]:  # nothing moves
+        return np.full(1, NONE), np.zeros((1, len(slope))), np.zeros(1, np.complex128)
     count = min(MODES, matrix.shape[-1])
     if not (np.isfinite(matrix).all() and np.isfinite(slope).all()):
         return np.full(count, BEYOND), np.zeros((count, len(slope))), np.zeros(count, np.complex128)

@@ -11,7 +11,7 @@ import apc
 from apc.tuning.demands import read_against, read_demands
 from apc.tuning.front import front
 from tests.commands import Cli, write
-from tests.topologies import AVERAGE, MESH, compiled, replaced, told, wall
+from tests.topologies import AVERAGE, MESH, SCENES, compiled, replaced, told, wall
 
 K, B, CONTACT, MASS = "coordination.stiffness", "coordination.damping", "contact.stiffness", "device.mass"
 RANGE = {K: (10.0, 7000.0)}
@@ -93,6 +93,12 @@ def test_a_front_is_the_best_of_a_gain_for_each_bound_on_what_is_felt() -> None:
     assert asked.value == pytest.approx(found.designs[1].value, rel=5e-3)
     with pytest.raises(apc.ApcError, match="E996"):
         front(model, demands, read_against("feel.error at 1 Hz"))  # which is least where it is stiffest
+
+
+def test_where_nothing_moves_nothing_limits_gains() -> None:
+    scene = apc.with_hands(apc.compile(str(SCENES / "teleoperation-pair.yaml")), "clamped")
+    found = apc.tune(scene, RANGE | {B: (0.0, 50.0)}, maximize=K)
+    assert found.proved and found.value == RANGE[K][1] and not found.binding
 
 
 def test_motions_die_out_no_faster_with_any_gains_of_a_grid() -> None:
