@@ -2,7 +2,7 @@
 
 Takes: the groups of equal peers of a scene, and the exchange between them.
 Gives: `split`; `Arrangement`, `arrange`; `loops_at_right_angles`; `complete_loops`, `dense_loop`,
-`dense`, `split_exchangeable`; `couple`, `complete_degrees`.
+`dense`, `refuse_dense`, `split_exchangeable`; `couple`, `complete_degrees`.
 Guarantees: the systems of a split, each as often as its multiplicity says, have together the spectrum of
 `dense`, whatever the number of peers. Weights are exact; a mean over nobody, or of weights that add up to 0,
 raises.
@@ -168,10 +168,15 @@ def dense(groups: Sequence[PeerGroup], exchange: Exchange) -> ClosedSystem:
     ApcError
         E801, E802 a mean that can't be; E804 more than `MOST_STATES` states.
     """
+    refuse_dense(groups, exchange)
+    return close_loop(dense_loop(groups, exchange))
+
+
+def refuse_dense(groups: Sequence[PeerGroup], exchange: Exchange) -> None:
+    """Refuse so many peers before each of them is looked at."""
     states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
     if states > MOST_STATES:
         raise too_large(exchange, f"{exchange.peers:,} peers", states)
-    return close_loop(dense_loop(groups, exchange))
 
 
 def dense_loop(groups: Sequence[PeerGroup], exchange: Exchange) -> Loop:
