@@ -171,7 +171,7 @@ def open_systems(
     by_site = {id(group.site): found.sites[group.name] for group in found.groups}
     return [
         (one, tuple(by_site[id(group.site)] for group in one.sites))
-        for one in split(found.groups, found.exchange).systems
+        for one in split(found.groups, found.exchange)
     ]
 
 

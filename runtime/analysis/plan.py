@@ -18,8 +18,8 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Loop
 from apc.eigen.graph_loops import common_graph
-from apc.eigen.modes import arrange, dense_loop
-from apc.eigen.peers import MOST_STATES, PeerGroup, more_differ, peer_groups, states_of, too_large, used_ways
+from apc.eigen.modes import arrange, dense_loop, refuse_dense
+from apc.eigen.peers import MOST_STATES, PeerGroup, more_differ, peer_groups, too_large, used_ways
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.parameters import Numbers
@@ -121,7 +121,7 @@ def make_plan(
         what = f"a ring of {exchange.peers:,} peers is as many systems, up to {LARGEST_RING:,} are solved"
         raise ApcError(Mistake("E804", Place(exchange.scene), what, hint=f"count: {LARGEST_RING}"))
     if method == "dense":
-        _refuse_dense(groups, exchange)
+        refuse_dense(groups, exchange)
         loops: tuple[Loop, ...] = (dense_loop(groups, exchange),)
         found, notes = "dense", tuple[str, ...]()
     else:
@@ -184,13 +184,6 @@ def _determinant_bytes(loop: Loop) -> int:
         len(one.schedule.heard) for one in loop.sites
     )
     return (KEPT_OF_SITE * len(loop.sites) + SITE_AT_WORK) * entries
-
-
-def _refuse_dense(groups: Sequence[PeerGroup], exchange: Exchange) -> None:
-    """Refuse so many peers before each of them is looked at."""
-    states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
-    if states > MOST_STATES:
-        raise too_large(exchange, f"{exchange.peers:,} peers", states)
 
 
 def not_populations(system: CompiledSystem, jacobians: Sequence[SiteJacobians]) -> str:

@@ -45,12 +45,6 @@ DOUBTFUL = 512
 # seconds at this size.
 MOST_PROVED = 120
 
-# A radius known so well needs no more bits: floats can't tell it better.
-SHARP = 2.0**-50
-
-# A verdict that is proved isn't followed by more than so many times its bits, for a sharper radius.
-SHARPENING = 4
-
 # Bits by which a root is moved from one that it is equal to: the last ones are rounded.
 SPARE = 8
 
@@ -106,7 +100,7 @@ def prove(system: ClosedSystem, free: RigidModes) -> Proof:
         Its rigid modes; drifts are looked for only where the eigenvalue 1 remains without them.
     """
     searched = bool(free.drifts) or not free.names
-    best, settled = None, 0
+    doubtful = any(doubt for way, doubt in system.doubts.items() if way not in system.surds)
     for bits in PRECISIONS:
         with precision(bits):
             matrix = frame_balls(system)
@@ -121,15 +115,9 @@ def prove(system: ClosedSystem, free: RigidModes) -> Proof:
             for name in ("centres", "radii")
         )
         inside = False if False in verdicts else None if None in verdicts else True
-        settled = settled or (bits if inside is not None else 0)
-        if best is None or inside is not None or bits == PRECISIONS[-1]:
-            best = Proof(inside, settled or bits, free, centres, radii)
-        if inside is not None and (_sharp(best) or bits >= SHARPENING * settled):
+        if inside is not None or (doubtful and bits >= DOUBTFUL):
             break
-        if any(doubt for way, doubt in system.doubts.items() if way not in system.surds) and bits >= DOUBTFUL:
-            break
-    assert best is not None
-    return best
+    return Proof(inside, bits, free, centres, radii)
 
 
 def _polynomials(matrix: Balls, free: RigidModes) -> list[Any]:
@@ -204,11 +192,3 @@ def _stands_still(matrix: Balls, free: RigidModes) -> bool:
             if not flint.arb(moved - own).contains(0):
                 return False
     return True
-
-
-def _sharp(proof: Proof) -> bool:
-    """Say whether the largest eigenvalues are known as well as floats can tell."""
-    sizes = np.abs(proof.centres)
-    largest = sizes.max(initial=0.0)
-    reaching = sizes + proof.radii >= largest - proof.radii.min(initial=np.inf)
-    return bool(np.all(proof.radii[reaching] <= SHARP * max(largest, 1.0)))

@@ -25,10 +25,6 @@ Complexes = NDArray[np.complex128]
 Places = NDArray[np.intp]
 Matrix = NDArray[Any]  # float64 or complex128
 
-# An inverse of the eigenvectors is used if its rows are left vectors to this; derivatives have half their
-# digits then, even where another eigenvalue is as near as 0.01.
-SPOILT = 1e-10
-
 # A derivative of an eigenvalue of worse condition than this is mostly rounding.
 WORST = 1e10
 
@@ -114,28 +110,12 @@ def eigenvalues(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
     found = np.zeros((2, *matrix.shape[:2]), dtype=np.complex128)
     for part in components((matrix != 0).any(axis=0) | (slope != 0).any(axis=0)):
         block = np.index_exp[:, part[:, None], part]
-        found[:, :, part] = _by_vectors(matrix[block], slope[block])
+        pairs = eigenpairs(matrix[block])
+        with np.errstate(all="ignore"):
+            moves = pairs.slopes(slope[block])
+            vague = (np.abs(pairs.values) < SMALL) | ~(pairs.condition < WORST) | ~np.isfinite(moves)
+        found[:, :, part] = pairs.values, np.where(vague, 0.0, moves)
     return found[0], found[1]
-
-
-def _by_vectors(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
-    """Return the eigenvalues (k, n) of matrices (k, n, n) and their derivatives, see `eigenvalues`."""
-    values, right = np.linalg.eig(matrix)
-    left = inverses(right)
-    with np.errstate(all="ignore"):
-        # A defective cluster spoils the inverse, of the others hardly ever.
-        off = np.abs(left @ matrix - values[..., None] * left).max(axis=-1)
-        small = np.abs(values) < SMALL
-        spoilt = ~(small | (off <= SPOILT * np.abs(left).max(axis=-1))).all(axis=-1)
-    pairs = Eigenpairs(*(one.astype(np.complex128) for one in (values, right, left)))
-    if spoilt.any():
-        again = eigenpairs(matrix[spoilt])
-        pairs.values[spoilt], pairs.right[spoilt], pairs.left[spoilt] = again.values, again.right, again.left
-        small = np.abs(pairs.values) < SMALL
-    with np.errstate(all="ignore"):
-        derivative = pairs.slopes(slope)
-        vague = small | ~(pairs.condition < WORST) | ~np.isfinite(derivative)
-    return pairs.values, np.where(vague, 0.0, derivative)
 
 
 def refined(matrix: Matrix, guess: Eigenpairs) -> Eigenpairs:

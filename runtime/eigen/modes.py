@@ -1,8 +1,8 @@
 """A whole system as few and small loops instead of one large one.
 
 Takes: the groups of equal peers of a scene, and the exchange between them.
-Gives: `Split`, `split`; `Arrangement`, `arrange`; `loops_at_right_angles`; `complete_loops`, `dense_loop`,
-`dense`, `split_exchangeable`; `couple`, `complete_degrees`.
+Gives: `split`; `Arrangement`, `arrange`; `loops_at_right_angles`; `complete_loops`, `dense_loop`,
+`dense`, `refuse_dense`, `split_exchangeable`; `couple`, `complete_degrees`.
 Guarantees: the systems of a split, each as often as its multiplicity says, have together the spectrum of
 `dense`, whatever the number of peers. Weights are exact; a mean over nobody, or of weights that add up to 0,
 raises.
@@ -41,24 +41,15 @@ from apc.frame.schedule import Way
 
 
 @dataclass(frozen=True, slots=True)
-class Split:
-    """A whole system as independent ones; `method` is "modes" or "dense", `notes` say why."""
-
-    method: str
-    systems: tuple[ClosedSystem, ...]
-    notes: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class Arrangement:
-    """A whole system as independent loops; `method` and `notes` as in `Split`."""
+    """A whole system as independent loops; `method` is "modes" or "dense", `notes` say why."""
 
     method: str
     loops: tuple[Loop, ...]
     notes: tuple[str, ...]
 
 
-def split(groups: Sequence[PeerGroup], exchange: Exchange) -> Split:
+def split(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[ClosedSystem, ...]:
     """Split the whole system into as few and small closed systems as its graphs and groups allow.
 
     Parameters
@@ -73,11 +64,11 @@ def split(groups: Sequence[PeerGroup], exchange: Exchange) -> Split:
     ApcError
         E801, E802 a mean that can't be; E804 one system of too many states.
     """
-    found = arrange(groups, exchange)
-    for loop in found.loops:
+    loops = arrange(groups, exchange).loops
+    for loop in loops:
         if loop.states > MOST_STATES:
             raise too_large(exchange, f"{exchange.peers:,} peers", loop.states)
-    return Split(found.method, tuple(close_loop(loop) for loop in found.loops), found.notes)
+    return tuple(close_loop(loop) for loop in loops)
 
 
 def arrange(groups: Sequence[PeerGroup], exchange: Exchange) -> Arrangement:
@@ -177,10 +168,15 @@ def dense(groups: Sequence[PeerGroup], exchange: Exchange) -> ClosedSystem:
     ApcError
         E801, E802 a mean that can't be; E804 more than `MOST_STATES` states.
     """
+    refuse_dense(groups, exchange)
+    return close_loop(dense_loop(groups, exchange))
+
+
+def refuse_dense(groups: Sequence[PeerGroup], exchange: Exchange) -> None:
+    """Refuse so many peers before each of them is looked at."""
     states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
     if states > MOST_STATES:
         raise too_large(exchange, f"{exchange.peers:,} peers", states)
-    return close_loop(dense_loop(groups, exchange))
 
 
 def dense_loop(groups: Sequence[PeerGroup], exchange: Exchange) -> Loop:

@@ -197,7 +197,7 @@ def _directions(system: CompiledSystem, prepared: Prepared) -> dict[str, Compile
         E933 where what moves along one direction acts on what moves along another.
     """
     along = directions_of(system)
-    for loop in split(*lifted_groups(system, prepared=prepared)).systems if along else ():
+    for loop in split(*lifted_groups(system, prepared=prepared)) if along else ():
         parts = load_pool("scipy.sparse.csgraph").connected_components(loop.matrix != 0, connection="weak")[1]
         of: dict[str, set[str]] = {}
         for name, part_ in zip(loop.layout.names, parts.tolist(), strict=True):

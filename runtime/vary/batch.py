@@ -362,7 +362,7 @@ def batch_evaluator(
     matrices
         Whether the systems' matrices are wanted, and not the maps of the sites alone.
     """
-    systems = split(groups, exchange).systems if matrices else ()
+    systems = split(groups, exchange) if matrices else ()
     if durations is None:
         durations = {
             event.duration: (float(event.duration * group.schedule.quantum), 0.0)

@@ -97,7 +97,7 @@ class PointEvaluator:
 
     def states(self) -> int:
         """Return how many states the largest closed system has, with the scene's own numbers."""
-        systems = split(*lifted_groups(self.system, prepared=self.prepared)).systems
+        systems = split(*lifted_groups(self.system, prepared=self.prepared))
         return max((len(one.matrix) for one in systems), default=0)
 
     def matrices(self, values: Floats) -> tuple[Floats, ...]:
@@ -157,7 +157,7 @@ class PointEvaluator:
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedSystem, ...]:
         """Return the closed systems at one point (m,), as an analysis has them."""
         overrides = overrides_at(self.system, self.free, value)
-        return split(*lifted_groups(apply(self.system, overrides), prepared=self.prepared)).systems
+        return split(*lifted_groups(apply(self.system, overrides), prepared=self.prepared))
 
     def errors(self, values: Floats) -> tuple[Floats, ...]:
         """Return bounds (k, n, n) on the errors of the matrices at values (k, m), entry by entry."""

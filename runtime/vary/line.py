@@ -258,7 +258,7 @@ class DelayLine(_JudgedLine):
     def _judge_within(self, value: Fraction) -> Verdict:
         """Return the verdict at a delay that moves events, of all systems without anything beside."""
         changed = system_with_delay(self.system, self.free, value)
-        return judged(split(*lifted_groups(changed, prepared=self.prepared)).systems)
+        return judged(split(*lifted_groups(changed, prepared=self.prepared)))
 
     def stretches(self) -> Iterator[Stretch]:
         """Yield the value at which the line begins, then the stretches from one coincidence to the next."""

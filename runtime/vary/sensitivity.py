@@ -116,7 +116,7 @@ def sensitivities(system: CompiledSystem, *, prepared: Prepared | None = None) -
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         free, prepared = varied(system), prepared or prepare(system)
         start = prepare_at_start(system, prepared, free) or prepared
-        systems = split(*lifted_groups(system, prepared=start)).systems
+        systems = split(*lifted_groups(system, prepared=start))
         most = solve_spectrum(systems, in_balls=False).spectral_radius + SHARED
 
         def clusters_of(together: Sequence[Free]) -> list[_Cluster] | None:

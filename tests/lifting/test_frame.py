@@ -75,7 +75,7 @@ def at(comp: float, comm: float, phase: float = 0, first: float = 0, own: bool =
 def check(scene: Scene) -> None:
     """Compare the split and the dense spectrum of a scene's text with that of peers stepped one by one."""
     groups, exchange = lifted_groups(compiled(text_of(scene)))
-    systems = split(groups, exchange).systems
+    systems = split(groups, exchange)
     modes = np.concatenate([np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in systems])
     whole = np.linalg.eigvals(dense(groups, exchange).matrix)
     expected = np.linalg.eigvals(np.array(frame_matrix(scene)))

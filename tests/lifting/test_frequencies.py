@@ -61,7 +61,7 @@ def test_what_folds_onto_the_real_axis_is_told_by_its_changes_of_sign(halves: in
 
 
 def test_what_a_mode_turns_hangs_on_no_phase_of_its_vector() -> None:
-    for system in split(*lifted_groups(apc.compile(SCENES / "two-users-reported.yaml"))).systems:
+    for system in split(*lifted_groups(apc.compile(SCENES / "two-users-reported.yaml"))):
         values, vectors = np.linalg.eig(system.matrix.astype(complex))
         values.imag[np.abs(values.imag) < 1e-12] = 0.0
         shares = np.abs(vectors * np.linalg.pinv(vectors).T)

@@ -43,7 +43,7 @@ def test_an_edge_function_is_linearized_pair_by_pair(operator: str, graph: str, 
 
 def _split(system: CompiledSystem) -> np.ndarray:
     """Return all eigenvalues of the split system, each as often as it counts."""
-    systems = split(*lifted_groups(system)).systems
+    systems = split(*lifted_groups(system))
     return np.concatenate([np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in systems])
 
 
