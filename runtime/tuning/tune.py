@@ -398,7 +398,14 @@ class _Work:
             if passive and self.demands.box:
                 found.append(Proved(named, replace(_unlooked(self.system.name, ranges), notes=(ONE_BY_ONE,))))
                 continue
-            proof = proved_at(scene, ranges, passive=passive, inside=1.0 if self.limits.by_growth else inside)
+            inner = 1.0 if self.limits.by_growth else inside
+            try:
+                proof = proved_at(scene, ranges, passive=passive, inside=inner)
+            except ApcError as error:
+                if not ranges:
+                    raise
+                # No box of such scenes is proved, as of those that are not linear.
+                proof = replace(_unlooked(self.system.name, ranges), notes=(error.mistakes[0].what,))
             if proof.stable and (self._unproved or not self._felt(numbers, point)):
                 proof = replace(proof, verdict=UNDECIDED, stable=None, notes=(*proof.notes, SLOWER))
             found.append(Proved(named, proof))
