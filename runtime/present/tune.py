@@ -85,7 +85,7 @@ def _sentence(found: Tuning) -> str:
     if found.unit == "1" and found.aim not in [one.parameter for one in found.gains]:
         power = 2 if found.criterion == "mean-square" else 1  # of what a frame multiplies
         settled = found.frame_s * power * math.log(SETTLED) / math.log(found.value)
-        least = f"{_multiplied(found)} below {found.value:.6g}, next to the least found{over}, is {proved}"
+        least = f"{_radius(found)} below {found.value:.6g}, next to the least found{over}, is {proved}"
         time = f"within {quantity(settled, 's', 3)} all motions die out but for {100 * SETTLED:.0f} %"
         return f"{found.topology}: {least}; {time}"
     value = f"{quantity(found.value, found.unit, TYPED)} is the {best} {found.aim}"
@@ -99,11 +99,11 @@ def _room(found: Tuning) -> str:
     if found.felt:
         return f"{math.exp(found.worst):.6g} of what is allowed in the worst scenario"
     radius, most = math.exp(found.worst + found.allowed), math.exp(found.allowed)
-    return f"{_multiplied(found)} of {radius:.6g} in the worst scenario, {most:.6g} allowed"
+    return f"{_radius(found)} of {radius:.6g} in the worst scenario, {most:.6g} allowed"
 
 
-def _multiplied(found: Tuning) -> str:
-    return "a frame's factor of mean squares" if found.criterion == "mean-square" else "a spectral radius"
+def _radius(found: Tuning) -> str:
+    return "a mean-square radius" if found.criterion == "mean-square" else "a spectral radius"
 
 
 def _proof_lines(found: Tuning) -> list[str]:
