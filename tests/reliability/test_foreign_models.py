@@ -20,6 +20,7 @@ from apc.__main__ import run
 from apc.compiler import cache, seal, store
 from apc.compiler.compiled import CompiledSystem
 from tests.commands import write
+from tests.reliability.test_unchanged_scenes import PART, TEXT
 from tests.topologies import AVERAGE, ROOT, compiled, replaced, told
 
 Other = Callable[[], CompiledSystem]
@@ -161,21 +162,6 @@ def test_what_was_compiled_serves_this_user_alone(
 
 # ---- a model by itself ----
 
-PART = """\
-component: Tie
-about: A spring to where the device is at rest.
-connectors: {flange: Flange}
-parameters: {stiffness: {unit: N/m, min: 0}}
-equations: [flange.f = stiffness*flange.x]
-"""
-WITH_FILES = """\
-topology: scene
-library: parts
-peers: {user: {table: users.csv}}
-masses: {device: {mass: 1 kg, damping: 2 N*s/m}}
-couplers: {tie: {type: Tie, flange: device, stiffness: 3 N/m}}
-"""
-
 
 def test_a_model_of_somebody_else_needs_no_file_beside_it_and_not_this_library(
     other: Other, monkeypatch: pytest.MonkeyPatch
@@ -183,7 +169,7 @@ def test_a_model_of_somebody_else_needs_no_file_beside_it_and_not_this_library(
     Path("parts").mkdir()
     write("parts/tie.yaml", PART)
     write("users.csv", "device.mass [kg]\n1\n2\n")
-    write("scene.yaml", WITH_FILES)
+    write("scene.yaml", TEXT)
     assert run(["compile"]) == 0
     expected = store.encoded(apc.load(MODEL))
     for path in ("scene.yaml", "users.csv", "parts/tie.yaml"):
