@@ -725,7 +725,8 @@ def _demands(
     """Return a scene as its study or a criterion has its devices held, and what is asked of gains."""
     from apc.tuning.demands import held_as_studied, read_demands
 
-    system, means = _model(model, values), criterion
+    means: str | None = criterion
+    system = _model(model, values)
     if criterion is None:
         system, means = held_as_studied(system)
     ranges, borne = (

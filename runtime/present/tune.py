@@ -21,7 +21,7 @@ from apc.present.forms import MEANT, labelled, notes, quantity, record, table
 from apc.present.pictures import COLOURS, new_figure
 from apc.present.region_picture import draw_panel
 from apc.regions.panels import Panel
-from apc.regions.region import region
+from apc.regions.region import Region, region
 from apc.tuning.bound import SHARE
 
 if TYPE_CHECKING:
@@ -156,7 +156,8 @@ def refuse_picture(gains: Sequence[Range]) -> None:
 def tuning_picture(found: Tuning, ax: Any = None) -> Any:
     """Draw two gains now and then, over the stable regions of the scenes that limit them; return the Axes."""
     refuse_picture(found.ranges)
-    regions, ranges = [], (found.ranges[0], found.ranges[1])
+    regions: list[Region] = []
+    ranges = found.ranges[0], found.ranges[1]
     for one, scene in zip(found.binding, found.scenes, strict=True):
         name = _where(one) or found.topology
         if name not in [known.topology for known in regions]:
