@@ -218,7 +218,7 @@ def _cut_open(group: PeerGroup, pushes: Sequence[Push]) -> Opened:
 def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
     """Close a loop whose contacts are cut open, or say why that can't be judged."""
     free = find_rigid_modes(close_loop(loop))
-    if free.generalized.shape[1]:
+    if free.drifts:
         return "with all contacts open, something drifts ever farther"
     names = [(*one.group.lifted.z_names, *(f"{part}[{tick}]" for part, tick in one.ticks)) for one in opened]
     layout = lay_out(names, [site.schedule for site in loop.sites])

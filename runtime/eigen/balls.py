@@ -225,7 +225,7 @@ def _multiply(matrix: Balls, rows: Balls) -> Balls:
     return product
 
 
-def _flint(block: Balls) -> Any:
+def square(block: Balls) -> Any:
     """Return an array (n, m) of balls as a matrix of python-flint."""
     height, width = block.shape
     return flint.arb_mat(height, width, block.ravel().tolist())
@@ -242,7 +242,7 @@ def _exact(value: NDArray[Any]) -> Balls:
 
 def _solve(matrix: Balls, right: Balls) -> Balls | None:
     try:
-        found = np.array(_flint(matrix).solve(_flint(right)).entries(), dtype=object)
+        found = np.array(square(matrix).solve(square(right)).entries(), dtype=object)
     except ZeroDivisionError:
         return None
     return found.reshape(right.shape)
@@ -251,11 +251,6 @@ def _solve(matrix: Balls, right: Balls) -> Balls | None:
 BALLS = Arithmetic(
     _multiply, np.add, np.subtract, _exact, _solve, bounded=np.vectorize(flint.arb, otypes=[object])
 )
-
-
-def square(balls: Balls) -> Any:
-    """Return an array of balls as a matrix of python-flint."""
-    return _flint(balls)
 
 
 def reduced_balls(matrix: Balls, vectors: Sequence[Sequence[Fraction]], held: NDArray[np.intp]) -> Balls:

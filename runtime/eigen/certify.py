@@ -177,7 +177,8 @@ def root_discs(polynomial: Any) -> Discs:
 
 def _above(value: Any) -> float:
     """Return a float that is not below a ball."""
-    return float(np.nextafter(float(value.upper()), np.inf)) if value.is_finite() else np.inf
+    known = float(value.upper()) if value.is_finite() else np.inf
+    return known + 4 * UNIT * abs(known)
 
 
 def _stands_still(matrix: Balls, free: RigidModes) -> bool:

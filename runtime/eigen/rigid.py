@@ -49,25 +49,19 @@ MOST_NAMED = 4
 class RigidModes:
     """The invariant subspace to remove before eigenvalues are computed.
 
-    `directions` (n, k) are eigenvectors with eigenvalue 1, `generalized` (n, drifts) the second vectors
-    of Jordan pairs, both over the state of the closed system; `names` says what moves in each direction.
-    `exact` holds the same vectors, directions first, as rationals.
+    `basis` (n, k + drifts) holds eigenvectors with eigenvalue 1, then the second vectors of Jordan pairs,
+    over the state of the closed system; `names` (k,) say what moves in each direction, and `exact` holds the
+    same vectors as rationals.
     """
 
-    directions: Floats
-    generalized: Floats
+    basis: Floats
     names: tuple[str, ...]
     exact: tuple[tuple[Fraction, ...], ...]
 
     @property
     def drifts(self) -> int:
         """The number of motions that grow with time for want of damping."""
-        return int(self.generalized.shape[1])
-
-    @property
-    def basis(self) -> Floats:
-        """All vectors to remove (n, k + drifts)."""
-        return np.hstack([self.directions, self.generalized])
+        return len(self.exact) - len(self.names)
 
 
 def find_rigid_modes(system: ClosedSystem | Loop, *, with_drifts: bool = True) -> RigidModes:
@@ -83,13 +77,13 @@ def find_rigid_modes(system: ClosedSystem | Loop, *, with_drifts: bool = True) -
     states = [state for _, state in _standing_solutions(system)]
     pairs = [state for _, state in _drifts(system, states)] if with_drifts else []
     names = system.names
+    vectors = tuple(map(tuple, (*states, *pairs)))
     return RigidModes(
-        directions=_columns(states, len(names)),
-        generalized=_columns(pairs, len(names)),
+        basis=np.array(vectors, dtype=np.float64).reshape(len(vectors), len(names)).T,
         names=tuple(
             ", ".join(name for name, entry in zip(names, state, strict=True) if entry) for state in states
         ),
-        exact=tuple(tuple(vector) for vector in (*states, *pairs)),
+        exact=vectors,
     )
 
 
@@ -99,14 +93,8 @@ def rigid_modes_here(system: ClosedSystem) -> RigidModes:
     Where the matrix tells that 1 is none of its eigenvalues there are none, and none are looked for.
     """
     if misses_one(system.matrix, system.error):
-        nothing = np.zeros((len(system.names), 0))
-        return RigidModes(nothing, nothing, (), ())
+        return RigidModes(np.zeros((len(system.names), 0)), (), ())
     return find_rigid_modes(system, with_drifts=False)
-
-
-def _columns(vectors: Sequence[Sequence[Fraction]], n: int) -> Floats:
-    """Return exact vectors as the columns of a float matrix (n, len(vectors))."""
-    return np.array(vectors, dtype=np.float64).reshape(len(vectors), n).T
 
 
 @dataclass(frozen=True, slots=True)

@@ -175,7 +175,7 @@ def solve_spectrum(
     radius = min(max(largest, low), high)  # a proof can know better than the vectors of floats
     rigid = drifts = 0
     for system, one in zip(systems, solved, strict=True):
-        rigid += system.multiplicity * one.free.directions.shape[1]
+        rigid += system.multiplicity * len(one.free.names)
         drifts += system.multiplicity * one.free.drifts
     verdict, stable = judge([one.inside for one in solved], rigid, drifts)
     return Spectrum(

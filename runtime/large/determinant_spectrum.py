@@ -129,7 +129,7 @@ def _solve_loop(loop: Loop) -> _Solved:
     """Find the largest modes of a loop."""
     function = of_loop(loop.sites, loop.coupling, loop.doubts)
     prompt = without_packets(loop)
-    rigid, drifts = find_rigid_modes(prompt, with_drifts=False).directions.shape[1], 0
+    rigid, drifts = len(find_rigid_modes(prompt, with_drifts=False).names), 0
     starts = _delay_starts(function)
     zeros = find_zeros(function, starts, rigid=rigid, listed=LISTED, near=0)
     if (

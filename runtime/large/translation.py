@@ -63,7 +63,7 @@ def count_translations(listed: Sequence[Population], exchange: Exchange) -> int 
     population_of = {id(group): population for group, population in zip(groups, listed, strict=True)}
     total = 0
     for loop in complete_loops(groups, exchange):
-        free = find_rigid_modes(loop, with_drifts=False).directions.shape[1]
+        free = len(find_rigid_modes(loop, with_drifts=False).names)
         if free and not hold_for_all(loop, [population_of[id(group)] for group in loop.sites]):
             return None
         total += loop.multiplicity * free

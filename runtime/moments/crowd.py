@@ -296,7 +296,7 @@ def _luck(common: Loop, weights: Coupling, memories: Sequence[Remembered]) -> li
 def standing_motions(loop: Loop) -> Floats:
     """Return the rigid motions of a loop over its sites' own states."""
     states = sum(len(site.lifted.z_names) for site in loop.sites)
-    return find_rigid_modes(without_packets(loop), with_drifts=False).directions[:states]
+    return find_rigid_modes(without_packets(loop), with_drifts=False).basis[:states]
 
 
 def peer_classes(told: Hearing) -> tuple[tuple[Loop, ...], Coupling]:

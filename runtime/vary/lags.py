@@ -240,7 +240,7 @@ def _sheet(loop: Loop, rows: Sequence[Sequence[Sequence[_Packet] | None]], count
                 if weight and slot >= 0:
                     weights[layer, kind, line, starts[h] + sent[h].index(packet)] = float(weight)
     loops = bordered(side_by_side([group.lifted for group in loop.sites]), weights)
-    rigid = find_rigid_modes(without_packets(loop), with_drifts=False).directions.shape[1]
+    rigid = len(find_rigid_modes(without_packets(loop), with_drifts=False).names)
     ages = np.array([one + [0] * (most - len(one)) for one in lags])
     return _LateSheet(loops, np.array(alike), ages, rigid, int(ages.max()))
 

@@ -362,7 +362,7 @@ def _family(of: Asked, times: tuple[int, ...], given: tuple[Override, ...]) -> _
     for loop, wiring in zip(plan.loops, evaluator.wirings, strict=True):
         if wiring.moving or (wiring.rigid.names and what_stands(loop).unfelt):
             return None
-        rigid += loop.multiplicity * wiring.rigid.directions.shape[1]
+        rigid += loop.multiplicity * len(wiring.rigid.names)
         drifts += loop.multiplicity * wiring.rigid.drifts
     names = {one.name: column for column, one in zip(columns, free, strict=True)}
     every = (*timed_system.parameters, *(one for group in timed_system.groups for one in group.values))
