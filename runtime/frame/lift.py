@@ -33,8 +33,8 @@ from apc.frame.site import LinearSite, every_matrix
 
 Matrix = NDArray[Any]
 
-# Steps one after another, each with its duration in quanta and what moves as it begins.
-Seen = Sequence[tuple[int, Matrix]]
+# What is shown each step: its duration in quanta, and what moves as it begins.
+Watch = Callable[[int, Matrix], None]
 
 # Packets that a peer sends or hears in a frame, each a row or column of the frame's map and of the loop's.
 MOST_PACKETS = 1000
@@ -271,7 +271,6 @@ def _play_again(
     at: _Moment,
     numbers: Arithmetic,
     received: Matrix | None,
-    watch: Callable[[Seen], None] | None = None,
 ) -> None:
     """Play events that come again and again: once, over what they need, and that as often as they come.
 
@@ -285,8 +284,6 @@ def _play_again(
         What all is of.
     received
         What is heard (n_r, columns); without it, the last columns, one a packet.
-    watch
-        As of `follow`, with `received`.
 
     Notes
     -----
@@ -319,9 +316,7 @@ def _play_again(
         else:
             once.value[named_at(value, 0)] = unit[..., place, :]
     body = schedule.events[again.first : again.first + again.length]
-    seen: list[tuple[int, Matrix]] = []
-    watching = playing if watch is None else replace(playing, watch=lambda one: seen.extend(_kept(one)))
-    dict(watching.play(body, once, lambda row: unit[..., n + row, :]))
+    dict(playing.play(body, once, lambda row: unit[..., n + row, :]))
     step = _over(once.moving[..., :n_x, :], [row_of(once, value, 1) for value in again.entering])
 
     def after(later: Matrix, earlier: Matrix) -> Matrix:
@@ -331,18 +326,13 @@ def _play_again(
         return found
 
     y = _over(at.moving[..., :n_x, :], [row_of(at, value, 0) for value in needed])
-    if watch is not None and received is not None:
-        each = _each_time(step, y, received, again.count, numbers)
-        watch([(duration, numbers.multiply(moving, each)) for duration, moving in seen])
-        found = numbers.multiply(step, each[-1])
+    whole = _often(step, again.count, after)
+    found = numbers.multiply(whole[..., :n], y)
+    if received is None:
+        heard = found.shape[-1] - n_r
+        found[..., heard:] = numbers.add(found[..., heard:], whole[..., n:])
     else:
-        whole = _often(step, again.count, after)
-        found = numbers.multiply(whole[..., :n], y)
-        if received is None:
-            heard = found.shape[-1] - n_r
-            found[..., heard:] = numbers.add(found[..., heard:], whole[..., n:])
-        else:
-            found = numbers.add(found, numbers.multiply(whole[..., n:], received))
+        found = numbers.add(found, numbers.multiply(whole[..., n:], received))
     at.moving[..., :n_x, :] = found[..., :n_x, :]
     for place, value in enumerate(again.entering, n_x):
         if value.partition == HELD:
@@ -365,38 +355,6 @@ def _often(step: Matrix, count: int, after: Callable[[Matrix, Matrix], Matrix]) 
     return whole
 
 
-def _each_time(step: Matrix, y: Matrix, received: Matrix, count: int, numbers: Arithmetic) -> Matrix:
-    """Return what each of `count` times needs, and all that is heard (count, n + n_r, columns).
-
-    Parameters
-    ----------
-    step
-        [T R] of one time (n_y, n + n_r).
-    y
-        What the first needs (n, columns).
-    received
-        All that is heard (n_r, columns).
-    count
-        How many times there are.
-    numbers
-        The arithmetic: floats, exact rationals or balls.
-
-    Notes
-    -----
-    What the first few have, the next as many have after as many times: their map is squared each time.
-    """
-    each = np.concatenate([y, received])[None]
-    square = np.concatenate([step, np.eye(step.shape[1])[len(step) :]])
-    while len(each) < count:
-        each = np.concatenate([each, numbers.multiply(square, each[: count - len(each)])])
-        square = numbers.multiply(square, square)
-    return each
-
-
-def _kept(seen: Seen) -> Seen:
-    return [(duration, moving.copy()) for duration, moving in seen]
-
-
 def follow(
     site: LinearSite,
     schedule: Schedule,
@@ -405,8 +363,7 @@ def follow(
     hear: Callable[[int], Matrix | None],
     *,
     numbers: Arithmetic = FLOATS,
-    watch: Callable[[Seen], None] | None = None,
-    at_once: bool = False,
+    watch: Watch | None = None,
 ) -> Generator[tuple[int, Matrix], None, Matrix]:
     """Follow a site, or many, through one frame, event by event, over numbers of any kind.
 
@@ -429,9 +386,6 @@ def follow(
     watch
         Is shown each step before it is made: its duration in quanta, and the continuous states above what the
         holds put out (n_x + n_u, columns). Without it, what comes again and again is played once.
-    at_once
-        Whether that is played once all the same, and shown step by step, each with what moves at every time
-        (times, n_x + n_u, columns); not of many.
 
     Yields
     ------
@@ -443,7 +397,7 @@ def follow(
     """
     playing = replace(_Playing.of(site, steps, start.dtype, numbers.multiply, watch), many=start.shape[:-2])
     at = playing.begin(schedule, start)
-    again = schedule.repeats if watch is None or at_once else None
+    again = schedule.repeats if watch is None else None
     if again is None:
         yield from playing.play(schedule.events, at, hear)
         return playing.end(schedule, at)
@@ -454,7 +408,7 @@ def follow(
         while (packet := hear(row)) is None:
             yield -1, at.nothing
         received[..., row, :] = packet
-    _play_again(playing, schedule, again, at, numbers, received, watch)
+    _play_again(playing, schedule, again, at, numbers, received)
     yield from playing.play(schedule.events[again.end :], at, hear)
     return playing.end(schedule, at)
 
@@ -483,7 +437,7 @@ class _Playing:
     many: tuple[int, ...]  # of how many sites
     number: Any
     multiply: Callable[[Matrix, Matrix], Matrix]
-    watch: Callable[[Seen], None] | None
+    watch: Watch | None
 
     @classmethod
     def of(
@@ -492,7 +446,7 @@ class _Playing:
         steps: Mapping[int, Matrix],
         number: Any,
         multiply: Callable[[Matrix, Matrix], Matrix],
-        watch: Callable[[Seen], None] | None = None,
+        watch: Watch | None = None,
     ) -> _Playing:
         sends = [_beside(send.x, send.u) for send in site.sends]
         ticks = [_beside(tick.x, tick.u, tick.m, tick.r) for tick in site.ticks]
@@ -539,7 +493,7 @@ class _Playing:
             match event:
                 case Propagate(duration):
                     if self.watch is not None:
-                        self.watch([(duration, moving)])
+                        self.watch(duration, moving)
                     moving[..., :n_x, :] = self.multiply(self.steps[duration][..., :n_x, :], moving)
                 case Act(hold, one):
                     moving[..., n_x + hold, :] = value.get(one, at.nothing)
