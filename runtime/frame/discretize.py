@@ -97,7 +97,8 @@ def discretize(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) 
     Parameters
     ----------
     a, b
-        A (n_x, n_x) and B (n_x, n_u), entries exact: `Fraction` or float taken at its word.
+        A (n_x, n_x) and B (n_x, n_u), entries exact: `Fraction` or float taken at its word. Or those of many
+        sites in floats (k, …), which may be off by `COEFFICIENT_ROUNDINGS`.
     durations
         T in seconds.
 
@@ -107,6 +108,8 @@ def discretize(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) 
         E806 an entry of the exponential is too large for a float: something grows without measure within T;
         E812 too many states, or too many that move together.
     """
+    if a.ndim > 2:
+        return tuple(step_rows(a, b, float(duration)) for duration in durations)
     if len(durations) * (a.size + b.size) > FEW_ENTRIES:
         return _discretized(a, b, durations)
     entries = (*a.ravel().tolist(), *b.ravel().tolist())

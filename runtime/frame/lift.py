@@ -1,7 +1,7 @@
 """One frame of one site as one linear map.
 
 Takes: a `LinearSite` and its `Schedule`; or the matrices of many sites at once, with a leading axis (k).
-Gives: `FrameMap`, `compose`; `BoundedMap`, `LiftedSite`, `lift`, `bounded`, `composed_bounded`; `follow`,
+Gives: `FrameMap`, `compose`; `BoundedMap`, `LiftedSite`, `lift`, `named`, `composed_bounded`; `follow`,
 event by event.
 Guarantees: `compose` and `follow` take numbers of any kind. `lift` propagates the continuous part by its
 exact exponential; every matrix comes with a bound on its rounding error, entry by entry.
@@ -61,12 +61,6 @@ class FrameMap:
         """Return the map whose blocks are made of these and of those of others."""
         return FrameMap(*map(change, self.blocks, *(one.blocks for one in others)))
 
-    @property
-    def largest(self) -> Matrix:
-        """The largest entry of [P Q] and that of [S D]; NaN where one is."""
-        p, q, s, d = (block.max(initial=0.0) for block in self.blocks)
-        return np.maximum([p, s], [q, d])
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoundedMap(FrameMap):
@@ -79,24 +73,14 @@ class BoundedMap(FrameMap):
         """The map with its errors as radii."""
         return self.mapped(with_radius, self.error)
 
-    def row(self, place: int) -> BoundedMap:
-        """Return one map of many."""
-        return BoundedMap(
-            *self.mapped(lambda block: block[place]).blocks, self.error.mapped(lambda block: block[place])
-        )
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiftedSite(BoundedMap):
-    """The one-frame map of a site, or of many of one kind.
-
-    `estimated` says that the errors of some site are an estimate, as the bound says nothing.
-    """
+    """The one-frame map of a site, or of many of one kind."""
 
     z_names: tuple[str, ...]
     continuous: int  # the first so many entries of z are continuous states
     frame_s: float
-    estimated: bool = False
 
 
 def lift(
@@ -105,24 +89,30 @@ def lift(
     *,
     exact: LinearSite | None = None,
 ) -> LiftedSite:
-    """Compose a site's events over one frame.
+    """Compose the events of a site, or of many, over one frame.
 
     Parameters
     ----------
     site
-        The site's matrices, in floats.
+        The site's matrices, in floats; or those of many sites of one kind (k, …).
     schedule
         What happens in a frame.
     exact
         The site's matrices in rationals, whose exponentials are taken; without it, those of `site` count as
         exact.
+
+    Notes
+    -----
+    Each coefficient carries its own roundings as a radius, and each event adds its own to these (see
+    `radius`). The bound holds whatever the scaling of the states; of many sites it is wider, as their
+    exponentials are taken in floats.
     """
     check_packets(schedule)
     durations = step_durations(schedule)
     exact = site if exact is None else exact
     found = discretize(exact.a, exact.b, [duration * schedule.quantum for duration in durations])
     both = composed_bounded(site, schedule, dict(zip(durations, found, strict=True)))
-    return named(site.kind, schedule, both.mapped(value_of), both.mapped(radius_of))
+    return named(site.kind, schedule, both)
 
 
 def check_packets(schedule: Schedule) -> None:
@@ -139,51 +129,31 @@ def step_durations(schedule: Schedule) -> list[int]:
     return sorted({event.duration for event in schedule.events if isinstance(event, Propagate)})
 
 
-def named(
-    kind: Kind, schedule: Schedule, frame: FrameMap, error: FrameMap, *, estimated: bool = False
-) -> LiftedSite:
-    """Return a frame's map and its error with the names of its states.
+def named(kind: Kind, schedule: Schedule, both: FrameMap) -> LiftedSite:
+    """Return a frame's map, which has its radii, with the names of its states.
 
     Parameters
     ----------
-    kind, schedule
+    kind, schedule, both
         Of the site or sites.
-    frame, error
-        Their map, and the bounds on it.
-    estimated
-        Whether these are an estimate.
     """
     return LiftedSite(
-        *frame.blocks,
-        error=error,
+        *both.mapped(value_of).blocks,
+        error=both.mapped(radius_of),
         z_names=(*(state.name for state in kind.states), *schedule.value_names),
         continuous=len(kind.states),
         frame_s=float(schedule.frame_s),
-        estimated=estimated,
     )
 
 
-def bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> tuple[FrameMap, FrameMap]:
-    """Compose a frame, and bound its rounding error.
+def composed_bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> FrameMap:
+    """Return the composed frame of one site or many, its matrices with their radii.
 
     Parameters
     ----------
-    site, schedule
-        One site or many, and what happens in a frame.
-    steps
-        Its exponentials by duration in quanta.
-
-    Notes
-    -----
-    Each coefficient carries its own roundings as a radius, and each event adds its own to these (see
-    `radius`). The bound holds whatever the scaling of the states.
+    site, schedule, steps
+        The matrices in floats, what happens in a frame, the exponentials by duration in quanta.
     """
-    both = composed_bounded(site, schedule, steps)
-    return both.mapped(value_of), both.mapped(radius_of)
-
-
-def composed_bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> FrameMap:
-    """Return `bounded` as one map of matrices with their radii."""
     off = {
         duration: with_radius(step.matrix, step.roundings * UNIT * step.size)
         for duration, step in steps.items()
@@ -195,20 +165,6 @@ def with_roundings(site: LinearSite) -> LinearSite:
     """Return a site's matrices with their radii, those of what CasADi rounds."""
     charge = COEFFICIENT_ROUNDINGS * UNIT
     return every_matrix(site, lambda matrix: with_radius(matrix, charge * np.abs(matrix)))
-
-
-def roundings_of(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> float:
-    """Return the roundings of all events of a frame, in units of UNIT."""
-    size = sum(site.b.shape[-2:])
-    width = size + max((tick.m.shape[-1] + tick.r.shape[-1] for tick in site.ticks), default=0)
-    width += len(schedule.heard)
-    return sum(
-        size + steps[event.duration].roundings
-        if isinstance(event, Propagate)
-        else width + COEFFICIENT_ROUNDINGS
-        for event in schedule.events
-        if not isinstance(event, Act)
-    )
 
 
 def compose(
