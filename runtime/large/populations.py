@@ -24,7 +24,7 @@ from apc.eigen.spectrum import Mode, Motion, oscillation
 from apc.frame.course import turns
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import BoundedMap, FrameMap, LiftedSite, lift
-from apc.frame.linearize import linearize_rows, site_of_row, sites_of_rows
+from apc.frame.linearize import linearize, linearize_rows, site_of
 from apc.frame.parameters import Numbers
 from apc.frame.radius import RADII, radius_of, rounded, value_of
 from apc.frame.schedule import Schedule
@@ -108,8 +108,7 @@ def populations(
 def _lifted(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedSite:
     """Return the maps of many sites of one kind from their matrices (k, …)."""
     parts = [
-        lift(sites_of_rows(site, rows[start : start + CHUNK]), schedule)
-        for start in range(0, len(rows), CHUNK)
+        lift(site_of(site, rows[start : start + CHUNK]), schedule) for start in range(0, len(rows), CHUNK)
     ]
     return _joined(parts)
 
@@ -141,9 +140,7 @@ def _every_block(lifted: LiftedSite, change: Callable[[Floats], Floats]) -> Lift
 
 def site_one(population: Population, row: int) -> LinearSite:
     """Return the matrices of one of the different peers by itself."""
-    return site_of_row(
-        population.jacobians, linearize_rows(population.jacobians, population.parameters[[row]])[0]
-    )
+    return linearize(population.jacobians, population.parameters[row])
 
 
 def hear_themselves(lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats) -> BoundedMap:
