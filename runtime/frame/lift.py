@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -38,9 +37,6 @@ Watch = Callable[[int, Matrix], None]
 
 # Packets that a peer sends or hears in a frame, each a row or column of the frame's map and of the loop's.
 MOST_PACKETS = 1000
-
-# Sites whose exponentials are remembered, and of how many states.
-KEPT, FEW_STATES = 128, 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,7 +184,7 @@ def compose(
         What these matrices are of.
     """
     n_z = len(site.kind.states) + len(schedule.carried)
-    unit = _unit(n_z + len(schedule.heard), numbers.exact)
+    unit = numbers.exact(np.eye(n_z + len(schedule.heard)))
     playing = _Playing.of(site, steps, unit.dtype, numbers.multiply)
     at = playing.begin(schedule, unit[..., :n_z, :])
     sent: dict[int, Matrix] = {}
@@ -206,18 +202,6 @@ def compose(
     z = playing.end(schedule, at)
     s = _over(z[..., :0, :], [sent[row] for row in range(len(schedule.sent))])
     return FrameMap(z[..., :n_z], z[..., n_z:], s[..., :n_z], s[..., n_z:])
-
-
-def _unit(size: int, exact: Callable[[Matrix], Matrix]) -> Matrix:
-    """Return the unit matrix of some kind of number; a small one is made once."""
-    return _known_unit(size, exact) if size <= FEW_STATES else exact(np.eye(size))
-
-
-@lru_cache(maxsize=KEPT)
-def _known_unit(size: int, exact: Callable[[Matrix], Matrix]) -> Matrix:
-    unit = exact(np.eye(size))
-    unit.flags.writeable = False
-    return unit
 
 
 def _play_again(
@@ -264,7 +248,7 @@ def _play_again(
         index = value.index + before[value.partition] + later * again.ticks[value.partition]
         return Value(value.partition, value.output, index)
 
-    unit = _unit(n + n_r, numbers.exact)
+    unit = numbers.exact(np.eye(n + n_r))
     once = playing.at_rest(unit[..., :n_x, :])
     for place, value in enumerate(needed, n_x):
         if value.partition == HELD:

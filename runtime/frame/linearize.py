@@ -223,7 +223,8 @@ def _finite_slopes(
         E808 a value of the site, or a slope of one, that is not finite.
     """
     if site.parameters_suffice:
-        flat = linearize_rows(site, np.asarray(parameters, dtype=np.float64)[None])[0]
+        rows = linearize_rows(site, np.asarray(parameters, dtype=np.float64)[None])
+        flat: NDArray[np.float64] = rows[0]
     else:
         if not site.affine:  # else the start is anywhere
             check_start(site, parameters, listening)
