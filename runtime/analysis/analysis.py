@@ -361,12 +361,10 @@ def _solve_populations(
     from apc.large.translation import count_translations
 
     listed = populations(system, prepared.jacobians, prepared.schedules, numbers)
-    rounded = "what rounding does to the peers' own motion is estimated here, not bounded"
-    notes = (rounded,) if any(population.lifted.estimated for population in listed) else ()
     rigid = count_translations(listed, exchange)
     spectrum = solve_populations(listed, exchange, rigid=rigid or 0)
     free = "the first peer moves freely in a way that not all others do: left open"
-    return spectrum, notes if rigid is not None else (*notes, free)
+    return spectrum, () if rigid is not None else (free,)
 
 
 def lifted_groups(

@@ -28,7 +28,7 @@ from apc.eigen.graph_modes import Surd
 from apc.eigen.relative import Relative, relative
 from apc.frame.discretize import step_balls
 from apc.frame.exact import is_rational
-from apc.frame.lift import Seen, follow
+from apc.frame.lift import follow
 from apc.frame.radius import Arithmetic
 from apc.frame.schedule import Propagate, Schedule, Way
 from apc.frame.site import LinearSite, entrywise
@@ -114,7 +114,7 @@ def closed_frame(
     *,
     weights: Weights | None = None,
     state: Balls | None = None,
-    watch: Callable[[int, Seen], None] | None = None,
+    watch: Callable[[int, int, Balls], None] | None = None,
 ) -> Balls:
     """Follow all sites of a closed system through one frame, over its state.
 
@@ -130,7 +130,7 @@ def closed_frame(
     state
         The states (n, columns) at the start of the frame; without it, the unit matrix.
     watch
-        Is shown each site's steps before they are made (see `lift.follow`).
+        Is shown each site's steps before they are made, its number first (see `lift.follow`).
 
     Returns
     -------

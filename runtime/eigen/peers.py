@@ -34,7 +34,6 @@ from apc.frame.linearize import (
     linearize,
     linearize_exact,
     linearize_rows,
-    site_of_row,
     start_sends,
     start_values,
 )
@@ -471,7 +470,7 @@ def _by_matrices(
     exchange: Exchange,
 ) -> tuple[PeerGroup, ...]:
     """Group peers of equal matrices, whatever their start values and constant forces."""
-    rows: dict[_Key, tuple[int, Floats, Floats]] = {}
+    rows: dict[_Key, tuple[int, Floats]] = {}
     members: dict[_Key, list[tuple[int, Peers]]] = {}
     for place, group in enumerate(system.groups):
         parameters = numbers.parameters[place]
@@ -480,15 +479,15 @@ def _by_matrices(
             parameters, linearize_rows(jacobians[group.kind], parameters), strict=True
         ):
             keys.append((group.kind, exchange.role(place), matrices.tobytes()))
-            rows.setdefault(keys[-1], (place, vector, matrices))
+            rows.setdefault(keys[-1], (place, vector))
         for key, peers in _split(keys, numbers.rows[place]):
             members.setdefault(key, []).append((place, peers))
     check_size([jacobians[key[0]] for key in members], exchange)
     found = []
     for number, (key, parts) in enumerate(members.items()):
-        place, vector, matrices = rows[key]
+        place, vector = rows[key]
         built = jacobians[key[0]]
-        site = site_of_row(built, matrices)
+        site = linearize(built, vector)
         found.append(build_group(number, parts, vector, built, site, schedules[place], exchange))
     return tuple(found)
 
@@ -599,7 +598,7 @@ def group_of_row(
     group, count
         The scene's group, and how many.
     """
-    site = site_of_row(built, linearize_rows(built, vector[None])[0])
+    site = linearize(built, vector)
     parts = [(group, Runs((range(count),)))]
     return build_group(group, parts, vector, built, site, schedule, exchange)
 

@@ -35,7 +35,6 @@ from apc.eigen.closing import ClosedSystem, Loop
 from apc.eigen.enclosure import misses_one
 from apc.eigen.null_space import null_space, null_space_modulo, residue
 from apc.eigen.peers import PeerGroup, states_of
-from apc.frame.lift import Seen
 from apc.frame.site import LinearSite, entrywise
 
 Floats = NDArray[np.float64]
@@ -349,9 +348,9 @@ def _ramp_equations(
     def euler(a: Matrix, b: Matrix, duration: Fraction) -> Matrix:
         return np.hstack([np.eye(len(a), dtype=np.int64) + a * number(duration), b * number(duration)])
 
-    def watch(g: int, seen: Seen) -> None:
+    def watch(g: int, _: int, moving: Matrix) -> None:
         moved = np.hstack([sites[g].a, sites[g].b])
-        equations.extend(BALLS.multiply(moved, moving) - own[g] for _, moving in seen)
+        equations.append(BALLS.multiply(moved, moving) - own[g])
 
     weights = {
         way: [[(h, number(weight)) for h, weight in enumerate(row) if weight] for row in rows]

@@ -45,7 +45,7 @@ from apc.frame.discretize import TOO_LARGE, discretize
 from apc.frame.exchange import Exchange
 from apc.frame.lift import MOST_PACKETS, FrameMap, check_packets, compose, named, step_durations
 from apc.frame.ports import OUTSIDE, with_cuts, with_holds, with_ports
-from apc.frame.radius import FLOATS, Arithmetic
+from apc.frame.radius import FLOATS, RADII, Arithmetic
 from apc.frame.schedule import Heard, Schedule, Tick, Value
 from apc.frame.site import LinearSite
 from apc.memory import refuse_beyond
@@ -282,7 +282,7 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
     ]
     inputs = [Port(f"force on {push.part}", "N") for push in forces]
     inputs += [Port(f"noise on {kind.states[place].name}", kind.states[place].unit) for place in noises]
-    lifted_site = named(site.kind, full, frame, frame.mapped(np.zeros_like))
+    lifted_site = named(site.kind, full, frame.mapped(RADII.exact))
     return _Opened(
         group=group.with_site(site, group.exact, full, lifted_site),
         map=frame,

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.frame.discretize import exponential_values
-from apc.frame.lift import Seen, follow
+from apc.frame.lift import follow
 from apc.frame.radius import FLOATS
 from apc.frame.schedule import Propagate, Schedule
 from apc.frame.site import LinearSite, every_matrix, matrices_of
@@ -170,22 +170,16 @@ def _courses(
         halves = rows.reshape(len(rows), 2, count)
         return np.asarray(np.einsum("khn,nck->hck", matrix, halves).reshape(-1, 2 * count))
 
-    def watch(seen: Seen) -> None:
-        # Each mode's rows times its own columns, of every time: (k, points of all steps, times, 2).
-        columns = [moving.reshape(-1, n, 2, count).transpose(3, 1, 0, 2) for _, moving in seen]
-        path = [
-            fine[duration] @ own.reshape(count, n, -1)
-            for (duration, _), own in zip(seen, columns, strict=True)
-        ]
-        every = np.concatenate(path, axis=1).reshape(count, -1, columns[0].shape[2], 2)
-        parts.append(every.transpose(2, 1, 0, 3).reshape(-1, count, 2))
+    def watch(duration: int, moving: Floats) -> None:
+        # Each mode's rows times its own columns: (points, k, 2).
+        columns = moving.reshape(n, 2, count).transpose(2, 0, 1)
+        parts.append((fine[duration] @ columns).swapaxes(0, 1))
 
     listened = rows_of(heard)
     course = follow(
         *(site, schedule, steps, rows_of(start), lambda row: listened[row]),
         numbers=replace(FLOATS, multiply=multiply),
         watch=watch,
-        at_once=one_site,
     )
     while True:
         try:

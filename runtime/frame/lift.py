@@ -1,7 +1,7 @@
 """One frame of one site as one linear map.
 
 Takes: a `LinearSite` and its `Schedule`; or the matrices of many sites at once, with a leading axis (k).
-Gives: `FrameMap`, `compose`; `BoundedMap`, `LiftedSite`, `lift`, `bounded`, `composed_bounded`; `follow`,
+Gives: `FrameMap`, `compose`; `BoundedMap`, `LiftedSite`, `lift`, `named`, `composed_bounded`; `follow`,
 event by event.
 Guarantees: `compose` and `follow` take numbers of any kind. `lift` propagates the continuous part by its
 exact exponential; every matrix comes with a bound on its rounding error, entry by entry.
@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -33,14 +32,11 @@ from apc.frame.site import LinearSite, every_matrix
 
 Matrix = NDArray[Any]
 
-# Steps one after another, each with its duration in quanta and what moves as it begins.
-Seen = Sequence[tuple[int, Matrix]]
+# What is shown each step: its duration in quanta, and what moves as it begins.
+Watch = Callable[[int, Matrix], None]
 
 # Packets that a peer sends or hears in a frame, each a row or column of the frame's map and of the loop's.
 MOST_PACKETS = 1000
-
-# Sites whose exponentials are remembered, and of how many states.
-KEPT, FEW_STATES = 128, 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,12 +57,6 @@ class FrameMap:
         """Return the map whose blocks are made of these and of those of others."""
         return FrameMap(*map(change, self.blocks, *(one.blocks for one in others)))
 
-    @property
-    def largest(self) -> Matrix:
-        """The largest entry of [P Q] and that of [S D]; NaN where one is."""
-        p, q, s, d = (block.max(initial=0.0) for block in self.blocks)
-        return np.maximum([p, s], [q, d])
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoundedMap(FrameMap):
@@ -79,24 +69,14 @@ class BoundedMap(FrameMap):
         """The map with its errors as radii."""
         return self.mapped(with_radius, self.error)
 
-    def row(self, place: int) -> BoundedMap:
-        """Return one map of many."""
-        return BoundedMap(
-            *self.mapped(lambda block: block[place]).blocks, self.error.mapped(lambda block: block[place])
-        )
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiftedSite(BoundedMap):
-    """The one-frame map of a site, or of many of one kind.
-
-    `estimated` says that the errors of some site are an estimate, as the bound says nothing.
-    """
+    """The one-frame map of a site, or of many of one kind."""
 
     z_names: tuple[str, ...]
     continuous: int  # the first so many entries of z are continuous states
     frame_s: float
-    estimated: bool = False
 
 
 def lift(
@@ -105,24 +85,30 @@ def lift(
     *,
     exact: LinearSite | None = None,
 ) -> LiftedSite:
-    """Compose a site's events over one frame.
+    """Compose the events of a site, or of many, over one frame.
 
     Parameters
     ----------
     site
-        The site's matrices, in floats.
+        The site's matrices, in floats; or those of many sites of one kind (k, …).
     schedule
         What happens in a frame.
     exact
         The site's matrices in rationals, whose exponentials are taken; without it, those of `site` count as
         exact.
+
+    Notes
+    -----
+    Each coefficient carries its own roundings as a radius, and each event adds its own to these (see
+    `radius`). The bound holds whatever the scaling of the states; of many sites it is wider, as their
+    exponentials are taken in floats.
     """
     check_packets(schedule)
     durations = step_durations(schedule)
     exact = site if exact is None else exact
     found = discretize(exact.a, exact.b, [duration * schedule.quantum for duration in durations])
     both = composed_bounded(site, schedule, dict(zip(durations, found, strict=True)))
-    return named(site.kind, schedule, both.mapped(value_of), both.mapped(radius_of))
+    return named(site.kind, schedule, both)
 
 
 def check_packets(schedule: Schedule) -> None:
@@ -139,51 +125,31 @@ def step_durations(schedule: Schedule) -> list[int]:
     return sorted({event.duration for event in schedule.events if isinstance(event, Propagate)})
 
 
-def named(
-    kind: Kind, schedule: Schedule, frame: FrameMap, error: FrameMap, *, estimated: bool = False
-) -> LiftedSite:
-    """Return a frame's map and its error with the names of its states.
+def named(kind: Kind, schedule: Schedule, both: FrameMap) -> LiftedSite:
+    """Return a frame's map, which has its radii, with the names of its states.
 
     Parameters
     ----------
-    kind, schedule
+    kind, schedule, both
         Of the site or sites.
-    frame, error
-        Their map, and the bounds on it.
-    estimated
-        Whether these are an estimate.
     """
     return LiftedSite(
-        *frame.blocks,
-        error=error,
+        *both.mapped(value_of).blocks,
+        error=both.mapped(radius_of),
         z_names=(*(state.name for state in kind.states), *schedule.value_names),
         continuous=len(kind.states),
         frame_s=float(schedule.frame_s),
-        estimated=estimated,
     )
 
 
-def bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> tuple[FrameMap, FrameMap]:
-    """Compose a frame, and bound its rounding error.
+def composed_bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> FrameMap:
+    """Return the composed frame of one site or many, its matrices with their radii.
 
     Parameters
     ----------
-    site, schedule
-        One site or many, and what happens in a frame.
-    steps
-        Its exponentials by duration in quanta.
-
-    Notes
-    -----
-    Each coefficient carries its own roundings as a radius, and each event adds its own to these (see
-    `radius`). The bound holds whatever the scaling of the states.
+    site, schedule, steps
+        The matrices in floats, what happens in a frame, the exponentials by duration in quanta.
     """
-    both = composed_bounded(site, schedule, steps)
-    return both.mapped(value_of), both.mapped(radius_of)
-
-
-def composed_bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> FrameMap:
-    """Return `bounded` as one map of matrices with their radii."""
     off = {
         duration: with_radius(step.matrix, step.roundings * UNIT * step.size)
         for duration, step in steps.items()
@@ -195,20 +161,6 @@ def with_roundings(site: LinearSite) -> LinearSite:
     """Return a site's matrices with their radii, those of what CasADi rounds."""
     charge = COEFFICIENT_ROUNDINGS * UNIT
     return every_matrix(site, lambda matrix: with_radius(matrix, charge * np.abs(matrix)))
-
-
-def roundings_of(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> float:
-    """Return the roundings of all events of a frame, in units of UNIT."""
-    size = sum(site.b.shape[-2:])
-    width = size + max((tick.m.shape[-1] + tick.r.shape[-1] for tick in site.ticks), default=0)
-    width += len(schedule.heard)
-    return sum(
-        size + steps[event.duration].roundings
-        if isinstance(event, Propagate)
-        else width + COEFFICIENT_ROUNDINGS
-        for event in schedule.events
-        if not isinstance(event, Act)
-    )
 
 
 def compose(
@@ -232,7 +184,7 @@ def compose(
         What these matrices are of.
     """
     n_z = len(site.kind.states) + len(schedule.carried)
-    unit = _unit(n_z + len(schedule.heard), numbers.exact)
+    unit = numbers.exact(np.eye(n_z + len(schedule.heard)))
     playing = _Playing.of(site, steps, unit.dtype, numbers.multiply)
     at = playing.begin(schedule, unit[..., :n_z, :])
     sent: dict[int, Matrix] = {}
@@ -252,18 +204,6 @@ def compose(
     return FrameMap(z[..., :n_z], z[..., n_z:], s[..., :n_z], s[..., n_z:])
 
 
-def _unit(size: int, exact: Callable[[Matrix], Matrix]) -> Matrix:
-    """Return the unit matrix of some kind of number; a small one is made once."""
-    return _known_unit(size, exact) if size <= FEW_STATES else exact(np.eye(size))
-
-
-@lru_cache(maxsize=KEPT)
-def _known_unit(size: int, exact: Callable[[Matrix], Matrix]) -> Matrix:
-    unit = exact(np.eye(size))
-    unit.flags.writeable = False
-    return unit
-
-
 def _play_again(
     playing: _Playing,
     schedule: Schedule,
@@ -271,7 +211,6 @@ def _play_again(
     at: _Moment,
     numbers: Arithmetic,
     received: Matrix | None,
-    watch: Callable[[Seen], None] | None = None,
 ) -> None:
     """Play events that come again and again: once, over what they need, and that as often as they come.
 
@@ -285,8 +224,6 @@ def _play_again(
         What all is of.
     received
         What is heard (n_r, columns); without it, the last columns, one a packet.
-    watch
-        As of `follow`, with `received`.
 
     Notes
     -----
@@ -311,7 +248,7 @@ def _play_again(
         index = value.index + before[value.partition] + later * again.ticks[value.partition]
         return Value(value.partition, value.output, index)
 
-    unit = _unit(n + n_r, numbers.exact)
+    unit = numbers.exact(np.eye(n + n_r))
     once = playing.at_rest(unit[..., :n_x, :])
     for place, value in enumerate(needed, n_x):
         if value.partition == HELD:
@@ -319,9 +256,7 @@ def _play_again(
         else:
             once.value[named_at(value, 0)] = unit[..., place, :]
     body = schedule.events[again.first : again.first + again.length]
-    seen: list[tuple[int, Matrix]] = []
-    watching = playing if watch is None else replace(playing, watch=lambda one: seen.extend(_kept(one)))
-    dict(watching.play(body, once, lambda row: unit[..., n + row, :]))
+    dict(playing.play(body, once, lambda row: unit[..., n + row, :]))
     step = _over(once.moving[..., :n_x, :], [row_of(once, value, 1) for value in again.entering])
 
     def after(later: Matrix, earlier: Matrix) -> Matrix:
@@ -331,18 +266,13 @@ def _play_again(
         return found
 
     y = _over(at.moving[..., :n_x, :], [row_of(at, value, 0) for value in needed])
-    if watch is not None and received is not None:
-        each = _each_time(step, y, received, again.count, numbers)
-        watch([(duration, numbers.multiply(moving, each)) for duration, moving in seen])
-        found = numbers.multiply(step, each[-1])
+    whole = _often(step, again.count, after)
+    found = numbers.multiply(whole[..., :n], y)
+    if received is None:
+        heard = found.shape[-1] - n_r
+        found[..., heard:] = numbers.add(found[..., heard:], whole[..., n:])
     else:
-        whole = _often(step, again.count, after)
-        found = numbers.multiply(whole[..., :n], y)
-        if received is None:
-            heard = found.shape[-1] - n_r
-            found[..., heard:] = numbers.add(found[..., heard:], whole[..., n:])
-        else:
-            found = numbers.add(found, numbers.multiply(whole[..., n:], received))
+        found = numbers.add(found, numbers.multiply(whole[..., n:], received))
     at.moving[..., :n_x, :] = found[..., :n_x, :]
     for place, value in enumerate(again.entering, n_x):
         if value.partition == HELD:
@@ -365,38 +295,6 @@ def _often(step: Matrix, count: int, after: Callable[[Matrix, Matrix], Matrix]) 
     return whole
 
 
-def _each_time(step: Matrix, y: Matrix, received: Matrix, count: int, numbers: Arithmetic) -> Matrix:
-    """Return what each of `count` times needs, and all that is heard (count, n + n_r, columns).
-
-    Parameters
-    ----------
-    step
-        [T R] of one time (n_y, n + n_r).
-    y
-        What the first needs (n, columns).
-    received
-        All that is heard (n_r, columns).
-    count
-        How many times there are.
-    numbers
-        The arithmetic: floats, exact rationals or balls.
-
-    Notes
-    -----
-    What the first few have, the next as many have after as many times: their map is squared each time.
-    """
-    each = np.concatenate([y, received])[None]
-    square = np.concatenate([step, np.eye(step.shape[1])[len(step) :]])
-    while len(each) < count:
-        each = np.concatenate([each, numbers.multiply(square, each[: count - len(each)])])
-        square = numbers.multiply(square, square)
-    return each
-
-
-def _kept(seen: Seen) -> Seen:
-    return [(duration, moving.copy()) for duration, moving in seen]
-
-
 def follow(
     site: LinearSite,
     schedule: Schedule,
@@ -405,8 +303,7 @@ def follow(
     hear: Callable[[int], Matrix | None],
     *,
     numbers: Arithmetic = FLOATS,
-    watch: Callable[[Seen], None] | None = None,
-    at_once: bool = False,
+    watch: Watch | None = None,
 ) -> Generator[tuple[int, Matrix], None, Matrix]:
     """Follow a site, or many, through one frame, event by event, over numbers of any kind.
 
@@ -429,9 +326,6 @@ def follow(
     watch
         Is shown each step before it is made: its duration in quanta, and the continuous states above what the
         holds put out (n_x + n_u, columns). Without it, what comes again and again is played once.
-    at_once
-        Whether that is played once all the same, and shown step by step, each with what moves at every time
-        (times, n_x + n_u, columns); not of many.
 
     Yields
     ------
@@ -443,7 +337,7 @@ def follow(
     """
     playing = replace(_Playing.of(site, steps, start.dtype, numbers.multiply, watch), many=start.shape[:-2])
     at = playing.begin(schedule, start)
-    again = schedule.repeats if watch is None or at_once else None
+    again = schedule.repeats if watch is None else None
     if again is None:
         yield from playing.play(schedule.events, at, hear)
         return playing.end(schedule, at)
@@ -454,7 +348,7 @@ def follow(
         while (packet := hear(row)) is None:
             yield -1, at.nothing
         received[..., row, :] = packet
-    _play_again(playing, schedule, again, at, numbers, received, watch)
+    _play_again(playing, schedule, again, at, numbers, received)
     yield from playing.play(schedule.events[again.end :], at, hear)
     return playing.end(schedule, at)
 
@@ -483,7 +377,7 @@ class _Playing:
     many: tuple[int, ...]  # of how many sites
     number: Any
     multiply: Callable[[Matrix, Matrix], Matrix]
-    watch: Callable[[Seen], None] | None
+    watch: Watch | None
 
     @classmethod
     def of(
@@ -492,7 +386,7 @@ class _Playing:
         steps: Mapping[int, Matrix],
         number: Any,
         multiply: Callable[[Matrix, Matrix], Matrix],
-        watch: Callable[[Seen], None] | None = None,
+        watch: Watch | None = None,
     ) -> _Playing:
         sends = [_beside(send.x, send.u) for send in site.sends]
         ticks = [_beside(tick.x, tick.u, tick.m, tick.r) for tick in site.ticks]
@@ -539,7 +433,7 @@ class _Playing:
             match event:
                 case Propagate(duration):
                     if self.watch is not None:
-                        self.watch([(duration, moving)])
+                        self.watch(duration, moving)
                     moving[..., :n_x, :] = self.multiply(self.steps[duration][..., :n_x, :], moving)
                 case Act(hold, one):
                     moving[..., n_x + hold, :] = value.get(one, at.nothing)

@@ -1,9 +1,9 @@
 """The matrices of a site where it starts: of one, or of many at once.
 
 Takes: a kind's `SiteJacobians`, a parameter vector or many, what the site hears at the start.
-Gives: `linearize`, `linearize_exact`, `linearize_rows`, `of_rows`; `site_of_row`, `sites_of_rows`,
-`site_of_entries`; what a site is and sends at the start (`start_values`, `start_sends`, `start_arguments`,
-`start_names`, `reaches_start`, `sends_nothing`, `at_start`); `Listening`.
+Gives: `linearize`, `linearize_exact`, `linearize_rows`, `of_rows`; `site_of`, `site_of_entries`; what a site
+is and sends at the start (`start_values`, `start_sends`, `start_arguments`, `start_names`, `reaches_start`,
+`sends_nothing`, `at_start`); `Listening`.
 Guarantees: a site that is not affine is linearized at its start values; holds put out zero there.
 Does not: decide when anything happens (see `scheduling`); ask who hears whom (see `peers`).
 """
@@ -26,7 +26,7 @@ from apc.frame.exact import evaluate_exact
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.names import Free
 from apc.frame.parameters import exact_numbers, scope_of
-from apc.frame.site import LinearSite, assemble, cut, matrices_of, with_own_parts
+from apc.frame.site import LinearSite, assemble, cut, every_matrix, with_own_parts
 
 # Kinds that are kept as they start, and functions of many sites.
 KEPT = 64
@@ -183,10 +183,8 @@ def linearize(
     if listening is not None and site.edges:
         # A sum of slopes over many peers: rounded once, whatever cancels in it.
         exact = linearize_exact(site, parameters, listening)
-        return assemble(
-            site.kind, site.affine, [one.astype(np.float64) for one in matrices_of(exact)], _channels_of(site)
-        )
-    return site_of_row(site, _finite_slopes(site, parameters, listening))
+        return every_matrix(exact, lambda matrix: matrix.astype(np.float64))
+    return site_of(site, _finite_slopes(site, parameters, listening))
 
 
 def linearize_exact(
@@ -201,21 +199,17 @@ def linearize_exact(
     """
     assert listening is not None or not site.edges, "who is heard decides what an edge function does"
     assert site.function.is_a("SXFunction"), "the solution of a nonlinear loop is no rational number"
+    _finite_slopes(site, parameters, listening)
+    arguments = start_arguments(site, exact_numbers(site.kind, parameters), Fraction, listening)
+    exact = site_of_entries(site, evaluate_exact(site.function, arguments)[0], 0)
     if listening is None:
-        return _exact(site, parameters, None)
-    exact = _exact(site, parameters, listening)
+        return exact
     rest = iter(listening.own)
     own = [
         [None if (part := next(rest)) is None else np.array(part, dtype=object) for _ in partition.receives]
         for partition in site.kind.clocks
     ]
     return with_own_parts(exact, own, np.add, np.multiply.outer)
-
-
-def _exact(site: SiteJacobians, parameters: NDArray[np.float64], listening: Listening | None) -> LinearSite:
-    _finite_slopes(site, parameters, listening)
-    arguments = start_arguments(site, exact_numbers(site.kind, parameters), Fraction, listening)
-    return site_of_entries(site, evaluate_exact(site.function, arguments)[0], 0)
 
 
 def _finite_slopes(
@@ -229,13 +223,13 @@ def _finite_slopes(
         E808 a value of the site, or a slope of one, that is not finite.
     """
     if site.parameters_suffice:
-        one = linearize_rows(site, np.asarray(parameters, dtype=np.float64)[None])
-        _refuse_infinite(site, one[0])
-        return one.ravel()
-    if not site.affine:  # else the start is anywhere
-        check_start(site, parameters, listening)
-    arguments = start_arguments(site, [float(value) for value in parameters], float, listening)
-    flat = np.asarray(site.function(*arguments), dtype=np.float64).ravel()
+        rows = linearize_rows(site, np.asarray(parameters, dtype=np.float64)[None])
+        flat: NDArray[np.float64] = rows[0]
+    else:
+        if not site.affine:  # else the start is anywhere
+            check_start(site, parameters, listening)
+        arguments = start_arguments(site, [float(value) for value in parameters], float, listening)
+        flat = np.asarray(site.function(*arguments), dtype=np.float64).ravel()
     _refuse_infinite(site, flat)
     return flat
 
@@ -302,7 +296,7 @@ def _check_finite(rows: Sequence[str], values: NDArray[np.float64], what: str, w
 def linearize_rows(site: SiteJacobians, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the matrices of an affine site without edges for many parameter vectors (k, n_p), as rows.
 
-    The rows (k, …) hold what `site_of_row` makes a site of.
+    The rows (k, …) hold what `site_of` makes a site of.
     """
     assert site.parameters_suffice, "the start matters"
     count, function = len(parameters), site.function
@@ -362,14 +356,10 @@ def of_rows(function: Any, given: Mapping[int, NDArray[np.float64]]) -> list[NDA
     return found
 
 
-def sites_of_rows(site: SiteJacobians, rows: NDArray[np.float64]) -> LinearSite:
-    """Return the sites of many rows (k, …) of `linearize_rows` as one, matrices with a leading axis (k)."""
-    matrices, start = [], 0
-    for height, width in site.shapes:
-        block = rows[:, start : start + height * width].reshape(len(rows), width, height)
-        matrices.append(np.ascontiguousarray(block.swapaxes(1, 2)))
-        start += height * width
-    return assemble(site.kind, site.affine, matrices, _channels_of(site))
+def site_of(site: SiteJacobians, numbers: NDArray[Any]) -> LinearSite:
+    """Return the site of a row of `linearize_rows`, or of many (k, …) as one with a leading axis (k)."""
+    channels = [tick.channels for tick in site.pattern.ticks]
+    return assemble(site.kind, site.affine, cut(numbers, site.shapes), channels)
 
 
 def site_of_entries(site: SiteJacobians, found: Sequence[Any], zero: Any) -> LinearSite:
@@ -378,15 +368,4 @@ def site_of_entries(site: SiteJacobians, found: Sequence[Any], zero: Any) -> Lin
     entries = np.empty(sparsity.numel(), dtype=object)
     entries[:] = [zero]
     entries[sparsity.row()] = found
-    return assemble(site.kind, site.affine, cut(entries, site.shapes), _channels_of(site))
-
-
-def site_of_row(site: SiteJacobians, row: NDArray[np.float64]) -> LinearSite:
-    """Return the site of one row of `linearize_rows`. Raises ApcError E808 where a slope is not finite."""
-    _refuse_infinite(site, row)
-    return assemble(site.kind, site.affine, cut(row, site.shapes), _channels_of(site))
-
-
-def _channels_of(site: SiteJacobians) -> list[tuple[tuple[int, ...], ...]]:
-    """Return the channels each partition's receives depend on."""
-    return [tick.channels for tick in site.pattern.ticks]
+    return site_of(site, entries)

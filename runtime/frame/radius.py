@@ -1,8 +1,8 @@
 """What the kernel computes with: floats, or floats that carry their radius.
 
 Takes: matrices of floats, real or complex, and bounds on what their entries are off by.
-Gives: `Arithmetic`, `FLOATS`, `RADII`; `with_radius`, `rounded`, `value_of`, `radius_of`; `solve`;
-`common_shape`.
+Gives: `Arithmetic`, `FLOATS`, `RADII`; `with_radius`, `rounded`, `value_of`, `radius_of`, `slopes_of`,
+`spread_of`; `solve`; `common_shape`.
 Guarantees: a sum or product in `RADII` holds that of all matrices within the radii of its operands, its own
 rounding and that of the radius included.
 Does not: carry rational numbers or balls of many digits (see `balls`); charge what underflows, less
@@ -81,29 +81,56 @@ def radius_of(matrix: Matrix) -> Matrix:
     return matrix[..., 1, :, :]
 
 
+def slopes_of(matrix: Matrix) -> Matrix:
+    """Return how matrices over cells change towards each side (…, m, n, n'); of others, none."""
+    return matrix[..., 2:, :, :]
+
+
+def spread_of(matrix: Matrix) -> Matrix:
+    """Return how far entries (…, n, m) change within a cell, to first order."""
+    return np.asarray(np.abs(slopes_of(matrix)).sum(axis=-3))
+
+
 def _multiply(left: Matrix, right: Matrix) -> Matrix:
-    """Return the product of matrices with their radii; NaN or infinite where a bound is."""
+    """Return the product of matrices with their radii, over cells too; NaN or infinite where a bound is.
+
+    Notes
+    -----
+    (a + α)(b + β) = a b + (a β + α b) + α β: over cells, the last is in the radius, as is what a sum of
+    products rounds.
+    """
     a, b, off_a, off_b = value_of(left), value_of(right), radius_of(left).real, radius_of(right).real
+    sides = left.shape[-3] - 2
     terms = a.shape[-1]
     if terms > FEW:  # a term is none where its factor is exactly 0
         terms = int(np.count_nonzero(left.any(axis=-3), axis=-1).max(initial=0))
     kind = np.complex128 if "c" in (left.dtype.kind, right.dtype.kind) else np.float64
     if kind is np.complex128:  # of either part twice as many products, and √2 times as far together
         terms = 3 * terms + 2
+    if sides:
+        terms += sides + 2
     charge = (terms + 2) * UNIT / (1 - (terms + 2) * UNIT)
     many = common_shape(a.shape[:-2], b.shape[:-2])
-    found = np.empty((*many, 2, a.shape[-2], b.shape[-1]), dtype=kind)
+    found = np.empty((*many, 2 + sides, a.shape[-2], b.shape[-1]), dtype=kind)
     np.matmul(a, b, out=value_of(found))
     # Each radius is as much larger as adding it up may have rounded it down. Of many matrices writing and
     # fetching their numbers takes longer than computing them: nothing is written twice.
     size = np.abs(b)
     weight = charge * size
+    if sides:
+        spread_a, spread_b = spread_of(left), spread_of(right)
+        weight += charge * spread_b
+        first = np.matmul(a[..., None, :, :], slopes_of(right), out=slopes_of(found))
+        first += slopes_of(left) @ b[..., None, :, :]
     weight += off_b
     off = np.matmul(np.abs(a), weight, out=radius_of(found))
+    if sides:
+        off_b = off_b + spread_b
+        off += spread_a @ (charge * size + off_b)
     if off_a.any():
         size += off_b
         off += off_a @ size
-    off *= 1 + 5 * charge
+    off *= 1 + 8 * charge
     return found
 
 
@@ -113,7 +140,9 @@ def _added(left: Matrix, right: Matrix, values: Callable[[Matrix, Matrix], Matri
     value, off = value_of(found), radius_of(found)
     np.add(radius_of(left), radius_of(right), out=off)
     off += UNIT * np.abs(value)
-    off *= 1 + 4 * UNIT
+    if found.shape[-3] > 2:
+        off += UNIT * spread_of(found)
+    off *= 1 + (found.shape[-3] + 4) * UNIT
     return found
 
 
@@ -163,8 +192,7 @@ def solve(matrix: Matrix, right: Matrix, numbers: Arithmetic | None = None) -> M
 
 def _most(matrix: Matrix) -> Matrix:
     """Return the largest magnitudes of entries (…, n, m) within their radii, wherever in a cell."""
-    sides = np.abs(matrix[..., 2:, :, :]).sum(axis=-3)
-    found = np.abs(value_of(matrix)) + radius_of(matrix).real + sides
+    found = np.abs(value_of(matrix)) + radius_of(matrix).real + spread_of(matrix)
     return np.asarray(found * (1 + matrix.shape[-3] * UNIT))
 
 

@@ -95,10 +95,11 @@ def assemble(
 
 
 def cut(flat: Matrix, shapes: Sequence[tuple[int, int]]) -> list[Matrix]:
-    """Cut a row of numbers into column-major matrices."""
+    """Cut a row of numbers, or many (k, …), into matrices that it holds column by column."""
     matrices, start = [], 0
     for rows, columns in shapes:
-        matrices.append(flat[start : start + rows * columns].reshape((rows, columns), order="F"))
+        block = flat[..., start : start + rows * columns].reshape(*flat.shape[:-1], columns, rows)
+        matrices.append(np.ascontiguousarray(block.swapaxes(-1, -2)))
         start += rows * columns
     return matrices
 

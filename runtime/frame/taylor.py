@@ -24,7 +24,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.frame.discretize import LEFT_OUT, TERMS, UNIT
-from apc.frame.radius import FEW, RADII, Arithmetic, common_shape, radius_of, solve, value_of, with_radius
+from apc.frame.radius import (
+    RADII,
+    Arithmetic,
+    radius_of,
+    slopes_of,
+    solve,
+    spread_of,
+    value_of,
+    with_radius,
+)
 
 Matrix = NDArray[Any]
 
@@ -43,7 +52,7 @@ def taylor(parameters: int) -> Arithmetic:
     def bounded(value: Matrix, off: Matrix) -> Matrix:
         return within(with_radius(value, off), parameters)
 
-    found = Arithmetic(_multiply, _add, _subtract, exact, bounded=bounded)
+    found = replace(RADII, exact=exact, bounded=bounded)
     return replace(found, solve=lambda matrix, right: solve(matrix, right, found))
 
 
@@ -65,8 +74,8 @@ def entrywise(left: Matrix, right: Matrix) -> Matrix:
     left, right = over_as_many(left, right), over_as_many(right, left)
     count = left.shape[-3] - 2
     a, b, off_a, off_b = value_of(left), value_of(right), radius_of(left), radius_of(right)
-    spread_a, spread_b, size_a, size_b = _spread(left), _spread(right), np.abs(a), np.abs(b)
-    first = _slopes(left) * b[..., None, :, :], a[..., None, :, :] * _slopes(right)
+    spread_a, spread_b, size_a, size_b = spread_of(left), spread_of(right), np.abs(a), np.abs(b)
+    first = slopes_of(left) * b[..., None, :, :], a[..., None, :, :] * slopes_of(right)
     found = np.concatenate([(a * b)[..., None, :, :]] * 2 + [first[0] + first[1]], axis=-3)
     off = spread_a * spread_b + (size_a + spread_a) * off_b + off_a * (size_b + spread_b + off_b)
     off += (count + 2) * UNIT * (size_a * size_b + spread_a * size_b + size_a * spread_b)
@@ -84,7 +93,7 @@ def within(matrix: Matrix, parameters: int) -> Matrix:
 
 def hull(matrix: Matrix) -> Matrix:
     """Return matrices over cells as matrices with radii (…, 2, n, m) that hold them all over the cells."""
-    off = radius_of(matrix) + _spread(matrix)
+    off = radius_of(matrix) + spread_of(matrix)
     return with_radius(value_of(matrix), off * (1 + matrix.shape[-3] * UNIT))
 
 
@@ -97,62 +106,6 @@ def corners(matrix: Matrix) -> list[Matrix]:
     return found
 
 
-def _slopes(matrix: Matrix) -> Matrix:
-    return matrix[..., 2:, :, :]
-
-
-def _spread(matrix: Matrix) -> Matrix:
-    """Return how far entries (…, n, m) change within a cell, to first order."""
-    return np.asarray(np.abs(_slopes(matrix)).sum(axis=-3))
-
-
-def _multiply(left: Matrix, right: Matrix) -> Matrix:
-    """Return the product of matrices over cells.
-
-    Notes
-    -----
-    (a + α)(b + β) = a b + (a β + α b) + α β, the last in the radius, as is what a sum of products rounds
-    (see `radius`).
-    """
-    a, b, off_a, off_b = value_of(left), value_of(right), radius_of(left), radius_of(right)
-    terms = a.shape[-1]
-    if terms > FEW:  # a term is none where its factor is exactly 0
-        terms = int(np.count_nonzero(left.any(axis=-3), axis=-1).max(initial=0))
-    charge = (terms + left.shape[-3] + 2) * UNIT
-    many = common_shape(a.shape[:-2], b.shape[:-2])
-    found = np.empty((*many, left.shape[-3], a.shape[-2], b.shape[-1]))
-    np.matmul(a, b, out=value_of(found))
-    first = np.matmul(a[..., None, :, :], _slopes(right), out=_slopes(found))
-    size_b, spread_b, size_a = np.abs(b), _spread(right), np.abs(a)
-    off = np.matmul(size_a, off_b + charge * (size_b + spread_b), out=radius_of(found))
-    moving = _slopes(left)
-    if moving.any() or off_a.any():
-        first += moving @ b[..., None, :, :]
-        spread_a = _spread(left)
-        off += (off_a + charge * spread_a) @ size_b
-        off += (off_a + spread_a) @ (off_b + spread_b)
-    off *= 1 + 8 * charge
-    return found
-
-
-def _add(left: Matrix, right: Matrix) -> Matrix:
-    return _rounded(left + right)
-
-
-def _subtract(left: Matrix, right: Matrix) -> Matrix:
-    found = left - right
-    np.add(radius_of(left), radius_of(right), out=radius_of(found))
-    return _rounded(found)
-
-
-def _rounded(found: Matrix) -> Matrix:
-    """Return a sum of which each entry was rounded once, with that in its radius."""
-    off = radius_of(found)
-    off += UNIT * (np.abs(value_of(found)) + _spread(found))
-    off *= 1 + (found.shape[-3] + 4) * UNIT
-    return found
-
-
 def reciprocal(number: Matrix) -> Matrix:
     """Return 1/x of numbers (…, 2 + m, 1, 1) over cells; infinite or NaN where one may be 0.
 
@@ -160,12 +113,12 @@ def reciprocal(number: Matrix) -> Matrix:
     -----
     1/x = 1/v − (x − v)/v² + (x − v)²/(v² x).
     """
-    value, spread = np.abs(value_of(number)), _spread(number) + radius_of(number)
+    value, spread = np.abs(value_of(number)), spread_of(number) + radius_of(number)
     found = number / -np.square(value_of(number))[..., None, :, :]
     value_of(found)[...] = 1 / value_of(number)
     apart = value - spread * (1 + 8 * UNIT)
     off = radius_of(number) + spread * np.where(apart > 0, spread / apart, np.inf)
-    off = off / np.square(value) + 8 * UNIT * (1 / value + _spread(found))
+    off = off / np.square(value) + 8 * UNIT * (1 / value + spread_of(found))
     radius_of(found)[...] = off * (1 + 64 * UNIT)
     return found
 
@@ -186,7 +139,7 @@ def step_over(a: Matrix, b: Matrix, seconds: float) -> Matrix:
     """
     numbers = taylor(a.shape[-3] - 2)
     n_x, n_u = a.shape[-1], b.shape[-1]
-    size = (np.abs(value_of(a)) + radius_of(a) + _spread(a)).sum(axis=-2).max(initial=0.0) * seconds
+    size = (np.abs(value_of(a)) + radius_of(a) + spread_of(a)).sum(axis=-2).max(initial=0.0) * seconds
     if not size < SHORT * 2.0**MOST_SQUARINGS:
         return np.full((*a.shape[:-1], n_x + n_u), np.nan)
     squarings = max(0, int(np.ceil(np.log2(max(size, SHORT) / SHORT) + 1e-9)))
@@ -207,6 +160,6 @@ def step_over(a: Matrix, b: Matrix, seconds: float) -> Matrix:
 def _scaled(matrix: Matrix, factor: float) -> Matrix:
     """Return matrices over cells times a number that is off by one rounding."""
     found = matrix * factor
-    radius_of(found)[...] += 2 * UNIT * (np.abs(value_of(found)) + _spread(found))
+    radius_of(found)[...] += 2 * UNIT * (np.abs(value_of(found)) + spread_of(found))
     radius_of(found)[...] *= 1 + (found.shape[-3] + 4) * UNIT
     return found

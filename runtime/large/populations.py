@@ -21,11 +21,10 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Closed, Feedback, StateLayout, close, lay_out
 from apc.eigen.peers import states_of
 from apc.eigen.spectrum import Mode, Motion, oscillation
-from apc.frame.batch_lift import CHUNK, lift_rows
 from apc.frame.course import turns
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.lift import BoundedMap, FrameMap, LiftedSite
-from apc.frame.linearize import linearize_rows, site_of_row
+from apc.frame.lift import BoundedMap, FrameMap, LiftedSite, lift
+from apc.frame.linearize import linearize, linearize_rows, site_of
 from apc.frame.parameters import Numbers
 from apc.frame.radius import RADII, radius_of, rounded, value_of
 from apc.frame.schedule import Schedule
@@ -36,6 +35,9 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Complexes = NDArray[np.complex128]
 
+
+# Sites composed together: their matrices then stay in the cache of a processor.
+CHUNK = 2048
 
 # Peers of all groups where some differ: a number is kept of each, some hundred megabytes of so many.
 MOST_DIFFERENT = 2 * 10**7
@@ -96,11 +98,29 @@ def populations(
     found = []
     for place, (group, schedule) in enumerate(zip(system.groups, schedules, strict=True)):
         site, parameters = jacobians[group.kind], numbers.parameters[place]
-        lifted = lift_rows(site, schedule, linearize_rows(site, parameters))
+        lifted = _lifted(site, schedule, linearize_rows(site, parameters))
         rows = numbers.rows[place]
         counts = np.bincount(rows, minlength=len(parameters)).astype(np.float64)
         found.append(Population(group.name, place, site, schedule, parameters, lifted, rows, counts))
     return tuple(found)
+
+
+def _lifted(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedSite:
+    """Return the maps of many sites of one kind from their matrices (k, …)."""
+    parts = [
+        lift(site_of(site, rows[start : start + CHUNK]), schedule) for start in range(0, len(rows), CHUNK)
+    ]
+    return _joined(parts)
+
+
+def _joined(parts: Sequence[LiftedSite]) -> LiftedSite:
+    """Return the maps of several chunks of sites as those of all."""
+
+    def whole(first: FrameMap, *others: FrameMap) -> FrameMap:
+        return first.mapped(lambda *blocks: np.concatenate(blocks), *others)
+
+    p, q, s, d = whole(*parts).blocks
+    return replace(parts[0], p=p, q=q, s=s, d=d, error=whole(*(one.error for one in parts)))
 
 
 def some_rows(lifted: LiftedSite, places: slice | Integers) -> LiftedSite:
@@ -120,9 +140,7 @@ def _every_block(lifted: LiftedSite, change: Callable[[Floats], Floats]) -> Lift
 
 def site_one(population: Population, row: int) -> LinearSite:
     """Return the matrices of one of the different peers by itself."""
-    return site_of_row(
-        population.jacobians, linearize_rows(population.jacobians, population.parameters[[row]])[0]
-    )
+    return linearize(population.jacobians, population.parameters[row])
 
 
 def hear_themselves(lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats) -> BoundedMap:

@@ -2,36 +2,38 @@
 
 Takes: populations, and the exchange between them.
 Gives: `count_translations`.
-Guarantees: a motion counts if it is one in exact arithmetic for every peer, each with its own numbers.
-Does not: find a motion that only some peers of a population are free to make: a count of eigenvalues (see
-`zeros`) then finds one more at 1 than was said, and the verdict is left open.
+Guarantees: a motion counts if it is one in exact arithmetic, whatever the numbers in which peers differ.
+Does not: find a motion that only some peers of a population are free to make, or only by a relation between
+these numbers: a count of eigenvalues (see `zeros`) then finds one more at 1 than was said, and the verdict is
+left open.
 
 The first peer of each population stands for all: were all peers like it, the standing solutions of the common
-and the difference system would be found exactly (see `rigid`). Each of these is then put into the equations
-of every peer, modulo two primes.
+and the difference system would be found exactly (see `rigid`). Each of these is then put into the
+equations of a peer with random rationals in the place of the numbers in which peers differ: a quotient of
+polynomials that vanishes there vanishes for all, but for one chance in 2^50.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from fractions import Fraction
+from random import Random
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apc.eigen.closing import Loop
 from apc.eigen.modes import complete_loops
 from apc.eigen.peers import PeerGroup, group_of_row
 from apc.eigen.rigid import find_rigid_modes, stays_rigid
-from apc.frame.exact import evaluate_exact
+from apc.frame.exact import evaluate_exact, is_rational
 from apc.frame.exchange import Exchange
+from apc.frame.jacobians import guards_of
 from apc.frame.linearize import site_of_entries
-from apc.frame.residues import PRIMES, Residues, residues_of, residues_of_rounded
+from apc.frame.parameters import exact_numbers
 from apc.frame.site import LinearSite
 from apc.large.populations import Population
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+LARGEST = 2**61 - 1  # of what random numbers are made of: a prime
 
 
 def representatives(listed: Sequence[Population], exchange: Exchange) -> list[PeerGroup]:
@@ -80,29 +82,24 @@ def hold_for_all(loop: Loop, listed: Sequence[Population]) -> bool:
     listed
         The population of each site.
     """
-    try:
-        for prime in PRIMES:
-            for place, population in enumerate(listed):
-                sites = [group.exact for group in loop.sites]
-                sites[place] = _all_peers(population, np.unique(population.rows), prime)
-                if not stays_rigid(loop, sites):
-                    return False
-    except (TypeError, ValueError, ZeroDivisionError):  # an operation that is none of a field
-        return False
+    for place, population in enumerate(listed):
+        sites: list[LinearSite | None] = [group.exact for group in loop.sites]
+        sites[place] = _any_peer(population)
+        known = [one for one in sites if one is not None]
+        if len(known) < len(sites) or not stays_rigid(loop, known):
+            return False
     return True
 
 
-def _all_peers(population: Population, rows: Integers, prime: int) -> LinearSite:
-    """Return the matrices of some of a population's different peers, each entry a column modulo a prime."""
-    built = population.jacobians
-    columns = [residues_of(column, prime) for column in population.parameters[rows].T]
-    for place, rationals in built.kind.rounded:
-        columns[place] = residues_of_rounded(population.parameters[rows, place], rationals, prime)
-    zero = Residues(np.zeros(len(rows), np.int64), prime)
-    arguments = [[zero] * built.function.numel_in(argument) for argument in range(4)]
-
-    def number(value: float) -> Residues:
-        return zero + Fraction(value)
-
-    flat = evaluate_exact(built.function, [*arguments, columns, [zero]], number=number)[0]
-    return site_of_entries(built, flat, zero)
+def _any_peer(population: Population) -> LinearSite | None:
+    """Return the matrices of a peer of random numbers where peers differ; None unless they are quotients."""
+    built, numbers = population.jacobians, population.parameters
+    symbols = built.function.sx_in()
+    if not is_rational(built.function) or guards_of(built.function(*symbols), symbols[4]):
+        return None
+    vector, random = exact_numbers(built.kind, numbers[0]), Random(0)
+    for place in np.flatnonzero((numbers != numbers[0]).any(axis=0)):
+        vector[place] = Fraction(random.randrange(1, LARGEST), LARGEST)
+    arguments = [[Fraction(0)] * size for size in map(built.function.numel_in, range(4))]
+    found = evaluate_exact(built.function, [*arguments, vector, [Fraction(0)]])[0]
+    return site_of_entries(built, found, 0)

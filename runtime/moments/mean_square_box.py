@@ -39,7 +39,6 @@ from apc.frame.lift import FrameMap, named
 from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
-from apc.frame.radius import radius_of, value_of
 from apc.frame.taylor import hull, within
 from apc.moments.crowd import Classes, classes_of, hearing, moments_of, peer_classes, remembered_of
 from apc.moments.gains import below_1
@@ -128,9 +127,7 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
     whole = tuple((ranges[place].low, ranges[place].high) for place in own)
     maps = [one.mapped(lambda block: hull(block)[0]) for one in frames_over(frames, [whole])[0]]
     lifted_wide = [
-        group.with_lifted(
-            named(group.jacobians.kind, group.schedule, frame.mapped(value_of), frame.mapped(radius_of))
-        )
+        group.with_lifted(named(group.jacobians.kind, group.schedule, frame))
         for group, frame in zip(told.groups, maps, strict=True)
     ]
     wide = peer_classes(replace(told, groups=tuple(lifted_wide)))[0][0]

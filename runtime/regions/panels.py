@@ -19,7 +19,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.ages import linear_sites
 from apc.frame.exchange import build_exchange
-from apc.frame.linearize import linearize_rows, site_of_row
+from apc.frame.linearize import linearize
 from apc.frame.names import Range
 from apc.frame.overrides import Override, apply, parse_override
 from apc.frame.parameters import resolve
@@ -190,10 +190,7 @@ def gain_factor(system: CompiledSystem, axis: Range) -> int:
         if not built.parameters_suffice:
             what = "the scene weighs its others one by one, so that there is no effective gain to compare at"
             raise ApcError(Mistake("E906", PLACE, what))
-        before, after = (
-            site_of_row(built, linearize_rows(built, numbers.parameters[place][:1])[0])
-            for numbers in (first, second)
-        )
+        before, after = (linearize(built, numbers.parameters[place][0]) for numbers in (first, second))
         for partition, tick_a, tick_b in zip(built.kind.clocks, before.ticks, after.ticks, strict=True):
             for column in np.flatnonzero((tick_a.r != tick_b.r).any(axis=0)).tolist():
                 receive = partition.receives[column]

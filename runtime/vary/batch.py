@@ -33,7 +33,7 @@ from apc.frame.discretize import Step, exponential_rows, exponential_values
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import FrameMap, LiftedSite, compose, composed_bounded, lift
-from apc.frame.linearize import linearize_exact, linearize_rows, of_rows, site_of_row, sites_of_rows
+from apc.frame.linearize import linearize, linearize_exact, linearize_rows, of_rows, site_of
 from apc.frame.names import Free, value_now
 from apc.frame.parameters import free_rows
 from apc.frame.radius import RADII, radius_of, value_of
@@ -279,7 +279,7 @@ class BatchEvaluator:
 
     def _lift_bounded(self, group: PeerGroup, vectors: Floats) -> tuple[LinearSite, FrameMap]:
         rows = linearize_rows(group.jacobians, vectors)
-        site, steps, lost = self._placed(group, sites_of_rows(group.jacobians, rows))
+        site, steps, lost = self._placed(group, site_of(group.jacobians, rows))
         steps = steps or self.steps(site, np.zeros((1, 1)), exponential_rows)
         with np.errstate(all="ignore"):
             frame = composed_bounded(site, group.schedule, steps)
@@ -289,7 +289,7 @@ class BatchEvaluator:
     def _lift(self, group: PeerGroup, values: Matrices) -> FrameMap:
         if self.tangents:
             rows = self.rows(group.jacobians, self.vectors(group, values))
-            own = sites_of_rows(group.jacobians, rows)
+            own = site_of(group.jacobians, rows)
         else:
             own = every_matrix(group.site, lambda block: np.array(block[None]))
         site, fixed, lost = self._placed(group, own)
@@ -420,7 +420,7 @@ def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Step
         if site_key(group) in found:
             continue
         vectors = evaluator.vectors(group, point + (STEP * 1j) * along)
-        site = sites_of_rows(group.jacobians, evaluator.rows(group.jacobians, vectors))
+        site = site_of(group.jacobians, evaluator.rows(group.jacobians, vectors))
         if not (np.iscomplexobj(site.a) and (site.a.imag.any() or site.b.imag.any())):
             found[site_key(group)] = evaluator.steps(site, point, exponential_rows)
     return found
@@ -433,7 +433,7 @@ def lifted_here(systems: Sequence[Wired]) -> tuple[Wired, ...]:
     def lifted(group: PeerGroup) -> PeerGroup:
         key, built = site_key(group), group.jacobians
         if key not in known:
-            site = site_of_row(built, linearize_rows(built, group.parameters[None])[0])
+            site = linearize(built, group.parameters)
             known[key] = site, lift(site, group.schedule, exact=group.exact)
         site, frame = known[key]
         return replace(group, site=site).with_lifted(frame)

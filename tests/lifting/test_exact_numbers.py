@@ -1,4 +1,4 @@
-"""Exact numbers: rationals, ratios of polynomials, residues, every operation of CasADi."""
+"""Exact numbers: rationals, ratios of polynomials, every operation of CasADi."""
 
 from __future__ import annotations
 
