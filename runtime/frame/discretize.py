@@ -18,6 +18,7 @@ precision loses log₂(bT/m) bits where the mass is tiny. Arb's exponential (Joh
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -52,6 +53,9 @@ FEW_TOGETHER, MOST_TOGETHER = 64, 250
 DOUBTFUL = 1e4
 # Inputs beside fewer states: each is a row more of the exponential.
 FEWEST_INPUTS = 8
+
+# Steps of sites that are remembered, and of how many entries in all, A's and B's for each duration.
+KEPT, FEW_ENTRIES = 128, 1 << 14
 
 # Entries of a large matrix, as a share of all, up to which its products leave out the zeros.
 SPARSE = 1 / 16
@@ -106,6 +110,24 @@ def discretize(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) 
     """
     if a.ndim > 2:
         return tuple(step_rows(a, b, float(duration)) for duration in durations)
+    if len(durations) * (a.size + b.size) > FEW_ENTRIES:
+        return _discretized(a, b, durations)
+    entries = (*a.ravel().tolist(), *b.ravel().tolist())
+    return _known_steps(entries, a.shape, b.shape, tuple(durations))
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _known_steps(
+    entries: tuple[Any, ...], of_a: tuple[int, int], of_b: tuple[int, int], durations: tuple[Fraction, ...]
+) -> tuple[Step, ...]:
+    """Return `discretize` of few entries, row by row: what only couplers and links change is remembered."""
+    whole = np.array([*entries, None])[:-1]  # of objects, also where there are no entries
+    split = of_a[0] * of_a[1]
+    return _discretized(whole[:split].reshape(of_a), whole[split:].reshape(of_b), durations)
+
+
+def _discretized(a: NDArray[Any], b: NDArray[Any], durations: Sequence[Fraction]) -> tuple[Step, ...]:
+    """Return `discretize`, computed."""
     n_x = len(a)
     matrices = np.zeros((len(durations), n_x, n_x + b.shape[1]))
     sizes = np.full(matrices.shape, UNDERFLOW)
