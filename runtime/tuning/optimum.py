@@ -230,12 +230,13 @@ class Search:
             rough = np.clip(np.nan_to_num(ended.x[:size], nan=0.5), 0.0, 1.0)
             rough = np.where(np.abs(rough - np.round(rough)) < OPEN, np.round(rough), rough)
             found = self._polished(rough, rows_of)
-            better = self._rank(found) < self._rank(best)
-            if better:
+            (unmet, value), known = self._rank(found), self._rank(best)
+            far = (unmet, value + OPEN) < known
+            if (unmet, value) < known:
                 best, here = found, np.append(rough, ended.x[size:])
-            if better and ended.success and reach == 1:
+            if far and ended.success and reach == 1:
                 break
-            reach *= 1.0 if better and reach < 1 else SHORTER
+            reach *= 1.0 if far and reach < 1 else SHORTER
         return best
 
     def _remembered(self) -> Callable[[Floats], Rows]:
