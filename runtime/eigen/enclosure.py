@@ -38,6 +38,9 @@ Matrix = NDArray[Any]  # float64 or complex128
 # cluster at zero, which is taken together.
 SMALL = 1e-2
 
+# Where floats scatter clusters at zero to: below these eigenvalues are taken together, one after the other.
+CLUSTERS = SMALL, 0.3
+
 # How much larger than the largest of a cluster's discs must be those of a scaling that all can have.
 FARTHER = 1.25
 
@@ -125,7 +128,7 @@ def _enclose_split(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure
     pairs = pairs.at(descending(pairs.values)[0])
     sizes = np.abs(pairs.values[0])
     low, high, errors = 0.0, np.inf, np.full(len(sizes), np.inf)
-    for limit in (0.0, SMALL, np.inf):
+    for limit in (0.0, *CLUSTERS, np.inf):
         if high - low <= SHARP * max(low, 1.0):
             break
         form, basis, small = load_pool("scipy.linalg").schur(
