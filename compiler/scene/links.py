@@ -139,7 +139,9 @@ def _range(node: Sequence, link: str, component: Component, numbers: NamedNumber
     low, high = (numbers.read_for(item, "delay", declared) for item in node.items)
     if low.number >= high.number:
         what = f"the range of {link}.delay"
-        raise fault("E207", node.place, what, "its lower end first", f"{low} to {high}")
+        first, last = (item.text if isinstance(item, Scalar) else "" for item in node.items)
+        hint = f"delay: [{last}, {first}]" if low.number > high.number else f"delay: {first}"
+        raise fault("E207", node.place, what, "its lower end first", f"{first} to {last}", hint)
     if low.expression is not None or high.expression is not None:
         raise fault("E203", node.place, "a range of delays", "two quantities", form(node), "[20 ms, 60 ms]")
     return low, high

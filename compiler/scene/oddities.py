@@ -42,6 +42,7 @@ def oddities(
             what = (
                 f"{name}.delay is a range: analyze and tune are for all of it, other answers for its middle"
             )
+            what += "; simulate and export want one delay"
             warnings.add("W275", entry.place, what)
     outer = [part for part in parts if part.name.partition("[")[0] in entries and "." not in part.name]
     counts = {group.name: group.count for group in groups}

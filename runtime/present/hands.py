@@ -43,7 +43,8 @@ def passive_text(found: PassiveHands) -> str:
         )
     lines += [line for text in told for line in wrapped(text, "  ", "  ")]
     clamped = measured(found.clamped_radius, found.clamped_error)
-    lines += ["", *labelled("devices clamped", f"spectral radius {clamped}")]
+    moves = f"spectral radius {clamped}" if found.clamped_radius or found.clamped_error else "nothing moves"
+    lines += ["", *labelled("devices clamped", moves)]
     lines += labelled("proof", found.proof) if found.proof else []
     if found.modes:
         headings = ("mode", "damping", "needed", "at", "at rest", "")

@@ -79,15 +79,13 @@ def _sentence(found: Tuning) -> str:
     if not found.met:
         return f"{found.topology}: no gains were found in these ranges with which {stable}{over}"
     proved = "proved" if found.proved else "not proved"
-    if found.worst >= 0:
-        proved += ", and in some of it it is not so"
     best = "largest" if found.larger else "least"
     if found.unit == "1" and found.aim not in [one.parameter for one in found.gains]:
         power = 2 if found.criterion == "mean-square" else 1  # of what a frame multiplies
         settled = found.frame_s * power * math.log(SETTLED) / math.log(found.value)
-        least = f"{_radius(found)} below {found.value:.6g}, next to the least found{over}, is {proved}"
-        time = f"within {quantity(settled, 's', 3)} all motions die out but for {100 * SETTLED:.0f} %"
-        return f"{found.topology}: {least}; {time}"
+        time = f"all motions die out but for {100 * SETTLED:.0f} % within {quantity(settled, 's', 3)}{over}"
+        least = f"with {_radius(found)} below {found.value:.6g}, next to the least found; it is {proved}"
+        return f"{found.topology}: {time}, {least}"
     value = f"{quantity(found.value, found.unit, TYPED)} is the {best} {found.aim}"
     return f"{found.topology}: {value} found with which {stable}{over}; it is {proved}"
 

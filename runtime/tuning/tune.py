@@ -73,6 +73,9 @@ CORNERS = (
     "before rounding: the ends and the middle of each range in a box were looked at, and no point between"
 )
 
+# What is said where gains are none that meet all demands, as there was no time to look farther.
+LATE = "the time was up: these gains are those that were looked at last"
+
 # Scenarios added at a time; how far above the others a limit is that counts.
 MORE, ABOVE = 3, 1e-9
 
@@ -344,6 +347,8 @@ class _Work:
         """Return the other gains where there is most room beside the one in a column."""
         if column is None:
             return found.gains
+        if self.late:  # where no time is left to see if other scenarios bear the middle
+            return np.delete(found.gains, column)
         search = Search(self._rest(gains, column), self.scenarios, None, steps=STEPS)
         begin = replace(found, gains=np.delete(found.gains, column))
         return search.rough(search.shares(begin)).gains
@@ -352,7 +357,7 @@ class _Work:
         """Return gains of which all but one are their middle to as few digits as leave room."""
         rest = self._rest(gains, column)
         ranges = rest.demands.free
-        digits = range(1, DIGITS + 1)
+        digits = range(DIGITS if self.late else 1, DIGITS + 1)
         listed = [
             [
                 min(max(_decimal(value, count), one.low), one.high)
@@ -455,6 +460,7 @@ class _Work:
     ) -> Tuning:
         demands, column = self.demands, self.demands.aim.gain
         worst = float(self.limits.worst(self.every, np.array([[float(one) for one in gains]])).max())
+        met = met and (column is None or worst < 0)
         value = float(gains[column]) if column is not None else self._inside(gains)
         if column is None and self.limits.by_growth:
             value = math.exp(worst + self.limits.allowed)
@@ -498,7 +504,7 @@ class _Work:
             binding=tuple(self._binding(found, met=met)),
             looked=self.looked + sum(map(len, self.limits.samples.values())),
             bounded=self._bounded(found, gains) if met else None,
-            notes=(CORNERS,) if demands.box and self.limits.slow else (),
+            notes=(*[CORNERS] * bool(demands.box and self.limits.slow), *[LATE] * (self.late and not met)),
             left_out=(
                 *near_start(self.system, self.limits.prepared),
                 *left_out(
