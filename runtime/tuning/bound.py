@@ -95,7 +95,7 @@ def _looked(
         matrix = matrices_over(question, [cells[place] for place in left.tolist()])
         size += matrix[:, 0].size
         reach[left] = np.maximum(reach[left], np.abs(matrix[:, 2:]).sum(axis=(2, 3)))
-        outside = np.isfinite(matrix).all(axis=(1, 2, 3))
+        outside = np.asarray(np.isfinite(matrix).all(axis=(1, 2, 3)))
         values = np.linalg.eigvals(value_of(matrix[outside]))
         outside[outside] = np.abs(values).max(axis=1, initial=0.0) > 1
         low = [least_radius(one[0], one[2:], one[1]) for one in matrix[outside]]
