@@ -51,7 +51,7 @@ FREE, CLAMPED, HELD, PASSIVE = HANDS = ("free", "clamped", "held", "passive")
 UNHELD = ("E931", "E932")
 
 # What a peer without a device lacks.
-OWN_MASS = "a mass of its own at each peer, as masses: {device: {mass: 0.1 kg}}"
+OWN_MASS = "masses: {device: {mass: 0.1 kg}}, where it moves in a plane with type: PlanarMass, at each peer"
 
 # What the parameters of a hand that is put on every device are named after, and what each is.
 HAND = "hand"
