@@ -333,6 +333,7 @@ class Page:
     def _ask_tune(self) -> None:
         """Have the gains looked for, from where all other sliders are."""
         if (asked := self._tuning_asked()) is not None:
+            self.desks[TUNED].forget("tune")  # who asks twice wants it twice
             self.tuned.say("Computing …")
             self._ask("tune", tuple(overrides_of(self.sliders, self.places)), asked)
 

@@ -68,7 +68,7 @@ def memory(peer: Peer, signal: LocalSignal) -> str:
     return f"{'x' if signal.role == 'state' else 'u'}[{signal.place[0]}]"
 
 
-def unit_of(peer: Peer) -> dict[str, str]:
+def parameter_units(peer: Peer) -> dict[str, str]:
     """Return the unit of each of a peer's parameters."""
     known = {parameter.name: parameter.unit for parameter in peer.system.parameters}
     return {name: known.get(name, "1") for name in peer.kind.parameters}
@@ -133,7 +133,7 @@ def header(peer: Peer) -> str:
     computed = [
         one for partition in kind.clocks for one in zip(partition.outputs, partition.units, strict=True)
     ]
-    units = unit_of(peer)
+    units = parameter_units(peer)
     settings = [f"{own} [{units[own]}]" for own in (kind.parameters[place] for place in peer.settable)]
     inside = [(one.name, one.unit) if i not in peer.outside else ("", "") for i, one in enumerate(states)]
     listed = [
@@ -172,7 +172,7 @@ def source(peer: Peer, include: str) -> str:
     """Return the code; `include` is the name of the header."""
     kind, name = peer.kind, peer.identifier
     kinds = tuple(dict.fromkeys(peer.instants))
-    units = unit_of(peer)
+    units = parameter_units(peer)
     named = zip(_parameters(peer), kind.parameters, peer.parameters.tolist(), strict=True)
     over = {line.sending: line.name for line in peer.sending}
     begin = [

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from apc.exports.c_text import block, filled, memory, number, row, unit_of
+from apc.exports.c_text import block, filled, memory, number, parameter_units, row
 from apc.exports.peer_step import (
     MOST_HEARD,
     Peer,
@@ -134,7 +134,7 @@ def _looked_at(peer: Peer, member: str, prefix: str) -> list[Variable]:
         own = f"{member}.{memory(peer, signal)}"
         name = f"{FORCE_ON}{prefix}{signal.name.removeprefix(FORCE_ON)}" if given else prefix + signal.name
         found.append(Variable(name, signal.unit, own, given=given, moving=moving, start=start))
-    units, names = unit_of(peer), peer.kind.parameters
+    units, names = parameter_units(peer), peer.kind.parameters
     for k, place in enumerate(peer.settable):
         name, start = names[place], float(peer.parameters[place])
         found.append(Variable(prefix + name, units[name], f"{member}.p[{k}]", fixed=True, start=start))

@@ -156,8 +156,8 @@ def tuning_picture(found: Tuning, ax: Any = None) -> Any:
     refuse_picture(found.ranges)
     regions: list[Region] = []
     ranges = found.ranges[0], found.ranges[1]
-    for one, scene in zip(found.binding, found.scenes, strict=True):
-        name = _where(one) or found.topology
+    for where, scene in zip(map(_where, found.binding) if found.binding else [""], found.scenes, strict=True):
+        name = where or found.topology
         if name not in [known.topology for known in regions]:
             regions.append(replace(region(scene, ranges, criterion=found.criterion), topology=name))
     if ax is None:
@@ -166,9 +166,10 @@ def tuning_picture(found: Tuning, ax: Any = None) -> Any:
     draw_panel(ax, f"{found.topology}{more}", Panel("", tuple(regions), (1,) * len(regions), ()))
     (now, best) = np.array([(one.now, float(one.value)) for one in found.gains]).T
     ax.annotate("", best, now, arrowprops={"arrowstyle": "->", "color": "0.3"})
-    ax.plot(*now, "o", color="0.3", label="now")
-    ax.plot(*best, "*", color="black", markersize=11, label="found")
-    ax.figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
+    whole: dict[str, Any] = {"clip_on": False, "zorder": 5}  # where an end of a range is best, too
+    ax.plot(*now, "o", color="0.3", label="now", **whole)
+    ax.plot(*best, "*", color="black", markersize=11, label="found", **whole)
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False, fontsize=8)
     return ax
 
 

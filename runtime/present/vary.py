@@ -93,6 +93,8 @@ def _stable_ranges(found: Critical) -> str:
 def _on_stable_side(crossing: Crossing) -> float:
     """Return a crossing as far inside as its error, to no digit that the error hides."""
     inward = -crossing.error if crossing.stable_side == "below" else crossing.error
+    if not math.isfinite(inward):
+        return crossing.value
     known = Decimal(crossing.value).adjusted() - Decimal(crossing.error).adjusted() if inward else SHOWN
     rounding = ROUND_FLOOR if crossing.stable_side == "below" else ROUND_CEILING
     context = Context(min(max(known, 1), SHOWN), rounding)

@@ -82,6 +82,8 @@ def join(parts: list[Pairs]) -> Pairs:
 def log_magnitudes(matrices: Sequence[Floats], count: int) -> Floats:
     """Return the logarithms of the `count` largest magnitudes of all systems (k, count), descending."""
     found = np.hstack([np.abs(np.linalg.eigvals(one)) for one in matrices])
+    if not found.shape[1]:  # nothing moves
+        found = np.zeros((len(found), 1))
     largest = -np.sort(-found, axis=1)[:, :count]
     logarithms: Floats = np.log(np.maximum(largest, LEAST_MAGNITUDE))
     return logarithms

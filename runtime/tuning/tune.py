@@ -133,7 +133,7 @@ class Tuning(Result):
     `error`; both are a spectral radius where that is the aim. `met` says whether any gains meet all demands
     in floats; `proved` whether all was proved of these. `worst` is how much faster than allowed the fastest
     motion grows in a frame, ln |λ| less the `allowed`, below 0 if it is slower. `decay` is a factor a second.
-    `scenes` are those in which something binds, in the order of `binding`. `looked` points were looked at.
+    `scenes` are those of `binding`, or one if nothing binds. `looked` points were looked at.
     `bounded` is in how many cells it is proved that no gains of these ranges do better by `bound.SHARE`, None
     where it is not.
     """
@@ -514,10 +514,7 @@ class _Work:
                 ),
             ),
             ranges=demands.free,
-            scenes=tuple(
-                self._scene(found.scenarios[found.rows.scenario[place]])
-                for place in np.flatnonzero(found.multipliers > 0)
-            ),
+            scenes=tuple(map(self._scene, self._binding_scenarios(found) or self.every[:1])),
         )
 
     def _bounded(self, found: Optimum, gains: Sequence[Fraction]) -> int | None:
@@ -527,8 +524,7 @@ class _Work:
             return None
         worst = self.limits.worst(self.every, np.array([[float(one) for one in gains]]))[0]
         order = np.argsort(-worst, kind="stable").tolist()
-        binding = [found.scenarios[place] for place in found.rows.scenario[found.multipliers > 0].tolist()]
-        listed = dict.fromkeys([*binding, *(self.every[place] for place in order)])
+        listed = dict.fromkeys([*self._binding_scenarios(found), *(self.every[place] for place in order)])
         self.told("proving that no gains do better")
         return none_better(
             [self._scene(one) for one in list(listed)[:LIMITING]],
@@ -540,6 +536,10 @@ class _Work:
             inside=self._inside(gains),
             until=self.until,
         )
+
+    def _binding_scenarios(self, found: Optimum) -> list[Scenario]:
+        """Return the scenario of each mode that binds."""
+        return [found.scenarios[place] for place in found.rows.scenario[found.multipliers > 0].tolist()]
 
     def _scene(self, scenario: Scenario) -> CompiledSystem:
         _, scene = self.limits.settings[scenario.setting]
