@@ -31,7 +31,7 @@ from apc.memory import refuse_beyond
 from apc.network.nominal import refuse_range
 from apc.network.timetable import Luck, Route, Timetable, luck_of, routes_of
 from apc.simulation.flow import Flow, Tolerance, flow_of, rows_to_move, state_scales
-from apc.simulation.forcing import Kernel, SiteForcing, site_forcing
+from apc.simulation.forcing import SiteForcing, site_forcing
 from apc.simulation.machine import Library, Machine, library_of
 from apc.simulation.pairs import count_pairs
 from apc.simulation.population import (
@@ -406,7 +406,7 @@ def _check_step(
 
 def _forces(member: Member) -> tuple[SiteForcing, ...]:
     """Return the forces that change with time on each different site of a group; none if none does."""
-    program, kernels = member.program, dict[Any, tuple[Kernel, ...]]()
+    program = member.program
     if not program.impulse_rows:
         return ()
-    return tuple(site_forcing(program.rates, one, program.seconds, kernels) for one in member.parameters)
+    return tuple(site_forcing(program.rates, one, program.seconds) for one in member.parameters)
