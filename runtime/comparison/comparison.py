@@ -237,7 +237,7 @@ def _feel(system: CompiledSystem, prepared: Prepared, at: str) -> Feel:
     """Return what is felt, at the first device there is if it isn't said: a server has none."""
     names = held_names(system, prepared)
     at = at or (names[0].partition(".")[0] if names else "")
-    return feel(system, FREQUENCIES, at=at, quick=True, prepared=prepared)
+    return feel(system, FREQUENCIES, at=at, beside=(), prepared=prepared)
 
 
 def _passive(system: CompiledSystem, prepared: Prepared) -> PassiveHands:

@@ -214,7 +214,7 @@ def _feel(system: CompiledSystem, prepared: Prepared, at: str) -> dict[str, Any]
     """Return what is felt at a device, the first there is if it isn't said, and what else may be held."""
     frequencies = read_frequencies(system, None, LOWEST, None, FREQUENCIES)
     names = held_names(system, prepared)
-    found = feel(system, frequencies, at=at or next(iter(names), ""), quick=True, prepared=prepared)
+    found = feel(system, frequencies, at=at or next(iter(names), ""), beside=(), prepared=prepared)
     return {
         "names": names,
         "at": found.at,

@@ -136,7 +136,7 @@ def find_devices(
     """
     kind = site.kind
     owners = {_part(one.name) for one in kind.states}
-    gripped = {own for own in owners for one in kind.held if own == one or own.startswith(f"{one}.")}
+    gripped = {own for own in owners if _grips(kind, own)}
     if not _is_plain(site):
         return {}
     told_of = _told_of(site)
@@ -180,14 +180,26 @@ def find_devices(
 
 @functools.lru_cache(maxsize=64)
 def coupled_directly(kinds: tuple[Kind, ...]) -> bool:
-    """Say whether no kind of peer has a mass that others are not told about, nor a hand.
+    """Say whether no kind of peer has a mass that others are not told about, nor hands are elsewhere.
+
+    Where some have a hand, each of the others has the part that it is joined to, and may be held there.
 
     Parameters
     ----------
     kinds
         Those of a scene.
     """
-    return not any(kind.held or _keeps_to_itself(jacobians(kind)) for kind in kinds)
+    if any(_keeps_to_itself(jacobians(kind)) for kind in kinds):
+        return False
+    parts = [{_part(state.name) for state in kind.states} for kind in kinds]
+    gripped = [{part for part in own if _grips(kind, part)} for kind, own in zip(kinds, parts, strict=True)]
+    anywhere = set().union(*gripped)
+    return not all(gripped) and all(own & anywhere for own in parts if anywhere)
+
+
+def _grips(kind: Kind, part: str) -> bool:
+    """Say whether a hand of the scene is joined to a part."""
+    return any(part == one or part.startswith(f"{one}.") for one in kind.held)
 
 
 def _keeps_to_itself(site: SiteJacobians) -> bool:

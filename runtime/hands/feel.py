@@ -9,7 +9,7 @@ Does not: look at how a hand answers back (see `passivity`), or at packets that 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, Unpack
@@ -34,6 +34,9 @@ from apc.threads import single_threaded
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+
+# What is told beside the responses.
+BESIDE = ("low_frequency", "network_viscosity", "hinf", "h2")
 
 # The harmonics of the frame rate that are looked at beside the fundamental.
 ALIASES = (0, 1, -1)
@@ -146,7 +149,7 @@ def feel(
     at: str = "",
     between: str = "",
     unstable: bool = False,
-    quick: bool = False,
+    beside: Collection[str] = BESIDE,
     prepared: Prepared | None = None,
 ) -> Feel:
     """Say what a hand feels.
@@ -162,8 +165,8 @@ def feel(
         peer who has one, along the first of its directions, and the next peer's, if not given.
     unstable
         Whether the map of an unstable scene is wanted, which has no response in time.
-    quick
-        Leave out what is told beside the responses.
+    beside
+        What is told beside the responses, of `BESIDE`; some tens of milliseconds each.
     prepared
         From `analysis.prepare`, of this system with any numbers.
 
@@ -191,10 +194,11 @@ def feel(
         bounds = [
             1.01 * off / np.where(value == 0, np.inf, np.abs(value)) for value, off in (own, across, error)
         ]
-        steady = verdict.stable is not False and not quick
-        slow, viscosity = (None, None) if quick else _slowly(system, answers, port, other)
-        hinf = _extremes(answers) if steady else ()
-        h2 = _noise(system, answers) if steady else ()
+        steady = verdict.stable is not False
+        slow = _slow(answers) if "low_frequency" in beside else None
+        viscosity = _viscosity(system, slow, port, other) if slow and "network_viscosity" in beside else None
+        hinf = _extremes(answers) if steady and "hinf" in beside else ()
+        h2 = _noise(system, answers) if steady and "h2" in beside else ()
     linear = all(prepared.jacobians[group.kind].affine for group in system.groups)
     here, there = (
         f"{answers.exchange.peer_name(one.peer)}.{device.part}"
@@ -205,8 +209,9 @@ def feel(
     notes = {
         others: len(directions) > 1,
         "of the map: the scene is unstable": verdict.stable is False,
-        "of slow motions nothing is told: something of the scene is slower still": not slow and not quick,
-        "what noise does is not told: the fastest clock has a phase": steady and not h2,
+        "of slow motions nothing is told: something of the scene is slower still": not slow
+        and "low_frequency" in beside,
+        "what noise does is not told: the fastest clock has a phase": steady and not h2 and "h2" in beside,
     }
     return Feel(
         topology=system.name,
@@ -232,19 +237,14 @@ def feel(
     )
 
 
-def _slowly(
-    system: CompiledSystem, felt: Responses, port: Port, other: Port
-) -> tuple[Slow | None, Viscosity | None]:
-    """Return what is felt of slow motions, and what of its damping comes of the network."""
-    slow = _slow(felt)
-    if slow is None:
-        return None, None
+def _viscosity(system: CompiledSystem, slow: Slow, port: Port, other: Port) -> Viscosity | None:
+    """Return what of the damping felt of slow motions comes of the network."""
 
     def damping_of(changed: CompiledSystem) -> tuple[float, float] | None:
         own = _slow(responses(changed, prepare(changed), port, other))
         return None if own is None else (own.damping, own.errors[1])
 
-    return slow, network_viscosity(system, (slow.damping, slow.errors[1]), damping_of)
+    return network_viscosity(system, (slow.damping, slow.errors[1]), damping_of)
 
 
 def _unstable(system: CompiledSystem, radius: float) -> ApcError:

@@ -87,10 +87,13 @@ def _peak(loop: Pushed, pushed: int, of: int, row: int, basis: Floats, at: Float
     forces = np.linalg.inv(powers) / np.sqrt(weights)
     columns = nodes * len(site.seconds)
     inputs = np.zeros((loop.k.shape[-1], columns))
+    lanes = {
+        seconds: _lanes(site, float(seconds), nodes) @ forces / float(seconds) ** 0.5
+        for seconds in set(site.seconds)
+    }
     for place, seconds in enumerate(site.seconds):
         own = slice(place * nodes, (place + 1) * nodes)
-        lanes = _lanes(site, float(seconds), nodes) @ forces / float(seconds) ** 0.5
-        inputs[loop.kicks[pushed][place, :-1], own] = lanes
+        inputs[loop.kicks[pushed][place, :-1], own] = lanes[seconds]
     rows = nodes * len(other.seconds)
     outputs, through = np.zeros((rows, loop.c.shape[-2])), np.zeros((rows, columns))
     known = {seconds: _within(other, float(seconds), at, row, forces) for seconds in set(other.seconds)}

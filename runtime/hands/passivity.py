@@ -294,6 +294,8 @@ def _growth(scale: float, *spare: float) -> Growth:
     needed = [scale - one for one in spare]
     logs = [np.sign(one) if np.isinf(one) else (one - scale) / (abs(one) + scale) for one in needed]
     radius, high, low = (float(np.exp(2 * one)) for one in logs)
+    if spare[1] >= 0:  # passive, if only just
+        high = min(high, float(np.nextafter(1.0, 0.0)))
     return Growth(radius, low, high, exact=True, proved=True)
 
 

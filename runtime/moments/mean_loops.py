@@ -26,10 +26,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Feedback, Loop, StateLayout, bounded_weight, close
 from apc.eigen.peers import PeerGroup
 from apc.eigen.relative import Relative, relative_coordinates, relative_rows, with_doubt
-from apc.frame.discretize import UNIT
+from apc.frame.discretize import TOO_LARGE, UNIT
 from apc.frame.lift import FrameMap
 from apc.frame.radius import radius_of, value_of
 from apc.frame.schedule import Selected, Sent, Way
@@ -42,8 +43,9 @@ Matrix = NDArray[Any]
 # The packets of one link with one delay: what luck is drawn for.
 Route = tuple[str, str]
 
-# What stands still is sent as a small fraction of how far it stands aside: a gear's ratio, say.
-FINEST = 10**6
+# What stands still is sent as a small fraction of how far it stands aside: a gear's ratio, say. Where a frame
+# grows by many decades floats tell only coarser ones.
+FINEST = (10**6, 10**4, 100)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -313,6 +315,11 @@ def standing_state(matrix: Matrix, standing: Floats, loop: Loop, offsets: Sequen
     """Return rigid motions with what is remembered of them: whatever stands still is heard as it is sent.
 
     Of rational weights, it is made of small fractions; which of them, the matrix tells.
+
+    Raises
+    ------
+    ApcError
+        E806 the frame grows so fast that floats don't.
     """
     own = [len(group.lifted.z_names) for group in loop.sites]
     moving = np.concatenate([offset + np.arange(size) for offset, size in zip(offsets, own, strict=False)])
@@ -322,11 +329,14 @@ def standing_state(matrix: Matrix, standing: Floats, loop: Loop, offsets: Sequen
     if not standing.shape[1] or not len(rest):
         return basis
     value = value_of(matrix)
-    held = np.linalg.solve(
-        np.eye(len(rest)) - value[np.ix_(rest, rest)], value[np.ix_(rest, moving)] @ standing
-    )
-    basis[rest] = [[float(Fraction(one).limit_denominator(FINEST)) for one in row] for row in held.tolist()]
+    still, sent = np.eye(len(rest)) - value[np.ix_(rest, rest)], value[np.ix_(rest, moving)] @ standing
+    held = np.linalg.lstsq(still, sent)[0]
     numbers = arithmetic_of(matrix)
-    off = hull(numbers.subtract(numbers.multiply(matrix, numbers.exact(basis)), numbers.exact(basis)))
-    assert (np.abs(value_of(off)) <= radius_of(off)).all(), "what stands still is heard otherwise"
-    return basis
+    for finest in FINEST:
+        basis[rest] = [
+            [float(Fraction(one).limit_denominator(finest)) for one in row] for row in held.tolist()
+        ]
+        off = hull(numbers.subtract(numbers.multiply(matrix, numbers.exact(basis)), numbers.exact(basis)))
+        if (np.abs(value_of(off)) <= radius_of(off)).all():
+            return basis
+    raise ApcError(Mistake("E806", Place("the scene"), TOO_LARGE))

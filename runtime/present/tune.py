@@ -23,6 +23,7 @@ from apc.present.region_picture import draw_panel
 from apc.regions.panels import Panel
 from apc.regions.region import Region, region
 from apc.tuning.bound import SHARE
+from apc.tuning.demands import RADIUS, SETTLING
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -54,7 +55,10 @@ def tuning_text(found: Tuning) -> str:
     ]
     lines += [*table(rows), ""]
     if found.met:
-        best = f"{measured(found.best, found.error, found.unit)}, the best of {found.looked:,} points"
+        value = measured(found.best, found.error, found.unit)
+        if _levelled(found):  # found without knowing how far any better one may be
+            value = quantity(found.best, found.unit, BUYS + 1)
+        best = f"{value}, the best of {found.looked:,} points"
         lines += labelled("before rounding", best)
     if found.bounded:
         better = f"no gains in these ranges do better by {100 * float(SHARE):.3g} %"
@@ -80,7 +84,7 @@ def _sentence(found: Tuning) -> str:
         return f"{found.topology}: no gains were found in these ranges with which {stable}{over}"
     proved = "proved" if found.proved else "not proved"
     best = "largest" if found.larger else "least"
-    if found.unit == "1" and found.aim not in [one.parameter for one in found.gains]:
+    if found.aim in (RADIUS, SETTLING):
         power = 2 if found.criterion == "mean-square" else 1  # of what a frame multiplies
         settled = found.frame_s * power * math.log(SETTLED) / math.log(found.value)
         time = f"all motions die out but for {100 * SETTLED:.0f} % within {quantity(settled, 's', 3)}{over}"
@@ -90,11 +94,16 @@ def _sentence(found: Tuning) -> str:
     return f"{found.topology}: {value} found with which {stable}{over}; it is {proved}"
 
 
+def _levelled(found: Tuning) -> bool:
+    """Say whether the aim is what is felt, or a weighted sum."""
+    return found.aim not in (RADIUS, SETTLING, *(one.parameter for one in found.gains))
+
+
 def _room(found: Tuning) -> str:
     """Return how near the worst scenario is to what is allowed."""
     if found.criterion == "passive":
         return f"{-found.worst:.3g} of what hands can draw, as a logarithm"
-    if found.felt:
+    if found.felt or _levelled(found):
         return f"{math.exp(found.worst):.6g} of what is allowed in the worst scenario"
     radius, most = math.exp(found.worst + found.allowed), math.exp(found.allowed)
     return f"{_radius(found)} of {radius:.6g} in the worst scenario, {most:.6g} allowed"
@@ -136,9 +145,9 @@ def _where(one: Binding) -> str:
 def _binding_lines(found: Tuning, one: Binding) -> list[str]:
     where = _where(one)
     mode = f"{one.shape} mode at {in_hertz(one.frequency_hz)}" if one.shape else ""
-    other = "" if where else "what is felt" if found.felt else "stability"
+    other = "what is felt" if found.felt else found.aim if _levelled(found) else "stability"
     lines = wrapped(": ".join(filter(None, [where, mode])) or other, "    ", "      ")
-    for label, value, unit, better in one.buys if found.met and found.unit != "1" else ():
+    for label, value, unit, better in one.buys if found.met and found.aim not in (RADIUS, SETTLING) else ():
         buys = quantity(better, found.unit, BUYS)
         lines += wrapped(f"1 % less of {label} = {quantity(value, unit)} buys {buys}", "      ", "        ")
     return lines

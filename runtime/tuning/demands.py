@@ -10,6 +10,7 @@ Does not: compute.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -36,38 +37,54 @@ FREE, AIM, SUBJECT, OVER, AGAINST = (
 # What may be minimized beside a gain.
 RADIUS, SETTLING = "spectral_radius", "settling_time"
 
-# What hands feel, as `Feel` has it, and its unit.
+# What hands feel, by its name in a demand: its unit, and whether it is at a frequency. `error_h2` is the rms
+# of a copy's error for white forces of 1 N rms at all hands.
 FELT = {
-    "impedance": ("impedance", "N*s/m"),
-    "transmitted": ("transmitted_admittance", "m/s/N"),
-    "error": ("error_per_force", "m/N"),
+    "impedance": ("N*s/m", True),
+    "transmitted": ("m/s/N", True),
+    "error": ("m/N", True),
+    "damping": ("N*s/m", False),
+    "error_h2": ("m/N", False),
 }
 
-# By a quantity of `Feel` its name in a demand, and its unit.
-UNIT_OF = {quantity: (name, unit) for name, (quantity, unit) in FELT.items()}
+# A term of a weighted sum: its sign, its weight if it has one, its name.
+_TERM = re.compile(r"([+-])\s*(?:([\d.]+(?:e[+-]?\d+)?)\s*\*\s*)?(.*?)\s*(?=\s[+-]\s|$)")
 
 _FREE = '--free "coordination.stiffness=10 N/m:5000 N/m"'
 
 
 @dataclass(frozen=True, slots=True)
-class Aim:
-    """What is to be best: the gain in column `gain`, large or not; None is how fast all motions die out.
+class Felt:
+    """What a hand feels, by its `name` in `FELT`, at a frequency or (NaN) of all; of a demand its `most`."""
 
-    That is the spectral radius, or the time after which none is left but for 2 %: the same gains.
-    """
+    name: str
+    frequency_hz: float
+    most: float = math.inf
 
-    label: str
-    gain: int | None
-    larger: bool
+    @property
+    def label(self) -> str:
+        """What it is called in a demand."""
+        at = f" at {self.frequency_hz:.6g} Hz" if FELT[self.name][1] else ""
+        return f"feel.{self.name}{at}"
 
 
 @dataclass(frozen=True, slots=True)
-class Felt:
-    """A demand on what a hand feels: the size of a `quantity` of `Feel` at a frequency, at most so."""
+class Aim:
+    """What is to be best: the number in a `column`, large or not; None is how fast all motions die out.
 
-    quantity: str
-    frequency_hz: float
-    most: float
+    That is the spectral radius, or the time after which none is left but for 2 %: the same gains. Columns are
+    the gains and, where there are `terms`, a level that the weighted sum of these is to stay on the good side
+    of: (weight, the place of a gain or what is felt), in SI, with the largest value of all scenarios. `level`
+    is the range it is looked for in; `fixed` is what it is where that is known.
+    """
+
+    label: str
+    column: int | None
+    larger: bool
+    unit: str
+    terms: tuple[tuple[float, int | Felt], ...] = ()
+    level: Range | None = None
+    fixed: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +105,16 @@ class Demands:
     decay: float
     felt: tuple[Felt, ...]
     criterion: str
+
+    @property
+    def columns(self) -> tuple[Range, ...]:
+        """All that is chosen: the gains, and the level of an aim that has one."""
+        return (*self.free, *((self.aim.level,) if self.aim.level else ()))
+
+    @property
+    def measured(self) -> tuple[Felt, ...]:
+        """All that has to be known of what hands feel: the demands, then the terms of the aim."""
+        return (*self.felt, *(one for _, one in self.aim.terms if isinstance(one, Felt)))
 
     @property
     def over(self) -> tuple[Range, ...]:
@@ -114,7 +141,8 @@ def read_demands(
     free
         The gains: `NAME=LOW:HIGH` each.
     maximize, minimize
-        One of them: what is to be best.
+        One of them: what is to be best, a gain, `spectral_radius`, `settling_time`, what is felt such as
+        `feel.error at 1 Hz`, or a weighted sum of these in SI, `feel.damping - 0.01*coordination.stiffness`.
     subject
         Demands beside stability: `decay=60 dB in 2 s`, `feel.impedance at 5 Hz < 20 N*s/m`.
     over
@@ -161,7 +189,7 @@ def read_demands(
     felt = tuple(_felt(text) for text in subject if text.strip().startswith("feel."))
     decay = min((_decay(text) for text in subject if not text.strip().startswith("feel.")), default=1.0)
     best = _aim(gains, maximize, minimize)
-    if chosen == PASSIVE and (decay < 1 or best.gain is None):
+    if chosen == PASSIVE and (decay < 1 or best.column is None):
         asked = "a decay" if decay < 1 else best.label
         what = f"{asked} and --hands passive don't go together: what hands can draw has no modes that decay"
         raise ApcError(Mistake("E930", SUBJECT if decay < 1 else PLACE, what, hint="--hands clamped"))
@@ -227,16 +255,39 @@ def _aim(gains: Sequence[Range], maximize: str, minimize: str) -> Aim:
     text, larger = (maximize or minimize).strip(), bool(maximize)
     names = [one.free.label for one in gains]
     if text in names:
-        return Aim(text, names.index(text), larger)
+        return Aim(text, names.index(text), larger, gains[names.index(text)].unit)
     if text in (RADIUS, SETTLING) and not larger:
-        return Aim(text, None, larger)
-    option = "--maximize" if larger else "--minimize"
-    what = f"{option} {text[:60] or 'nothing'}"
-    expected = f"one of the free numbers ({', '.join(names)})" + (
-        "" if larger else f", {RADIUS} or {SETTLING}"
-    )
-    hint = f"{option} {nearest(text, names) or names[0]}"
-    raise ApcError(Mistake("E996", Place(option), what, expected, hint=hint))
+        return Aim(text, None, larger, "1")
+    option = Place("--maximize" if larger else "--minimize")
+    terms = []
+    for sign, weight, name in _TERM.findall(text if text[:1] in "+-" else f"+ {text}"):
+        if name not in names and not name.startswith("feel."):
+            what = f"{option.file} {text[:60] or 'nothing'}"
+            others = "" if larger else f", {RADIUS} or {SETTLING}"
+            expected = f"a free number ({', '.join(names)}), feel.…, a weighted sum of them{others}"
+            hint = f"{option.file} {nearest(name, names) or names[0]}"
+            raise ApcError(Mistake("E996", option, what, expected, hint=hint))
+        own = names.index(name) if name in names else _measure(name, option)
+        terms.append((float(f"{sign}{weight or 1}"), own))
+    unit = "1"
+    if len(terms) == 1 and terms[0][0] == 1 and isinstance(terms[0][1], Felt):
+        unit = FELT[terms[0][1].name][0]
+    return Aim(text, len(gains), larger, unit, tuple(terms))
+
+
+def _measure(text: str, place: Place, wants: str = "") -> Felt:
+    """Read `feel.impedance at 5 Hz`, or `feel.damping`."""
+    name, at, frequency = (one.strip() for one in text.strip().removeprefix("feel.").partition(" at "))
+    if name not in FELT or bool(at) != FELT[name][1]:
+        names = ", ".join(f"feel.{one}{' at 5 Hz' if at else ''}" for one, (_, at) in FELT.items())
+        example = f'{place.file} "feel.impedance at 5 Hz{wants}"'
+        raise ApcError(Mistake("E996", place, "what is felt", f"one of {names}", text[:80], example))
+    if not at:
+        return Felt(name, math.nan)
+    hertz = _part(frequency, "a frequency", "Hz", f"feel.{name} at 5 Hz{wants}", place)
+    if hertz <= 0:
+        raise ApcError(Mistake("E996", place, "a frequency", "more than 0 Hz", text[:80]))
+    return Felt(name, float(hertz))
 
 
 def _decay(text: str) -> float:
@@ -246,8 +297,8 @@ def _decay(text: str) -> float:
     if name != "decay" or not (within and size.lower().endswith("db")):
         wants = "decay=… dB in … or feel.… at … < …"
         raise ApcError(Mistake("E996", SUBJECT, "a demand", wants, text[:80], '"decay=60 dB in 2 s"'))
-    decibels = _part(size[:-2].strip(), "decibels", "1", "decay=60 dB in 2 s")
-    seconds = _part(time, "a time", "s", "decay=60 dB in 2 s")
+    decibels = _part(size[:-2].strip(), "decibels", "1", "decay=60 dB in 2 s", SUBJECT)
+    seconds = _part(time, "a time", "s", "decay=60 dB in 2 s", SUBJECT)
     if not (decibels > 0 and seconds > 0):
         raise ApcError(Mistake("E996", SUBJECT, "a decay", "more than 0 dB in more than 0 s", value[:80]))
     return float(10 ** (-decibels / 20 / seconds))
@@ -256,35 +307,22 @@ def _decay(text: str) -> float:
 def _felt(text: str) -> Felt:
     """Read `feel.impedance at 5 Hz < 20 N*s/m`, of a topology `feel.impedance at 5 Hz=< 20 N*s/m`."""
     named, less, most = (one.strip() for one in text.replace("=<", "<").replace("= <", "<").partition("<"))
-    name, at, frequency = (one.strip() for one in named.removeprefix("feel.").partition(" at "))
-    if name not in FELT or not (at and less):
-        names = ", ".join(f"feel.{one}" for one in FELT)
-        example = '"feel.impedance at 5 Hz < 20 N*s/m"'
-        raise ApcError(
-            Mistake("E996", SUBJECT, "a demand on what is felt", f"one of {names}", text[:80], example)
-        )
-    quantity, unit = FELT[name]
-    hint = f"feel.{name} at 5 Hz < 20 {unit}"
-    hertz = _part(frequency, "a frequency", "Hz", hint)
-    limit = _part(most, f"feel.{name}", unit, hint)
-    if not (hertz > 0 and limit > 0):
-        raise ApcError(Mistake("E996", SUBJECT, "a demand on what is felt", "numbers above 0", text[:80]))
-    return Felt(quantity, float(hertz), float(limit))
+    felt = _measure(named if less else text, SUBJECT, " < 20 N*s/m")
+    unit = FELT[felt.name][0]
+    limit = _part(most, felt.label, unit, f"{felt.label} < 20 {unit}", SUBJECT)
+    if limit <= 0:
+        raise ApcError(Mistake("E996", SUBJECT, "a demand on what is felt", "a number above 0", text[:80]))
+    return replace(felt, most=float(limit))
 
 
 def read_against(text: str) -> Felt:
     """Read what a gain is weighed against, `feel.impedance at 5 Hz`. Raises ApcError E996."""
-    name, at, _ = text.strip().removeprefix("feel.").partition(" at ")
-    if name.strip() not in FELT or not at or "<" in text:
-        names, example = ", ".join(f"feel.{one}" for one in FELT), '--against "feel.impedance at 5 Hz"'
-        wants = f"one of {names}, at a frequency"
-        raise ApcError(Mistake("E996", AGAINST, "what a gain is weighed against", wants, text[:80], example))
-    return _felt(f"{text} < 1 {FELT[name.strip()][1]}")
+    return _measure(text if text.strip().startswith("feel.") else f"feel.{text.strip()}", AGAINST)
 
 
-def _part(text: str, what: str, unit: str, example: str) -> Fraction:
+def _part(text: str, what: str, unit: str, example: str, place: Place) -> Fraction:
     """Read a quantity within a demand, of which an example is the line to write."""
     try:
-        return option_value("--subject", text, what=what, unit=unit)
+        return option_value(place.file, text, what=what, unit=unit)
     except ApcError as error:
-        raise ApcError(replace(one, hint=f'--subject "{example}"') for one in error.mistakes) from None
+        raise ApcError(replace(one, hint=f'{place.file} "{example}"') for one in error.mistakes) from None

@@ -19,7 +19,7 @@ from apc.analysis.analysis import prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.result import Result
-from apc.tuning.demands import AGAINST, UNIT_OF, Demands, Felt
+from apc.tuning.demands import AGAINST, FELT, Demands, Felt
 from apc.tuning.limits import Limits
 from apc.tuning.tune import Tuning, tune
 from apc.vary.crossing import Told
@@ -96,14 +96,15 @@ def front(
     ApcError
         E996 the aim is no gain, or what is felt doesn't get worse as it grows.
     """
-    column, until = demands.aim.gain, time.monotonic() + seconds
-    if column is None:
+    column, until = demands.aim.column, time.monotonic() + seconds
+    if column is None or demands.aim.terms:
         raise ApcError(Mistake("E996", AGAINST, f"{demands.aim.label} is no gain to be weighed against it"))
     limits = Limits(system, prepare(system), replace(demands, felt=(replace(against, most=1.0),)))
 
     def felt(gains: Floats) -> float:
         """Return the largest that is felt in any scenario at gains (m,)."""
-        return max(float(np.exp(limits.felt(one, np.append(gains, one.point)[None]))[0, 0]) for one in every)
+        points = ((one.setting, np.append(gains, one.point)[None]) for one in every)
+        return max(float(limits.measured(*point)[0, 0, 0]) for point in points)
 
     every = limits.every()
     best = tune(system, demands, seconds=seconds, told=told)
@@ -113,7 +114,7 @@ def front(
     others[:, column] = np.linspace(float(end), at_best[column], SCANNED)
     low, high = min(map(felt, others)), felt(at_best)
     if not (best.met and low < high * (1 - 1e-6)):
-        what = f"the best {demands.aim.label} is the best for feel.{UNIT_OF[against.quantity][0]}, too"
+        what = f"the best {demands.aim.label} is the best for {against.label}, too"
         raise ApcError(Mistake("E996", AGAINST, what))
     designs, notes = [_design(best, high)], best.notes
     for place, bound in enumerate(np.geomspace(high, low * LEAST, points)[1:].tolist(), 1):
@@ -126,14 +127,13 @@ def front(
         if found.met:
             designs.append(_design(found, felt(np.array([float(one.value) for one in found.gains]))))
     designs.sort(key=lambda one: one.felt)
-    name, unit = UNIT_OF[against.quantity]
     return Front(
         topology=system.name,
         aim=demands.aim.label,
         unit=best.unit,
         larger=demands.aim.larger,
-        against=f"feel.{name} at {against.frequency_hz:.6g} Hz",
-        against_unit=unit,
+        against=against.label,
+        against_unit=FELT[against.name][0],
         designs=tuple(designs),
         knee=_knee(designs),
         criterion=demands.criterion,

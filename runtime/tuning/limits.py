@@ -8,7 +8,7 @@ Does not: choose scenarios, or prove (see `tune`).
 A scenario is a scene of its own, a number of peers and a delay (`settings`), and a point of the box. What
 limits gains there is how fast each of the largest modes grows, ln |λ| less what is allowed; over a lossy
 network or with passive hands it is the one number that the criterion has. What is felt counts as the
-logarithm of what it is of the most it may be.
+logarithm of what it is of the most it may be, and an aim's level by how far what it bounds is beyond it.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Prepared
 from apc.compiler.compiled import CompiledSystem
-from apc.compiler.errors import ApcError
+from apc.compiler.errors import ApcError, Mistake
 from apc.eigen.eigenpairs import eigenvalues
 from apc.frame.overrides import Override, apply
 from apc.hands.feel import feel
 from apc.threads import load_pool
-from apc.tuning.demands import PLACE, Demands
+from apc.tuning.demands import PLACE, SUBJECT, Demands, Felt
 from apc.vary.batch import BatchEvaluator, MatrixSource
 from apc.vary.delay_box import standing_delays
 from apc.vary.evaluator import evaluator_of_many
@@ -46,12 +46,13 @@ MODES = 4
 # The step of a difference, of a range: what it cuts off and what rounding leaves of it are then alike.
 STEP = 1e-6
 
-# The bound of each response, as `Feel` has it; less than any size.
-BOUND_OF = {
-    "impedance": "bound",
-    "transmitted_admittance": "transmitted_bound",
-    "error_per_force": "error_bound",
+# Responses as `Feel` has them, and their bounds; in what of it all else is; less than any size.
+RESPONSES = {
+    "impedance": ("impedance", "bound"),
+    "transmitted": ("transmitted_admittance", "transmitted_bound"),
+    "error": ("error_per_force", "error_bound"),
 }
+PART_OF = {"damping": "low_frequency", "error_h2": "h2"}
 TINY = 1e-300
 
 # Points of a grid along each range of a box; how near to the top of what limits gains there it is followed.
@@ -71,9 +72,9 @@ class Scenario:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """Limits at one point of the gains: `values` (n,), below 0 where met, and `slopes` (n, m).
+    """Limits at one point of the columns: `values` (n,), below 0 where met, and `slopes` (n, m).
 
-    A slope is that over the whole range of a gain, or of a number of the box.
+    A slope is that over the whole range of a column, or of a number of the box.
     `block` (n,) numbers the scenario and system that each is of, `eigenvalue` (n,) tells those of one block
     apart, NaN of what has none, and `scenario` (n,) is the place of its scenario.
     """
@@ -94,6 +95,7 @@ class Limits:
     demands: Demands
     known: dict[int, MatrixSource] = field(default_factory=dict)
     samples: dict[Scenario, Floats] = field(default_factory=dict)
+    felt: dict[tuple[int, tuple[float, ...]], Floats] = field(default_factory=dict)
 
     @cached_property
     def settings(self) -> list[tuple[tuple[Override, ...], CompiledSystem]]:
@@ -127,7 +129,7 @@ class Limits:
     @property
     def slow(self) -> bool:
         """Whether one point takes milliseconds."""
-        return bool(self.demands.felt) or not isinstance(self.family(0), BatchEvaluator)
+        return bool(self.demands.measured) or not isinstance(self.family(0), BatchEvaluator)
 
     def every(self) -> list[Scenario]:
         """Return the middle and the corners of the box in every setting."""
@@ -148,18 +150,23 @@ class Limits:
             )
         return self.known[setting]
 
-    def worst(self, scenarios: Sequence[Scenario], gains: Floats) -> Floats:
-        """Return the largest value in each scenario (k, s) at gains (k, m)."""
-        found = np.empty((len(gains), len(scenarios)))
+    def worst(self, scenarios: Sequence[Scenario], chosen: Floats) -> Floats:
+        """Return the largest value in each scenario (k, s) with columns (k, m)."""
+        found = np.empty((len(chosen), len(scenarios)))
         for place, one in enumerate(scenarios):
-            points = np.hstack([gains, np.tile(one.point, (len(gains), 1))])
-            sizes = [_sizes(matrix) for matrix in self.family(one.setting).matrices(points)]
-            grown = np.max([np.full(len(gains), NONE), *sizes], axis=0) - self.allowed
-            found[:, place] = np.max([grown, *self.felt(one, points).T], axis=0)
+            points = np.hstack([chosen, np.tile(one.point, (len(chosen), 1))])
+            sizes = [_sizes(matrix) for matrix in self.family(one.setting).matrices(self._numbers(points))]
+            grown = np.max([np.full(len(chosen), NONE), *sizes], axis=0) - self.allowed
+            found[:, place] = np.max([grown, *self.asked(one.setting, points).T], axis=0)
         return found
 
-    def worst_within(self, setting: int, gains: Floats) -> tuple[Scenario, float]:
-        """Return the point of the box that limits gains (m,) most in a setting, and its value.
+    def _numbers(self, points: Floats) -> Floats:
+        """Return the gains and the box of points (k, m + b), without the level of an aim."""
+        level = range(len(self.demands.free), len(self.demands.columns))
+        return np.delete(points, level, axis=-1)
+
+    def worst_within(self, setting: int, chosen: Floats) -> tuple[Scenario, float]:
+        """Return the point of the box that limits columns (m,) most in a setting, and its value.
 
         The worst of a grid is followed to the top by Powell's method, which takes no slopes: where modes take
         turns there is a ridge.
@@ -168,8 +175,8 @@ class Limits:
 
         def value(shares: Floats) -> Floats:
             """Return the values at points of the box (k, b), each from 0 to 1 along every range."""
-            points = np.hstack([np.tile(gains, (len(shares), 1)), low + shares * (high - low)])
-            sizes = [_sizes(matrix) for matrix in self.family(setting).matrices(points)]
+            points = np.hstack([np.tile(chosen, (len(shares), 1)), low + shares * (high - low)])
+            sizes = [_sizes(matrix) for matrix in self.family(setting).matrices(self._numbers(points))]
             return np.asarray(np.max(sizes, axis=0))
 
         grid = np.array(list(itertools.product(np.linspace(0, 1, GRID), repeat=len(low))))
@@ -182,51 +189,83 @@ class Limits:
         point = low + np.clip(top.x, 0, 1) * (high - low)
         return Scenario(setting, tuple(point.tolist())), -float(top.fun) - self.allowed
 
-    def felt(self, scenario: Scenario, points: Floats, *, bounded: bool = False) -> Floats:
-        """Return ln of what is felt by what may be at most (k, q) at points of gains and box (k, m + b)."""
-        asked = self.demands.felt
-        found = np.full((len(points), len(asked)), BEYOND)
-        _, scene = self.settings[scenario.setting]
+    def asked(self, setting: int, points: Floats, *, bounded: bool = False) -> Floats:
+        """Return how far points (k, m + b) are from the demands on what is felt, and the level (k, q).
+
+        With `bounded` they are so far at least, with what rounding leaves open of what is felt.
+        """
+        demands, aim = self.demands, self.demands.aim
+        felt = self.measured(setting, self._numbers(points))
+        off = felt[..., 1] if bounded else np.zeros(felt.shape[:2])
+        count = len(demands.felt)
+        found = np.log(np.maximum(felt[:, :count, 0] + off[:, :count], TINY))
+        found -= np.log([one.most for one in demands.felt])
+        if aim.level or aim.fixed is not None:
+            level = points[:, len(demands.free)] if aim.fixed is None else np.full(len(points), aim.fixed)
+            weights = [abs(weight) for weight, one in aim.terms if isinstance(one, Felt)]
+            beyond = (-1 if aim.larger else 1) * (self.sums(setting, points) - level) + off[
+                :, count:
+            ] @ weights
+            found = np.column_stack([found, beyond / np.maximum(np.abs(level), TINY)])
+        return np.minimum(np.nan_to_num(found, nan=BEYOND), BEYOND)
+
+    def sums(self, setting: int, points: Floats) -> Floats:
+        """Return the weighted sum that is the aim (k,) at points (k, m + b)."""
+        felt = iter(self.measured(setting, self._numbers(points))[:, len(self.demands.felt) :, 0].T)
+        terms = self.demands.aim.terms
+        return np.sum(
+            [weight * (next(felt) if isinstance(one, Felt) else points[:, one]) for weight, one in terms],
+            axis=0,
+        )
+
+    def measured(self, setting: int, numbers: Floats) -> Floats:
+        """Return what is felt with gains and box (k, n), and what it may be off by (k, q, 2).
+
+        It is infinite where nothing is felt, or nothing can be said.
+        """
+        asked = self.demands.measured
+        found = np.full((len(numbers), len(asked), 2), np.inf)
+        _, scene = self.settings[setting]
         free = [one.free for one in (*self.demands.free, *self.demands.box)]
-        for row, point in zip(found, points.tolist() if asked else (), strict=False):
-            changed = apply(scene, [Override(*pair) for pair in zip(free, map(Fraction, point), strict=True)])
-            for place, one in enumerate(asked):
+        for row, point in zip(found, map(tuple, numbers.tolist()) if asked else (), strict=False):
+            if (setting, point) not in self.felt:
+                pairs = zip(free, map(Fraction, point), strict=True)
                 with contextlib.suppress(ApcError):
-                    told = feel(
-                        changed, [one.frequency_hz], unstable=True, quick=True, prepared=self.prepared
-                    )
-                    size = abs(complex(getattr(told, one.quantity)[0]))
-                    share = float(getattr(told, BOUND_OF[one.quantity])[0]) if bounded else 0.0
-                    row[place] = math.log(max(size * (1 + share), TINY) / one.most)
+                    changed = apply(scene, [Override(*pair) for pair in pairs])
+                    row[:] = felt_in(changed, asked, self.prepared)
+                self.felt[setting, point] = row.copy()
+            row[:] = self.felt[setting, point]
         return found
 
-    def sampled(self, scenario: Scenario, gains: Floats) -> Floats:
-        """Return the largest value in a scenario (k,) at gains (k, m), the same whenever it is asked."""
+    def sampled(self, scenario: Scenario, chosen: Floats) -> Floats:
+        """Return the largest value in a scenario (k,) with columns (k, m), the same whenever it is asked."""
         if scenario not in self.samples:
-            self.samples[scenario] = self.worst([scenario], gains)[:, 0]
+            self.samples[scenario] = self.worst([scenario], chosen)[:, 0]
         return self.samples[scenario]
 
-    def rows(self, scenarios: Sequence[Scenario], gains: Floats, *, wide: bool = False) -> Rows:
-        """Return all limits at gains (m,), their slopes along the numbers of the box, too, if `wide`."""
-        ranges = [*self.demands.free, *self.demands.box]
+    def rows(self, scenarios: Sequence[Scenario], chosen: Floats, *, wide: bool = False) -> Rows:
+        """Return all limits with columns (m,), their slopes along the numbers of the box, too, if `wide`."""
+        ranges = [*self.demands.columns, *self.demands.box]
         along = np.diag([float(one.high - one.low) for one in ranges])
-        along = along if wide else along[: len(gains)]
+        along = along if wide else along[: len(chosen)]
         parts: list[tuple[Floats, Floats, Complexes, int]] = []
         for place, one in enumerate(scenarios):
-            point = np.append(gains, one.point)
+            point = np.append(chosen, one.point)
             family = self.family(one.setting)
             inwards = along * np.where(point > [float(own.low + own.high) / 2 for own in ranges], -1, 1)
+            moved = np.vstack([point, point + STEP * inwards])
             if isinstance(family, GrowthEvaluator):
-                moved = np.vstack([point, point + STEP * inwards]).tolist()
-                roots = np.array([family.parts(one) for one in moved])
+                distinct, which = np.unique(self._numbers(moved), axis=0, return_inverse=True)
+                roots = np.array([family.parts(one) for one in distinct.tolist()])[which.reshape(-1)]
                 parts.append((*_differences(np.log(np.maximum(roots, TINY)) - self.allowed, inwards), place))
             else:
-                for pair in family.slopes(np.tile(point, (len(along), 1)), along):
+                at = np.tile(self._numbers(point), (len(along), 1))
+                for pair in family.slopes(at, self._numbers(along)):
                     values, slopes, found = _largest(*pair)
                     parts.append((values - self.allowed, slopes, found, place))
-            if self.demands.felt:
-                felt = self.felt(one, np.vstack([point, point + STEP * inwards]))
-                parts.append((*_differences(felt, inwards), place))
+            asked = self.asked(one.setting, moved)
+            if asked.shape[1]:
+                parts.append((*_differences(asked, inwards), place))
         counts = [len(values) for values, *_ in parts]
         return Rows(
             np.concatenate([values for values, *_ in parts]),
@@ -235,6 +274,43 @@ class Limits:
             np.concatenate([found for *_, found, _ in parts]),
             np.repeat([place for *_, place in parts], counts),
         )
+
+
+def felt_in(system: CompiledSystem, asked: Sequence[Felt], prepared: Prepared) -> list[tuple[float, float]]:
+    """Return each of what is asked about the hands of a scene, with what it may be off by.
+
+    Parameters
+    ----------
+    system
+        The compiled scene, with its numbers.
+    asked
+        What is felt.
+    prepared
+        From `analysis.prepare`, of this scene with any numbers.
+
+    Raises
+    ------
+    ApcError
+        Those of `feel`; E996 nothing is felt of it.
+    """
+    hertz = [one.frequency_hz for one in asked if not math.isnan(one.frequency_hz)] or [1.0]
+    beside = {PART_OF[one.name] for one in asked if one.name in PART_OF}
+    told = feel(system, hertz, unstable=not beside, beside=beside, prepared=prepared)
+    found = []
+    for one in asked:
+        value, off = 0.0, 0.0
+        if one.name in RESPONSES:
+            response, bound = (getattr(told, name) for name in RESPONSES[one.name])
+            value = abs(complex(response[hertz.index(one.frequency_hz)]))
+            off = value * float(bound[hertz.index(one.frequency_hz)])
+        elif one.name == "damping" and told.low_frequency is not None:
+            value, off = told.low_frequency.damping, told.low_frequency.errors[1]
+        elif one.name == "error_h2" and told.h2 and told.h2[0].error_m is not None:
+            value, off = told.h2[0].error_m, told.h2[0].errors[0] or 0.0
+        if value == 0:
+            raise ApcError(Mistake("E996", SUBJECT, f"of {one.label} nothing is felt in this scene"))
+        found.append((value, off))
+    return found
 
 
 def _differences(values: Floats, along: Floats) -> tuple[Floats, Floats, Complexes]:

@@ -43,7 +43,10 @@ ROUGH = 1e-9
 SHORTER, NEAREST = 0.25, 1e-3
 
 # More than any aim is worth.
-HUGE = 1e3
+HUGE = 1e9
+
+# How far the level of an aim may be from where it is looked for, in widths of that range.
+FAR = 1e6
 
 # The least share of a range in which points are spread by ratios.
 SMALLEST = 1e-3
@@ -91,19 +94,31 @@ class Search:
 
     @cached_property
     def _low(self) -> Floats:
-        return np.array([float(one.low) for one in self.limits.demands.free])
+        return np.array([float(one.low) for one in self.limits.demands.columns])
 
     @cached_property
     def _width(self) -> Floats:
-        return np.array([float(one.high) for one in self.limits.demands.free]) - self._low
+        return np.array([float(one.high) for one in self.limits.demands.columns]) - self._low
 
-    def _gains(self, shares: Floats) -> Floats:
+    @cached_property
+    def _ends(self) -> Floats:
+        """The least and largest share of each range (2, m): the level of an aim may be beyond its own."""
+        ends = np.array([np.zeros(len(self._low)), np.ones(len(self._low))])
+        if self.limits.demands.aim.level:
+            ends[:, -1] = -FAR, FAR
+        return ends
+
+    def _inner(self, shares: Floats) -> NDArray[np.bool_]:
+        """Say which shares are not at an end."""
+        return np.asarray((shares > self._ends[0] + OPEN) & (shares < self._ends[1] - OPEN))
+
+    def gains(self, shares: Floats) -> Floats:
         """Return gains (…, m) of shares of their ranges."""
-        return np.asarray(self._low + self._width * np.clip(shares, 0.0, 1.0))
+        return np.asarray(self._low + self._width * np.clip(shares, *self._ends))
 
     def _worst(self, shares: Floats) -> Floats:
         """Return the largest limit at shares (k, m)."""
-        return np.asarray(self.limits.worst(self.scenarios, self._gains(shares)).max(axis=1))
+        return np.asarray(self.limits.worst(self.scenarios, self.gains(shares)).max(axis=1))
 
     def _merit(self, shares: Floats, worst: Floats) -> Floats:
         """Return what is to be small (k,), of points that meet the limits."""
@@ -129,9 +144,10 @@ class Search:
         than
             What is known: only a point that does better in all scenarios is returned then, if there is one.
         """
-        points = np.vstack([np.clip((present - self._low) / self._width, 0.0, 1.0), self._even])
-        gains = self._gains(points)
+        points = np.vstack([np.clip((present - self._low) / self._width, *self._ends), self.even])
+        gains = self.gains(points)
         worst = np.max([self.limits.sampled(one, gains) for one in self.scenarios], axis=0)
+        points = self._levelled(points, self.scenarios)
         order = np.argsort(self._order(points, worst), kind="stable")
         if than is not None:
             met = self.column is not None and than.worst <= BINDS
@@ -140,11 +156,27 @@ class Search:
         size, left = (SLOW_LOOK if self.limits.slow else LOOK), LOOKS
         for begin in range(0, min(len(order), size * LOOKS), size):
             some = order[begin : begin + size]
-            ranks = self._order(points[some], self.limits.worst(every, gains[some]).max(axis=1))
+            points[some] = self._levelled(points[some], every)
+            ranks = self._order(points[some], self.limits.worst(every, self.gains(points[some])).max(axis=1))
             place, left = int(np.argmin(ranks)), left - 1
             if ranks[place] < (known - OPEN if than is not None else 0.0 if left else np.inf):
                 return [points[some[place]]]
         return []
+
+    def _levelled(self, points: Floats, scenarios: Sequence[Scenario]) -> Floats:
+        """Return points (k, m) with the level of the aim, if it has one, where it is just met."""
+        if not self.limits.demands.aim.level:
+            return points
+        gains = self.gains(points)
+        sums = np.array(
+            [
+                self.limits.sums(one.setting, np.hstack([gains, np.tile(one.point, (len(gains), 1))]))
+                for one in scenarios
+            ]
+        )
+        level = sums.min(axis=0) if self.sign > 0 else sums.max(axis=0)
+        shares = (level - self._low[-1]) / self._width[-1] - OPEN * self.sign
+        return np.column_stack([points[:, :-1], np.nan_to_num(shares, nan=self.sign * FAR)])
 
     def _order(self, points: Floats, worst: Floats) -> Floats:
         """Return what the best of points (k, m) has least of, far below 0 where it meets the limits."""
@@ -152,9 +184,10 @@ class Search:
         return merit if self.column is None else np.where(worst <= 0, merit - HUGE, worst)
 
     @cached_property
-    def _even(self) -> Floats:
+    def even(self) -> Floats:
         """Points (k, m) spread evenly over the ranges, every other one by ratios, and over their ends."""
-        count = FELT_POINTS if self.limits.demands.felt else SLOW_POINTS if self.limits.slow else POINTS
+        demands = self.limits.demands
+        count = FELT_POINTS if demands.measured else SLOW_POINTS if self.limits.slow else POINTS
         even = _even(count, len(self._low))
         top = self._low + self._width
         near = np.where(self._low > 0, self._low, SMALLEST * self._width)
@@ -163,7 +196,10 @@ class Search:
         ends = [even[: len(even) // FACES].copy() for _ in range(2 * len(top))]
         for place, points in enumerate(ends):
             points[:, place // 2] = place % 2
-        return np.vstack([even, *ends])
+        points = np.vstack([even, *ends])
+        if demands.aim.level:  # where any gains are on its good side
+            points[:, -1] = -self.sign * FAR
+        return points
 
     def best(self, starts: Sequence[Floats]) -> Optimum:
         """Return the best that descents from starts (shares of the ranges) find."""
@@ -173,7 +209,7 @@ class Search:
         cloud = _even(count, len(self._low)) - 0.5
         looked = 0
         for _ in range(AGAIN):
-            around = [np.clip(self.shares(chosen) + 2 * size * cloud, 0.0, 1.0) for size in SPREADS]
+            around = [np.clip(self.shares(chosen) + 2 * size * cloud, *self._ends) for size in SPREADS]
             points = np.vstack(around)
             worst = self._worst(points)
             looked += len(points)
@@ -217,7 +253,7 @@ class Search:
 
         best, reach = self._optimum(start, rows_of, 0.0), 1.0
         while reach > NEAREST:
-            near = np.clip([here[:size] - reach, here[:size] + reach], 0.0, 1.0).T.tolist()
+            near = np.clip([here[:size] - reach, here[:size] + reach], *self._ends).T.tolist()
             ended = optimize.minimize(
                 lambda z: float(aim @ z),
                 here,
@@ -227,8 +263,9 @@ class Search:
                 constraints=[{"type": "ineq", "fun": left, "jac": moves}],
                 options={"ftol": ROUGH if self.limits.slow else 1e-14, "maxiter": self.steps},
             )
-            rough = np.clip(np.nan_to_num(ended.x[:size], nan=0.5), 0.0, 1.0)
-            rough = np.where(np.abs(rough - np.round(rough)) < OPEN, np.round(rough), rough)
+            rough = np.clip(np.nan_to_num(ended.x[:size], nan=0.5), *self._ends)
+            for end in self._ends:
+                rough = np.where(np.abs(rough - end) < OPEN, end, rough)
             found = self._polished(rough, rows_of)
             (unmet, value), known = self._rank(found), self._rank(best)
             far = (unmet, value + OPEN) < known
@@ -246,7 +283,7 @@ class Search:
         def rows_of(shares: Floats) -> Rows:
             key = np.ascontiguousarray(shares).tobytes()
             if key not in known:
-                known[key] = self.limits.rows(self.scenarios, self._gains(shares))
+                known[key] = self.limits.rows(self.scenarios, self.gains(shares))
             return known[key]
 
         return rows_of
@@ -255,7 +292,7 @@ class Search:
         """Return the root of the conditions of an optimum beside a rough one, or that itself."""
         here = rows_of(rough)
         before = self._optimum(rough, rows_of, 0.0)
-        inner = (rough > OPEN) & (rough < 1 - OPEN)
+        inner = self._inner(rough)
         active = np.flatnonzero(before.multipliers > 0).tolist()
         spare = self.column is None
         if self.limits.slow or not len(active) or len(active) > inner.sum() + spare:
@@ -279,7 +316,7 @@ class Search:
         begin = np.concatenate([rough[inner], before.multipliers[active], [before.worst] if spare else []])
         root = load_pool("scipy.optimize").root(conditions, begin, tol=1e-14)
         shares, rest = unpacked(root.x)
-        near = np.abs(shares - rough).max() <= SPREADS[1] and (shares >= 0).all() and (shares <= 1).all()
+        near = np.abs(shares - rough).max() <= SPREADS[1] and (shares == np.clip(shares, *self._ends)).all()
         weights = rest[:-1] if spare else rest
         if not (near and np.abs(root.fun).max() <= OPEN and (weights >= 0).all()):
             return before
@@ -296,7 +333,7 @@ class Search:
     def _value(self, shares: Floats, rows_of: Callable[[Floats], Rows]) -> float:
         """Return the value of the aim: a gain, or the largest ln |λ| of a frame."""
         if self.column is not None:
-            return float(self._gains(shares)[self.column])
+            return float(self.gains(shares)[self.column])
         return float(rows_of(shares).values.max()) + self.limits.allowed
 
     def _optimum(self, shares: Floats, rows_of: Callable[[Floats], Rows], error: float) -> Optimum:
@@ -305,7 +342,7 @@ class Search:
         worst = float(rows.values.max(initial=-np.inf))
         level = worst if self.column is None else 0.0
         near = np.flatnonzero(rows.values >= level - BINDS * 100)
-        inner = (shares > OPEN) & (shares < 1 - OPEN)
+        inner = self._inner(shares)
         slopes = rows.slopes[near][:, inner].T
         balance: Any = (slopes, -self._aim()[inner])
         if self.column is None:  # weights of one
@@ -320,7 +357,7 @@ class Search:
         error = max(error, LEAST * abs(value))
         if self.limits.slow and self.column is not None:
             error = max(error, 10 * ROUGH * float(self._width[self.column]))
-        return Optimum(tuple(self.scenarios), self._gains(shares), value, error, worst, rows, multipliers, 0)
+        return Optimum(tuple(self.scenarios), self.gains(shares), value, error, worst, rows, multipliers, 0)
 
 
 def _same(found: Rows, here: Rows, one: int) -> int:

@@ -32,16 +32,15 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.compiler.timings import part
 from apc.finite_equations import finite_equations
-from apc.frame.names import Range, value_now
+from apc.frame.names import Free, Range, value_now
 from apc.frame.overrides import Override, apply
-from apc.hands.feel import feel
 from apc.hands.passivity import passive_hands
 from apc.network.nominal import left_out
 from apc.result import Result
 from apc.threads import single_threaded
 from apc.tuning.bound import none_better
-from apc.tuning.demands import SUBJECT, Demands, Felt
-from apc.tuning.limits import Limits, Scenario
+from apc.tuning.demands import PLACE, Demands, Felt
+from apc.tuning.limits import RESPONSES, TINY, Limits, Scenario, felt_in
 from apc.tuning.optimum import BINDS, Optimum, Search
 from apc.vary.crossing import Told
 from apc.vary.growth import MEAN_SQUARE, PASSIVE
@@ -199,14 +198,10 @@ def tune(
     Raises
     ------
     ApcError
-        Those of the analysis that the scene needs, such as E898 a network that can't be judged; of `feel`.
+        Those of the analysis that the scene needs, such as E898 a network that can't be judged; of `feel`;
+        E996 what is asked about hands is felt nowhere.
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        for one in demands.felt:  # what can't be felt anywhere is refused here
-            told_of = feel(system, [one.frequency_hz], unstable=True, quick=True)
-            if not abs(getattr(told_of, one.quantity)[0]) > 0:
-                what = f"of {one.quantity.replace('_', ' ')} nothing is felt in this scene"
-                raise ApcError(Mistake("E996", SUBJECT, what))
         return _Work(system, demands, time.monotonic() + seconds, told or (lambda _: None)).done()
 
 
@@ -223,17 +218,45 @@ class _Work:
 
     def __post_init__(self) -> None:
         self.limits = Limits(self.system, prepare(self.system), self.demands)
+        if self.demands.felt:  # what can't be felt anywhere is refused before anything is looked for
+            felt_in(
+                self.system, [one for one in self.demands.felt if one.name in RESPONSES], self.limits.prepared
+            )
         self.every = self.limits.every()
         self.present = np.array([float(value_now(self.system, one.free)) for one in self.demands.free])
         first = len(self.every) // len(self.limits.settings)
         self.scenarios = list(dict.fromkeys((self.every[0], self.every[-first])))
+        if self.demands.aim.terms:
+            self._levelled()
+
+    def _levelled(self) -> None:
+        """Find where the aim's level is looked for: from the best that is known on."""
+        search = Search(self.limits, self.scenarios, None)
+        points = np.vstack([self.present, search.gains(search.even)])
+        sums = np.array(
+            [
+                self.limits.sums(one.setting, np.hstack([points, np.tile(one.point, (len(points), 1))]))
+                for one in self.scenarios
+            ]
+        )
+        known = sums[np.isfinite(sums)]
+        if not len(known):
+            what = f"nothing is known of {self.demands.aim.label} with any gains that were looked at"
+            raise ApcError(Mistake("E996", PLACE, what, hint="wider ranges, or another aim"))
+        best = float(known.max() if self.demands.aim.larger else known.min())
+        wide = max(abs(best), TINY)
+        label = Free(self.demands.aim.label)
+        level = Range(label, self.demands.aim.unit, Fraction(best), Fraction(best + wide))
+        self.demands = replace(self.demands, aim=replace(self.demands.aim, level=level))
+        self.limits = replace(self.limits, demands=self.demands)
+        self.present = np.append(self.present, best)
 
     @property
     def _unproved(self) -> bool:
         """Whether nothing proves what is asked, beside that it is stable."""
-        decays = self.limits.by_growth and (self.demands.decay < 1 or self.demands.aim.gain is None)
+        decays = self.limits.by_growth and (self.demands.decay < 1 or self.demands.aim.column is None)
         boxed = self.demands.criterion == PASSIVE and self.demands.box
-        felt = self.demands.felt and (self.demands.box or self.demands.delay)
+        felt = self.demands.measured and (self.demands.box or self.demands.delay)
         return decays or bool(boxed or felt)
 
     @property
@@ -244,13 +267,13 @@ class _Work:
         aim = self.demands.aim
         starts: list[Floats] = []
         while True:
-            found = self._borne(aim.gain, starts)
-            if aim.gain is not None and found.worst > BINDS:  # perhaps they only were not found
+            found = self._borne(aim.column, starts)
+            if aim.column is not None and found.worst > BINDS:  # perhaps they only were not found
                 least = self._borne(None, [])
                 if least.worst > 0:
                     return self._unmet(least)
-                found = self._borne(aim.gain, [self._shares(least)])
-            if aim.gain is None and self.demands.decay < 1 and found.worst > BINDS:
+                found = self._borne(aim.column, [self._shares(least)])
+            if aim.column is None and self.demands.decay < 1 and found.worst > BINDS:
                 return self._unmet(found)
             gains, proofs, failed = self._settled(found)
             if failed is None or self.late:
@@ -302,7 +325,7 @@ class _Work:
 
     def _settled(self, found: Optimum) -> tuple[list[Fraction], list[Proved], Scenario | None]:
         """Return gains as they are typed, what is proved of them, and a scenario that they don't bear."""
-        column = self.demands.aim.gain
+        column = self.demands.aim.column
         shares = [0.0] if column is None or self._unproved else BACK_IN_BOX if self.demands.over else BACK
         if not found.multipliers.any():  # the end of a range, which leaves room
             shares = [0.0, *shares]
@@ -310,9 +333,10 @@ class _Work:
         while True:
             gains = [_decimal(value, DIGITS) for value in found.gains.tolist()]
             if column is not None:
-                own = self.demands.free[column]
-                back = self._back(float(found.gains[column]), shares[place])
-                gains[column] = min(max(back, own.low), own.high)
+                gains[column] = self._back(float(found.gains[column]), shares[place])
+                if column < len(self.demands.free):
+                    own = self.demands.free[column]
+                    gains[column] = min(max(gains[column], own.low), own.high)
             if column is None or len(gains) > 1:
                 middle = self._middle(gains, column, found) if middle is None else middle
                 gains = self._typed(gains, column, middle)
@@ -335,10 +359,13 @@ class _Work:
         return _decimal(moved, DIGITS, ROUND_FLOOR if larger else ROUND_CEILING)
 
     def _rest(self, gains: Sequence[Fraction], column: int | None) -> Limits:
-        """Return the limits of all other gains, the one in a column being as it is."""
-        free = self.demands.free
+        """Return the limits of all other gains, the number in a column being as it is."""
+        free, aim = self.demands.free, self.demands.aim
         if column is None:
             return self.limits
+        if aim.level:
+            fixed_level = replace(aim, level=None, fixed=float(gains[column]))
+            return replace(self.limits, demands=replace(self.demands, aim=fixed_level), samples={})
         others = tuple(one for place, one in enumerate(free) if place != column)
         fixed = apply(self.system, [Override(free[column].free, gains[column])])
         return Limits(fixed, self.limits.prepared, replace(self.demands, free=others))
@@ -384,7 +411,7 @@ class _Work:
         inside = self._inside(gains)
         delay, counts = self.demands.delay, self.demands.counts
         ranges = [*([delay] if delay else []), *self.demands.box]
-        changes = [Override(one.free, value) for one, value in zip(self.demands.free, gains, strict=True)]
+        changes = [Override(one.free, value) for one, value in zip(self.demands.free, gains, strict=False)]
         point = np.array([[float(one) for one in gains]])
         worst = self.limits.worst(self.every, point)[0]
         order: dict[tuple[Override, ...], None] = {}
@@ -423,14 +450,12 @@ class _Work:
     def _felt(self, numbers: tuple[Override, ...], point: Floats) -> bool:
         """Say whether it is proved that what is felt is as asked, where only numbers of peers vary."""
         places = [place for place, (own, _) in enumerate(self.limits.settings) if own == numbers]
-        found = [
-            self.limits.felt(Scenario(place, ()), point, bounded=True).max(initial=-1.0) for place in places
-        ]
+        found = [self.limits.asked(place, point, bounded=True).max(initial=-1.0) for place in places]
         return max(found, default=-1.0) < 0
 
     def _inside(self, gains: Sequence[Fraction]) -> float:
         """Return what the spectral radius is to be proved below: of the least there is, a little above it."""
-        if self.demands.aim.gain is not None or self.limits.by_growth:
+        if self.demands.aim.column is not None or self.limits.by_growth:
             return math.exp(self.limits.allowed)
         point = np.array([[float(one) for one in gains]])
         least = 1 - math.exp(float(self.limits.worst(self.every, point).max()) + self.limits.allowed)
@@ -458,7 +483,7 @@ class _Work:
     def _answer(
         self, found: Optimum, gains: Sequence[Fraction], proofs: Sequence[Proved], *, met: bool = True
     ) -> Tuning:
-        demands, column = self.demands, self.demands.aim.gain
+        demands, column = self.demands, self.demands.aim.column
         worst = float(self.limits.worst(self.every, np.array([[float(one) for one in gains]])).max())
         met = met and (column is None or worst < 0)
         value = float(gains[column]) if column is not None else self._inside(gains)
@@ -472,7 +497,7 @@ class _Work:
         return Tuning(
             topology=self.system.name,
             aim=demands.aim.label,
-            unit=demands.free[column].unit if column is not None else "1",
+            unit=demands.aim.unit,
             larger=demands.aim.larger,
             met=met,
             proved=met and bool(proofs) and all(one.proof.stable for one in proofs),
@@ -491,7 +516,7 @@ class _Work:
                     float(now),
                 )
                 for one, typed, before, now in zip(
-                    demands.free, gains, found.gains, self.present, strict=True
+                    demands.free, gains, found.gains, self.present, strict=False
                 )
             ),
             over=demands.over,
@@ -519,8 +544,8 @@ class _Work:
 
     def _bounded(self, found: Optimum, gains: Sequence[Fraction]) -> int | None:
         """Return in how many cells it is proved that no gains do better, see `none_better`."""
-        demands, column = self.demands, self.demands.aim.gain
-        if column is None or not found.multipliers.any() or self.limits.by_growth or demands.felt:
+        demands, column = self.demands, self.demands.aim.column
+        if column is None or not found.multipliers.any() or self.limits.by_growth or demands.measured:
             return None
         worst = self.limits.worst(self.every, np.array([[float(one) for one in gains]]))[0]
         order = np.argsort(-worst, kind="stable").tolist()
@@ -549,17 +574,17 @@ class _Work:
     def _binding(self, found: Optimum, *, met: bool) -> list[Binding]:
         """Return what binds: each mode with a multiplier, and what less of the ends that meet there buys."""
         listed = []
-        aim = self.demands.aim.gain
+        aim = self.demands.aim.column
         rows = self.limits.rows(found.scenarios, found.gains, wide=True)
         scale = 1.0
         if aim is not None and met:
-            one = self.demands.free[aim]
+            one = self.demands.columns[aim]
             scale = float(one.high - one.low) * (1 if self.demands.aim.larger else -1)
         for place in np.flatnonzero(found.multipliers > 0):
             scenario = found.scenarios[rows.scenario[place]]
             numbers, _ = self.limits.settings[scenario.setting]
             buys = []
-            slopes = rows.slopes[place][len(self.demands.free) :]
+            slopes = rows.slopes[place][len(self.demands.columns) :]
             for own, value, slope in zip(self.demands.box, scenario.point, slopes, strict=True):
                 if value in (float(own.low), float(own.high)):
                     share = 0.01 * abs(value) / float(own.high - own.low)
@@ -579,9 +604,9 @@ class _Work:
     def _mode(self, found: Optimum, scenario: Scenario, eigenvalue: complex) -> tuple[str, float]:
         """Return the shape and the frequency of a mode, "" and NaN where there is none."""
         passive = self.demands.criterion == PASSIVE
-        if np.isnan(eigenvalue) and not (passive and not self.demands.felt):
+        if np.isnan(eigenvalue) and not (passive and not self.demands.measured):
             return "", math.nan
-        pairs = zip(self.demands.free, map(Fraction, found.gains.tolist()), strict=True)
+        pairs = zip(self.demands.free, map(Fraction, found.gains.tolist()), strict=False)
         changed = apply(self._scene(scenario), [Override(one.free, value) for one, value in pairs])
         if passive:
             worst = passive_hands(changed).worst

@@ -110,6 +110,9 @@ def refuse_time(system: CompiledSystem, free: Free, place: Place, criterion: str
         raise ApcError(Mistake("E930", place, what, hint=f"--in {MEAN_SQUARE}, with free hands"))
 
 
+BEYOND_FLOATS = "E806"
+
+
 def growth_at(
     system: CompiledSystem,
     prepared: Prepared,
@@ -166,13 +169,17 @@ class GrowthEvaluator:
     criterion: str = MEAN_SQUARE
 
     def growth(self, value: Sequence[float], *, bounded: bool = False) -> Growth:
-        """Return what second moments grow by at a point (m,)."""
+        """Return what second moments grow by at a point (m,), NaN where a frame grows beyond floats."""
         overrides = [
             Override(one, Fraction(float(number))) for one, number in zip(self.free, value, strict=True)
         ]
-        return growth_at(
-            *(self.system, self.prepared, overrides, self.place), bounded=bounded, criterion=self.criterion
-        )
+        where = self.system, self.prepared, overrides, self.place
+        try:
+            return growth_at(*where, bounded=bounded, criterion=self.criterion)
+        except ApcError as error:
+            if error.mistakes[0].code != BEYOND_FLOATS:
+                raise
+            return Growth(math.nan, math.nan, math.nan, exact=True)
 
     def parts(self, value: Sequence[float]) -> list[float]:
         """Return the roots at a point (m,), of which the largest counts: one of each loop of hands."""

@@ -45,7 +45,7 @@ def test_responses_are_those_of_one_dense_system_of_all_users(count: int, ring: 
         masses = np.linspace(0.08, 0.13, count)
         text = unlike(masses, text)
     hertz = (0.7, 2.9, 9.7, 21.7, 58.3)
-    found = feel(compiled(text), hertz, quick=True)
+    found = feel(compiled(text), hertz, beside=())
     for place, one in enumerate(hertz):
         here, there, apart = responses(masses, 300.0, one, ring=ring)
         assert found.impedance[place] == pytest.approx(1 / here, rel=1e-9)
@@ -234,14 +234,14 @@ def test_what_can_t_be_felt_is_refused(text: str, frequency: list[float], at: st
 def test_the_first_device_is_held_along_its_first_direction_which_is_said(
     name: str, at: str, others: tuple[str, ...]
 ) -> None:
-    found = feel(apc.compile(SCENES / f"{name}.yaml"), [1.0], quick=True)
+    found = feel(apc.compile(SCENES / f"{name}.yaml"), [1.0], beside=())
     assert (found.at, found.notes) == (at, others)
 
 
 def test_in_a_plane_a_hand_feels_along_each_axis_what_it_feels_on_a_line() -> None:
-    plane, line = apc.compile(SCENES / "planar-users.yaml"), feel(compiled(AVERAGE), [1.0, 10.0], quick=True)
+    plane, line = apc.compile(SCENES / "planar-users.yaml"), feel(compiled(AVERAGE), [1.0, 10.0], beside=())
     for axis in ("x[1]", "x[2]"):
-        found = feel(plane, [1.0, 10.0], at=f"user[1].device.{axis}", quick=True)
+        found = feel(plane, [1.0, 10.0], at=f"user[1].device.{axis}", beside=())
         assert (found.between, found.copy) == (f"user[2].device.{axis}", "cube")
         for name in ("impedance", "transmitted_admittance", "error_per_force"):
             np.testing.assert_allclose(getattr(found, name), getattr(line, name), rtol=1e-9, atol=1e-12)
@@ -279,5 +279,5 @@ def test_the_command_line_says_what_python_does(
     ):
         assert why in said(*wrong, code=code)
     assert "noise" in said("--frequencies", "1 Hz", "--set", "haptic.phase=0.3 ms").splitlines()[1]
-    lossy = feel(apc.compile(SCENES / "lossy-average.yaml"), [1.0], quick=True)
+    lossy = feel(apc.compile(SCENES / "lossy-average.yaml"), [1.0], beside=())
     assert "packet loss" in str(lossy).splitlines()[1]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import pytest
 
 import apc
@@ -14,6 +16,7 @@ from tests.bruteforce import Scene
 from tests.held_scenes import scene, system_of
 from tests.networks.second_moments import Law, second_moment_radius
 from tests.networks.test_loss import STIFFNESS
+from tests.topologies import AVERAGE, compiled, replaced
 
 
 def grown(system: CompiledSystem) -> Margins:
@@ -109,3 +112,19 @@ def test_a_box_that_is_not_served_is_refused_by_name(loss: str, box: str, why: s
         apc.prove_box(system_of(scene(3, 500.0, loss=loss)), {box: "±1%"})
     assert why in str(error.value)
     assert error.value.mistakes[0].hint == f"apc critical {box} --in mean-square"
+
+
+def test_a_frame_that_grows_by_many_decades_is_unstable_and_what_lies_beyond_is_looked_past() -> None:
+    """Two rooms with a fast link in each: at a large damping there a slow frame grows 1e14-fold, and more."""
+    near = "  inside: {type: AveragePosition, object: cube, stiffness: 300 N/m, clock: haptic, link: near,"
+    near += " damping: 2 N*s/m}\n"
+    links = "links:\n  near: {clock: fast, delay: 2 ms, graph: {edges: [[1, 2], [3, 4]]}}\n"
+    lan = "lan: {clock: network, delay: 40 ms, loss: 5 %, graph: {edges: [[1, 3], [1, 4], [2, 3], [2, 4]]}}"
+    changes = ("count: 3", "count: 4"), ("network: 8 ms", "network: 20 ms\n  fast: 2 ms")
+    more = ("links:\n", near + links), ("lan: {clock: network, delay: 8 ms}", lan)
+    model = compiled(replaced(AVERAGE, *changes, *more))
+    for damping in (1000.0, 1e4):
+        with pytest.raises(ApcError, match="E806") if damping > 1e3 else nullcontext():
+            verdict = apc.judge_network(model, set={"inside.damping": damping})
+            assert verdict is not None and verdict.stable is False
+    assert apc.critical(model, "inside.damping").value is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -93,6 +94,35 @@ def test_a_front_is_the_best_of_a_gain_for_each_bound_on_what_is_felt() -> None:
     assert asked.value == pytest.approx(found.designs[1].value, rel=5e-3)
     with pytest.raises(apc.ApcError, match="E996"):
         front(model, demands, read_against("feel.error at 1 Hz"))  # which is least where it is stiffest
+
+
+# What is to be best, whether large, and what it is with a stiffness.
+AIMS: dict[str, tuple[bool, Callable[[apc.Feel, float], float]]] = {
+    "feel.error at 1 Hz": (False, lambda felt, _: abs(felt.error_per_force[0])),
+    "feel.impedance at 5 Hz": (True, lambda felt, _: abs(felt.impedance[1])),
+    "feel.error_h2": (False, lambda felt, _: felt.h2[0].error_m or np.nan),
+    "feel.damping - 0.01*coordination.stiffness": (
+        False,
+        lambda felt, stiffness: (
+            felt.low_frequency.damping - 0.01 * stiffness if felt.low_frequency else np.nan
+        ),
+    ),
+}
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("aim", AIMS)
+def test_what_is_felt_is_no_better_with_any_gains_of_a_grid(aim: str) -> None:
+    model, free, (larger, worth) = compiled(AVERAGE), {K: (10.0, 5000.0), B: (0.0, 50.0)}, AIMS[aim]
+    found = apc.tune(model, free, **{"maximize" if larger else "minimize": aim})
+    typed = tuple(float(one.value) for one in found.gains)
+    sums, sign = [], -1 if larger else 1
+    for stiffness, damping in (typed, *itertools.product(np.linspace(10, 5000, 6), np.linspace(0, 50, 6))):
+        at = {K: float(stiffness), B: float(damping)}
+        if apc.analyze(model, set=at).stable:
+            sums.append(sign * worth(apc.feel(model, [1.0, 5.0], set=at), stiffness))
+    assert found.proved and sums[0] <= sign * found.value  # what is typed keeps what is said
+    assert sign * found.best <= min(sums[1:]) + 1e-4 * abs(found.best)
 
 
 def test_where_nothing_moves_nothing_limits_gains() -> None:
