@@ -121,7 +121,7 @@ def eigenvalues(matrix: Floats, slope: Floats) -> tuple[Complexes, Complexes]:
 def refined(matrix: Matrix, guess: Eigenpairs) -> Eigenpairs:
     """Return of each matrix (k, n, n) the eigenvalue nearest to a guess (k, 1), by inverse iteration."""
     shift = guess.values[..., None] * (1 + SHIFT)
-    inverse = np.linalg.inv(matrix - shift * np.eye(matrix.shape[-1]))
+    inverse = inverses(matrix - shift * np.eye(matrix.shape[-1]))
     v, w = guess.right, guess.left
     for _ in range(STEPS):
         v, w = inverse @ v, w @ inverse

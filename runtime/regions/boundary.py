@@ -58,6 +58,10 @@ JUMP = 1e-6
 # Points nearer to each other than this are one.
 COINCIDENT = 1e-11
 
+# Points on either side of a chord at which the boundary is looked for, at growing distances, and of
+# how many chords at most.
+FARTHER, FEW = 24, 8
+
 # A middle farther from where it is expected, in lengths of the interval, is not on the same piece.
 ASTRAY = 0.25
 
@@ -332,6 +336,7 @@ def _search(
 ) -> Integers:
     """Put a knot into intervals nothing is known about, where a line across their middle meets the boundary.
 
+    It meets it near the chord, or farther off: around a long tongue, say, whose sides are near each other.
     Returns the halves that are not good enough yet; an interval without such a crossing keeps the chord as
     its error. Along a jump the boundary is followed by straight lines: they are off by what the knot is.
     """
@@ -339,13 +344,18 @@ def _search(
     chord = knots.points[b] - knots.points[a]
     middle = (knots.points[a] + knots.points[b]) / 2
     across = np.stack([chord[:, 1], -chord[:, 0]], axis=1) / 2  # to the right, where it is unstable
-    stable, unstable = just_inside(middle - across), just_inside(middle + across)
-    ends = (
-        deciding.log_magnitudes(deciding.family.matrices(np.concatenate([stable, unstable])), 1)[:, 0]
-        .reshape(2, -1)
-        .T
-    )
-    found = (ends[:, 0] < 0) & (ends[:, 1] >= 0)
+    # From stable to unstable, in units of half a chord: nearby, then out to where the square ends.
+    reach = FARTHER if len(a) <= FEW else 1
+    out = np.geomspace(1, 2 / np.maximum(_norm(across), COINCIDENT), reach)
+    places = np.concatenate([-out[::-1], out])[:, :, None] * across + middle  # (2 · reach, k, 2)
+    places = np.asarray(just_inside(places.reshape(-1, 2)))
+    growth = deciding.log_magnitudes(deciding.family.matrices(places), 1)[:, 0].reshape(2 * reach, -1)
+    turns = (growth[:-1] < 0) & (growth[1:] >= 0)
+    away = np.abs(np.arange(2 * reach - 1) - reach + 1)
+    nearest = np.argmin(np.where(turns, away[:, None], reach), axis=0)
+    found, every = turns.any(axis=0), np.arange(len(a))
+    stable, unstable = (places.reshape(2 * reach, -1, 2)[nearest + one, every] for one in (0, 1))
+    ends = np.stack([growth[nearest + one, every] for one in (0, 1)], axis=1)
     knots.error[a[~found]] = np.linalg.norm(chord[~found], axis=1)
     a, b = a[found], b[found]
     if not len(a):

@@ -110,7 +110,8 @@ def refuse_time(system: CompiledSystem, free: Free, place: Place, criterion: str
         raise ApcError(Mistake("E930", place, what, hint=f"--in {MEAN_SQUARE}, with free hands"))
 
 
-BEYOND_FLOATS = "E806"
+# Where there is no number: a frame that grows beyond floats, and beyond what a parameter may be.
+NOWHERE = ("E806", "E624")
 
 
 def growth_at(
@@ -169,7 +170,7 @@ class GrowthEvaluator:
     criterion: str = MEAN_SQUARE
 
     def growth(self, value: Sequence[float], *, bounded: bool = False) -> Growth:
-        """Return what second moments grow by at a point (m,), NaN where a frame grows beyond floats."""
+        """Return what second moments grow by at a point (m,), NaN where there is none."""
         overrides = [
             Override(one, Fraction(float(number))) for one, number in zip(self.free, value, strict=True)
         ]
@@ -177,7 +178,7 @@ class GrowthEvaluator:
         try:
             return growth_at(*where, bounded=bounded, criterion=self.criterion)
         except ApcError as error:
-            if error.mistakes[0].code != BEYOND_FLOATS:
+            if error.mistakes[0].code not in NOWHERE:
                 raise
             return Growth(math.nan, math.nan, math.nan, exact=True)
 

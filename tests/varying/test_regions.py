@@ -107,6 +107,10 @@ FIELDS = {
     "a corner bitten off": (["u - 0.51", "-" + disc(0.51, 0.52, 0.03)], 0.51 - np.pi * 0.0009 / 2, 0, 3),
     "through the nodes of a grid": (["u + v - 1"], 0.5, 0, 1),
     "much smaller than a cell": ([disc(0.53, 0.53, 0.015)], np.pi * 0.015**2, 1, 0),
+    "a tongue with another curve in its cell": (
+        ["0.01*(u - 0.3) - 4*(v - 0.5)^2", "0.44 - v"],
+        *(0.56 - 4 / 3 * 0.7 * np.sqrt(0.7 / 400), 0, 2),
+    ),
     "along the edge of the rectangle": (["-u"], 1.0, 0, 0),
     "everything": (["0.1*u + 0.1*v - 2"], 1.0, 0, 0),
     "nothing": (["0.1*u + 0.1*v + 1"], 0.0, 0, 0),
