@@ -157,10 +157,14 @@ def open_scene(
         system = with_hands(system, hands)
     if not settings:
         return system
-    from apc.frame.names import notes_for_all_groups
+    from apc.frame.names import OVERRIDE, notes_for_all_groups
     from apc.frame.overrides import apply, parse_override
 
     overrides = [parse_override(system, text) for text in settings]
+    for place, one in enumerate(overrides):
+        if any(one.free == other.free for other in overrides[:place]):
+            what = f"{one.free.label} is set twice"
+            raise ApcError(Mistake("E621", OVERRIDE, what, "one value", hint=f'--set "{settings[place]}"'))
     if told is not None:
         for note in notes_for_all_groups(system, [one.free for one in overrides]):
             told(note)

@@ -1,16 +1,18 @@
 """Quantities given to an option of the command line.
 
-Takes: an option's name and its text. Gives: `option_value`.
+Takes: an option's name and its text. Gives: `option_value`, `option_values`, `with_last_unit`.
 Guarantees: what is wrong is told at the option, with the words to write there.
 Does not: know any option.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 
-from apc.compiler.errors import ApcError, Place
+from apc.compiler.errors import ApcError, Mistake, Place
 
 
 def option_value(option: str, text: str, *, what: str, unit: str) -> Fraction:
@@ -43,3 +45,49 @@ def option_value(option: str, text: str, *, what: str, unit: str) -> Fraction:
             replace(one, hint=f'{option} "{hint}"' if hint else "")
             for one, hint in zip(error.mistakes, hints, strict=True)
         ) from None
+
+
+_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
+
+
+def with_last_unit(texts: Sequence[str]) -> list[str]:
+    """Return the texts of quantities, those of numbers alone with the unit of the last: `0,8 ms`."""
+    last = _NUMBER.sub("", texts[-1], count=1).strip()
+    return [f"{text.strip()} {last}" if last and _NUMBER.fullmatch(text) else text.strip() for text in texts]
+
+
+def option_values(
+    label: str, unit: str, texts: Sequence[str], place: Place, *, between: str = ":"
+) -> tuple[Fraction, ...]:
+    """Read quantities in SI; one without a unit takes that of the last.
+
+    Parameters
+    ----------
+    label, unit
+        What they are values of, and a unit that fits.
+    texts
+        As they were given.
+    place
+        Where.
+    between
+        What stands between two of them.
+
+    Raises
+    ------
+    ApcError
+        Those of `units.quantity`, with what is to be written in the place of one, or of all.
+    """
+    from apc.compiler.language.units import quantity
+
+    if unit != "1" and all(_NUMBER.fullmatch(text) for text in texts):
+        hint = f"{label}={between.join(f'{text.strip()} {unit}' for text in texts)}"
+        got = f"{between.join(texts)} (no unit)"
+        raise ApcError(Mistake("E204", place, label, unit, got[:80], hint))
+    try:
+        return tuple(
+            Fraction(quantity(text, place, what=label, unit=unit).value) for text in with_last_unit(texts)
+        )
+    except ApcError as error:
+        # A hint of a key and its value is no range: what is to be written differently is the value.
+        mistakes = [replace(one, hint=one.hint.removeprefix(f"{label}: ")) for one in error.mistakes]
+        raise ApcError(mistakes) from None

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache, lru_cache
 from pathlib import Path
@@ -178,6 +178,9 @@ def quantity(text: str, place: Place, *, what: str, unit: str) -> Quantity:
         parsed = parse_quantity(text, place)
     except ApcError as error:
         [mistake] = error.mistakes
+        alone = not set("*/^") & set(text)  # it is all there is of the unit
+        if mistake.code == "E223" and alone and mistake.hint and not _is_of(mistake.hint, wanted.dimension):
+            raise ApcError(replace(mistake, hint=unit)) from None
         if mistake.code != "E221" or mistake.hint:
             raise
         example = f"{what}: 1 {unit}".removesuffix(" 1")

@@ -48,6 +48,9 @@ _PROBLEMS: tuple[tuple[str, str, str], ...] = (
 )
 
 
+# A line that is a key with its value, which nothing can belong to.
+_KEY_AND_VALUE = re.compile(r"[^\s:{}\[\]'\"]+: +[^\s|>&]")
+
 # What a bracket stands behind in a text, and what it holds with the rest of the text.
 _TEXT = re.compile(r"[^\s,:{}\[\]'\"][^,:{}\[\]'\"]*\Z")
 _BRACKET = re.compile(r"[\[{][^{}\[\]]*[\]}][^,:{}\[\]]*")
@@ -86,6 +89,15 @@ def _item_among_keys(line: int, lines: Lines) -> Mistake | None:
     return Mistake("E109", place, AMONG_KEYS, hint=text[2:].strip()) if text.startswith("- ") else None
 
 
+def _indented_further(line: int, lines: Lines) -> Mistake | None:
+    """Return the mistake of a line that is indented further than the one above, whose key has a value."""
+    (text, place), (above, at) = (_code(one, lines) for one in (line, _line_above(line, lines)))
+    if not (_KEY_AND_VALUE.match(text) and _KEY_AND_VALUE.match(above)) or place.column <= at.column:
+        return None
+    what = f"this line is indented by {place.column - 1} spaces, the one above it by {at.column - 1}"
+    return Mistake("E109", place, what, hint=f"{' ' * (at.column - 1)}{text}")
+
+
 def _code(line: int, lines: Lines) -> tuple[str, Place]:
     """Return a line without its indent and comment, and where it starts; an empty text where none is."""
     text = lines.lines[line].partition(" #")[0] if 0 <= line < len(lines.lines) else ""
@@ -113,7 +125,10 @@ def not_yaml(error: yaml.MarkedYAMLError, lines: Lines) -> Mistake:
         return Mistake("E109", where, f"a text with {rest[0]} in it needs quotes here", hint=f'"{text}"')
     opening, above = (error.context_mark or mark).line, _line_above(mark.line, lines)
     slips = {
-        "mapping values": ((_without_colon, mark.line), (_without_colon, above)),
+        "mapping values": (
+            *((_without_colon, mark.line), (_without_colon, above)),
+            (_indented_further, mark.line),
+        ),
         "could not find expected ':'": ((_without_colon, opening),),
         "block": ((_item_among_keys, mark.line), (_item_among_keys, opening), (_without_colon, above)),
     }

@@ -35,6 +35,7 @@ from apc.frame.overrides import Override, apply, check_bounds
 from apc.frame.parameters import exact_numbers, scope_of
 from apc.frame.site import LinearSite
 from apc.network.nominal import refuse_channel_number
+from apc.option_value import option_values
 
 _PLACE = Place("box")
 
@@ -60,9 +61,6 @@ def parse_range(system: CompiledSystem, text: str) -> Range:
         E830 not of that form, E831 a parameter that a box can't leave open, E833 limits that can't be; those
         of `names.find` and `units.quantity`.
     """
-    # Imported here: the language of quantities, which an analysis without a box never needs.
-    from apc.compiler.language.units import quantity
-
     name, equals, value = (part.strip() for part in text.partition("="))
     if not (equals and name and value):
         raise _malformed(text)
@@ -80,11 +78,7 @@ def parse_range(system: CompiledSystem, text: str) -> Range:
         first, colon, last = (part.strip() for part in value.partition(":"))
         if not (colon and first and last):
             raise _malformed(text)
-        try:
-            low, high = (quantity(one, _PLACE, what=name, unit=parameter.unit).value for one in (first, last))
-        except ApcError as error:  # what is to be written is an end of a range
-            mistakes = [replace(one, hint=one.hint.removeprefix(f"{name}: ")) for one in error.mistakes]
-            raise ApcError(mistakes) from None
+        low, high = option_values(name, parameter.unit, (first, last), _PLACE)
     _check_limits(parameter, low, high, name)
     return Range(free, parameter.unit, low, high)
 

@@ -39,6 +39,9 @@ from apc.eigen.peers import MOST_STATES, PeerGroup, group_name, states_of, too_l
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.schedule import Way
 
+# The shape of modes of peers that differ.
+COUPLED = "coupled"
+
 
 @dataclass(frozen=True, slots=True)
 class Arrangement:
@@ -135,12 +138,11 @@ def complete_loops(groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loo
     exchange
         The links, all of them complete.
     """
-    peers = sum(group.count for group in groups)
     degrees = complete_degrees(groups, exchange)
     weights = couple(
         groups, exchange, lambda way, g, h: Fraction(groups[h].count - (1 if g == h else 0)), degrees
     )
-    loops = [Loop("single" if peers == 1 else "common", 1, tuple(groups), weights)]
+    loops = [Loop(_together_named(groups), 1, tuple(groups), weights)]
     if all(group.count < 2 for group in groups):
         return tuple(loops)
     apart = couple(groups, exchange, lambda way, g, h: Fraction(-1 if g == h else 0), degrees)
@@ -202,7 +204,12 @@ def dense_loop(groups: Sequence[PeerGroup], exchange: Exchange) -> Loop:
     coupling = couple(
         everyone, exchange, lambda way, g, h: weights[way.link].get((g, h), Fraction(0)), degrees
     )
-    return Loop("dense", 1, everyone, coupling)
+    return Loop(COUPLED, 1, everyone, coupling)
+
+
+def _together_named(sites: Sequence[PeerGroup]) -> str:
+    """Return how peers move together: one alone, equal ones alike, others each in its own way."""
+    return COUPLED if len(sites) > 1 else "common" if sites[0].count > 1 else "single"
 
 
 def split_exchangeable(loop: Loop, exchange: Exchange) -> tuple[Loop, ...]:
@@ -230,7 +237,7 @@ def split_exchangeable(loop: Loop, exchange: Exchange) -> tuple[Loop, ...]:
         way: tuple(tuple(_weight_of(loop, way, members, others) for others in classes) for members in classes)
         for way in loop.coupling
     }
-    loops = [replace(loop, name="common", sites=sites, coupling=coupling)]
+    loops = [replace(loop, name=_together_named(sites), sites=sites, coupling=coupling)]
     for site, members in zip(sites, classes, strict=True):
         if len(members) > 1:
             first, second = members[:2]

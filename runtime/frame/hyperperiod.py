@@ -123,7 +123,10 @@ def _check_frame_length(
             f"the clocks' common period is {float(frame * quantum):.6g} s, {ticks} ticks "
             f"({clocks}); at most {MOST_TICKS} can be analysed"
         )
+        least = float(frame * quantum) / MOST_TICKS
+        alone = len(count) == 1 or frame == max(count.values())
         hint = "periods that are simple multiples of one another"
+        hint = f"a period of {1000 * least:.2g} ms or more for the fastest clock" if alone else hint
         odd = max(system.clocks, key=lambda clock: period.get(clock.name, Fraction(0)).denominator)
         place = Place(system.origin.topology, odd.line, odd.column)
         raise ApcError(Mistake("E805", place, what, hint=hint))

@@ -1,8 +1,8 @@
 """What a person calls a parameter or a timing, and what stands behind the name.
 
 Takes: a `CompiledSystem` and a name such as `contact.stiffness`, `right.hand.force` or `links.lan.delay`.
-Gives: `Free`, `Range`, `find`, `is_named`, `named_times`, `parameter_of`, `value_now`, `unit_of`,
-`values_by_group`, `notes_for_all_groups`.
+Gives: `Free`, `Range`, `proposed_range`, `find`, `is_named`, `named_times`, `parameter_of`, `value_now`,
+`unit_of`, `values_by_group`, `notes_for_all_groups`.
 Guarantees: a name that means nothing raises, with the nearest real one.
 Does not: read or change values.
 """
@@ -67,6 +67,17 @@ class Range:
     unit: str
     low: Fraction
     high: Fraction
+
+
+def proposed_range(system: CompiledSystem, wanted: str = "", *, without: str = "") -> str:
+    """Return a range of a stiffness or damping to propose, `NAME=LOW:HIGH`: the wanted one, if it is one."""
+    units = {"N/m": 1000, "N*s/m": 10}
+    named = [one for one in system.parameters if is_named(one.name) and one.unit in units]
+    named = [one for one in named if one.name == wanted] or [one for one in named if one.name != without]
+    if not named:
+        return "NAME=LOW:HIGH"
+    first = named[0]
+    return f"{first.name}=0 {first.unit}:{2 * first.value or units[first.unit]:g} {first.unit}"
 
 
 def given_ranges(system: CompiledSystem, others: Collection[Range] = ()) -> list[Range]:

@@ -188,7 +188,7 @@ def _check_held(
         left = MOST_HELD - (number - held[longest])
         three = decimal.Context(prec=3, rounding=decimal.ROUND_FLOOR)
         most = float(three.create_decimal_from_float(float(seconds * left / held[longest])))
-        fits = f"{longest}: {most:g} s, or a slower clock" if left > 0 else ""
+        fits = f"{longest.rpartition('.')[2]}: {most:g} s, or a slower clock" if left > 0 else ""
         hint = fits or "shorter delays of all forces, or a slower clock"
         raise ApcError(Mistake("E805", Place(system.origin.topology), what, hint=hint))
 

@@ -106,7 +106,7 @@ def responses(system: CompiledSystem, prepared: Prepared, port: Port, other: Por
         other=held[other],
         loops=tuple(pushed_loop(loop, sites) for loop in wide),
         plain=plain,
-        members=tuple(site.count if common.name == "common" else 1 for site in common.sites),
+        members=tuple(site.count for site in common.sites),
         own=here,
         to=there,
         alone=apart[0] if apart else None,
@@ -156,8 +156,9 @@ def _check_kicks(system: CompiledSystem, group: PeerGroup) -> None:
 
 def _arranged(system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exchange) -> tuple[Loop, ...]:
     """Return one loop of all classes of equal peers, and one of each class apart; or all peers in one."""
-    first, *apart = arrange(groups, exchange).loops
-    if first.name in ("common", "single") and _by_classes(first, apart):
+    arranged = arrange(groups, exchange)
+    first, *apart = arranged.loops
+    if arranged.method == "modes" and _by_classes(first, apart):
         return first, *apart
     states = sum(group.count * len(group.lifted.z_names) for group in groups)
     if states > MOST_STATES:

@@ -54,7 +54,7 @@ def passive_text(found: PassiveHands) -> str:
 
 def _worst(found: PassiveHands, worst: PassiveMode) -> str:
     """Say how the devices move that take most energy out, or need most damping."""
-    moved = "all alike" if worst.name in ("common", "single") else f"in the mode {worst.name}"
+    moved = "all alike" if worst.name in ("common", "single") else f"in a {worst.name} mode"
     if worst.more is None:
         held = "with its devices clamped the scene is unstable, and no damping of theirs helps"
         return f"Devices that move {moved}: {held}."

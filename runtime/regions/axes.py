@@ -14,7 +14,7 @@ from fractions import Fraction
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import with_unit
-from apc.frame.names import Free, Range, unit_of
+from apc.frame.names import Free, Range, proposed_range, unit_of
 from apc.sweeps.grid import parse_axis
 
 PLACE = Place("region")
@@ -53,7 +53,9 @@ def parse_axes(
             text = f"{own.parameter}={float(own.low)!r} {unit}:{float(own.high)!r} {unit}"
         if text is None:
             what = f"the scene has no studies: region:, so that --{letter} must be given"
-            raise ApcError(Mistake("E901", PLACE, what, hint=f'--{letter} "{_FORM}"'))
+            other = (x or "").partition("=")[0].strip()
+            hint = f'--{letter} "{proposed_range(system, without=other)}"'
+            raise ApcError(Mistake("E901", PLACE, what, hint=hint))
         name, equals, span = (part.strip() for part in text.partition("="))
         if not (equals and name and span.count(":") == 1):
             hint = f'--{letter} "{_FORM}"'

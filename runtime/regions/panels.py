@@ -23,11 +23,11 @@ from apc.frame.linearize import linearize
 from apc.frame.names import Range
 from apc.frame.overrides import Override, apply, parse_override
 from apc.frame.parameters import resolve
+from apc.option_value import with_last_unit
 from apc.regions.axes import PLACE, parse_axes
 from apc.regions.overlay import Overlay, overlay_points, parse_overlay
 from apc.regions.region import CELLS, Floats, Region, region
 from apc.result import Look, Result
-from apc.sweeps.grid import with_last_unit
 from apc.vary.crossing import Told
 
 # By what a parameter is moved to see which weights follow it: no round ratio, so that none of them agree.

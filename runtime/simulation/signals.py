@@ -147,7 +147,8 @@ def choose(
     available
         What can be recorded of a peer of each group.
     patterns
-        Names with `*` for any text and `?` for any character; without a group they mean every peer's.
+        Names with `*` for any text and `?` for any character; without a group they mean every peer's, and
+        with a group's name alone every one's of it.
 
     Raises
     ------
@@ -161,7 +162,8 @@ def choose(
         wanted = np.full((group.count, len(found)), not patterns)
         for pattern, test in tests:
             for place, local in enumerate(found):
-                fits = [bool(test.fullmatch(local.name))]
+                fits = [bool(test.fullmatch(one)) for one in (local.name, f"{group.name}.{local.name}")]
+                fits = [any(fits)]
                 if not fits[0] and ("[" in pattern or pattern.startswith(("*", group.name))):
                     names = (f"{group.name}[{i + 1}].{local.name}" for i in range(group.count))
                     fits = [bool(test.fullmatch(name)) for name in names]

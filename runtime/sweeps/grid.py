@@ -1,7 +1,7 @@
 """Which parameters a sweep varies, and every combination of their values.
 
 Takes: a `CompiledSystem`, names of parameters, and texts such as `0 N/m:3000 N/m:11` or `0, 8 ms`.
-Gives: `GridAxis`, `Grid`, `parse_axis`, `with_last_unit`, `build_grid`, `check_size`.
+Gives: `GridAxis`, `Grid`, `parse_axis`, `build_grid`, `check_size`.
 Guarantees: values are exact rationals in SI; the order of points is that of the axes as given, the last one
 turning fastest; what can be known to be out of bounds is told before any point is computed.
 Does not: compute points.
@@ -10,7 +10,6 @@ Does not: compute points.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -22,6 +21,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.names import Free, find, unit_of
 from apc.frame.overrides import Override, apply
+from apc.option_value import option_values
 from apc.vary.evaluator import reaches_count
 
 PLACE = Place("sweep")
@@ -33,7 +33,6 @@ MOST_POINTS = 10_000_000
 MOST_DIGITS = 20  # of a count that are read: it is too large anyway
 
 _FORM = "--over contact.stiffness='100 N/m:3000 N/m:30'"
-_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +157,7 @@ def _whole_numbers(label: str, values: Sequence[Fraction], *, every: bool) -> tu
 
 
 def _list(label: str, unit: str, text: str) -> tuple[Fraction, ...]:
-    values = _quantities(label, unit, text.split(","))
+    values = option_values(label, unit, text.split(","), PLACE, between=",")
     for place, value in enumerate(values):
         if value in values[:place]:
             got = f"{float(value):g} {unit} twice"
@@ -176,7 +175,7 @@ def _range(label: str, unit: str, text: str) -> tuple[Fraction, ...]:
     if len(rest) > 1:
         raise ApcError(Mistake("E881", PLACE, what, "LOW:HIGH:COUNT or LOW:HIGH:COUNT:log", text[:80], _FORM))
     count = _count(what, rest[0].strip()) if rest else DEFAULT_COUNT
-    low, high = _quantities(label, unit, ends)
+    low, high = option_values(label, unit, ends, PLACE)
     if low >= high:
         got = f"{ends[0].strip()} to {ends[1].strip()}"
         expected = "its lower end first, and the upper above it"
@@ -197,24 +196,6 @@ def _count(what: str, text: str) -> int:
     if not (text.isascii() and text.isdecimal() and len(text) <= MOST_DIGITS and int(text) >= 2):
         raise ApcError(Mistake("E881", PLACE, what, "2 values or more", text[:40] or "nothing", _FORM))
     return int(text)
-
-
-def _quantities(label: str, unit: str, texts: Sequence[str]) -> tuple[Fraction, ...]:
-    """Read quantities; one without a unit takes that of the last."""
-    from apc.compiler.language.units import quantity
-
-    try:
-        return tuple(quantity(text, PLACE, what=label, unit=unit).value for text in with_last_unit(texts))
-    except ApcError as error:
-        # A hint of a key and its value is no range: what is to be written differently is the value.
-        mistakes = [replace(one, hint=one.hint.removeprefix(f"{label}: ")) for one in error.mistakes]
-        raise ApcError(mistakes) from None
-
-
-def with_last_unit(texts: Sequence[str]) -> list[str]:
-    """Return the texts of quantities, those of numbers alone with the unit of the last: `0,8 ms`."""
-    last = _NUMBER.sub("", texts[-1], count=1).strip()
-    return [f"{text.strip()} {last}" if last and _NUMBER.fullmatch(text) else text.strip() for text in texts]
 
 
 def _check_bounds(system: CompiledSystem, axis: GridAxis, value: Fraction) -> None:

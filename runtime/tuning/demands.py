@@ -20,7 +20,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place, nearest
 from apc.frame.devices import FREE as FREE_HANDS
 from apc.frame.devices import with_hands
-from apc.frame.names import Free, Range, find, given_ranges
+from apc.frame.names import Free, Range, find, given_ranges, proposed_range
 from apc.frame.overrides import Override, apply
 from apc.network.nominal import unreliable
 from apc.option_value import option_value
@@ -49,8 +49,6 @@ FELT = {
 
 # A term of a weighted sum: its sign, its weight if it has one, its name.
 _TERM = re.compile(r"([+-])\s*(?:([\d.]+(?:e[+-]?\d+)?)\s*\*\s*)?(.*?)\s*(?=\s[+-]\s|$)")
-
-_FREE = '--free "coordination.stiffness=10 N/m:5000 N/m"'
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +161,14 @@ def read_demands(
     if not (maximize or minimize):
         maximize, minimize = (dict(system.tune).get(key, "") for key in ("maximize", "minimize"))
     if not free:
-        raise ApcError(Mistake("E995", FREE, "no number is free: which may be chosen?", hint=_FREE))
+        raise ApcError(
+            Mistake(
+                "E995",
+                FREE,
+                "no number is free: which may be chosen?",
+                hint=f'--free "{proposed_range(system, maximize or minimize)}"',
+            )
+        )
     gains = [_range(system, text, FREE) for text in free]
     for one in gains:
         if reaches_count(system, one.free) or is_delay(system, one.free):
