@@ -16,6 +16,7 @@ from __future__ import annotations
 import glob
 import os
 import platform
+import shlex
 import shutil
 import stat
 import sys
@@ -286,7 +287,9 @@ def check_target(path: Path) -> None:
 
 def unwritable(path: Path, error: Exception) -> ApcError:
     """Return the message (E601) of a file or folder that can't be written."""
-    return ApcError(Mistake("E601", Place(str(path)), f"can't be written: {_reason(error)}"))
+    lacking = isinstance(error, FileNotFoundError) and not path.parent.exists()
+    hint = f"mkdir -p {shlex.quote(str(path.parent))}" if lacking else ""
+    return ApcError(Mistake("E601", Place(str(path)), f"can't be written: {_reason(error)}", hint=hint))
 
 
 def begin_file(path: Path) -> Path:

@@ -62,6 +62,12 @@ class Library:
         return tuple(sorted(self.files))
 
     @property
+    def replaced(self) -> dict[str, Path]:
+        """The files of a user's components that take the place of built-in ones, by name."""
+        built_in = builtin_files()
+        return {name: path for name, path in self.files.items() if built_in.get(name, path) != path}
+
+    @property
     def component_names(self) -> tuple[str, ...]:
         """The names of the components among them."""
         return tuple(name for name in self.names if definition_of(self._source(name))[0] == "component")

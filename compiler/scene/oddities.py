@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from scipy.cluster.hierarchy import DisjointSet
 
@@ -20,7 +21,10 @@ from apc.compiler.source.nodes import Sequence as ListNode
 
 
 def oddities(
-    parts: Sequence[Part], entries: Mapping[str, PartEntry], groups: Iterable[SceneGroup]
+    parts: Sequence[Part],
+    entries: Mapping[str, PartEntry],
+    groups: Iterable[SceneGroup],
+    replaced: Mapping[str, Path],
 ) -> tuple[Mistake, ...]:
     """Return the warnings about a scene, in the order of its file.
 
@@ -32,6 +36,8 @@ def oddities(
         The entries of the topology.
     groups
         The groups of peers.
+    replaced
+        The files of components that take the place of the library's, by name.
     """
     used = {word for part in parts for _, word in part.references}
     warnings = Mistakes()
@@ -45,6 +51,11 @@ def oddities(
             what += "; simulate and export want one delay"
             warnings.add("W275", entry.place, what)
     outer = [part for part in parts if part.name.partition("[")[0] in entries and "." not in part.name]
+    for part in {part.component.name: part for part in reversed(outer)}.values():
+        if part.component.name in replaced:
+            file = replaced[part.component.name].name
+            what = f"{part.component.name} is that of {file}, in the place of the library's"
+            warnings.add("W276", part.place, what)
     counts = {group.name: group.count for group in groups}
     joined = {group: _joined([part for part in outer if group in part.groups]) for group in counts}
     hearing = {part.name: part for part in outer if part.component.hears_others}

@@ -180,7 +180,7 @@ def build_scene(source: Source, library: Library) -> Scene:
         tune,
         tuple(sorted(files.names)),
         root.place,
-        oddities(parts, entries, groups),
+        oddities(parts, entries, groups, library.replaced),
     )
 
 

@@ -63,7 +63,7 @@ def tuning_text(found: Tuning) -> str:
     if found.bounded:
         better = f"no gains in these ranges do better by {100 * float(SHARE):.3g} %"
         lines += labelled("no others", f"{better}, proved in {found.bounded:,} cells")
-    lines += labelled("room", _room(found))
+    lines += labelled("margin", _margin(found)) if found.met else []
     lines += _proof_lines(found)
     if found.binding:
         lines += ["", "  what binds" if found.met else "  what is in the way"]
@@ -99,10 +99,11 @@ def _levelled(found: Tuning) -> bool:
     return found.aim not in (RADIUS, SETTLING, *(one.parameter for one in found.gains))
 
 
-def _room(found: Tuning) -> str:
+def _margin(found: Tuning) -> str:
     """Return how near the worst scenario is to what is allowed."""
     if found.criterion == "passive":
-        return f"{-found.worst:.3g} of what hands can draw, as a logarithm"
+        needed = (1 + found.worst) / (1 - found.worst)  # see `hands.passivity.passive_growth`
+        return f"passive hands need {needed:.4g} of the damping there is in the worst scenario"
     if found.felt or _levelled(found):
         return f"{math.exp(found.worst):.6g} of what is allowed in the worst scenario"
     radius, most = math.exp(found.worst + found.allowed), math.exp(found.allowed)

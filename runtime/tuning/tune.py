@@ -529,7 +529,11 @@ class _Work:
             binding=tuple(self._binding(found, met=met)),
             looked=self.looked + sum(map(len, self.limits.samples.values())),
             bounded=self._bounded(found, gains) if met else None,
-            notes=(*[CORNERS] * bool(demands.box and self.limits.slow), *[LATE] * (self.late and not met)),
+            notes=(
+                *[why for why in (self._why(),) if why and not met],
+                *[CORNERS] * bool(demands.box and self.limits.slow),
+                *[LATE] * (self.late and not met),
+            ),
             left_out=(
                 *near_start(self.system, self.limits.prepared),
                 *left_out(
@@ -541,6 +545,10 @@ class _Work:
             ranges=demands.free,
             scenes=tuple(map(self._scene, self._binding_scenarios(found) or self.every[:1])),
         )
+
+    def _why(self) -> str:
+        """Return why no gains bear passive hands, where that follows from the equations alone."""
+        return passive_hands(self.system).why if self.demands.criterion == PASSIVE else ""
 
     def _bounded(self, found: Optimum, gains: Sequence[Fraction]) -> int | None:
         """Return in how many cells it is proved that no gains do better, see `none_better`."""
