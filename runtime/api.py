@@ -681,16 +681,16 @@ def front(
     seconds: float | None = None,
     set: Values | None = None,
 ) -> Front:
-    """Weigh a gain against what a hand feels: the best of the one for each of several bounds on the other.
+    """Weigh an aim against what a hand feels: the best of the one for each of several bounds on the other.
 
     Parameters
     ----------
     model, free, maximize, minimize, subject, over, criterion, set
         As for `tune`.
     against
-        What is felt: "feel.impedance at 5 Hz", or transmitted, or error.
+        What is felt: "feel.impedance at 5 Hz", or transmitted, error, damping, error_h2.
     points
-        How many bounds, from the least that is felt to what the best gain is felt like.
+        How many bounds, from the least that is felt to what the best of the aim is felt like.
     seconds
         How long to go on at most, with all of them.
 

@@ -115,7 +115,7 @@ class PartReader:
         shown = f"{name} ({component.name})"
         if component.hears_others and peers == 1:
             what = f"{shown} follows the other peers and"
-            hint = f"at: [{', '.join(counts)}]" if len(counts) > 1 else "count: 2"
+            hint = f"at: [{', '.join(counts)}]" if len(counts) > 1 else f"{next(iter(counts))}: {{count: 2}}"
             mistakes.add("E208", entry.place, what, expected="at least 2 peers", got="1", hint=hint)
         if due and peers > due:
             hint = f"count: {due}, or groups that make {due}: at: [left, right]"

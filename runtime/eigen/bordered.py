@@ -133,7 +133,7 @@ def logarithm(loops: Bordered, lags: Integers, rows: Integers, points: Complexes
     n_z, n = loops.states, loops.fixed.shape[-1]
     value, turning = np.full((2, len(rows)), np.nan, np.complex128)
     place = np.arange(n_z)
-    chunk = max(1, TOGETHER // n**2)
+    chunk = max(1, TOGETHER // max(n, 1) ** 2)
     for start in range(0, len(rows), chunk):
         some = slice(start, start + chunk)
         row, at, exponents = rows[some], points[some], lags[some].T

@@ -9,6 +9,7 @@ Does not: answer for an unreliable network (see `moments`), or for all of a rang
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 from fractions import Fraction
 
@@ -66,7 +67,11 @@ def refuse_range(system: CompiledSystem) -> None:
         low, middle, high = (_ms(value) for value in (one.low, (one.low + one.high) / 2, one.high))
         what = f"{one.free.label} is a range, {low} to {high}, of which this takes one"
         hint = f'--set "{one.free.label}={middle}"'
-        raise ApcError(Mistake("E899", Place(system.origin.topology), what, hint=hint))
+        told = (
+            re.search(rf":(\d+):(\d+): W275 {re.escape(one.free.label)} ", text) for text in system.warnings
+        )
+        line, column = next((map(int, found.groups()) for found in told if found), (0, 0))
+        raise ApcError(Mistake("E899", Place(system.origin.topology, line, column), what, hint=hint))
 
 
 def _ms(seconds: Fraction) -> str:

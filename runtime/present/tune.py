@@ -189,11 +189,14 @@ def front_text(found: Front) -> str:
     best = "largest" if found.larger else "least"
     title = f"{found.topology}: the {best} {found.aim} for each bound on {found.against}"
     names = {found.knee: "knee", 0: "least felt", last: best}  # an end is no knee
-    rows = [(found.against, *(name for name, _, _ in found.designs[0].gains), "", "")]
+    names_of = [name for name, _, _ in found.designs[0].gains]
+    apart = found.aim not in names_of  # what is best is in no column of the gains
+    rows = [(found.against, *[found.aim] * apart, *names_of, "", "")]
     for place, one in enumerate(found.designs):
         gains = (quantity(value, unit, TYPED) for _, value, unit in one.gains)
         proved = "" if one.proved else "not proved"
-        rows.append((quantity(one.felt, found.against_unit, 5), *gains, names.get(place, ""), proved))
+        value = [quantity(one.value, found.unit, 5)] * apart
+        rows.append((quantity(one.felt, found.against_unit, 5), *value, *gains, names.get(place, ""), proved))
     meant = [MEANT[found.criterion]] if found.criterion in MEANT else []
     said = notes([*meant, *found.left_out, *found.notes])
     return "\n".join([*wrapped(title, "", "  "), *said, "", *table(rows)])

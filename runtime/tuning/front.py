@@ -1,6 +1,6 @@
-"""A gain against what a hand feels: the best of the one for every bound on the other (a Pareto front).
+"""An aim against what a hand feels: the best of the one for every bound on the other (a Pareto front).
 
-Takes: a `CompiledSystem`, `Demands` whose aim is a gain, and the quantity it is weighed against.
+Takes: a `CompiledSystem`, `Demands`, and the quantity that their aim is weighed against.
 Gives: `Design`, `Front`, `front`.
 Guarantees: each design is that of `tune` with its bound as a demand, proved or not as there.
 Does not: say that no designs lie beyond.
@@ -19,7 +19,7 @@ from apc.analysis.analysis import prepare
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake
 from apc.result import Result
-from apc.tuning.demands import AGAINST, FELT, Demands, Felt
+from apc.tuning.demands import AGAINST, FELT, Aim, Demands, Felt
 from apc.tuning.limits import Limits
 from apc.tuning.tune import Tuning, tune
 from apc.vary.crossing import Told
@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 
 POINTS = 20  # designs of a front
 LEAST = 1 + 1e-3  # how far above the least that is felt the last bound is
-SCANNED = 40  # values of the gain among which the least that is felt is looked for
+SAME = 1e-3  # what is felt with the best gains is no more than the least there is, relatively
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,12 +78,12 @@ def front(
     seconds: float = float("inf"),
     told: Told | None = None,
 ) -> Front:
-    """Return the best of a gain for each of several bounds on what a hand feels.
+    """Return the best of an aim for each of several bounds on what a hand feels.
 
     Parameters
     ----------
     system, demands
-        As for `tune`; the aim is a gain.
+        As for `tune`.
     against
         What is felt, its `most` of no meaning.
     points
@@ -94,26 +94,22 @@ def front(
     Raises
     ------
     ApcError
-        E996 the aim is no gain, or what is felt doesn't get worse as it grows.
+        E996 what is felt is least where the aim is best.
     """
-    column, until = demands.aim.column, time.monotonic() + seconds
-    if column is None or demands.aim.terms:
-        raise ApcError(Mistake("E996", AGAINST, f"{demands.aim.label} is no gain to be weighed against it"))
-    limits = Limits(system, prepare(system), replace(demands, felt=(replace(against, most=1.0),)))
+    until = time.monotonic() + seconds
+    limits = Limits(system, prepare(system), replace(demands, felt=(against,)))
+    every = limits.every()
 
     def felt(gains: Floats) -> float:
         """Return the largest that is felt in any scenario at gains (m,)."""
         points = ((one.setting, np.append(gains, one.point)[None]) for one in every)
         return max(float(limits.measured(*point)[0, 0, 0]) for point in points)
 
-    every = limits.every()
     best = tune(system, demands, seconds=seconds, told=told)
-    at_best = np.array([float(one.value) for one in best.gains])
-    end = demands.free[column].low if demands.aim.larger else demands.free[column].high
-    others = np.tile(at_best, (SCANNED, 1))
-    others[:, column] = np.linspace(float(end), at_best[column], SCANNED)
-    low, high = min(map(felt, others)), felt(at_best)
-    if not (best.met and low < high * (1 - 1e-6)):
+    least = Aim(against.label, len(demands.free), False, FELT[against.name][0], ((1.0, against),))
+    other = tune(system, replace(demands, aim=least), seconds=until - time.monotonic(), told=told)
+    low, high = other.best, felt(np.array([float(one.value) for one in best.gains]))
+    if not (best.met and other.met and low < high * (1 - SAME)):
         what = f"the best {demands.aim.label} is the best for {against.label}, too"
         raise ApcError(Mistake("E996", AGAINST, what))
     designs, notes = [_design(best, high)], best.notes

@@ -79,7 +79,7 @@ LATE = "the time was up: these gains are those that were looked at last"
 MORE, ABOVE = 3, 1e-9
 
 # Settings in which the worst point inside a box is looked for, those first whose corners limit gains most.
-NEAREST = 8
+MOST_LIMITED = 8
 
 # Scenarios, those first that limit gains most, in one of which gains that would do better are unstable.
 LIMITING = 12
@@ -318,7 +318,7 @@ class _Work:
         new = [one for one in new if one not in self.scenarios]
         if not new and self.demands.box and not self.limits.slow:
             nearest = dict.fromkeys(self.every[place].setting for place in order.tolist())
-            within = (self.limits.worst_within(one, gains) for one in list(nearest)[:NEAREST])
+            within = (self.limits.worst_within(one, gains) for one in list(nearest)[:MOST_LIMITED])
             new = [one for one, value in within if value > level + ABOVE and one not in self.scenarios]
         self.scenarios += new
         return bool(new)

@@ -129,6 +129,7 @@ def test_where_nothing_moves_nothing_limits_gains() -> None:
     scene = apc.with_hands(apc.compile(str(SCENES / "teleoperation-pair.yaml")), "clamped")
     found = apc.tune(scene, RANGE | {B: (0.0, 50.0)}, maximize=K)
     assert found.proved and found.value == RANGE[K][1] and not found.binding
+    assert apc.critical(scene, "wan.delay").value is None
     assert found.plot().get_xlabel().startswith(K)  # of the scene as it is
 
 
