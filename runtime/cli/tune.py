@@ -64,8 +64,8 @@ def tune_command(
     settings: tuple[str, ...],
     write: Path | None = option("Write the topology with these gains in it, comments and all (.yaml)."),
     plot: Path | None = picture_option(
-        "Draw two gains, now and then, over the stable regions of what limits them, or with --against the "
-        "front: .png, .svg or .pdf."
+        "Draw two gains over the stable regions of what limits them and what a strike comes to, now and "
+        "with the gains found; or with --against the front: .png, .svg or .pdf."
     ),
     as_json: bool,
 ) -> None:
@@ -87,7 +87,6 @@ def tune_command(
     from apc.frame.devices import FREE
     from apc.inputs import open_scene
     from apc.present.pictures import write_picture
-    from apc.present.tune import refuse_picture
     from apc.tuning.demands import held_as_studied, read_against, read_demands, read_seconds
     from apc.tuning.front import front
     from apc.tuning.tune import tune
@@ -120,8 +119,6 @@ def tune_command(
             write_picture(weighed.plot, plot)
         print_result(weighed, as_json=as_json, written=[plot])
         return
-    if plot is not None:
-        refuse_picture(demands.free)
     with status_line() as told:
         found = tune(system, demands, seconds=read_seconds(time), told=told)
     if write is not None and found.met:

@@ -10,25 +10,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apc.compiler.errors import ApcError, Mistake, Place
+from apc.compiler.compiled import LENGTH
 from apc.compiler.words import counted, enumerated, in_hertz, measured, with_unit, wrapped
+from apc.frame.overrides import Override, apply
 from apc.present.analysis import range_document, range_text
 from apc.present.forms import MEANT, labelled, notes, quantity, record, table
 from apc.present.pictures import COLOURS, new_figure
 from apc.present.region_picture import draw_panel
 from apc.regions.panels import Panel
 from apc.regions.region import Region, region
+from apc.simulation.strike import WATCHED, strike
+from apc.simulation.trajectory import simulate
 from apc.tuning.bound import SHARE
 from apc.tuning.demands import RADIUS, SETTLING
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from apc.frame.names import Range
     from apc.tuning.front import Front
     from apc.tuning.tune import Binding, Tuning
 
@@ -154,24 +155,29 @@ def _binding_lines(found: Tuning, one: Binding) -> list[str]:
     return lines
 
 
-def refuse_picture(gains: Sequence[Range]) -> None:
-    """Refuse a picture of other than two gains: ApcError E996."""
-    if len(gains) != 2:
-        got = ", ".join(one.free.label for one in gains)
-        raise ApcError(Mistake("E996", Place("--plot"), "a picture", "two gains that are free", got))
-
-
 def tuning_picture(found: Tuning, ax: Any = None) -> Any:
-    """Draw two gains now and then, over the stable regions of the scenes that limit them; return the Axes."""
-    refuse_picture(found.ranges)
+    """Draw two gains over the stable regions, and what a strike comes to now and with the gains found.
+
+    Into an Axes that is given only the first of them is drawn, of any other number of gains the second; the
+    first Axes is returned.
+    """
+    moves = any(state.unit == "m/s" for kind in found.scenes[0].kinds for state in kind.states)
+    two = len(found.ranges) == 2 or not moves
+    panels = [*[_draw_gains] * two, *[_draw_struck] * moves]
+    axes = [ax] if ax else new_figure((5.0 * len(panels), 4.4)).subplots(1, len(panels), squeeze=False)[0]
+    for draw, one in zip(panels, axes, strict=False):
+        draw(found, one)
+    return axes[0]
+
+
+def _draw_gains(found: Tuning, ax: Any) -> None:
+    """Draw two gains now and then, over the stable regions of the scenes that limit them."""
     regions: list[Region] = []
     ranges = found.ranges[0], found.ranges[1]
     for where, scene in zip(map(_where, found.binding) if found.binding else [""], found.scenes, strict=True):
         name = where or found.topology
         if name not in [known.topology for known in regions]:
             regions.append(replace(region(scene, ranges, criterion=found.criterion), topology=name))
-    if ax is None:
-        ax = new_figure((5.2, 4.4)).subplots()
     more = "; what is asked beside stability is not drawn" if found.felt or found.decay < 1 else ""
     draw_panel(ax, f"{found.topology}{more}", Panel("", tuple(regions), (1,) * len(regions), ()))
     (now, best) = np.array([(one.now, float(one.value)) for one in found.gains]).T
@@ -180,7 +186,29 @@ def tuning_picture(found: Tuning, ax: Any = None) -> Any:
     ax.plot(*now, "o", color="0.3", label="now", **whole)
     ax.plot(*best, "*", color="black", markersize=11, label="found", **whole)
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False, fontsize=8)
-    return ax
+
+
+def _draw_struck(found: Tuning, ax: Any) -> None:
+    """Draw where a struck device goes in the scene that limits gains most, now and with those found."""
+    scene = found.scenes[0]
+    for label, values in (
+        ("found", [one.value for one in found.gains]),
+        ("now", [Fraction(one.now) for one in found.gains]),
+    ):
+        changes = [Override(own.free, value) for own, value in zip(found.ranges, values, strict=True)]
+        struck, name = strike(apply(scene, changes))
+        played = simulate(struck, duration=WATCHED, signals=[f"{name}.*"], jit=False)
+        place = next(place for place, one in enumerate(played.signals) if one.unit == LENGTH)
+        ax.plot(played.time, 1000 * played.values[:, place], label=label, zorder=3 - len(ax.lines))
+        if label == "found":
+            low, high = ax.get_ylim()
+    least, most = ax.get_ylim()  # what grows without end is cut off
+    ax.set_ylim(max(least, 3 * low - 2 * high), min(most, 3 * high - 2 * low))
+    where = f", {_where(found.binding[0])}" if found.binding and _where(found.binding[0]) else ""
+    ax.set_title(f"{name} struck{where}", fontsize=9)
+    ax.set(xlabel="time (s)", ylabel=f"{played.signals[place].local} (mm)")
+    ax.legend(frameon=False, fontsize=8)
+    ax.grid(linewidth=0.4, alpha=0.5)
 
 
 def front_text(found: Front) -> str:

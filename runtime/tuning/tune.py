@@ -166,12 +166,14 @@ class Tuning(Result):
     scenes: tuple[CompiledSystem, ...] = field(compare=False, repr=False)
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw two gains now and then, over the stable regions of what limits them; return the Axes.
+        """Draw two gains over the stable regions of what limits them, and a strike; return the Axes.
+
+        A strike is played now and with the gains found, in the scenario that limits them most.
 
         Raises
         ------
         ApcError
-            E875 matplotlib is not installed; E996 not two gains are free; those of `regions.region`.
+            E875 matplotlib is not installed; those of `regions.region` and `trajectory.simulate`.
         """
         return self._shown("picture", ax)
 
