@@ -24,11 +24,10 @@ from apc.eigen.bordered import wires_of
 from apc.eigen.closing import Coupling
 from apc.eigen.peers import PeerGroup
 from apc.frame.exchange import Exchange, check_mean
-from apc.frame.lift import BoundedMap, FrameMap
 from apc.frame.schedule import Heard, Sent, Way
 from apc.large.characteristic import Characteristic
 from apc.large.populations import Population, hear_themselves, rows_of
-from apc.large.transfer import build_transfer
+from apc.large.transfer import Sites, transfer_of
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -122,20 +121,19 @@ def of_populations(listed: Sequence[Population], exchange: Exchange) -> tuple[Ch
         ),
         others=tuple(others),
     )
-    transfers = []
+    sites = []
     for g, population in enumerate(listed):
         k = len(population.parameters)
         own, weight = (np.tile(row, (k, 1)) for row in (places.own[g], places.others[g]))
         maps = hear_themselves(population.lifted, population.schedule, own, weight)
-        placed = _placed(maps, places.sent[g], places.heard[g], len(sent_place), len(heard_place))
-        transfers.append(build_transfer(placed, population.counts))
+        sites.append(Sites(maps, population.counts, places.sent[g], places.heard[g]))
     lags = sorted({heard.lag for _, heard in heard_place})
     weights = np.zeros((len(lags), len(heard_place), len(sent_place)))
     for (receiver, heard), line in heard_place.items():
         for (sender, sent), row in sent_place.items():
             if sent == heard.sent and on_the_way(heard.way, sender, receiver):
                 weights[lags.index(heard.lag), line, row] = 1.0
-    return Characteristic(tuple(transfers), tuple(lags), weights, np.zeros_like(weights)), places
+    return _function(sites, tuple(lags), weights, np.zeros_like(weights)), places
 
 
 def of_loop(sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way, float]) -> Characteristic:
@@ -152,30 +150,18 @@ def of_loop(sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way,
     """
     sent_starts = np.cumsum([0, *(len(group.schedule.sent) for group in sites)])
     heard_starts = np.cumsum([0, *(len(group.schedule.heard) for group in sites)])
-    n_s, n_r = int(sent_starts[-1]), int(heard_starts[-1])
-    transfers = []
+    listed = []
     for g, group in enumerate(sites):
         rows = np.arange(sent_starts[g], sent_starts[g + 1])
         lines = np.arange(heard_starts[g], heard_starts[g + 1])
-        placed = _placed(rows_of(group.lifted, 1), rows, lines, n_s, n_r)
-        transfers.append(build_transfer(placed, np.ones(1)))
-    return Characteristic(tuple(transfers), *wires_of(sites, coupling, doubts))
+        listed.append(Sites(rows_of(group.lifted, 1).bounded, np.ones(1), rows, lines))
+    return _function(listed, *wires_of(sites, coupling, doubts))
 
 
-def _placed(maps: BoundedMap, rows: Integers, lines: Integers, n_s: int, n_r: int) -> BoundedMap:
-    """Return sites among all that is sent and heard: `rows` of s and `lines` of r are theirs."""
-
-    def wide(block: Floats) -> Floats:
-        found = np.zeros((*block.shape[:2], n_r))
-        found[:, :, lines] = block
-        return found
-
-    def tall(block: Floats) -> Floats:
-        found = np.zeros((len(block), n_s, block.shape[2]))
-        found[:, rows] = block
-        return found
-
-    def placed(one: FrameMap) -> FrameMap:
-        return FrameMap(one.p, wide(one.q), tall(one.s), tall(wide(one.d)))
-
-    return BoundedMap(*placed(maps).blocks, placed(maps.error))
+def _function(
+    sites: Sequence[Sites], lags: tuple[int, ...], weights: Floats, errors: Floats
+) -> Characteristic:
+    """Return f of sites that hear each other by weights (l, n_r, n_s), which may be off by so much."""
+    n_r, n_s = weights.shape[1:]
+    known = np.stack([weights, errors, np.zeros_like(weights)]).reshape(3, len(lags), n_r * n_s)
+    return Characteristic(transfer_of(sites, n_s, n_r), np.array(lags, np.int64), known)

@@ -21,7 +21,7 @@ from apc.eigen.rigid import find_rigid_modes
 from apc.eigen.spectrum import Mode, Spectrum, judge
 from apc.frame.exchange import Exchange
 from apc.frame.lift import FrameMap
-from apc.large.characteristic import Characteristic, null_vectors, weights_at
+from apc.large.characteristic import Characteristic, matrices_in, null_vectors, weights_in
 from apc.large.determinant import Places, heard_weights, of_loop, of_populations, senders_of
 from apc.large.populations import (
     Population,
@@ -34,7 +34,7 @@ from apc.large.populations import (
     state_names,
     turned_by,
 )
-from apc.large.transfer import CHUNK, differentiate
+from apc.large.transfer import CHUNK, respond
 from apc.large.zeros import Zero, Zeros, find_zeros, near_poles
 
 Floats = NDArray[np.float64]
@@ -155,11 +155,11 @@ def _delay_starts(function: Characteristic) -> Complexes:
     Where k is an eigenvalue of T(ζ) W(ζ) ζ^d, f has a zero if ζ^d = k(ζ): near the unit circle ζ is
     |k|^(1/d) times a d-th root of 1, turned by what k is turned.
     """
-    delay = max((1, *function.lags))
+    delay = max(1, function.longest)
     turns = np.arange(delay // 2 + 1)
     on_circle = np.exp(2j * np.pi * turns / delay) * (1 + 1e-9)
-    value, _ = differentiate(function.transfers, on_circle)
-    gain = np.linalg.eigvals(value @ weights_at(function, on_circle)) * (on_circle**delay)[:, None]
+    around = np.eye(function.transfer.shape[0]) - matrices_in(function, on_circle, np.zeros(len(turns)))[:, 0]
+    gain = np.linalg.eigvals(around) * (on_circle**delay)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         logarithm = (np.log(gain) + 2j * np.pi * turns[:, None]) / delay
     starts = np.exp(logarithm).ravel()
@@ -188,7 +188,7 @@ def _loop_mode(function: Characteristic, loop: Loop, zero: Zero) -> Mode:
     value = zero.value * (1 + BESIDE)
     motions, sent = _nearly_free(function, loop, value)
     felt = np.concatenate([one.felt[0] for one in motions])
-    waiting = _waiting(function, value, felt, max(function.lags, default=0))
+    waiting = _waiting(function, value, felt, function.longest)
     lags = np.arange(1, len(waiting) + 1)[:, None]
     on_the_way = np.abs(waiting * sent * value ** -lags.astype(np.float64))
     shares: dict[str, float] = {}
@@ -220,8 +220,8 @@ def _nearly_free(function: Characteristic, loop: Loop, value: complex) -> tuple[
         _move(one, value, np.zeros((1, one.q.shape[2])), np.zeros(one.s.shape[1]), push)
         for one, push in zip(maps, pushes, strict=True)
     ]
-    answer = differentiate(function.transfers, np.array([value]))[0][0]
-    hearing = weights_at(function, np.array([value]))[0]
+    at = np.array([value]), np.zeros(1)
+    answer, hearing = respond(function.transfer, *at)[0, 0], weights_in(function, *at)[0, 0]
     sent_alone = np.concatenate(
         [(one.s @ moved.z[..., None])[0, :, 0] for one, moved in zip(maps, alone, strict=True)]
     )
@@ -247,7 +247,7 @@ def _population_mode(
         return _own_mode(listed[zero.site[0]], places, zero, zero.site)
     value = zero.value
     sent, weight = null_vectors(function, value)
-    heard = weights_at(function, np.array([value]))[0] @ sent
+    heard = weights_in(function, np.array([value]), np.zeros(1))[0, 0] @ sent
     motions = [
         _move_population(
             population, places.own[g], places.others[g], value, heard[places.heard[g]], weight[places.sent[g]]
@@ -257,7 +257,7 @@ def _population_mode(
     felt = np.zeros(len(heard), np.complex128)
     for g, (population, motion) in enumerate(zip(listed, motions, strict=True)):
         felt[places.heard[g]] += population.counts @ motion.felt
-    waiting = _waiting(function, value, felt, max(function.lags, default=0))
+    waiting = _waiting(function, value, felt, function.longest)
     shares: dict[str, float] = {}
     most, dominant = -1.0, (0, 0)
     for g, (population, motion) in enumerate(zip(listed, motions, strict=True)):
@@ -352,8 +352,10 @@ def _move_population(
 
 def _waiting(function: Characteristic, value: complex, felt: Complexes, depth: int) -> Complexes:
     """Return what weighs a packet l = 1 … depth frames old, (depth, n_s): all who still hear it."""
-    found = np.zeros((depth, function.weights.shape[2]), np.complex128)
-    for lag, weight in zip(function.lags, function.weights, strict=True):
+    n_s, n_r = function.transfer.shape
+    found = np.zeros((depth, n_s), np.complex128)
+    weights = function.weights[0].reshape(len(function.lags), n_r, n_s)
+    for lag, weight in zip(function.lags.tolist(), weights, strict=True):
         ages = np.arange(1, lag + 1)
         found[:lag] += (value ** (ages - lag - 1).astype(np.float64))[:, None] * (felt @ weight)
     return found

@@ -23,10 +23,10 @@ from apc.eigen.peers import states_of
 from apc.eigen.spectrum import Mode, Motion, oscillation
 from apc.frame.course import turns
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.lift import BoundedMap, FrameMap, LiftedSite, lift
+from apc.frame.lift import FrameMap, LiftedSite, lift
 from apc.frame.linearize import linearize, linearize_rows, site_of
 from apc.frame.parameters import Numbers
-from apc.frame.radius import RADII, radius_of, rounded, value_of
+from apc.frame.radius import RADII, rounded
 from apc.frame.schedule import Schedule
 from apc.frame.site import LinearSite, every_matrix
 from apc.memory import refuse_beyond
@@ -143,8 +143,8 @@ def site_one(population: Population, row: int) -> LinearSite:
     return linearize(population.jacobians, population.parameters[row])
 
 
-def hear_themselves(lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats) -> BoundedMap:
-    """Let every site hear its own packets, weighed, and leave the rest of what it hears open.
+def hear_themselves(lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats) -> FrameMap:
+    """Let every site hear its own packets, weighed, the rest of what it hears left open: with radii.
 
     Parameters
     ----------
@@ -169,8 +169,7 @@ def hear_themselves(lifted: LiftedSite, schedule: Schedule, own: Floats, others:
         layout, feedback = _open_loop(some_rows(lifted, chunk), schedule, own[chunk], others[chunk])
         heard = Feedback(rounded(feedback.now), rounded(feedback.before))
         parts.append(_cut(close([some_rows(lifted, chunk).bounded], [heard], layout, numbers=RADII)))
-    whole = parts[0].mapped(lambda *blocks: np.concatenate(blocks), *parts[1:])
-    return BoundedMap(*whole.mapped(value_of).blocks, error=whole.mapped(radius_of))
+    return parts[0].mapped(lambda *blocks: np.concatenate(blocks), *parts[1:])
 
 
 def hear_roughly(lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats) -> FrameMap:

@@ -15,7 +15,7 @@ finds nothing. A count around the pole tells.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 
@@ -30,7 +30,6 @@ from apc.large.characteristic import (
     count_around,
     refine,
 )
-from apc.large.transfer import Transfer
 
 Complexes = NDArray[np.complex128]
 Floats = NDArray[np.float64]
@@ -78,7 +77,7 @@ def held_around(function: Characteristic, point: complex) -> tuple[float, int]:
             if not radius < WIDEST * abs(point):
                 break
             inside = count_around(function, point, radius, arcs=SMALL_ARCS, most=SMALL_POINTS)
-            poles = poles_within(function, point, radius)
+            poles = _poles_where(function, point, radius, 1)
             if inside is not None and poles is not None and inside + poles > 0:
                 return radius, inside + poles
             radius *= WIDER
@@ -86,26 +85,13 @@ def held_around(function: Characteristic, point: complex) -> tuple[float, int]:
     return float(np.inf), 0
 
 
-def poles_within(function: Characteristic, centre: complex, radius: float) -> int | None:
-    """Return how many poles are within a circle, each as often as f has it; None: no telling."""
-    total = 0
-    for one in function.transfers:
-        distance = np.abs(one.eigenvalues - centre)
-        if np.any(np.abs(distance - radius) <= one.eigenvalue_errors):
-            return None
-        total += int((distance < radius).sum())
-    return total
-
-
-def _poles_beyond(function: Characteristic, radius: float) -> int | None:
-    """Return how many of the sites' eigenvalues are larger, multiplicities counted; None: no telling."""
-    total = 0
-    for one in function.transfers:
-        size = np.abs(one.eigenvalues)
-        if np.any(np.abs(size - radius) <= one.eigenvalue_errors):
-            return None
-        total += int(((size > radius).sum(axis=1) * one.counts).sum())
-    return total
+def _poles_where(function: Characteristic, centre: complex, radius: float, each: Floats | int) -> int | None:
+    """Return how many poles are within a circle, each so often; None: no telling."""
+    poles = function.transfer.poles
+    distance = np.abs(poles.values - centre)
+    if np.any(np.abs(distance - radius) <= poles.errors):
+        return None
+    return int(((distance < radius) * each).sum())
 
 
 def beyond(function: Characteristic, radius: float, rigid: int) -> int | None:
@@ -120,16 +106,17 @@ def beyond(function: Characteristic, radius: float, rigid: int) -> int | None:
     rigid
         How many eigenvalues are 1.
     """
-    poles = _poles_beyond(function, radius)
+    counts = function.transfer.poles.counts
+    poles = _poles_where(function, 0.0, radius, counts)
     turns = None if poles is None else count_around(function, 0.0, radius, arcs=_arcs(function))
     if poles is None or turns is None:
         return None
-    return poles - turns - (rigid if radius < 1 else 0)
+    return int(counts.sum()) - poles - turns - (rigid if radius < 1 else 0)
 
 
 def _arcs(function: Characteristic) -> int:
     """Return how many arcs to begin with: f turns as often as its longest delay has frames."""
-    return max(FIRST_ARCS, 2 * max(function.lags, default=0))
+    return max(FIRST_ARCS, 2 * function.longest)
 
 
 def just_outside(
@@ -209,10 +196,10 @@ def _count_near(
 # Zeros nearer to one another than this, relatively, are one that was found twice.
 SAME = 1e-11
 
-# Poles that are eigenvalues themselves, looked at of each structure.
+# Poles that are eigenvalues themselves, looked at of all.
 MOST_HELD = 64
 
-# Poles taken out of f, of each structure, where zeros are looked for: those that population about the zeros.
+# Poles taken out of f where zeros are looked for: those that population about the zeros.
 TAKEN_OUT = 128
 
 # Points on a ring, and poles, to look for missed zeros from.
@@ -273,9 +260,9 @@ def find_zeros(
     listed
         How many of the largest eigenvalues to report.
     near
-        How many of the largest poles, of each structure, zeros are looked for close to.
+        How many of the largest poles zeros are looked for close to.
     """
-    if not max(float(one.eigenvalue_errors.max(initial=0.0)) for one in function.transfers) < FARTHEST:
+    if not function.transfer.poles.errors.max(initial=0.0) < FARTHEST:
         return Zeros(0.0, float(np.inf), 0.0, (), False, not rigid)
     rigid_radius = _rigid_radius(function, rigid)
     exact = [one for one in _held_poles(function) if abs(one.value - 1) > rigid_radius]
@@ -332,7 +319,7 @@ def _rigid_radius(function: Characteristic, rigid: int) -> float:
     radius = max(CLEAR * float(ball.change[0]) * 1e-7, FIRST_RADIUS)
     while radius < WIDEST:
         inside = count_around(function, 1.0, radius, arcs=SMALL_ARCS, most=SMALL_POINTS)
-        poles = poles_within(function, 1.0, radius)
+        poles = _poles_where(function, 1.0, radius, 1)
         if inside is not None and poles is not None and inside + poles == rigid:
             return radius
         radius *= WIDER
@@ -348,7 +335,7 @@ def _widened(function: Characteristic, zeros: Complexes, rigid: int, radius: flo
     for distance in np.sort(distances[(distances > radius) & (distances < WIDEST)])[::-1]:
         wider = 2 * float(distance)
         inside = count_around(function, 1.0, wider, arcs=SMALL_ARCS, most=SMALL_POINTS)
-        poles = poles_within(function, 1.0, wider)
+        poles = _poles_where(function, 1.0, wider, 1)
         if rigid and inside is not None and poles is not None and inside + poles == rigid:
             return wider
     return radius
@@ -357,25 +344,19 @@ def _widened(function: Characteristic, zeros: Complexes, rigid: int, radius: flo
 def _held_poles(function: Characteristic) -> list[Zero]:
     """Return the poles that are eigenvalues themselves: of sites that are alike, or that nobody hears.
 
-    Of each structure the largest few.
+    Of all the largest few.
     """
-    found = []
-    for which, one in enumerate(function.transfers):
-        unheard = ~one.residues.any(axis=2)
-        times = np.where(unheard, one.counts, one.counts - 1)
-        times = np.where((np.abs(one.poles) > 0) & (one.poles.imag >= 0), times, 0)
-        for place, site in _largest_poles(one, times > 0):
-            error = float(one.eigenvalue_errors[site, place])
-            many = int(times[place, site])
-            found.append(Zero(complex(one.poles[place, site]), error, many, (which, site)))
-    return found
+    poles = function.transfer.poles
+    times = np.where(poles.heard, poles.counts - 1, poles.counts)
+    held = np.flatnonzero((times > 0) & (poles.values.imag >= 0))[:MOST_HELD]
+    return [_own(function, place, float(poles.errors[place]), int(times[place])) for place in held.tolist()]
 
 
-def _largest_poles(one: Transfer, chosen: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    """Return where the largest few of some poles of a structure are, each its place and its site."""
-    places, sites = np.nonzero(chosen)
-    order = np.argsort(-np.abs(one.poles[places, sites]), kind="stable")[:MOST_HELD]
-    return zip(places[order].tolist(), sites[order].tolist(), strict=True)
+def _own(function: Characteristic, place: int, error: float, times: int) -> Zero:
+    """Return a pole as an eigenvalue."""
+    poles = function.transfer.poles
+    which, site = poles.sites[place].tolist()
+    return Zero(complex(poles.values[place]), error, times, (which, site))
 
 
 def _cancelled_poles(
@@ -383,21 +364,21 @@ def _cancelled_poles(
 ) -> list[Zero]:
     """Return the poles beyond a circle that are eigenvalues all the same, as a count around each tells.
 
-    Of each structure the largest few.
+    Of all the largest few.
     """
     found: list[Zero] = []
     taken = [*zeros.tolist(), *(one.value for one in known)]
-    for which, one in enumerate(function.transfers):
-        outside = (np.abs(one.poles) >= beyond * (1 - SAME)) & (one.poles.imag >= 0)
-        outside &= (np.abs(one.poles) > 0) & (np.abs(one.poles - 1) > rigid_radius)
-        for place, site in _largest_poles(one, outside):
-            pole = complex(one.poles[place, site])
-            if any(abs(pole - other) <= SAME * abs(pole) for other in taken):
-                continue
-            taken.append(pole)
-            error, many = held_around(function, pole)
-            if np.isfinite(error) and not any(abs(pole - zero) <= 2 * error for zero in zeros.tolist()):
-                found.append(Zero(pole, error, many, (which, site)))
+    poles = function.transfer.poles
+    outside = (np.abs(poles.values) >= beyond * (1 - SAME)) & (poles.values.imag >= 0)
+    outside &= np.abs(poles.values - 1) > rigid_radius
+    for place in np.flatnonzero(outside)[:MOST_HELD].tolist():
+        pole = complex(poles.values[place])
+        if any(abs(pole - other) <= SAME * abs(pole) for other in taken):
+            continue
+        taken.append(pole)
+        error, many = held_around(function, pole)
+        if np.isfinite(error) and not any(abs(pole - zero) <= 2 * error for zero in zeros.tolist()):
+            found.append(_own(function, place, error, many))
     return found
 
 
@@ -434,10 +415,6 @@ def _search(
 
 
 def near_poles(function: Characteristic, most: int) -> Complexes:
-    """Return the largest poles of f in the upper half plane (z,), no more than `most` of each structure."""
-    found = [np.zeros(0, np.complex128)]
-    for one in function.transfers:
-        heard = one.residues.any(axis=2) & (one.poles.imag >= 0) & (np.abs(one.poles) > 0)
-        part = one.poles[heard]
-        found.append(part[np.argsort(-np.abs(part), kind="stable")[:most]])
-    return np.concatenate(found)
+    """Return the largest poles of f in the upper half plane (z,), no more than `most`."""
+    poles = function.transfer.poles
+    return poles.values[poles.heard & (poles.values.imag >= 0)][:most]
