@@ -1,7 +1,7 @@
 """The characteristic function of a population: small, whatever the number of peers and the length of delays.
 
 Takes: the `Transfer` of all sites, and how what they send comes back to them; discs and circles.
-Gives: `Characteristic`, `weights_in`, `matrices_in`, `characteristic_ball`, `refine`, `null_vectors`;
+Gives: `Characteristic`, `weights_in`, `matrices_in`, `characteristic_ball`, `refine`;
 `count_around`.
 Guarantees: its value in a disc comes with a bound; an eigenvalue of the whole system is a zero of it, or a
 pole of a site that the zero would have to cancel. A count is right, None says that it can't be told.
@@ -51,6 +51,12 @@ class Characteristic:
     def innermost(self) -> float:
         """The least |ζ| at which it can be evaluated."""
         return self.transfer.innermost
+
+    @property
+    def weights_by_lag(self) -> dict[int, Floats]:
+        """W_l (n_r, n_s) by l."""
+        n_s, n_r = self.transfer.shape
+        return dict(zip(self.lags.tolist(), self.weights[0].reshape(len(self.lags), n_r, n_s), strict=True))
 
     @property
     def longest(self) -> int:
@@ -189,12 +195,3 @@ def _log_rate(function: Characteristic, points: Complexes) -> Complexes:
     rate = np.where(np.isfinite(matrix).all(axis=(1, 2)), complex(np.inf), complex(np.nan))
     rate[fine] = np.trace(np.linalg.solve(matrix[fine], change[fine]), axis1=1, axis2=2)
     return rate
-
-
-def null_vectors(function: Characteristic, point: complex) -> tuple[Complexes, Complexes]:
-    """Return s and χ with (I − T W) s ≈ 0 and χ (I − T W) ≈ 0, of norm 1, at a zero of f.
-
-    s is what is sent in the mode, χ what weighs it.
-    """
-    left, _, right = np.linalg.svd(matrices_in(function, np.array([point]), np.zeros(1))[0, 0])
-    return right[-1].conj(), left[:, -1].conj()
