@@ -1,7 +1,7 @@
 """The characteristic function of a population: small, whatever the number of peers and the length of delays.
 
 Takes: the `Transfer` of all sites, and how what they send comes back to them; discs and circles.
-Gives: `Characteristic`, `weights_in`, `matrices_in`, `characteristic_ball`, `refine`;
+Gives: `Characteristic`, `characteristic_of`, `parts_in`, `matrices_in`, `characteristic_ball`, `refine`;
 `count_around`.
 Guarantees: its value in a disc comes with a bound; an eigenvalue of the whole system is a zero of it, or a
 pole of a site that the zero would have to cancel. A count is right, None says that it can't be told.
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from apc.eigen.winding import Ball, determinant_ball, wind
 from apc.frame.radius import RADII, Matrix
-from apc.large.transfer import Transfer, powers, respond
+from apc.large.transfer import Transfer, add_fractions, powers
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -41,11 +41,16 @@ POINT = 1e-30
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Characteristic:
-    """f(ζ) = det(I − T W); `weights` (3, l, n_r · n_s) are W_l with their radii, `lags` (l,) the l."""
+    """f(ζ) = det(I − T W); `lags` (l,) and `weights` (l, n_r, n_s) are W's.
+
+    `smooth` (3, terms + l, 2 n_s · n_r), with its radii, is what powers of 1/ζ, 0, 1, … and the lags, make of
+    T's series and of W.
+    """
 
     transfer: Transfer
     lags: Integers
-    weights: Matrix
+    weights: Floats
+    smooth: Matrix
 
     @property
     def innermost(self) -> float:
@@ -53,21 +58,43 @@ class Characteristic:
         return self.transfer.innermost
 
     @property
-    def weights_by_lag(self) -> dict[int, Floats]:
-        """W_l (n_r, n_s) by l."""
-        n_s, n_r = self.transfer.shape
-        return dict(zip(self.lags.tolist(), self.weights[0].reshape(len(self.lags), n_r, n_s), strict=True))
-
-    @property
     def longest(self) -> int:
         """The longest delay, in frames."""
         return int(self.lags.max(initial=0))
 
 
-def weights_in(function: Characteristic, points: Complexes, reach: Floats) -> Matrix:
-    """Return W in discs (z, 3, n_r, n_s), see `transfer`."""
-    weights = RADII.multiply(powers(points, reach, function.lags), function.weights)
-    return weights.swapaxes(0, 1).reshape(len(points), 3, *function.transfer.shape[::-1])
+def characteristic_of(
+    transfer: Transfer, lags: Sequence[int], weights: Floats, errors: Floats
+) -> Characteristic:
+    """Return f of sites that hear each other by weights (l, n_r, n_s), which may be off by so much."""
+    terms, size = transfer.series.shape[1:]
+    smooth = np.zeros((3, terms + len(lags), 2 * size))
+    smooth[:2, :terms, :size] = transfer.series
+    smooth[:2, terms:, size:] = np.stack([weights, errors]).reshape(2, len(lags), size)
+    return Characteristic(transfer, np.array(lags, np.int64), weights, smooth)
+
+
+def parts_in(
+    function: Characteristic, points: Complexes, reach: Floats, *, bounded: bool = True
+) -> tuple[Matrix, Matrix]:
+    """Return T (z, 3, n_s, n_r) and W (z, 3, n_r, n_s) in discs, see `transfer`.
+
+    Parameters
+    ----------
+    function
+        f.
+    points, reach
+        The discs (z,).
+    bounded
+        Whether T's radii are asked for; without them it is as good as any.
+    """
+    shape = function.transfer.shape
+    exponents = np.concatenate([np.arange(function.smooth.shape[1] - len(function.lags)), function.lags])
+    found = RADII.multiply(powers(points, reach, exponents), function.smooth).swapaxes(0, 1)
+    series, hearing = np.split(found.astype(np.complex128), 2, axis=-1)
+    answer = series.reshape(len(points), 3, *shape)
+    add_fractions(function.transfer, answer, points, reach, bounded=bounded)
+    return answer, hearing.reshape(len(points), 3, *shape[::-1])
 
 
 def matrices_in(
@@ -80,10 +107,9 @@ def matrices_in(
     function
         f.
     points, reach, bounded
-        As `respond` has them.
+        As `parts_in` has them.
     """
-    answer = respond(function.transfer, points, reach, bounded=bounded)
-    around = RADII.multiply(answer, weights_in(function, points, reach))
+    around = RADII.multiply(*parts_in(function, points, reach, bounded=bounded))
     unit = np.zeros(around.shape[1:])
     unit[0] = np.eye(len(unit[0]))
     return RADII.subtract(unit, around)

@@ -26,7 +26,7 @@ from apc.eigen.peers import PeerGroup
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.schedule import Heard, Schedule, Sent, Way
 from apc.frame.site import LinearSite
-from apc.large.characteristic import Characteristic
+from apc.large.characteristic import Characteristic, characteristic_of
 from apc.large.populations import Population, hear_themselves
 from apc.large.transfer import Sites, transfer_of
 
@@ -120,7 +120,8 @@ def of_populations(
         for (sender, sent), row in sent_place.items():
             if sent == heard.sent and on_the_way(heard.way, sender, receiver):
                 weights[lags.index(heard.lag), line, row] = 1.0
-    return _function(sites, tuple(lags), weights, np.zeros_like(weights)), tuple(members)
+    transfer = transfer_of(sites, len(sent_place), len(heard_place))
+    return characteristic_of(transfer, lags, weights, np.zeros_like(weights)), tuple(members)
 
 
 def of_loop(
@@ -150,13 +151,5 @@ def of_loop(
                 site=lambda row, group=group: group.site,
             )
         )
-    return _function([one.sites for one in members], *wires_of(groups, coupling, doubts)), tuple(members)
-
-
-def _function(
-    sites: Sequence[Sites], lags: tuple[int, ...], weights: Floats, errors: Floats
-) -> Characteristic:
-    """Return f of sites that hear each other by weights (l, n_r, n_s), which may be off by so much."""
-    n_r, n_s = weights.shape[1:]
-    known = np.stack([weights, errors, np.zeros_like(weights)]).reshape(3, len(lags), n_r * n_s)
-    return Characteristic(transfer_of(sites, n_s, n_r), np.array(lags, np.int64), known)
+    transfer = transfer_of([one.sites for one in members], n_s, n_r)
+    return characteristic_of(transfer, *wires_of(groups, coupling, doubts)), tuple(members)

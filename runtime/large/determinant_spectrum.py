@@ -20,10 +20,10 @@ from apc.eigen.rigid import find_rigid_modes
 from apc.eigen.spectrum import Mode, Spectrum, judge
 from apc.frame.exchange import Exchange
 from apc.frame.radius import value_of
-from apc.large.characteristic import Characteristic, matrices_in, weights_in
+from apc.large.characteristic import Characteristic, matrices_in, parts_in
 from apc.large.determinant import Member, of_loop, of_populations
 from apc.large.populations import Population, hear_themselves, lines_of, mode_of, turned_by
-from apc.large.transfer import CHUNK, Sites, respond
+from apc.large.transfer import CHUNK, Sites
 from apc.large.zeros import Zero, Zeros, find_zeros, near_poles
 
 Floats = NDArray[np.float64]
@@ -215,8 +215,7 @@ def _mode(
     n_r = 1 + max((int(line) for one in members for line in one.sites.lines), default=-1)
     answer, hearing = np.zeros((n_s, n_r), np.complex128), np.zeros((n_r, n_s), np.complex128)
     if function is not None:
-        at = np.array([value]), np.zeros(1)
-        answer, hearing = respond(function.transfer, *at)[0, 0], weights_in(function, *at)[0, 0]
+        answer, hearing = (part[0, 0] for part in parts_in(function, np.array([value]), np.zeros(1)))
     sent, felt = np.zeros(n_s, np.complex128), np.zeros(n_r, np.complex128)
     for one, move in zip(members, moves, strict=True):
         sent[one.sites.rows] += one.sites.counts @ move.sends(move.right[..., 0])
@@ -224,7 +223,7 @@ def _mode(
     sent = np.linalg.solve(np.eye(n_s) - answer @ hearing, sent)
     felt = np.linalg.solve((np.eye(n_r) - hearing @ answer).T, felt)
     heard, weight = hearing @ sent, felt @ hearing
-    weights = {} if function is None else function.weights_by_lag
+    weights = {} if function is None else dict(zip(function.lags.tolist(), function.weights, strict=True))
     shares: dict[str, float] = {}
     most, turned = -1.0, (0.0, 1.0)
     for one, move in zip(members, moves, strict=True):

@@ -2,7 +2,7 @@
 
 Takes: the maps x⁺ = P x + Q r, s = S x + D r of many sites with their radii, how often each site counts, and
 where its rows of s and lines of r are among all; discs.
-Gives: `Sites`, `Transfer`, `transfer_of`; `Poles`; `respond`, `powers`.
+Gives: `Sites`, `Transfer`, `transfer_of`; `Poles`; `powers`, `add_fractions`.
 Guarantees: an answer holds in a disc about each point: value, radius and slope hold all that rounding does,
 and what the maps may be off by.
 Does not: answer nearer to zero than `Transfer.innermost`.
@@ -38,6 +38,9 @@ Complexes = NDArray[np.complex128]
 # distance from zero on, where two to the power of `DOUBLINGS` terms of its series leave 2^−64 of the first.
 INNER, FARTHER, DOUBLINGS = 0.15, 4.0, 5
 TERMS = 2**DOUBLINGS
+
+# A term is left out where it and all after it are this share of a rounding.
+CUT = 2.0**-7
 
 # Sites worked on together, and answers: they stay in the cache of a processor.
 CHUNK, ANSWERS = 1024, 65_536
@@ -90,7 +93,7 @@ class _Fractions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transfer:
-    """T of all sites: fractions, and the terms of D, ζ⁻¹, ζ⁻², … (3, 1 + terms, n_s · n_r)."""
+    """T of all sites: fractions, and the terms of D, ζ⁻¹, ζ⁻², … (2, 1 + terms, n_s · n_r) with radii."""
 
     fractions: tuple[_Fractions, ...]
     series: Matrix
@@ -138,13 +141,23 @@ def transfer_of(listed: Sequence[Sites], n_s: int, n_r: int) -> Transfer:
                 heard = fractions[-1].residues[0].any(axis=-1).reshape(len(some), count)
                 place = np.stack([np.full(len(some), which), start + some], axis=-1)
                 poles.append(Poles(values[some, :count], error, counts, heard, place))
+    innermost = FARTHER * max(inner)
     return Transfer(
         fractions=tuple(fractions),
-        series=np.concatenate([series, np.zeros_like(series[:1])]).reshape(3, 1 + TERMS, n_s * n_r),
+        series=_shortened(series.reshape(2, 1 + TERMS, n_s * n_r), innermost),
         shape=(n_s, n_r),
-        innermost=FARTHER * max(inner),
+        innermost=innermost,
         poles=_joined(poles),
     )
+
+
+def _shortened(series: Matrix, innermost: float) -> Matrix:
+    """Return a series of 1/ζ without what is less than a rounding of its first term."""
+    sizes = (np.abs(series[0]) + series[1]) * innermost ** -np.arange(float(1 + TERMS))[:, None]
+    left = np.cumsum(sizes[::-1], axis=0)[::-1]
+    kept = max(1, np.count_nonzero((left > CUT * UNIT * left[0]).any(axis=1)))
+    series[1, 0] += (1 + TERMS * UNIT) * left[kept:][:1].sum(axis=0)
+    return series[:, :kept]
 
 
 def _joined(poles: Sequence[Poles]) -> Poles:
@@ -310,31 +323,32 @@ def powers(points: Complexes, reach: Floats, exponents: Integers) -> Matrix:
     """
     near = np.maximum(np.abs(points) - reach, np.finfo(np.float64).tiny)[:, None]
     share = reach[:, None] / near
-    value = points[:, None] ** -exponents
+    value = (1 / points)[:, None] ** exponents  # far out, it dies out to nothing
     off = share**2 * exponents * (exponents + 1) / 2 + (1 + exponents * share) * (16 + 8 * exponents) * UNIT
     slope = -exponents * reach[:, None] * value / points[:, None]
-    return np.stack([value, near**-exponents * off, slope])
+    return np.stack([value, (1 / near) ** exponents * off, slope])
 
 
-def respond(transfer: Transfer, points: Complexes, reach: Floats, *, bounded: bool = True) -> Matrix:
-    """Return what all sites answer in discs (z, 3, n_s, n_r), a radius of NaN where it is not known.
+def add_fractions(
+    transfer: Transfer, total: Matrix, points: Complexes, reach: Floats, *, bounded: bool = True
+) -> None:
+    """Add to what its series gives in discs what T's poles do; a radius is NaN where it is not known.
 
     Parameters
     ----------
     transfer
         T.
+    total
+        The answers (z, 3, n_s, n_r), written over.
     points, reach
         The discs (z,).
     bounded
-        Whether the radii are asked for; without them the answer is as good as any.
+        Whether radii are asked for.
 
     Notes
     -----
     1/(ζ + h − p) = q − h q² + h² q²/(ζ + h − p), q = 1/(ζ − p): the last is at most (ρ|q|)² |q|/(1 − ρ|q|).
     """
-    exponents = np.arange(transfer.series.shape[1])
-    summed = RADII.multiply(powers(points, reach, exponents), transfer.series).astype(np.complex128)
-    total = summed.swapaxes(0, 1).reshape(len(points), 3, *transfer.shape)
     nearest = np.abs(points) - reach
     # A quotient rounds, a product, each sum over poles and that of all parts.
     rounded = 4 * (8 + len(transfer.fractions) + max(one.poles.size for one in transfer.fractions)) * UNIT
@@ -355,7 +369,6 @@ def respond(transfer: Transfer, points: Complexes, reach: Floats, *, bounded: bo
                 found[:, 1] += _reaction(one, near, nearest[some])
             total[some, :, one.rows[:, None], one.lines] += found
     total[~(nearest >= transfer.innermost), 1] = np.nan
-    return total
 
 
 def _by_poles(inverse: Matrix, residues: Matrix, shape: Matrix) -> Matrix:
