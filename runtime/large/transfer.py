@@ -35,9 +35,8 @@ Integers = NDArray[np.int64]
 Complexes = NDArray[np.complex128]
 
 # Eigenvalues within this share of the largest go into the block; it is looked at from so many times that
-# distance from zero on, where two to the power of `DOUBLINGS` terms of its series leave 2^−64 of the first.
-INNER, FARTHER, DOUBLINGS = 0.15, 4.0, 5
-TERMS = 2**DOUBLINGS
+# distance from zero on, where so many terms of its series leave 2^−64 of the first.
+INNER, FARTHER, TERMS = 0.15, 4.0, 32
 
 # A term is left out where it and all after it are this share of a rounding.
 CUT = 2.0**-7
@@ -86,7 +85,9 @@ class _Fractions:
     rows: Integers
     lines: Integers
     poles: Complexes  # (k, K)
-    residues: Matrix  # (2, k · K, n_s · n_r), with their radii, multiplicities included
+    residues: Complexes  # (k · K, n_s · n_r), multiplicities included
+    sizes: Floats
+    errors: Floats
     block: Floats
     circle: Floats
 
@@ -112,11 +113,10 @@ def transfer_of(listed: Sequence[Sites], n_s: int, n_r: int) -> Transfer:
     n_s, n_r
         How much is sent and heard by all.
     """
-    series = np.zeros((2, 1 + TERMS, n_s, n_r))
+    series = np.zeros((1 + TERMS, 2, n_s, n_r))
     fractions, inner = [], [np.finfo(np.float64).tiny]
     poles: list[Poles] = []
     for which, sites in enumerate(listed):
-        own = np.ix_(*map(range, series.shape[:2]), sites.rows, sites.lines)
         size = np.abs(value_of(sites.maps.p)) + radius_of(sites.maps.p)
         scale = balance(size.max(axis=0))
         for start in range(0, len(size), CHUNK):
@@ -137,14 +137,15 @@ def transfer_of(listed: Sequence[Sites], n_s: int, n_r: int) -> Transfer:
                     maps, counts, values[some, :count], vectors[some, :, :count], FARTHER * inner[-1]
                 )
                 fractions.append(_Fractions(sites.rows, sites.lines, *part))
-                series[own] = RADII.add(series[own].swapaxes(0, 1), terms).swapaxes(0, 1)
-                heard = fractions[-1].residues[0].any(axis=-1).reshape(len(some), count)
+                own = np.ix_(range(len(terms)), range(2), sites.rows, sites.lines)
+                series[own] = RADII.add(series[own], terms)
+                heard = fractions[-1].residues.any(axis=-1).reshape(len(some), count)
                 place = np.stack([np.full(len(some), which), start + some], axis=-1)
                 poles.append(Poles(values[some, :count], error, counts, heard, place))
     innermost = FARTHER * max(inner)
     return Transfer(
         fractions=tuple(fractions),
-        series=_shortened(series.reshape(2, 1 + TERMS, n_s * n_r), innermost),
+        series=_shortened(series.swapaxes(0, 1).reshape(2, 1 + TERMS, n_s * n_r), innermost),
         shape=(n_s, n_r),
         innermost=innermost,
         poles=_joined(poles),
@@ -177,7 +178,7 @@ def _joined(poles: Sequence[Poles]) -> Poles:
 
 def _split(
     maps: FrameMap, counts: Floats, values: Complexes, vectors: Complexes, radius: float
-) -> tuple[tuple[Complexes, Matrix, Floats, Floats], Floats, Matrix]:
+) -> tuple[tuple[Complexes, Complexes, Floats, Floats, Floats, Floats], Floats, Matrix]:
     """Split sites that all have as many poles.
 
     Parameters
@@ -221,14 +222,16 @@ def _split(
     residues = np.moveaxis(residues * counts[:, None, None, None, None], 2, 0)
     terms, block = _block_series(a[..., large:], b[..., large:, :], small, radius)
     terms = np.concatenate([maps.d[:, :, None], terms], axis=2)
+    kept = terms.shape[2]
     terms = RADII.multiply(RADII.exact(counts[None]), terms.swapaxes(0, 1).reshape(2, sites, -1))
     u, w = _rank_one(change)
     u, w, sent = (_last_as_one(one, large) for one in (u[:, None], w[:, None], _size(a)))
     heard = _last_as_one(_size(b).swapaxes(1, 2), large)
     circle = np.concatenate([u * w, counts[:, None, None] * sent * u, w * heard], axis=1).swapaxes(1, 2)
     error = _pole_errors(values, circle[:, :-1, 0], circle[:, -1, 0] * block / radius)
-    fractions = values, residues.reshape(2, sites * large, n_s * n_r), block, circle
-    return fractions, error, terms.reshape(2, 1 + TERMS, n_s, n_r).swapaxes(0, 1)
+    exact, off = residues.reshape(2, sites * large, n_s * n_r)
+    fractions = values, exact, np.abs(exact), off.real.copy(), block, circle
+    return fractions, error, terms.reshape(2, kept, n_s, n_r).swapaxes(0, 1)
 
 
 def _pole_errors(values: Complexes, own: Floats, block: Floats) -> Floats:
@@ -284,17 +287,18 @@ def _block_series(row: Matrix, column: Matrix, small: Complexes, radius: float) 
     ends = np.linalg.norm(_size(row), axis=2)[:, :, None] * np.linalg.norm(_size(column), axis=1)[:, None]
     n_r = column.shape[-1]
     power, block = RADII.exact(small), np.ones(len(small))
-    for doubling in range(DOUBLINGS):
-        block *= 1 + norms(_size(power)) * radius ** -(2**doubling)
+    terms, size = 1, norms(_size(power)) / radius
+    while terms < TERMS and not (size < CUT * UNIT).all():
+        block *= 1 + size
         column = np.concatenate([column, RADII.multiply(power, column)], axis=-1)
-        power = RADII.multiply(power, power)
-    left = norms(_size(power)) * radius**-TERMS
-    block *= np.where(left < 0.5, (1 + 1e-6) / (1 - np.minimum(left, 0.5)), np.inf)
+        power, terms = RADII.multiply(power, power), 2 * terms
+        size = norms(_size(power)) * radius**-terms
+    block *= np.where(size < 0.5, (1 + 1e-6) / (1 - np.minimum(size, 0.5)), np.inf)
     found = RADII.multiply(row, column)
-    terms = with_radius(value_of(found).real, radius_of(found).real + np.abs(value_of(found).imag))
-    terms = np.moveaxis(terms.reshape(*terms.shape[:-1], TERMS, n_r), -2, 2)
-    terms[:, 1, 0] += ends * (left * block)[:, None, None]
-    return terms, block
+    real = with_radius(value_of(found).real, radius_of(found).real + np.abs(value_of(found).imag))
+    real = np.moveaxis(real.reshape(*real.shape[:-1], terms, n_r), -2, 2)
+    real[:, 1, 0] += ends * (size * block)[:, None, None]
+    return real, block
 
 
 def _rank_one(sizes: Floats) -> tuple[Floats, Floats]:
@@ -353,20 +357,22 @@ def add_fractions(
     # A quotient rounds, a product, each sum over poles and that of all parts.
     rounded = 4 * (8 + len(transfer.fractions) + max(one.poles.size for one in transfer.fractions)) * UNIT
     for one in transfer.fractions:
-        residues, errors = one.residues
         for some in _pieces(one, len(points)):
             inverse, radius = 1.0 / (points[some, None, None] - one.poles), reach[some, None, None]
             found = np.zeros((len(inverse), 3, len(one.rows), len(one.lines)), np.complex128)
-            found[:, 0] = _by_poles(inverse, residues, found)
-            found[:, 2] = _by_poles(inverse * inverse * -radius, residues, found)
+            found[:, 0] = _by_poles(inverse, one.residues, found)
             if bounded:
-                far = np.abs(inverse)
-                moved = radius * far
+                moved = radius * (far := np.abs(inverse))
                 with np.errstate(all="ignore"):
-                    near = np.where(moved < 1, far / (1 - moved), np.nan)  # 1/(|ζ − p| − ρ)
-                found[:, 1] = _by_poles(near * (moved * moved + rounded), np.abs(residues), found)
-                found[:, 1] += _by_poles(near, errors.real, found)
-                found[:, 1] += _reaction(one, near, nearest[some])
+                    near = far / (1 - moved)  # 1/(|ζ − p| − ρ), negative where a pole is in the disc
+                    near[near.min(axis=(1, 2), initial=0.0) < 0] = np.nan
+                found[:, 1] = _by_poles(near, one.errors, found) + _reaction(one, near, nearest[some])
+                moved *= moved
+                moved += rounded
+                moved *= near
+                found[:, 1] += _by_poles(moved, one.sizes, found)
+            inverse *= inverse
+            found[:, 2] = -radius * _by_poles(inverse, one.residues, found)
             total[some, :, one.rows[:, None], one.lines] += found
     total[~(nearest >= transfer.innermost), 1] = np.nan
 
@@ -379,8 +385,8 @@ def _by_poles(inverse: Matrix, residues: Matrix, shape: Matrix) -> Matrix:
 def _reaction(one: _Fractions, near: Floats, nearest: Floats) -> Floats:
     """Return what the errors of P do at most (z, n_s, n_r), see `_split`, where |ζ| is at least `nearest`."""
     n_s = len(one.rows)
-    block = (one.block / nearest[:, None])[..., None]
-    summed = np.concatenate([near, block], axis=-1).swapaxes(0, 1) @ one.circle
+    summed = near.swapaxes(0, 1) @ one.circle[:, :-1]
+    summed += (one.block[:, None] / nearest)[..., None] * one.circle[:, -1:]
     circle, sent, heard = summed[..., 0], summed[..., 1 : n_s + 1], summed[..., n_s + 1 :]
     with np.errstate(all="ignore"):
         sent = sent / np.where(circle < 1, 1 - circle, np.nan)[..., None]
