@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,8 +149,12 @@ def of_loop(
         members.append(
             Member(
                 *(group.name, schedule, group.z_names, sites, 0 * unit, unit, unit),
-                site=lambda row, group=group: group.site,
+                site=partial(_site_of, group),
             )
         )
     transfer = transfer_of([one.sites for one in members], n_s, n_r)
     return characteristic_of(transfer, *wires_of(groups, coupling, doubts)), tuple(members)
+
+
+def _site_of(group: PeerGroup, _: int) -> LinearSite:
+    return group.site

@@ -216,12 +216,12 @@ def _mode(
     answer, hearing = np.zeros((n_s, n_r), np.complex128), np.zeros((n_r, n_s), np.complex128)
     if function is not None:
         answer, hearing = (part[0, 0] for part in parts_in(function, np.array([value]), np.zeros(1)))
-    sent, felt = np.zeros(n_s, np.complex128), np.zeros(n_r, np.complex128)
+    alone, weighed = np.zeros(n_s, np.complex128), np.zeros(n_r, np.complex128)
     for one, move in zip(members, moves, strict=True):
-        sent[one.sites.rows] += one.sites.counts @ move.sends(move.right[..., 0])
-        felt[one.sites.lines] += one.sites.counts @ (one.others * move.left[:, move.n_z :, 0])
-    sent = np.linalg.solve(np.eye(n_s) - answer @ hearing, sent)
-    felt = np.linalg.solve((np.eye(n_r) - hearing @ answer).T, felt)
+        alone[one.sites.rows] += one.sites.counts @ move.sends(move.right[..., 0])
+        weighed[one.sites.lines] += one.sites.counts @ (one.others * move.left[:, move.n_z :, 0])
+    sent = np.linalg.solve(np.eye(n_s) - answer @ hearing, alone)
+    felt = np.linalg.solve((np.eye(n_r) - hearing @ answer).T, weighed)
     heard, weight = hearing @ sent, felt @ hearing
     weights = {} if function is None else dict(zip(function.lags.tolist(), function.weights, strict=True))
     shares: dict[str, float] = {}

@@ -114,7 +114,7 @@ def transfer_of(listed: Sequence[Sites], n_s: int, n_r: int) -> Transfer:
         How much is sent and heard by all.
     """
     series = np.zeros((1 + TERMS, 2, n_s, n_r))
-    fractions, inner = [], [np.finfo(np.float64).tiny]
+    fractions, inner = [], [float(np.finfo(np.float64).tiny)]
     poles: list[Poles] = []
     for which, sites in enumerate(listed):
         size = np.abs(value_of(sites.maps.p)) + radius_of(sites.maps.p)
@@ -137,7 +137,7 @@ def transfer_of(listed: Sequence[Sites], n_s: int, n_r: int) -> Transfer:
                     maps, counts, values[some, :count], vectors[some, :, :count], FARTHER * inner[-1]
                 )
                 fractions.append(_Fractions(sites.rows, sites.lines, *part))
-                own = np.ix_(range(len(terms)), range(2), sites.rows, sites.lines)
+                own = np.ix_(np.arange(len(terms)), np.arange(2), sites.rows, sites.lines)
                 series[own] = RADII.add(series[own], terms)
                 heard = fractions[-1].residues.any(axis=-1).reshape(len(some), count)
                 place = np.stack([np.full(len(some), which), start + some], axis=-1)
