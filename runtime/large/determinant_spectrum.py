@@ -221,7 +221,7 @@ def _mode(
         alone[one.sites.rows] += one.sites.counts @ move.sends(move.right[..., 0])
         weighed[one.sites.lines] += one.sites.counts @ (one.others * move.left[:, move.n_z :, 0])
     sent = np.linalg.solve(np.eye(n_s) - answer @ hearing, alone)
-    felt = np.linalg.solve((np.eye(n_r) - hearing @ answer).T, weighed)
+    felt = np.linalg.solve((np.eye(n_r) - hearing @ answer).T, weighed).astype(np.complex128)
     heard, weight = hearing @ sent, felt @ hearing
     weights = {} if function is None else dict(zip(function.lags.tolist(), function.weights, strict=True))
     shares: dict[str, float] = {}
