@@ -142,7 +142,7 @@ def of_loop(
     n_s = n_r = 0
     members = []
     for group in groups:
-        schedule, maps = group.schedule, group.lifted.bounded.mapped(lambda block: block[None])
+        schedule, maps = group.schedule, group.lifted.mapped(lambda block: block[None])
         rows, lines = np.arange(n_s, n_s + len(schedule.sent)), np.arange(n_r, n_r + len(schedule.heard))
         n_s, n_r = n_s + len(rows), n_r + len(lines)
         sites, unit = Sites(maps, np.ones(1), rows, lines), np.ones(len(lines))

@@ -103,7 +103,7 @@ def populations(
         site, parameters = jacobians[group.kind], numbers.parameters[place]
         matrices = linearize_rows(site, parameters)
         parts = [
-            lift(site_of(site, matrices[start : start + CHUNK]), schedule).bounded
+            lift(site_of(site, matrices[start : start + CHUNK]), schedule)
             for start in range(0, len(matrices), CHUNK)
         ]
         rows = numbers.rows[place]
