@@ -212,7 +212,7 @@ def _cut_open(group: PeerGroup, pushes: Sequence[Push]) -> Opened:
     followed = np.array(slopes, dtype=object).reshape(len(ticks), len(bare.exact.a))
     plain = not any(one.slopes[one.states :].any() for one in pushes)
     jumps = next((one.part for one in pushes if one.sector), "")
-    return Opened(bare, wide_map, len(bare.lifted.z_names), tuple(ticks), followed, plain, jumps)
+    return Opened(bare, wide_map, len(bare.z_names), tuple(ticks), followed, plain, jumps)
 
 
 def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
@@ -220,7 +220,7 @@ def _open_loop(loop: Loop, opened: Sequence[Opened]) -> OpenLoop | str:
     free = find_rigid_modes(close_loop(loop))
     if free.drifts:
         return "with all contacts open, something drifts ever farther"
-    names = [(*one.group.lifted.z_names, *(f"{part}[{tick}]" for part, tick in one.ticks)) for one in opened]
+    names = [(*one.group.z_names, *(f"{part}[{tick}]" for part, tick in one.ticks)) for one in opened]
     layout = lay_out(names, [site.schedule for site in loop.sites])
     closed = close_outside(
         loop, [one.map for one in opened], [len(one.ticks) for one in opened], layout, numbers=RADII

@@ -178,23 +178,23 @@ class ClosedSystem:
 
 def close_loop(loop: Loop | ClosedSystem) -> ClosedSystem:
     """Let K sites hear each other: r_g = Σ_h W_gh s_h, each packet as old as its receiver finds it."""
-    lifted = [group.lifted for group in loop.sites]
+    maps = [group.lifted for group in loop.sites]
     layout = lay_out_loop(loop)
-    closed = close([site.bounded for site in lifted], feedback_of(loop, layout), layout, numbers=RADII)
+    closed = close(maps, feedback_of(loop, layout), layout, numbers=RADII)
     return ClosedSystem(
         name=loop.name,
         multiplicity=loop.multiplicity,
         sites=loop.sites,
         coupling=loop.coupling,
-        frame_s=lifted[0].frame_s,
+        frame_s=float(loop.sites[0].schedule.frame_s),
         layout=layout,
         matrix=value_of(closed.matrix),
         error=radius_of(closed.matrix),
         heard=tuple(map(value_of, closed.heard)),
         motion=tuple(
             offset + place
-            for site, offset in zip(lifted, layout.offsets, strict=True)
-            for place in range(site.continuous)
+            for group, offset in zip(loop.sites, layout.offsets, strict=True)
+            for place in range(len(group.site.kind.states))
         ),
         doubts=loop.doubts,
         surds=loop.surds,

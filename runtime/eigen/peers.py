@@ -28,7 +28,7 @@ from apc.compiler.weights import exact_weight
 from apc.frame.exact import evaluate_exact
 from apc.frame.exchange import Exchange, check_mean
 from apc.frame.jacobians import SiteJacobians, edge_name
-from apc.frame.lift import LiftedSite, check_packets, lift
+from apc.frame.lift import FrameMap, check_packets, lift
 from apc.frame.linearize import (
     Listening,
     linearize,
@@ -112,7 +112,7 @@ class PeerGroup:
     site: LinearSite
     exacting: Callable[[], LinearSite]
     schedule: Schedule
-    lifting: Callable[[], LiftedSite]
+    lifting: Callable[[], FrameMap]
     peers: Peers
     role: int
     place: int
@@ -125,8 +125,8 @@ class PeerGroup:
         return self.exacting()
 
     @property
-    def lifted(self) -> LiftedSite:
-        """The map of one frame."""
+    def lifted(self) -> FrameMap:
+        """The map of one frame, with its radii."""
         return self.lifting()
 
     @property
@@ -134,7 +134,7 @@ class PeerGroup:
         """The names of its part of the state: what moves, then what is remembered."""
         return (*(state.name for state in self.site.kind.states), *self.schedule.value_names)
 
-    def with_lifted(self, lifted: LiftedSite) -> PeerGroup:
+    def with_lifted(self, lifted: FrameMap) -> PeerGroup:
         """Return the same peers with another map of one frame."""
         return replace(self, lifting=lambda: lifted)
 
@@ -150,7 +150,7 @@ class PeerGroup:
         return listed[0] if len(listed) == 1 else listed[sender.place]
 
     def with_site(
-        self, site: LinearSite, exact: LinearSite, schedule: Schedule, lifted: LiftedSite | None = None
+        self, site: LinearSite, exact: LinearSite, schedule: Schedule, lifted: FrameMap | None = None
     ) -> PeerGroup:
         """Return the same peers with other equations and events in a frame.
 
@@ -208,7 +208,7 @@ def build_group(
         # The functions of a nonlinear loop can't be walked one by one.
         return linearize_exact(built, vector, listening) if built.walkable else rational_floats(site)
 
-    def lifting() -> LiftedSite:
+    def lifting() -> FrameMap:
         return lift(site, schedule, exact=exacting() if built.walkable else None)
 
     return PeerGroup(

@@ -455,7 +455,7 @@ def angles_in_frame(system: ClosedSystem, values: Complexes, vectors: Complexes,
     for g, (group, offset, heard) in enumerate(zip(system.sites, system.offsets, system.heard, strict=True)):
         own = np.flatnonzero(moving & (site_of == g))
         if len(own):
-            start = vectors[offset : offset + len(group.lifted.z_names), own].T
+            start = vectors[offset : offset + len(group.z_names), own].T
             received = (heard @ vectors[:, own]).T
             site = every_matrix(group.site, lambda matrix: matrix[None])
             angles[own] = turns(site, group.schedule, start, received, dominant[own] - offset, values[own])

@@ -43,7 +43,7 @@ from apc.finite_equations import finite_equations
 from apc.frame.devices import Device, Push, find_push
 from apc.frame.discretize import TOO_LARGE, discretize
 from apc.frame.exchange import Exchange
-from apc.frame.lift import MOST_PACKETS, FrameMap, check_packets, compose, named, step_durations
+from apc.frame.lift import MOST_PACKETS, FrameMap, check_packets, compose, step_durations
 from apc.frame.ports import OUTSIDE, with_cuts, with_holds, with_ports
 from apc.frame.radius import FLOATS, RADII, Arithmetic
 from apc.frame.schedule import Heard, Schedule, Tick, Value
@@ -282,9 +282,8 @@ def _open(system: CompiledSystem, group: PeerGroup, cut: str, numbers: Numbers) 
     ]
     inputs = [Port(f"force on {push.part}", "N") for push in forces]
     inputs += [Port(f"noise on {kind.states[place].name}", kind.states[place].unit) for place in noises]
-    lifted_site = named(site.kind, full, frame.mapped(RADII.exact))
     return _Opened(
-        group=group.with_site(site, group.exact, full, lifted_site),
+        group=group.with_site(site, group.exact, full, frame.mapped(RADII.exact)),
         map=frame,
         units=tuple(units),
         signals=signals,

@@ -1,8 +1,7 @@
 """One frame of one site as one linear map.
 
 Takes: a `LinearSite` and its `Schedule`; or the matrices of many sites at once, with a leading axis (k).
-Gives: `FrameMap`, `compose`; `BoundedMap`, `LiftedSite`, `lift`, `named`, `composed_bounded`; `follow`,
-event by event.
+Gives: `FrameMap`, `compose`; `lift`, `composed_bounded`; `follow`, event by event.
 Guarantees: `compose` and `follow` take numbers of any kind. `lift` propagates the continuous part by its
 exact exponential; every matrix comes with a bound on its rounding error, entry by entry.
 Does not: know who the others are (see `modes`).
@@ -26,7 +25,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Kind
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize
-from apc.frame.radius import FLOATS, RADII, Arithmetic, common_shape, radius_of, value_of, with_radius
+from apc.frame.radius import FLOATS, RADII, Arithmetic, common_shape, with_radius
 from apc.frame.schedule import HELD, Act, Event, Propagate, Repeats, Schedule, Send, Tick, Value, shifted
 from apc.frame.site import LinearSite, every_matrix
 
@@ -58,34 +57,13 @@ class FrameMap:
         return FrameMap(*map(change, self.blocks, *(one.blocks for one in others)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BoundedMap(FrameMap):
-    """A map and what it may be off by, entry by entry."""
-
-    error: FrameMap
-
-    @property
-    def bounded(self) -> FrameMap:
-        """The map with its errors as radii."""
-        return self.mapped(with_radius, self.error)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LiftedSite(BoundedMap):
-    """The one-frame map of a site, or of many of one kind."""
-
-    z_names: tuple[str, ...]
-    continuous: int  # the first so many entries of z are continuous states
-    frame_s: float
-
-
 def lift(
     site: LinearSite,
     schedule: Schedule,
     *,
     exact: LinearSite | None = None,
-) -> LiftedSite:
-    """Compose the events of a site, or of many, over one frame.
+) -> FrameMap:
+    """Compose the events of a site, or of many, over one frame, with radii of what may be off.
 
     Parameters
     ----------
@@ -107,8 +85,7 @@ def lift(
     durations = step_durations(schedule)
     exact = site if exact is None else exact
     found = discretize(exact.a, exact.b, [duration * schedule.quantum for duration in durations])
-    both = composed_bounded(site, schedule, dict(zip(durations, found, strict=True)))
-    return named(site.kind, schedule, both)
+    return composed_bounded(site, schedule, dict(zip(durations, found, strict=True)))
 
 
 def check_packets(schedule: Schedule) -> None:
@@ -123,23 +100,6 @@ def check_packets(schedule: Schedule) -> None:
 def step_durations(schedule: Schedule) -> list[int]:
     """Return the durations of a frame's steps, in quanta."""
     return sorted({event.duration for event in schedule.events if isinstance(event, Propagate)})
-
-
-def named(kind: Kind, schedule: Schedule, both: FrameMap) -> LiftedSite:
-    """Return a frame's map, which has its radii, with the names of its states.
-
-    Parameters
-    ----------
-    kind, schedule, both
-        Of the site or sites.
-    """
-    return LiftedSite(
-        *both.mapped(value_of).blocks,
-        error=both.mapped(radius_of),
-        z_names=(*(state.name for state in kind.states), *schedule.value_names),
-        continuous=len(kind.states),
-        frame_s=float(schedule.frame_s),
-    )
 
 
 def composed_bounded(site: LinearSite, schedule: Schedule, steps: Mapping[int, Step]) -> FrameMap:

@@ -90,7 +90,7 @@ def responses(system: CompiledSystem, prepared: Prepared, port: Port, other: Por
         sites[id(own.schedule)] = site
     plain, wide = _arranged(system, groups, exchange), _arranged(system, opened, exchange)
     common = wide[0]
-    if (states := sum(len(site.lifted.z_names) for site in common.sites)) > MOST_TOGETHER:
+    if (states := sum(len(site.z_names) for site in common.sites)) > MOST_TOGETHER:
         what = f"{len(common.sites):,} peers that differ have {states:,} states and readings in a frame"
         hint = f"fewer peers that differ: {MOST_TOGETHER:,} at most"
         raise ApcError(Mistake("E933", Place(system.origin.topology), f"apc feel: {what}", hint=hint))
@@ -160,7 +160,7 @@ def _arranged(system: CompiledSystem, groups: Sequence[PeerGroup], exchange: Exc
     first, *apart = arranged.loops
     if arranged.method == "modes" and _by_classes(first, apart):
         return first, *apart
-    states = sum(group.count * len(group.lifted.z_names) for group in groups)
+    states = sum(group.count * len(group.z_names) for group in groups)
     if states > MOST_STATES:
         what = f"{exchange.peers:,} peers on such a graph make one system of {states:,} states and readings"
         hint = f"peers on complete graphs, or {MOST_STATES:,} in all"

@@ -29,7 +29,7 @@ from apc.eigen.closing import Loop, close_loop
 from apc.eigen.peers import PeerGroup
 from apc.frame.devices import Device
 from apc.frame.discretize import COEFFICIENT_ROUNDINGS, UNIT, Step, discretize, exponential_rows
-from apc.frame.lift import check_packets, composed_bounded, named, step_durations
+from apc.frame.lift import check_packets, composed_bounded, step_durations
 from apc.frame.ports import Ports, with_holds, with_ports
 from apc.frame.radius import RADII, solve, value_of, with_radius
 from apc.frame.schedule import Propagate, Schedule
@@ -108,7 +108,7 @@ def open_site(group: PeerGroup, device: Device | None) -> tuple[PeerGroup, Site]
     durations = step_durations(full)
     found = discretize(group.exact.a, group.exact.b, [one * full.quantum for one in durations])
     kicked = [_with_kicks(step, n_x) for step in found]
-    lifted = named(site.kind, full, composed_bounded(site, full, dict(zip(durations, kicked, strict=True))))
+    lifted = composed_bounded(site, full, dict(zip(durations, kicked, strict=True)))
     charge = COEFFICIENT_ROUNDINGS * UNIT
     push = np.zeros((2, n_x))
     if device is not None:

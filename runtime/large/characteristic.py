@@ -1,8 +1,8 @@
 """The characteristic function of a population: small, whatever the number of peers and the length of delays.
 
-Takes: the `Transfer`s of all sites, and how what they send comes back to them; circles.
-Gives: `Characteristic`, `Matrices`, `matrices_at`, `characteristic_ball`, `refine`, `null_vectors`,
-`weights_at`; `count_around`.
+Takes: the `Transfer` of all sites, and how what they send comes back to them; discs and circles.
+Gives: `Characteristic`, `characteristic_of`, `parts_in`, `matrices_in`, `characteristic_ball`, `refine`;
+`count_around`.
 Guarantees: its value in a disc comes with a bound; an eigenvalue of the whole system is a zero of it, or a
 pole of a site that the zero would have to cancel. A count is right, None says that it can't be told.
 Does not: know who the sites are (see `determinant`), or where zeros may be (see `zeros`).
@@ -22,12 +22,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.norms import PRODUCT_ROUNDINGS
 from apc.eigen.winding import Ball, determinant_ball, wind
-from apc.frame.discretize import UNIT
-from apc.large.transfer import Transfer, differentiate, respond
+from apc.frame.radius import RADII, Matrix
+from apc.large.transfer import Transfer, add_fractions, powers
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 Complexes = NDArray[np.complex128]
 
 
@@ -35,53 +35,49 @@ Complexes = NDArray[np.complex128]
 # that from which on rounding alone moves it. Nobody looks for a zero so many times beyond the largest pole.
 STEPS, LONGEST, ARRIVED, NEAR, FARTHEST = 40, 0.1, 1e-15, 1e-6, 1e6
 
+# The radius of a disc about a point that is looked at by itself.
+POINT = 1e-30
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Characteristic:
-    """f(ζ) = det(I − T W); `weights` (l, n_r, n_s) are W_l, `lags` the l.
+    """f(ζ) = det(I − T W); `lags` (l,) and `weights` (l, n_r, n_s) are W's.
 
-    The weights are right to `weight_errors`.
+    `smooth` (3, terms + l, 2 n_s · n_r), with its radii, is what powers of 1/ζ, 0, 1, … and the lags, make of
+    T's series and of W.
     """
 
-    transfers: tuple[Transfer, ...]
-    lags: tuple[int, ...]
+    transfer: Transfer
+    lags: Integers
     weights: Floats
-    weight_errors: Floats
+    smooth: Matrix
 
     @property
     def innermost(self) -> float:
         """The least |ζ| at which it can be evaluated."""
-        return 2 * max(one.inner for one in self.transfers)
+        return self.transfer.innermost
+
+    @property
+    def longest(self) -> int:
+        """The longest delay, in frames."""
+        return int(self.lags.max(initial=0))
 
 
-def weights_at(function: Characteristic, points: Complexes) -> Complexes:
-    """Return W (z, n_r, n_s)."""
-    powers = points[:, None] ** -np.array(function.lags)
-    return np.asarray(np.einsum("zl,lrs->zrs", powers, function.weights))
+def characteristic_of(
+    transfer: Transfer, lags: Sequence[int], weights: Floats, errors: Floats
+) -> Characteristic:
+    """Return f of sites that hear each other by weights (l, n_r, n_s), which may be off by so much."""
+    terms, size = transfer.series.shape[1:]
+    smooth = np.zeros((3, terms + len(lags), 2 * size))
+    smooth[:2, :terms, :size] = transfer.series
+    smooth[:2, terms:, size:] = np.stack([weights, errors]).reshape(2, len(lags), size)
+    return Characteristic(transfer, np.array(lags, np.int64), weights, smooth)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Matrices:
-    """I − T W at ζ + h: `value` + h · `slope`, but for what `doubt` bounds in the disc (z, n, n).
-
-    `weight` (z, n_r, n_s) is W at ζ, `weight_doubt` what it may be off by anywhere in the disc.
-    """
-
-    value: Complexes
-    slope: Complexes
-    doubt: Floats
-    weight: Complexes
-    weight_doubt: Floats
-
-
-def _weight_slopes(function: Characteristic, points: Complexes) -> Complexes:
-    """Return dW/dζ (z, n_r, n_s)."""
-    lags = np.array(function.lags)
-    return np.asarray(np.einsum("zl,lrs->zrs", -lags * points[:, None] ** (-lags - 1), function.weights))
-
-
-def matrices_at(function: Characteristic, points: Complexes, reach: Floats) -> Matrices:
-    """Return I − T W at the centres of discs, its slope there, and a bound on the rest in each.
+def parts_in(
+    function: Characteristic, points: Complexes, reach: Floats, *, bounded: bool = True
+) -> tuple[Matrix, Matrix]:
+    """Return T (z, 3, n_s, n_r) and W (z, 3, n_r, n_s) in discs, see `transfer`.
 
     Parameters
     ----------
@@ -89,28 +85,34 @@ def matrices_at(function: Characteristic, points: Complexes, reach: Floats) -> M
         f.
     points, reach
         The discs (z,).
+    bounded
+        Whether T's radii are asked for; without them it is as good as any.
     """
-    lags = np.array(function.lags)
-    answer = respond(function.transfers, points, reach)
-    weight, weight_slope = weights_at(function, points), _weight_slopes(function, points)
-    # Taylor's remainder of ζ^−l; a power by way of logarithms loses a rounding a turn.
-    near = np.maximum(np.abs(points) - reach, np.finfo(np.float64).tiny)[:, None]
-    share = reach[:, None] / near
-    largest = near**-lags
-    wander = largest * (share**2 * lags * (lags + 1) / 2 + (1 + lags * share) * (16 + 8 * lags) * UNIT)
-    weight_doubt = np.einsum("zl,lrs->zrs", wander, np.abs(function.weights))
-    weight_doubt += np.einsum("zl,lrs->zrs", largest, function.weight_errors)
-    size = np.einsum("zl,lrs->zrs", np.abs(points[:, None]) ** -lags, np.abs(function.weights))
-    n_s, n_r = answer.value.shape[1:]
-    moved = reach[:, None, None]
-    value_size, slope_size = np.abs(answer.value), moved * np.abs(answer.slope)
-    weight_moved = moved * np.abs(weight_slope)
-    total = (value_size + slope_size) @ weight_doubt + slope_size @ weight_moved
-    total += answer.doubt @ (size + weight_moved + weight_doubt)
-    rounded = value_size @ (size + weight_moved) + slope_size @ size + np.eye(n_s)
-    total += PRODUCT_ROUNDINGS * (n_s + n_r + 2) * UNIT * rounded
-    slope = -(answer.slope @ weight + answer.value @ weight_slope)
-    return Matrices(np.eye(n_s) - answer.value @ weight, slope, total, weight, weight_doubt + weight_moved)
+    shape = function.transfer.shape
+    exponents = np.concatenate([np.arange(function.smooth.shape[1] - len(function.lags)), function.lags])
+    found = RADII.multiply(powers(points, reach, exponents), function.smooth).swapaxes(0, 1)
+    series, hearing = np.split(found.astype(np.complex128), 2, axis=-1)
+    answer = series.reshape(len(points), 3, *shape)
+    add_fractions(function.transfer, answer, points, reach, bounded=bounded)
+    return answer, hearing.reshape(len(points), 3, *shape[::-1])
+
+
+def matrices_in(
+    function: Characteristic, points: Complexes, reach: Floats, *, bounded: bool = True
+) -> Matrix:
+    """Return I − T W in discs (z, 3, n_s, n_s), see `transfer`.
+
+    Parameters
+    ----------
+    function
+        f.
+    points, reach, bounded
+        As `parts_in` has them.
+    """
+    around = RADII.multiply(*parts_in(function, points, reach, bounded=bounded))
+    unit = np.zeros(around.shape[1:])
+    unit[0] = np.eye(len(unit[0]))
+    return RADII.subtract(unit, around)
 
 
 def characteristic_ball(function: Characteristic, points: Complexes, reach: Floats) -> Ball:
@@ -124,8 +126,8 @@ def characteristic_ball(function: Characteristic, points: Complexes, reach: Floa
         The discs (z,).
     """
     with np.errstate(all="ignore"):
-        found = matrices_at(function, points, reach)
-    return determinant_ball(found.value, found.slope, found.doubt, reach)
+        found = matrices_in(function, points, reach)
+    return determinant_ball(found[:, 0], found[:, 2], found[:, 1].real, np.ones(len(points)))
 
 
 def count_around(
@@ -211,25 +213,11 @@ def _whole(upper: Complexes) -> Complexes:
 
 def _log_rate(function: Characteristic, points: Complexes) -> Complexes:
     """Return f′/f = tr((I − T W)⁻¹ (I − T W)′), infinite at a zero."""
-    value, slope = differentiate(function.transfers, points)
-    weight = weights_at(function, points)
-    weight_slope = _weight_slopes(function, points)
-    matrix = np.eye(value.shape[1]) - value @ weight
-    change = -(slope @ weight + value @ weight_slope)
+    found = matrices_in(function, points, np.full(len(points), POINT), bounded=False)
+    matrix, change = found[:, 0], found[:, 2] / POINT
     sign, _ = np.linalg.slogdet(matrix)
     fine = np.abs(sign) > 0.5
     # A zero to the last digit is arrived at; on a pole nothing is known.
     rate = np.where(np.isfinite(matrix).all(axis=(1, 2)), complex(np.inf), complex(np.nan))
     rate[fine] = np.trace(np.linalg.solve(matrix[fine], change[fine]), axis1=1, axis2=2)
     return rate
-
-
-def null_vectors(function: Characteristic, point: complex) -> tuple[Complexes, Complexes]:
-    """Return s and χ with (I − T W) s ≈ 0 and χ (I − T W) ≈ 0, of norm 1, at a zero of f.
-
-    s is what is sent in the mode, χ what weighs it.
-    """
-    at = np.array([point])
-    value, weight = differentiate(function.transfers, at)[0][0], weights_at(function, at)[0]
-    left, _, right = np.linalg.svd(np.eye(len(value)) - value @ weight)
-    return right[-1].conj(), left[:, -1].conj()

@@ -1,7 +1,7 @@
 """Populations by a small determinant: all different on a complete graph, or delays of any length.
 
 Takes: populations of different peers on complete graphs; or a few sites that hear each other.
-Gives: `of_populations`, `of_loop`; `Places`, `senders_of`.
+Gives: `Member`; `of_populations`, `of_loop`.
 Guarantees: the determinant's size is what is sent in a frame, by one peer of each role or by the few sites,
 whatever the number of peers or the length of a delay.
 Does not: find its zeros (see `zeros`).
@@ -13,9 +13,10 @@ other by weights, r_g = Σ_h W_gh ζ^(−lag) s_h, are det(I − T W) = 0, T = d
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,64 +25,58 @@ from apc.eigen.bordered import wires_of
 from apc.eigen.closing import Coupling
 from apc.eigen.peers import PeerGroup
 from apc.frame.exchange import Exchange, check_mean
-from apc.frame.lift import BoundedMap, FrameMap
-from apc.frame.schedule import Heard, Sent, Way
-from apc.large.characteristic import Characteristic
-from apc.large.populations import Population, hear_themselves, rows_of
-from apc.large.transfer import build_transfer
+from apc.frame.schedule import Heard, Schedule, Sent, Way
+from apc.frame.site import LinearSite
+from apc.large.characteristic import Characteristic, characteristic_of
+from apc.large.populations import Population, hear_themselves
+from apc.large.transfer import Sites, transfer_of
 
 Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
-def senders_of(listed: Sequence[Population], exchange: Exchange) -> list[Floats]:
-    """Return, for each population, how many others each line of r could hear on its complete graph (n_r,)."""
-    senders = {
-        link: float(sum(population.counts.sum() for population in listed if population.sends(link)))
-        for link in exchange.links
-    }
-    return [
-        np.array(
-            [
-                senders[one.way.link] - (1 if population.sends(one.way.link) else 0)
-                for one in population.schedule.heard
-            ]
-        )
-        for population in listed
-    ]
+@dataclass(frozen=True, slots=True, eq=False)
+class Member:
+    """The peers of a population, or one site of a loop, as they hear: r = `own` of themselves + `others` τ.
+
+    `sites` have their maps without what they hear of themselves; τ is what is sent to `lines` by all, own
+    packets included. A line weighs all that others send by `alike` together. `site` gives one's matrices.
+    """
+
+    name: str
+    schedule: Schedule
+    z_names: tuple[str, ...]
+    sites: Sites
+    own: Floats  # (n_r,)
+    others: Floats
+    alike: Floats
+    site: Callable[[int], LinearSite]
 
 
-def heard_weights(listed: Sequence[Population], exchange: Exchange) -> list[Floats]:
-    """Return, for each population, what each line of r weighs another's packet by on complete graphs (n_r,).
+def _weights(
+    population: Population, listed: Sequence[Population], exchange: Exchange
+) -> tuple[Floats, Floats]:
+    """Return what each line of r weighs another's packet by on a complete graph, and how many others send.
 
     Raises
     ------
     ApcError
         E801 a mean over nobody.
     """
-    weights = []
-    for population, senders in zip(listed, senders_of(listed, exchange), strict=True):
-        own = np.ones(len(senders))
-        for line, (one, others) in enumerate(zip(population.schedule.heard, senders.tolist(), strict=True)):
-            if one.way.operator == "mean":
-                first = int(exchange.starts[population.group])
-                check_mean(exchange, first, one.way.link, "mean", others > 0, Fraction(others))
-                own[line] = 1.0 / others
-        weights.append(own)
-    return weights
+    weights, senders = np.ones((2, len(population.schedule.heard)))
+    for line, one in enumerate(population.schedule.heard):
+        link = one.way.link
+        senders[line] = sum(other.counts.sum() for other in listed if other.sends(link))
+        senders[line] -= population.sends(link)
+        if one.way.operator == "mean":
+            first, others = int(exchange.starts[population.group]), float(senders[line])
+            check_mean(exchange, first, link, "mean", others > 0, Fraction(others))
+            weights[line] = 1.0 / others
+    return weights, senders
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Places:
-    """Where in s and r of the whole each population's rows are; how it weighs its own packets and others'."""
-
-    sent: tuple[Integers, ...]
-    heard: tuple[Integers, ...]
-    own: tuple[Floats, ...]
-    others: tuple[Floats, ...]
-
-
-def of_populations(listed: Sequence[Population], exchange: Exchange) -> tuple[Characteristic, Places]:
+def of_populations(
+    listed: Sequence[Population], exchange: Exchange
+) -> tuple[Characteristic, tuple[Member, ...]]:
     """Return the characteristic function of different peers on complete graphs.
 
     Parameters
@@ -94,88 +89,72 @@ def of_populations(listed: Sequence[Population], exchange: Exchange) -> tuple[Ch
     roles = [exchange.role(population.group) for population in listed]
     sent_place: dict[tuple[int, Sent], int] = {}
     heard_place: dict[tuple[int, Heard], int] = {}
+    group_of: dict[int, int] = {}
     for role, population in zip(roles, listed, strict=True):
+        group_of.setdefault(role, population.group)
         for sent in population.schedule.sent:
             sent_place.setdefault((role, sent), len(sent_place))
         for heard in population.schedule.heard:
             heard_place.setdefault((role, heard), len(heard_place))
-    group_of = {
-        role: population.group for role, population in reversed(list(zip(roles, listed, strict=True)))
-    }
 
     def on_the_way(way: Way, sender: int, receiver: int) -> bool:
         return exchange.delay(way.link, group_of[sender], group_of[receiver]) == way.delay
 
-    others = heard_weights(listed, exchange)
-    places = Places(
-        sent=tuple(
-            np.array([sent_place[role, one] for one in population.schedule.sent], np.int64)
-            for role, population in zip(roles, listed, strict=True)
-        ),
-        heard=tuple(
-            np.array([heard_place[role, one] for one in population.schedule.heard], np.int64)
-            for role, population in zip(roles, listed, strict=True)
-        ),
-        own=tuple(
-            -weight * np.array([float(on_the_way(one.way, role, role)) for one in population.schedule.heard])
-            for role, population, weight in zip(roles, listed, others, strict=True)
-        ),
-        others=tuple(others),
-    )
-    transfers = []
-    for g, population in enumerate(listed):
-        k = len(population.parameters)
-        own, weight = (np.tile(row, (k, 1)) for row in (places.own[g], places.others[g]))
-        maps = hear_themselves(population.lifted, population.schedule, own, weight)
-        placed = _placed(maps, places.sent[g], places.heard[g], len(sent_place), len(heard_place))
-        transfers.append(build_transfer(placed, population.counts))
+    members, sites = [], []
+    for role, population in zip(roles, listed, strict=True):
+        schedule = population.schedule
+        weight, senders = _weights(population, listed, exchange)
+        rows = np.array([sent_place[role, one] for one in schedule.sent], np.int64)
+        lines = np.array([heard_place[role, one] for one in schedule.heard], np.int64)
+        own = -weight * np.array([float(on_the_way(one.way, role, role)) for one in schedule.heard])
+        alone = Sites(population.maps, population.counts, rows, lines)
+        names = (*(state.name for state in population.jacobians.kind.states), *schedule.value_names)
+        members.append(
+            Member(
+                *(population.name, schedule, names, alone, own, weight, weight * senders, population.site),
+            )
+        )
+        sites.append(replace(alone, maps=hear_themselves(population.maps, schedule, own, weight)))
     lags = sorted({heard.lag for _, heard in heard_place})
     weights = np.zeros((len(lags), len(heard_place), len(sent_place)))
     for (receiver, heard), line in heard_place.items():
         for (sender, sent), row in sent_place.items():
             if sent == heard.sent and on_the_way(heard.way, sender, receiver):
                 weights[lags.index(heard.lag), line, row] = 1.0
-    return Characteristic(tuple(transfers), tuple(lags), weights, np.zeros_like(weights)), places
+    transfer = transfer_of(sites, len(sent_place), len(heard_place))
+    return characteristic_of(transfer, lags, weights, np.zeros_like(weights)), tuple(members)
 
 
-def of_loop(sites: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way, float]) -> Characteristic:
+def of_loop(
+    groups: Sequence[PeerGroup], coupling: Coupling, doubts: Mapping[Way, float]
+) -> tuple[Characteristic, tuple[Member, ...]]:
     """Return the characteristic function of a few sites that hear each other, delays of any length.
 
     Parameters
     ----------
-    sites
+    groups
         The K sites.
     coupling
         What each hears of each, W (K, K) by way.
     doubts
         By how much each entry of a way's W may be off, where it isn't exact.
     """
-    sent_starts = np.cumsum([0, *(len(group.schedule.sent) for group in sites)])
-    heard_starts = np.cumsum([0, *(len(group.schedule.heard) for group in sites)])
-    n_s, n_r = int(sent_starts[-1]), int(heard_starts[-1])
-    transfers = []
-    for g, group in enumerate(sites):
-        rows = np.arange(sent_starts[g], sent_starts[g + 1])
-        lines = np.arange(heard_starts[g], heard_starts[g + 1])
-        placed = _placed(rows_of(group.lifted, 1), rows, lines, n_s, n_r)
-        transfers.append(build_transfer(placed, np.ones(1)))
-    return Characteristic(tuple(transfers), *wires_of(sites, coupling, doubts))
+    n_s = n_r = 0
+    members = []
+    for group in groups:
+        schedule, maps = group.schedule, group.lifted.mapped(lambda block: block[None])
+        rows, lines = np.arange(n_s, n_s + len(schedule.sent)), np.arange(n_r, n_r + len(schedule.heard))
+        n_s, n_r = n_s + len(rows), n_r + len(lines)
+        sites, unit = Sites(maps, np.ones(1), rows, lines), np.ones(len(lines))
+        members.append(
+            Member(
+                *(group.name, schedule, group.z_names, sites, 0 * unit, unit, unit),
+                site=partial(_site_of, group),
+            )
+        )
+    transfer = transfer_of([one.sites for one in members], n_s, n_r)
+    return characteristic_of(transfer, *wires_of(groups, coupling, doubts)), tuple(members)
 
 
-def _placed(maps: BoundedMap, rows: Integers, lines: Integers, n_s: int, n_r: int) -> BoundedMap:
-    """Return sites among all that is sent and heard: `rows` of s and `lines` of r are theirs."""
-
-    def wide(block: Floats) -> Floats:
-        found = np.zeros((*block.shape[:2], n_r))
-        found[:, :, lines] = block
-        return found
-
-    def tall(block: Floats) -> Floats:
-        found = np.zeros((len(block), n_s, block.shape[2]))
-        found[:, rows] = block
-        return found
-
-    def placed(one: FrameMap) -> FrameMap:
-        return FrameMap(one.p, wide(one.q), tall(one.s), tall(wide(one.d)))
-
-    return BoundedMap(*placed(maps).blocks, placed(maps.error))
+def _site_of(group: PeerGroup, _: int) -> LinearSite:
+    return group.site

@@ -1,7 +1,7 @@
 """The spectrum of a population by its characteristic function: bounds, verdict, the largest modes.
 
 Takes: loops with long delays, or populations of different peers on complete graphs.
-Gives: `solve_loops`, `solve_populations`; `frequency_of`.
+Gives: `solve_loops`, `solve_populations`.
 Guarantees: as `zeros`: the radius is bounded from both sides, and nothing beyond it is missed; a verdict
 nearer to the boundary than its bound says so. Rigid modes are known from the equations.
 Does not: list more than the largest modes.
@@ -9,32 +9,21 @@ Does not: list more than the largest modes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.eigen.closing import Loop, without_packets
-from apc.eigen.eigenpairs import eigenpairs
 from apc.eigen.rigid import find_rigid_modes
 from apc.eigen.spectrum import Mode, Spectrum, judge
 from apc.frame.exchange import Exchange
-from apc.frame.lift import FrameMap
-from apc.large.characteristic import Characteristic, null_vectors, weights_at
-from apc.large.determinant import Places, heard_weights, of_loop, of_populations, senders_of
-from apc.large.populations import (
-    Population,
-    hear_roughly,
-    lines_of,
-    mode_of,
-    rows_of,
-    site_one,
-    some_rows,
-    state_names,
-    turned_by,
-)
-from apc.large.transfer import CHUNK, differentiate
+from apc.frame.radius import value_of
+from apc.large.characteristic import Characteristic, matrices_in, parts_in
+from apc.large.determinant import Member, of_loop, of_populations
+from apc.large.populations import Population, hear_themselves, lines_of, mode_of, turned_by
+from apc.large.transfer import CHUNK, Sites
 from apc.large.zeros import Zero, Zeros, find_zeros, near_poles
 
 Floats = NDArray[np.float64]
@@ -55,8 +44,9 @@ LEAST_START, SAME_START = 0.5, 1e-9
 # Zeros of a loop that Newton's method starts from, the largest by their estimate.
 STARTS = 64
 
-# How far aside of an eigenvalue, relatively, its vectors are looked for by inverse iteration.
-BESIDE = 1e-10
+# How far aside of an eigenvalue, relatively, its vectors are looked for by inverse iteration; of a pole
+# farther, as what answers there is large and rounded.
+BESIDE, BESIDE_POLE = 1e-13, 1e-10
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,17 +82,22 @@ def solve_populations(listed: Sequence[Population], exchange: Exchange, *, rigid
     rigid
         How many common translations there are, from the equations (see `translation`).
     """
-    function, places = of_populations(listed, exchange)
+    function, members = of_populations(listed, exchange)
     peers = int(sum(len(population.parameters) for population in listed))
     zeros = find_zeros(
         function,
-        _common_starts(listed, exchange),
+        _common_starts(members),
         rigid=rigid,
         listed=LISTED_OF_MANY if peers > MANY else LISTED,
         near=NEAR_POLES,
     )
-    modes = _with_conjugates(_population_mode(function, places, listed, zero) for zero in zeros.found)
-    return _spectrum([_Solved(zeros, rigid, 0, modes)], [1])
+    modes = [
+        _mode(function, members, zero, "different peers", 1)
+        if zero.site is None
+        else _own_mode(members, zero)
+        for zero in zeros.found
+    ]
+    return _spectrum([_Solved(zeros, rigid, 0, _with_conjugates(modes))], [1])
 
 
 def _spectrum(solved: Sequence[_Solved], multiplicities: Sequence[int]) -> Spectrum:
@@ -127,7 +122,7 @@ def _spectrum(solved: Sequence[_Solved], multiplicities: Sequence[int]) -> Spect
 
 def _solve_loop(loop: Loop) -> _Solved:
     """Find the largest modes of a loop."""
-    function = of_loop(loop.sites, loop.coupling, loop.doubts)
+    function, members = of_loop(loop.sites, loop.coupling, loop.doubts)
     prompt = without_packets(loop)
     rigid, drifts = len(find_rigid_modes(prompt, with_drifts=False).names), 0
     starts = _delay_starts(function)
@@ -139,14 +134,10 @@ def _solve_loop(loop: Loop) -> _Solved:
         and (drifts := find_rigid_modes(loop).drifts)
     ):
         zeros = find_zeros(function, starts, rigid=rigid + drifts, listed=LISTED, near=0)
-    modes = _with_conjugates(_loop_mode(function, loop, zero) for zero in zeros.found)
+    modes = _with_conjugates(
+        _mode(function, members, zero, loop.name, loop.multiplicity) for zero in zeros.found
+    )
     return _Solved(zeros, rigid, drifts, modes)
-
-
-def frequency_of(loop: Loop, value: complex) -> float:
-    """Return the frequency in Hz of the motion of an eigenvalue of a loop, whole turns in a frame counted."""
-    function = of_loop(loop.sites, loop.coupling, loop.doubts)
-    return _loop_mode(function, loop, Zero(value, 0.0, 1)).frequency_hz
 
 
 def _delay_starts(function: Characteristic) -> Complexes:
@@ -155,11 +146,11 @@ def _delay_starts(function: Characteristic) -> Complexes:
     Where k is an eigenvalue of T(ζ) W(ζ) ζ^d, f has a zero if ζ^d = k(ζ): near the unit circle ζ is
     |k|^(1/d) times a d-th root of 1, turned by what k is turned.
     """
-    delay = max((1, *function.lags))
+    delay = max(1, function.longest)
     turns = np.arange(delay // 2 + 1)
     on_circle = np.exp(2j * np.pi * turns / delay) * (1 + 1e-9)
-    value, _ = differentiate(function.transfers, on_circle)
-    gain = np.linalg.eigvals(value @ weights_at(function, on_circle)) * (on_circle**delay)[:, None]
+    around = np.eye(function.transfer.shape[0]) - matrices_in(function, on_circle, np.zeros(len(turns)))[:, 0]
+    gain = np.linalg.eigvals(around) * (on_circle**delay)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         logarithm = (np.log(gain) + 2j * np.pi * turns[:, None]) / delay
     starts = np.exp(logarithm).ravel()
@@ -169,193 +160,165 @@ def _delay_starts(function: Characteristic) -> Complexes:
     return np.concatenate([starts, poles * (1 + 1e-3), poles * (1 - 1e-3)])
 
 
-def _common_starts(listed: Sequence[Population], exchange: Exchange) -> Complexes:
+def _common_starts(members: Sequence[Member]) -> Complexes:
     """Return the eigenvalues of populations of copies of one peer, for some peers: all moving alike."""
     found = [np.zeros(0, np.complex128)]
-    weights = zip(heard_weights(listed, exchange), senders_of(listed, exchange), strict=True)
-    for population, (weight, senders) in zip(listed, weights, strict=True):
-        few = np.unique(np.linspace(0, len(population.parameters) - 1, SAMPLES).astype(np.int64))
-        own = np.tile(weight * senders, (len(few), 1))
-        alike = hear_roughly(some_rows(population.lifted, few), population.schedule, own, 0 * own)
-        values = np.linalg.eigvals(alike.p).astype(np.complex128).ravel()
+    for one in members:
+        few = np.unique(np.linspace(0, len(one.sites.counts) - 1, SAMPLES).astype(np.int64))
+        some = one.sites.maps.mapped(lambda block, few=few: block[few])
+        alike = hear_themselves(some, one.schedule, one.alike, 0 * one.alike)
+        values = np.linalg.eigvals(value_of(alike.p)).astype(np.complex128).ravel()
         kept = (values.imag >= 0) & (np.abs(values) > LEAST_START) & (np.abs(values - 1) > SAME_START)
         found.append(values[kept])
     return np.concatenate(found)
 
 
-def _loop_mode(function: Characteristic, loop: Loop, zero: Zero) -> Mode:
-    """Describe a zero of a loop; the packets of a channel on their way count together."""
-    value = zero.value * (1 + BESIDE)
-    motions, sent = _nearly_free(function, loop, value)
-    felt = np.concatenate([one.felt[0] for one in motions])
-    waiting = _waiting(function, value, felt, max(function.lags, default=0))
-    lags = np.arange(1, len(waiting) + 1)[:, None]
-    on_the_way = np.abs(waiting * sent * value ** -lags.astype(np.float64))
-    shares: dict[str, float] = {}
-    place = 0
-    for group, motion in zip(loop.sites, motions, strict=True):
-        prefix = f"{group.name}." if len(loop.sites) > 1 else ""
-        for name, share in zip(group.lifted.z_names, np.abs(motion.w[0] * motion.z[0]), strict=True):
-            shares[prefix + name] = float(share)
-        for name, depth in zip(group.schedule.sent_names, group.schedule.depths, strict=True):
-            share = float(on_the_way[:depth, place].sum())
-            shares[prefix + name] = shares.get(prefix + name, 0.0) + share
-            place += 1
-    dominant = max(range(len(motions)), key=lambda g: float(np.abs(motions[g].w * motions[g].z).max()))
-    motion, own = motions[dominant], loop.sites[dominant]
-    turned = turned_by(own.site, own.schedule, zero.value, motion.z[0], motion.r[0], motion.w[0])
-    return mode_of(zero.value, zero.error, turned, shares, loop.name, loop.multiplicity)
-
-
-def _nearly_free(function: Characteristic, loop: Loop, value: complex) -> tuple[list[_Motion], Complexes]:
-    """Return how the sites move next to an eigenvalue when all is pushed a little, and what they send.
-
-    Inverse iteration: it serves where I − T W has no null vector too, at a pole that is an eigenvalue. Any
-    push will do that no symmetry of the scene is blind to.
-    """
-    random = np.random.default_rng(0)
-    pushes = [random.uniform(0.5, 1.0, (1, len(group.lifted.p))) for group in loop.sites]
-    maps = [rows_of(group.lifted, 1) for group in loop.sites]
-    alone = [
-        _move(one, value, np.zeros((1, one.q.shape[2])), np.zeros(one.s.shape[1]), push)
-        for one, push in zip(maps, pushes, strict=True)
-    ]
-    answer = differentiate(function.transfers, np.array([value]))[0][0]
-    hearing = weights_at(function, np.array([value]))[0]
-    sent_alone = np.concatenate(
-        [(one.s @ moved.z[..., None])[0, :, 0] for one, moved in zip(maps, alone, strict=True)]
+def _own_mode(members: Sequence[Member], zero: Zero) -> Mode:
+    """Describe an eigenvalue of one peer by itself: of equal peers moving apart, or of one nobody hears."""
+    assert zero.site is not None
+    which, row = zero.site
+    one, every = members[which], members[which].sites
+    alone = Sites(
+        every.maps.mapped(lambda block: block[row : row + 1]),
+        *(np.ones(1), np.arange(len(every.rows)), np.arange(len(every.lines))),
     )
-    sent = np.linalg.solve(np.eye(len(answer)) - answer @ hearing, sent_alone)
-    felt_alone = np.concatenate([one.felt[0] for one in alone])
-    felt = np.linalg.solve((np.eye(len(hearing)) - hearing @ answer).T, felt_alone)
-    heard, weight = hearing @ sent, felt @ hearing
-    motions = []
-    s_start = r_start = 0
-    for one, push in zip(maps, pushes, strict=True):
-        rows = slice(s_start, s_start + one.s.shape[1])
-        lines = slice(r_start, r_start + one.q.shape[2])
-        s_start, r_start = rows.stop, lines.stop
-        motions.append(_move(one, value, heard[None, lines], weight[rows], push))
-    return motions, sent
+    member = replace(one, sites=alone, site=lambda _: one.site(row))
+    return _mode(None, [member], zero, f"{one.name} by itself", zero.multiplicity)
 
 
-def _population_mode(
-    function: Characteristic, places: Places, listed: Sequence[Population], zero: Zero
+def _mode(
+    function: Characteristic | None, members: Sequence[Member], zero: Zero, shape: str, multiplicity: int
 ) -> Mode:
-    """Describe a zero of a heterogeneous population; the shares of a population's peers are added up."""
-    if zero.site:
-        return _own_mode(listed[zero.site[0]], places, zero, zero.site)
-    value = zero.value
-    sent, weight = null_vectors(function, value)
-    heard = weights_at(function, np.array([value]))[0] @ sent
-    motions = [
-        _move_population(
-            population, places.own[g], places.others[g], value, heard[places.heard[g]], weight[places.sent[g]]
-        )
-        for g, population in enumerate(listed)
-    ]
-    felt = np.zeros(len(heard), np.complex128)
-    for g, (population, motion) in enumerate(zip(listed, motions, strict=True)):
-        felt[places.heard[g]] += population.counts @ motion.felt
-    waiting = _waiting(function, value, felt, max(function.lags, default=0))
+    """Describe a zero; the shares of a population's peers are added up, and those of a channel's packets.
+
+    Parameters
+    ----------
+    function
+        f, None if nobody hears another.
+    members
+        All who move.
+    zero
+        Of f, or a pole that is an eigenvalue.
+    shape, multiplicity
+        As in `Mode`.
+
+    Notes
+    -----
+    Inverse iteration: all is pushed a little. It serves where I − T W has no null vector too, at a pole that
+    is an eigenvalue. Of what the sites do by themselves, s₁ is sent and weighed by t₁: together they send
+    s = (I − T W)⁻¹ s₁, and weigh what they hear by t = t₁ (I − W T)⁻¹.
+    """
+    value = zero.value * (1 + (BESIDE_POLE if zero.site else BESIDE))
+    random = np.random.default_rng(0)
+    moves = [_moves(one, value, random) for one in members]
+    n_s = 1 + max((int(row) for one in members for row in one.sites.rows), default=-1)
+    n_r = 1 + max((int(line) for one in members for line in one.sites.lines), default=-1)
+    answer, hearing = np.zeros((n_s, n_r), np.complex128), np.zeros((n_r, n_s), np.complex128)
+    if function is not None:
+        answer, hearing = (part[0, 0] for part in parts_in(function, np.array([value]), np.zeros(1)))
+    alone, weighed = np.zeros(n_s, np.complex128), np.zeros(n_r, np.complex128)
+    for one, move in zip(members, moves, strict=True):
+        alone[one.sites.rows] += one.sites.counts @ move.sends(move.right[..., 0])
+        weighed[one.sites.lines] += one.sites.counts @ (one.others * move.left[:, move.n_z :, 0])
+    sent = np.linalg.solve(np.eye(n_s) - answer @ hearing, alone)
+    felt = np.linalg.solve((np.eye(n_r) - hearing @ answer).T, weighed).astype(np.complex128)
+    heard, weight = hearing @ sent, felt @ hearing
+    weights = {} if function is None else dict(zip(function.lags.tolist(), function.weights, strict=True))
     shares: dict[str, float] = {}
-    most, dominant = -1.0, (0, 0)
-    for g, (population, motion) in enumerate(zip(listed, motions, strict=True)):
-        n_z = len(population.lifted.z_names)
-        covector = motion.w.copy()
-        place = n_z
-        for row, depth in enumerate(population.schedule.depths):
-            covector[:, place : place + depth] += waiting[:depth, places.sent[g][row]]
-            place += depth
-        own = np.abs(covector * motion.z)
-        for name, share in zip(state_names(population), population.counts @ own, strict=True):
-            name = f"{population.name}.{name}" if len(listed) > 1 else name
-            shares[name] = shares.get(name, 0.0) + float(share)
+    most, turned = -1.0, (0.0, 1.0)
+    for one, move in zip(members, moves, strict=True):
+        sites, schedule, n_z = one.sites, one.schedule, move.n_z
+        right = move.right[..., 0] + move.right[..., 1:] @ heard[sites.lines]
+        left = move.left[..., 0] + move.left[..., 1:] @ weight[sites.rows]
+        z, r, w, mu = right[:, :n_z], right[:, n_z:], left[:, :n_z], left[:, n_z:]
+        prefix = f"{one.name}." if len(members) > 1 else ""
+        own = np.abs(w * z)
+        listed = dict(zip(one.z_names, sites.counts @ own, strict=True))
+        known = {lag: one.own[:, None] * picked for lag, picked in lines_of(schedule).items()}
+        packets = move.sends(right)
+        for row, (name, depth) in enumerate(zip(schedule.sent_names, schedule.depths, strict=True)):
+            by_others = _waiting(weights, value, felt[None], depth, sites.rows[row])
+            waiting = _waiting(known, value, mu, depth, row) + by_others
+            aged = waiting * value ** -np.arange(1.0, depth + 1)[:, None]
+            listed[name] = listed.get(name, 0.0) + np.abs(aged * packets[:, row]).sum(axis=0) @ sites.counts
+        for name, share in listed.items():
+            shares[prefix + name] = shares.get(prefix + name, 0.0) + float(share)
         peer = int(np.argmax(own.sum(axis=1)))
         if float(own[peer].sum()) > most:
-            most, dominant = float(own[peer].sum()), (g, peer)
-    g, peer = dominant
-    motion, site = motions[g], site_one(listed[g], peer)
-    turned = turned_by(site, listed[g].schedule, zero.value, motion.z[peer], motion.r[peer], motion.w[peer])
-    return mode_of(zero.value, zero.error, turned, shares, "different peers", zero.multiplicity)
-
-
-def _own_mode(population: Population, places: Places, zero: Zero, site: tuple[int, int]) -> Mode:
-    """Describe an eigenvalue of one peer by itself: of equal peers moving apart, or of one nobody hears."""
-    g, row = site
-    some = some_rows(population.lifted, slice(row, row + 1))
-    own, others = places.own[g], places.others[g]
-    alone = hear_roughly(some, population.schedule, own[None], others[None])
-    pairs = eigenpairs(alone.p[0])
-    nearest = int(np.argmin(np.abs(pairs.values - zero.value)))
-    z, w = pairs.right[:, nearest], pairs.left[nearest]
-    now, before, _ = lines_of(population.schedule)
-    n_z = some.p.shape[-1]
-    received = own * (now @ (alone.s[0] @ z) + before @ z[n_z:])
-    shares: dict[str, float] = {}
-    for name, share in zip(state_names(population), np.abs(w * z).tolist(), strict=True):
-        shares[name] = shares.get(name, 0.0) + share
-    turned = turned_by(site_one(population, row), population.schedule, zero.value, z, received, w)
-    return mode_of(zero.value, zero.error, turned, shares, f"{population.name} by itself", zero.multiplicity)
+            most = float(own[peer].sum())
+            turned = turned_by(one.site(peer), schedule, zero.value, z[peer], r[peer], w[peer])
+    return mode_of(zero.value, zero.error, turned, shares, shape, multiplicity)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Motion:
-    """Sites in a mode: their states z (k, n), what weighs these, w (k, n), and what they hear, r (k, n_r).
+class _Moves:
+    """How sites move at ζ: `right` (k, n, 1 + n_r), states z and what is heard r, pushed, then by each τ.
 
-    `felt` (k, n_r) weighs what comes from outside.
+    `left` (k, n, 1 + n_s) weighs these, pushed, then by what weighs each packet; `sending` (k, n_s, n) is
+    [S D].
     """
 
-    z: Complexes
-    w: Complexes
-    r: Complexes
-    felt: Complexes
+    right: Complexes
+    left: Complexes
+    sending: Floats
+    n_z: int
+
+    def sends(self, moved: Complexes) -> Complexes:
+        """Return what is sent (k, n_s) by sites that move so (k, n)."""
+        return np.asarray((self.sending @ moved[..., None])[..., 0])
 
 
-def _move(
-    maps: FrameMap,
-    value: complex,
-    heard: Complexes | Floats,
-    weight: Complexes | Floats,
-    push: Floats | float = 0.0,
-) -> _Motion:
-    """Return how sites move at ζ, hearing r (k, n_r) from outside, with what they send weighed by χ (n_s,).
+def _moves(one: Member, value: complex, random: np.random.Generator) -> _Moves:
+    """Return how sites move at ζ, each hearing itself and pushed by its own v, a chunk at a time.
 
-    (ζ − P) z = Q r + v and w (ζ − P) = χ S + v, pushed by v (k, n); w Q + χ D weighs r.
+    (ζ − P) z = Q r + v and r = own N (S z + D r) + others τ, with N = Σ_l ζ^(−l) A_l. Any v will do that no
+    symmetry of the scene is blind to.
     """
-    p, q, s, d = maps.blocks
-    shifted = value * np.eye(p.shape[-1]) - p
-    driven = (q @ heard[..., None])[..., 0] + push
-    z: Complexes = np.linalg.solve(shifted, driven[..., None])[..., 0].astype(np.complex128)
-    covector = (weight @ s + push)[..., None]
-    w: Complexes = np.linalg.solve(shifted.swapaxes(1, 2), covector)[..., 0].astype(np.complex128)
-    return _Motion(z, w, heard.astype(np.complex128), (w[:, None, :] @ q)[:, 0] + weight @ d)
+    p, q, s, d = map(value_of, one.sites.maps.blocks)
+    n_z, n_r = q.shape[1:]
+    k, n_s = s.shape[:2]
+    loop = np.zeros((n_r, n_s), np.complex128)
+    for lag, picked in lines_of(one.schedule).items():
+        loop += value**-lag * one.own[:, None] * picked
+    sending = np.concatenate([s, d], axis=-1)
+    pushed = np.zeros((k, n_z + n_r, 1))
+    pushed[:, :n_z] = random.uniform(0.5, 1.0, (k, n_z, 1))
+    heard = np.zeros((k, n_z + n_r, n_r))
+    heard[:, n_z:] = np.diag(one.others)
+    driven = np.concatenate([pushed, heard], axis=-1)
+    weighed = np.concatenate([pushed, sending.swapaxes(1, 2)], axis=-1)
+    right = np.empty((k, n_z + n_r, 1 + n_r), np.complex128)
+    left = np.empty((k, n_z + n_r, 1 + n_s), np.complex128)
+    for start in range(0, k, CHUNK):
+        some = slice(start, start + CHUNK)
+        top = np.concatenate([p[some], q[some]], axis=-1)
+        matrix = np.concatenate([top, loop @ sending[some]], axis=1) * -1.0
+        matrix += np.diag([value] * n_z + [1.0] * n_r)
+        right[some] = np.linalg.solve(matrix, driven[some])
+        left[some] = np.linalg.solve(matrix.swapaxes(1, 2), weighed[some])
+    return _Moves(right, left, sending, n_z)
 
 
-def _move_population(
-    population: Population, own: Floats, others: Floats, value: complex, heard: Complexes, weight: Complexes
-) -> _Motion:
-    """Return how the peers of a population move, each hearing itself by `own` (n_r,), a chunk at a time."""
-    parts = []
-    now, before, _ = lines_of(population.schedule)
-    for start in range(0, len(population.parameters), CHUNK):
-        some = some_rows(population.lifted, slice(start, start + CHUNK))
-        k = len(some.p)
-        alone = hear_roughly(some, population.schedule, np.tile(own, (k, 1)), np.tile(others, (k, 1)))
-        moved = _move(alone, value, np.tile(heard, (k, 1)), weight)
-        sent = (alone.s @ moved.z[..., None] + alone.d @ moved.r[..., None])[..., 0]
-        packets = moved.z[:, some.p.shape[-1] :]
-        received = others * heard + own * (sent @ now.T + packets @ before.T)
-        parts.append(replace(moved, r=received))
-    return _Motion(*(np.concatenate([getattr(part, name) for part in parts]) for name in _Motion.__slots__))
+def _waiting(
+    weights: Mapping[int, Floats], value: complex, felt: Complexes, depth: int, row: int
+) -> Complexes:
+    """Return what weighs a packet of a row, l = 1 … depth frames old, (depth, k): all who still hear it.
 
-
-def _waiting(function: Characteristic, value: complex, felt: Complexes, depth: int) -> Complexes:
-    """Return what weighs a packet l = 1 … depth frames old, (depth, n_s): all who still hear it."""
-    found = np.zeros((depth, function.weights.shape[2]), np.complex128)
-    for lag, weight in zip(function.lags, function.weights, strict=True):
-        ages = np.arange(1, lag + 1)
-        found[:lag] += (value ** (ages - lag - 1).astype(np.float64))[:, None] * (felt @ weight)
+    Parameters
+    ----------
+    weights
+        By lag, what each line weighs packets by (n_r, n_s).
+    value
+        ζ.
+    felt
+        What weighs each line (k, n_r).
+    depth, row
+        The oldest, and of which row of s.
+    """
+    ages = np.arange(1, depth + 1)
+    found = np.zeros((depth, len(felt)), np.complex128)
+    for lag, weight in weights.items():
+        found[:lag] += (value ** (ages[:lag] - lag - 1.0))[:, None] * (felt @ weight[:, row])
     return found
 
 

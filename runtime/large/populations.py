@@ -1,8 +1,7 @@
 """Peers by the thousand, all different: the matrices of every one, without an object for each.
 
 Takes: a `CompiledSystem`, its numbers, Jacobians and schedules.
-Gives: `Population`, `populations`, `some_rows`, `site_one`; `hear_themselves`, `hear_roughly`, `lines_of`;
-`state_names`, `turned_by`, `mode_of`.
+Gives: `Population`, `populations`, `joined`; `hear_themselves`, `lines_of`; `turned_by`, `mode_of`.
 Guarantees: a population costs what its different peers cost in one array operation each, not in one Python
 call each; equal peers of a population are counted.
 Does not: merge equal peers of different groups (see `peers`), or take sites that are not affine.
@@ -10,23 +9,23 @@ Does not: merge equal peers of different groups (see `peers`), or take sites tha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
-from apc.eigen.closing import Closed, Feedback, StateLayout, close, lay_out
+from apc.eigen.closing import Feedback, close, lay_out
 from apc.eigen.peers import states_of
 from apc.eigen.spectrum import Mode, Motion, oscillation
 from apc.frame.course import turns
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.lift import BoundedMap, FrameMap, LiftedSite, lift
+from apc.frame.lift import FrameMap, lift
 from apc.frame.linearize import linearize, linearize_rows, site_of
 from apc.frame.parameters import Numbers
-from apc.frame.radius import RADII, radius_of, rounded, value_of
+from apc.frame.radius import RADII, rounded
 from apc.frame.schedule import Schedule
 from apc.frame.site import LinearSite, every_matrix
 from apc.memory import refuse_beyond
@@ -48,8 +47,8 @@ ENTRY = 100  # bytes of an entry of a different peer's matrix: with its radius, 
 class Population:
     """The peers of one group of the scene, k different ones.
 
-    `group` is its place in the scene; `parameters` (k, n_p) and `lifted` are the different peers', `rows`
-    (count,) says which each peer is, `counts` (k,) how many are.
+    `group` is its place in the scene; `parameters` (k, n_p) and `maps` (k, …), with their radii, are the
+    different peers', `rows` (count,) says which each peer is, `counts` (k,) how many are.
     """
 
     name: str
@@ -57,9 +56,13 @@ class Population:
     jacobians: SiteJacobians
     schedule: Schedule
     parameters: Floats
-    lifted: LiftedSite
+    maps: FrameMap
     rows: Integers
     counts: Floats
+
+    def site(self, row: int) -> LinearSite:
+        """Return the matrices of one of the different peers by itself."""
+        return linearize(self.jacobians, self.parameters[row])
 
     def sends(self, link: str) -> bool:
         """Say whether these peers send over a link."""
@@ -98,126 +101,67 @@ def populations(
     found = []
     for place, (group, schedule) in enumerate(zip(system.groups, schedules, strict=True)):
         site, parameters = jacobians[group.kind], numbers.parameters[place]
-        lifted = _lifted(site, schedule, linearize_rows(site, parameters))
+        matrices = linearize_rows(site, parameters)
+        parts = [
+            lift(site_of(site, matrices[start : start + CHUNK]), schedule)
+            for start in range(0, len(matrices), CHUNK)
+        ]
         rows = numbers.rows[place]
         counts = np.bincount(rows, minlength=len(parameters)).astype(np.float64)
-        found.append(Population(group.name, place, site, schedule, parameters, lifted, rows, counts))
+        found.append(Population(group.name, place, site, schedule, parameters, joined(parts), rows, counts))
     return tuple(found)
 
 
-def _lifted(site: SiteJacobians, schedule: Schedule, rows: Floats) -> LiftedSite:
-    """Return the maps of many sites of one kind from their matrices (k, …)."""
-    parts = [
-        lift(site_of(site, rows[start : start + CHUNK]), schedule) for start in range(0, len(rows), CHUNK)
-    ]
-    return _joined(parts)
-
-
-def _joined(parts: Sequence[LiftedSite]) -> LiftedSite:
+def joined(parts: Sequence[FrameMap]) -> FrameMap:
     """Return the maps of several chunks of sites as those of all."""
-
-    def whole(first: FrameMap, *others: FrameMap) -> FrameMap:
-        return first.mapped(lambda *blocks: np.concatenate(blocks), *others)
-
-    p, q, s, d = whole(*parts).blocks
-    return replace(parts[0], p=p, q=q, s=s, d=d, error=whole(*(one.error for one in parts)))
+    return parts[0].mapped(lambda *blocks: np.concatenate(blocks), *parts[1:])
 
 
-def some_rows(lifted: LiftedSite, places: slice | Integers) -> LiftedSite:
-    """Return some of the sites."""
-    return _every_block(lifted, lambda block: block[places])
-
-
-def rows_of(lifted: LiftedSite, count: int) -> LiftedSite:
-    """Return `count` copies of one lifted site."""
-    return _every_block(lifted, lambda block: np.broadcast_to(block, (count, *block.shape)))
-
-
-def _every_block(lifted: LiftedSite, change: Callable[[Floats], Floats]) -> LiftedSite:
-    p, q, s, d = lifted.mapped(change).blocks
-    return replace(lifted, p=p, q=q, s=s, d=d, error=lifted.error.mapped(change))
-
-
-def site_one(population: Population, row: int) -> LinearSite:
-    """Return the matrices of one of the different peers by itself."""
-    return linearize(population.jacobians, population.parameters[row])
-
-
-def hear_themselves(lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats) -> BoundedMap:
-    """Let every site hear its own packets, weighed, and leave the rest of what it hears open.
+def hear_themselves(maps: FrameMap, schedule: Schedule, own: Floats, others: Floats) -> FrameMap:
+    """Let every site hear its own packets, weighed, the rest of what it hears left open: with radii.
 
     Parameters
     ----------
-    lifted
-        k sites.
-    schedule
-        Theirs.
+    maps, schedule
+        Of k sites, with their radii.
     own
-        What each line of r weighs the site's own packets by (k, n_r).
+        What each line of r weighs the site's own packets by (n_r,).
     others
-        What each line weighs what still comes from outside by (k, n_r).
+        What each line weighs what still comes from outside by (n_r,).
 
     Notes
     -----
-    The state is z, then the packets on their way, row by row of s, the youngest first. With A₀ and B_p
-    picking what each line hears of this frame's packets and of those on their way,
-    r = others·τ + own·(A₀ s + B_p q) and s = S z + D r: as in `closing.close`, D A₀ is nilpotent.
+    The state is z, then the packets on their way, row by row of s, the youngest first. With A_l picking what
+    each line hears of the packets of l frames ago, r = others·τ + own·Σ_l A_l s(−l) and s = S z + D r: as in
+    `closing.close`, D A₀ is nilpotent.
     """
+    layout, picked = lay_out([[""] * maps.p.shape[-1]], [schedule]), lines_of(schedule)
+    n, n_r = len(layout.names), len(schedule.heard)
+    now, before = np.zeros((n_r, len(schedule.sent))), np.zeros((n_r, n + n_r))
+    now += picked.get(0, 0.0)
+    for packet, place in layout.places.items():
+        if packet.lag in picked:
+            before[:, place] = picked[packet.lag][:, packet.row]
+    before = own[:, None] * before
+    before[:, n:] = np.diag(others)
+    heard = Feedback(rounded(own[:, None] * now), rounded(before))
     parts = []
-    for start in range(0, len(own), CHUNK):
-        chunk = slice(start, start + CHUNK)
-        layout, feedback = _open_loop(some_rows(lifted, chunk), schedule, own[chunk], others[chunk])
-        heard = Feedback(rounded(feedback.now), rounded(feedback.before))
-        parts.append(_cut(close([some_rows(lifted, chunk).bounded], [heard], layout, numbers=RADII)))
-    whole = parts[0].mapped(lambda *blocks: np.concatenate(blocks), *parts[1:])
-    return BoundedMap(*whole.mapped(value_of).blocks, error=whole.mapped(radius_of))
+    for start in range(0, len(maps.p), CHUNK):
+        some = maps.mapped(lambda block, start=start: block[start : start + CHUNK])
+        closed = close([some], [heard], layout, numbers=RADII)
+        matrix, sent = closed.matrix, closed.sent
+        parts.append(FrameMap(matrix[..., :n], matrix[..., n:], sent[..., :n], sent[..., n:]))
+    return joined(parts)
 
 
-def hear_roughly(lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats) -> FrameMap:
-    """Return the map that `hear_themselves` gives, without its errors."""
-    layout, feedback = _open_loop(lifted, schedule, own, others)
-    return _cut(close([lifted], [feedback], layout))
-
-
-def _open_loop(
-    lifted: LiftedSite, schedule: Schedule, own: Floats, others: Floats
-) -> tuple[StateLayout, Feedback]:
-    """Return the state of each site by itself, and what it hears of it and, behind it, of the others."""
-    now, before, _ = lines_of(schedule)
-    nothing = np.zeros((*own.shape, lifted.p.shape[-1]))
-    outside = others[:, :, None] * np.eye(own.shape[1])
-    heard = np.concatenate([nothing, own[:, :, None] * before, outside], axis=-1)
-    return lay_out([lifted.z_names], [schedule]), Feedback(own[:, :, None] * now, heard)
-
-
-def _cut(closed: Closed) -> FrameMap:
-    """Return the map of closed loops over their states and what comes from outside."""
-    n = closed.matrix.shape[-2]
-    return FrameMap(
-        closed.matrix[..., :n], closed.matrix[..., n:], closed.sent[..., :n], closed.sent[..., n:]
-    )
-
-
-def lines_of(schedule: Schedule) -> tuple[Floats, Floats, int]:
-    """Return A₀ (n_r, n_s), B_p (n_r, n_q) and the number n_q of packets on their way."""
-    place = {one: row for row, one in enumerate(schedule.sent)}
-    starts = np.cumsum([0, *schedule.depths])
-    now = np.zeros((len(schedule.heard), len(schedule.sent)))
-    before = np.zeros((len(schedule.heard), int(starts[-1])))
+def lines_of(schedule: Schedule) -> dict[int, Floats]:
+    """Return which of its own packets each line of r hears if a site hears itself: by lag, (n_r, n_s)."""
+    found: dict[int, Floats] = {}
     for line, one in enumerate(schedule.heard):
-        if one.sent not in place:  # this kind does not send it
-            continue
-        if one.lag == 0:
-            now[line, place[one.sent]] = 1.0
-        else:
-            before[line, starts[place[one.sent]] + one.lag - 1] = 1.0
-    return now, before, int(starts[-1])
-
-
-def state_names(population: Population) -> list[str]:
-    """Return the names of a peer's state, z and then the packets on their way."""
-    waiting = zip(population.schedule.sent_names, population.schedule.depths, strict=True)
-    return [*population.lifted.z_names, *(name for name, depth in waiting for _ in range(depth))]
+        if one.sent in schedule.sent:
+            picked = found.setdefault(one.lag, np.zeros((len(schedule.heard), len(schedule.sent))))
+            picked[line, schedule.sent.index(one.sent)] = 1.0
+    return found
 
 
 def turned_by(

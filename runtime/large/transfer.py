@@ -1,17 +1,20 @@
-"""What many sites together answer: their poles and residues, and their sum at a frequency, with bounds.
+"""What many sites together answer, by partial fractions: their poles and residues, and their sum in discs.
 
-Takes: the maps x⁺ = P x + Q r, s = S x + D r of many sites, what these may be off by, and how often each
-site counts; points.
-Gives: `Transfer`, `build_transfer`; `Response`, `respond`, `differentiate`.
-Guarantees: the errors hold all that rounding does, and those of the matrices. A response holds in a disc
-about each point, not only at it.
-Does not: answer nearer to zero than twice `Transfer.inner`.
+Takes: the maps x⁺ = P x + Q r, s = S x + D r of many sites with their radii, how often each site counts, and
+where its rows of s and lines of r are among all; discs.
+Gives: `Sites`, `Transfer`, `transfer_of`; `Poles`; `powers`, `add_fractions`.
+Guarantees: an answer holds in a disc about each point: value, radius and slope hold all that rounding does,
+and what the maps may be off by.
+Does not: answer nearer to zero than `Transfer.innermost`.
 
     T(ζ) = Σ_i n_i (D_i + S_i (ζ − P_i)⁻¹ Q_i)
 
-Each P_i is split, X⁻¹ P X = diag(p_1, …, p_K, T₂): the eigenvalues beyond `inner` one by one, and all that
-is smaller, queues running empty and the like, as one block that may be defective. The block's part is a
+Each P_i is split, X⁻¹ P X = diag(p_1, …, p_K, T₂) + Δ: the eigenvalues beyond `INNER` one by one, and all
+that is smaller, queues running empty and the like, as one block that may be defective. The block's part is a
 short power series of 1/ζ, added up over all sites before any ζ is known.
+
+What is known in a disc of radius ρ about ζ is an array (…, 3, n, m) as `radius` has it over a cell: value,
+radius and ρ times the slope.
 """
 
 from __future__ import annotations
@@ -22,223 +25,280 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.norms import PRODUCT_ROUNDINGS, balance
+from apc.eigen.norms import balance, norms
 from apc.frame.discretize import UNIT
-from apc.frame.lift import BoundedMap, FrameMap
-from apc.large.diagonal import block_diagonal, block_norms, block_norms_along, block_resolvent
+from apc.frame.lift import FrameMap
+from apc.frame.radius import RADII, Matrix, radius_of, solve, value_of, with_radius
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 Complexes = NDArray[np.complex128]
 
-# Eigenvalues within this share of the largest go into the block; at twice that distance from zero its series
-# gains a bit a term, (inner/|ζ|)^k < 2^−k.
-INNER = 0.3
+# Eigenvalues within this share of the largest go into the block; it is looked at from so many times that
+# distance from zero on, where so many terms of its series leave 2^−64 of the first.
+INNER, FARTHER, TERMS = 0.15, 4.0, 32
 
-# Terms of the block's power series: at twice `inner`, 2^−64 of the first is left. It is cut where what is
-# left is this share of a rounding. So many terms, two to this power, are had by one product: of matrices so
-# small, it takes no longer than one term.
-SERIES, CUT = 64, 2.0**-7
-DOUBLINGS = 2
+# A term is left out where it and all after it are this share of a rounding.
+CUT = 2.0**-7
 
-# What residues may be off by, relatively, before those that should be nothing count as larger.
-FINE = 1e-9
+# Sites worked on together, and answers: they stay in the cache of a processor.
+CHUNK, ANSWERS = 1024, 65_536
 
-# Sites worked on together: they stay in the cache of a processor.
-CHUNK = 1024
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sites:
+    """k sites of one structure among all that is sent and heard: `rows` of s and `lines` of r are theirs.
+
+    `maps` (k, …) have their radii; `counts` (k,) say how often each site is there.
+    """
+
+    maps: FrameMap
+    counts: Floats
+    rows: Integers
+    lines: Integers
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Poles:
+    """The poles of all sites that are no part of a block, the largest first, with their conjugates.
+
+    Each is off by no more than `errors`, wherever beyond `Transfer.innermost` that is asked; `counts` say how
+    often its site is there, `heard` whether it has a residue, `sites` (m, 2) which of the structures it is
+    of, and which site.
+    """
+
+    values: Complexes
+    errors: Floats
+    counts: Floats
+    heard: NDArray[np.bool_]
+    sites: Integers
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fractions:
+    """Some sites of equally many poles K, their rows and lines as in `Sites`.
+
+    Beside the n_s rows and n_r lines, what an error of P does has `circle` (k, K + 1, 1 + n_s + n_r): u w,
+    |S X| u and w |Y Q|, see `_split`, the block last; `block` (k,) bounds ‖(ζ − T₂)⁻¹‖ |ζ|.
+    """
+
+    rows: Integers
+    lines: Integers
+    poles: Complexes  # (k, K)
+    residues: Complexes  # (k · K, n_s · n_r), multiplicities included
+    sizes: Floats
+    errors: Floats
+    block: Floats
+    circle: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transfer:
-    """Sites of one structure by their poles, k sites of at most K poles beyond `inner`.
+    """T of all sites: fractions, and the terms of D, ζ⁻¹, ζ⁻², … (2, 1 + terms, n_s · n_r) with radii."""
 
-    `eigenvalues` (k, n) are all of each site, `eigenvalue_errors` what they may be off by; `counts` (k,) how
-    often each site is there. The rest is what `respond` adds up, multiplicities included: a place beyond a
-    site's poles has the pole 0 and nothing on it.
-    """
-
-    inner: float
-    counts: Floats
-    eigenvalues: Complexes  # (k, n), the K largest first
-    eigenvalue_errors: Floats
-    poles: Complexes  # (K, k)
-    residues: Complexes  # (K, k, n_s · n_r)
-    residue_sizes: Floats
-    residue_error: Floats  # (k,): what they may be off by, relative to their sizes, which are bounds for it
-    block: Floats  # (k,): a bound on ‖(ζ − T₂)⁻¹‖ from twice `inner` on
-    loop: Floats  # (k, K + 1): u w, see `build_transfer`; the block last
-    left: Floats  # (k, K + 1, n_s): |S X| u
-    right: Floats  # (k, K + 1, n_r): w |Y Q|
-    together: Floats  # (k, n_s · n_r): what an error of P does where every |ζ − p_k| = 1
-    loops: Floats  # (k,): Σ u w
-    series: Floats  # (up to 1 + SERIES, n_s, n_r): D, then ζ⁻¹, ζ⁻², …
-    series_sizes: Floats
-    series_errors: Floats
+    fractions: tuple[_Fractions, ...]
+    series: Matrix
+    shape: tuple[int, int]
+    innermost: float
+    poles: Poles
 
 
-def build_transfer(maps: BoundedMap, counts: Floats) -> Transfer:
+def transfer_of(listed: Sequence[Sites], n_s: int, n_r: int) -> Transfer:
     """Split every site into its poles and a block of what dies out at once.
 
     Parameters
     ----------
-    maps
-        Those of the k sites (k, …).
-    counts
-        How often each is there (k,).
-
-    Notes
-    -----
-    With computed X and Y ≈ X⁻¹, P + E = X (Λ + Δ) X⁻¹ holds for some |Δ| ≤ |X⁻¹| (|P X − X Λ| + |E| |X|). A
-    majorant of rank one, Δ_kl ≤ u_k w_l, makes the Neumann series of (ζ − Λ − Δ)⁻¹ a geometric one: what it
-    changes is at most (Σ_k |S X|_k u_k/|ζ − p_k|) (Σ_l w_l |Y Q|_l/|ζ − p_l|) / (1 − Σ_k u_k w_k/|ζ − p_k|).
+    listed
+        All sites.
+    n_s, n_r
+        How much is sent and heard by all.
     """
-    sites, n = maps.p.shape[:2]
-    scale = balance(np.max(np.abs(maps.p) + maps.error.p, axis=0))
-    values, vectors = np.empty((sites, n), np.complex128), np.empty((sites, n, n), np.complex128)
-    for place in _chunks(np.arange(sites)):
-        own, right = np.linalg.eig(maps.p[place] / scale[:, None] * scale)
-        order = np.argsort(-np.abs(own), axis=1, kind="stable")
-        values[place] = np.take_along_axis(own, order, axis=1)
-        vectors[place] = np.take_along_axis(right, order[:, None, :], axis=2)
-    inner = INNER * min(1.0, float(np.abs(values).max(initial=0.0))) or INNER
-    return _gathered(maps, scale, counts, values, vectors, inner)
-
-
-def _gathered(
-    maps: BoundedMap, scale: Floats, counts: Floats, values: Complexes, vectors: Complexes, inner: float
-) -> Transfer:
-    """Split the sites, those of equally many poles together, and put the parts side by side."""
-    sites, n = values.shape
-    n_s, n_r = maps.d.shape[1:]
-    large = (np.abs(values) > inner).sum(axis=1)
-    most = int(large.max(initial=0))
-    errors = np.full((sites, n), np.inf)
-    poles = np.zeros((most, sites), np.complex128)
-    residues = np.zeros((most, sites, n_s * n_r), np.complex128)
-    sizes = np.zeros(residues.shape)
-    doubt, block = np.zeros(sites), np.zeros(sites)
-    loop = np.zeros((sites, most + 1))
-    left, right = np.zeros((sites, most + 1, n_s)), np.zeros((sites, most + 1, n_r))
-    series = np.zeros((3, 1 + SERIES, n_s, n_r))
-    series[0, 0] += np.tensordot(counts, maps.d, 1)
-    series[1, 0] += np.tensordot(counts, np.abs(maps.d), 1)
-    series[2, 0] += np.tensordot(counts, maps.error.d, 1)
-    for count in np.unique(large).tolist():
-        for place in _chunks(np.flatnonzero(large == count)):
-            own = _balanced(maps, place, scale)
-            part = _split(own, counts[place], values[place], vectors[place], count, inner)
-            poles[:count, place] = values[place, :count].T
-            residues[:count, place] = (counts[place, None, None] * part.residues).swapaxes(0, 1)
-            sizes[:count, place] = (counts[place, None, None] * part.sizes).swapaxes(0, 1)
-            kept = [*range(count), most]  # the block comes last
-            left[np.ix_(place, kept)] = counts[place, None, None] * part.left
-            right[np.ix_(place, kept)], loop[np.ix_(place, kept)] = part.right, part.loop
-            doubt[place], block[place] = part.doubt, part.block
-            errors[place] = part.errors
-            series += part.series
-    used = max(1, 1 + int(np.flatnonzero(series.any(axis=(0, 2, 3))).max(initial=0)))
-    series = series[:, :used].copy()  # a view would keep all terms
+    series = np.zeros((1 + TERMS, 2, n_s, n_r))
+    fractions, inner = [], [float(np.finfo(np.float64).tiny)]
+    poles: list[Poles] = []
+    for which, sites in enumerate(listed):
+        size = np.abs(value_of(sites.maps.p)) + radius_of(sites.maps.p)
+        scale = balance(size.max(axis=0))
+        for start in range(0, len(size), CHUNK):
+            # Over states in other units, powers of two so that nothing is rounded.
+            p, q, s, d = (block[start : start + CHUNK] for block in sites.maps.blocks)
+            p, q, s = p / scale[:, None] * scale, q / scale[:, None], s * scale
+            values, vectors = np.linalg.eig(value_of(p))
+            order = np.argsort(-np.abs(values), axis=1, kind="stable")
+            values = np.take_along_axis(values, order, axis=1).astype(np.complex128)
+            vectors = np.take_along_axis(vectors, order[:, None, :], axis=2).astype(np.complex128)
+            inner.append(INNER * min(1.0, float(np.abs(values).max(initial=0.0))) or INNER)
+            large = (np.abs(values) > inner[-1]).sum(axis=1)
+            for count in np.unique(large).tolist():
+                some = np.flatnonzero(large == count)
+                maps = FrameMap(p[some], q[some], s[some], d[some])
+                counts = sites.counts[start + some]
+                part, error, terms = _split(
+                    maps, counts, values[some, :count], vectors[some, :, :count], FARTHER * inner[-1]
+                )
+                fractions.append(_Fractions(sites.rows, sites.lines, *part))
+                own = np.ix_(np.arange(len(terms)), np.arange(2), sites.rows, sites.lines)
+                series[own] = RADII.add(series[own], terms)
+                heard = fractions[-1].residues.any(axis=-1).reshape(len(some), count)
+                place = np.stack([np.full(len(some), which), start + some], axis=-1)
+                poles.append(Poles(values[some, :count], error, counts, heard, place))
+    innermost = FARTHER * max(inner)
     return Transfer(
-        inner=inner,
-        counts=counts,
-        eigenvalues=values,
-        eigenvalue_errors=errors,
-        poles=poles,
-        residues=residues,
-        residue_sizes=sizes,
-        residue_error=doubt,
-        block=block,
-        loop=loop,
-        left=left,
-        right=right,
-        together=(left.sum(axis=1)[:, :, None] * right.sum(axis=1)[:, None, :]).reshape(sites, n_s * n_r),
-        loops=loop.sum(axis=1),
-        series=series[0],
-        series_sizes=series[1],
-        series_errors=series[2],
+        fractions=tuple(fractions),
+        series=_shortened(series.swapaxes(0, 1).reshape(2, 1 + TERMS, n_s * n_r), innermost),
+        shape=(n_s, n_r),
+        innermost=innermost,
+        poles=_joined(poles),
     )
 
 
-def _balanced(maps: BoundedMap, place: NDArray[np.intp], scale: Floats) -> BoundedMap:
-    """Return some sites over states in other units, powers of two so that nothing is rounded."""
-    inverse = (1.0 / scale)[:, None]
-
-    def balanced(one: FrameMap) -> FrameMap:
-        p, q = one.p[place] * inverse * scale, one.q[place] * inverse
-        return FrameMap(p, q, one.s[place] * scale, one.d[place])
-
-    return BoundedMap(*balanced(maps).blocks, balanced(maps.error))
+def _shortened(series: Matrix, innermost: float) -> Matrix:
+    """Return a series of 1/ζ without what is less than a rounding of its first term."""
+    sizes = (np.abs(series[0]) + series[1]) * innermost ** -np.arange(float(1 + TERMS))[:, None]
+    left = np.cumsum(sizes[::-1], axis=0)[::-1]
+    kept = max(1, np.count_nonzero((left > CUT * UNIT * left[0]).any(axis=1)))
+    series[1, 0] += (1 + TERMS * UNIT) * left[kept:][:1].sum(axis=0)
+    return series[:, :kept]
 
 
-def _chunks(places: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
-    """Cut places into chunks."""
-    for start in range(0, len(places), CHUNK):
-        yield places[start : start + CHUNK]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Parts:
-    """A chunk of sites of equally many poles; the fields as in `Transfer`, each site counted once.
-
-    But for `series` (3, 1 + SERIES, n_s, n_r): its terms, their sizes and errors, of all sites together.
-    """
-
-    residues: Complexes
-    sizes: Floats
-    doubt: Floats
-    block: Floats
-    loop: Floats
-    left: Floats
-    right: Floats
-    errors: Floats
-    series: Floats
+def _joined(poles: Sequence[Poles]) -> Poles:
+    """Return the poles of all sites (k, K), the largest first."""
+    values = np.concatenate([one.values.ravel() for one in poles])
+    order = np.argsort(-np.abs(values), kind="stable")
+    each = [np.repeat(np.arange(len(one.values)), one.values.shape[1]) for one in poles]
+    counts, sites = (
+        np.concatenate([getattr(one, name)[row] for one, row in zip(poles, each, strict=True)])[order]
+        for name in ("counts", "sites")
+    )
+    errors, heard = (
+        np.concatenate([getattr(one, name).ravel() for one in poles])[order] for name in ("errors", "heard")
+    )
+    return Poles(values[order], errors, counts, heard, sites)
 
 
 def _split(
-    maps: BoundedMap, counts: Floats, values: Complexes, vectors: Complexes, large: int, inner: float
-) -> _Parts:
-    """Split sites that all have `large` poles beyond `inner`."""
-    sites, n = values.shape
-    charge = PRODUCT_ROUNDINGS * (n + 2) * UNIT
-    found = block_diagonal(maps.p, maps.error.p, values, vectors, large)
-    basis, dual, small, change, grown = found.basis, found.dual, found.small, found.change, found.grown
-    weight, size = np.abs(dual), np.abs(basis)
+    maps: FrameMap, counts: Floats, values: Complexes, vectors: Complexes, radius: float
+) -> tuple[tuple[Complexes, Complexes, Floats, Floats, Floats, Floats], Floats, Matrix]:
+    """Split sites that all have as many poles.
 
-    a, b = maps.s @ basis, dual @ maps.q
-    a_doubt = (maps.error.s + charge * np.abs(maps.s)) @ size
-    b_doubt = weight @ (maps.error.q * grown + charge * np.abs(maps.q))
-    b_doubt += (grown - 1) * np.abs(b).max(axis=1, keepdims=True)
-    a_size, b_size = np.abs(a), np.abs(b)
-    residues = a[:, :, :large].swapaxes(1, 2)[..., None] * b[:, :large, None, :]
-    product = (a_size + a_doubt).swapaxes(1, 2)[:, :large, :, None] * (b_size + b_doubt)[:, :large, None, :]
-    exact = np.abs(residues)
-    off = np.maximum(product - exact, 0.0) + 8 * UNIT * product
-    # Relative to each residue. One that should be nothing is off by something all the same: where that would
-    # spoil the others, it counts as large as its error says.
-    least = UNIT * product.max(axis=(1, 2, 3), initial=0.0) + np.finfo(np.float64).tiny
-    doubt = (off / np.maximum(exact, least[:, None, None, None])).max(axis=(1, 2, 3), initial=0.0)
-    whole = off.max(axis=(1, 2, 3), initial=0.0) / np.maximum(exact.max(axis=(1, 2, 3), initial=0.0), least)
-    doubt = np.minimum(doubt, np.maximum(whole, FINE))
-    sizes = np.maximum(
-        exact, (1 + 8 * UNIT) * off / np.maximum(doubt, np.finfo(np.float64).tiny)[:, None, None, None]
-    )
+    Parameters
+    ----------
+    maps
+        Those of the sites, with their radii.
+    counts
+        How often each is there (k,).
+    values, vectors
+        The poles (k, K) and their vectors (k, n, K).
+    radius
+        From which |ζ| on T is asked for.
 
-    u, w = _rank_one(block_norms(change, large))
-    left = block_norms_along(a_size + a_doubt, large) * u[:, None, :]
-    right = block_norms_along((b_size + b_doubt).swapaxes(1, 2), large) * w[:, None, :]
-    errors = np.repeat(u[:, -1:] * w[:, -1:], n, axis=1)
-    errors[:, :large] = _disc_radii(values[:, :large], u * w, inner)
-    block = block_resolvent(small, 2 * inner)
-    return _Parts(
-        residues=residues.reshape(sites, large, a.shape[1] * b.shape[2]),
-        sizes=sizes.reshape(sites, large, a.shape[1] * b.shape[2]),
-        doubt=doubt,
-        block=block,
-        loop=u * w,
-        left=left.swapaxes(1, 2),
-        right=right.swapaxes(1, 2),
-        errors=errors,
-        series=_block_series(counts, (a, b, a_doubt, b_doubt), small, charge, block, 2 * inner),
+    Returns
+    -------
+    The last fields of `_Fractions`; what the poles of each site may be off by; the terms of D, ζ⁻¹, …
+    (terms, 2, n_s, n_r).
+
+    Notes
+    -----
+    P + E = X (Λ + Δ) X⁻¹ holds for some |Δ| ≤ |X⁻¹ (P X − X Λ)|, radii included. A majorant of rank one,
+    Δ_kl ≤ u_k w_l, makes the Neumann series of (ζ − Λ − Δ)⁻¹ a geometric one: what it changes is at most
+    (Σ_k |S X|_k u_k/|ζ − p_k|) (Σ_l w_l |Y Q|_l/|ζ − p_l|) / (1 − Σ_k u_k w_k/|ζ − p_k|).
+    """
+    sites, large = values.shape
+    n, n_s, n_r = vectors.shape[1], maps.s.shape[-2], maps.q.shape[-1]
+    basis, small = _block_basis(value_of(maps.p), values, vectors)
+    diagonal = np.zeros((sites, n, n), np.complex128)
+    diagonal[:, range(large), range(large)] = values
+    diagonal[:, large:, large:] = small
+    exact = RADII.exact(basis)
+    left = RADII.subtract(RADII.multiply(maps.p, exact), RADII.multiply(exact, RADII.exact(diagonal)))
+    found = solve(exact, np.concatenate([left, maps.q], axis=-1))
+    if found is None:  # vectors that are nearly one another: nothing is known
+        found = np.full((sites, 2, n, n + n_r), np.inf, np.complex128)
+    change, b = _size(found[..., :n]), found[..., n:]
+    a = RADII.multiply(maps.s, exact)
+    residues = RADII.multiply(
+        np.moveaxis(a, -1, 1)[:, :large, ..., None], np.moveaxis(b, -2, 1)[:, :large, ..., None, :]
     )
+    residues = np.moveaxis(residues * counts[:, None, None, None, None], 2, 0)
+    terms, block = _block_series(a[..., large:], b[..., large:, :], small, radius)
+    terms = np.concatenate([maps.d[:, :, None], terms], axis=2)
+    kept = terms.shape[2]
+    terms = RADII.multiply(RADII.exact(counts[None]), terms.swapaxes(0, 1).reshape(2, sites, -1))
+    u, w = _rank_one(change)
+    u, w, sent = (_last_as_one(one, large) for one in (u[:, None], w[:, None], _size(a)))
+    heard = _last_as_one(_size(b).swapaxes(1, 2), large)
+    circle = np.concatenate([u * w, counts[:, None, None] * sent * u, w * heard], axis=1).swapaxes(1, 2)
+    error = _pole_errors(values, circle[:, :-1, 0], circle[:, -1, 0] * block / radius)
+    exact, off = residues.reshape(2, sites * large, n_s * n_r)
+    fractions = values, exact, np.abs(exact), off.real.copy(), block, circle
+    return fractions, error, terms.reshape(2, kept, n_s, n_r).swapaxes(0, 1)
+
+
+def _pole_errors(values: Complexes, own: Floats, block: Floats) -> Floats:
+    """Return how far the poles p_l can be off (k, K): Σ_l u_l w_l/|z − p_l| < 1 wherever none is nearer.
+
+    What is farther from all of them than all u w together is; and what is twice a pole's own from it, where
+    the others, at half their distance, leave it room.
+    """
+    gaps = np.abs(values[:, :, None] - values[:, None, :]) / 2
+    gaps[:, range(gaps.shape[1]), range(gaps.shape[1])] = np.inf
+    with np.errstate(all="ignore"):
+        others = (own[:, None, :] / gaps).sum(axis=2) + block[:, None]
+        together = np.where(block < 0.5, 2 * own.sum(axis=1), np.inf)[:, None]
+    return np.where(others < 0.5, np.minimum(2 * own, together), together)
+
+
+def _size(matrix: Matrix) -> Floats:
+    """Return the largest magnitudes that entries have within their radii."""
+    return np.asarray(np.abs(value_of(matrix)) + radius_of(matrix).real)
+
+
+def _block_basis(matrices: Floats, values: Complexes, vectors: Complexes) -> tuple[Complexes, Complexes]:
+    """Return X = [eigenvectors of the large values, X₂] and T₂, for many matrices.
+
+    With the vectors' QR, X_L = Q₁ R, M is block triangular over [X_L Q₂]: [Λ C; 0 T₂]. The rows of W with
+    w_k (p_k − T₂) = −c_k take C away, X₂ = Q₂ + X_L W, whether or not T₂ has a set of eigenvectors.
+    """
+    n, large = vectors.shape[1:]
+    q, r = np.linalg.qr(vectors, mode="complete")
+    rest, adjoint = q[:, :, large:], q.conj().swapaxes(1, 2)
+    moved = matrices @ rest
+    small = adjoint[:, large:] @ moved
+    coupling = np.linalg.solve(r[:, :large], adjoint[:, :large] @ moved)
+    shifted = values[:, :, None, None] * np.eye(n - large) - small[:, None]
+    mixing = np.linalg.solve(shifted.swapaxes(2, 3), -coupling[..., None])[..., 0]
+    return np.concatenate([vectors, rest + vectors @ mixing], axis=2), small
+
+
+def _block_series(row: Matrix, column: Matrix, small: Complexes, radius: float) -> tuple[Matrix, Floats]:
+    """Return the terms S X₂ T₂^j Y₂ Q of ζ^(−j−1) of each site, and a bound on ‖(ζ − T₂)⁻¹‖ |ζ| (k,).
+
+    What is left of the series is charged to the first term; both hold from |ζ| = radius on.
+
+    Parameters
+    ----------
+    row, column
+        S X₂ (k, 2, n_s, m) and Y₂ Q (k, 2, m, n_r).
+    small
+        T₂ (k, m, m).
+    radius
+        |ζ|.
+    """
+    ends = np.linalg.norm(_size(row), axis=2)[:, :, None] * np.linalg.norm(_size(column), axis=1)[:, None]
+    n_r = column.shape[-1]
+    power, block = RADII.exact(small), np.ones(len(small))
+    terms, size = 1, norms(_size(power)) / radius
+    while terms < TERMS and not (size < CUT * UNIT).all():
+        block *= 1 + size
+        column = np.concatenate([column, RADII.multiply(power, column)], axis=-1)
+        power, terms = RADII.multiply(power, power), 2 * terms
+        size = norms(_size(power)) * radius**-terms
+    block *= np.where(size < 0.5, (1 + 1e-6) / (1 - np.minimum(size, 0.5)), np.inf)
+    found = RADII.multiply(row, column)
+    real = with_radius(value_of(found).real, radius_of(found).real + np.abs(value_of(found).imag))
+    real = np.moveaxis(real.reshape(*real.shape[:-1], terms, n_r), -2, 2)
+    real[:, 1, 0] += ends * (size * block)[:, None, None]
+    return real, block
 
 
 def _rank_one(sizes: Floats) -> tuple[Floats, Floats]:
@@ -250,236 +310,91 @@ def _rank_one(sizes: Floats) -> tuple[Floats, Floats]:
     return u, w
 
 
-def _disc_radii(values: Complexes, loop: Floats, inner: float) -> Floats:
-    """Return how far the large eigenvalues can be off: where Σ_k u_k w_k/|z − p_k| < 1 there is none.
-
-    Twice all their shares together is far enough from each; its own share is, where the others, at half
-    their distance, leave it room.
-    """
-    own, total = loop[:, :-1], loop[:, :-1].sum(axis=1, keepdims=True)
-    gaps = np.abs(values[:, :, None] - values[:, None, :]) / 2
-    gaps[:, range(gaps.shape[1]), range(gaps.shape[1])] = np.inf
-    with np.errstate(divide="ignore"):
-        others = (own[:, None, :] / gaps).sum(axis=2) + loop[:, -1:] / inner
-    alone = np.where(others < 0.5, own / (1 - np.minimum(others, 0.5)), np.inf)
-    alone = np.where(alone < gaps.min(axis=2, initial=np.inf), alone, np.inf)
-    together = np.where(loop[:, -1:] / inner < 0.5, 2 * total, np.inf)
-    return np.minimum(alone, together)
+def _last_as_one(rows: Floats, large: int) -> Floats:
+    """Return rows (k, m, n) with the entries from `large` on as one, their 2-norm: (k, m, large + 1)."""
+    return np.concatenate([rows[..., :large], np.linalg.norm(rows[..., large:], axis=-1)[..., None]], axis=-1)
 
 
-def _block_series(
-    counts: Floats,
-    ends: tuple[Complexes, Complexes, Floats, Floats],
-    small: Complexes,
-    charge: float,
-    block: Floats,
-    radius: float,
-) -> Floats:
-    """Return the terms S X₂ T₂^j Y₂ Q of ζ^(−j−1) of all sites, their sizes, and what they may be off by.
-
-    What is left of the series when it is cut, at |ζ| = radius, is charged to the constant term.
+def powers(points: Complexes, reach: Floats, exponents: Integers) -> Matrix:
+    """Return ζ^−l in discs (3, z, l), by Taylor's remainder; a power loses a rounding a turn or so.
 
     Parameters
     ----------
-    counts
-        How often each site is there (k,).
-    ends
-        S X (k, n_s, n) and Y Q (k, n, n_r), and what they may be off by.
-    small
-        T₂ (k, m, m), over the last m states.
-    charge
-        What a product is off by, relative to that of the sizes.
-    block, radius
-        The bound on ‖(ζ − T₂)⁻¹‖ (k,) from |ζ| = radius on.
+    points, reach
+        The discs (z,).
+    exponents
+        The l.
     """
-    large = ends[0].shape[2] - small.shape[2]
-    row, column, row_doubt, doubt = (
-        ends[0][:, :, large:],
-        ends[1][:, large:],
-        ends[2][:, :, large:],
-        ends[3][:, large:],
-    )
-    lines, together = column.shape[2], 2**DOUBLINGS
-    terms = np.zeros((3, 1 + SERIES, row.shape[1], lines))
-    row_size = np.abs(row)
-    height = np.linalg.norm(row_size, axis=2)[:, :, None]
-    first = height * np.linalg.norm(np.abs(column), axis=1)[:, None, :]
-    left = first * block[:, None, None]
-    column, doubt, power, power_doubt = _doubled(column, doubt, small, charge)
-    for term in range(0, SERIES, together):
-        more = ~(left <= CUT * UNIT * first).all(axis=(1, 2))
-        if not more.any():
-            break
-        if 2 * np.count_nonzero(more) < len(more):  # go on with the few sites that die out slowly
-            terms[2, 0] += np.tensordot(counts[~more], left[~more], 1)
-            counts, block, height, first = (one[more] for one in (counts, block, height, first))
-            row, row_size, row_doubt = row[more], row_size[more], row_doubt[more]
-            column, doubt = column[more], doubt[more]
-            power, power_doubt = power[more], power_doubt[more]
-        size = np.abs(column)
-        value, rounded, most = row @ column, doubt + charge * size, size + doubt
-        off = row_size @ rounded + row_doubt @ most + np.abs(value.imag)
-        for kind, part in enumerate((value.real, np.abs(value), off)):
-            added = np.tensordot(counts, part, 1).reshape(-1, together, lines)
-            terms[kind, term + 1 : term + 1 + together] += added.swapaxes(0, 1)
-        column, doubt = power @ column, np.abs(power) @ rounded + power_doubt @ most
-        dying = np.linalg.norm(np.abs(column[:, :, :lines]), axis=1)[:, None, :]
-        left = height * dying * (block * radius ** -(term + together))[:, None, None]
-    terms[2, 0] += np.tensordot(counts, left, 1)
-    return terms
+    near = np.maximum(np.abs(points) - reach, np.finfo(np.float64).tiny)[:, None]
+    share = reach[:, None] / near
+    value = (1 / points)[:, None] ** exponents  # far out, it dies out to nothing
+    off = share**2 * exponents * (exponents + 1) / 2 + (1 + exponents * share) * (16 + 8 * exponents) * UNIT
+    slope = -exponents * reach[:, None] * value / points[:, None]
+    return np.stack([value, (1 / near) ** exponents * off, slope])
 
 
-def _doubled(
-    column: Complexes, doubt: Floats, small: Complexes, charge: float
-) -> tuple[Complexes, Floats, Complexes, Floats]:
-    """Return C, T C, T² C, … side by side, the next power of T, and what both may be off by.
+def add_fractions(
+    transfer: Transfer, total: Matrix, points: Complexes, reach: Floats, *, bounded: bool = True
+) -> None:
+    """Add to what its series gives in discs what T's poles do; a radius is NaN where it is not known.
 
     Parameters
     ----------
-    column, doubt
-        C (k, m, n_r), and what it may be off by.
-    small
-        T (k, m, m).
-    charge
-        What a product is off by, relative to that of the sizes.
-    """
-    power, power_doubt = small, np.zeros(small.shape)
-    for _ in range(DOUBLINGS):
-        size, weight = np.abs(column), np.abs(power)
-        more = weight @ (doubt + charge * size) + power_doubt @ (size + doubt)
-        column = np.concatenate([column, power @ column], axis=2)
-        doubt = np.concatenate([doubt, more], axis=2)
-        power_doubt = weight @ (power_doubt + charge * weight) + power_doubt @ (weight + power_doubt)
-        power = power @ power
-    return column, doubt, power, power_doubt
-
-
-# A pole nearer than the inverse of this is looked at by itself.
-CLOSE = 300.0
-
-# Answers computed together: they stay in the cache of a processor.
-ANSWERS = 65_536
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Response:
-    """T(ζ + h) = `value` + h · `slope`, but for what `doubt` bounds in the disc (z, n_s, n_r)."""
-
-    value: Complexes
-    slope: Complexes
-    doubt: Floats
-
-
-def respond(transfers: Sequence[Transfer], points: Complexes, reach: Floats) -> Response:
-    """Add up what all sites answer at some points, and bound it in discs about them.
-
-    Parameters
-    ----------
-    transfers
-        The sites, those of a structure together.
-    points
-        ζ (z,), the centres.
-    reach
-        The discs' radii ρ (z,).
+    transfer
+        T.
+    total
+        The answers (z, 3, n_s, n_r), written over.
+    points, reach
+        The discs (z,).
+    bounded
+        Whether radii are asked for.
 
     Notes
     -----
     1/(ζ + h − p) = q − h q² + h² q²/(ζ + h − p), q = 1/(ζ − p): the last is at most (ρ|q|)² |q|/(1 − ρ|q|).
     """
-    shape = (len(points), *transfers[0].series.shape[1:])
-    value, slope = np.zeros(shape, np.complex128), np.zeros(shape, np.complex128)
-    doubt = np.zeros(shape)
-    # Each chunk's sum rounds once a pole, the sum of the chunks once a chunk.
-    chunks = sum(1 + one.poles.shape[1] // CHUNK for one in transfers)
-    most = max((len(one.poles) * min(CHUNK, one.poles.shape[1]) for one in transfers), default=0)
-    rounding = (most + chunks + 16) * 2 * UNIT
-    for one in transfers:
-        _add_series(one, points, reach, value, slope, doubt)
-        for chunk, places in _pieces(one, points):
-            at, radius = points[places], reach[places, None, None]
-            residues = one.residues[:, chunk].reshape(one.poles[:, chunk].size, shape[1] * shape[2])
-            sizes = one.residue_sizes[:, chunk].reshape(residues.shape)
-            inverse = 1.0 / (at[:, None, None] - one.poles[:, chunk])
-            far, flat = np.abs(inverse), (len(at), -1)
-            value[places] += (inverse.reshape(flat) @ residues).reshape(len(at), *shape[1:])
-            inverse *= inverse
-            slope[places] -= (inverse.reshape(flat) @ residues).reshape(len(at), *shape[1:])
-            with np.errstate(divide="ignore", invalid="ignore"):
-                moved = radius * far
-                near = far / (1 - moved)  # 1/(|ζ − p| − ρ)
-                # Negative where a pole is in the disc: nothing is known there.
-                lost = near.min(axis=(1, 2), initial=0.0) < 0
-                moved *= moved
-                moved += 3 * (one.residue_error[chunk] + rounding)  # of the value, and twice of the slope
-                moved *= near
-                bound = (moved.reshape(flat) @ sizes).reshape(len(at), *shape[1:]) + _reaction(
-                    one, chunk, near
-                )
-            bound[lost] = np.nan
-            doubt[places] += bound
-    return Response(value, slope, doubt)
-
-
-def _reaction(one: Transfer, chunk: slice, near: Floats) -> Floats:
-    """Return what the errors of a chunk's P do at most (z, n_s, n_r), see `build_transfer`.
-
-    Sites whose poles are all far count all their poles as the nearest; only for the others it matters which.
-    """
-    nearest = np.maximum(near.max(axis=1, initial=0.0), one.block[chunk])
-    close = ~(nearest <= CLOSE)
-    nearest[close] = 0.0
-    reach = nearest * one.loops[chunk]
-    total = (nearest * nearest / np.where(reach < 1, 1 - reach, 0.0)) @ one.together[chunk]
-    left, right = one.left[chunk], one.right[chunk]
-    total = total.reshape(len(near), left.shape[2], right.shape[2])
-    place, site = np.nonzero(close)
-    if len(place):
-        wide = np.concatenate([near[place, :, site], one.block[chunk][site, None]], axis=1)[:, None, :]
-        circle = (wide[:, 0] * one.loop[chunk][site]).sum(axis=1)
-        sent = (wide @ left[site])[:, 0] / np.where(circle < 1, 1 - circle, 0.0)[:, None]
-        np.add.at(total, place, sent[:, :, None] * (wide @ right[site])[:, 0][:, None, :])
-    return np.asarray(total)
-
-
-def differentiate(transfers: Sequence[Transfer], points: Complexes) -> tuple[Complexes, Complexes]:
-    """Return T (z, n_s, n_r) at some points (z,), and dT/dζ."""
-    shape = (len(points), *transfers[0].series.shape[1:])
-    value, slope = np.zeros(shape, np.complex128), np.zeros(shape, np.complex128)
-    for one in transfers:
-        exponents = np.arange(len(one.series))
-        power = points[:, None] ** -exponents
-        value += np.einsum("zj,jsr->zsr", power, one.series)
-        slope -= np.einsum("zj,jsr->zsr", power * exponents / points[:, None], one.series)
-        for chunk, places in _pieces(one, points):
-            at = points[places]
-            inverse = (1.0 / (at[:, None, None] - one.poles[:, chunk])).reshape(len(at), -1)
-            residues = one.residues[:, chunk].reshape(one.poles[:, chunk].size, shape[1] * shape[2])
-            value[places] += (inverse @ residues).reshape(len(at), *shape[1:])
-            slope[places] -= ((inverse * inverse) @ residues).reshape(len(at), *shape[1:])
-    return value, slope
-
-
-def _pieces(one: Transfer, points: Complexes) -> Iterator[tuple[slice, slice]]:
-    """Yield which sites answer at which points together."""
-    count, sites = one.poles.shape
-    most = max(1, ANSWERS // max(1, min(sites, CHUNK) * count))
-    for start in range(0, sites, CHUNK):
-        for place in range(0, len(points), most):
-            yield slice(start, start + CHUNK), slice(place, place + most)
-
-
-def _add_series(
-    one: Transfer, points: Complexes, reach: Floats, value: Complexes, slope: Complexes, doubt: Floats
-) -> None:
-    """Add D and what dies out at once, and their bounds."""
-    terms = np.arange(len(one.series))
-    power = points[:, None] ** -terms
-    value += np.einsum("zj,jsr->zsr", power, one.series)
-    slope -= np.einsum("zj,jsr->zsr", power * terms / points[:, None], one.series)
     nearest = np.abs(points) - reach
-    nearest = np.where(nearest >= 2 * one.inner, nearest, np.nan)  # too near to zero: nothing is known
-    sizes, share = nearest[:, None] ** -terms, (reach / nearest)[:, None]
-    rounded = sizes * (1 + terms * share)
-    doubt += np.einsum("zj,jsr->zsr", rounded, one.series_errors + 64 * UNIT * one.series_sizes)
-    # Taylor's remainder of ζ^−j.
-    doubt += np.einsum("zj,jsr->zsr", sizes * share**2 * (terms * (terms + 1) / 2), one.series_sizes)
+    # A quotient rounds, a product, each sum over poles and that of all parts.
+    rounded = 4 * (8 + len(transfer.fractions) + max(one.poles.size for one in transfer.fractions)) * UNIT
+    for one in transfer.fractions:
+        for some in _pieces(one, len(points)):
+            inverse, radius = 1.0 / (points[some, None, None] - one.poles), reach[some, None, None]
+            found = np.zeros((len(inverse), 3, len(one.rows), len(one.lines)), np.complex128)
+            found[:, 0] = _by_poles(inverse, one.residues, found)
+            if bounded:
+                moved = radius * (far := np.abs(inverse))
+                with np.errstate(all="ignore"):
+                    near = far / (1 - moved)  # 1/(|ζ − p| − ρ), negative where a pole is in the disc
+                    near[near.min(axis=(1, 2), initial=0.0) < 0] = np.nan
+                found[:, 1] = _by_poles(near, one.errors, found) + _reaction(one, near, nearest[some])
+                moved *= moved
+                moved += rounded
+                moved *= near
+                found[:, 1] += _by_poles(moved, one.sizes, found)
+            inverse *= inverse
+            found[:, 2] = -radius * _by_poles(inverse, one.residues, found)
+            total[some, :, one.rows[:, None], one.lines] += found
+    total[~(nearest >= transfer.innermost), 1] = np.nan
+
+
+def _by_poles(inverse: Matrix, residues: Matrix, shape: Matrix) -> Matrix:
+    """Return what poles (z, k, K) weighed by residues (k · K, n_s · n_r) add up to (z, n_s, n_r)."""
+    return (inverse.reshape(len(inverse), -1) @ residues).reshape(len(inverse), *shape.shape[2:])
+
+
+def _reaction(one: _Fractions, near: Floats, nearest: Floats) -> Floats:
+    """Return what the errors of P do at most (z, n_s, n_r), see `_split`, where |ζ| is at least `nearest`."""
+    n_s = len(one.rows)
+    summed = near.swapaxes(0, 1) @ one.circle[:, :-1]
+    summed += (one.block[:, None] / nearest)[..., None] * one.circle[:, -1:]
+    circle, sent, heard = summed[..., 0], summed[..., 1 : n_s + 1], summed[..., n_s + 1 :]
+    with np.errstate(all="ignore"):
+        sent = sent / np.where(circle < 1, 1 - circle, np.nan)[..., None]
+    return np.asarray(sent.transpose(1, 2, 0) @ heard.swapaxes(0, 1))
+
+
+def _pieces(one: _Fractions, points: int) -> Iterator[slice]:
+    """Yield which points are answered together."""
+    most = max(1, ANSWERS // max(1, one.poles.size))
+    for start in range(0, points, most):
+        yield slice(start, start + most)

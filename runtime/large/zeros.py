@@ -15,9 +15,9 @@ finds nothing. A count around the pole tells.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,6 @@ from apc.large.characteristic import (
     count_around,
     refine,
 )
-from apc.large.transfer import Transfer
 
 Complexes = NDArray[np.complex128]
 Floats = NDArray[np.float64]
@@ -58,8 +57,8 @@ INMOST = 1.1
 SMALL_ARCS, SMALL_POINTS = 12, 300
 
 # Circles between which the largest eigenvalue must be are drawn together until they are this close,
-# relatively, at the cost of no more counts than these; a circle that can't be counted is tried so far aside.
-BRACKETED, MOST_COUNTS, BESIDE = 1e-3, 40, 1e-4
+# relatively, at the cost of no more counts than these; the first circle that is tried is so far aside.
+BRACKETED, MOST_COUNTS, BESIDE = 1e-3, 40, 1e-6
 
 # Points from which a circle about a zero is looked for, and circles tried from each.
 LOOKS = 4
@@ -72,40 +71,37 @@ def held_around(function: Characteristic, point: complex) -> tuple[float, int]:
     """
     aside = ASIDE * abs(point)
     for _ in range(LOOKS):
-        ball = characteristic_ball(function, np.array([point + aside]), np.zeros(1))
-        radius = max(CLEAR * float(ball.change[0]) * aside, FIRST_RADIUS * abs(point))
+        radius = _least_radius(function, point, aside)
         for _ in range(LOOKS):
             if not radius < WIDEST * abs(point):
                 break
-            inside = count_around(function, point, radius, arcs=SMALL_ARCS, most=SMALL_POINTS)
-            poles = poles_within(function, point, radius)
-            if inside is not None and poles is not None and inside + poles > 0:
-                return radius, inside + poles
+            if (held := _held_in(function, point, radius)) > 0:
+                return radius, held
             radius *= WIDER
         aside /= NEARER  # a pole or another zero may be that close
     return float(np.inf), 0
 
 
-def poles_within(function: Characteristic, centre: complex, radius: float) -> int | None:
-    """Return how many poles are within a circle, each as often as f has it; None: no telling."""
-    total = 0
-    for one in function.transfers:
-        distance = np.abs(one.eigenvalues - centre)
-        if np.any(np.abs(distance - radius) <= one.eigenvalue_errors):
-            return None
-        total += int((distance < radius).sum())
-    return total
+def _least_radius(function: Characteristic, point: complex, aside: float) -> float:
+    """Return the radius of the least circle about a zero worth counting, by how f is known aside of it."""
+    ball = characteristic_ball(function, np.array([point + aside]), np.zeros(1))
+    return max(CLEAR * float(ball.change[0]) * aside, FIRST_RADIUS * abs(point))
 
 
-def _poles_beyond(function: Characteristic, radius: float) -> int | None:
-    """Return how many of the sites' eigenvalues are larger, multiplicities counted; None: no telling."""
-    total = 0
-    for one in function.transfers:
-        size = np.abs(one.eigenvalues)
-        if np.any(np.abs(size - radius) <= one.eigenvalue_errors):
-            return None
-        total += int(((size > radius).sum(axis=1) * one.counts).sum())
-    return total
+def _held_in(function: Characteristic, point: complex, radius: float) -> int:
+    """Return how many eigenvalues are within a circle, −1 if that can't be told: poles as f has them."""
+    inside = count_around(function, point, radius, arcs=SMALL_ARCS, most=SMALL_POINTS)
+    poles = _poles_in(function, point, radius, 1)
+    return -1 if inside is None or poles is None else inside + poles
+
+
+def _poles_in(function: Characteristic, point: complex, radius: float, each: Floats | int) -> int | None:
+    """Return how many poles are within a circle, each so often; None: no telling."""
+    poles = function.transfer.poles
+    distance = np.abs(poles.values - point)
+    if np.any(np.abs(distance - radius) <= poles.errors):
+        return None
+    return int(((distance < radius) * each).sum())
 
 
 def beyond(function: Characteristic, radius: float, rigid: int) -> int | None:
@@ -120,42 +116,42 @@ def beyond(function: Characteristic, radius: float, rigid: int) -> int | None:
     rigid
         How many eigenvalues are 1.
     """
-    poles = _poles_beyond(function, radius)
+    counts = function.transfer.poles.counts
+    poles = _poles_in(function, 0.0, radius, counts)
     turns = None if poles is None else count_around(function, 0.0, radius, arcs=_arcs(function))
     if poles is None or turns is None:
         return None
-    return poles - turns - (rigid if radius < 1 else 0)
+    return int(counts.sum()) - poles - turns - (rigid if radius < 1 else 0)
 
 
 def _arcs(function: Characteristic) -> int:
     """Return how many arcs to begin with: f turns as often as its longest delay has frames."""
-    return max(FIRST_ARCS, 2 * max(function.lags, default=0))
+    return max(FIRST_ARCS, 2 * function.longest)
 
 
-def just_outside(
-    function: Characteristic, largest: float, error: float, rigid: int, rigid_radius: float
+def count_from(
+    function: Characteristic, radius: float, step: float, rigid: int, rigid_radius: float
 ) -> tuple[float, int]:
-    """Return a circle just outside of the largest zero, and how many eigenvalues are beyond, or −1.
+    """Return the first circle outwards that can be counted, and how many eigenvalues are beyond, or −1.
 
     Parameters
     ----------
     function
         f.
-    largest, error
-        The largest one's magnitude, and what it may be off by.
+    radius, step
+        Where to begin, and by how much more to step out, then ever more.
     rigid, rigid_radius
         How many eigenvalues are 1, and the circle about 1 that has no others.
     """
-    width = max(OUTSIDE * error, 4 * FIRST_RADIUS) if np.isfinite(error) else WIDEST
     for _ in range(TRIES):
-        radius = max(largest + width, function.innermost * INMOST)
-        if rigid and abs(radius - 1) <= rigid_radius:
-            radius = 1 + 2 * rigid_radius
-        found = beyond(function, radius, rigid)
-        if found is not None:
-            return radius, found
-        width *= WIDER
-    return largest + width, -1
+        near = max(radius + step, function.innermost * INMOST)
+        if rigid and abs(near - 1) <= rigid_radius:
+            near = 1 + 2 * rigid_radius
+        found = beyond(function, near, rigid)
+        if found is not None and found >= 0:
+            return near, found
+        step *= WIDER
+    return radius + step, -1
 
 
 def bracket(
@@ -177,42 +173,27 @@ def bracket(
     inmost = function.innermost * INMOST
     outer, radius, step = float(np.inf), max(high, low, inmost), 1e-6
     for _ in range(MOST_COUNTS):
-        radius, found = _count_near(function, radius, rigid, rigid_radius)
-        if found == 0:
-            outer = min(outer, radius)
-        elif found > 0:
-            low = max(low, radius)
+        near, found = count_from(function, radius, BESIDE * radius, rigid, rigid_radius)
+        if found >= 0 and near < outer:
+            low, outer = (low, near) if found == 0 else (max(low, near), outer)
         elif np.isfinite(outer):
             break  # what can't be counted here is left between the two
+        if outer <= max(low, inmost) * (1 + BRACKETED):
+            break
         if np.isfinite(outer):
-            if outer <= max(low, inmost) * (1 + BRACKETED):
-                break
             radius = max(float(np.sqrt(max(low, outer / 2) * outer)), inmost)
         else:
             radius, step = radius * (1 + step), step * WIDER
     return low, outer
 
 
-def _count_near(
-    function: Characteristic, radius: float, rigid: int, rigid_radius: float
-) -> tuple[float, int]:
-    """Return a radius near to one, and how many eigenvalues are beyond it; −1 if that can't be told."""
-    for aside in (0.0, BESIDE, -BESIDE):
-        near = radius * (1 + aside)
-        if near > function.innermost and not (rigid and abs(near - 1) <= rigid_radius):
-            found = beyond(function, near, rigid)
-            if found is not None and found >= 0:
-                return near, found
-    return radius, -1
-
-
 # Zeros nearer to one another than this, relatively, are one that was found twice.
 SAME = 1e-11
 
-# Poles that are eigenvalues themselves, looked at of each structure.
+# Poles that are eigenvalues themselves, looked at of all.
 MOST_HELD = 64
 
-# Poles taken out of f, of each structure, where zeros are looked for: those that population about the zeros.
+# Poles taken out of f where zeros are looked for: those that population about the zeros.
 TAKEN_OUT = 128
 
 # Points on a ring, and poles, to look for missed zeros from.
@@ -273,22 +254,26 @@ def find_zeros(
     listed
         How many of the largest eigenvalues to report.
     near
-        How many of the largest poles, of each structure, zeros are looked for close to.
+        How many of the largest poles zeros are looked for close to.
     """
-    if not max(float(one.eigenvalue_errors.max(initial=0.0)) for one in function.transfers) < FARTHEST:
+    if not function.transfer.poles.errors.max(initial=0.0) < FARTHEST:
         return Zeros(0.0, float(np.inf), 0.0, (), False, not rigid)
-    rigid_radius = _rigid_radius(function, rigid)
+    least = _least_radius(function, 1.0, ASIDE)
+    rigid_radius = _rigid_radius(function, rigid, [least * WIDER**more for more in range(16)], 0.0)
     exact = [one for one in _held_poles(function) if abs(one.value - 1) > rigid_radius]
     poles = near_poles(function, TAKEN_OUT)
     close = near_poles(function, near) * (1 + 1e-7)
     zeros = _distinct(refine(function, np.concatenate([starts, close]), poles=poles), rigid_radius)
-    rigid_radius = _widened(function, zeros, rigid, rigid_radius)
+    # Where several are one, Newton's method arrives at the root of its rounding only.
+    wider = sorted((2 * np.abs(zeros - 1)[np.abs(zeros - 1) < WIDEST]).tolist(), reverse=True)
+    rigid_radius = _rigid_radius(function, rigid, wider, rigid_radius)
     zeros = _distinct(zeros, rigid_radius)
-    error_of = cache(partial(_zero_error, function))
+    error_of = cache(lambda zero: held_around(function, zero)[0])
     low, high, beyond = 0.0, 0.0, -1
     for search in range(SEARCHES):
         largest, error = _largest(zeros, exact, error_of)
-        high, beyond = just_outside(function, largest, error, rigid, rigid_radius)
+        width = max(OUTSIDE * error, 4 * FIRST_RADIUS) if np.isfinite(error) else WIDEST
+        high, beyond = count_from(function, largest, width, rigid, rigid_radius)
         if not beyond:
             break
         if beyond < 0 or search:  # from where it must be, if nothing was found from around what is known
@@ -324,58 +309,33 @@ def _largest(
     return (abs(largest.value), largest.error) if largest else (0.0, 0.0)
 
 
-def _rigid_radius(function: Characteristic, rigid: int) -> float:
-    """Return the radius of a circle about 1 within which all zeros are the rigid ones, 0 without any."""
+def _rigid_radius(function: Characteristic, rigid: int, radii: Sequence[float], known: float) -> float:
+    """Return the first of some circles about 1 in which all eigenvalues are the rigid ones.
+
+    Without one, that which is known; 0 where nothing is rigid, and `WIDEST` where none is shown.
+    """
     if not rigid:
         return 0.0
-    ball = characteristic_ball(function, np.array([1 + 1e-7]), np.zeros(1))
-    radius = max(CLEAR * float(ball.change[0]) * 1e-7, FIRST_RADIUS)
-    while radius < WIDEST:
-        inside = count_around(function, 1.0, radius, arcs=SMALL_ARCS, most=SMALL_POINTS)
-        poles = poles_within(function, 1.0, radius)
-        if inside is not None and poles is not None and inside + poles == rigid:
-            return radius
-        radius *= WIDER
-    return WIDEST
-
-
-def _widened(function: Characteristic, zeros: Complexes, rigid: int, radius: float) -> float:
-    """Return a circle about 1 that holds the rigid zeros as Newton's method found them, and no others.
-
-    Where several are one, it arrives at the root of its rounding only.
-    """
-    distances = np.abs(zeros - 1)
-    for distance in np.sort(distances[(distances > radius) & (distances < WIDEST)])[::-1]:
-        wider = 2 * float(distance)
-        inside = count_around(function, 1.0, wider, arcs=SMALL_ARCS, most=SMALL_POINTS)
-        poles = poles_within(function, 1.0, wider)
-        if rigid and inside is not None and poles is not None and inside + poles == rigid:
-            return wider
-    return radius
+    found = (radius for radius in radii if radius < 2 * WIDEST and _held_in(function, 1.0, radius) == rigid)
+    return next(found, known or WIDEST)
 
 
 def _held_poles(function: Characteristic) -> list[Zero]:
     """Return the poles that are eigenvalues themselves: of sites that are alike, or that nobody hears.
 
-    Of each structure the largest few.
+    Of all the largest few.
     """
-    found = []
-    for which, one in enumerate(function.transfers):
-        unheard = ~one.residues.any(axis=2)
-        times = np.where(unheard, one.counts, one.counts - 1)
-        times = np.where((np.abs(one.poles) > 0) & (one.poles.imag >= 0), times, 0)
-        for place, site in _largest_poles(one, times > 0):
-            error = float(one.eigenvalue_errors[site, place])
-            many = int(times[place, site])
-            found.append(Zero(complex(one.poles[place, site]), error, many, (which, site)))
-    return found
+    poles = function.transfer.poles
+    times = np.where(poles.heard, poles.counts - 1, poles.counts)
+    held = np.flatnonzero((times > 0) & (poles.values.imag >= 0))[:MOST_HELD]
+    return [_own(function, place, float(poles.errors[place]), int(times[place])) for place in held.tolist()]
 
 
-def _largest_poles(one: Transfer, chosen: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    """Return where the largest few of some poles of a structure are, each its place and its site."""
-    places, sites = np.nonzero(chosen)
-    order = np.argsort(-np.abs(one.poles[places, sites]), kind="stable")[:MOST_HELD]
-    return zip(places[order].tolist(), sites[order].tolist(), strict=True)
+def _own(function: Characteristic, place: int, error: float, times: int) -> Zero:
+    """Return a pole as an eigenvalue."""
+    poles = function.transfer.poles
+    which, site = poles.sites[place].tolist()
+    return Zero(complex(poles.values[place]), error, times, (which, site))
 
 
 def _cancelled_poles(
@@ -383,27 +343,22 @@ def _cancelled_poles(
 ) -> list[Zero]:
     """Return the poles beyond a circle that are eigenvalues all the same, as a count around each tells.
 
-    Of each structure the largest few.
+    Of all the largest few.
     """
     found: list[Zero] = []
     taken = [*zeros.tolist(), *(one.value for one in known)]
-    for which, one in enumerate(function.transfers):
-        outside = (np.abs(one.poles) >= beyond * (1 - SAME)) & (one.poles.imag >= 0)
-        outside &= (np.abs(one.poles) > 0) & (np.abs(one.poles - 1) > rigid_radius)
-        for place, site in _largest_poles(one, outside):
-            pole = complex(one.poles[place, site])
-            if any(abs(pole - other) <= SAME * abs(pole) for other in taken):
-                continue
-            taken.append(pole)
-            error, many = held_around(function, pole)
-            if np.isfinite(error) and not any(abs(pole - zero) <= 2 * error for zero in zeros.tolist()):
-                found.append(Zero(pole, error, many, (which, site)))
+    poles = function.transfer.poles
+    outside = (np.abs(poles.values) >= beyond * (1 - SAME)) & (poles.values.imag >= 0)
+    outside &= np.abs(poles.values - 1) > rigid_radius
+    for place in np.flatnonzero(outside)[:MOST_HELD].tolist():
+        pole = complex(poles.values[place])
+        if any(abs(pole - other) <= SAME * abs(pole) for other in taken):
+            continue
+        taken.append(pole)
+        error, many = held_around(function, pole)
+        if np.isfinite(error) and not any(abs(pole - zero) <= 2 * error for zero in zeros.tolist()):
+            found.append(_own(function, place, error, many))
     return found
-
-
-def _zero_error(function: Characteristic, zero: complex) -> float:
-    """Return the radius of a circle about an estimate that has an eigenvalue in it, inf if none is shown."""
-    return held_around(function, zero)[0]
 
 
 def _distinct(zeros: Complexes, rigid_radius: float) -> Complexes:
@@ -434,10 +389,6 @@ def _search(
 
 
 def near_poles(function: Characteristic, most: int) -> Complexes:
-    """Return the largest poles of f in the upper half plane (z,), no more than `most` of each structure."""
-    found = [np.zeros(0, np.complex128)]
-    for one in function.transfers:
-        heard = one.residues.any(axis=2) & (one.poles.imag >= 0) & (np.abs(one.poles) > 0)
-        part = one.poles[heard]
-        found.append(part[np.argsort(-np.abs(part), kind="stable")[:most]])
-    return np.concatenate(found)
+    """Return the largest poles of f in the upper half plane (z,), no more than `most`."""
+    poles = function.transfer.poles
+    return poles.values[poles.heard & (poles.values.imag >= 0)][:most]

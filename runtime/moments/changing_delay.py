@@ -159,7 +159,8 @@ def _gain(loop: Loop, heard: _Heard, ratios: Ratios, sizes: Sizes) -> float:
         (g, line, row)
         for g, (site, listed) in enumerate(zip(now.sites, rows, strict=True))
         for line, row in enumerate(listed)
-        if heard.spread[row] and (site.lifted.q[:, line].any() or site.lifted.d[:, line].any())
+        if heard.spread[row]
+        and any(value_of(block)[:, line].any() for block in (site.lifted.q, site.lifted.d))
     ]
     # Of several numbers that are heard as one, that which counts once is what the others add to.
     entering = [
@@ -174,7 +175,7 @@ def _gain(loop: Loop, heard: _Heard, ratios: Ratios, sizes: Sizes) -> float:
             if site == g:
                 before[:, line, n + place] = share, 8 * np.finfo(float).eps * share
         feedback.append(Feedback(hears.now, before))
-    closed = close([site.lifted.bounded for site in now.sites], feedback, layout, numbers=RADII)
+    closed = close([site.lifted for site in now.sites], feedback, layout, numbers=RADII)
     before = np.zeros_like(closed.sent)
     senders = [
         (h, row, one) for h, site in enumerate(now.sites) for row, one in enumerate(site.schedule.sent)

@@ -27,6 +27,7 @@ from apc.eigen.rigid import find_rigid_modes
 from apc.frame.exchange import Exchange
 from apc.frame.lift import FrameMap
 from apc.frame.parameters import resolve
+from apc.frame.radius import radius_of, value_of
 from apc.frame.schedule import Event, Schedule, Selected, Send, Sent, Tick, Way, tick_by_tick
 from apc.frame.scheduling import build_schedules
 from apc.frame.taylor import arithmetic_of, entrywise
@@ -295,7 +296,7 @@ def _luck(common: Loop, weights: Coupling, memories: Sequence[Remembered]) -> li
 
 def standing_motions(loop: Loop) -> Floats:
     """Return the rigid motions of a loop over its sites' own states."""
-    states = sum(len(site.lifted.z_names) for site in loop.sites)
+    states = sum(len(site.z_names) for site in loop.sites)
     return find_rigid_modes(without_packets(loop), with_drifts=False).basis[:states]
 
 
@@ -349,7 +350,7 @@ def remembered_of(
     """
     heard: dict[Route, list[Selected]] = {}
     for site, rows in zip(common.sites, told.of(common), strict=True):
-        size = site.lifted.mapped(lambda block, off: np.abs(block) + off, site.lifted.error)
+        size = site.lifted.mapped(lambda block: np.abs(value_of(block)) + radius_of(block))
         felt: Flags = np.any(size.q, axis=0) | np.any(size.d, axis=0)
         for place, row in enumerate(rows):
             if felt[place] and not row.gap:

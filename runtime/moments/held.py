@@ -32,7 +32,7 @@ from apc.eigen.modes import dense_loop
 from apc.eigen.peers import MOST_STATES, PeerGroup
 from apc.eigen.relative import Relative, relative_coordinates, relative_rows, with_doubt
 from apc.frame.parameters import resolve
-from apc.frame.radius import RADII
+from apc.frame.radius import RADII, value_of
 from apc.frame.schedule import Heard, Schedule
 from apc.moments.crowd import Hearing, standing_motions
 from apc.moments.mean_loops import standing_state
@@ -150,7 +150,8 @@ def _unheld(link: Link, schedules: Sequence[Schedule]) -> str:
 
 def lossy_rows(group: PeerGroup, lossy: frozenset[str]) -> list[tuple[int, Heard]]:
     """Return the rows of r of a site that hear a link of some and that something follows from."""
-    counts = np.abs(group.lifted.q).sum(axis=0) + np.abs(group.lifted.d).sum(axis=0)
+    q, d = value_of(group.lifted.q), value_of(group.lifted.d)
+    counts = np.abs(q).sum(axis=0) + np.abs(d).sum(axis=0)
     return [
         (line, one)
         for line, one in enumerate(group.schedule.heard)
@@ -222,7 +223,7 @@ def held_loop(loop: Loop, ears: Sequence[Ear], lossy: frozenset[str]) -> HeldLoo
                     doubt = 0.0 if ear.sender is None else loop.doubts.get(heard.way, 0.0)
                     before[:, line, at] = bounded_weight(weight, doubt)
         feedback.append(Feedback(heard_there.now, before))
-    closed = close([group.lifted.bounded for group in deaf.sites], feedback, layout, numbers=RADII)
+    closed = close([group.lifted for group in deaf.sites], feedback, layout, numbers=RADII)
     firsts = np.cumsum([0] + [len(group.schedule.sent) for group in deaf.sites]).tolist()
     senders = [(ear.sender, ear.row) for ear in ears if ear.sender is not None]
     sent = closed.sent[:, [firsts[sender] + row for sender, row in senders]]
@@ -300,7 +301,7 @@ def every_channel(
             link = loop.sites[ear.sender].schedule.sent[ear.row].link
             of_way.setdefault((link, g, ear.sender), []).append(len(ears))
             ears.append(ear)
-    states = sum(len(site.lifted.z_names) for site in loop.sites) + len(ears)
+    states = sum(len(site.z_names) for site in loop.sites) + len(ears)
     if most is not None and states > most:
         what = f"{peers:,} peers and their channels have {states:,} states"
         raise UnservedError(f"{what}, and {most} are the most")

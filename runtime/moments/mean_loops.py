@@ -174,7 +174,7 @@ def with_memory(group: PeerGroup, remembered: Sequence[Remembered], frame: Frame
     frame
         Its map, where it is not the group's: over a cell, say.
     """
-    plain, row_of = frame or group.lifted.bounded, {one: row for row, one in enumerate(group.schedule.sent)}
+    plain, row_of = frame or group.lifted, {one: row for row, one in enumerate(group.schedule.sent)}
     numbers = [
         (one, channel)
         for one in remembered
@@ -321,7 +321,7 @@ def standing_state(matrix: Matrix, standing: Floats, loop: Loop, offsets: Sequen
     ApcError
         E806 the frame grows so fast that floats don't.
     """
-    own = [len(group.lifted.z_names) for group in loop.sites]
+    own = [len(group.z_names) for group in loop.sites]
     moving = np.concatenate([offset + np.arange(size) for offset, size in zip(offsets, own, strict=False)])
     basis = np.zeros((offsets[-1], standing.shape[1]))
     basis[moving] = standing

@@ -35,7 +35,7 @@ from apc.compiler.timings import part
 from apc.eigen.closing import Loop, without_packets
 from apc.eigen.rigid import stays_rigid
 from apc.frame.discretize import UNIT
-from apc.frame.lift import FrameMap, named
+from apc.frame.lift import FrameMap
 from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
 from apc.frame.parameters import resolve
@@ -126,10 +126,7 @@ def _question(system: CompiledSystem, ranges: Sequence[Range]) -> _Question:
     frames = open_frames(sites, [group.schedule for group in told.groups])
     whole = tuple((ranges[place].low, ranges[place].high) for place in own)
     maps = [one.mapped(lambda block: hull(block)[0]) for one in frames_over(frames, [whole])[0]]
-    lifted_wide = [
-        group.with_lifted(named(group.jacobians.kind, group.schedule, frame))
-        for group, frame in zip(told.groups, maps, strict=True)
-    ]
+    lifted_wide = [group.with_lifted(frame) for group, frame in zip(told.groups, maps, strict=True)]
     wide = peer_classes(replace(told, groups=tuple(lifted_wide)))[0][0]
     memories = remembered_of(opened.at, told, wide)
     classes = classes_of(told)

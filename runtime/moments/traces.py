@@ -92,7 +92,7 @@ def trace_radius(system: CompiledSystem, prepared: Prepared) -> Found:
     found = []
     for loop in arrange(told.groups, told.exchange).loops:
         packets = sum(depth[sent.link] for site in loop.sites for sent in site.schedule.sent)
-        if packets + sum(len(site.lifted.z_names) for site in loop.sites) > MOST_STATES:
+        if packets + sum(len(site.z_names) for site in loop.sites) > MOST_STATES:
             raise UnservedError("the recorded delays are longer than can be followed")
         found.append(_period(loop, told, heard, depth, slots, frames))
     low, high, radius, doubt = np.array(found).max(axis=0).tolist()
@@ -166,7 +166,7 @@ def _period(
         if numbers not in known:
             now = hearing_packets(loop, rows, iter(numbers), depth, slots)
             layout = lay_out_loop(now)
-            maps = [site.lifted.bounded for site in now.sites]
+            maps = [site.lifted for site in now.sites]
             matrix = close(maps, feedback_of(now, layout), layout, numbers=RADII).matrix
             if at is None:
                 at = with_doubt(relative_coordinates(find_rigid_modes(now, with_drifts=False).basis))

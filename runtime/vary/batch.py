@@ -32,7 +32,7 @@ from apc.eigen.rigid import find_rigid_modes
 from apc.frame.discretize import Step, exponential_rows, exponential_values
 from apc.frame.exchange import Exchange
 from apc.frame.jacobians import SiteJacobians
-from apc.frame.lift import FrameMap, LiftedSite, compose, composed_bounded, lift
+from apc.frame.lift import FrameMap, compose, composed_bounded, lift
 from apc.frame.linearize import linearize, linearize_exact, linearize_rows, of_rows, site_of
 from apc.frame.names import Free, value_now
 from apc.frame.parameters import free_rows
@@ -428,7 +428,7 @@ def _fixed(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Step
 
 def lifted_here(systems: Sequence[Wired]) -> tuple[Wired, ...]:
     """Return systems whose sites are linearized and lifted at the parameters they have, each once."""
-    known: dict[tuple[int, int], tuple[LinearSite, LiftedSite]] = {}
+    known: dict[tuple[int, int], tuple[LinearSite, FrameMap]] = {}
 
     def lifted(group: PeerGroup) -> PeerGroup:
         key, built = site_key(group), group.jacobians

@@ -33,6 +33,7 @@ from apc.frame.ages import aged
 from apc.frame.hyperperiod import ClockGrid, Times
 from apc.frame.names import Free
 from apc.frame.parameters import resolve
+from apc.frame.radius import value_of
 from apc.frame.schedule import Schedule, Selected, tick_by_tick
 from apc.frame.scheduling import build_schedules, newest
 from apc.vary.delays import INSIDE, reaches_parameters, system_with_delay, timing_slopes
@@ -239,7 +240,7 @@ def _sheet(loop: Loop, rows: Sequence[Sequence[Sequence[_Packet] | None]], count
             for h, weight in enumerate(loop.coupling[one.way][g]):
                 if weight and slot >= 0:
                     weights[layer, kind, line, starts[h] + sent[h].index(packet)] = float(weight)
-    loops = bordered(side_by_side([group.lifted for group in loop.sites]), weights)
+    loops = bordered(side_by_side([group.lifted.mapped(value_of) for group in loop.sites]), weights)
     rigid = len(find_rigid_modes(without_packets(loop), with_drifts=False).names)
     ages = np.array([one + [0] * (most - len(one)) for one in lags])
     return _LateSheet(loops, np.array(alike), ages, rigid, int(ages.max()))

@@ -186,7 +186,7 @@ def _angles(
         if not len(own):
             continue
         here = bounded.at(own)
-        start = vectors[own, offset : offset + len(group.lifted.z_names)]
+        start = vectors[own, offset : offset + len(group.z_names)]
         received = (here.heard[g] @ vectors[own, :, None])[:, :, 0]
         states = leads[own] - offset
         found[own] = turns(here.sites[g], group.schedule, start, received, states, values[own])
