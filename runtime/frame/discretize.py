@@ -19,7 +19,7 @@ precision loses log₂(bT/m) bits where the mass is tiny. Arb's exponential (Joh
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -57,16 +57,13 @@ FEWEST_INPUTS = 8
 # Steps of sites that are remembered, and of how many entries in all, A's and B's for each duration.
 KEPT, FEW_ENTRIES = 128, 1 << 14
 
-# Entries of a large matrix, as a share of all, up to which its products leave out the zeros.
-SPARSE = 1 / 16
-
 # Rounding errors charged to every coefficient a site's functions give, in units of UNIT: CasADi evaluates
 # short polynomials of the parameters, a few roundings an entry.
 COEFFICIENT_ROUNDINGS = 8
 
-# With ‖X‖ ≤ 1/2, or 2, the Taylor series of φ₁ is right to 2^−64 after so many terms: (1/2)^17/17! and
-# 2^27/27! are less than 2^−64, with all that follows.
-TERMS, MORE_TERMS = 16, 25
+# With ‖X‖ ≤ 1/2 the Taylor series of φ₁ is right to 2^−64 after so many terms: (1/2)^17/17! is less than
+# 2^−64, with all that follows.
+TERMS = 16
 LEFT_OUT = 2.0**-64
 
 # What a number below the range of floats may be off by when it is rounded to zero, in units of UNIT.
@@ -283,16 +280,16 @@ def exponential_rows(
     is less than 2^−64 of the largest, which counts where more states stand in a row than it has terms.
     """
     n_x, n_u = b.shape[-2:]
-    x, g, last, steps = _squared_steps(a, b, seconds)
+    x, g, steps = _squared_steps(a, b, seconds)
     step = next(steps)
-    absolute = _products(np.abs(x))[0]
-    large = _phi(absolute, np.abs(x), last)
+    size = np.abs(x)
+    large = _phi(size)
     terms = max(np.count_nonzero(x, axis=-1).max(initial=0), np.count_nonzero(g, axis=-2).max(initial=0))
     charge = float(terms + 6 + rounded)
-    grown, pushed = np.eye(n_x) + absolute(large), np.abs(g)
-    error = (charge * UNIT) * np.concatenate([absolute(grown), grown @ pushed], axis=-1)
+    grown, pushed = np.eye(n_x) + size @ large, np.abs(g)
+    error = (charge * UNIT) * np.concatenate([size @ grown, grown @ pushed], axis=-1)
     error[..., :n_x] += UNIT * np.abs(step[..., :n_x])
-    if n_x > last:
+    if n_x > TERMS:
         error[..., :n_x] += LEFT_OUT
         error[..., n_x:] += LEFT_OUT * pushed.sum(axis=-2, keepdims=True)
     for following in steps:
@@ -315,9 +312,9 @@ def exponential_values(a: Matrix, b: Matrix, seconds: float) -> Matrix:
     From E = F − I, E ← 2 E + E²: what is slow beside what is fast keeps the digits that 1 would take from it,
     once more with each squaring.
     """
-    x, g, last, squarings, times = _scaled(a, b, seconds)
-    phi = _phi(times, x, last)
-    grown = np.concatenate([times(phi), phi @ g], axis=-1)
+    x, g, squarings = _scaled(a, b, seconds)
+    phi = _phi(x)
+    grown = np.concatenate([x @ phi, phi @ g], axis=-1)
     n_x = a.shape[-1]
     for _ in range(squarings):
         grown = 2 * grown + grown[..., :n_x] @ grown
@@ -326,31 +323,28 @@ def exponential_values(a: Matrix, b: Matrix, seconds: float) -> Matrix:
     return np.asarray(grown)
 
 
-def _squared_steps(a: Matrix, b: Matrix, seconds: float) -> tuple[Matrix, Matrix, int, Iterator[Matrix]]:
-    """Return X and B T/2^s of `exponential_rows`, the last power, and what gives each [F G] in turn."""
-    x, g, last, squarings, times = _scaled(a, b, seconds)
+def _squared_steps(a: Matrix, b: Matrix, seconds: float) -> tuple[Matrix, Matrix, Iterator[Matrix]]:
+    """Return X and B T/2^s of `exponential_rows`, and what gives each [F G] in turn."""
+    x, g, squarings = _scaled(a, b, seconds)
 
     def steps() -> Iterator[Matrix]:
-        phi = _phi(times, x, last)
-        step = np.concatenate([np.eye(a.shape[-1]) + times(phi), phi @ g], axis=-1)
+        phi = _phi(x)
+        step = np.concatenate([np.eye(a.shape[-1]) + x @ phi, phi @ g], axis=-1)
         yield step
         for _ in range(squarings):
             step = step @ _whole(step)
             yield step
 
-    return x, g, last, steps()
+    return x, g, steps()
 
 
-def _scaled(
-    a: Matrix, b: Matrix, seconds: float
-) -> tuple[Matrix, Matrix, int, int, Callable[[Matrix], Matrix]]:
-    """Return X and B T/2^s, the last power of the series, s, and what multiplies by X."""
+def _scaled(a: Matrix, b: Matrix, seconds: float) -> tuple[Matrix, Matrix, int]:
+    """Return X and B T/2^s, and s."""
     x = a * seconds
-    times, limit, last = _products(x)
     norm = float(np.abs(x).sum(axis=-2).max(initial=0.0))
-    squarings = max(0, int(np.ceil(np.log2(norm / limit)))) if 0 < norm < np.inf else 0
+    squarings = max(0, int(np.ceil(np.log2(2 * norm)))) if 0 < norm < np.inf else 0
     scale = 2.0**-squarings
-    return x * scale, b * (seconds * scale), last, squarings, lambda other: times(other) * scale
+    return x * scale, b * (seconds * scale), squarings
 
 
 def _whole(step: Matrix) -> Matrix:
@@ -360,34 +354,17 @@ def _whole(step: Matrix) -> Matrix:
     return np.concatenate([step, below], axis=-2)
 
 
-def _phi(times: Callable[[Matrix], Matrix], x: Matrix, last: int) -> Matrix:
-    """Return φ₁(X) = I + X/2! + X²/3! + … up to a power, from X and what multiplies by it."""
+def _phi(x: Matrix) -> Matrix:
+    """Return φ₁(X) = I + X/2! + X²/3! + … up to a power."""
     diagonal = np.arange(x.shape[-1])
-    found = x / (last + 1)
-    for term in range(last - 1, -1, -1):
+    found = x / (TERMS + 1)
+    for term in range(TERMS - 1, -1, -1):
         # In place: a sum with a matrix of mostly zeros takes as long as a product.
         found[..., diagonal, diagonal] += 1
         if term:
-            found = times(found)
+            found = x @ found
             found /= term + 1
     return np.asarray(found)
-
-
-def _products(x: Matrix) -> tuple[Callable[[Matrix], Matrix], float, int]:
-    """Return what multiplies by matrices (k, n, n), how large they may be for a series, and its last power.
-
-    Of large ones that are mostly zero products are short and squares are not.
-    """
-    if x.shape[-1] <= FEW_TOGETHER or np.count_nonzero(x) > SPARSE * x.size:
-        return lambda other: x @ other, 0.5, TERMS
-    import scipy.sparse
-
-    own = [scipy.sparse.csr_array(one) for one in x]
-    return (
-        lambda other: np.stack([one @ block for one, block in zip(own, other, strict=True)]),
-        2.0,
-        MORE_TERMS,
-    )
 
 
 def moved_together(a: NDArray[Any]) -> Iterator[Integers]:
