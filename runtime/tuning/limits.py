@@ -207,16 +207,14 @@ class Limits:
                 :, count:
             ] @ weights
             found = np.column_stack([found, beyond / np.maximum(np.abs(level), TINY)])
-        return np.minimum(np.nan_to_num(found, nan=BEYOND), BEYOND)
+        return np.asarray(np.minimum(np.nan_to_num(found, nan=BEYOND), BEYOND))
 
     def sums(self, setting: int, points: Floats) -> Floats:
         """Return the weighted sum that is the aim (k,) at points (k, m + b)."""
         felt = iter(self.measured(setting, self._numbers(points))[:, len(self.demands.felt) :, 0].T)
         terms = self.demands.aim.terms
-        return np.sum(
-            [weight * (next(felt) if isinstance(one, Felt) else points[:, one]) for weight, one in terms],
-            axis=0,
-        )
+        parts = [weight * (next(felt) if isinstance(one, Felt) else points[:, one]) for weight, one in terms]
+        return np.asarray(np.sum(parts, axis=0))
 
     def measured(self, setting: int, numbers: Floats) -> Floats:
         """Return what is felt with gains and box (k, n), and what it may be off by (k, q, 2).
