@@ -1,8 +1,7 @@
 """The characteristic function of a population: small, whatever the number of peers and the length of delays.
 
 Takes: the `Transfer` of all sites, and how what they send comes back to them; discs and circles.
-Gives: `Characteristic`, `characteristic_of`, `parts_in`, `matrices_in`, `characteristic_ball`, `refine`;
-`count_around`.
+Gives: `Characteristic`, `characteristic_of`, `parts_in`, `matrices_in`, `characteristic_ball`, `refine`.
 Guarantees: its value in a disc comes with a bound; an eigenvalue of the whole system is a zero of it, or a
 pole of a site that the zero would have to cancel. A count is right, None says that it can't be told.
 Does not: know who the sites are (see `determinant`), or where zeros may be (see `zeros`).
@@ -22,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.winding import Ball, determinant_ball, wind
+from apc.eigen.winding import Ball, determinant_ball
 from apc.frame.radius import RADII, Matrix
 from apc.large.transfer import Transfer, add_fractions, powers
 
@@ -128,32 +127,6 @@ def characteristic_ball(function: Characteristic, points: Complexes, reach: Floa
     with np.errstate(all="ignore"):
         found = matrices_in(function, points, reach)
     return determinant_ball(found[:, 0], found[:, 2], found[:, 1].real, np.ones(len(points)))
-
-
-def count_around(
-    function: Characteristic,
-    centre: float | complex,
-    radius: float,
-    *,
-    arcs: int,
-    most: int | None = None,
-) -> int | None:
-    """Return zeros less poles of f within a circle, None if that can't be told.
-
-    Parameters
-    ----------
-    function
-        f.
-    centre, radius, arcs, most
-        As `winding.wind` has them.
-    """
-    return wind(
-        lambda points, reach: characteristic_ball(function, points, reach),
-        centre,
-        radius,
-        arcs=arcs,
-        most=most,
-    )
 
 
 def refine(

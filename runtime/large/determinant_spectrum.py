@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from apc.eigen.closing import Loop, without_packets
 from apc.eigen.rigid import find_rigid_modes
-from apc.eigen.spectrum import Mode, Spectrum, judge
+from apc.eigen.spectrum import Mode, Motion, Spectrum, judge
 from apc.frame.exchange import Exchange
 from apc.frame.radius import value_of
 from apc.large.characteristic import Characteristic, matrices_in, parts_in
 from apc.large.determinant import Member, of_loop, of_populations
-from apc.large.populations import Population, hear_themselves, lines_of, mode_of, turned_by
+from apc.large.populations import Population, hear_themselves, lines_of, turned_by
 from apc.large.transfer import CHUNK, Sites
 from apc.large.zeros import Zero, Zeros, find_zeros, near_poles
 
@@ -247,7 +247,9 @@ def _mode(
         if float(own[peer].sum()) > most:
             most = float(own[peer].sum())
             turned = turned_by(one.site(peer), schedule, zero.value, z[peer], r[peer], w[peer])
-    return mode_of(zero.value, zero.error, turned, shares, shape, multiplicity)
+    total = sum(shares.values()) or 1.0
+    motion = Motion(*turned, tuple((name, share / total) for name, share in shares.items()))
+    return Mode(zero.value, abs(zero.value), multiplicity, shape, zero.error, (motion,))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

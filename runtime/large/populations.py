@@ -1,7 +1,7 @@
 """Peers by the thousand, all different: the matrices of every one, without an object for each.
 
 Takes: a `CompiledSystem`, its numbers, Jacobians and schedules.
-Gives: `Population`, `populations`, `joined`; `hear_themselves`, `lines_of`; `turned_by`, `mode_of`.
+Gives: `Population`, `populations`, `joined`; `hear_themselves`, `lines_of`; `turned_by`.
 Guarantees: a population costs what its different peers cost in one array operation each, not in one Python
 call each; equal peers of a population are counted.
 Does not: merge equal peers of different groups (see `peers`), or take sites that are not affine.
@@ -9,7 +9,7 @@ Does not: merge equal peers of different groups (see `peers`), or take sites tha
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,7 @@ from apc.compiler.compiled import CompiledSystem
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.eigen.closing import Feedback, close, lay_out
 from apc.eigen.peers import states_of
-from apc.eigen.spectrum import Mode, Motion, oscillation
+from apc.eigen.spectrum import oscillation
 from apc.frame.course import turns
 from apc.frame.jacobians import SiteJacobians
 from apc.frame.lift import FrameMap, lift
@@ -182,42 +182,6 @@ def turned_by(
     if not count:
         return 0.0, 1.0
     state = np.array([int(np.argmax(np.abs(covector[:count] * z[:count])))])
-    start, received = (
-        block[None].astype(np.complex128) for block in (z[: count + len(schedule.carried)], heard)
-    )
     site = every_matrix(site, lambda matrix: matrix[None])
-    angle = turns(site, schedule, start, received, state, np.array([value]))
+    angle = turns(site, schedule, z[None], heard[None], state, np.array([value]))
     return oscillation(abs(value), float(angle[0]), float(schedule.frame_s))
-
-
-def mode_of(
-    value: complex,
-    error: float,
-    turned: tuple[float, float],
-    shares: Mapping[str, float],
-    shape: str,
-    multiplicity: int,
-) -> Mode:
-    """Put a mode together.
-
-    Parameters
-    ----------
-    value, error
-        The eigenvalue and what it may be off by.
-    turned
-        From `turned_by`.
-    shares
-        How much each state takes part, in any unit.
-    shape, multiplicity
-        As in `Mode`.
-    """
-    frequency, damping = turned
-    total = sum(shares.values()) or 1.0
-    return Mode(
-        eigenvalue=value,
-        magnitude=abs(value),
-        multiplicity=multiplicity,
-        shape=shape,
-        error=error,
-        motion=(Motion(frequency, damping, tuple((name, share / total) for name, share in shares.items())),),
-    )

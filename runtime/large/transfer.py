@@ -115,7 +115,7 @@ def transfer_of(listed: Sequence[Sites], n_s: int, n_r: int) -> Transfer:
     """
     series = np.zeros((1 + TERMS, 2, n_s, n_r))
     fractions, inner = [], [float(np.finfo(np.float64).tiny)]
-    poles: list[Poles] = []
+    poles: list[tuple[Matrix, ...]] = []
     for which, sites in enumerate(listed):
         size = np.abs(value_of(sites.maps.p)) + radius_of(sites.maps.p)
         scale = balance(size.max(axis=0))
@@ -139,16 +139,19 @@ def transfer_of(listed: Sequence[Sites], n_s: int, n_r: int) -> Transfer:
                 fractions.append(_Fractions(sites.rows, sites.lines, *part))
                 own = np.ix_(np.arange(len(terms)), np.arange(2), sites.rows, sites.lines)
                 series[own] = RADII.add(series[own], terms)
-                heard = fractions[-1].residues.any(axis=-1).reshape(len(some), count)
+                heard = np.asarray(fractions[-1].residues.any(axis=-1))
                 place = np.stack([np.full(len(some), which), start + some], axis=-1)
-                poles.append(Poles(values[some, :count], error, counts, heard, place))
+                each = np.repeat(counts, count), heard, np.repeat(place, count, axis=0)
+                poles.append((values[some, :count].ravel(), error.ravel(), *each))
     innermost = FARTHER * max(inner)
+    every = [np.concatenate(part) for part in zip(*poles, strict=True)]
+    order = np.argsort(-np.abs(every[0]), kind="stable")
     return Transfer(
         fractions=tuple(fractions),
         series=_shortened(series.swapaxes(0, 1).reshape(2, 1 + TERMS, n_s * n_r), innermost),
         shape=(n_s, n_r),
         innermost=innermost,
-        poles=_joined(poles),
+        poles=Poles(*(part[order] for part in every)),
     )
 
 
@@ -159,21 +162,6 @@ def _shortened(series: Matrix, innermost: float) -> Matrix:
     kept = max(1, np.count_nonzero((left > CUT * UNIT * left[0]).any(axis=1)))
     series[1, 0] += (1 + TERMS * UNIT) * left[kept:][:1].sum(axis=0)
     return series[:, :kept]
-
-
-def _joined(poles: Sequence[Poles]) -> Poles:
-    """Return the poles of all sites (k, K), the largest first."""
-    values = np.concatenate([one.values.ravel() for one in poles])
-    order = np.argsort(-np.abs(values), kind="stable")
-    each = [np.repeat(np.arange(len(one.values)), one.values.shape[1]) for one in poles]
-    counts, sites = (
-        np.concatenate([getattr(one, name)[row] for one, row in zip(poles, each, strict=True)])[order]
-        for name in ("counts", "sites")
-    )
-    errors, heard = (
-        np.concatenate([getattr(one, name).ravel() for one in poles])[order] for name in ("errors", "heard")
-    )
-    return Poles(values[order], errors, counts, heard, sites)
 
 
 def _split(

@@ -17,17 +17,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.winding import FIRST_ARCS
+from apc.eigen.winding import FIRST_ARCS, wind
 from apc.large.characteristic import (
     FARTHEST,
     Characteristic,
     characteristic_ball,
-    count_around,
     refine,
 )
 
@@ -90,7 +89,7 @@ def _least_radius(function: Characteristic, point: complex, aside: float) -> flo
 
 def _held_in(function: Characteristic, point: complex, radius: float) -> int:
     """Return how many eigenvalues are within a circle, −1 if that can't be told: poles as f has them."""
-    inside = count_around(function, point, radius, arcs=SMALL_ARCS, most=SMALL_POINTS)
+    inside = wind(partial(characteristic_ball, function), point, radius, arcs=SMALL_ARCS, most=SMALL_POINTS)
     poles = _poles_in(function, point, radius, 1)
     return -1 if inside is None or poles is None else inside + poles
 
@@ -117,16 +116,12 @@ def beyond(function: Characteristic, radius: float, rigid: int) -> int | None:
         How many eigenvalues are 1.
     """
     counts = function.transfer.poles.counts
+    arcs = max(FIRST_ARCS, 2 * function.longest)  # f turns as often as its longest delay has frames
     poles = _poles_in(function, 0.0, radius, counts)
-    turns = None if poles is None else count_around(function, 0.0, radius, arcs=_arcs(function))
+    turns = None if poles is None else wind(partial(characteristic_ball, function), 0.0, radius, arcs=arcs)
     if poles is None or turns is None:
         return None
     return int(counts.sum()) - poles - turns - (rigid if radius < 1 else 0)
-
-
-def _arcs(function: Characteristic) -> int:
-    """Return how many arcs to begin with: f turns as often as its longest delay has frames."""
-    return max(FIRST_ARCS, 2 * function.longest)
 
 
 def count_from(
