@@ -132,7 +132,7 @@ def build_scene(source: Source, library: Library) -> Scene:
     root = Body(node, TOPOLOGY, "a topology", mistakes)
     for key, example in REQUIRED.items():
         if key not in root.nodes:
-            what = f"the topology has no {key}" + ("" if key == "topology" else " section")
+            what = "the topology has no name" if key == "topology" else f"the topology has no {key} section"
             mistakes.add("E201", root.place, what, hint=f"{key}: {example}")
     bodies = read_counts(root, files)
     counts = {name: group.count for name, group in bodies.items()}

@@ -38,7 +38,7 @@ def comparison_text(found: Comparison) -> str:
     """Return what `apc compare` prints: a table for each question, a line for each scheme."""
     schemes = found.schemes
     feet: dict[str, int] = {}
-    lines = [f"{counted(len(schemes), 'scheme')} side by side"]
+    lines = [counted(len(schemes), "scheme") + " side by side" * (len(schemes) > 1)]
     lines += notes([*_meant(found), *found.left_out, *(f"note: {text}" for text in found.notes)])
     tables: list[tuple[tuple[str, ...], list[tuple[str, ...]]]] = [
         (("",), [(f"{one.topology}, {counted(one.peers, 'peer', ',d')}",) for one in schemes]),

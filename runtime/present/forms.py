@@ -22,8 +22,8 @@ from apc.later import Later
 
 # What stable means by a criterion, where it is not that motions die out.
 MEANT = {
-    "mean-square": "stable in mean square, over the network as it is",
-    "passive": "stable with every passive hand at every device",
+    "mean-square": "judged in mean square, over the network as it is",
+    "passive": "judged with every passive hand at every device",
 }
 
 LINEARIZED = ", linearized at its start"

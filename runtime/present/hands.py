@@ -123,7 +123,7 @@ def feel_text(found: Feel) -> str:
             share = measured(network.network, network.error, "N*s/m")
             lines += labelled("of that", f"{share}, which the network adds")
         if slow.mass < 0:
-            lines += note("a mass below 0: forces that come late push on what speeds up")
+            lines += note("a mass below 0: late forces act as negative inertia, for slow motions")
         lines.append("")
     headings = ("frequency", "impedance", "phase", "arrives", "copies apart", "alias")
     units = ("Hz", "N*s/m", "degrees", "mm/s/N", "mm/N", "")

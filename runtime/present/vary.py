@@ -61,7 +61,7 @@ def critical_text(found: Critical) -> str:
         kind = "jump, " if one.kind == "jump" else ""
         turns = "" if math.isnan(one.frequency_hz) else f", {in_hertz(one.frequency_hz)}"
         lines.append(f"    {kind}stable {one.stable_side} it{turns}, {one.proof}")
-    lines += ["", f"  scanned {_span(found.scanned, unit)}"]
+    lines += [*[""] * bool(found.crossings), f"  scanned {_span(found.scanned, unit)}"]
     lines.append(f"  {counted(found.looked, 'value')} looked at: two crossings near to each other could hide")
     if found.left_open:
         parts = ", ".join(_span(one, unit) for one in found.left_open[:SHOWN])

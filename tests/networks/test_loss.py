@@ -166,7 +166,7 @@ def test_a_region_over_loss_ends_where_the_references_do() -> None:
     assert [*ends.values()] == pytest.approx([1096.4108683656323, 1383.5619], rel=1e-6)
     assert (found.criterion, curve.mode, found.left_out) == ("mean-square", "mean-square", ())
     assert found.contains(0.3, 1200.0) and not found.contains(0.05, 1200.0)
-    assert str(found).splitlines()[1] == "  stable in mean square, over the network as it is"
+    assert str(found).splitlines()[1] == "  judged in mean square, over the network as it is"
 
 
 def test_loss_is_a_parameter_like_others() -> None:
