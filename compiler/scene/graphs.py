@@ -24,6 +24,9 @@ from apc.compiler.source.nodes import Node, Scalar, Sequence
 from apc.compiler.source.reading import Body, among, brief, fault, form, mapping_of, text_of, unknown
 
 SHAPES = ("complete", "ring", "star")
+
+# What others call a graph in which each is joined to each.
+MEANING_COMPLETE = ("mesh", "full", "all", "clique")
 PAIRS = ("edges", "arcs")
 
 COMPLETE = Graph("complete", np.zeros((0, 2), np.int64), np.zeros(0))
@@ -61,6 +64,8 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
         return replace(COMPLETE, shape=word)
     if word is not None:
         what = f"there is no graph {brief(word)}"
+        if word.lower() in MEANING_COMPLETE:
+            raise fault("E206", node.place, what, hint=COMPLETE.shape)
         raise unknown("E206", node.place, what, word, (*SHAPES, *PAIRS))
     hint = "[[1, 2], [2, 3]]"
     body = Body(mapping_of(node, "graph", f"graph: {{edges: {hint}}}"), PAIRS, "graph", mistakes)

@@ -79,5 +79,7 @@ def _read_clock(name: str, node: Node, numbers: NamedNumbers, root: Body) -> Sce
         raise fault("E207", period.place, what, "more than 0 s", str(period), hint)
     if not 0 <= phase.number < period.number:
         expected = "0 s or more and less than its period"
-        raise fault("E207", phase.place, f"the phase of clock {name}", expected, str(phase))
+        rest = 1000 * float(phase.number % period.number)
+        hint = f"phase: {rest:.6g} ms"
+        raise fault("E207", phase.place, f"the phase of clock {name}", expected, str(phase), hint)
     return SceneClock(name, period, phase)
