@@ -51,55 +51,38 @@ PUSHES: dict[str, tuple[str, Callable[[Any], Any], list[float]]] = {
     "a constant": ("type: ConstantForce, force: 3 N", lambda t: 3, []),
     "a step at a tick": ("type: StepForce, force: 3 N, start: 32 ms", lambda t: 3 * (t > 0.032), [0.032]),
     "a step between two ticks": (
-        "type: StepForce, force: 3 N, start: 0.03125 s",
-        lambda t: 3 * (t > 0.03125),
-        [0.03125],
-    ),
+        "type: StepForce, force: 3 N, start: 0.03125 s", lambda t: 3 * (t > 0.03125), [0.03125]),
     "a ramp with both corners between ticks": (
         "type: RampForce, force: 2 N, start: 0.015625 s, rise: 0.0625 s",
         lambda t: 2 * min(mpmath.mpf(1), max(mpmath.mpf(0), (t - mpmath.mpf("0.015625")) * 16)),
-        [0.015625, 0.078125],
-    ),
+        [0.015625, 0.078125]),
     "a sine": (
         "type: SineForce, force: 2 N, frequency: 8 Hz, phase: 0.5 rad",
         lambda t: 2 * mpmath.sin(2 * mpmath.mpf(3.141592653589793) * 8 * t + mpmath.mpf("0.5")),
-        [0.03125, 0.0625],
-    ),
+        [0.03125, 0.0625]),
     "a sine of many turns a tick": (
         "type: SineForce, force: 2 N, frequency: 512 Hz",
         lambda t: 2 * mpmath.sin(2 * mpmath.mpf(3.141592653589793) * 512 * t),
-        [k / 512 for k in range(1, 12)],
-    ),
+        [k / 512 for k in range(1, 12)]),
     "a table": (
         "type: TableForce, force: push.csv",
-        lambda t: mpmath.mpf(
-            2 * t * 16 if t < 0.0625 else 2 - 192 * (t - mpmath.mpf("0.0625")) if t < 0.078125 else -1
-        ),
-        [0.0625, 0.078125, 0.125],
-    ),
+        lambda t: mpmath.mpf(32 * t if t < 0.0625 else max(2 - 192 * (t - mpmath.mpf("0.0625")), -1)),
+        [0.0625, 0.078125, 0.125]),
     "powers and functions": (
         "type: Powers",
         lambda t: mpmath.sqrt(t) + t**2.5 + mpmath.exp(-t) + mpmath.log(1 + t) / (1 + t) + mpmath.cos(40 * t),
-        [1e-6, 1e-4, 1e-3, 1e-2],
-    ),
+        [1e-6, 1e-4, 1e-3, 1e-2]),
     "a tap within a tick": (
-        "type: Tap",
-        lambda t: 100 * (mpmath.mpf(0.0429) <= t < mpmath.mpf(0.043)),
-        [0.0429, 0.043],
-    ),
+        "type: Tap", lambda t: 100 * (mpmath.mpf(0.0429) <= t < mpmath.mpf(0.043)), [0.0429, 0.043]),
     "steps of a staircase": (
-        "type: Steps",
-        lambda t: mpmath.floor(64 * t) / 8,
-        [k / 64 for k in range(1, 7)],
-    ),
-}
+        "type: Steps", lambda t: mpmath.floor(64 * t) / 8, [k / 64 for k in range(1, 7)]),
+}  # fmt: skip
 
 
 def by_quadrature(
     force: Callable[[Any], Any],
     edges: list[float],
     end: Fraction,
-    *,
     mass: float = MASS,
     damping: float = DAMPING,
 ) -> list[float]:
