@@ -72,7 +72,7 @@ def test_the_delay_that_is_proposed_for_a_force_is_taken(asked: str, tmp_path: P
 
     [message] = late(asked)
     assert "values that are computed and do not act yet; at most 1,000 can be analysed" in message
-    assert late(message.split("Write: contact.delay: ")[1].split(",")[0]) == []
+    assert late(message.split("Write: delay: ")[1].split(",")[0]) == []
 
 
 def wrong(*pairs: tuple[str, str]) -> str:
