@@ -639,7 +639,8 @@ def tune(
     free
         Ranges of the gains by name: {"coordination.stiffness": "10 N/m:5000 N/m"} or, in SI, (10, 5000).
     maximize, minimize
-        One of them: the gain that is to be large, or small; "spectral_radius" may be small, too.
+        One of them: a gain, what hands feel ("feel.error at 1 Hz", "feel.damping", "feel.error_h2"), or a
+        weighted sum of these in SI; "spectral_radius" and "settling_time" may be small, too.
     subject
         Demands beside stability, such as "decay=60 dB in 2 s".
     over

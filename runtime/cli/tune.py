@@ -39,14 +39,17 @@ def tune_command(
     free: tuple[str, ...] = option(
         "A gain that may be chosen, and from where to where. Repeat it.", "PATH=LO:HI"
     ),
-    maximize: str = option("The gain that is to be as large as can be.", "PATH"),
+    maximize: str = option("What is to be as large as can be: a gain, or as for --minimize.", "AIM"),
     minimize: str = option(
-        "The gain, or settling_time or spectral_radius (the same gains), that is to be as small as can be.",
-        "PATH",
+        "What is to be as small as can be: a gain; settling_time or spectral_radius (the same gains); "
+        '"feel.error at 1 Hz", or feel.impedance, feel.transmitted; feel.damping of slow motions; '
+        "feel.error_h2, for white forces of 1 N rms; or a weighted sum in SI of gains and these, "
+        '"feel.damping - 0.01*coordination.stiffness".',
+        "AIM",
     ),
     subject: tuple[str, ...] = option(
         'Beside stability: "decay=60 dB in 2 s"; "feel.impedance at 5 Hz < 20 N*s/m", or feel.transmitted in '
-        "m/s/N, feel.error in m/N. May be repeated.",
+        "m/s/N, feel.error in m/N, feel.damping, feel.error_h2. May be repeated.",
         "DEMAND",
     ),
     against: str = option(
@@ -71,8 +74,8 @@ def tune_command(
 ) -> None:
     """Find the gains that do best, and prove that they do.
 
-    The free gains are chosen so that one of them is as large (or small) as can
-    be while the scene is stable in all that stands in --over. They are printed
+    The free gains are chosen so that an aim, as one of them, is as large (or
+    small) as can be while the scene is stable in all that stands in --over. They are printed
     to four digits, and proved at these: in boxes, for every number of peers,
     over the network as it is. That no gains in these ranges do better by 2 %
     is proved where that is quick; the answer says so, and how many points were
