@@ -185,9 +185,8 @@ class GroupReader:
             with mistakes:
                 what = f"set names {brief(key.text)}, which is no parameter or variable of a part"
                 if isinstance(node, MappingNode) and any(one.name == key.text for one in self.parts):
-                    inner = [f"{key.text}.{own.text}" for own, _ in node.entries]
-                    written = [one.text for _, one in node.entries if isinstance(one, Scalar)]
-                    hint = ", ".join(map("{}: {}".format, inner, written))
+                    pairs = [(own.text, one.text) for own, one in node.entries if isinstance(one, Scalar)]
+                    hint = ", ".join(f"{key.text}.{name}: {value}" for name, value in pairs)
                     raise fault("E206", key.place, what, hint=hint)
                 item, wholes = self._settable(key.text, key.place, group.name, "E206", what)
                 if isinstance(item, Option | Reference):

@@ -79,7 +79,7 @@ def _read_clock(name: str, node: Node, numbers: NamedNumbers, root: Body) -> Sce
         raise fault("E207", period.place, what, "more than 0 s", str(period), hint)
     if not 0 <= phase.number < period.number:
         expected = "0 s or more and less than its period"
-        rest = 1000 * float(phase.number % period.number)
-        hint = f"phase: {rest:.6g} ms"
+        rest = f"{1000 * float(phase.number % period.number):.6g}"
+        hint = f"phase: {rest} ms" if float(rest) < 1000 * float(period.number) else ""
         raise fault("E207", phase.place, f"the phase of clock {name}", expected, str(phase), hint)
     return SceneClock(name, period, phase)

@@ -180,7 +180,7 @@ def find_devices(
 
 @functools.lru_cache(maxsize=64)
 def coupled_directly(kinds: tuple[Kind, ...]) -> bool:
-    """Say whether no kind of peer has a mass that others are not told about, nor hands are elsewhere.
+    """Say whether devices are coupled directly: no mass is kept from the others, and some peers have no hand.
 
     Where some have a hand, each of the others has the part that it is joined to, and may be held there.
 

@@ -1,7 +1,7 @@
 """A peer with ways in and out: values that come from outside in a frame, and what is read of it there.
 
 Takes: a `LinearSite` whose last holds are the ways in, and its `Schedule`.
-Gives: `Ports`, `with_holds`, `with_ports`; `Around`, `with_ways`, `with_cuts`, `OUTSIDE`.
+Gives: `Ports`, `with_holds`, `with_ports`; `with_cuts`, `OUTSIDE`.
 Guarantees: the peer moves as before; what comes in and what is read are entries of z, so that every step of
 the kernel takes them along.
 Does not: say what comes in, or lift.
@@ -46,19 +46,6 @@ class Ports:
     added: range
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Around:
-    """A way around a clock partition: what its ticks `follow` goes out, what comes in is added by `into`.
-
-    `into` (n_y,) says how much of what comes in each of its rows takes; `follows` has a row for each variant
-    of the partition's columns, one of most.
-    """
-
-    partition: int
-    into: Matrix
-    follows: LinearTick
-
-
 def with_holds(site: LinearSite, columns: Matrix) -> LinearSite:
     """Return a site with more holds, whose values nothing reads and that move states as the columns say.
 
@@ -90,7 +77,8 @@ def with_cuts(
 ) -> tuple[LinearSite, Schedule]:
     """Return a site some of whose computed values come from outside, and its schedule.
 
-    What a tick would compute of such a value is one more output of its partition, see `with_ways`.
+    What a tick would compute of such a value is one more output of its partition. Cut by cut and tick by
+    tick, that is the last that is carried, and what comes in the last that is heard.
 
     Parameters
     ----------
@@ -101,58 +89,23 @@ def with_cuts(
     cuts
         The partition and output of each value.
     """
-    ticks, ways = list(site.ticks), []
-    for partition, output in cuts:
-        tick, outputs = ticks[partition], len(site.kind.clocks[partition].outputs)
-        rows = slice(output, None, outputs)  # of each variant one
-        into = np.zeros(len(tick.x), dtype=tick.r.dtype)
-        into[rows] = 1
-        x, u, m, r = (one[rows].copy() for one in (tick.x, tick.u, tick.m, tick.r))
-        ways.append(Around(partition, into, LinearTick(tick.clock, x, u, m, r, ())))
-        x, u, m, r = (one.copy() for one in (tick.x, tick.u, tick.m, tick.r))
-        x[rows] = u[rows] = m[rows] = r[rows] = 0
-        ticks[partition] = replace(tick, x=x, u=u, m=m, r=r)
-    return with_ways(replace(site, ticks=tuple(ticks)), schedule, ways)
-
-
-def with_ways(site: LinearSite, schedule: Schedule, ways: Sequence[Around]) -> tuple[LinearSite, Schedule]:
-    """Return a site whose ticks also compute what ways around follow, and add what comes from outside.
-
-    Way by way and tick by tick, what they follow is the last that is carried, and what comes in the last that
-    is heard.
-
-    Parameters
-    ----------
-    site
-        The site, of floats or of rationals.
-    schedule
-        What happens in a frame.
-    ways
-        The ways.
-    """
     ticks, clocks = list(site.ticks), list(site.kind.clocks)
     carried, heard = list(schedule.carried), list(schedule.heard)
     rows: dict[int, list[int]] = {}
-    for way in ways:
-        partition = way.partition
+    for partition, output in cuts:
         tick, own, count = ticks[partition], clocks[partition], schedule.ticks[partition]
         outputs = len(own.outputs)
-        # A tick may have several variants of its rows, one below the other; ways before this one added some.
-        variants = len(way.follows.x)
-        into = way.into.reshape(variants, -1)
-        added = outputs - into.shape[1]
-        into = np.concatenate([into, np.zeros((variants, added + 1), dtype=into.dtype)], axis=1)
+        # A tick may have several variants of its rows, one below the other; cuts before this one added some.
+        variants = len(tick.x) // outputs
+        into = np.zeros((len(tick.r), 1), dtype=tick.r.dtype)
         blocks = []
-        for one, follows in zip(
-            (tick.x, tick.u, tick.m, tick.r),
-            (way.follows.x, way.follows.u, way.follows.m, way.follows.r),
-            strict=True,
-        ):
-            wide = np.zeros((variants, 1, one.shape[1]), dtype=one.dtype)
-            wide[:, 0, : follows.shape[1]] = follows
-            blocks.append(np.concatenate([one.reshape(variants, outputs, one.shape[1]), wide], axis=1))
-        blocks[3] = np.concatenate([blocks[3], into[:, :, None]], axis=2)
-        x, u, m, r = (one.reshape(variants * (outputs + 1), one.shape[2]) for one in blocks)
+        for block in (tick.x, tick.u, tick.m, np.concatenate([tick.r, into], axis=1)):
+            one = block.reshape(variants, outputs, block.shape[1])
+            one = np.concatenate([one, one[:, output : output + 1]], axis=1)
+            one[:, output] = 0
+            blocks.append(one.reshape(variants * (outputs + 1), block.shape[1]))
+        x, u, m, r = blocks
+        r[output :: outputs + 1, -1] = 1
         ticks[partition] = replace(tick, x=x, u=u, m=m, r=r)
         clocks[partition] = replace(
             own, outputs=(*own.outputs, f"followed {outputs}"), units=(*own.units, "1")

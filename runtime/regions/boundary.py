@@ -1,7 +1,7 @@
 """Boundary curves of a stable region in the unit square, to a stated accuracy.
 
 Takes: a `Eigenvalues` and the `Survey` of its cells.
-Gives: `Arc`, `trace`; `trace_steps` for a boundary that has steps; `stable_area`, `relative_to`.
+Gives: `Arc`, `trace`, `traced`; `trace_steps` for a boundary that has steps; `stable_area`, `relative_to`.
 Guarantees: every point lies on the boundary to rounding; between its points a curve is the cubic Hermite
 interpolant through points and tangents, and that has been measured against the true boundary in the middle
 of every interval. Where one mode takes over from another the curve has a corner, solved for. Steps are known
@@ -39,7 +39,7 @@ from apc.regions.boundary_points import (
 )
 from apc.regions.curves import area_beside, handles_of, off_an_arc, straight_handles, tangents
 from apc.regions.deciding import Eigenvalues, Pairs, join
-from apc.regions.survey import Survey
+from apc.regions.survey import Survey, survey
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -57,6 +57,9 @@ JUMP = 1e-6
 
 # Points nearer to each other than this are one.
 COINCIDENT = 1e-11
+
+# An error of a curve, of the unit square, beyond which it is lost; how often cells are halved to find it.
+LOST, MOST_HALVED = 1e-3, 3
 
 # Points on either side of a chord at which the boundary is looked for, at growing distances, and of
 # how many chords at most.
@@ -516,6 +519,43 @@ def _straight(points: Floats, errors: Floats, knot: Floats, value: complex, chai
         chain=chain,
         smooth=False,
     )
+
+
+def traced(
+    deciding: Eigenvalues,
+    samples: Callable[[Floats], Floats],
+    *,
+    cells: int,
+    tolerance: float,
+    offset: Floats,
+) -> tuple[tuple[Arc, ...], Survey, float, float]:
+    """Survey the unit square and follow the boundary; cells are halved where a curve is lost.
+
+    It was then taken for another one: two crossings lie on one side of a cell.
+
+    Parameters
+    ----------
+    deciding, tolerance, offset
+        As for `trace`.
+    samples, cells
+        As for `survey`.
+
+    Returns
+    -------
+    The arcs, the survey they are of, and the stable area with its error, of the unit square.
+    """
+    found = survey(samples, cells=cells)
+    arcs = trace(deciding, found, tolerance=tolerance, offset=offset)
+    area, off = stable_area(arcs, found)
+    for halving in range(1, MOST_HALVED + 1):
+        if off >= 1 or max((float(one.errors.max()) for one in arcs), default=0.0) <= LOST:
+            break
+        finer = survey(samples, cells=cells * 2**halving)
+        again = trace(deciding, finer, tolerance=tolerance, offset=offset)
+        better = stable_area(again, finer)
+        if better[1] < off:  # not at a cusp, say
+            arcs, found, (area, off) = again, finer, better
+    return arcs, found, area, off
 
 
 def stable_area(arcs: Sequence[Arc], found: Survey) -> tuple[float, float]:

@@ -30,7 +30,7 @@ from apc.frame.names import Free, Range, notes_for_all_groups
 from apc.frame.overrides import apply
 from apc.network.nominal import left_out, refuse_channel_number
 from apc.regions.axes import PLACE
-from apc.regions.boundary import Arc, relative_to, stable_area, trace, trace_steps
+from apc.regions.boundary import Arc, relative_to, stable_area, trace_steps, traced
 from apc.regions.curves import between
 from apc.regions.deciding import Eigenvalues, largest
 from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
@@ -75,9 +75,6 @@ TOLERANCE_OF_GROWTH = 1e-6
 
 # How often the straight lines of a boundary known by verdicts alone are halved, where it has no steps.
 HALVINGS = 3
-
-# An error of a curve, of the unit square, beyond which it is lost; how often cells are halved to find it.
-LOST, HALVINGS_OF_CELLS = 1e-3, 3
 
 # How near to 0 or π, in radians, an eigenvalue's angle may come before its turns are counted again.
 FOLD = 0.1
@@ -405,30 +402,18 @@ def _surveyed(plane: _Plane, cells: int, tolerance: float, told: Told | None) ->
             told(f"looking at {counted(looked, 'point')}")
         return _samples(deciding, plane, points)
 
-    found, offset = survey(samples, cells=cells), plane.family.rectangle.offset
     if plane.stepped:
+        found = survey(samples, cells=cells)
         arcs = trace_steps(
             lambda points: samples(points)[:, 0],
             lambda point: largest(plane.family.matrices(point[None])),
             found,
             halvings=plane.halvings,
         )
+        area, off = stable_area(arcs, found)
     else:
-        arcs = trace(deciding, found, tolerance=tolerance, offset=offset)
-    area, off = stable_area(arcs, found)
-    for halving in range(1, HALVINGS_OF_CELLS + 1):
-        # Where a curve is lost, it was taken for another one: two crossings lie on one side of a cell.
-        if (
-            plane.stepped
-            or not max((float(one.errors.max()) for one in arcs), default=0.0) > LOST
-            or off >= 1
-        ):
-            break
-        finer = survey(samples, cells=cells * 2**halving)
-        again = trace(deciding, finer, tolerance=tolerance, offset=offset)
-        better = stable_area(again, finer)
-        if better[1] < off:  # not at a cusp, say
-            arcs, found, (area, off) = again, finer, better
+        offset = plane.family.rectangle.offset
+        arcs, found, area, off = traced(deciding, samples, cells=cells, tolerance=tolerance, offset=offset)
     if off >= 1:  # of the unit square: the boundary may be anywhere in it
         raise blurred()
     return Striped(arcs, area, off, found.corners[0], (found.cell, found.cell), found.finest / found.cell)

@@ -25,11 +25,11 @@ from apc.eigen.relative import relative_bounded
 from apc.eigen.spectrum import mode_near
 from apc.frame.names import Range, parameter_of
 from apc.regions.axes import PLACE
-from apc.regions.boundary import Arc, stable_area, trace
+from apc.regions.boundary import Arc, traced
 from apc.regions.curves import straight_handles, tangents
 from apc.regions.deciding import Eigenvalues, largest, log_magnitudes
 from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
-from apc.regions.survey import HALVINGS, survey
+from apc.regions.survey import HALVINGS
 from apc.vary.batch import batch_evaluator
 from apc.vary.counts import count_pieces
 from apc.vary.crossing import ESTIMATE, search
@@ -233,9 +233,13 @@ def _moving(
     family = _within(source, piece, rectangle)
     if family is None:
         return None
-    found = survey(lambda points: log_magnitudes(family.matrices(points), BRANCHES), cells=cells)
-    arcs = trace(Eigenvalues(family), found, tolerance=tolerance, offset=rectangle.offset)
-    area, off = stable_area(arcs, found)
+    arcs, found, area, off = traced(
+        Eigenvalues(family),
+        lambda points: log_magnitudes(family.matrices(points), BRANCHES),
+        cells=cells,
+        tolerance=tolerance,
+        offset=rectangle.offset,
+    )
     placed = tuple(_placed(arc, ends) for arc in arcs)
     return _Strip(ends[0], ends[1], placed, (found.corners[0], found.corners[1]), area, off)
 

@@ -44,6 +44,7 @@ BEGINNING = legendre.legvander([-1.0], TERMS - 1)[0] @ TRANSFORM
 # Last coefficients of this size, relative to the whole, may be rounding errors; what they leave out is less.
 AGREE = 64 * UNIT
 MOST_HALVINGS = 48  # what a jump within so small a part of an interval is missed by is far below a rounding
+LOST = 1e-9  # what is left open beyond, of the whole, after so many: a force whose integral has no end
 MOST_HALVED = (
     2**18
 )  # parts of the intervals of one chunk: some seconds; a jump in an interval takes a hundred
@@ -139,6 +140,8 @@ def _impulses_of_length(site: SiteForcing, duration: float, starts: Floats) -> F
         np.maximum.at(size, rows, terms)
         off = (error > AGREE * size[rows]).any(axis=1) & np.isfinite(value).all(axis=1)
         off &= halvings < MOST_HALVINGS
+        if halvings == MOST_HALVINGS and (error > LOST * size[rows]).any():
+            raise _too_fast(starts, duration)
         np.add.at(total, rows[~off], value[~off])
         if off.any():
             halved += int(off.sum())

@@ -162,8 +162,7 @@ def choose(
         wanted = np.full((group.count, len(found)), not patterns)
         for pattern, test in tests:
             for place, local in enumerate(found):
-                fits = [bool(test.fullmatch(one)) for one in (local.name, f"{group.name}.{local.name}")]
-                fits = [any(fits)]
+                fits = [any(test.fullmatch(one) for one in (local.name, f"{group.name}.{local.name}"))]
                 if not fits[0] and ("[" in pattern or pattern.startswith(("*", group.name))):
                     names = (f"{group.name}[{i + 1}].{local.name}" for i in range(group.count))
                     fits = [bool(test.fullmatch(name)) for name in names]

@@ -47,8 +47,13 @@ FELT = {
     "error_h2": ("m/N", False),
 }
 
+# A sign that stands in a name, and in no exponent.
+_UNSPACED = re.compile(r"(?<![\d.])[a-z]\s*[+-]\s*[\d.a-z]")
+
 # A term of a weighted sum: its sign, its weight if it has one, its name.
-_TERM = re.compile(r"([+-])\s*(?:([\d.]+(?:e[+-]?\d+)?)\s*\*\s*)?(.*?)\s*(?=\s[+-]\s|$)")
+_TERM = re.compile(
+    r"([+-])\s*(?:((?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*\*\s*)?(.*?)\s*(?=\s[+-]\s|$)", re.ASCII
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +78,7 @@ class Aim:
     That is the spectral radius, or the time after which none is left but for 2 %: the same gains. Columns are
     the gains and, where there are `terms`, a level that the weighted sum of these is to stay on the good side
     of: (weight, the place of a gain or what is felt), in SI, with the largest value of all scenarios. `level`
-    is the range it is looked for in; `fixed` is what it is where that is known.
+    is the range it is looked for in; `fixed` is what it is where that is known, `scale` how large it is.
     """
 
     label: str
@@ -83,6 +88,7 @@ class Aim:
     terms: tuple[tuple[float, int | Felt], ...] = ()
     level: Range | None = None
     fixed: float | None = None
+    scale: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,7 +271,15 @@ def _aim(gains: Sequence[Range], maximize: str, minimize: str) -> Aim:
         return Aim(text, None, larger, "1")
     option = Place("--maximize" if larger else "--minimize")
     terms = []
-    for sign, weight, name in _TERM.findall(text if text[:1] in "+-" else f"+ {text}"):
+    for sign, weight, name in _TERM.findall(text if text.startswith(("+", "-")) else f"+ {text}"):
+        if spaced := _UNSPACED.search(name):
+            apart = re.sub(r"\s*([+-])\s*", " \\1 ", text)
+            hint = f'{option.file} "{apart}"'
+            raise ApcError(
+                Mistake("E996", option, f"{spaced[0]}: a sum has spaces around + and -", hint=hint)
+            )
+        if not 0 < float(weight or 1) < math.inf:
+            raise ApcError(Mistake("E996", option, "a weight", "a number above 0", weight[:40]))
         if name not in names and not name.startswith("feel."):
             what = f"{option.file} {text[:60] or 'nothing'}"
             others = "" if larger else f", {RADIUS} or {SETTLING}"

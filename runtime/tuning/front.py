@@ -109,8 +109,12 @@ def front(
     least = Aim(against.label, len(demands.free), False, FELT[against.name][0], ((1.0, against),))
     other = tune(system, replace(demands, aim=least), seconds=until - time.monotonic(), told=told)
     low, high = other.best, felt(np.array([float(one.value) for one in best.gains]))
-    if not (best.met and other.met and low < high * (1 - SAME)):
+    if not (best.met and other.met):
+        what = f"no gains were found in these ranges that meet all demands, whatever {against.label} is"
+        raise ApcError(Mistake("E996", AGAINST, what))
+    if not 0 < low < high * (1 - SAME):
         what = f"the best {demands.aim.label} is the best for {against.label}, too"
+        what = f"{against.label} can be below 0: there are no bounds in equal ratios" if low <= 0 else what
         raise ApcError(Mistake("E996", AGAINST, what))
     designs, notes = [_design(best, high)], best.notes
     for place, bound in enumerate(np.geomspace(high, low * LEAST, points)[1:].tolist(), 1):

@@ -206,15 +206,16 @@ class Limits:
             beyond = (-1 if aim.larger else 1) * (self.sums(setting, points) - level) + off[
                 :, count:
             ] @ weights
-            found = np.column_stack([found, beyond / np.maximum(np.abs(level), TINY)])
-        return np.asarray(np.minimum(np.nan_to_num(found, nan=BEYOND), BEYOND))
+            found = np.column_stack([found, beyond / aim.scale])
+        return np.clip(np.nan_to_num(found, nan=BEYOND), NONE, BEYOND)
 
     def sums(self, setting: int, points: Floats) -> Floats:
-        """Return the weighted sum that is the aim (k,) at points (k, m + b)."""
+        """Return the weighted sum that is the aim (k,) at points (k, m + b), NaN where nothing is known."""
         felt = iter(self.measured(setting, self._numbers(points))[:, len(self.demands.felt) :, 0].T)
         terms = self.demands.aim.terms
         parts = [weight * (next(felt) if isinstance(one, Felt) else points[:, one]) for weight, one in terms]
-        return np.asarray(np.sum(parts, axis=0))
+        total = np.asarray(np.sum(parts, axis=0))
+        return np.where(np.isfinite(total), total, np.nan)
 
     def measured(self, setting: int, numbers: Floats) -> Floats:
         """Return what is felt with gains and box (k, n), and what it may be off by (k, q, 2).
@@ -255,7 +256,8 @@ class Limits:
             if isinstance(family, GrowthEvaluator):
                 distinct, which = np.unique(self._numbers(moved), axis=0, return_inverse=True)
                 roots = np.array([family.parts(one) for one in distinct.tolist()])[which.reshape(-1)]
-                parts.append((*_differences(np.log(np.maximum(roots, TINY)) - self.allowed, inwards), place))
+                grown = np.nan_to_num(np.log(np.maximum(roots, TINY)), nan=BEYOND) - self.allowed
+                parts.append((*_differences(grown, inwards), place))
             else:
                 at = np.tile(self._numbers(point), (len(along), 1))
                 for pair in family.slopes(at, self._numbers(along)):

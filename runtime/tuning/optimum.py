@@ -35,8 +35,9 @@ LOOK, SLOW_LOOK, LOOKS = 64, 8, 4
 # The least error, of a value: floats know no more of where their eigenvalues cross.
 LEAST = 1e-9
 
-# How nearly a descent is followed to its end where a point takes milliseconds, as a share of the range.
-ROUGH = 1e-9
+# How nearly a descent is followed to its end, as a share of the range: of matrices, where a point takes
+# milliseconds, and where it takes tens of them and slopes are differences of what is felt.
+FINE, ROUGH, ROUGHER = 1e-14, 1e-9, 1e-7
 
 # How far a descent goes at most before limits are linear again, shorter each time that it leads to nothing,
 # as far beyond them limits say nothing of where they are; and how far at last.
@@ -81,8 +82,8 @@ class Optimum:
 class Search:
     """A search for the best gains in some scenarios.
 
-    The gain in `column` is to be large (`sign` 1) or small (−1); without a column the largest limit is to be
-    as small as can be. A descent takes so many `steps` at most.
+    The gain, or level, in `column` is to be large (`sign` 1) or small (−1); without a column the largest
+    limit is to be as small as can be. A descent takes so many `steps` at most.
     Inside, ranges are 0 to 1; t stands for the largest limit, where that is the aim.
     """
 
@@ -107,6 +108,11 @@ class Search:
         if self.limits.demands.aim.level:
             ends[:, -1] = -FAR, FAR
         return ends
+
+    @property
+    def _near(self) -> float:
+        """How nearly a descent is followed to its end."""
+        return ROUGHER if self.limits.demands.measured else ROUGH if self.limits.slow else FINE
 
     def _inner(self, shares: Floats) -> NDArray[np.bool_]:
         """Say which shares are not at an end."""
@@ -176,7 +182,7 @@ class Search:
         )
         level = sums.min(axis=0) if self.sign > 0 else sums.max(axis=0)
         shares = (level - self._low[-1]) / self._width[-1] - OPEN * self.sign
-        return np.column_stack([points[:, :-1], np.nan_to_num(shares, nan=self.sign * FAR)])
+        return np.column_stack([points[:, :-1], np.nan_to_num(shares, nan=-self.sign * FAR)])
 
     def _order(self, points: Floats, worst: Floats) -> Floats:
         """Return what the best of points (k, m) has least of, far below 0 where it meets the limits."""
@@ -261,14 +267,14 @@ class Search:
                 method="SLSQP",
                 bounds=[*near, *[(None, None)] * spare],
                 constraints=[{"type": "ineq", "fun": left, "jac": moves}],
-                options={"ftol": ROUGH if self.limits.slow else 1e-14, "maxiter": self.steps},
+                options={"ftol": self._near, "maxiter": self.steps},
             )
             rough = np.clip(np.nan_to_num(ended.x[:size], nan=0.5), *self._ends)
             for end in self._ends:
                 rough = np.where(np.abs(rough - end) < OPEN, end, rough)
             found = self._polished(rough, rows_of)
             (unmet, value), known = self._rank(found), self._rank(best)
-            far = (unmet, value + OPEN) < known
+            far = (unmet, value + max(OPEN, self._near)) < known
             if (unmet, value) < known:
                 best, here = found, np.append(rough, ended.x[size:])
             if far and ended.success and reach == 1:
@@ -356,7 +362,7 @@ class Search:
             error = scale * float(multipliers @ np.abs(rows.values - level))
         error = max(error, LEAST * abs(value))
         if self.limits.slow and self.column is not None:
-            error = max(error, 10 * ROUGH * float(self._width[self.column]))
+            error = max(error, 10 * self._near * float(self._width[self.column]))
         return Optimum(tuple(self.scenarios), self.gains(shares), value, error, worst, rows, multipliers, 0)
 
 

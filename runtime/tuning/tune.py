@@ -40,7 +40,7 @@ from apc.result import Result
 from apc.threads import single_threaded
 from apc.tuning.bound import none_better
 from apc.tuning.demands import PLACE, Demands, Felt
-from apc.tuning.limits import RESPONSES, TINY, Limits, Scenario, felt_in
+from apc.tuning.limits import RESPONSES, Limits, Scenario, felt_in
 from apc.tuning.optimum import BINDS, Optimum, Search
 from apc.vary.crossing import Told
 from apc.vary.growth import MEAN_SQUARE, PASSIVE
@@ -57,6 +57,9 @@ ROOM = 0.5
 # begin farther back: cells beside a limit are small, and there are very many.
 BACK = (0.0, 1e-4, 1e-3, 1e-2)
 BACK_IN_BOX = (5e-3, 1e-2)
+
+# How far a level is kept from what it bounds, of its size: far more than rounding, less than what is shown.
+SLACK = 1e-5
 
 # Steps on the way to where there is most room: any room does.
 STEPS = 12
@@ -246,10 +249,10 @@ class _Work:
             what = f"nothing is known of {self.demands.aim.label} with any gains that were looked at"
             raise ApcError(Mistake("E996", PLACE, what, hint="wider ranges, or another aim"))
         best = float(known.max() if self.demands.aim.larger else known.min())
-        wide = max(abs(best), TINY)
-        label = Free(self.demands.aim.label)
-        level = Range(label, self.demands.aim.unit, Fraction(best), Fraction(best + wide))
-        self.demands = replace(self.demands, aim=replace(self.demands.aim, level=level))
+        scale = abs(best) or float(np.abs(known).max()) or 1.0
+        name, unit = Free(self.demands.aim.label), self.demands.aim.unit
+        level = Range(name, unit, Fraction(best), Fraction(best) + Fraction(scale))
+        self.demands = replace(self.demands, aim=replace(self.demands.aim, level=level, scale=scale))
         self.limits = replace(self.limits, demands=self.demands)
         self.present = np.append(self.present, best)
 
@@ -342,6 +345,8 @@ class _Work:
             if column is None or len(gains) > 1:
                 middle = self._middle(gains, column, found) if middle is None else middle
                 gains = self._typed(gains, column, middle)
+            if self.demands.aim.level:
+                gains[-1] = self._worth(gains)
             point = np.array([float(one) for one in gains])
             if column is not None and not self.late and self._added(point, -ABOVE):
                 middle = None
@@ -353,6 +358,17 @@ class _Work:
                 if failed is not None or last or all(one.proof.stable for one in proofs):
                     return gains, proofs, failed
             place += 1
+
+    def _worth(self, gains: Sequence[Fraction]) -> Fraction:
+        """Return the level that an aim keeps with gains in every scenario, rounded to where it is kept."""
+        point = np.array([float(one) for one in gains])
+        sums = [self.limits.sums(one.setting, np.append(point, one.point)[None])[0] for one in self.every]
+        larger = self.demands.aim.larger
+        worst = float(min(sums) if larger else max(sums))
+        if not math.isfinite(worst):
+            return gains[-1]
+        margin = (-1 if larger else 1) * SLACK * self.demands.aim.scale
+        return _decimal(worst + margin, DIGITS + 1, ROUND_FLOOR if larger else ROUND_CEILING)
 
     def _back(self, value: float, share: float) -> Fraction:
         """Return a gain less a share of it, rounded to the side where it does less."""
@@ -480,6 +496,8 @@ class _Work:
     def _unmet(self, least: Optimum) -> Tuning:
         """Return that no gains were found that meet all demands, and those that miss them least."""
         gains = [_decimal(value, DIGITS) for value in least.gains.tolist()]
+        if self.demands.aim.level:
+            gains[-1] = self._worth(gains)
         return self._answer(least, gains, [], met=False)
 
     def _answer(
@@ -495,7 +513,7 @@ class _Work:
             (found.value, found.error) if column is not None else (math.exp(found.value), found.error)
         )
         if column is not None and not met:
-            best = float(found.gains[column])
+            best = value if demands.aim.level else float(found.gains[column])
         return Tuning(
             topology=self.system.name,
             aim=demands.aim.label,
@@ -555,7 +573,13 @@ class _Work:
     def _bounded(self, found: Optimum, gains: Sequence[Fraction]) -> int | None:
         """Return in how many cells it is proved that no gains do better, see `none_better`."""
         demands, column = self.demands, self.demands.aim.column
-        if column is None or not found.multipliers.any() or self.limits.by_growth or demands.measured:
+        if (
+            column is None
+            or not found.multipliers.any()
+            or self.limits.by_growth
+            or demands.measured
+            or demands.aim.level
+        ):
             return None
         worst = self.limits.worst(self.every, np.array([[float(one) for one in gains]]))[0]
         order = np.argsort(-worst, kind="stable").tolist()

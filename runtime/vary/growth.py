@@ -187,7 +187,12 @@ class GrowthEvaluator:
         if self.criterion != PASSIVE:
             return [math.sqrt(self.growth(value).radius)]
         changes = [Override(*one) for one in zip(self.free, map(Fraction, value), strict=True)]
-        found = loop_growths(apply(self.system, changes), self.prepared, bounded=False)
+        try:
+            found = loop_growths(apply(self.system, changes), self.prepared, bounded=False)
+        except ApcError as error:
+            if error.mistakes[0].code not in NOWHERE:
+                raise
+            return [math.nan]
         return [math.sqrt(one.radius) for one in found]
 
     def matrices(self, values: Floats) -> tuple[Floats, ...]:
