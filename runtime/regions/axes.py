@@ -53,7 +53,8 @@ def parse_axes(
             text = f"{own.parameter}={float(own.low)!r} {unit}:{float(own.high)!r} {unit}"
         if text is None:
             what = f"the scene has no studies: region:, so that --{letter} must be given"
-            other = (y if letter == "x" else x or "").partition("=")[0].strip() if (x or y) else ""
+            given = (y if letter == "x" else x) or ""
+            other = given.partition("=")[0].strip()
             hint = f'--{letter} "{proposed_range(system, without=other)}"'
             raise ApcError(Mistake("E901", PLACE, what, hint=hint))
         name, equals, span = (part.strip() for part in text.partition("="))

@@ -207,7 +207,7 @@ class Limits:
                 :, count:
             ] @ weights
             found = np.column_stack([found, beyond / aim.scale])
-        return np.clip(np.nan_to_num(found, nan=BEYOND), NONE, BEYOND)
+        return np.asarray(np.clip(np.nan_to_num(found, nan=BEYOND), NONE, BEYOND))
 
     def sums(self, setting: int, points: Floats) -> Floats:
         """Return the weighted sum that is the aim (k,) at points (k, m + b), NaN where nothing is known."""
