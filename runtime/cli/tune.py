@@ -75,11 +75,11 @@ def tune_command(
     """Find the gains that do best, and prove that they do.
 
     The free gains are chosen so that an aim, as one of them, is as large (or
-    small) as can be while the scene is stable in all that stands in --over. They are printed
-    to four digits, and proved at these: in boxes, for every number of peers,
-    over the network as it is. That no gains in these ranges do better by 2 %
-    is proved where that is quick; the answer says so, and how many points were
-    looked at. What is left out is as the topology's studies: tune: says.
+    small) as can be while the scene is stable in all that stands in --over.
+    They are printed to four digits, and proved at these: in boxes, for every
+    number of peers, over the network as it is. That no gains in these ranges
+    do better by 2 % is proved where that is quick; the answer says so, and how
+    many points were looked at. What is left out is as the topology's studies: tune: says.
 
     \b
         apc tune --free "coordination.stiffness=10 N/m:5000 N/m" \\

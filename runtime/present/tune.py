@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apc.compiler.compiled import LENGTH
+from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted, enumerated, in_hertz, measured, with_unit, wrapped
 from apc.frame.overrides import Override, apply
 from apc.present.analysis import range_document, range_text
@@ -57,7 +58,7 @@ def tuning_text(found: Tuning) -> str:
     lines += [*table(rows), ""]
     if found.met:
         value = measured(found.best, found.error, found.unit)
-        if _levelled(found):  # found without knowing how far any better one may be
+        if _is_felt(found):  # found without knowing how far any better one may be
             value = quantity(found.best, found.unit, BUYS + 1)
         best = f"{value}, the best of {found.looked:,} points"
         lines += labelled("before rounding", best)
@@ -95,18 +96,18 @@ def _sentence(found: Tuning) -> str:
     return f"{found.topology}: {value} found with which {stable}{over}; it is {proved}"
 
 
-def _levelled(found: Tuning) -> bool:
+def _is_felt(found: Tuning) -> bool:
     """Say whether the aim is what is felt, or a weighted sum."""
     return found.aim not in (RADIUS, SETTLING, *(one.parameter for one in found.gains))
 
 
 def _margin(found: Tuning) -> str:
     """Return how near the worst scenario is to what is allowed."""
+    if found.felt or _is_felt(found):
+        return f"{math.exp(found.worst):.6g} of what is allowed in the worst scenario"
     if found.criterion == "passive":
         needed = (1 + found.worst) / (1 - found.worst)  # see `hands.passivity.passive_growth`
         return f"passive hands need {needed:.4g} of the damping there is in the worst scenario"
-    if found.felt or _levelled(found):
-        return f"{math.exp(found.worst):.6g} of what is allowed in the worst scenario"
     radius, most = math.exp(found.worst + found.allowed), math.exp(found.allowed)
     return f"{_radius(found)} of {radius:.6g} in the worst scenario, {most:.6g} allowed"
 
@@ -147,7 +148,7 @@ def _where(one: Binding) -> str:
 def _binding_lines(found: Tuning, one: Binding) -> list[str]:
     where = _where(one)
     mode = f"{one.shape} mode at {in_hertz(one.frequency_hz)}" if one.shape else ""
-    other = "what is felt" if found.felt else found.aim if _levelled(found) else "stability"
+    other = "what is felt" if found.felt else found.aim if _is_felt(found) else "stability"
     lines = wrapped(": ".join(filter(None, [where, mode])) or other, "    ", "      ")
     for label, value, unit, better in one.buys if found.met and found.aim not in (RADIUS, SETTLING) else ():
         buys = quantity(better, found.unit, BUYS)
@@ -162,7 +163,10 @@ def tuning_picture(found: Tuning, ax: Any = None) -> Any:
     first Axes is returned.
     """
     moves = any(state.unit == "m/s" for kind in found.scenes[0].kinds for state in kind.states)
-    two = len(found.ranges) == 2 or not moves
+    two = len(found.ranges) == 2
+    if not (two or moves):
+        what = "nothing moves in this scene, and a stable region is of two gains"
+        raise ApcError(Mistake("E996", Place("--plot"), what, hint='another --free "PATH=LO:HI"'))
     panels = [*[_draw_gains] * two, *[_draw_struck] * moves]
     axes = [ax] if ax else new_figure((5.0 * len(panels), 4.4)).subplots(1, len(panels), squeeze=False)[0]
     for draw, one in zip(panels, axes, strict=False):
@@ -219,11 +223,12 @@ def front_text(found: Front) -> str:
     names = {found.knee: "knee", 0: "least felt", last: best}  # an end is no knee
     names_of = [name for name, _, _ in found.designs[0].gains]
     apart = found.aim not in names_of  # what is best is in no column of the gains
-    rows = [(found.against, *[found.aim] * apart, *names_of, "", "")]
+    heads = ["felt", "best"] if apart else [found.against]  # the title names both
+    rows = [(*heads, *names_of, "", "")]
     for place, one in enumerate(found.designs):
         gains = (quantity(value, unit, TYPED) for _, value, unit in one.gains)
         proved = "" if one.proved else "not proved"
-        value = [quantity(one.value, found.unit, 5)] * apart
+        value = [quantity(one.value, found.unit, 4)] * apart
         rows.append((quantity(one.felt, found.against_unit, 5), *value, *gains, names.get(place, ""), proved))
     meant = [MEANT[found.criterion]] if found.criterion in MEANT else []
     said = notes([*meant, *found.left_out, *found.notes])

@@ -8,7 +8,8 @@ Does not: choose scenarios, or prove (see `tune`).
 A scenario is a scene of its own, a number of peers and a delay (`settings`), and a point of the box. What
 limits gains there is how fast each of the largest modes grows, ln |λ| less what is allowed; over a lossy
 network or with passive hands it is the one number that the criterion has. What is felt counts as the
-logarithm of what it is of the most it may be, and an aim's level by how far what it bounds is beyond it.
+logarithm of what it is of the most it may be, and an aim's level by how far what it bounds is beyond it, of
+the aim's size.
 """
 
 from __future__ import annotations

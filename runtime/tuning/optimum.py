@@ -153,7 +153,7 @@ class Search:
         points = np.vstack([np.clip((present - self._low) / self._width, *self._ends), self.even])
         gains = self.gains(points)
         worst = np.max([self.limits.sampled(one, gains) for one in self.scenarios], axis=0)
-        points = self._levelled(points, self.scenarios)
+        points = self._at_level(points, self.scenarios)
         order = np.argsort(self._order(points, worst), kind="stable")
         if than is not None:
             met = self.column is not None and than.worst <= BINDS
@@ -162,14 +162,14 @@ class Search:
         size, left = (SLOW_LOOK if self.limits.slow else LOOK), LOOKS
         for begin in range(0, min(len(order), size * LOOKS), size):
             some = order[begin : begin + size]
-            points[some] = self._levelled(points[some], every)
+            points[some] = self._at_level(points[some], every)
             ranks = self._order(points[some], self.limits.worst(every, self.gains(points[some])).max(axis=1))
             place, left = int(np.argmin(ranks)), left - 1
             if ranks[place] < (known - OPEN if than is not None else 0.0 if left else np.inf):
                 return [points[some[place]]]
         return []
 
-    def _levelled(self, points: Floats, scenarios: Sequence[Scenario]) -> Floats:
+    def _at_level(self, points: Floats, scenarios: Sequence[Scenario]) -> Floats:
         """Return points (k, m) with the level of the aim, if it has one, where it is just met."""
         if not self.limits.demands.aim.level:
             return points

@@ -133,8 +133,9 @@ class Tuning(Result):
 
     `value` is that of the aim with the gains as they are typed, `best` before they were rounded, right to
     `error`; both are a spectral radius where that is the aim. `met` says whether any gains meet all demands
-    in floats; `proved` whether all was proved of these. `worst` is how much faster than allowed the fastest
-    motion grows in a frame, ln |λ| less the `allowed`, below 0 if it is slower. `decay` is a factor a second.
+    in floats; `proved` whether all was proved of these. `worst` is the largest limit (see `limits`), as how
+    much faster than allowed the fastest motion grows in a frame, ln |λ| less the `allowed`, below 0 if all
+    are met. `decay` is a factor a second.
     `scenes` are those of `binding`, or one if nothing binds. `looked` points were looked at.
     `bounded` is in how many cells it is proved that no gains of these ranges do better by `bound.SHARE`, None
     where it is not.
@@ -232,9 +233,9 @@ class _Work:
         first = len(self.every) // len(self.limits.settings)
         self.scenarios = list(dict.fromkeys((self.every[0], self.every[-first])))
         if self.demands.aim.terms:
-            self._levelled()
+            self._with_level()
 
-    def _levelled(self) -> None:
+    def _with_level(self) -> None:
         """Find where the aim's level is looked for: from the best that is known on."""
         search = Search(self.limits, self.scenarios, None)
         points = np.vstack([self.present, search.gains(search.even)])
