@@ -223,7 +223,10 @@ def front_text(found: Front) -> str:
     names = {found.knee: "knee", 0: "least felt", last: best}  # an end is no knee
     names_of = [name for name, _, _ in found.designs[0].gains]
     apart = found.aim not in names_of  # what is best is in no column of the gains
-    heads = ["felt", "best"] if apart else [found.against]  # the title names both
+    heads = ["felt", best] if apart else [found.against]  # the title names both
+    knee = labelled("knee", f"{quantity(found.designs[found.knee].felt, found.against_unit, 5)} felt")
+    if apart:  # there is no room for names
+        names = {}
     rows = [(*heads, *names_of, "", "")]
     for place, one in enumerate(found.designs):
         gains = (quantity(value, unit, TYPED) for _, value, unit in one.gains)
@@ -232,7 +235,7 @@ def front_text(found: Front) -> str:
         rows.append((quantity(one.felt, found.against_unit, 5), *value, *gains, names.get(place, ""), proved))
     meant = [MEANT[found.criterion]] if found.criterion in MEANT else []
     said = notes([*meant, *found.left_out, *found.notes])
-    return "\n".join([*wrapped(title, "", "  "), *said, "", *table(rows)])
+    return "\n".join([*wrapped(title, "", "  "), *said, "", *table(rows), *[line for line in knee if apart]])
 
 
 def front_picture(found: Front, ax: Any = None) -> Any:
@@ -245,7 +248,7 @@ def front_picture(found: Front, ax: Any = None) -> Any:
     end = "largest" if found.larger else "least"
     for place, name in {found.knee: "knee", 0: "least felt", len(x) - 1: end}.items():
         at = (float(x[place]), float(y[place]))
-        ax.annotate(name, at, xytext=(6, -12), textcoords="offset points", fontsize=8)
+        ax.annotate(name, at, xytext=(6, 6 if y[0] > y[-1] else -12), textcoords="offset points", fontsize=8)
     ax.margins(0.12)  # room for the names
     ax.grid(linewidth=0.4, alpha=0.5)
     return ax

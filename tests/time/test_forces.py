@@ -41,9 +41,17 @@ OWN = (
 )
 LAWS = {
     "Powers": "sqrt(time/T) + (time/T)^2.5 + exp(-time/T) + log(1 + time/T)/(1 + time/T) + cos(40*time/T)",
+    "Choices": "if time < 0.03125*T or (time > 0.0625*T and not time > 0.078125*T) then max(time/T, 0.015625)"
+    " else min(abs(time/T - 0.05078125), sign(time/T - 0.0546875)/16)",
     "Tap": "if time < 0.0429*T then 0 else if time < 0.043*T then 100 else 0",
     "Steps": "floor(64*time/T)/8",
 }
+
+
+def choices(t: Any) -> Any:
+    if t < 0.03125 or 0.0625 < t <= 0.078125:
+        return max(t, mpmath.mpf("0.015625"))
+    return min(abs(t - mpmath.mpf("0.05078125")), mpmath.sign(t - mpmath.mpf("0.0546875")) / 16)
 
 
 # What pushes, its force in N over seconds, and where it bends or jumps.
@@ -72,6 +80,7 @@ PUSHES: dict[str, tuple[str, Callable[[Any], Any], list[float]]] = {
         "type: Powers",
         lambda t: mpmath.sqrt(t) + t**2.5 + mpmath.exp(-t) + mpmath.log(1 + t) / (1 + t) + mpmath.cos(40 * t),
         [1e-6, 1e-4, 1e-3, 1e-2]),
+    "choices": ("type: Choices", choices, [k / 256 for k in range(1, 26)]),
     "a tap within a tick": (
         "type: Tap", lambda t: 100 * (mpmath.mpf(0.0429) <= t < mpmath.mpf(0.043)), [0.0429, 0.043]),
     "steps of a staircase": (

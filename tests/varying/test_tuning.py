@@ -122,7 +122,7 @@ def test_what_is_felt_is_no_better_with_any_gains_of_a_grid(aim: str) -> None:
         if apc.analyze(model, set=at).stable:
             sums.append(sign * worth(apc.feel(model, [1.0, 5.0], set=at), stiffness))
     assert found.proved and sums[0] <= sign * found.value  # what is typed keeps what is said
-    assert sign * found.best <= min(sums[1:]) + 1e-4 * abs(found.best)
+    assert sign * found.best <= min(sums[1:]) + 1e-4 * abs(found.best)  # where a descent ends
 
 
 def test_where_nothing_moves_nothing_limits_gains() -> None:
