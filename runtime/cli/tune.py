@@ -43,13 +43,14 @@ def tune_command(
     minimize: str = option(
         "What is to be as small as can be: a gain; settling_time or spectral_radius (the same gains); "
         '"feel.error at 1 Hz", or feel.impedance, feel.transmitted; feel.damping of slow motions; '
-        "feel.error_h2, for white forces of 1 N rms; or a weighted sum in SI of gains and these, "
+        "feel.error_h2, for white forces of 1 N rms, feel.error_hinf, the largest gain at any frequency; or "
+        "a weighted sum in SI of gains and these, "
         '"feel.damping - 0.01*coordination.stiffness".',
         "AIM",
     ),
     subject: tuple[str, ...] = option(
         'Beside stability: "decay=60 dB in 2 s"; "feel.impedance at 5 Hz < 20 N*s/m", or feel.transmitted in '
-        "m/s/N, feel.error in m/N, feel.damping, feel.error_h2. May be repeated.",
+        "m/s/N, feel.error in m/N, feel.damping, feel.error_h2, feel.error_hinf. May be repeated.",
         "DEMAND",
     ),
     against: str = option(

@@ -132,7 +132,7 @@ def feel_text(found: Feel) -> str:
     told += [f"copies: of {found.copy}, from the mean of the others'"] if found.copy else []
     told += ["alias: the largest part that sampling moves to another frequency, beside that at this one"]
     lines += ["", *wrapped("; ".join(told), "  ", "  ")]
-    if found.hinf:
+    if found.hinf and found.stable is not False:
         lines += ["", "  Largest gain at any frequency (H∞), forces of any course:"]
         lines += table([_extreme(one) for one in found.hinf])
     for one in found.h2:  # of a sample that is off by a mm, a µm is what a mm is of 1 N

@@ -299,6 +299,8 @@ class _Work:
             search = Search(self.limits, self.scenarios, column, sign)
             if not starts:
                 starts = begun = search.start(self.present, self.every)
+                for one in starts:
+                    self.limits.heard(self.scenarios, search.gains(one))
             found = search.best(starts)
             self.looked += found.looked
             bound = found.rows.scenario[found.multipliers > 0]
@@ -306,7 +308,7 @@ class _Work:
                 self.scenarios = [one for place, one in enumerate(self.scenarios) if place in bound]
             level = max(found.worst, 0.0 if column is not None else -math.inf)
             starts = [search.shares(found)]
-            if self._added(found.gains, level):
+            if self._added(found.gains, level) or self.limits.heard(self.scenarios, found.gains):
                 if not self.late:
                     continue
                 return search.at(begun[0]) if begun else found
@@ -387,7 +389,8 @@ class _Work:
             return replace(self.limits, demands=replace(self.demands, aim=fixed_level), samples={})
         others = tuple(one for place, one in enumerate(free) if place != column)
         fixed = apply(self.system, [Override(free[column].free, gains[column])])
-        return Limits(fixed, self.limits.prepared, replace(self.demands, free=others))
+        demands, heard = replace(self.demands, free=others), self.limits.frequencies
+        return Limits(fixed, self.limits.prepared, demands, frequencies=heard)
 
     def _middle(self, gains: Sequence[Fraction], column: int | None, found: Optimum) -> Floats:
         """Return the other gains where there is most room beside the one in a column."""
