@@ -17,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -93,11 +94,12 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What limits the gains of a scene."""
+    """What limits the gains of a scene; after the time `until` of several points only the first is judged."""
 
     system: CompiledSystem
     prepared: Prepared
     demands: Demands
+    until: float = math.inf
     known: dict[int, MatrixSource] = field(default_factory=dict)
     samples: dict[Scenario, Floats] = field(default_factory=dict)
     felt: dict[tuple[int, tuple[float, ...], int], Floats] = field(default_factory=dict)
@@ -126,6 +128,11 @@ class Limits:
     def allowed(self) -> float:
         """What ln |λ| of a frame may be at most."""
         return math.log(self.demands.decay) * float(self.prepared.schedules[0].frame_s)
+
+    @property
+    def late(self) -> bool:
+        """Whether the time is up."""
+        return time.monotonic() > self.until
 
     @property
     def by_growth(self) -> bool:
@@ -158,12 +165,19 @@ class Limits:
 
     def worst(self, scenarios: Sequence[Scenario], chosen: Floats) -> Floats:
         """Return the largest value in each scenario (k, s) with columns (k, m)."""
-        found = np.empty((len(chosen), len(scenarios)))
-        for place, one in enumerate(scenarios):
-            points = np.hstack([chosen, np.tile(one.point, (len(chosen), 1))])
-            sizes = [_sizes(matrix) for matrix in self.family(one.setting).matrices(self._numbers(points))]
-            grown = np.max([np.full(len(chosen), NONE), *sizes], axis=0) - self.allowed
-            found[:, place] = np.max([grown, *self.asked(one.setting, points).T], axis=0)
+        found = np.full((len(chosen), len(scenarios)), BEYOND)
+        size = 1 if self.slow else len(chosen)
+        for begin in range(0, len(chosen), size):
+            if begin and self.late:
+                break
+            some = slice(begin, begin + size)
+            for place, one in enumerate(scenarios):
+                points = np.hstack([chosen[some], np.tile(one.point, (len(chosen[some]), 1))])
+                sizes = [
+                    _sizes(matrix) for matrix in self.family(one.setting).matrices(self._numbers(points))
+                ]
+                grown = np.max([np.full(len(points), NONE), *sizes], axis=0) - self.allowed
+                found[some, place] = np.max([grown, *self.asked(one.setting, points).T], axis=0)
         return found
 
     def _numbers(self, points: Floats) -> Floats:
@@ -266,6 +280,8 @@ class Limits:
         free = [one.free for one in (*self.demands.free, *self.demands.box)]
         for row, point in zip(found, map(tuple, numbers.tolist()) if asked else (), strict=False):
             if (setting, point, len(asked)) not in self.felt:
+                if row is not found[0] and self.late:
+                    break
                 pairs = zip(free, map(Fraction, point), strict=True)
                 with contextlib.suppress(ApcError):
                     changed = apply(scene, [Override(*pair) for pair in pairs])
