@@ -30,8 +30,8 @@ class Look(TypedDict, total=False):
 class Result:
     """What is found, abstract. `shown_by` names its module of `apc.present`, and it there: "vary:critical".
 
-    That module has a function for each form of it: `critical_text`, `critical_picture`. Its document is its
-    fields (`forms.document`), unless there is a `critical_document`.
+    That module has a function for each form of it: `critical_text`, which yields its lines,
+    `critical_picture`. Its document is its fields (`forms.document`), unless there is a `critical_document`.
     """
 
     __slots__ = ()
@@ -55,8 +55,7 @@ class Result:
 
     def __str__(self) -> str:
         """Return the result as text of at most 80 columns."""
-        text: str = self._shown("text")
-        return text
+        return "\n".join(self._shown("text")).rstrip()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain data, ready for JSON."""

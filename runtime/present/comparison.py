@@ -16,7 +16,7 @@ import numpy as np
 
 from apc.compiler.words import counted, known_digits, measured, with_unit, wrapped
 from apc.present.comparison_picture import comparison_picture  # noqa: F401 -- looked up
-from apc.present.forms import MEANT, notes, picked, quantity, reached, record, table
+from apc.present.forms import MEANT, Lines, notes, picked, quantity, reached, record, table
 from apc.tables import Column, Row
 
 if TYPE_CHECKING:
@@ -34,13 +34,13 @@ VARIED = (
 )
 
 
-def comparison_text(found: Comparison) -> str:
-    """Return what `apc compare` prints: a table for each question, a line for each scheme."""
+def comparison_text(found: Comparison) -> Lines:
+    """Yield what `apc compare` prints: a table for each question, a line for each scheme."""
     schemes = found.schemes
     feet: dict[str, int] = {}
-    lines = [counted(len(schemes), "scheme") + " side by side" * (len(schemes) > 1)]
-    lines += notes([*_meant(found), *found.left_out, *(f"note: {text}" for text in found.notes)])
-    tables: list[tuple[tuple[str, ...], list[tuple[str, ...]]]] = [
+    yield counted(len(schemes), "scheme") + " side by side" * (len(schemes) > 1)
+    yield from notes(*_meant(found), *found.left_out, *(f"note: {text}" for text in found.notes))
+    tables: list[tuple[tuple[str, ...], Iterable[tuple[str, ...]]]] = [
         (("",), [(f"{one.topology}, {counted(one.peers, 'peer', ',d')}",) for one in schemes]),
         (("verdict", "spectral radius a frame"), [_verdict(one, feet) for one in schemes]),
     ]
@@ -49,14 +49,15 @@ def comparison_text(found: Comparison) -> str:
     for key, heading in VARIED:
         tables.append(((heading, "of"), [_varied(one, key, feet) for one in schemes]))
     tables.append((("felt at 1 Hz", "at 10 Hz", "of the hand at"), [_felt(one, feet) for one in schemes]))
-    tables.append((("work a tick", "a peer sends at most", "all send"), [_costs(one) for one in schemes]))
+    tables.append((("work a tick", "a peer sends at most", "all send"), map(_costs, schemes)))
     for headings, cells in tables:
         rows = [("", *headings), *((str(place), *row) for place, row in enumerate(cells, 1))]
-        lines += ["", *(line for line in table(rows, later=5) if line)]
-    lines += [""] if feet else []
+        yield ""
+        yield from filter(None, table(rows, later=5))
+    if feet:
+        yield ""
     for text, number in feet.items():
-        lines += wrapped(text, f"  [{number}] ", "      ")
-    return "\n".join(lines)
+        yield from wrapped(text, f"  [{number}] ", "      ")
 
 
 def _marked(cell: str, texts: Iterable[str], feet: dict[str, int]) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.words import known_digits, measured, wrapped
-from apc.present.forms import LINEARIZED, document, labelled, note, notes, record, table
+from apc.present.forms import LINEARIZED, Lines, document, labelled, notes, record, sentences, table
 from apc.present.pictures import COLOURS, new_figure
 from apc.tables import Column, Row
 
@@ -31,25 +31,26 @@ SHOWN = 12
 DIGITS = 6
 
 
-def passive_text(found: PassiveHands) -> str:
-    """Return whether a scene is stable with any passive hands, in words and numbers."""
-    lines = wrapped(f"{found.topology}: {found.verdict}{LINEARIZED if found.linearized else ''}", "", "  ")
-    lines += [*notes(found.left_out), ""]
-    worst = found.worst
-    told = [f"{found.why}."] if found.why else [] if worst is None else [_worst(found, worst)]
+def passive_text(found: PassiveHands) -> Lines:
+    """Yield whether a scene is stable with any passive hands, in words and numbers."""
+    yield from wrapped(f"{found.topology}: {found.verdict}{LINEARIZED if found.linearized else ''}", "", "  ")
+    yield from notes(*found.left_out)
+    yield ""
+    if found.why:
+        yield from sentences(f"{found.why}.")
+    elif found.worst is not None:
+        yield from sentences(_worst(found, found.worst))
     if found.why and not found.modes:
-        told.append(
+        yield from sentences(
             "Take the velocity by a backward difference of samples, as VirtualWall does, or none (damping 0)."
         )
-    lines += [line for text in told for line in wrapped(text, "  ", "  ")]
+    yield ""
     clamped = measured(found.clamped_radius, found.clamped_error)
     moves = f"spectral radius {clamped}" if found.clamped_radius or found.clamped_error else "nothing moves"
-    lines += ["", *labelled("devices clamped", moves)]
-    lines += labelled("proof", found.proof) if found.proof else []
+    yield from labelled(("devices clamped", moves), ("proof", found.proof))
     if found.modes:
-        headings = ("mode", "damping", "needed", "at", "at rest", "")
-        lines += ["", *table([headings, *map(_mode, found.modes)])]
-    return "\n".join(lines)
+        yield ""
+        yield from table([("mode", "damping", "needed", "at", "at rest", ""), *map(_mode, found.modes)])
 
 
 def _worst(found: PassiveHands, worst: PassiveMode) -> str:
@@ -109,46 +110,49 @@ def passive_document(found: PassiveHands) -> dict[str, Any]:
     return whole
 
 
-def feel_text(found: Feel) -> str:
-    """Return what is felt at a device, in words and numbers."""
+def feel_text(found: Feel) -> Lines:
+    """Yield what is felt at a device, in words and numbers."""
     title = f"{found.topology}: what a hand feels at {found.at}{LINEARIZED if found.linearized else ''}"
-    lines = [*wrapped(title, "", "  "), *notes((*found.notes, *found.left_out)), ""]
+    yield from wrapped(title, "", "  ")
+    yield from notes(*found.notes, *found.left_out)
+    yield ""
     slow = found.low_frequency
     if slow is not None:
-        lines.append("  Of slow motions, the other hands as the scene has them:")
+        yield "  Of slow motions, the other hands as the scene has them:"
         parts = zip(("mass", "damping", "stiffness"), ("kg", "N*s/m", "N/m"), slow.errors, strict=True)
         for name, unit, error in parts:
-            lines += labelled(name, measured(getattr(slow, name), error, unit))
+            yield from labelled((name, measured(getattr(slow, name), error, unit)))
         if (network := found.network_viscosity) is not None:
             share = measured(network.network, network.error, "N*s/m")
-            lines += labelled("of that", f"{share}, which the network adds")
+            yield from labelled(("of that", f"{share}, which the network adds"))
         if slow.mass < 0:
-            lines += note("a mass below 0: late forces act as negative inertia, for slow motions")
-        lines.append("")
+            yield from notes("a mass below 0: late forces act as negative inertia, for slow motions")
+        yield ""
     headings = ("frequency", "impedance", "phase", "arrives", "copies apart", "alias")
     units = ("Hz", "N*s/m", "degrees", "mm/s/N", "mm/N", "")
-    lines += table([headings, units, *_rows_shown(found)], ">>>>>>")
+    yield from table([headings, units, *_rows_shown(found)], ">>>>>>")
     told = [f"arrives: at {found.between}"] if found.between else []
     told += [f"copies: of {found.copy}, from the mean of the others'"] if found.copy else []
     told += ["alias: the largest part that sampling moves to another frequency, beside that at this one"]
-    lines += ["", *wrapped("; ".join(told), "  ", "  ")]
+    yield ""
+    yield from sentences("; ".join(told))
     if found.hinf:
-        lines += ["", "  Largest gain at any frequency (H∞), forces of any course:"]
-        lines += table([_extreme(one) for one in found.hinf])
+        yield "\n  Largest gain at any frequency (H∞), forces of any course:"
+        yield from table([_extreme(one) for one in found.hinf])
     for one in found.h2:  # of a sample that is off by a mm, a µm is what a mm is of 1 N
         what, small = ("1 N rms of every hand", "m")
         if one.source != "hands":
             what, small = "1 mm rms of every device's samples", "µ"
         values = [
-            f"{what} {measured(value * 1e3, off * 1e3, unit)}"
-            for what, value, off, unit in (
+            f"{quantity} {measured(value * 1e3, off * 1e3, unit)}"
+            for quantity, value, off, unit in (
                 ("copies apart", one.error_m, one.errors[0], f"{small}m"),
                 ("velocity", one.velocity_m_s, one.errors[1], f"{small}m/s"),
             )
             if value is not None and off is not None
         ]
-        lines += ["", *note(f"{', '.join(values) or 'it drifts'} (rms) for {what}, new at each tick")]
-    return "\n".join(lines)
+        yield ""
+        yield from notes(f"{', '.join(values) or 'it drifts'} (rms) for {what}, new at each tick")
 
 
 def _curves(found: Feel) -> list[tuple[NDArray[np.complex128], Floats, float, bool, str]]:

@@ -8,10 +8,11 @@ Does not: compute.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from apc.compiler.words import measured, wrapped
-from apc.present.forms import LINEARIZED, labelled, notes, record
+from apc.compiler.words import measured
+from apc.present.forms import LINEARIZED, Lines, labelled, notes, record, sentences
 
 if TYPE_CHECKING:
     from apc.moments.network import NetworkVerdict
@@ -24,50 +25,46 @@ _WORDS = {
 }
 
 
-def network_text(found: NetworkVerdict) -> str:
-    """Return what becomes of a scene over its network, in words and numbers."""
+def network_text(found: NetworkVerdict) -> Lines:
+    """Yield what becomes of a scene over its network, in words and numbers."""
     radius = found.mean_square_radius
     where = " over its network" if radius is None else ""
-    lines = [f"{found.topology}: {found.verdict}{where}{LINEARIZED if found.linearized else ''}", ""]
-    facts = []
+    yield f"{found.topology}: {found.verdict}{where}{LINEARIZED if found.linearized else ''}"
+    yield ""
     if radius is not None:
-        lines += [*wrapped(_WORDS[found.verdict.removeprefix("probably ")], "  ", "  "), ""]
+        yield from sentences(_WORDS[found.verdict.removeprefix("probably ")])
+        yield ""
         error, root = found.error or 0.0, math.sqrt(radius)
         rooted = measured(root, error / (2 * root) if root else error)
-        facts = [
+        yield from labelled(
             ("mean squares", f"multiplied by {measured(radius, error)} a frame"),
             ("their root", f"{rooted}, to compare with a spectral radius"),
-        ]
+        )
     if found.rms_error_m is not None:
         apart = f"{found.rms_error_m * 1e3:.4g} mm rms, for 1 N rms at every hand, white from tick to tick"
-        facts.append(("copies apart", apart))
+        yield from labelled(("copies apart", apart))
     if found.almost_sure is not None:
         low, high = found.almost_sure.interval
         exponent = f"growth e^{found.almost_sure.exponent:.4g} a frame ({low:.4g} to {high:.4g})"
-        facts.append(("almost surely", exponent))
+        yield from labelled(("almost surely", exponent))
     if found.losses_in_a_row is not None:
-        facts += _losses(found.losses_in_a_row)
-    if found.proof:
-        facts.append(("proof", found.proof))
-    lines += [line for label, text in facts for line in labelled(label, text)]
-    return "\n".join([*lines, *notes(found.notes)]).rstrip()
+        yield from labelled(*_losses(found.losses_in_a_row))
+    yield from labelled(("proof", found.proof))
+    yield from notes(*found.notes)
 
 
-def _losses(found: LossesInARow) -> list[tuple[str, str]]:
-    told = []
+def _losses(found: LossesInARow) -> Iterator[tuple[str, str]]:
     if found.certified is not None:
         harmless = (
             f"any pattern of at most {found.certified}" if found.certified else "not even one at a time"
         )
-        told.append(("losses in a row", f"{harmless} is certified harmless"))
+        yield "losses in a row", f"{harmless} is certified harmless"
     pattern = "".join("×" if lost else "·" for lost in found.unstable_pattern or ())
-    grows = f"a motion grows by {found.growth:.6g} a frame" if pattern else ""
+    grows = f"grow by {found.growth:.6g} a frame" if pattern else ""
     if "×" in pattern:
-        grows = grows.replace("a motion grows", "makes a motion grow")
-        told.append(("worst pattern", f"{pattern} lost again and again (×) {grows}"))
+        yield "worst pattern", f"{pattern} lost again and again (×) makes a motion {grows}"
     elif pattern:
-        told.append(("losses in a row", f"with none {grows}"))
-    return told
+        yield "losses in a row", f"with none a motion {grows.replace('grow', 'grows', 1)}"
 
 
 def network_document(found: NetworkVerdict) -> dict[str, Any]:

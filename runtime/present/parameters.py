@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from apc.compiler.words import with_unit, wrapped
-from apc.present.forms import quantity, table
+from apc.compiler.words import with_unit
+from apc.present.forms import Lines, quantity, sentences, table
 
 if TYPE_CHECKING:
     from apc.frame.settable import Parameters, Settable
@@ -20,11 +20,13 @@ HOW = (
 )
 
 
-def parameters_text(found: Parameters) -> str:
-    """Return a line a number: name, value, limits, and what it is."""
+def parameters_text(found: Parameters) -> Lines:
+    """Yield a line a number: name, value, limits, and what it is."""
+    yield f"{found.topology}: what may be set\n"
     rows = [(one.name, _value(one), _limits(one), _told(one)) for one in found.rows]
-    lines = table([("name", "value", "limits", ""), *rows], later=6)
-    return "\n".join([f"{found.topology}: what may be set", "", *lines, "", *wrapped(HOW, "  ", "  ")])
+    yield from table([("name", "value", "limits", ""), *rows], later=6)
+    yield ""
+    yield from sentences(HOW)
 
 
 def _value(one: Settable) -> str:

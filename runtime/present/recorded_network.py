@@ -12,40 +12,42 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import counted, wrapped
-from apc.present.forms import document, labelled, notes, record
+from apc.present.forms import Lines, document, labelled, notes, record
 
 if TYPE_CHECKING:
     from apc.network.recorded import NetworkRecording, Share
 
 
-def recording_text(found: NetworkRecording) -> str:
-    """Return what a recording amounts to, in words and numbers, and a link's entry that says so."""
+def recording_text(found: NetworkRecording) -> Lines:
+    """Yield what a recording amounts to, in words and numbers, and a link's entry that says so."""
     of = f" by {found.program}" if found.program else ""
     file = Path(found.file).name
-    lines = [f"{file}: {counted(found.packets, 'packet', ',')} recorded{of}", ""]
+    yield f"{file}: {counted(found.packets, 'packet', ',')} recorded{of}"
+    yield ""
     if found.left_out:
-        lines += [*notes(found.left_out), ""]
-    facts = [("lost", _share(found.lost))]
+        yield from notes(*found.left_out)
+        yield ""
+    yield from labelled(("lost", _share(found.lost)))
     if found.lost.count:
         how = "losses follow losses" if found.bursty else "no more than luck makes of independent losses"
         average = f"{found.lost.count / found.bursts:.3g} packets on average"
         bursts = f"{found.bursts:,}, {average}, {found.longest_burst:,} the longest"
-        facts += [("bursts", bursts), ("", f"{how} (Fisher's exact test)")]
+        yield from labelled(("bursts", bursts), ("", f"{how} (Fisher's exact test)"))
     if found.law is not None:
         several = found.packets > found.lost.count + 1
         spread = f", standard deviation {_ms(found.deviation)}" if several else ""
-        facts += [("delay", f"{_ms(found.shortest)} to {_ms(found.longest)}")]
-        facts += [("  mean", f"{_ms(found.mean)}{spread}")]
-        facts += [(f"  {100 * share:g} %", f"at most {_ms(delay)}") for share, delay in found.quantiles]
+        quantiles = ((f"  {100 * share:g} %", f"at most {_ms(delay)}") for share, delay in found.quantiles)
+        span = f"{_ms(found.shortest)} to {_ms(found.longest)}"
+        yield from labelled(("delay", span), ("  mean", f"{_ms(found.mean)}{spread}"), *quantiles)
     if found.overtaken is not None:
-        facts.append(("overtaken", counted(found.overtaken, "packet", ",")))
-    lines += [line for label, text in facts for line in labelled(label, text)]
-    lines += ["", "  as keys of a link", *wrapped(link_entry(found), "    ", "     ")]
+        yield from labelled(("overtaken", counted(found.overtaken, "packet", ",")))
+    yield "\n  as keys of a link"
+    yield from wrapped(link_entry(found), "    ", "     ")
     if found.law is not None and found.law.jitter:
         away = f"shares of packets below a delay differ by at most {100 * found.law.distance:.2g} %"
         nearest = f"{found.law.distribution} is the nearest of the distributions: {away}"
-        lines += wrapped(nearest, "    ", "    ")
-    return "\n".join([*lines, "  or packet by packet", f"    lan: {{clock: network, trace: {file}}}"])
+        yield from wrapped(nearest, "    ", "    ")
+    yield f"  or packet by packet\n    lan: {{clock: network, trace: {file}}}"
 
 
 def recording_document(found: NetworkRecording) -> dict[str, Any]:

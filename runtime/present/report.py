@@ -27,10 +27,9 @@ import msgspec
 from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, check_target, read_file, unwritable, write_file, write_text
 from apc.compiler.timings import part
-from apc.compiler.words import wrapped
 from apc.optional import missing, need
 from apc.present.comparison_picture import comparison_picture
-from apc.present.forms import document, json_text, record
+from apc.present.forms import Lines, document, json_text, notes, record
 from apc.present.graph import graph_picture
 from apc.present.pictures import svg_image
 from apc.reports.contents import Report, SceneReport, Section
@@ -79,15 +78,14 @@ code { background: var(--tint); padding: .1rem .3rem; overflow-wrap: anywhere; }
 """
 
 
-def report_text(found: Report) -> str:
-    """Return what is printed of a report: a line a section, and why those are empty that are."""
-    lines = []
+def report_text(found: Report) -> Lines:
+    """Yield what is printed of a report: a line a section, and why those are empty that are."""
     for one in found.scenes:
-        lines += ["", one.name]
+        if one is not found.scenes[0]:
+            yield ""
+        yield one.name
         for section in one.sections:
-            told = section.refused or f"as {section.command}"
-            lines += wrapped(f"{TITLES[section.key]}: {told}", "  ", "    ")
-    return "\n".join(lines[1:])
+            yield from notes(f"{TITLES[section.key]}: {section.refused or f'as {section.command}'}")
 
 
 def report_document(found: Report) -> dict[str, Any]:
