@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
+from typing import Any
 
 from apc.answer import answer
 from apc.compiler.pipeline import compile_topology
 from apc.compiler.view.listing import diagram_of
 from apc.present.graph import graph_picture
-from apc.present.pictures import svg_image
-from apc.present.report import POLICY, STYLE
+from apc.present.pages import page
 
 _COMMENTS = re.compile(r"(^#.*\n)|[ \t]+#.*$", re.MULTILINE)
 
@@ -35,28 +34,16 @@ def gallery_page(topologies: Sequence[Path]) -> str:
     ApcError
         Their mistakes.
     """
-    links = "".join(f'<a href="#{path.stem}">{escape(path.stem)}</a> ' for path in topologies)
-    return "\n".join(
-        [
-            '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
-            f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>Scenes of apc</title><style>{STYLE}</style></head><body>",
-            "<header><h1>Scenes of apc</h1><p>A scene is copied by <code>apc new --like NAME</code>.</p>",
-            f"<nav>{links}</nav></header><main>",
-            *map(_scene, topologies),
-            "</main></body></html>",
-        ]
-    )
+    return page("gallery.html", scenes=[_scene(path) for path in topologies])
 
 
-def _scene(path: Path) -> str:
-    """Return the section of a scene."""
-    diagram, system = diagram_of(path), compile_topology(path)
-    verdict = str(answer(system, margins=False)).partition("\n\n")[0]
-    text = _COMMENTS.sub("", path.read_text(encoding="utf-8"))
-    return (
-        f'<section id="{path.stem}"><h2>{escape(path.stem)}</h2><p>{escape(system.about)}</p>'
-        f"<figure>{svg_image(graph_picture(diagram), system.name)}</figure>"
-        f"<pre>{escape(verdict)}</pre><pre>{escape(text)}</pre></section>"
-    )
+def _scene(path: Path) -> dict[str, Any]:
+    """Return what the page says of a scene."""
+    system = compile_topology(path)
+    return {
+        "name": path.stem,
+        "about": system.about,
+        "figure": graph_picture(diagram_of(path)),
+        "verdict": str(answer(system, margins=False)).partition("\n\n")[0],
+        "text": _COMMENTS.sub("", path.read_text(encoding="utf-8")),
+    }
