@@ -50,7 +50,7 @@ class Result:
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
         """Return what a notebook shows: the text, and as HTML the text with its picture."""
-        html: str = import_module("apc.present.notebook").html_of(self)
+        html: str = import_module("apc.present.pictures").html_of(self)
         return {"text/plain": str(self), "text/html": html}
 
     def __str__(self) -> str:

@@ -19,6 +19,7 @@ from apc.compiler.words import counted, in_hertz, measured, wrapped
 from apc.present.forms import (
     LINEARIZED,
     Lines,
+    Plain,
     document,
     labelled,
     listed,
@@ -85,7 +86,7 @@ def compile_text(system: CompiledSystem, needs: Needs, target: Path) -> Lines:
     )
     yield f"{system.name} → {target}"
     yield from notes(str(replace(needs, pairs=())))  # they follow, with their reason
-    yield f"  frame {_time(float(needs.frame))}: {ticks or 'no clock is used, any frame will do'}"
+    yield f"  frame {quantity(float(needs.frame), 's')}: {ticks or 'no clock is used, any frame will do'}"
     yield from warning_lines(system.warnings)
     dropped = (f"left out: {name}, as {reason}" for name, reason in system.dropped)
     yield from notes(*_pairwise(system), *dropped)
@@ -133,7 +134,7 @@ def analysis_text(result: Analysis) -> Lines:
     radius = measured(result.spectral_radius, result.spectral_radius_error)
     unfelt = f"{listed(result.unfelt, MOST_UNFELT)}, which nothing that moves reads at these values"
     yield from labelled(
-        ("spectral radius", f"{radius} per frame of {_time(result.frame_s)}"),
+        ("spectral radius", f"{radius} per frame of {quantity(result.frame_s, 's')}"),
         ("peers", f"{result.peers}, {result.states_per_peer} states each"),
         ("method", result.method + (f", {free} left out" if free else "")),
         ("proof", result.proof),
@@ -144,14 +145,14 @@ def analysis_text(result: Analysis) -> Lines:
     yield from notes(*result.notes)
 
 
-def analysis_document(result: Analysis) -> dict[str, Any]:
+def analysis_document(result: Analysis) -> Plain:
     """Return what `apc analyze --json` prints of the analysis itself."""
     return record(result, {"modes": [_mode_document(mode) for mode in result.modes]})
 
 
-def _mode_document(mode: Mode) -> dict[str, Any]:
+def _mode_document(mode: Mode) -> Plain:
     (motion,) = mode.motion
-    moved: dict[str, Any] = document(motion, {"participation": dict(motion.participation)})
+    moved: Plain = document(motion, {"participation": dict(motion.participation)})
     return record(mode, {"motion": ..., **moved})
 
 
@@ -205,7 +206,7 @@ def network_answer_text(found: NetworkAnswer) -> Lines:
     yield f"{found.verdict}\n\n{found.sensitivities}\n\n{found.margins}"
 
 
-def network_answer_document(found: NetworkAnswer) -> dict[str, Any]:
+def network_answer_document(found: NetworkAnswer) -> Plain:
     """Return the verdict over the network as it is, and what moves it, as plain data."""
     return found.verdict.to_dict() | {
         "sensitivities": found.sensitivities.to_dict(),
@@ -214,7 +215,7 @@ def network_answer_document(found: NetworkAnswer) -> dict[str, Any]:
     }
 
 
-def answer_document(found: Answer) -> dict[str, Any]:
+def answer_document(found: Answer) -> Plain:
     """Return what `apc analyze --json` prints: the analysis with more keys."""
     parts = ("network", "sensitivities", "contact_modes", "switching", "buzz")
     told = found.analysis.to_dict()
@@ -291,10 +292,6 @@ def _leading(mode: Mode) -> str:
     return ", ".join(f"{name} {share:.0%}" for name, share in largest if share >= LEAST_SHARE)
 
 
-def _time(seconds: float) -> str:
-    return f"{seconds * 1e3:.6g} ms" if seconds < 1 else f"{seconds:.6g} s"
-
-
 def needs_text(found: Needs) -> Lines:
     """Yield what a scene needs in one sentence."""
     several = len(found.sites) > 1
@@ -364,12 +361,12 @@ def range_text(found: Range) -> str:
     return f"{found.free.label} from {low} to {high}"
 
 
-def range_document(found: Range) -> dict[str, Any]:
+def range_document(found: Range) -> Plain:
     """Return a parameter and its range as plain data."""
     return {"parameter": found.free.label, "unit": found.unit, "range": document((found.low, found.high))}
 
 
-def box_proof_document(found: BoxProof) -> dict[str, Any]:
+def box_proof_document(found: BoxProof) -> Plain:
     """Return what was proved of a box as plain data."""
     return {
         **picked(found, "topology", "left_out", "verdict", "stable", "cells", "open_share", "notes"),
@@ -407,7 +404,7 @@ def contact_modes_text(found: ContactModes) -> Lines:
     yield from notes(*refused, *found.notes)
 
 
-def contact_modes_document(found: ContactModes) -> dict[str, Any]:
+def contact_modes_document(found: ContactModes) -> Plain:
     """Return the modes of contact as plain data."""
     modes = [_analysed(mode, {"on": dict(mode.on)}, "frequency_hz") for mode in found.modes]
     return record(found, {"unstable": found.unstable, "modes": modes})
@@ -430,12 +427,12 @@ def switching_text(found: Switching) -> Lines:
     yield from wrapped(f"{found.topology}, contacts that open and close at will: {said}", "", "  ")
 
 
-def switching_document(found: Switching) -> dict[str, Any]:
+def switching_document(found: Switching) -> Plain:
     """Return whether contacts may open and close at will, as plain data."""
     return {"stable": found.stable, **document(found)}
 
 
-def _analysed(found: ContactMode | Outcome, instead: dict[str, Any], *more: str) -> dict[str, Any]:
+def _analysed(found: ContactMode | Outcome, instead: Plain, *more: str) -> Plain:
     """Return plain data of what may have been refused: then there are no numbers of an analysis."""
     if not found.verdict:
         instead |= dict.fromkeys(("verdict", "spectral_radius", "spectral_radius_error", *more))
@@ -467,7 +464,7 @@ def conventions_text(found: Conventions) -> Lines:
         yield "\n  What is heard before the first packet can't change the verdict."
 
 
-def conventions_document(found: Conventions) -> dict[str, Any]:
+def conventions_document(found: Conventions) -> Plain:
     """Return what every convention leads to as plain data."""
     outcomes = [_analysed(one, {}) for one in found.outcomes]
     return record(found, {"flips": found.flips, "repeated": found.repeated, "outcomes": outcomes})

@@ -14,7 +14,7 @@ from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import counted
-from apc.present.forms import Lines, document, listed, notes, picked, record
+from apc.present.forms import Lines, Plain, document, listed, notes, picked, record
 
 if TYPE_CHECKING:
     from apc.exports.code import Code
@@ -47,7 +47,7 @@ def state_space_control(found: StateSpace) -> Any:
     return as_control(found)
 
 
-def state_space_document(found: StateSpace) -> dict[str, Any]:
+def state_space_document(found: StateSpace) -> Plain:
     """Return a state space as plain data."""
     function = found.function and found.function.serialize()
     instead = {"made_by": json.loads(found.made_by), "function": function, "meaning": found.meaning}
@@ -79,7 +79,7 @@ def code_text(found: Code) -> Lines:
     yield from notes(f"method between ticks: {found.method}; all numbers in SI units")
 
 
-def code_document(found: Code) -> dict[str, Any]:
+def code_document(found: Code) -> Plain:
     """Return a peer's code as plain data."""
     from apc.exports.c_text import source
 
@@ -119,7 +119,7 @@ def unit_text(found: Unit) -> Lines:
     yield from notes(told)
 
 
-def unit_document(found: Unit) -> dict[str, Any]:
+def unit_document(found: Unit) -> Plain:
     """Return an FMU as plain data."""
     variables = [
         {**picked(one, "name", "unit"), "input": bool(one.given), "parameter": one.fixed}

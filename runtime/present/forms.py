@@ -1,8 +1,8 @@
 """The forms that all results share: plain data, JSON, notes, labelled lines and tables.
 
 Takes: frozen values, texts.
-Gives: `document`, `record`, `picked`, `reached`, `json_text`; `Lines`; `quantity`, `listed`, `notes`,
-`sentences`, `labelled`, `table`; `MEANT`.
+Gives: `Plain`, `document`, `record`, `picked`, `reached`, `json_text`; `quantity`, `listed`; `Lines`,
+`notes`, `sentences`, `labelled`, `table`; `MEANT`.
 Guarantees: a document is made of what JSON has words for; the same value gives the same text; a line is at
 most 80 columns wide where its words allow it.
 Does not: know a result.
@@ -25,6 +25,9 @@ MEANT = {
     "mean-square": "judged in mean square, over the network as it is",
     "passive": "judged with every passive hand at every device",
 }
+
+# Plain data, ready for JSON.
+Plain = dict[str, Any]
 
 # A text as its result has it: line by line, each at most 80 columns wide.
 Lines = Iterator[str]
@@ -61,13 +64,13 @@ def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
     return document(value.tolist())  # of an array
 
 
-def record(value: Any, instead: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def record(value: Any, instead: Mapping[str, Any] | None = None) -> Plain:
     """Return a dataclass as plain data, see `document`."""
-    plain: dict[str, Any] = document(value, instead)
+    plain: Plain = document(value, instead)
     return plain
 
 
-def picked(value: Any, *names: str) -> dict[str, Any]:
+def picked(value: Any, *names: str) -> Plain:
     """Return some fields and properties of a value as plain data."""
     return {name: document(getattr(value, name)) for name in names}
 

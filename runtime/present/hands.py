@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.words import known_digits, measured, wrapped
-from apc.present.forms import LINEARIZED, Lines, document, labelled, notes, record, sentences, table
+from apc.present.forms import LINEARIZED, Lines, Plain, document, labelled, notes, record, sentences, table
 from apc.present.pictures import COLOURS, new_figure
-from apc.tables import Column, Row
+from apc.tables import Column, Tabled
 
 if TYPE_CHECKING:
     from apc.hands.feel import Extremes, Feel
@@ -103,10 +103,10 @@ def _mode(one: PassiveMode) -> tuple[str, ...]:
     return name, damping, needed, at, stiffness, verdict
 
 
-def passive_document(found: PassiveHands) -> dict[str, Any]:
+def passive_document(found: PassiveHands) -> Plain:
     """Return the same as plain data."""
     modes = [{**document(one), "damping_needed": document(one.needed)} for one in found.modes]
-    whole: dict[str, Any] = {"hands": "passive", **document(found, {"modes": modes})}
+    whole: Plain = {"hands": "passive", **document(found, {"modes": modes})}
     return whole
 
 
@@ -192,7 +192,7 @@ def _extreme(one: Extremes) -> tuple[str, str]:
     return f"{one.mode}, {what}", size
 
 
-def feel_document(found: Feel) -> dict[str, Any]:
+def feel_document(found: Feel) -> Plain:
     """Return the same as plain data, in SI; complex numbers as pairs."""
     instead = {
         "hinf": {f"{one.mode} {one.of}": one for one in found.hinf},
@@ -234,7 +234,7 @@ def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
         phase.set_ylabel("phase of the impedance (°)")
         if np.abs(degrees).max() <= 90:
             phase.set_yticks(range(-90, 91, 45))
-    legend: dict[str, Any] = {"fontsize": 8, "frameon": False, "ncols": 2 if kind == "nyquist" else 1}
+    legend: Plain = {"fontsize": 8, "frameon": False, "ncols": 2 if kind == "nyquist" else 1}
     if ax is None:
         size.figure.legend(*size.get_legend_handles_labels(), loc="outside lower center", **legend)
     else:
@@ -242,7 +242,7 @@ def feel_picture(found: Feel, kind: str = "bode", ax: Any = None) -> Any:
     return size.figure
 
 
-def feel_rows(found: Feel) -> tuple[list[Column], Iterator[Row], dict[str, Any]]:
+def feel_rows(found: Feel) -> Tabled:
     """Return the columns of a table of responses, a row a frequency, and what it is of."""
     responses = (("impedance", "N*s/m"), ("transmitted admittance", "m/s/N"), ("error per force", "m/N"))
     headings = [Column("frequency", "Hz")]

@@ -9,16 +9,16 @@ Does not: compute, or draw itself (see `region_picture`).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.words import counted, known_digits, measured, with_unit
 from apc.present.analysis import range_document
-from apc.present.forms import MEANT, Lines, notes, picked, quantity, sentences, table
+from apc.present.forms import MEANT, Lines, Plain, notes, picked, quantity, sentences, table
 from apc.present.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up
-from apc.tables import Column, Row
+from apc.tables import Column, Row, Tabled
 
 if TYPE_CHECKING:
     from apc.regions.panels import Panel, Panels
@@ -89,7 +89,7 @@ def _point(curve: Curve, place: int) -> str:
     return "({}, {})".format(*(known_digits(one, curve.error * abs(one), 6) for one in curve.points[place]))
 
 
-def region_document(found: Region) -> dict[str, Any]:
+def region_document(found: Region) -> Plain:
     """Return what `apc region --json` prints of one region."""
     names = ("topology", "tolerance", "stable_area", "stable_area_error", "cell", "criterion", "left_out")
     return {
@@ -104,7 +104,7 @@ def region_document(found: Region) -> dict[str, Any]:
     }
 
 
-def _curve_document(curve: Curve) -> dict[str, Any]:
+def _curve_document(curve: Curve) -> Plain:
     names = ("points", "handles", "error", "mode", "frequency_hz", "closed", "smooth")
     return picked(curve, *names) | {"stable_side": "left"}
 
@@ -127,14 +127,14 @@ def panels_text(found: Panels) -> Lines:
             yield ""
 
 
-def panels_document(found: Panels) -> dict[str, Any]:
+def panels_document(found: Panels) -> Plain:
     """Return what `apc region --json` prints: the region itself if it is alone, else the panels."""
     if found.alone is not None:
         return found.alone.to_dict()
     return {"normalized": found.normalized, "panels": [_panel_document(one) for one in found.panels]}
 
 
-def _panel_document(panel: Panel) -> dict[str, Any]:
+def _panel_document(panel: Panel) -> Plain:
     return {
         "panel": panel.title,
         "regions": [
@@ -145,7 +145,7 @@ def _panel_document(panel: Panel) -> dict[str, Any]:
     }
 
 
-def panels_rows(found: Panels) -> tuple[list[Column], Iterator[Row], dict[str, Any]]:
+def panels_rows(found: Panels) -> Tabled:
     """Return the columns of a table of boundary points, a row a point, and how they were made."""
     regions = [(one, panel.title) for panel in found.panels for one in panel.regions]
     made = {
@@ -157,7 +157,7 @@ def panels_rows(found: Panels) -> tuple[list[Column], Iterator[Row], dict[str, A
     return _columns(regions[0][0]), rows, made
 
 
-def region_rows(found: Region) -> tuple[list[Column], Iterator[Row], dict[str, Any]]:
+def region_rows(found: Region) -> Tabled:
     """Return the same of one region."""
     return _columns(found), _rows(found), {}
 

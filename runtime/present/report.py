@@ -26,7 +26,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, check_target, read_file, unwritable, write_file, write_text
 from apc.compiler.timings import part
 from apc.optional import missing, need
-from apc.present.forms import Lines, document, json_text, notes, record
+from apc.present.forms import Lines, Plain, document, json_text, notes, record
 from apc.present.graph import graph_picture
 from apc.present.pages import inert, page
 from apc.reports.contents import Report, Section
@@ -60,7 +60,7 @@ def report_text(found: Report) -> Lines:
             yield from notes(f"{TITLES[section.key]}: {section.refused or f'as {section.command}'}")
 
 
-def report_document(found: Report) -> dict[str, Any]:
+def report_document(found: Report) -> Plain:
     """Return a report as plain data: what is needed to compute it again, and all of its tables."""
     scenes = [
         document(one, {"path": ..., "file": one.path.name, "sections": [*map(_kept, one.sections)]})
@@ -69,7 +69,7 @@ def report_document(found: Report) -> dict[str, Any]:
     return {"apc_report": 2, "versions": dict(found.versions), "scenes": scenes}
 
 
-def _kept(section: Section) -> dict[str, Any]:
+def _kept(section: Section) -> Plain:
     """Return a section as plain data: of its results what is the same wherever it is computed anew."""
     results = [_comparable(one.to_dict()) for one in section.results]
     return record(section, {"drawn": ..., "results": results})
@@ -157,7 +157,7 @@ class KeptSection(TypedDict):
 
     key: str
     refused: str
-    results: list[dict[str, Any]]
+    results: list[Plain]
 
 
 class KeptScene(TypedDict):

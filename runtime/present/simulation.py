@@ -23,6 +23,7 @@ from apc.compiler.words import counted, in_hertz, wrapped
 from apc.optional import need
 from apc.present.forms import (
     Lines,
+    Plain,
     document,
     json_text,
     labelled,
@@ -152,11 +153,11 @@ def error_text(estimate: ErrorEstimate) -> str:
     return f"{about}{size}, {worst.relative:.1g} of its range ({estimate.compared})"
 
 
-def played_document(found: Played) -> dict[str, Any]:
+def played_document(found: Played) -> Plain:
     """Return what `apc simulate --json` prints."""
     summary = found.summary
 
-    def keyed(values: Sequence[Any] | None, *keys: str) -> dict[str, Any] | None:
+    def keyed(values: Sequence[Any] | None, *keys: str) -> Plain | None:
         return None if values is None else dict(zip(keys, values, strict=True))
 
     return {
@@ -179,14 +180,14 @@ def played_document(found: Played) -> dict[str, Any]:
     }
 
 
-def _error_document(found: ErrorEstimate) -> dict[str, Any]:
+def _error_document(found: ErrorEstimate) -> Plain:
     signals = [
         document(one, {"at": ..., "span": ..., "time_s": one.at, "range": one.span}) for one in found.signals
     ]
     return {"kind": found.kind, "compared_with": found.compared, "signals": signals}
 
 
-def provenance_document(found: Provenance) -> dict[str, Any]:
+def provenance_document(found: Provenance) -> Plain:
     """Return what made a result as plain data."""
     instead = {
         "texts": ...,
@@ -416,7 +417,7 @@ def _beside(ensemble: Ensemble, found: MeanSquare) -> str:
     return f"{told}what moves the others is a force that goes on, which that verdict is not about"
 
 
-def ensemble_document(found: Ensemble) -> dict[str, Any]:
+def ensemble_document(found: Ensemble) -> Plain:
     """Return what many runs amount to as plain data."""
     from apc.simulation.ensemble import QUANTILES, share_interval
 
@@ -425,7 +426,7 @@ def ensemble_document(found: Ensemble) -> dict[str, Any]:
         verdict: {"runs": count, "share": count / n, "share_95": list(share_interval(count, n))}
         for verdict, count in found.verdicts
     }
-    instead: dict[str, Any] = {
+    instead: Plain = {
         "duration": ...,
         "duration_s": found.duration,
         "runs": n,

@@ -20,7 +20,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.words import counted, enumerated, in_hertz, measured, with_unit, wrapped
 from apc.frame.overrides import Override, apply
 from apc.present.analysis import range_document, range_text
-from apc.present.forms import MEANT, Lines, labelled, notes, quantity, record, table
+from apc.present.forms import MEANT, Lines, Plain, labelled, notes, quantity, record, table
 from apc.present.pictures import COLOURS, new_figure
 from apc.present.region_picture import draw_panel
 from apc.regions.panels import Panel
@@ -184,7 +184,7 @@ def _draw_gains(found: Tuning, ax: Any) -> None:
     draw_panel(ax, f"{found.topology}{more}", Panel("", tuple(regions), (1,) * len(regions), ()))
     (now, best) = np.array([(one.now, float(one.value)) for one in found.gains]).T
     ax.annotate("", best, now, arrowprops={"arrowstyle": "->", "color": "0.3"})
-    whole: dict[str, Any] = {"clip_on": False, "zorder": 5}  # where an end of a range is best, too
+    whole: Plain = {"clip_on": False, "zorder": 5}  # where an end of a range is best, too
     ax.plot(*now, "o", color="0.3", label="now", **whole)
     ax.plot(*best, "*", color="black", markersize=11, label="found", **whole)
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False, fontsize=8)
@@ -254,7 +254,7 @@ def front_picture(found: Front, ax: Any = None) -> Any:
     return ax
 
 
-def tuning_document(found: Tuning) -> dict[str, Any]:
+def tuning_document(found: Tuning) -> Plain:
     """Return the gains, what is proved of them and what binds as plain data."""
     proofs = [
         {"counts": dict(one.counts), "verdict": one.proof.verdict, "stable": one.proof.stable}

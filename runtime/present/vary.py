@@ -16,7 +16,18 @@ from numpy.typing import NDArray
 
 from apc.compiler.words import counted, in_hertz, known_digits, measured, with_unit, wrapped
 from apc.optional import need
-from apc.present.forms import MEANT, Lines, as_shown, document, notes, quantity, record, sentences, table
+from apc.present.forms import (
+    MEANT,
+    Lines,
+    Plain,
+    as_shown,
+    document,
+    notes,
+    quantity,
+    record,
+    sentences,
+    table,
+)
 
 if TYPE_CHECKING:
     import pandas
@@ -143,7 +154,7 @@ def critical_picture(found: Critical, ax: Any) -> Any:
     return locus_picture(root_locus(found.system, found), ax)
 
 
-def critical_document(found: Critical) -> dict[str, Any]:
+def critical_document(found: Critical) -> Plain:
     """Return where a scene's verdict changes with a parameter as plain data."""
     return record(found, {"groups": dict(found.groups)})
 
@@ -173,7 +184,7 @@ def margins_text(found: Margins) -> Lines:
     yield from notes(found.note)
 
 
-def margins_document(found: Margins) -> dict[str, Any]:
+def margins_document(found: Margins) -> Plain:
     """Return the margins as plain data."""
     return {"margins": document(found.rows), "note": found.note}
 
@@ -205,7 +216,7 @@ def _change(value: float, error: float) -> str:
     return f"{value:+.{min(max(known, 1), DIGITS) - 1}e}"
 
 
-def sensitivities_document(found: Sensitivities) -> dict[str, Any]:
+def sensitivities_document(found: Sensitivities) -> Plain:
     """Return the derivatives as plain data."""
     return {
         "spectral_radius": found.radius,
@@ -224,7 +235,7 @@ def analyses_text(found: Analyses) -> Lines:
     yield from _verdict_lines(*(Counter(one.ravel().tolist()) for one in (found.verdict, found.message)))
 
 
-def analyses_document(found: Analyses) -> dict[str, Any]:
+def analyses_document(found: Analyses) -> Plain:
     """Return many analyses as plain data, a list a column."""
     columns = {heading: column.tolist() for heading, column in _analyses_columns(found).items()}
     return {"topology": found.topology, "left_out": list(found.left_out), **document(columns)}
@@ -270,7 +281,7 @@ def sweep_text(found: Sweep) -> Lines:
     yield from (f"  note: {one}" for one in found.notes)
 
 
-def sweep_document(found: Sweep) -> dict[str, Any]:
+def sweep_document(found: Sweep) -> Plain:
     """Return what a sweep is and how it came out, without its rows, as plain data."""
     return {
         **found.made_of,
