@@ -31,7 +31,7 @@ class Result:
     """What is found, abstract. `shown_by` names its module of `apc.present`, and it there: "vary:critical".
 
     That module has a function for each form of it: `critical_text`, which yields its lines,
-    `critical_picture`. Its document is its fields (`forms.document`), unless there is a `critical_document`.
+    `critical_picture`. Its document is its fields (`forms.record`), unless there is a `critical_document`.
     """
 
     __slots__ = ()
@@ -82,5 +82,5 @@ class Result:
         forms: Any = import_module(f"apc.present.{module}")
         if hasattr(forms, f"{name}_{form}"):
             return getattr(forms, f"{name}_{form}")(self, *arguments)
-        other, called = {"document": ("forms", "document"), "table": ("pictures", "table_of")}[form]
+        other, called = {"document": ("forms", "record"), "table": ("pictures", "table_of")}[form]
         return getattr(import_module(f"apc.present.{other}"), called)(self)

@@ -47,7 +47,7 @@ from apc.explore.written import with_values
 from apc.frame.linearize import reaches_start
 from apc.frame.names import Range
 from apc.frame.overrides import Override, apply
-from apc.present.forms import json_text
+from apc.present.forms import Plain, json_text
 from apc.processes import model_bytes
 from apc.vary.evaluator import reaches_count, reaches_time
 from apc.vary.growth import MEAN_SQUARE, NOMINAL
@@ -186,7 +186,7 @@ class Page:
         self.tuned = Words("tuned")
         self.region, self.roots = RegionFigure(), RootsFigure()
         self.motion, self.feel = MotionFigure(), FeelFigure()
-        self.modes: Mapping[str, Any] | None = None  # of the newest verdict
+        self.modes: Plain | None = None  # of the newest verdict
         # Whether the scene is linear, and many points are analysed at once: what the first verdict says.
         self.linear: bool | None = None
         self.at_once = False
@@ -344,7 +344,7 @@ class Page:
         self.tune.disabled = asked is None
         self.tuned.say(NO_AXES if asked is None else TUNES.format(*reversed(names)) if asked[0] else STUDIED)
 
-    def _save_numbers(self, found: Mapping[str, Any]) -> None:
+    def _save_numbers(self, found: Plain) -> None:
         values = {one.label: one.texts[place] for one, place in self._pairs()}
         told = {"topology": self.system.name, "apc": program_version(), "set": values, **found}
         self.out.data = {"name": [f"{self.system.name}.json"], "text": [json_text(told)]}

@@ -9,7 +9,7 @@ Does not: know the browser, or keep an answer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -67,7 +67,7 @@ class Task:
 class Told:
     """What a section has to show, as plain data and arrays; None with the reason in `why`."""
 
-    found: Mapping[str, Any] | None
+    found: Plain | None
     why: str = ""
 
 

@@ -152,7 +152,7 @@ def analysis_document(result: Analysis) -> Plain:
 
 def _mode_document(mode: Mode) -> Plain:
     (motion,) = mode.motion
-    moved: Plain = document(motion, {"participation": dict(motion.participation)})
+    moved = record(motion, {"participation": dict(motion.participation)})
     return record(mode, {"motion": ..., **moved})
 
 
@@ -217,9 +217,8 @@ def network_answer_document(found: NetworkAnswer) -> Plain:
 
 def answer_document(found: Answer) -> Plain:
     """Return what `apc analyze --json` prints: the analysis with more keys."""
-    parts = ("network", "sensitivities", "contact_modes", "switching", "buzz")
     told = found.analysis.to_dict()
-    told |= {name: one.to_dict() if (one := getattr(found, name)) else None for name in parts}
+    told |= picked(found, "network", "sensitivities", "contact_modes", "switching", "buzz")
     told |= {
         "margins": document(found.margins.rows),
         "margins_note": found.margins.note,
@@ -429,7 +428,7 @@ def switching_text(found: Switching) -> Lines:
 
 def switching_document(found: Switching) -> Plain:
     """Return whether contacts may open and close at will, as plain data."""
-    return {"stable": found.stable, **document(found)}
+    return {"stable": found.stable, **record(found)}
 
 
 def _analysed(found: ContactMode | Outcome, instead: Plain, *more: str) -> Plain:

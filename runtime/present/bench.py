@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from apc.benchmark.bench import SAME, Bench, Comparison, Measured
 from apc.compiler.words import counted, wrapped
-from apc.present.forms import Lines, document, notes, table
+from apc.present.forms import Lines, notes, record, table
 from apc.present.pictures import COLOURS, new_figure
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ def hard_document(found: HardReport) -> dict[str, Any]:
     """Return what `apc bench --hard --json` prints."""
     return {
         "folder": found.folder,
-        "cases": [document(case, {"bound_over_error": case.looseness}) for case in found.cases],
+        "cases": [record(case, {"bound_over_error": case.looseness}) for case in found.cases],
         "without_truth": list(found.without),
         "failed": [case.name for case in found.failures],
         "undecided": [case.name for case in found.cases if case.undecided],

@@ -197,9 +197,7 @@ def comparison_document(found: Comparison) -> Plain:
 
 
 def _document(one: Scheme) -> Plain:
-    parts = ("analysis", "network", "passive", "played", "stiffness", "delay", "loss", "feel")
-    told = {key: None if (had := getattr(one, key)) is None else had.to_dict() for key in parts}
-    return record(one, {**picked(one, "verdict", "stable", "left_out"), **told, "missing": dict(one.missing)})
+    return record(one, {**picked(one, "verdict", "stable", "left_out"), "missing": dict(one.missing)})
 
 
 def comparison_rows(found: Comparison) -> Tabled:

@@ -19,6 +19,7 @@ from typing import Any
 
 from apc.compiler.words import with_unit, wrapped
 from apc.later import Later
+from apc.result import Result
 
 # What stable means by a criterion, where it is not that motions die out.
 MEANT = {
@@ -35,15 +36,13 @@ Lines = Iterator[str]
 LINEARIZED = ", linearized at its start"
 
 
-def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
-    """Return a value as plain data: a dataclass by its shown fields, a complex number as a pair, no NaN.
+def document(value: Any) -> Any:
+    """Return a value as plain data: a result by its own document, a complex number as a pair, no NaN.
 
     Parameters
     ----------
     value
         Dataclasses, mappings, sequences and arrays of numbers, texts and None.
-    instead
-        What is taken in the place of fields of a dataclass, or after them; `...` leaves a field out.
     """
     if value is None or isinstance(value, str | int):
         return value
@@ -53,10 +52,10 @@ def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
         return document((value.real, value.imag))
     if isinstance(value, Fraction):
         return float(value)
+    if isinstance(value, Result):
+        return value.to_dict()
     if is_dataclass(value):
-        shown = {one.name: None for one in fields(value) if one.repr}  # there are as many modes as states
-        own = {**shown, **(instead or {})}
-        value = {key: own[key] if key in (instead or {}) else getattr(value, key) for key in own}
+        return record(value)
     if isinstance(value, Mapping):
         return {key: document(item) for key, item in value.items() if item is not ...}
     if isinstance(value, tuple | list | Later):
@@ -65,8 +64,19 @@ def document(value: Any, instead: Mapping[str, Any] | None = None) -> Any:
 
 
 def record(value: Any, instead: Mapping[str, Any] | None = None) -> Plain:
-    """Return a dataclass as plain data, see `document`."""
-    plain: Plain = document(value, instead)
+    """Return a dataclass as plain data, by its shown fields.
+
+    Parameters
+    ----------
+    value
+        The dataclass.
+    instead
+        What is taken in the place of fields, or after them; `...` leaves a field out.
+    """
+    shown = [one.name for one in fields(value) if one.repr]  # there are as many modes as states
+    other = instead or {}
+    kept = {name: other[name] if name in other else getattr(value, name) for name in [*shown, *other]}
+    plain: Plain = document(kept)
     return plain
 
 

@@ -106,8 +106,7 @@ def _mode(one: PassiveMode) -> tuple[str, ...]:
 def passive_document(found: PassiveHands) -> Plain:
     """Return the same as plain data."""
     modes = [{**document(one), "damping_needed": document(one.needed)} for one in found.modes]
-    whole: Plain = {"hands": "passive", **document(found, {"modes": modes})}
-    return whole
+    return {"hands": "passive", **record(found, {"modes": modes})}
 
 
 def feel_text(found: Feel) -> Lines:

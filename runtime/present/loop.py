@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from apc.compiler.words import counted
 from apc.loop.packets import DROPPED
-from apc.present.forms import Lines, document, notes, record, table
+from apc.present.forms import Lines, notes, record, table
 from apc.present.network import recording_document
 
 if TYPE_CHECKING:
@@ -91,11 +91,11 @@ def run_comparison_document(found: RunComparison) -> dict[str, Any]:
     """Return a run beside its scene as plain data; times in seconds."""
     measured = [
         {
-            **document(one, {"analysis": ..., "network": one.network and one.network.verdict}),
+            **record(one, {"analysis": ..., "network": one.network and one.network.verdict}),
             "verdict": one.analysis.verdict,
             "spectral_radius": one.analysis.spectral_radius,
         }
         for one in found.measured
     ]
-    ways = [document(one, {"came": recording_document(one.came)}) for one in found.ways]
+    ways = [record(one, {"came": recording_document(one.came)}) for one in found.ways]
     return record(found, {"ways": ways, "measured": measured})

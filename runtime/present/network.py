@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from apc.compiler.words import counted, measured, wrapped
-from apc.present.forms import LINEARIZED, Lines, Plain, document, labelled, notes, record, sentences
+from apc.present.forms import LINEARIZED, Lines, Plain, labelled, notes, record, sentences
 
 if TYPE_CHECKING:
     from apc.moments.network import NetworkVerdict
@@ -111,7 +111,7 @@ def recording_text(found: NetworkRecording) -> Lines:
 def recording_document(found: NetworkRecording) -> Plain:
     """Return a recording as plain data: seconds, shares from 0 to 1."""
     shares = {name: getattr(found, name) for name in ("lost", "turns_bad", "turns_good")}
-    instead = {name: document(share, {"share": share.value}) for name, share in shares.items()}
+    instead = {name: record(share, {"share": share.value}) for name, share in shares.items()}
     return record(found, {"delays": ..., "entry": link_entry(found), **instead})
 
 

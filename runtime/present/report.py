@@ -26,7 +26,7 @@ from apc.compiler.errors import ApcError, Mistake, Place
 from apc.compiler.files import RefusedError, check_target, read_file, unwritable, write_file, write_text
 from apc.compiler.timings import part
 from apc.optional import missing, need
-from apc.present.forms import Lines, Plain, document, json_text, notes, record
+from apc.present.forms import Lines, Plain, json_text, notes, record
 from apc.present.graph import graph_picture
 from apc.present.pages import inert, page
 from apc.reports.contents import Report, Section
@@ -63,7 +63,7 @@ def report_text(found: Report) -> Lines:
 def report_document(found: Report) -> Plain:
     """Return a report as plain data: what is needed to compute it again, and all of its tables."""
     scenes = [
-        document(one, {"path": ..., "file": one.path.name, "sections": [*map(_kept, one.sections)]})
+        record(one, {"path": ..., "file": one.path.name, "sections": [*map(_kept, one.sections)]})
         for one in found.scenes
     ]
     return {"apc_report": 2, "versions": dict(found.versions), "scenes": scenes}

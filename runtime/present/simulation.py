@@ -174,7 +174,7 @@ def played_document(found: Played) -> Plain:
         "work_J": dict(summary.work),
         "rows": summary.rows,
         "end_s": summary.end,
-        "signals": [document(one, {"settled": ..., "settled_s": one.settled}) for one in summary.extents],
+        "signals": [record(one, {"settled": ..., "settled_s": one.settled}) for one in summary.extents],
         "error_estimate": None if found.error is None else _error_document(found.error),
         "provenance": provenance_document(found.provenance),
     }
@@ -182,7 +182,7 @@ def played_document(found: Played) -> Plain:
 
 def _error_document(found: ErrorEstimate) -> Plain:
     signals = [
-        document(one, {"at": ..., "span": ..., "time_s": one.at, "range": one.span}) for one in found.signals
+        record(one, {"at": ..., "span": ..., "time_s": one.at, "range": one.span}) for one in found.signals
     ]
     return {"kind": found.kind, "compared_with": found.compared, "signals": signals}
 
@@ -192,7 +192,7 @@ def provenance_document(found: Provenance) -> Plain:
     instead = {
         "texts": ...,
         "sha256": found.texts,
-        "tolerances": {one.state: document(one, {"state": ...}) for one in found.tolerances},
+        "tolerances": {one.state: record(one, {"state": ...}) for one in found.tolerances},
         "parameters": {name: {"value": value, "unit": unit} for name, value, unit in found.parameters},
         "timings": ...,
         "timings_s": dict(found.timings),
@@ -434,11 +434,10 @@ def ensemble_document(found: Ensemble) -> Plain:
         "verdicts": shares,
     }
     for name in LABELS:
-        one = found.statistics(name)
+        instead[name] = one = found.statistics(name)
         if one is not None:
             quantiles = dict(zip(map(str, QUANTILES), one.quantiles, strict=True))
-            one = document(one, {"count": ..., "runs": one.count, "quantiles": quantiles})
-        instead[name] = one
+            instead[name] = record(one, {"count": ..., "runs": one.count, "quantiles": quantiles})
     return record(found, instead)
 
 

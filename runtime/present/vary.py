@@ -1,7 +1,8 @@
-"""Critical values, margins, sensitivities, sweeps and many analyses as text, plain data and tables.
+"""What may be set; critical values, margins, sensitivities, sweeps, many analyses: as text, data and tables.
 
-Takes: results of `vary` and `sweeps`. Gives: their texts, documents and tables.
-Guarantees: a number is shown to the digits that its error leaves known.
+Takes: results of `vary` and `sweeps`, `Parameters`. Gives: their texts, documents and tables.
+Guarantees: a number is shown to the digits that its error leaves known; what may be set stands in the unit
+that `--set` takes it in.
 Does not: compute, but for the root locus that a picture of a critical value is.
 """
 
@@ -32,6 +33,7 @@ from apc.present.forms import (
 if TYPE_CHECKING:
     import pandas
 
+    from apc.frame.settable import Parameters, Settable
     from apc.sweeps.sweep import Sweep
     from apc.vary.critical import Critical
     from apc.vary.crossing import Crossing
@@ -43,6 +45,10 @@ SHOWN = 6  # rows of the table of what moves the radius most; digits of a value 
 DIGITS = 3  # of a change
 
 NONE_TOLD = "what moves the radius most: no change of it can be told from rounding"
+
+HOW = (
+    '--set NAME="VALUE UNIT" sets one, in every command that analyses; words, as of a type, stand in the file'
+)
 
 
 def critical_text(found: Critical) -> Lines:
@@ -295,3 +301,30 @@ def sweep_document(found: Sweep) -> Plain:
 def sweep_table(found: Sweep) -> pandas.DataFrame:
     """Return a sweep as a pandas table, with the headings as its columns."""
     return need("pandas", "data").DataFrame(dict(zip(found.headings, found.columns, strict=True)))
+
+
+def parameters_text(found: Parameters) -> Lines:
+    """Yield a line a number: name, value, limits, and what it is."""
+    yield f"{found.topology}: what may be set\n"
+    rows = [(one.name, _value(one), _limits(one), _told(one)) for one in found.rows]
+    yield from table([("name", "value", "limits", ""), *rows], later=6)
+    yield ""
+    yield from sentences(HOW)
+
+
+def _value(one: Settable) -> str:
+    if one.low == one.high:
+        return quantity(one.low, one.unit, 9)
+    return with_unit(f"{one.low:.4g} to {one.high:.4g}", one.unit)
+
+
+def _limits(one: Settable) -> str:
+    low = "" if one.minimum is None else f"{'>' if one.open_minimum else '≥'} {one.minimum:.9g}"
+    high = "" if one.maximum is None else f"≤ {one.maximum:.9g}"
+    return ", ".join(limit for limit in (low, high) if limit)
+
+
+def _told(one: Settable) -> str:
+    fixed = f"not to be set: {one.fixed}" if one.fixed else ""
+    follows = f"follows: {one.follows}" if one.follows else ""
+    return "; ".join(part for part in (one.about, follows, fixed) if part)
